@@ -65,6 +65,7 @@ GONE: dict[str, str] = {
     "design --past": "Say what is expected: --rate, --gain, --agreement.",
     "design --rate-width": "--width is that of the gain's interval.",
     "design --per-task": "A study asks for its gain over all tasks together.",
+    "evaluate --force": "Delete RUN/results/cache; nothing else remembers a file.",
     "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
     "render --rate-hz": "One frame is drawn for each recorded image.",
     **dict.fromkeys(

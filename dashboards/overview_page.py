@@ -43,7 +43,7 @@ COLUMNS = (
     ("executed", "Twin, executed"),
     ("gate", "Gate"),
     ("agreement", "Agreement"),
-    ("distance", "Tool off by"),
+    ("distance", "Tool path, lag"),
     ("cause", "Cause in the twin"),
 )
 LONGEST = 60

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, PrefixLoader, StrictUndefined
-from markupsafe import Markup
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
@@ -29,11 +28,9 @@ from dashboards.config import SHARE_LIMITS, ShareConfig
 from dashboards.episode_page import build_page
 from dashboards.figures import TimePlot
 from dashboards.library import episode_path
-from dashboards.loading import LOADING
 from dashboards.queue_page import SUBSAMPLING
 from evaluator.compare.rows import Comparison
-from evaluator.report.figures.drawing import DARK, LIGHT, Drawing
-from evaluator.report.figures.selection import drawings_of
+from evaluator.report.figures import DARK, LIGHT, Drawing, drawings_of
 from evaluator.report.front import FIGURES, front
 from evaluator.report.page import SHARED, environment, name_shared
 from evaluator.report.wording import stand_in_sentence
@@ -217,7 +214,7 @@ def _shared_parts(run: RunFolder, judgement: Judgement, report: str) -> dict[str
     """What the file says of the whole run."""
     results = judgement.results
     success = None if results is None else _table(results.tables, "success")
-    drawing, svg = _figure(judgement.comparison)
+    drawing = _figure(judgement.comparison)
     return {
         "name": run.path.resolve().name,
         "title": f"Trials of {run.path.resolve().name}",
@@ -228,7 +225,6 @@ def _shared_parts(run: RunFolder, judgement: Judgement, report: str) -> dict[str
         "first": None if results is None else front(results),
         "success": success,
         "drawing": drawing,
-        "svg": None if svg is None else Markup(svg),  # drawn by the evaluator
         "report": report,
     }
 
@@ -237,20 +233,10 @@ def _table(tables: Sequence[Table], name: str) -> Table | None:
     return next((table for table in tables if table.id == name and table.rows), None)
 
 
-def _figure(comparison: Comparison | None) -> tuple[Drawing | None, str | None]:
-    """Draw the report's first figure; none without matplotlib, or without groups."""
-    if comparison is None:
-        return None, None
-    drawn, _ = drawings_of(comparison)
-    first = next((d for name in FIGURES for d in drawn if d.id == name), None)
-    if first is None:
-        return None, None
-    try:
-        with LOADING:
-            from evaluator.report.figures import render  # noqa: PLC0415  # loads matplotlib
-    except ModuleNotFoundError:
-        return None, None
-    return first, render.render(first).inline
+def _figure(comparison: Comparison | None) -> Drawing | None:
+    """Draw the report's first figure; none without groups."""
+    drawn = [] if comparison is None else drawings_of(comparison)
+    return next((each for name in FIGURES for each in drawn if each.id == name), None)
 
 
 def _trial(run: RunFolder, row: IndexedTrial) -> SharedTrial:

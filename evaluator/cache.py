@@ -10,7 +10,6 @@ it raises. ``docs/decisions/0008-caches-and-processes.md`` says why.
 
 import hashlib
 import time
-from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -25,7 +24,7 @@ import bridge
 import evaluator
 from bridge.episode.provenance import software
 from bridge.whole_file import write_whole
-from evaluator.memory import Packed, packed, without_collecting
+from evaluator.memory import without_collecting
 
 Say = Callable[[str], None]
 Rows = dict[str, tuple[Any, ...]]
@@ -65,15 +64,9 @@ def code_version() -> bytes:
 
 
 def _to_plain(value: Any) -> Any:
-    if isinstance(value, array):
-        return value.tobytes()
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(type(value).__name__)
-
-
-def _from_plain(kind: type[Any], value: Any) -> Any:
-    return packed(value) if kind is Packed else value
 
 
 _encode = msgspec.msgpack.Encoder(enc_hook=_to_plain).encode
@@ -113,7 +106,6 @@ def read_rows(path: Path, kind: type[Any]) -> Rows:
             rows: Rows = msgspec.msgpack.decode(
                 body,
                 type=dict[str, tuple[kind, ...]],  # type: ignore[valid-type]
-                dec_hook=_from_plain,
             )
     except msgspec.MsgspecError as error:
         message = f"{path.name} holds something else ({error})"
@@ -145,7 +137,6 @@ class SummaryCache:
         self,
         folder: Path | None,
         *,
-        fresh: bool = False,
         say: Say = lambda text: None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -153,11 +144,9 @@ class SummaryCache:
 
         Args:
             folder: None keeps nothing.
-            fresh: Believe nothing that was kept, and keep what is made now.
             monotonic: The clock of periodic saving [s].
         """
         self._folder = folder
-        self._fresh = fresh
         self._say_once: Say | None = say
         self._monotonic = monotonic
         self._saved_s = monotonic()
@@ -215,7 +204,7 @@ class SummaryCache:
     def _of(self, kind: type[Any]) -> _Kept:
         if kind not in self._kept:
             rows: Rows = {}
-            if self._folder is not None and not self._fresh:
+            if self._folder is not None:
                 try:
                     rows = read_rows(self._path(kind), kind)
                 except OSError:  # not there, or not ours to read

@@ -35,7 +35,6 @@ def evaluate(
     against: Path | None = None,
     reviews: tuple[Path, ...] = (),
     interval: Literal["wilson", "clopper-pearson", "jeffreys"] = "wilson",
-    force: bool = False,
     everything: Annotated[bool, Parameter(name="--all")] = False,
     latex: bool = False,
     tables: Annotated[TableOptions, Parameter(name="*")] = AS_SAVED,
@@ -60,7 +59,6 @@ def evaluate(
         reviews: A second rater's labels (columns trial_id, rater, time, result, cause; or a folder
             of such files), beside those in RUN/reviews: kappa of each two raters.
         interval: Interval of success rates.
-        force: Read every file of the run again, whatever RUN/results/cache remembers.
         everything: Show and write the tables that nobody decides by, and list every number.
         latex: Write the headline tables as LaTeX, too.
         tables: How tables are read.
@@ -73,7 +71,6 @@ def evaluate(
         interval=interval,
         tables=tables,
         images=images,
-        force=force,
         everything=everything,
         latex=latex,
         check_published=check_published,
@@ -172,7 +169,6 @@ class _Asked:
     interval: str
     tables: TableOptions
     images: ImageOptions
-    force: bool
     everything: bool
     latex: bool
     check_published: Path | None
@@ -226,7 +222,7 @@ def _compare(sources: Sequence[Path], asked: _Asked, output: Output) -> "tuple[C
     run = RunFolder.open(source)
     if not trials_path(run).is_file():
         run.refuse_empty()
-    with SummaryCache(run.results_dir / FOLDER, fresh=asked.force, say=output.say) as cache:
+    with SummaryCache(run.results_dir / FOLDER, say=output.say) as cache:
         comparison = compare_run(
             run,
             method=asked.interval,
@@ -268,7 +264,6 @@ def _compare_several(sources: Sequence[Path], asked: _Asked, output: Output) -> 
         sources,
         method=asked.interval,
         options=asked.tables,
-        force=asked.force,
         output=output,
     )
 

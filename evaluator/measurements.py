@@ -4,13 +4,17 @@ An id is a pattern: ``gain.pp.{side}.{task}.{policy}``. ``Quantity.of`` fills in
 what a ``Measurement`` is made with, so no other module spells an id.
 """
 
+import math
+import sys
+from pathlib import Path
+
 from evaluator import motion_measurements as motion_measurements
 from evaluator import study_measurements as study_measurements
 from evaluator.metrics import image
 from evaluator.metrics.image_protocol import ImageMetric
 from evaluator.metrics.image_scores import METRICS
 from evaluator.quantity import REGISTRY as REGISTRY
-from evaluator.quantity import Better
+from evaluator.quantity import SIGNED, UP, Better, with_tables
 from evaluator.quantity import Defined as Defined
 from evaluator.quantity import Quantity as Quantity
 from evaluator.quantity import new_quantity as _new
@@ -97,6 +101,7 @@ GAIN_RELATIVE = _new(
     "1",
     "higher",
     "relative gain with replanning ({side}), (with - without) / without: {words}; not percentage points",
+    (-1.0, math.inf),
 )
 GAIN_POINTS_AVERAGE = _new(
     "gain.pp.{side}.average",
@@ -109,12 +114,19 @@ GAIN_RELATIVE_AVERAGE = _new(
     "1",
     "higher",
     "relative gain with replanning of the unrounded mean rates of {count} tasks ({side}); not percentage points",
+    (-1.0, math.inf),
 )
 # Agreement over groups. ``{what}`` says over which.
 
 
-def _agreement(name: str, unit: str, better: Better, definition: str) -> Quantity:
-    return _new(f"agreement.{name}", unit, better, f"{definition}{{resampled}}")
+def _agreement(
+    name: str,
+    unit: str,
+    better: Better,
+    definition: str,
+    allowed: tuple[float, float] | None = None,
+) -> Quantity:
+    return _new(f"agreement.{name}", unit, better, f"{definition}{{resampled}}", allowed)
 
 
 PEARSON_R = _agreement(
@@ -122,9 +134,14 @@ PEARSON_R = _agreement(
     "1",
     "higher",
     "Pearson r of the twin's and the recorded success rates {what}",
+    SIGNED,
 )
 PEARSON_R_OF_CONDITION = _new(
-    "agreement.pearson_r.{condition}", "1", "higher", PEARSON_R.definition
+    "agreement.pearson_r.{condition}",
+    "1",
+    "higher",
+    PEARSON_R.definition,
+    SIGNED,
 )
 BLIND_SHARE = _new(
     "agreement.blind_share",
@@ -143,6 +160,7 @@ REGRET = _new(
     "pp",
     "lower",
     "recorded success rate of the best candidate less that of what the twin ranks first ({words}), mean over the tasks that all have",
+    (0.0, 100.0),
 )
 WRONG_PAIRS = _new(
     "decision.wrong_pairs",
@@ -155,12 +173,14 @@ WRONG_BY = _new(
     "pp",
     "lower",
     "mean recorded difference of the pairs that the twin orders wrongly{words}",
+    (0.0, 100.0),
 )
 SPEARMAN = _agreement(
     "spearman_rho",
     "1",
     "higher",
     "Spearman rank correlation of the same rates {what}; average ranks",
+    SIGNED,
 )
 BIAS = _agreement(
     "bias_pp",
@@ -168,7 +188,13 @@ BIAS = _agreement(
     "none",
     "mean of sim rate - recorded rate {what}; above 0 the twin is optimistic",
 )
-MAE = _agreement("mae_pp", "pp", "lower", "mean |sim rate - recorded rate| {what}")
+MAE = _agreement(
+    "mae_pp",
+    "pp",
+    "lower",
+    "mean size of sim rate - recorded rate {what}",
+    (0.0, 100.0),
+)
 ORDER_ACCURACY = _agreement(
     "order_accuracy",
     "1",
@@ -194,12 +220,14 @@ PHI = _new(
     "1",
     "higher",
     "phi coefficient of {words} and the labelled outcome over trials",
+    SIGNED,
 )
 KAPPA = _new(
     "agreement.{by}.kappa",
     "1",
     "higher",
     "Cohen's kappa of {words} and the labelled outcome over trials",
+    SIGNED,
 )
 PPV = _new(
     "agreement.{by}.ppv",
@@ -286,6 +314,7 @@ def _image(images: str, metric: ImageMetric, variant: str) -> Quantity:
         metric.unit,
         "higher" if metric.higher_is_better else "lower",
         f"{metric.definition}{{protocol}}",
+        UP if metric.id.startswith("lpips") else SIGNED if metric.unit == "1" else UP,
     )
 
 
@@ -297,7 +326,11 @@ VIEWS, RENDERS = (
 )  # fmt: skip
 """By the metric, and whether the images were compared as they are stored."""
 LPIPS_MISSING = _new(
-    "views.{part}.lpips", "1", "lower", "learned perceptual image patch similarity"
+    "views.{part}.lpips",
+    "1",
+    "lower",
+    "learned perceptual image patch similarity",
+    UP,
 )
 DEPTHS = {
     name: _new(
@@ -313,3 +346,9 @@ DEPTHS = {
     )
 }
 """By the field of ``DepthScore``."""
+
+
+if __name__ == "__main__":  # python -m evaluator.measurements docs/metrics.md
+    for name in sys.argv[1:]:
+        page = Path(name)
+        page.write_text(with_tables(page.read_text()))

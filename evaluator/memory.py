@@ -1,15 +1,8 @@
-"""Millions of records in little memory and time: curves as packed doubles, no search for cycles."""
+"""Millions of records in little time: no search for cycles among them."""
 
 import gc
-from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    Packed = array[float]
-else:  # before Python 3.12 the class takes no parameters
-    Packed = array
 
 
 @contextmanager
@@ -27,8 +20,3 @@ def without_collecting() -> Iterator[None]:
     finally:
         if was_on:
             gc.enable()
-
-
-def packed(values: bytes = b"") -> Packed:
-    """Pack doubles, given by their bytes; none by default."""
-    return array("d", values)

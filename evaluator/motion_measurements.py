@@ -12,25 +12,16 @@ MOTIONS = {
         unit,
         "none" if name == "lag_s" else "lower",
         f"{what}, {{meaning}}: {words}, mean over trials; aligned by {{how}}",
+        (-0.2, 0.6) if name == "lag_s" else None,
     )
     for name, unit, what, words in (
-        ("position_mean_m", "m", TOOL, "mean distance over time"),
-        ("position_max_m", "m", TOOL, "largest distance over time"),
+        ("lag_s", "s", TOOL, "delay of least distance, a rigid motion apart"),
+        ("path_mean_m", "m", TOOL, "mean distance over time after that delay is taken out"),
+        ("path_max_m", "m", TOOL, "largest distance over time after that delay is taken out"),
+        ("position_mean_m", "m", TOOL, "mean distance at equal times"),
         ("end_point_m", "m", TOOL, "distance at the last common instant"),
         ("rotation_mean_rad", "rad", TOOL, "mean angle over time"),
-        ("rotation_max_rad", "rad", TOOL, "largest angle over time"),
-        ("end_point_rad", "rad", TOOL, "angle at the last common instant"),
-        ("lag_s", "s", TOOL, "delay of least distance, a rigid motion apart"),
-        ("without_lag_mean_m", "m", TOOL, "mean distance after that delay is taken out"),
-        (
-            "without_offset_mean_m",
-            "m",
-            TOOL,
-            "mean distance after delay and best rigid motion are taken out",
-        ),
-        ("relative_mean_m", "m", TOOL, "mean difference of what both do within one second"),
         ("joint_rms_rad", "rad", "joints", "root mean square error"),
-        ("joint_max_rad", "rad", "joints", "largest error of any joint"),
     )
 }
 """By the field of ``MotionSummary`` they are the mean of."""
@@ -54,19 +45,12 @@ BODY_DISTANCES = {
 }
 """By the field of ``BodyDistance``."""
 
-_STATE = "state.{{by}}_to_{{against}}.{{task}}.{{condition}}.{name}"
-_STATE_WORDS = "{{quantity}} after its last stage, {{who}} against {{other}}, in {{where}}: {kind} over {{count}} episodes of each one's mean over its objects"
 STATES = {
-    (name, kind): _new(
-        _STATE.format(name=f"{name}_{kind}_{unit}"),
+    name: _new(
+        f"state.{{by}}_to_{{against}}.{{task}}.{{condition}}.{name}_median_{unit}",
         unit,
         "lower",
-        _STATE_WORDS.format(kind=kind),
+        "{quantity} after its last stage, {who} against {other}, in {where}: median over {count} episodes of each one's mean over its objects",
     )
-    for name, kind, unit in (
-        ("position", "median", "m"),
-        ("position", "mean", "m"),
-        ("rotation", "median", "rad"),
-        ("extents", "median", "m"),
-    )
+    for name, unit in (("position", "m"), ("rotation", "rad"), ("extents", "m"))
 }

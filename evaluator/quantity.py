@@ -1,6 +1,8 @@
 """What a measurement is made of: its id, unit, definition, and the registry of all of them."""
 
+import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -50,6 +52,23 @@ class Quantity:
     definition: str
     """With words of the single measurement in braces."""
     better: Better
+    low: float
+    high: float
+    """The least and the largest value that the definition allows, ends included."""
+
+    def holds(self, value: float) -> bool:
+        """Whether a value is possible; what floats round off is not held against it."""
+        room = 1e-9 * max(1.0, abs(value))
+        return self.low - room <= value <= self.high + room
+
+    @property
+    def range_text(self) -> str:
+        """Write the range as a reader does."""
+        if self.unit == "rad" and self.high == math.pi:
+            return f"{self.low:g} to pi"
+        if math.isinf(self.low):
+            return "any"
+        return f"{self.low:g} and up" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
 
     def of(self, **words: object) -> Defined:
         """Name one measurement."""
@@ -71,12 +90,31 @@ class Quantity:
 
 REGISTRY: list[Quantity] = []
 """All that were defined so far."""
+_FAMILIES: dict[str, list[Quantity]] = {}
+"""The same by the first word of their ids."""
 
 
 def quantity_of(measurement_id: str) -> Quantity | None:
     """Return the quantity an id belongs to, the one with the fewest variable parts."""
-    found = [q for q in REGISTRY if q.pattern.fullmatch(measurement_id)]
+    family = measurement_id.partition(".")[0]
+    found = [q for q in _FAMILIES.get(family, ()) if q.pattern.fullmatch(measurement_id)]
     return min(found, key=lambda q: q.id.count("{"), default=None)
+
+
+INFINITY = math.inf
+RANGES: dict[str, tuple[float, float]] = {
+    "1": (0.0, 1.0),
+    "pp": (-100.0, 100.0),
+    "m": (0.0, INFINITY),
+    "rad": (0.0, math.pi),
+    "s": (-INFINITY, INFINITY),
+    "dB": (0.0, INFINITY),
+    "count": (0.0, INFINITY),
+}
+"""By unit, where a quantity has no range of its own."""
+SIGNED = (-1.0, 1.0)
+"""Correlations and the like."""
+UP = (0.0, INFINITY)
 
 
 def new_quantity(
@@ -84,8 +122,46 @@ def new_quantity(
     unit: str,
     better: Better,
     definition: str,
+    allowed: tuple[float, float] | None = None,
 ) -> Quantity:
     """Register a quantity; ids and definitions may hold names of parts in braces."""
-    quantity = Quantity(id=id, unit=unit, definition=definition, better=better)
+    low, high = RANGES[unit] if allowed is None else allowed
+    quantity = Quantity(id=id, unit=unit, definition=definition, better=better, low=low, high=high)
     REGISTRY.append(quantity)
+    _FAMILIES.setdefault(id.partition(".")[0], []).append(quantity)
     return quantity
+
+
+def registry_table(families: Iterable[str]) -> str:
+    """Write the quantities of some families, the first words of their ids, as a list in markdown.
+
+    Of a definition its first clause; a range where it is not that of the unit.
+    """
+    wanted = set(families)
+    rows: dict[tuple[str, str], list[str]] = {}
+    for each in REGISTRY:
+        if each.id.partition(".")[0] in wanted:
+            words = re.sub(r"\{(protocol|resampled|where|without)\}", "", each.definition)
+            words = re.sub(r"[:;,]? ?\{(words|about|after)\}$", "", words)
+            words = _capitals(words).partition("; ")[0].replace("|", "/").strip(" :,;")
+            usual = (each.low, each.high) == RANGES[each.unit]
+            parts = ("" if each.unit == "1" else each.unit, "" if usual else each.range_text)
+            allowed = ", ".join(filter(None, parts))
+            rows.setdefault((words, allowed), []).append(_capitals(each.id))
+    lines = []
+    for (words, allowed), names in rows.items():
+        shown = ", ".join(f"`{name}`" for name in names)
+        lines.append(f"- {shown}: {words}{f' [{allowed}]' if allowed else ''}")
+    return "\n".join(lines)
+
+
+def _capitals(text: str) -> str:
+    return re.sub(r"\{(\w+)(?::\w+)?\}", lambda part: part[1].upper(), text)
+
+
+_BLOCK = re.compile(r"(<!-- registry: ([\w ]+) -->\n).*?(<!-- /registry -->)", re.DOTALL)
+
+
+def with_tables(page: str) -> str:
+    """Return a page whose blocks ``<!-- registry: FAMILIES -->`` hold what is registered now."""
+    return _BLOCK.sub(lambda m: f"{m[1]}{registry_table(m[2].split())}\n{m[3]}", page)

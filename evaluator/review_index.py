@@ -23,7 +23,7 @@ from evaluator.cache import FOLDER
 from evaluator.result import Interval, Measurement
 
 FILE_NAME = "review_index.sqlite"
-VERSION = 5
+VERSION = 6
 """Raise it whenever a column, or what one holds, changes."""
 NO_RESULTS = "no results yet"
 """Why there are no numbers of a run that was never evaluated."""
@@ -60,7 +60,9 @@ class IndexedTrial:
     executed_replay: str | None
     began_ns: int
     distance_m: float | None
-    """Largest distance of the recorded tool from the planned replay's, where it was measured."""
+    """Largest distance of the recorded tool's path from the planned replay's, the lag taken out."""
+    lag_s: float | None = None
+    """By how much the recorded tool comes later than the planned replay's."""
     fail_cause: str = ""
     """What kind of failure it is (``FailureKind``); empty for one that failed on neither side."""
     fail_stage: str = ""

@@ -6,24 +6,35 @@ case, blanks and signs, or when ``map`` says so; ``TableText.understood`` says w
 
 import csv
 import difflib
+import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import date, datetime, time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from bridge.errors import BridgeError, PathNotFoundError, UsageError
+from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, UsageError
 from bridge.terminal import RARE
 
-YES = ("success", "true", "yes", "y", "1", "pass", "passed", "accepted")
-NO = ("failure", "false", "no", "n", "0", "fail", "failed", "refused", "rejected")
+YES = (
+    *("success", "succeeded", "true", "yes", "y", "1", "pass", "passed", "accepted", "ok"),
+    *("ja", "oui", "si", "sí", "erfolg", "succès", "✓", "✔", "✅"),
+)
+NO = (
+    *("failure", "false", "no", "n", "0", "fail", "failed", "refused", "rejected", "nok"),
+    *("not ok", "nein", "non", "fehlschlag", "échec", "✗", "✘", "❌"),
+)
 UNKNOWN = ("", "unknown", "undecided", "none", "na", "n/a", "nan", "null", "-", "?")
 MOST = 10**12
 """Counted in one field; beyond it a count is a slip, and soon no number that a float holds."""
 ALIASES = {"outcome": "recorded", "sim": "sim_planned"}
 """Words that ``map`` takes for our columns."""
 OUTCOME_LIKE = ("outcome", "result", "results", "success", "succeeded", "label", "real")
-"""Columns that may be the outcome; nobody but the user can say so."""
+"""Columns that are read as the outcome where there is one of them and no ``recorded``."""
+WORKBOOKS = (".xlsx", ".xlsm")
+FIRST_LINES = 5
+"""Lines in which names of columns are looked for."""
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
 NEAR = 0.8
 """How like a column of ours a name must be to be taken for a slip."""
@@ -42,6 +53,8 @@ class TableOptions:
     names: Literal["ask", "merge", "apart"] = "ask"
     """Tasks, conditions or policies whose names differ only by case or blanks: ask refuses and
     lists them, merge counts them as one, apart as several."""
+    yes: bool = False
+    """Take a table as it was understood, where another reading is possible, too."""
 
     @property
     def mapped(self) -> dict[str, str]:
@@ -138,15 +151,22 @@ class SourceRow:
 
     def answer(self, name: str) -> bool | None:
         """Read yes, no or unknown."""
-        text = self.text(name).lower()
-        if text in UNKNOWN:
+        text = self.text(name)
+        if text.lower() in UNKNOWN:
             return None
-        for ending in (".0", ",0"):
-            text = text.removesuffix(ending) if text in (f"0{ending}", f"1{ending}") else text
-        if text in YES or text in NO:
-            return text in YES
+        found = answer_of(text)
+        if found is not None:
+            return found
         hint = "Write success, failure or unknown (true/false, yes/no, pass/fail, 1/0 are read too)"
-        raise self.refuse(f"{name} is {text!r}", hint)
+        raise self.refuse(f"{name} is {text.lower()!r}", hint)
+
+
+def answer_of(text: str) -> bool | None:
+    """Return what a yes or a no means; None for any other text."""
+    text = text.strip().lower()
+    for ending in (".0", ",0"):
+        text = text.removesuffix(ending) if text in (f"0{ending}", f"1{ending}") else text
+    return True if text in YES else False if text in NO else None
 
 
 def plain_name(name: str) -> str:
@@ -156,7 +176,7 @@ def plain_name(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class TableText:
-    """A table whose header is understood; its rows are read from the file at each pass."""
+    """A table whose header is understood."""
 
     path: Path
     delimiter: str
@@ -169,11 +189,13 @@ class TableText:
     left: tuple[str, ...] = ()
     axes: Mapping[str, str] = field(default_factory=dict)
     """By axis: the column that holds its value."""
+    grid: Sequence[tuple[int, list[str]]] = ()
+    """All lines that are not blank, with their numbers."""
 
     def lines(self) -> Iterator[tuple[int, list[str]]]:
         """Yield the rows below the header with their numbers; blank ones are left out."""
         width = len(self.header)
-        for number, cells in numbered_lines(self.path, self.delimiter):
+        for number, cells in self.grid:
             if number <= self.header_row:
                 continue
             yield number, (cells if len(cells) == width else self._fitted(number, cells))
@@ -206,21 +228,25 @@ class TableText:
             parts.append(f"axes: {', '.join(self.axes)}")
         if self.left:
             parts.append(f"not read: {', '.join(map(repr, self.left))}")
-        hints = [name for name in self.left if plain_name(name) in OUTCOME_LIKE]
-        if hints and "recorded" not in self.header and "side" not in self.header:
-            parts.append(f'if {hints[0]!r} is the outcome, say --map "outcome={hints[0]}"')
         return f"{self.path.name}: {'; '.join(parts)}"
 
 
 def open_table(
-    path: Path, known: Sequence[str], options: TableOptions = AS_SAVED, *, near: bool = True
+    path: Path,
+    known: Sequence[str],
+    options: TableOptions = AS_SAVED,
+    *,
+    near: bool = True,
+    words: Sequence[str] = (),
 ) -> TableText:
-    """Find out how a table is written and which of its columns are ours."""
-    if not path.is_file():
-        hint = "Give a run folder, or a CSV file."
-        raise PathNotFoundError(path=path, what="run folder or table", hint=hint)
-    _refuse_nul(path)
-    delimiter, names, row = _header(path, known)
+    """Find out how a table is written and which of its columns are ours.
+
+    Args:
+        near: Refuse names that are almost ours, and names that stand twice.
+        words: Further names by which the delimiter is known.
+    """
+    delimiter, grid = load_grid(path, (*known, *words))
+    row, names = (grid[0][0], [name.strip() for name in grid[0][1]]) if grid else (0, [])
     mapped = options.mapped
     theirs = {plain_name(name): ours for ours, name in mapped.items()}
     absent = [name for name in mapped.values() if plain_name(name) not in map(plain_name, names)]
@@ -254,50 +280,117 @@ def open_table(
         renamed=tuple(renamed),
         left=tuple(left),
         axes={plain_name(name): name for name in axes},
+        grid=grid,
     )
-    _refuse_doubled(table)
     if near:
+        _refuse_doubled(table)
         _refuse_slips(table, known)
     return table
 
 
-def _refuse_nul(path: Path) -> None:
-    with path.open("rb") as stream:
-        while block := stream.read(2**20):
-            if b"\0" in block:
-                hint = "It is damaged, or saved as UTF-16: save it as UTF-8 CSV"
-                raise TableError(path=path, row=None, found="not a CSV file (a NUL)", hint=hint)
+def load_grid(path: Path, known: Sequence[str]) -> tuple[str, list[tuple[int, list[str]]]]:
+    """Read the cells of a text table or of the first sheet of a workbook, and its delimiter.
 
-
-def _header(path: Path, known: Sequence[str]) -> tuple[str, list[str], int]:
-    """Return the delimiter, the names of the columns and their row; no names without a line."""
-    try:
-        with path.open(encoding="utf-8-sig") as stream:
-            said = _SEP.match(stream.readline())
-    except UnicodeDecodeError as error:
-        raise _no_text(path, error) from error
-    found: tuple[str, list[str], int] = (",", [], 0)
+    Of the delimiters the one is taken that makes most columns, of names in ``known`` above all;
+    blank lines and comments are left out.
+    """
+    if not path.is_file():
+        hint = "Give a run folder, or a table."
+        raise PathNotFoundError(path=path, what="run folder or table", hint=hint)
+    if path.suffix.lower() in WORKBOOKS:
+        return "", _workbook_cells(path)
+    text = _decoded(path)
+    said = _SEP.match(text.split("\n", 1)[0])
+    best: tuple[str, list[tuple[int, list[str]]]] = (",", [])
     most = -1
     for delimiter in (said[1],) if said else DELIMITERS:
-        first = next(numbered_lines(path, delimiter), None)
-        names = [] if first is None else [name.strip() for name in first[1]]
-        ours = sum(plain_name(name) in known for name in names)
-        if first is not None and 1000 * ours + len(names) > most:
-            most, found = 1000 * ours + len(names), (delimiter, names, first[0])
-    return found
+        lines = _lines(path, text, delimiter)
+        tops = [cells for _, cells in lines[:FIRST_LINES]]
+        score = max((_score(cells, known) for cells in tops), default=-1)
+        if score > most:
+            most, best = score, (delimiter, lines)
+    return best
 
 
-def numbered_lines(path: Path, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
-    """Yield the lines of a table with their numbers; blank ones and comments are left out."""
+def _workbook_cells(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the rows of the only sheet that holds any; merged cells all hold what one holds."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            for number, cells in enumerate(csv.reader(stream, delimiter=delimiter), start=1):
-                if any(cells) and not cells[0].startswith("#"):
-                    if number == 1 and len(cells) <= 2 and cells[0].lower().startswith("sep="):
-                        continue
-                    yield number, cells
-    except (UnicodeDecodeError, csv.Error) as error:
+        import openpyxl  # noqa: PLC0415  # only a workbook needs it
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            package="openpyxl", extra="report", purpose="a workbook"
+        ) from error
+    try:
+        book = openpyxl.load_workbook(path, data_only=True)
+    except Exception as error:  # whatever a damaged archive raises
+        found = f"not a workbook ({error})"
+        raise TableError(path=path, row=None, found=found, hint="Save it as .xlsx") from error
+    sheets = [sheet for sheet in book.worksheets if sheet.max_row > 1]
+    if len(sheets) > 1:
+        names = ", ".join(repr(sheet.title) for sheet in sheets)
+        raise UsageError(
+            f"{path} has several sheets with tables ({names}), and they may be different sides "
+            "of one study. Save each as a file of its own, or all in one sheet with a column side."
+        )
+    if not sheets:
+        return []
+    sheet = sheets[0]
+    rows = [[_cell_text(cell) for cell in row] for row in sheet.iter_rows()]
+    for area in sheet.merged_cells.ranges:
+        for row in range(area.min_row - 1, area.max_row):
+            for column in range(area.min_col - 1, area.max_col):
+                rows[row][column] = rows[area.min_row - 1][area.min_col - 1]
+    return [(number, cells) for number, cells in enumerate(rows, start=1) if any(cells)]
+
+
+def _cell_text(cell: Any) -> str:
+    value = cell.value
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, datetime | date | time):
+        return value.isoformat()
+    if isinstance(value, int | float):
+        percent = "%" in str(cell.number_format)
+        text = f"{100 * value:.12g}" if percent else f"{value:.17g}"
+        plain = repr(value) if not percent and float(text) == value else text
+        return f"{plain.removesuffix('.0')}{'%' if percent else ''}"
+    return str(value).strip()
+
+
+def _score(cells: Sequence[str], known: Sequence[str]) -> int:
+    return 1000 * sum(plain_name(name) in known for name in cells) + len(cells)
+
+
+def _decoded(path: Path) -> str:
+    data = path.read_bytes()
+    utf_16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+    if b"\0" in data and not utf_16:
+        hint = "It is damaged, or saved as UTF-16: save it as UTF-8 CSV"
+        raise TableError(path=path, row=None, found="not a CSV file (a NUL)", hint=hint)
+    try:
+        return data.decode("utf-16" if utf_16 else "utf-8-sig")
+    except UnicodeDecodeError as error:
         raise _no_text(path, error) from error
+
+
+def _lines(path: Path, text: str, delimiter: str) -> list[tuple[int, list[str]]]:
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
+    try:
+        return [
+            (number, cells)
+            for number, cells in enumerate(reader, start=1)
+            if any(cells) and not _is_remark(number, cells)
+        ]
+    except csv.Error as error:
+        raise _no_text(path, error) from error
+
+
+def _is_remark(number: int, cells: Sequence[str]) -> bool:
+    if number == 1 and len(cells) <= 2 and cells[0].lower().startswith("sep="):
+        return True
+    return cells[0].startswith("#") and not (cells[0].strip() == "#" and any(cells[1:]))
 
 
 def _no_text(path: Path, error: Exception) -> TableError:

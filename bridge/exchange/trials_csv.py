@@ -143,21 +143,37 @@ def _json_text(value: object) -> str:
 
 
 def trials_of(rows: Sequence[SourceRow]) -> list[TrialRecord]:
-    """Check the rows of a table of trials, each alone and beside the others."""
-    seen: dict[str, int] = {}
+    """Check the rows of a table of trials, each alone and beside the others.
+
+    Numbers that start anew in another group are told apart by its names.
+    """
+    seen: dict[tuple[str, ...], int] = {}
     units: dict[str, tuple[str, int]] = {}
-    trials = []
-    for row in rows:
-        trial = read_trial(row)
-        if trial.trial_id in seen:
+    trials = [read_trial(row) for row in rows]
+    if not all(trial.condition for trial in trials):  # one that is missing may be any of them
+        keys = [_group_and_id(replace(trial, condition="")) for trial in trials]
+    else:
+        keys = [_group_and_id(trial) for trial in trials]
+    for row, trial, key in zip(rows, trials, keys, strict=True):
+        if key in seen:
             raise row.refuse(
-                f"trial_id {trial.trial_id!r} stands in row {seen[trial.trial_id]} already",
-                "Give each trial its own id, or remove the copy",
+                f"trial_id {trial.trial_id!r} stands in row {seen[key]} already",
+                "Give each trial its own id, or remove the copy; real and sim one below the other "
+                "need a column side",
             )
-        seen[trial.trial_id] = row.row
+        seen[key] = row.row
         check_unit(row, trial, units)
-        trials.append(trial)
+    if len({trial.trial_id for trial in trials}) < len(trials):
+        trials = [
+            replace(trial, trial_id="/".join(filter(None, _group_and_id(trial))))
+            for trial in trials
+        ]
     return trials
+
+
+def _group_and_id(trial: TrialRecord) -> tuple[str, ...]:
+    side = "sim" if trial.recorded is None and trial.sim_planned is not None else ""
+    return trial.task, trial.condition, trial.policy, side, trial.trial_id
 
 
 def check_unit(row: SourceRow, trial: TrialRecord, units: dict[str, tuple[str, int]]) -> None:

@@ -16,6 +16,8 @@ from bridge.exchange.trials_csv import SIDES, UNITS
 COLUMNS = ("task", "condition", "policy", "side", "unit", "k", "n", "rate", "rate_percent")
 MOST_DIGITS = 30
 """Before or behind the point of a printed figure; more would take forever to compare."""
+FLOAT_DIGITS = 7
+"""Digits from which on a program and no person chose how many: 32-bit floats have so many."""
 
 
 class ImpossibleRateError(TableError):
@@ -42,6 +44,8 @@ class RateRecord:
     """k/n where both are known, else as printed."""
     row: int
     policy: str = ""
+    half: Fraction = Fraction(0)
+    """How far the true rate may lie from the printed one; 0 where a count says it exactly."""
 
 
 def read_rates(path: Path, options: TableOptions = AS_SAVED) -> list[RateRecord]:
@@ -119,6 +123,7 @@ def read_rate(row: SourceRow) -> RateRecord:
         rate=rate,
         row=row.row,
         policy=row.text("policy"),
+        half=printed[1] if printed is not None and k is None else Fraction(0),
     )
 
 
@@ -149,9 +154,13 @@ def is_figure(number: Decimal) -> bool:
 
 
 def half_digit(number: Decimal) -> Fraction:
-    """Return half a unit of the last printed digit."""
-    exponent = number.as_tuple().exponent
-    return Fraction(1, 2 * 10 ** max(0, -exponent if isinstance(exponent, int) else 0))
+    """Return how far the true value may lie from the printed one: half a unit of its last digit.
+
+    As many digits as a program prints end where its floats do: there the last ones are noise.
+    """
+    _, digits, exponent = number.as_tuple()
+    half = Fraction(1, 2 * 10 ** max(0, -exponent if isinstance(exponent, int) else 0))
+    return half + (abs(Fraction(number)) / 2**22 if len(digits) >= FLOAT_DIGITS else 0)
 
 
 def _count(row: SourceRow, printed: tuple[Fraction, Fraction], n: int, k: int | None) -> int:

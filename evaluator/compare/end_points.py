@@ -203,7 +203,6 @@ def compare_end_points(task: str, real: Side, sides: Sequence[Side], table_id: s
     """Compare every moved body of a task with every engine."""
     measurements: list[Measurement] = []
     rows: list[dict[str, Cell]] = []
-    each: list[dict[str, Cell]] = []
     left_out: list[Exclusion] = []
     for body in moved_bodies(real):
         for side in sides:
@@ -213,7 +212,6 @@ def compare_end_points(task: str, real: Side, sides: Sequence[Side], table_id: s
             found = body_measurements(task, side.name, body, compared)
             measurements += found
             rows.append(_row(body, side, compared, found))
-            each += [_row_of_run(body, side, item) for item in compared]
             left_out += _fitted(side, compared) if body != TOOL_BODY else []
     tables = (
         Table.of(
@@ -224,12 +222,6 @@ def compare_end_points(task: str, real: Side, sides: Sequence[Side], table_id: s
             "from, other simulated runs with every recorded one (mean over them). Displacement: "
             "end minus start, so where a body began plays no part. Intervals of the end point: "
             "order statistics, 95 %. Runs that something was fitted to do not count.",
-        ),
-        Table.of(
-            each,
-            id=f"runs_of_{table_id}",
-            title=f"End points of each recorded run: {task}",
-            note="Also of runs that something was fitted to; they are marked.",
         ),
     )
     return Part(
@@ -255,20 +247,6 @@ def _row(
         "displacement error (mm)": millimetres(by_name["displacement_m"].value),
         "error over normalised time (mm)": millimetres(by_name["over_time_m"].value),
         "the same, moving part (mm)": millimetres(by_name["moving_over_time_m"].value),
-    }
-
-
-def _row_of_run(body: str, side: Side, item: BodyComparison) -> dict[str, Cell]:
-    return {
-        "body": body,
-        "engine": side.name,
-        "recorded run": item.recorded,
-        "simulated runs": len(item.simulated),
-        "fitted to": item.fitted,
-        "end-point error (mm)": millimetres(item.distance.end_point_m),
-        "displacement error (mm)": millimetres(item.distance.displacement_m),
-        "error over normalised time (mm)": millimetres(item.distance.over_time_m),
-        "the same, moving part (mm)": millimetres(item.distance.moving_over_time_m),
     }
 
 

@@ -25,6 +25,7 @@ from evaluator.compare.success import (
     rate_groups,
     side_rates,
     trials_in,
+    unpaired_keys,
     varied_sim,
 )
 from evaluator.compare.tables import (
@@ -76,9 +77,9 @@ def compare_rows(
         rows=tuple(rows),
         groups=found.groups,
         measurements=found.measurements,
-        tables=_tables(rows, found, empty.recorded_word),
+        tables=_tables(rows, found, empty.recorded_word, source),
         exclusions=found.exclusions,
-        missing=tuple(_missing(rows, found.measurements)),
+        missing=tuple(_missing(rows, found.measurements, source)),
     )
 
 
@@ -124,13 +125,16 @@ def _measure(
     )
 
 
-def _tables(rows: Sequence[TrialRow], found: _Found, word: str) -> tuple[Table, ...]:
+def _tables(rows: Sequence[TrialRow], found: _Found, word: str, source: str) -> tuple[Table, ...]:
     """Lay out what was found; ``word`` is what the recorded side is called."""
+    # Who gave a table of outcomes knows how they were made.
+    given = source != "run" and not unpaired_keys(rows)
+    note = "Outcomes as the table gives them." if given else ""
     groups, measurements = found.groups, found.measurements
     return (
         *found.compared_tables,
         *conclusions_table(groups, found.answers, rows),
-        success_table(groups, word),
+        success_table(groups, word, note),
         *layout_table(groups, measurements, word),
         *gains_table(found.gains, word),
         *found.study_tables,
@@ -156,10 +160,13 @@ NO_DATA = (
 """Parts of the evaluation whose input a run may not have."""
 
 
-def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> list[str]:
+def _missing(
+    rows: Sequence[TrialRow], measurements: Sequence[Measurement], source: str
+) -> list[str]:
+    """Say what could not be computed; of a table only what some of its rows have, and not all."""
     found = []
     conditions = {row.condition for row in rows}
-    if not {WITH, WITHOUT} <= conditions:
+    if not {WITH, WITHOUT} <= conditions and (source == "run" or conditions & {WITH, WITHOUT}):
         there = ", ".join(sorted(name or "unnamed" for name in conditions))
         found.append(f"replanning gain: it needs both conditions, there is only {there}")
     sides: tuple[tuple[str, str], ...] = (
@@ -176,11 +183,11 @@ def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> l
     for side, words in sides:
         asked = rows if side == "sim_executed" else [r for r in rows if r.plan_id != NO_PLAN]
         without = trials_in(row for row in asked if getattr(row, side) is None)
-        if without:
+        if without and (source == "run" or without < trials_in(asked)):
             found.append(f"{side}: {without} of {trials_in(rows)} trials have no {words[2:]}")
     found += [
         f"{words}: no data ({why})"
-        for start, words, why in NO_DATA
+        for start, words, why in (NO_DATA if source == "run" else ())
         if not any(m.id.startswith(start) for m in measurements)
     ]
     return found

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
-from evaluator.measurements import Defined, slug
+from evaluator.measurements import Defined, quantity_of, slug
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.intervals import RATE_INTERVALS
 
@@ -122,6 +122,13 @@ def measured(
     if value is not None and not math.isfinite(value):
         value, interval = None, None
         reason = "the recorded or replayed data hold values that are not finite"
+    quantity = quantity_of(defined.id)
+    if value is not None and quantity is not None and not quantity.holds(value):
+        reason = f"computed {value:.6g}, which its definition does not allow; please report this"
+        value, interval = None, None
+    if interval is not None and quantity is not None:  # what cannot be is no part of an interval
+        low, high = max(interval.low, quantity.low), min(interval.high, quantity.high)
+        interval = replace(interval, low=low, high=high)
     return Measurement(
         **vars(defined),
         value=value,

@@ -5,14 +5,13 @@ Recorded against the executed replay: how well kinematics and base calibration f
 the planned replay: what the twin's own arm made of the difference.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
 from operator import attrgetter
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from bridge.clock import NS_PER_S
 from bridge.episode.reader import Episode
@@ -20,7 +19,6 @@ from bridge.episode.streams import JointTrack
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.measure import Part, average, degrees, measured, millimetres, milliseconds
 from evaluator.errors import UndefinedStatisticError
-from evaluator.memory import Packed, packed
 from evaluator.metrics.trajectory import (
     NORMALISED_SAMPLES,
     PoseErrors,
@@ -28,8 +26,6 @@ from evaluator.metrics.trajectory import (
     joint_errors,
     pose_errors,
     position_errors,
-    relative_errors,
-    without_rigid_motion,
 )
 from evaluator.motion_measurements import MOTIONS
 from evaluator.result import Cell, Measurement, Table
@@ -37,9 +33,6 @@ from evaluator.run_reader.tracks import Tracks, read_tracks
 
 SAME_CLOCK_NS = 2 * NS_PER_S
 """A replay whose stamps start this close to the execution uses the cell's clock."""
-STEPS_PER_S = 10
-"""Samples per second at which relative errors are taken, over steps of one second."""
-STEP_NS = NS_PER_S // STEPS_PER_S
 PLANNED, EXECUTED, RECORDED = "planned", "executed", "recorded"
 
 
@@ -62,25 +55,17 @@ class MotionSummary:
     duration_s: float
     """From the first to the last instant both know."""
     position_mean_m: float
-    position_max_m: float
+    """At the same instants: what the lag and the path make together."""
     end_point_m: float
     """At the last instant both know."""
     rotation_mean_rad: float
-    rotation_max_rad: float
-    end_point_rad: float
     lag_s: float | None
     """By how much ``side`` comes later, whatever rigid motion lies between; None without times."""
-    without_lag_mean_m: float | None
-    """Mean distance after that delay is taken out."""
-    without_offset_mean_m: float | None
-    """The same after the best rigid motion is taken out too; None for a straight motion."""
-    relative_mean_m: float | None
-    """Mean difference of what both do within a second; None below a second."""
+    path_mean_m: float
+    """Mean distance after that lag is taken out: another path, not a later one."""
+    path_max_m: float
     joint_rms_rad: float | None
     """Over all joints and instants; None without joints of the same names."""
-    joint_max_rad: float | None
-    curve_m: Packed
-    """Distance at 101 instants spread evenly over the duration."""
 
 
 def summarise_motions(
@@ -123,7 +108,8 @@ def compare_tracks(mine: Tracks, other: Tracks) -> MotionSummary:
         raise UndefinedStatisticError(statistic="motion", reason="no tool poses on both sides")
     errors = pose_errors(mine.tool, other.tool)
     summary = _summary(aligned_by, errors)
-    summary = _with_shape(summary, mine.tool, other.tool, errors)
+    if aligned_by != "normalised":
+        summary = _without_lag(summary, mine.tool, other.tool, errors)
     return _with_joints(summary, mine.joints, other.joints)
 
 
@@ -153,52 +139,29 @@ def _summary(aligned_by: str, errors: PoseErrors) -> MotionSummary:
         num_samples=len(position),
         duration_s=span_ns / NS_PER_S,
         position_mean_m=float(position.mean()),
-        position_max_m=float(position.max()),
         end_point_m=float(position[-1]),
         rotation_mean_rad=float(rotation.mean()),
-        rotation_max_rad=float(rotation.max()),
-        end_point_rad=float(rotation[-1]),
         lag_s=None,
-        without_lag_mean_m=None,
-        without_offset_mean_m=None,
-        relative_mean_m=None,
+        path_mean_m=float(position.mean()),
+        path_max_m=float(position.max()),
         joint_rms_rad=None,
-        joint_max_rad=None,
-        curve_m=_curve(errors.stamps_ns, position),
     )
 
 
-def _with_shape(
+def _without_lag(
     summary: MotionSummary, mine: PoseTrajectory, other: PoseTrajectory, errors: PoseErrors
 ) -> MotionSummary:
-    """Add what is left without a delay, without an offset too, and within single seconds."""
-    stamps_ns = errors.stamps_ns
-    same_m = mine.positions_at(stamps_ns)
-    if summary.aligned_by == "normalised":
-        left_m = _without_offset_m(same_m, other.positions_at(stamps_ns))
-        return replace(summary, without_offset_mean_m=left_m)
-    lag_s = _or_none(lambda: find_lag_s(stamps_ns, same_m, other))
-    if lag_s is not None:
+    """Align the time first; where no lag can be found the path is that of equal instants."""
+    same_m = mine.positions_at(errors.stamps_ns)
+    try:
+        lag_s = find_lag_s(errors.stamps_ns, same_m, other)
         later = other.shifted(round(lag_s * NS_PER_S))
-        summary = replace(
-            summary,
-            lag_s=lag_s,
-            without_lag_mean_m=_or_none(
-                lambda: float(position_errors(stamps_ns, same_m, later).mean())
-            ),
-            without_offset_mean_m=_without_offset_m(same_m, later.positions_at(stamps_ns)),
-        )
-    instants = np.arange(int(errors.stamps_ns[0]), int(errors.stamps_ns[-1]) + 1, STEP_NS)
-    if len(instants) <= STEPS_PER_S:
+        path_m = position_errors(errors.stamps_ns, same_m, later)
+    except UndefinedStatisticError:
         return summary
-    moved, _ = relative_errors(mine.at(instants), other.at(instants), STEPS_PER_S)
-    return replace(summary, relative_mean_m=float(moved.mean()))
-
-
-def _without_offset_m(
-    p_mine_m: Float[np.ndarray, "num_samples 3"], p_other_m: Float[np.ndarray, "num_samples 3"]
-) -> float | None:
-    return _or_none(lambda: float(without_rigid_motion(p_mine_m, p_other_m).mean()))
+    return replace(
+        summary, lag_s=lag_s, path_mean_m=float(path_m.mean()), path_max_m=float(path_m.max())
+    )
 
 
 def _with_joints(
@@ -214,22 +177,7 @@ def _with_joints(
     return replace(
         summary,
         joint_rms_rad=float(np.sqrt((over_time**2).mean())),
-        joint_max_rad=float(np.abs(errors.error_rad).max()),
     )
-
-
-def _curve(
-    stamps_ns: Int[np.ndarray, " num_samples"], values: Float[np.ndarray, " num_samples"]
-) -> Packed:
-    asked = np.linspace(stamps_ns[0], stamps_ns[-1], NORMALISED_SAMPLES)
-    return packed(np.interp(asked, stamps_ns, values).tobytes())
-
-
-def _or_none(compute: Callable[[], float]) -> float | None:
-    try:
-        return compute()
-    except UndefinedStatisticError:
-        return None
 
 
 Groups = Mapping[str, Sequence[MotionSummary]]
@@ -251,18 +199,14 @@ def group_table(groups: Groups) -> Table:
                     "condition": condition.replace("_", " "),
                     "against": name,
                     "trials": len(members),
-                    "mean distance (mm)": millimetres(
+                    "lag (ms)": milliseconds(average(members, attrgetter("lag_s"))),
+                    "path (mm)": millimetres(average(members, attrgetter("path_mean_m"))),
+                    "path, largest (mm)": millimetres(average(members, attrgetter("path_max_m"))),
+                    "at equal times (mm)": millimetres(
                         average(members, attrgetter("position_mean_m"))
                     ),
                     "end point (mm)": millimetres(average(members, attrgetter("end_point_m"))),
                     "mean angle (deg)": degrees(average(members, attrgetter("rotation_mean_rad"))),
-                    "delay (ms)": milliseconds(average(members, attrgetter("lag_s"))),
-                    "without delay (mm)": millimetres(
-                        average(members, attrgetter("without_lag_mean_m"))
-                    ),
-                    "without offset (mm)": millimetres(
-                        average(members, attrgetter("without_offset_mean_m"))
-                    ),
                     "joints, RMS (deg)": degrees(average(members, attrgetter("joint_rms_rad"))),
                 }
             )
@@ -271,8 +215,8 @@ def group_table(groups: Groups) -> Table:
         id="motion",
         title="Recorded, planned and executed motions",
         note="Tool centre point, means over trials. Planned, executed: recorded against that "
-        "replay. Twin: executed against planned replay. Without delay: the recorded motion shifted "
-        "in time; without offset: laid over by a rigid motion too.",
+        "replay. Twin: executed against planned replay. Lag: by how much the first comes later; "
+        "path: distance after the lag is taken out; at equal times both count together.",
     )
 
 

@@ -1,6 +1,7 @@
 """A table of printed rates into a ``Comparison``: no trials, so no pairing and no verdicts."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def compare_records(
     measurements = (
         *(side for group in groups for side in (group.recorded, group.sim)),
         *averages(groups, method=method),
-        *group_agreement(groups),
+        *_without_counts(groups, group_agreement(groups)),
         *gains,
         *compared.measurements,
         *regret_results(usable_groups(groups)),
@@ -57,9 +58,30 @@ def compare_records(
             *notes_table(notes(groups, measurements)),
         ),
         exclusions=tuple(left_out),
-        missing=("trial-level agreement: a table of rates does not say which trial succeeded",),
+        missing=() if _all_counted(groups) else (f"intervals: {NO_COUNTS}",),
         provenance={"software": software(), "file": path.name, "sha256": hash_file(path)},
     )
+
+
+NO_COUNTS = "rates without n: a column n, or 7/10 in the place of 70 %, gives an interval"
+
+
+def _all_counted(groups: Sequence[RateGroup]) -> bool:
+    return all(rate.n for group in usable_groups(groups) for rate in (group.recorded, group.sim))
+
+
+def _without_counts(
+    groups: Sequence[RateGroup], found: Sequence[Measurement]
+) -> Sequence[Measurement]:
+    """Leave intervals out where a rate has no n: nothing says how far it would move again."""
+    if _all_counted(groups):
+        return found
+    return [
+        replace(each, interval=None, reason_without_interval=NO_COUNTS)
+        if each.value is not None
+        else each
+        for each in found
+    ]
 
 
 def _rate_groups(

@@ -10,9 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.executions import NO_PLAN
-from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.motion import MotionSummary
-from evaluator.compare.states import StateSummary
 from evaluator.result import Exclusion, Measurement, Results, Table
 from evaluator.run_reader.episodes import FirstDivergence
 
@@ -185,10 +183,6 @@ class Comparison:
     missing: tuple[str, ...] = ()
     motions: tuple[MotionSummary, ...] = ()
     """How far each motion lies from its replays, with its course."""
-    states: tuple[StateSummary, ...] = ()
-    """Where objects were predicted, replayed and localised after each stage."""
-    views: tuple[ViewQuality, ...] = ()
-    """Every rendered view that was scored, with pictures of the worst."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Software, settings, and the content hash of every input file."""
 

@@ -63,7 +63,6 @@ def compare_run(
     # Words of what is missing come first, then those of images and imported motions.
     return replace(
         _with_parts(base, (views, methods, motions)),
-        views=(*views.views, *methods.views),
         provenance={**base.provenance, **images.origin()},
     )
 
@@ -189,7 +188,6 @@ def compare_read(
         exclusions=(*left_out, *base.exclusions, *summaries.left_out),
         missing=(*missing, *base.missing),
         motions=summaries.motions,
-        states=summaries.states,
         provenance=_provenance(reads),
     )
     parts = (

@@ -9,12 +9,12 @@ from pathlib import Path
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from bridge.exchange.results_intake import PUBLISHED, Left, Taken, look_through, take
 from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.terminal import Output
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare.against import against_tables
 from evaluator.compare.from_rows import compare_rows
+from evaluator.compare.intake import PUBLISHED, Left, Taken, look_through, take
 from evaluator.compare.names import settle_names
 from evaluator.compare.rates import compare_records
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
@@ -53,7 +53,6 @@ def compare_several(
     *,
     method: str = "wilson",
     options: TableOptions = AS_SAVED,
-    force: bool = False,
     output: Output = QUIET,
 ) -> Comparison:
     """Compare several runs, tables or folders of results as one study.
@@ -64,7 +63,7 @@ def compare_several(
     """
     refuse_twice(sources)
     with ExitStack() as caches:
-        gathered = _gather(sources, options, force, output, caches)
+        gathered = _gather(sources, options, output, caches)
     trials = gathered.rows()
     if not (trials or gathered.reads) and any(each.rates for each in gathered.taken):
         base = _rates_alone(gathered, sources, method, options)
@@ -126,7 +125,6 @@ def _named(sources: Sequence[Path]) -> str:
 def _gather(
     sources: Sequence[Path],
     options: TableOptions,
-    force: bool,
     output: Output,
     caches: ExitStack,
 ) -> _Gathered:
@@ -134,7 +132,7 @@ def _gather(
     for source in sources:
         if (source / "episodes").is_dir():
             run = RunFolder.open(source)
-            cache = SummaryCache(run.results_dir / FOLDER, fresh=force, say=output.say)
+            cache = SummaryCache(run.results_dir / FOLDER, say=output.say)
             read = read_run(run, caches.enter_context(cache), output)
             gathered.reads.append(_with_own_ids(read, gathered.reads))
         elif source.is_dir():

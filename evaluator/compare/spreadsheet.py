@@ -6,10 +6,10 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.run_folder import RunFolder
-from bridge.exchange.results_intake import PUBLISHED, Taken, take
 from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.exchange.trials_csv import TrialRecord, read_trials, trials_path
 from evaluator.compare.from_rows import compare_rows
+from evaluator.compare.intake import PUBLISHED, Taken, take
 from evaluator.compare.names import settle_names
 from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_records
@@ -94,12 +94,13 @@ def compare_taken(
 def unknown_sides(rows: Sequence[TrialRow]) -> list[Exclusion]:
     """Trials that lack a side; of an unpaired group all do, and each side counts on its own."""
     unpaired = unpaired_keys(rows)
+    has_twin = any(row.sim_planned is not None for row in rows)
     return [
         Exclusion(episode=row.episode, scope="agreement", reason=reason)
         for row in rows
         for reason, lacks in (
             ("the outcome is unknown", row.recorded is None),
-            ("sim_planned is unknown", row.sim_planned is None),
+            ("sim_planned is unknown", row.sim_planned is None and has_twin),
         )
         if lacks
         and (

@@ -151,16 +151,9 @@ Group = tuple[str, str, str, str]
 """Who predicts, what it is held against, task, condition."""
 
 
-def _number(
-    by_id: Mapping[str, Measurement], key: Group, quantity: str, kind: str = "median"
-) -> Measurement | None:
-    """Return one measurement of a group."""
-    return by_id.get(_defined(key, quantity, kind).id)
-
-
-def _defined(key: Group, name: str, kind: str, **words: object) -> Defined:
+def _defined(key: Group, name: str, **words: object) -> Defined:
     predicted_by, against, task, condition = key
-    return STATES[name, kind].of(
+    return STATES[name].of(
         by=predicted_by,
         against=against,
         task=task,
@@ -173,11 +166,10 @@ def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
     """Medians of each group."""
     rows = []
     for key in keys:
-        position = by_id[_defined(key, "position", "median").id]
-        rotation = _number(by_id, key, "rotation")
-        extents = _number(by_id, key, "extents")
+        position = by_id[_defined(key, "position").id]
+        rotation = by_id.get(_defined(key, "rotation").id)
+        extents = by_id.get(_defined(key, "extents").id)
         low, high = (millimetres(end) for end in ends(position.interval))
-        mean = by_id[_defined(key, "position", "mean").id]
         rows.append(
             {
                 "task": key[2],
@@ -188,7 +180,6 @@ def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
                 "median distance (mm)": millimetres(position.value),
                 "low (mm)": low,
                 "high (mm)": high,
-                "mean distance (mm)": millimetres(mean.value),
                 "median rotation (deg)": None if rotation is None else degrees(rotation.value),
                 "median extents (mm)": None if extents is None else millimetres(extents.value),
             }
@@ -263,27 +254,17 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
             "where": f"{task}, {condition.replace('_', ' ')}",
             "count": len(of_episode),
         }
-        make = partial(
-            measured,
-            n=len(values),
-            counted="object",
-            episodes=list(dict.fromkeys(episodes)),
-        )
         found.append(
-            make(
-                _defined(key, name, "median", **words),
+            measured(
+                _defined(key, name, **words),
                 partial(_median, of_episode, states, name),
+                n=len(values),
+                counted="object",
+                episodes=list(dict.fromkeys(episodes)),
+                interval_n=len(of_episode),
                 reason_without_interval=interval_or_reason(median_interval, of_episode)[1],
             )
         )
-        if name == "position":
-            found.append(
-                make(
-                    _defined(key, name, "mean", **words),
-                    partial(_mean, of_episode, states, name),
-                    reason_without_interval="the median has one",
-                )
-            )
     return found
 
 
@@ -292,11 +273,6 @@ def _median(
 ) -> float | tuple[float, Interval | None]:
     _some(values, states, quantity)
     return float(median(values)), interval_or_reason(median_interval, values)[0]
-
-
-def _mean(values: Sequence[float], states: Sequence[StateSummary], quantity: str) -> float:
-    _some(values, states, quantity)
-    return sum(values) / len(values)
 
 
 def _some(values: Sequence[float], states: Sequence[StateSummary], quantity: str) -> None:

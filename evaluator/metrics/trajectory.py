@@ -1,7 +1,6 @@
 """How far two poses of one body lie apart over a common clock.
 
-Also without a constant delay, which is the controller's, or without a constant rigid motion, which
-is the calibration's: what remains of an error when either is taken out belongs to neither.
+Also without a constant delay, which is the controller's: what remains is another path.
 """
 
 from dataclasses import dataclass
@@ -11,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.clock import NS_PER_S
 from bridge.episode.streams import JointTrack
-from bridge.geometry import se3
 from bridge.geometry.signals import LAGS_S, lag_of_least_cost
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.errors import UndefinedStatisticError
@@ -19,8 +17,6 @@ from evaluator.errors import UndefinedStatisticError
 MAX_INSTANTS = 200
 """Delays are compared at no more instants than this."""
 NOT_FINITE = "the recorded or replayed data hold values that are not finite"
-FLAT = 1e-9
-"""A second singular value below this share of the first: positions on a line."""
 
 
 def find_lag_s(
@@ -62,52 +58,6 @@ def _left_over_m(
     sizes[:, 2] *= np.where(np.linalg.det(covariance) < 0, -1.0, 1.0)
     spread = (sources**2).sum(axis=2).mean(axis=1) + (target**2).sum(axis=1).mean()
     return np.asarray(np.sqrt(np.maximum(spread - 2 * sizes.sum(axis=1), 0.0)))
-
-
-def align_rigid(
-    p_source_m: Float[np.ndarray, "num_poses 3"], p_target_m: Float[np.ndarray, "num_poses 3"]
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Find the rigid motion that best lays one list of positions over another.
-
-    Least squares without scale: Umeyama (1991), equations 40 and 41 with c = 1.
-
-    Args:
-        p_source_m: Positions in the source frame [m].
-        p_target_m: The same instants in the target frame [m].
-
-    Returns:
-        Rotation ``R_target_source`` and translation ``p_target_source`` [m].
-
-    Raises:
-        UndefinedStatisticError: When the source positions lie on a line, or are not finite.
-    """
-    middle_source, middle_target = p_source_m.mean(axis=0), p_target_m.mean(axis=0)
-    covariance = (p_target_m - middle_target).T @ (p_source_m - middle_source) / len(p_source_m)
-    if not np.isfinite(covariance).all():
-        raise UndefinedStatisticError(
-            statistic="rigid alignment",
-            reason=NOT_FINITE,
-        )
-    sizes = np.linalg.svd(covariance, compute_uv=False)
-    if sizes[1] <= FLAT * max(sizes[0], FLAT):
-        raise UndefinedStatisticError(
-            statistic="rigid alignment",
-            reason="the positions lie on a line, which any turn about it leaves as it is",
-        )
-    R = se3.nearest_rotation(covariance)
-    return R, middle_target - R @ middle_source
-
-
-def without_rigid_motion(
-    p_recorded_m: Float[np.ndarray, "num_poses 3"], p_replayed_m: Float[np.ndarray, "num_poses 3"]
-) -> Float[np.ndarray, " num_poses"]:
-    """Distance [m] of the same instants after the replay was laid over the recording.
-
-    Raises:
-        UndefinedStatisticError: When the replayed positions lie on a line, or are not finite.
-    """
-    R, shift = align_rigid(p_replayed_m, p_recorded_m)
-    return np.asarray(np.linalg.norm(p_recorded_m - (p_replayed_m @ R.T + shift), axis=1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,40 +104,6 @@ def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
     difference = recorded.position[common][:, mine] - replayed.at(stamps)[:, theirs]
     wrapped = difference - 2 * np.pi * np.round(difference / (2 * np.pi))
     return JointErrors(names=names, stamps_ns=stamps, error_rad=wrapped)
-
-
-def relative_errors(
-    recorded: PoseTrajectory, replayed: PoseTrajectory, step: int
-) -> tuple[Float[np.ndarray, " num_steps"], Float[np.ndarray, " num_steps"]]:
-    """Compare what each motion does within so many samples: relative pose error.
-
-    The difference of the two relative motions from sample i to i + step, for every i: Sturm et
-    al. (2012). A constant offset in front of either motion leaves it as it is.
-    Range: 0 and up, 0 is perfect. Undefined when: there are not more samples than ``step``.
-
-    Args:
-        step: Samples, at least 1.
-
-    Returns:
-        Length [m] and angle [rad] of the difference, one for each i.
-
-    Raises:
-        UndefinedStatisticError: When the motions are not longer than one step.
-    """
-    if len(recorded) <= step:
-        raise UndefinedStatisticError(
-            statistic="relative pose error",
-            reason=f"{len(recorded)} samples; a step is {step} samples long",
-        )
-    moved = []
-    for track in (recorded, replayed):
-        Ts = track.transforms()
-        moved.append(se3.invert(Ts[:-step]) @ Ts[step:])
-    difference = se3.invert(moved[0]) @ moved[1]
-    return (
-        np.asarray(np.linalg.norm(difference[:, :3, 3], axis=1)),
-        se3.rotation_angle_rad(difference[:, :3, :3]),
-    )
 
 
 NORMALISED_SAMPLES = 101

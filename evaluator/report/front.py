@@ -88,16 +88,16 @@ def sentence(row: Row) -> str:
     parts = [_bias_words(row)]
     yes, right = row["yes"], row["yes and right"]
     if isinstance(yes, int) and isinstance(right, int):
-        parts.append(f"a yes was right in {right} of {yes}{_whatever_words(row)}")
+        parts.append(f"when the twin predicted success it was right {right} of {yes}")
+        parts += _overall(row)
     return "; ".join(filter(None, [*parts, _ranking_words(row)])) + "."
 
 
-def _whatever_words(row: Row) -> str:
+def _overall(row: Row) -> list[str]:
     """Say what a yes has to be held against; nothing for results written before it was counted."""
     succeeded, trials = row.get("succeeded"), row.get("trials")
-    if not isinstance(succeeded, int) or not isinstance(trials, int):
-        return ""
-    return f", where {succeeded} of all {trials} succeeded"
+    known = isinstance(succeeded, int) and isinstance(trials, int)
+    return [f"overall {succeeded} of {trials} succeeded"] if known else []
 
 
 def answer(row: Row) -> str:
@@ -129,25 +129,17 @@ def _bias_words(row: Row) -> str:
     bias, low, high = (_number(row[name]) for name in ("bias (pp)", "low", "high"))
     if bias is None:
         return "the bias is not known"
+    size = f"bias {round(bias):+d} {noun('point', abs(round(bias)))}"
     if low is None or high is None:
-        word = "above" if bias > 0 else "below"
-        points = f"{_points(bias)} {word} the recorded rate" if round(bias) else "no gap"
-        return f"the twin shows {points}, without an interval"
+        return f"{size}, without an interval"
     ends = f"[{round(low):+d}, {round(high):+d}]"
     found = direction(low, high)
-    if found:
-        return f"the twin is {found} by {_points(bias)} {_sized(low, high)}"
-    return f"no bias is shown: {round(bias):+d} points {ends}"
+    return f"{size} {ends}: the twin is {found}" if found else f"{size}; interval {ends} includes 0"
 
 
 def _points(value: float) -> str:
     size = round(abs(value))
     return f"{size} {noun('point', size)}"
-
-
-def _sized(low: float, high: float) -> str:
-    small, large = sorted((abs(low), abs(high)))
-    return f"[{small:.0f}, {large:.0f}]"
 
 
 def _ranking_words(row: Row) -> str:
@@ -168,7 +160,7 @@ def _ranking_words(row: Row) -> str:
 
 def _summary(results: Results, num_tasks: int) -> str:
     by_id = {m.id: m for m in results.measurements}
-    parts = []
+    parts = _all_alike(results)
     side = agreeing_side(by_id)
     rate = by_id.get(f"agreement.{side}.rate")
     if rate is not None and rate.k is not None and rate.n:
@@ -184,12 +176,32 @@ def _summary(results: Results, num_tasks: int) -> str:
     r = by_id.get("agreement.pearson_r")
     if r is not None and r.value is not None:
         parts.append(
-            f"Its rates follow them with r = {r.value:.2f}{_ends(r, '.2f')}."
+            f"r = {r.value:.2f}{_ends(r, '.2f')} says nothing: its interval is too wide."
+            if _is_void(r)
+            else f"Its rates follow them with r = {r.value:.2f}{_ends(r, '.2f')}."
             if not r.is_beyond
             else f"Measured r = {r.value:.2f}; without the noise of counting r lies"
             f" in{_ends(r, '.2f')}."
         )
     return " ".join(parts)
+
+
+WIDE = 1.5
+"""An interval of r wider than this, of at most 2, says nothing."""
+
+
+def _is_void(r: Measurement) -> bool:
+    return r.interval is not None and r.interval.high - r.interval.low > WIDE
+
+
+def _all_alike(results: Results) -> list[str]:
+    """Say that nothing, or everything, succeeded: then no rate here ranks or judges anything."""
+    rates = [m for m in results.measurements if m.id.startswith("rate.recorded.") and m.n]
+    k, n = sum(m.k or 0 for m in rates), sum(m.n or 0 for m in rates)
+    if not n or any(m.k is None for m in rates) or 0 < k < n:
+        return []
+    word = "Nothing" if k == 0 else "Everything"
+    return [f"{word} succeeded: {k} of {n} recorded trials. That ranks no candidate."]
 
 
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:

@@ -16,9 +16,8 @@ from urllib.parse import quote
 from bridge.errors import MissingDependencyError
 from bridge.whole_file import write_whole
 from evaluator.report import wording
-from evaluator.report.figures.drawing import DARK, LIGHT, Drawing
+from evaluator.report.figures import DARK, LIGHT, Drawing
 from evaluator.report.front import FIGURES, front, front_tables
-from evaluator.report.pairs import Picture, ViewPair, pictures_of
 from evaluator.report.ranked import FIGURES as DECIDED
 from evaluator.report.ranked import decides, shown_tables
 from evaluator.report.sections import OTHER, SECTIONS, TRIALS, Section, numbers_of, section_of
@@ -57,9 +56,6 @@ SHARED = "shared"
 NO_SHARED = "<!--shared--><!--/shared-->"
 """Where the report names them; ``name_shared`` fills it in."""
 
-Inline = tuple[Drawing, str | None]
-"""A figure, and its SVG for the page; None where nothing could draw it."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
@@ -67,29 +63,25 @@ class Part:
 
     section: Section
     numbers: Sequence[tuple[str, Measurement]]
-    figures: Sequence[Inline]
-    worst: Sequence[tuple[ViewPair, Sequence[Picture]]]
+    figures: Sequence[Drawing]
     tables: Sequence[tuple[Table, bool]]
     """Each with whether a click shows it."""
 
 
 def page(
     results: Results,
-    figures: Sequence[Inline] = (),
-    pairs: Sequence[ViewPair] = (),
+    figures: Sequence[Drawing] = (),
     *,
     everything: bool = False,
 ) -> str:
     """Build the page of the results."""
     shown = shown_tables(results, everything=everything)
-    shown_first = [pair for name in FIGURES for pair in figures if pair[0].id == name][:1]
+    shown_first = [each for name in FIGURES for each in figures if each.id == name][:1]
     tables_first = front_tables(results)
     later = replace(results, tables=tuple(t for t in shown if t not in tables_first))
-    rest = [pair for pair in figures if pair not in shown_first]
+    rest = [each for each in figures if each not in shown_first]
     parts = [
-        part
-        for section in (*SECTIONS, OTHER)
-        if (part := _part(section, later, rest, pairs)) is not None
+        part for section in (*SECTIONS, OTHER) if (part := _part(section, later, rest)) is not None
     ]
     trials = next((table for table in shown if table.id == TRIALS), None)
     names = [("meaning", "What it means")]
@@ -109,7 +101,8 @@ def page(
         .get_template("report.html")
         .render(
             results=results,
-            title=f"{results.run}: how far to trust the twin",
+            title=f"{results.run}: {_question(results).lower()}",
+            question=_question(results),
             shared_mark=Markup(NO_SHARED),
             source=SOURCES.get(results.source, results.source),
             banner=wording.stand_in_sentence(results),
@@ -131,6 +124,13 @@ def page(
     )
 
 
+def _question(results: Results) -> str:
+    """What the page answers; a study without a twin asks for no trust in one."""
+    names = ("rate.sim", "agreement.", "views.", "image.", "motion.")
+    has_twin = any(m.value is not None and m.id.startswith(names) for m in results.measurements)
+    return "How far to trust the twin" if has_twin else "What succeeded, and how surely"
+
+
 def name_shared(report: Path) -> None:
     """Let a written report name the files in the folder ``shared`` beside it, or none."""
     try:
@@ -149,14 +149,12 @@ def name_shared(report: Path) -> None:
         return
 
 
-def _part(
-    section: Section, results: Results, figures: Sequence[Inline], pairs: Sequence[ViewPair]
-) -> Part | None:
+def _part(section: Section, results: Results, figures: Sequence[Drawing]) -> Part | None:
     """Collect one part, or nothing when the run has nothing for it."""
     tables = [
         table for table in results.tables if table.id != TRIALS and section_of(table.id) is section
     ]
-    drawn = [(drawing, svg) for drawing, svg in figures if drawing.id in section.figures]
+    drawn = [drawing for drawing in figures if drawing.id in section.figures]
     numbers = numbers_of(section, results.measurements)
     if not tables and not drawn and not any(m.value is not None for _, m in numbers):
         return None
@@ -164,7 +162,6 @@ def _part(
         section=section,
         numbers=numbers,
         figures=drawn,
-        worst=pictures_of(pairs) if section.id == "views" else (),
         tables=[(table, is_long(table)) for table in tables],
     )
 

@@ -33,10 +33,6 @@ TABLES: dict[str, str] = {
 FIGURES: dict[str, str] = {
     "success": "which candidate to use",
     "scatter": "whether the twin's rates may stand in for recorded ones",
-    "gains": "whether replanning is worth its time",
-    "motions": "whether to work on the controller or on the calibration",
-    "states": "whether the localisation is good enough for the task",
-    "views": "whether the scene is good enough to look at",
 }
 
 

@@ -95,14 +95,17 @@ def _write(
     state = state_of(run)
     rows = [] if comparison is None else list(comparison.rows)
     motions = () if comparison is None else comparison.motions
-    far_m = {
-        motion.episode: motion.position_max_m
+    off = {
+        motion.episode: (motion.path_max_m, motion.lag_s)
         for motion in motions
         if (motion.side, motion.against) == ("recorded", "planned")
     }
     regions = start_regions(rows)
     trials = sorted(
-        (_trial(row, far_m.get(row.episode), regions.get(row.episode, "")) for row in rows),
+        (
+            _trial(row, off.get(row.episode, (None, None)), regions.get(row.episode, ""))
+            for row in rows
+        ),
         key=severity,
     )
     about = {
@@ -128,14 +131,15 @@ def _write(
     return content
 
 
-def _trial(row: TrialRow, distance_m: float | None, region: str) -> IndexedTrial:
+def _trial(row: TrialRow, off: tuple[float | None, float | None], region: str) -> IndexedTrial:
     kind = failure_kind(row)
     shared = {each.name for each in fields(IndexedTrial)} & vars(row).keys()
     return IndexedTrial(
         **{name: getattr(row, name) for name in shared},
         file="" if row.path is None else row.path.name,
         failed_stage=first_failed_stage(row) if row.recorded is False else "",
-        distance_m=distance_m,
+        distance_m=off[0],
+        lag_s=off[1],
         fail_cause="" if kind is None else kind.cause,
         fail_stage="" if kind is None else kind.stage,
         fail_bodies="" if kind is None else kind.bodies,

@@ -85,7 +85,6 @@ SECTIONS: tuple[Section, ...] = (
             ("study.*", ""),
         ),
         tables=("comparisons", "standing", "comparison_numbers", "study_arms", "gains", "retries"),
-        figures=("gains",),
     ),
     Section(
         id="gate",
@@ -139,16 +138,14 @@ SECTIONS: tuple[Section, ...] = (
             (f"motion.{against}.{quantity}", f"{words}, {against} replay")
             for against in ("planned", "executed")
             for quantity, words in (
-                ("position_mean_m", "Tool, mean distance"),
+                ("lag_s", "Tool, lag behind the replay"),
+                ("path_mean_m", "Tool, mean distance of the paths, lag taken out"),
+                ("path_max_m", "Tool, largest distance of the paths"),
                 ("end_point_m", "Tool, distance at the end"),
-                ("rotation_mean_rad", "Tool, mean angle"),
-                ("lag_s", "Delay of the recorded motion"),
-                ("without_lag_mean_m", "Mean distance without the delay"),
                 ("joint_rms_rad", "Joints, root mean square"),
             )
         ),
-        tables=("motion*", "end_points_*", "runs_of_end_points_*"),
-        figures=("motions",),
+        tables=("motion*", "end_points_*"),
     ),
     Section(
         id="states",
@@ -157,7 +154,6 @@ SECTIONS: tuple[Section, ...] = (
         "replay left them; and whether labels and localised goals agree.",
         numbers=(("label.*", ""),),
         tables=("final_states", "label*"),
-        figures=("states",),
     ),
     Section(
         id="views",
@@ -175,7 +171,6 @@ SECTIONS: tuple[Section, ...] = (
             ("image.*", ""),
         ),
         tables=("views*", "image*"),
-        figures=("views",),
     ),
 )
 

@@ -27,8 +27,9 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("gain.pp.recorded.average", "Replanning gain, mean of tasks"),
     ("gain.relative.recorded.average", "The same, relative"),
     ("decision.regret_pp", "Loss of taking what sim ranks first"),
-    ("motion.planned.position_mean_m", "Tool: recorded to planned replay"),
-    ("motion.executed.position_mean_m", "Tool: recorded to executed replay"),
+    ("motion.planned.path_mean_m", "Tool path: recorded to planned replay, lag taken out"),
+    ("motion.planned.lag_s", "Tool lag: recorded behind planned replay"),
+    ("motion.executed.path_mean_m", "Tool path: recorded to executed replay, lag taken out"),
     ("views.all.psnr_db", "PSNR of held-out views, raw"),
     ("views.all.psnr_gain_db", "The same after a gain per image and channel"),
     ("views.all.ssim", "SSIM of held-out views"),
@@ -46,7 +47,7 @@ SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
     "dB": (1.0, " dB", ".2f"),
     "pp": (1.0, " pp", "+.1f"),
     "count": (1.0, "", ".0f"),
-    "s": (1.0, " s", ".3f"),
+    "s": (1000.0, " ms", "+.0f"),
 }
 """Factor, unit and digits in which a reader thinks."""
 PLAIN = (1.0, "", ".3f")
@@ -156,6 +157,8 @@ def headlines(results: Results) -> list[tuple[str, str, Measurement]]:
             if not name.startswith("motion.planned.")
         )
     found = [(label, by_id[name]) for name, label in listed if name in by_id]
+    if results.source not in ("run", "images"):  # who gave a table knows what is not in it
+        found = [(label, m) for label, m in found if m.value is not None]
     return [(label, measurement_text(m), m) for label, m in found]
 
 

@@ -2,16 +2,14 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from bridge.exchange.trials_csv import TrialRecord, write_trials
 from evaluator.compare.rows import Comparison
 from evaluator.compare.spreadsheet import record_from_row
 from evaluator.errors import EvaluatorError
-from evaluator.report.figures.distributions import worst_pairs
-from evaluator.report.figures.drawing import Drawing, Rendered
-from evaluator.report.figures.selection import drawings_of
+from evaluator.report.figures import drawings_of
 from evaluator.report.page import name_shared, page
 from evaluator.report.ranked import FIGURES, shown_tables
 from evaluator.report.tables import as_csv, as_latex, as_text
@@ -38,11 +36,13 @@ GROUPS = "success"
 
 HEADLINE_TABLES = ("conclusions", "success", "layout", "comparisons", "gains", "confusion")
 """Those that ``--latex`` writes for a paper."""
-OLD_FIGURES = ("confusion", "order", "bands", "tasks", "costs", "reliability", "funnel")
+OLD_FIGURES = (
+    *("confusion", "order", "bands", "tasks", "costs", "reliability", "funnel"),
+    *("gains", "motions", "states", "views"),
+)
 """Drawn by editions before."""
 
 PARQUET_PACKAGES = ("pyarrow",)
-FIGURE_PACKAGES = ("matplotlib",)
 LATEX_PACKAGES = ("pandas", "jinja2")
 INSTALL = "pip install 'robot-gst[report]'"
 
@@ -64,12 +64,8 @@ def write_report(
     comparison: Comparison, folder: Path, *, everything: bool = False, latex: bool = False
 ) -> Written:
     """Write every file of one evaluation into ``folder``, replacing an earlier one."""
-    drawn, not_drawn = drawings_of(comparison)
+    drawn = drawings_of(comparison)
     results = comparison.results()
-    if not_drawn:
-        words = "; ".join(f"{item.id} ({item.reason})" for item in not_drawn)
-        missing = f"figures without data, not drawn: {words}"
-        results = replace(results, missing=(*results.missing, missing))
     old = _old_files(folder)
     path = write_results(results, folder / "results.json")
     try:
@@ -77,15 +73,8 @@ def write_report(
         trials = [record_from_row(row) for row in comparison.rows]
         extra = [write_trials(folder / "trials.csv", trials)] if trials else []
         parquet, no_parquet = _write_parquet(folder, trials, results)
-        rendered, no_figures = _render(drawn)
-        inline = {item.drawing.id: item.inline for item in rendered}
-        text = page(
-            results,
-            [(drawing, inline.get(drawing.id)) for drawing in drawn],
-            worst_pairs(comparison.views),
-            everything=everything,
-        )
-        figures = {folder / "figures" / f"{item.drawing.id}.svg": item.svg for item in rendered}
+        text = page(results, drawn, everything=everything)
+        figures = {folder / "figures" / f"{each.id}.svg": each.svg.encode() for each in drawn}
         files = [*_write({folder / "report.html": text.encode()} | figures | tables)]
         name_shared(folder / "report.html")
         for one in set(old) - {*files, *extra, *parquet}:
@@ -98,21 +87,8 @@ def write_report(
         results=path,
         report=folder / "report.html",
         files=(*files, *extra, *parquet),
-        not_written="; ".join(filter(None, (no_figures, no_parquet, no_latex))) or None,
+        not_written="; ".join(filter(None, (no_parquet, no_latex))) or None,
     )
-
-
-def _render(drawn: Sequence[Drawing]) -> tuple[Sequence[Rendered], str | None]:
-    """Draw the figures, or say why not; matplotlib is heavy and may be missing."""
-    if not drawn:
-        return [], None
-    try:
-        from evaluator.report.figures import render  # noqa: PLC0415  # loads matplotlib
-    except ModuleNotFoundError as error:
-        if error.name not in FIGURE_PACKAGES:
-            raise
-        return [], f"figures not drawn: {error.name} is not installed ({INSTALL})"
-    return [render.render(drawing) for drawing in drawn], None
 
 
 def _write(contents: Mapping[Path, bytes]) -> list[Path]:
@@ -192,7 +168,7 @@ def summary_text(results: Results, written: Written) -> str:
     shown = [t for t in results.tables if t.id in SHOWN or t.id.startswith("end_points_")]
     parts += [as_text(table) for table in shown]
     lines = [f"{label}: {text}" for label, text, _ in headlines(results)]
-    if lines or not results.measurements:
+    if lines or not any(m.value is not None for m in results.measurements):
         parts.append("\n".join(lines) if lines else "Nothing could be measured.")
     if results.exclusions:
         parts.append(

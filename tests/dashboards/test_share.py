@@ -76,9 +76,8 @@ def test_the_file_holds_clips_plots_and_tables_and_the_report_names_it(run: RunF
 
 
 def test_without_names_the_worst_are_taken_and_a_wrong_name_says_the_nearest(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder,
 ) -> None:
-    monkeypatch.setattr(share_file, "_figure", lambda _: (None, None))  # matplotlib takes seconds
     assert build_share(run, ShareConfig()).trials == ("trial_0002",)
     with pytest.raises(UsageError, match="did you mean trial_0001"):
         build_share(run, ShareConfig(trials=("trial_001",)))
@@ -92,7 +91,7 @@ def test_a_smaller_limit_takes_quality_and_then_refuses(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("av")
-    monkeypatch.setattr(share_file, "_figure", lambda _: (None, None))
+    monkeypatch.setattr(share_file, "_figure", lambda _: None)
     names = ("trial_0001", "trial_0002")
     full = build_share(run, ShareConfig(trials=names))
     assert full.level == LEVELS[0]
@@ -108,7 +107,7 @@ def test_a_smaller_limit_takes_quality_and_then_refuses(
 def test_without_pyav_a_strip_of_pictures_stands_for_the_clip(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(share_file, "_figure", lambda _: (None, None))
+    monkeypatch.setattr(share_file, "_figure", lambda _: None)
     monkeypatch.setattr(share_file, "can_film", lambda: False)
     made = build_share(run, ShareConfig(trials=("trial_0002",)))
     assert "<video" not in made.text
@@ -121,7 +120,7 @@ def test_without_pyav_a_strip_of_pictures_stands_for_the_clip(
 def test_hostile_names_stay_text(
     synthetic: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(share_file, "_figure", lambda _: (None, None))
+    monkeypatch.setattr(share_file, "_figure", lambda _: None)
     run = RunFolder.create(tmp_path / "run")
     with synthetic.EpisodeWriter(run.episodes_dir / "x.mcap") as writer:
         writer.describe(
@@ -145,7 +144,7 @@ def test_hostile_names_stay_text(
 def test_the_page_of_failures_offers_the_file(
     browser: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(share_file, "_figure", lambda _: (None, None))
+    monkeypatch.setattr(share_file, "_figure", lambda _: None)
     (address,) = re.findall(r'href="(/share[^"]*)"', browser.get("/failures").text)
     assert address == "/share?trial=trial_0002&amp;trial=trial_0001"
     answer = browser.get(address.replace("&amp;", "&"))

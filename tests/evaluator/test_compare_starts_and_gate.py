@@ -59,7 +59,7 @@ def test_the_success_table_says_that_the_twin_selected_the_accepted_plans(six_tr
 def test_the_largest_tool_error_is_not_lost_between_samples(maker: Any) -> None:
     maker.trial("t1", num_poses=900)
     maker.replay("t1", num_poses=900, astray=301)
-    largest = compare_run(maker.run).results().get("motion.planned.position_max_m")
+    largest = compare_run(maker.run).results().get("motion.planned.path_max_m")
     assert largest.value == pytest.approx(1.0)
 
 

@@ -152,9 +152,6 @@ def test_runs_something_was_fitted_to_do_not_count_and_are_named(lab: Any) -> No
     named = {e.episode for e in comparison.exclusions if "fitted to this run" in e.reason}
     assert named == set(fitted)
     assert value(run, "other", "end_point").n == 8
-    table = next(t for t in comparison.tables if t.id == "runs_of_end_points_0")
-    marks = {row[2]: row[4] for row in table.rows if row[:2] == ("cube", ENGINE)}
-    assert {name for name, mark in marks.items() if mark} == set(fitted)
 
 
 @pytest.mark.parametrize(("lamp_m", "compared"), [(0.009, False), (0.011, True)])
@@ -180,6 +177,5 @@ def test_of_two_replays_of_one_run_the_newest_counts(lab: Any) -> None:
     )
     bodies = {"tool": way(0.3), "cube": old + np.array([0.05, 0.0, 0.0])}
     write(run.derived_dir / "push_0.again.mcap", info, bodies, derived)
-    table = next(t for t in compare_run(run).tables if t.id == "runs_of_end_points_0")
-    [row] = [row for row in table.rows if row[:3] == ("cube", ENGINE, "push_0")]
-    assert row[5] == pytest.approx(51.0, abs=0.01)
+    newest = [0.051, *(0.001 * n for n in range(2, 9))]  # it was 1 mm off, now 51
+    assert value(run, ENGINE, "end_point").value == pytest.approx(np.median(newest), abs=1e-5)

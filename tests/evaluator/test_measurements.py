@@ -1,15 +1,18 @@
 """The registry of measurements: nothing is measured that it does not define."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from evaluator.compare import compare_csv, compare_run
-from evaluator.measurements import REGISTRY, quantity_of
+from evaluator.compare.measure import measured
+from evaluator.measurements import BIAS, REGISTRY, quantity_of
+from evaluator.quantity import with_tables
 from evaluator.report.sections import SECTIONS
 from evaluator.report.wording import HEADLINES
-from evaluator.result import Measurement
+from evaluator.result import Interval, Measurement
 from evaluator.thresholds import SHORT
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -21,10 +24,38 @@ def check(measurements: tuple[Measurement, ...]) -> None:
         quantity = quantity_of(measurement.id)
         assert quantity is not None, f"{measurement.id} is not in evaluator/measurements.py"
         assert quantity.unit == measurement.unit, measurement.id
+        interval = measurement.interval
+        ends = () if interval is None else (interval.low, interval.high)
+        for value in (measurement.value, *ends):
+            assert value is None or quantity.low <= value <= quantity.high, (measurement.id, value)
 
 
-def test_a_run_has_only_registered_measurements(six_trials: Any) -> None:
+def test_every_measurement_of_a_run_is_registered_and_within_its_range(six_trials: Any) -> None:
     check(compare_run(six_trials.run).measurements)
+
+
+def test_a_number_that_cannot_be_is_not_printed() -> None:
+    """As a share of 188.9 percentage points, which stood in a report once."""
+    defined = BIAS.of(what="over 3 groups", resampled="")
+    wide = Interval(low=-300.0, high=120.0, level=0.95, method="x")
+    found = measured(defined, lambda: (188.9, wide))
+    assert found.value is None
+    assert "188.9" in str(found.reason_if_undefined)
+    kept = measured(defined, lambda: (8.0, wide), n=40)
+    assert kept.interval is not None
+    assert (kept.value, kept.interval.low, kept.interval.high) == (8.0, -100.0, 100.0)
+
+
+def test_the_page_of_metrics_is_written_from_the_registry() -> None:
+    page = (DOCS / "metrics.md").read_text()
+    hint = "run: python -m evaluator.measurements docs/metrics.md"
+    assert page == with_tables(page), hint
+    missing = [q.id for q in REGISTRY if f"`{plain(q.id)}`" not in page]
+    assert all(name.startswith("image.") for name in missing), hint  # as those of views
+
+
+def plain(name: str) -> str:
+    return re.sub(r"\{(\w+)\}", lambda part: part[1].upper(), name)
 
 
 @pytest.mark.parametrize("name", ["paper_table_rates.csv", "paper_table_published.csv"])

@@ -247,3 +247,69 @@ def test_a_table_names_the_intervals_that_it_prints(method: str, rates: str) -> 
         assert rates in table_of(results, "success").note
         assert "95 % score intervals" in table_of(results, "gains").note
     assert "Wilson" not in table_of(compare_csv(RATES, method="jeffreys").results(), "success").note
+
+
+def test_no_gain_at_all_is_not_called_underpowered(write_table: Callable[[str], Path]) -> None:
+    lines = [
+        f"a,{condition}_replanning,{side},trial,10,50,,"
+        for condition in ("without", "with")
+        for side in ("sim", "real")
+    ]
+    comparison = check_published(write_table(HEAD + "\n".join(lines) + "\n")).comparison
+    notes = [t for t in comparison.tables if t.id == "notes"]
+    assert not any("underpowered" in str(row) for table in notes for row in table.rows)
+
+
+def rounded_table(rates: list[tuple[float, float]], digits: int, *figures: str) -> str:
+    """A published table whose rates are printed in percent, without counts."""
+    lines = ["task,side,rate_percent,statistic,printed"]
+    for index, (real, sim) in enumerate(rates):
+        lines += [f"t{index},real,{real:.{digits}f},,", f"t{index},sim,{sim:.{digits}f},,"]
+    return "\n".join([*lines, *figures]) + "\n"
+
+
+TRUE_RATES = [(33.34, 41.44), (50.49, 45.51), (61.45, 72.36), (80.46, 77.55), (12.54, 20.35)]
+
+
+def test_a_figure_of_rates_before_they_were_rounded_is_no_difference(
+    write_table: Callable[[str], Path],
+) -> None:
+    import numpy as np
+
+    real, sim = np.array(TRUE_RATES).T
+    r, rmse = np.corrcoef(real, sim)[0, 1], np.sqrt(np.mean((sim - real) ** 2))
+    mae = np.abs(sim - real).mean()
+    rounded = np.corrcoef(np.round(real), np.round(sim))[0, 1]
+    assert f"{r:.4f}" != f"{rounded:.4f}"  # else this shows nothing
+    figures = (f",,,pearson_r,{r:.4f}", f",,,rmse_pp,{rmse:.2f}", f",,,mae_pp,{mae:.2f}")
+    check = check_published(write_table(rounded_table(TRUE_RATES, 0, *figures)))
+    verdicts = {f.what: f.verdict for f in check.findings}
+    for name in ("pearson_r", "rmse_pp", "mae_pp"):
+        assert verdicts[name] in ("as printed", "within the rounding of its rates"), name
+    assert verdicts["pearson_r"] == "within the rounding of its rates"
+    assert not check.failed
+    path = write_table(rounded_table(TRUE_RATES, 0, f",,,pearson_r,{r - 0.03:.4f}"))
+    (finding,) = check_published(path).failed
+    assert finding.verdict == "differs"
+    assert "as its rates are rounded" in finding.note
+
+
+def test_counts_leave_nothing_to_rounding(write_table: Callable[[str], Path]) -> None:
+    lines = ["task,side,n,rate_percent,statistic,printed"]
+    for index, (real, sim) in enumerate([(3, 5), (6, 6), (9, 7), (2, 4)]):
+        lines += [f"t{index},real,10,{10 * real},,", f"t{index},sim,10,{10 * sim},,"]
+    path = write_table("\n".join([*lines, ",,,,mae_pp,12.6"]) + "\n")
+    (finding,) = check_published(path).failed
+    assert (finding.verdict, finding.recomputed) == ("differs", pytest.approx(15.0))
+    assert "rounded" not in finding.note
+
+
+def test_rank_violation_is_given_in_both_orders(write_table: Callable[[str], Path]) -> None:
+    """By hand: only t0 and t1 are ordered otherwise; recorded they are 10 apart, in sim 20."""
+    rates = [(50.0, 60.0), (60.0, 40.0), (90.0, 90.0)]
+    check = check_published(write_table(rounded_table(rates, 0)))
+    found = {f.what.split()[0]: f.recomputed for f in check.findings}
+    assert found["mmrv"] == pytest.approx(2 * 0.1 / 3)
+    assert found["mmrv_sim_gap"] == pytest.approx(2 * 0.2 / 3)
+    assert found["spearman_rho"] == pytest.approx(0.5)
+    assert found["rmse_pp"] == pytest.approx((500 / 3) ** 0.5)

@@ -51,11 +51,12 @@ def test_a_published_table_gives_the_numbers_of_numpy(path: Path) -> None:
     results = comparison.results()
     r = results.get("agreement.pearson_r")
     assert r.value == pytest.approx(np.corrcoef(real, sim)[0, 1], abs=1e-9)
-    counted = all(group.recorded.n and group.sim.n for group in comparison.groups)
-    assert (r.interval is not None) == counted, "without n nothing has an interval"
-    if r.interval is not None:
+    if all(rate.n for group in comparison.groups for rate in group.pair):
+        assert r.interval is not None, r.reason_without_interval
         assert -1 <= r.interval.low < r.interval.high <= 1
-        assert r.interval.high - r.interval.low < 2
+        assert (r.interval.low, r.interval.high) != (-1, 1)
+    else:
+        assert "without n" in str(r.reason_without_interval)
     for name, value in (
         ("bias_pp", 100 * np.mean(sim - real)),
         ("mae_pp", 100 * np.mean(np.abs(sim - real))),

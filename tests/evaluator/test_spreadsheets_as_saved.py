@@ -3,7 +3,6 @@
 import json
 import shutil
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.errors import UsageError
-from bridge.exchange.results_intake import look_through, take
-from bridge.exchange.table_text import TableError, TableOptions, read_rows
+from bridge.exchange.table_text import TableOptions, read_rows
 from bridge.exchange.trials_csv import COLUMNS, read_trials
-from bridge.exchange.trials_rates import read_rates
 from evaluator.cli import evaluate
 from evaluator.compare import compare_csv
 from evaluator.compare.axes import axis_tables
+from evaluator.compare.intake import look_through, take
 from evaluator.compare.several import compare_several
 from evaluator.errors import AlikeNamesError
 
@@ -54,8 +52,8 @@ def test_what_was_understood_is_said(write_table: Callable[[str], Path]) -> None
     path = write_table("Scenario;Result;sim_planned\ncup;pass;\n")
     assert "'Result' read as recorded" in take(path, MAPPED).summary
     path = write_table("task,sim_planned,Result\ncup,yes,pass\n")
-    assert read_trials(path)[0].recorded is None  # nobody said that it is the outcome
-    assert '--map "outcome=Result"' in take(path).summary
+    assert take(path).trials[0].recorded is True
+    assert "'Result' read as recorded" in take(path).summary
 
 
 @pytest.mark.parametrize("unknown", ["", "NA", "n/a", "NaN", "-", "?", "none"])
@@ -94,14 +92,6 @@ def test_no_delimiter_changes_a_name(
     lines += [delimiter.join((str(i), task, "yes")) for i, task in enumerate(quoted)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     assert [row.text("task") for row in read_rows(path, ("task",), COLUMNS)] == tasks
-
-
-def test_rates_take_semicolons_and_decimal_commas(write_table: Callable[[str], Path]) -> None:
-    path = write_table("Task;Policy;Side;N;Rate %\ncup;A;Sim;3;66,7\ncup;A;Real;;50\n")
-    assert [(r.side, r.rate) for r in read_rates(path)] == [
-        ("sim", Fraction(2, 3)),
-        ("real", Fraction(1, 2)),
-    ]
 
 
 ALIKE = "trial_id,task,recorded,sim_planned\na,Cup,yes,yes\nb,cup,no,yes\nc,Cube,no,no\n"
@@ -163,7 +153,7 @@ def test_a_folder_of_results_is_read_and_what_is_left_is_said(
     (folder / "notes.md").write_text("monday")
     assert evaluate(folder, out=tmp_path / "out") == 0
     err = capsys.readouterr().err
-    assert "neither a trials CSV" in err
+    assert "neither a table of trials" in err
     taken, left = look_through(folder)
     assert {each.kind for each in taken} == {"trials", "rates"}
     assert {one.path.name for one in left} == {"lengths.csv", "notes.md"}
@@ -204,9 +194,7 @@ def test_a_table_of_single_rollouts_on_either_side_is_an_unpaired_study(
         lines += [f"place,{policy},real,{'success' if i < real else 'failure'}" for i in range(20)]
         lines += [f"place,{policy},Sim,{'success' if i < sim else 'failure'}" for i in range(200)]
     table = write_table("\n".join(lines) + "\n")
-    with pytest.raises(TableError, match=r'neither rates .* --map "outcome=...": Result'):
-        compare_csv(table)
-    comparison = compare_csv(table, options=TableOptions(map="outcome=Result"))
+    comparison = compare_csv(table)
     assert comparison.stand_in is False
     groups = {group.policy: group for group in comparison.groups}
     assert (groups["A"].recorded.k, groups["A"].recorded.n) == (14, 20)
@@ -215,12 +203,3 @@ def test_a_table_of_single_rollouts_on_either_side_is_an_unpaired_study(
     note = next(table.note for table in comparison.tables if table.id == "success")
     assert "Each side counts its own trials" in note
     assert "both sides are known" not in note
-    named = write_table("\n".join(["Task,Policy,Side,Outcome", *lines[1:]]) + "\n")
-    assert "'Outcome' read as recorded" in take(named).summary
-    assert compare_csv(named).groups == comparison.groups
-
-
-def test_a_rollout_on_no_known_side_is_refused(write_table: Callable[[str], Path]) -> None:
-    table = write_table("task,side,recorded\nplace,real,success\nplace,mars,success\n")
-    with pytest.raises(TableError, match=r"row 3: side is 'mars'. Sides: sim, real, stand-in"):
-        compare_csv(table)

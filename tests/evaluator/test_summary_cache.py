@@ -2,7 +2,6 @@
 
 import math
 import os
-from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 
 from evaluator import cache as cache_module
 from evaluator.cache import SummaryCache, read_rows, write_rows
-from evaluator.memory import Packed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +43,6 @@ class Everything:
     maybe: float | None = None
     unknown: bool | None = None
     curve_m: tuple[float, ...] = ()
-    packed_m: Packed = field(default_factory=lambda: array("d"))
     names: tuple[str, ...] | None = None
     inner: Inner | None = None
     places: dict[str, tuple[float, float, float]] = field(default_factory=dict)
@@ -67,7 +64,6 @@ FULL = Everything(
     maybe=1e-300,
     unknown=False,
     curve_m=(0.0, -0.0, 1.5),
-    packed_m=array("d", (0.0, -0.0, 0.1)),
     names=("x", ""),
     inner=Inner(name="i", pairs=(("grasp", True), ("place", None))),
     places={"cube": (0.1, 0.2, 0.3)},
@@ -87,7 +83,6 @@ everything = st.builds(
     maybe=st.none() | numbers,
     unknown=st.none() | st.booleans(),
     curve_m=st.lists(numbers, max_size=4).map(tuple),
-    packed_m=st.lists(numbers, max_size=4).map(lambda values: array("d", values)),
     names=st.none() | st.lists(names, max_size=3).map(tuple),
     inner=st.none() | st.builds(Inner, name=names),
     places=st.dictionaries(names, st.tuples(numbers, numbers, numbers), max_size=2),
@@ -182,17 +177,6 @@ def test_changed_code_forgets_everything(tmp_path: Path, monkeypatch: pytest.Mon
     assert "another version" in said[0]
     with SummaryCache(tmp_path) as cache:
         assert cache.find(Everything, "k") == (FULL,)
-
-
-def test_a_fresh_cache_believes_nothing_and_keeps_what_is_made(tmp_path: Path) -> None:
-    old, new = Other(text="old"), Other(text="new")
-    with SummaryCache(tmp_path) as cache:
-        cache.keep(Other, "k", (old,))
-    with SummaryCache(tmp_path, fresh=True) as cache:
-        assert cache.kept_or_made(Other, "k", lambda: (new,)) == (new,)
-    with SummaryCache(tmp_path) as cache:
-        assert cache.find(Other, "k") == (new,)
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_what_raises_is_not_kept(tmp_path: Path) -> None:

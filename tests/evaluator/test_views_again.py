@@ -50,12 +50,6 @@ def test_views_are_scored_once_and_again_when_they_change(
     assert scored == [6, 6]  # the first time, and without a cache
     texts = [write_results(r.results(), run.path / "r.json").read_bytes() for r in results]
     assert texts[0] == texts[1] == texts[2]
-    for first, second in zip(results[0].views, results[1].views, strict=True):
-        assert first.view_id == second.view_id
-        assert first.values == second.values
-        assert (first.rendered_u8 is None) == (second.rendered_u8 is None)
-        if first.rendered_u8 is not None:
-            np.testing.assert_array_equal(first.rendered_u8, second.rendered_u8)
     next(iter(run.derived())).unlink()
     load_golden_script("evaluation_others").write_views(run, np.random.default_rng(2))
     other = again(run)

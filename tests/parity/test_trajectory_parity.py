@@ -9,13 +9,7 @@ from scipy.spatial.transform import Rotation
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.task_file import ObjectModel
 from evaluator.metrics.state import turn_between_rad, turns_alike
-from evaluator.metrics.trajectory import (
-    align_rigid,
-    angles_rad,
-    pose_errors,
-    relative_errors,
-    without_rigid_motion,
-)
+from evaluator.metrics.trajectory import angles_rad, pose_errors
 
 pytestmark = pytest.mark.parity
 
@@ -71,55 +65,6 @@ def test_absolute_errors_are_those_of_evo(seed: int) -> None:
         ape = metrics.APE(relation)
         ape.process_data((as_evo(recorded), as_evo(replayed)))
         np.testing.assert_allclose(ours, ape.error, atol=TOLERANCE)
-
-
-@pytest.mark.parametrize("step", [1, 7])
-@pytest.mark.parametrize("seed", range(3))
-def test_relative_errors_are_those_of_evo(seed: int, step: int) -> None:
-    metrics = pytest.importorskip("evo.core.metrics")
-    recorded = motion(seed)
-    replayed = near(recorded, seed + 100)
-    ours = relative_errors(recorded, replayed, step)
-    for relation, error in zip(
-        (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad),
-        ours,
-        strict=True,
-    ):
-        rpe = metrics.RPE(relation, delta=step, delta_unit=metrics.Unit.frames, all_pairs=True)
-        rpe.process_data((as_evo(recorded), as_evo(replayed)))
-        np.testing.assert_allclose(error, rpe.error, atol=TOLERANCE)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_alignment_is_that_of_evo(seed: int) -> None:
-    metrics = pytest.importorskip("evo.core.metrics")
-    recorded = motion(seed)
-    moved = near(recorded, seed + 100)
-    far = PoseTrajectory(
-        moved.stamps_ns,
-        moved.p_m @ Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix().T + [1.0, -2.0, 0.5],
-        moved.q_wxyz,
-    )
-    theirs = as_evo(far)
-    R, p, scale = theirs.align(as_evo(recorded), correct_scale=False)
-    ours = align_rigid(far.p_m, recorded.p_m)
-    assert scale == 1.0
-    np.testing.assert_allclose(ours[0], R, atol=TOLERANCE)
-    np.testing.assert_allclose(ours[1], p, atol=TOLERANCE)
-    ape = metrics.APE(metrics.PoseRelation.translation_part)
-    ape.process_data((as_evo(recorded), theirs))
-    np.testing.assert_allclose(
-        without_rigid_motion(recorded.p_m, far.p_m), ape.error, atol=TOLERANCE
-    )
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_alignment_is_that_of_scipy(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    source, target = rng.normal(size=(2, 20, 3))
-    R, _ = align_rigid(source, target)
-    theirs, _ = Rotation.align_vectors(target - target.mean(axis=0), source - source.mean(axis=0))
-    np.testing.assert_allclose(R, theirs.as_matrix(), atol=TOLERANCE)
 
 
 def test_angles_are_those_of_scipy() -> None:

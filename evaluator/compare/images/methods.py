@@ -19,13 +19,9 @@ from bridge.errors import BridgeError, GstError, PathNotFoundError
 from bridge.media.color import JPEG_MAGIC, decode_color, open_image
 from bridge.media.image_quality import as_float
 from evaluator.compare.images.scores import (
-    NUM_WORST,
     Variant,
-    ViewQuality,
     score_variants,
-    shrunk_u8,
     spread,
-    values_by_id,
 )
 from evaluator.compare.images.tables import (
     Protocol,
@@ -164,7 +160,6 @@ class MethodReport:
 
     numbers: Mapping[str, Sequence[StampedMeasurement]]
     """By method, over the views that all of them have."""
-    views: tuple[ViewQuality, ...]
     exclusions: tuple[Exclusion, ...]
 
 
@@ -216,12 +211,7 @@ def compare_methods(
         )
         for method in scored
     }
-    shown = [
-        quality
-        for method in scored
-        for quality in _qualities(reference.images, method, {v: views[v] for v in common})
-    ]
-    return MethodReport(numbers=numbers, views=tuple(shown), exclusions=tuple(left_out))
+    return MethodReport(numbers=numbers, exclusions=tuple(left_out))
 
 
 def _name(method: str, view: str) -> str:
@@ -326,24 +316,4 @@ def _numbers(
             protocol,
             method=method.name,
         )
-    ]
-
-
-def _qualities(
-    reference: ImageSet, method: ImageSet, views: Mapping[str, _View]
-) -> list[ViewQuality]:
-    """One record for each view, with pictures of those with the lowest PSNR."""
-    values = {view: values_by_id(seen.scores[method.name]) for view, seen in views.items()}
-    rated = sorted((found["psnr_db"], view) for view, found in values.items() if "psnr_db" in found)
-    worst = {view for _, view in rated[:NUM_WORST]}
-    return [
-        ViewQuality(
-            episode=reference.name,
-            view_id=view,
-            method=method.name,
-            values=found,
-            recorded_u8=shrunk_u8(reference.load[view]()) if view in worst else None,
-            rendered_u8=shrunk_u8(method.load[view]()) if view in worst else None,
-        )
-        for view, found in values.items()
     ]

@@ -83,7 +83,6 @@ def compare_folders(options: ImageOptions) -> Comparison:
         tables=report.tables,
         exclusions=report.exclusions,
         missing=report.missing,
-        views=report.views,
         provenance={
             "software": software(),
             **options.origin(),
@@ -150,7 +149,6 @@ def _report(
         tables=(_headline(report.numbers, f"{origin}; recorded: {reference.images.where}"),),
         exclusions=report.exclusions,
         missing=tuple(missing),
-        views=report.views,
     )
 
 

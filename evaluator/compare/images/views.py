@@ -14,23 +14,16 @@ import numpy as np
 
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
-from bridge.media.color import decode_color
 from evaluator.cache import SummaryCache
 from evaluator.compare.images.scores import (
     GAIN,
-    NUM_WORST,
     RAW,
-    RECORDED,
-    RENDERED,
     Images,
     Variant,
-    ViewQuality,
     ViewScore,
     images_of,
     masked,
     score_views,
-    shrunk_u8,
-    values_by_id,
 )
 from evaluator.compare.images.tables import (
     Protocol,
@@ -119,7 +112,6 @@ class ViewReport:
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     missing: tuple[str, ...] = ()
-    views: tuple[ViewQuality, ...] = ()
 
 
 def compare_views(
@@ -140,7 +132,6 @@ def compare_views(
     tables: list[Table] = []
     found: dict[str, list[ViewScore]] = {}
     of: dict[str, DerivedFile] = {}
-    shown: list[ViewQuality] = []
     for file in views:
         name = file.path.stem
         source = file.derived.source_episode
@@ -154,7 +145,6 @@ def compare_views(
             continue
         left_out += [Exclusion(episode=name, scope="views", reason=reason) for reason in reasons]
         found[source], of[source] = scores, file
-        shown += _qualities(source, scores, images)
         tables.append(per_image_table(f"views_{len(tables)}", f"Held-out views: {name}", scores))
     everything = [score for scores in found.values() for score in scores]
     measurements = _measure("all", list(found), everything, of.values(), nets)
@@ -164,7 +154,6 @@ def compare_views(
         measurements=tuple(measurements),
         tables=tuple(tables),
         exclusions=tuple(left_out),
-        views=tuple(shown),
     )
 
 
@@ -209,27 +198,6 @@ def _newest(views: Sequence[DerivedFile]) -> tuple[list[DerivedFile], list[Exclu
         if file not in kept
     ]
     return kept, left_out
-
-
-def _qualities(source: str, scores: Sequence[ViewScore], images: Images) -> list[ViewQuality]:
-    """One record for each view, with pictures of those with the lowest PSNR."""
-    rated = [s for s in scores if s.psnr_db() is not None]
-    worst = sorted(rated, key=lambda s: s.psnr_db() or 0.0)[:NUM_WORST]
-    return [
-        ViewQuality(
-            episode=source,
-            view_id=f"{score.camera_id}/{score.stamp_ns}",
-            method=TWIN,
-            values=values_by_id(score.scores),
-            recorded_u8=_picture(images, RECORDED, score) if score in worst else None,
-            rendered_u8=_picture(images, RENDERED, score) if score in worst else None,
-        )
-        for score in scores
-    ]
-
-
-def _picture(images: Images, name: str, score: ViewScore) -> np.ndarray:
-    return shrunk_u8(decode_color(images.color[name][score.camera_id, score.stamp_ns]))
 
 
 def _measure(

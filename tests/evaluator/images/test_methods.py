@@ -12,7 +12,6 @@ from skimage.metrics import peak_signal_noise_ratio
 from bridge.errors import PathNotFoundError, UsageError
 from evaluator.cli import evaluate
 from evaluator.compare.images.renders import compare_folders
-from evaluator.compare.images.scores import PICTURE_WIDTH_PX, shrunk_u8
 from evaluator.compare.rows import Comparison
 from evaluator.errors import EvaluatorError
 from evaluator.metrics.image_protocol import ImageOptions
@@ -200,28 +199,6 @@ def test_wrong_use_is_told_apart(folders: Path) -> None:
     save(picture(1), folders / "good" / "0001.jpg")
     with pytest.raises(EvaluatorError, match=r"has 0001.jpg and 0001.png; keep one"):
         compared(folders)
-
-
-def test_the_worst_views_keep_small_pictures(tmp_path: Path) -> None:
-    for index in range(6):
-        recorded = picture(index, (96, 648))
-        save(recorded, tmp_path / "recorded" / f"{index}.png")
-        save(noisy(recorded, 3 + 2 * index), tmp_path / "good" / f"{index}.png")
-    comparison = compared(tmp_path, renders=(f"good={tmp_path / 'good'}",))
-    assert len(comparison.views) == 6
-    pictured = [v for v in comparison.views if v.rendered_u8 is not None]
-    assert [v.view_id for v in pictured] == ["2", "3", "4", "5"]
-    assert all(v.rendered_u8.shape == (32, 216, 3) for v in pictured)
-    assert pictured[0].values["psnr_gain_db"] >= pictured[0].values["psnr_db"] - 0.01
-
-
-def test_pictures_are_averaged_squares() -> None:
-    image = picture(3, (96, 960))
-    small = shrunk_u8(image)
-    assert small.shape == (32, 320, 3)
-    assert small.shape[1] <= PICTURE_WIDTH_PX
-    np.testing.assert_array_equal(small[0, 0], np.rint(image[:3, :3].mean(axis=(0, 1))))
-    np.testing.assert_array_equal(shrunk_u8(image / 255.0), small)
 
 
 @pytest.mark.slow

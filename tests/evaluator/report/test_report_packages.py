@@ -99,18 +99,6 @@ def take_away(monkeypatch: pytest.MonkeyPatch, package: str, user: str) -> None:
         monkeypatch.delitem(sys.modules, name)
 
 
-def test_without_matplotlib_no_figure_is_drawn_and_it_says_so(
-    six_trials: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    take_away(monkeypatch, "matplotlib", "evaluator.report.figures.render")
-    comparison = compare_run(six_trials.run)
-    written = write_report(comparison, six_trials.run.results_dir)
-    assert "figures not drawn: matplotlib is not installed" in str(written.not_written)
-    text = written.report.read_text()
-    assert "Not drawn." in text
-    assert "<svg" not in text
-
-
 def test_without_pyarrow_the_report_is_written_and_says_so(
     six_trials: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

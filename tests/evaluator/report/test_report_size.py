@@ -1,14 +1,11 @@
 """Large runs: the page stays small and says where the rest is; the results are complete."""
 
-from array import array
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.motion import MotionSummary
 from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.report.page import SHOWN_ROWS
 from evaluator.report.write import write_report
@@ -43,39 +40,7 @@ def many(count: int) -> Comparison:
                 stages=(("grasp", recorded or said), ("place", recorded)),
             )
         )
-    comparison = compare_rows(rows, run="large", source="run", stand_in=True)
-    return replace(comparison, motions=tuple(motion(rng, row, s) for row in rows for s in SIDES))
-
-
-SIDES = ("planned", "executed")
-
-
-def motion(rng: np.random.Generator, row: TrialRow, against: str) -> MotionSummary:
-    curve = (0.003 + 0.001 * rng.random(101)).tolist()
-    return MotionSummary(
-        episode=row.episode,
-        task=row.task,
-        condition=row.condition,
-        plan_id="p",
-        side="recorded",
-        against=against,
-        aligned_by="stamps",
-        num_samples=30,
-        duration_s=3.0,
-        position_mean_m=0.003,
-        position_max_m=0.004,
-        end_point_m=curve[-1],
-        rotation_mean_rad=0.01,
-        rotation_max_rad=0.02,
-        end_point_rad=0.01,
-        lag_s=None,
-        without_lag_mean_m=None,
-        without_offset_mean_m=None,
-        relative_mean_m=None,
-        joint_rms_rad=None,
-        joint_max_rad=None,
-        curve_m=array("d", curve),
-    )
+    return compare_rows(rows, run="large", source="run", stand_in=True)
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from evaluator.compare import compare_csv
 from evaluator.report.front import answer, front, next_trials, sentence
 from evaluator.report.page import page
 from evaluator.report.wording import measurement_text
+from evaluator.report.write import summary_text, write_report
 from evaluator.result import Interval, Measurement
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "examples" / "paper_table_rates.csv"
@@ -89,16 +90,17 @@ def row(**values: Any) -> dict[str, Any]:
     [
         (
             {"bias (pp)": 12.2, "low": 3.4, "high": 21.6, "yes": 18, "yes and right": 16},
-            "the twin is optimistic by 12 points [3, 22]; a yes was right in 16 of 18.",
+            "bias +12 points [+3, +22]: the twin is optimistic; when the twin predicted success it "
+            "was right 16 of 18.",
         ),
         (
             {"bias (pp)": -9.0, "low": -20.0, "high": -1.2, "ranked": "no", "more trials": 14},
-            "the twin is pessimistic by 9 points [1, 20]; enough to rank: no, 14 more trials "
+            "bias -9 points [-20, -1]: the twin is pessimistic; enough to rank: no, 14 more trials "
             "would do.",
         ),
         (
             {"bias (pp)": 2.0, "low": -5.0, "high": 9.0, "ranked": "yes", "best recorded": "A"},
-            "no bias is shown: +2 points [-5, +9]; enough to rank: yes, A is best.",
+            "bias +2 points; interval [-5, +9] includes 0; enough to rank: yes, A is best.",
         ),
     ],
 )
@@ -132,3 +134,39 @@ def test_the_task_that_the_fewest_trials_settle_is_worth_running_next() -> None:
     ]
     assert next_trials(rows).startswith("cube into box: 1 more trial would settle")
     assert next_trials(rows[2:]) == ""
+
+
+def shown(tmp_path: Path, text: str) -> tuple[str, str]:
+    """The first page and the terminal of a table."""
+    path = tmp_path / "table.csv"
+    path.write_text(text)
+    comparison = compare_csv(path)
+    written = write_report(comparison, tmp_path / "out")
+    first = front(written.content)
+    return first.summary + " ".join(first.missing), summary_text(written.content, written)
+
+
+def test_rates_without_n_ask_for_it_and_claim_no_interval(tmp_path: Path) -> None:
+    rates = "policy,real,sim\nA,50%,60%\nB,70%,65%\nC,30%,45%\nD,10%,20%\nE,80%,75%\n"
+    page_text, terminal = shown(tmp_path, rates)
+    assert "a column n" in page_text
+    for text in (page_text, terminal):
+        assert re.search(r"r .*0\.9", text)
+        assert not re.search(r"\[[-+.\d]+, ", text)
+
+
+def test_a_table_without_a_twin_is_told_nothing_about_one(tmp_path: Path) -> None:
+    trials = "task,policy,outcome\n" + "".join(
+        f"cup,{policy},{int(i < k)}\n" for policy, k in (("A", 3), ("B", 1)) for i in range(4)
+    )
+    for text in shown(tmp_path, trials):
+        for word in ("replay", "verdict", "sim_planned", "agree", "--samples", "gate"):
+            assert word not in text, (word, text)
+
+
+@pytest.mark.parametrize(("k", "words"), [(0, "Nothing succeeded: 0 of 6"), (3, "Everything")])
+def test_a_study_of_which_all_trials_end_alike_says_so(tmp_path: Path, k: int, words: str) -> None:
+    trials = "task,policy,recorded,sim_planned\n" + "".join(
+        f"cup,{policy},{int(i < k)},{int(i < 1)}\n" for policy in "AB" for i in range(3)
+    )
+    assert words in shown(tmp_path, trials)[0]

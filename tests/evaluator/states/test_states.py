@@ -265,14 +265,6 @@ def test_an_episode_counts_once_and_conditions_stay_apart() -> None:
     assert "4 values" in str(few.reason_without_interval)
 
 
-def test_a_mean_has_no_interval_and_names_the_median() -> None:
-    by_id = {m.id: m for m in state_results(states(24)).measurements}
-    mean = by_id["state.plan_to_recorded.cube_into_box.with_replanning.position_mean_m"]
-    assert mean.value is not None
-    assert mean.interval is None
-    assert mean.reason_without_interval == "the median has one"
-
-
 def test_what_is_missing_is_named_and_stages_have_a_table() -> None:
     lost = replace(states(1)[0], position_m=None, rotation_rad=None, reason="not found: behind it")
     part = state_results([lost, replace(lost, stage="grasp", is_last=False, reason="x")])

@@ -16,9 +16,14 @@ from typing import Any
 from bridge.errors import BridgeError, PathNotFoundError, UsageError
 from bridge.exchange.table_text import (
     AS_SAVED,
+    OUTCOME_LIKE,
+    UNKNOWN,
+    WORKBOOKS,
+    SourceRow,
     TableError,
     TableOptions,
     TableText,
+    answer_of,
     open_table,
     plain_name,
     read_rows,
@@ -36,12 +41,14 @@ from bridge.exchange.trials_csv import (
 )
 from bridge.exchange.trials_rates import COLUMNS as RATE_COLUMNS
 from bridge.exchange.trials_rates import RateRecord, rates_of
+from evaluator.compare.found_table import holds_fractions, read_found
+from evaluator.compare.table_words import KNOWN, DoubtfulTableError
 
 PUBLISHED = "a published table"
 LISTS = "Give a list of trials or rates"
 FIGURES = ("k", "n", "rate", "rate_percent")
 """A table with a column side and one of these is one of rates."""
-READ_ENDINGS = (".csv", ".tsv", ".txt", ".json")
+READ_ENDINGS = (".csv", ".tsv", ".txt", ".json", ".md", *WORKBOOKS)
 MOST_FILES = 20_000
 """Files of a folder that are looked at."""
 
@@ -69,31 +76,84 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     """Read a file; its content tells what it is."""
     if path.suffix.lower() == ".json":
         return _take_json(path)
-    # A slip in a name is told by the reader of the table, once it is known which one it is.
     known = (*COLUMNS, *RATE_COLUMNS, "statistic", "printed")
     _refuse_unknown(options, known)
-    table = open_table(path, known, options, near=False)
-    header = table.header
+    table = open_table(path, known, options, near=False, words=KNOWN)
+    header = set(table.header)
     if "statistic" in header:
         return Taken(path=path, kind=PUBLISHED, summary=f"{path.name}: rates with printed figures")
-    if "side" in header and not set(FIGURES) & set(header):
-        named = [name for name in table.left if plain_name(name) == "outcome"]
-        if named and "recorded" not in header:  # it says itself that it is the outcome
-            mapped = ",".join(filter(None, (options.map, f"outcome={named[0]}")))
-            options = replace(options, map=mapped)
-            table = open_table(path, known, options, near=False)
-        trials = read_trials_by_side(path, options)
+    ours = _with_outcome(table, options)
+    is_ours = "task" in header and not {"real", "sim"} & set(map(plain_name, table.left))
+    if is_ours and "side" in header and set(FIGURES) & header:
+        rows = read_rows(path, ("task", "side"), RATE_COLUMNS, options)
+        return _taken_rates(path, rates_of(_surely_percent(rows, options)), options)
+    if is_ours and "side" in header and "recorded" in ours.mapped | dict.fromkeys(header):
+        trials = read_trials_by_side(path, ours)
+        table = open_table(path, known, ours, near=False)
         understood = table.understood("trials of either side, without pairs", len(trials))
         return Taken(path=path, kind="trials", summary=understood, trials=tuple(trials))
-    if "side" in header:
-        rows = read_rows(path, ("task", "side"), RATE_COLUMNS, options)
-        return _taken_rates(path, rates_of(rows), options)
-    if "trial_id" in header or ("task" in header and set(SIDES_OF_TRIAL) & set(header)):
-        opened = open_trials(path, options)
+    if is_ours and "side" not in header and set(SIDES_OF_TRIAL) & header:
+        opened = open_trials(path, ours)
         trials = trials_of(rows_of(opened))
         understood = opened.understood("trials", len(trials))
         return Taken(path=path, kind="trials", summary=understood, trials=tuple(trials))
-    raise UsageError(_unknown_table(table))
+    return _take_found(table, options)
+
+
+def _with_outcome(table: TableText, options: TableOptions) -> TableOptions:
+    """Map the one column that is called an outcome, and holds nothing but yes and no."""
+    named = [name for name in table.left if plain_name(name) in OUTCOME_LIKE]
+    if "recorded" in table.header or len(named) != 1:
+        return options
+    place = table.header.index(named[0])
+    texts = [cells[place] for _, cells in table.grid[1:] if place < len(cells)]
+    if not all(t.strip().lower() in UNKNOWN or answer_of(t) is not None for t in texts):
+        return options
+    mapped = ",".join(filter(None, (options.map, f"outcome={named[0]}")))
+    return replace(options, map=mapped)
+
+
+def _surely_percent(rows: Sequence[SourceRow], options: TableOptions) -> Sequence[SourceRow]:
+    """Ask where all of ``rate_percent`` lie in 0..1: percent, or shares that were not scaled?"""
+    texts = [row.figure("rate_percent") for row in rows]
+    try:
+        numbers = [float(text) for text in texts if text and not text.endswith("%")]
+    except ValueError:
+        return rows
+    if not holds_fractions(numbers):
+        return rows
+    if not options.yes:
+        raise DoubtfulTableError(
+            f"{rows[0].path.name}: all of rate_percent lie in 0..1, so they look like shares of 1. "
+            "If they are shares say --yes; if they are percent write the sign: 0.5 %."
+        )
+    return [
+        replace(row, values={**row.values, "rate": text, "rate_percent": ""})
+        for row, text in zip(rows, texts, strict=True)
+    ]
+
+
+def _take_found(table: TableText, options: TableOptions) -> Taken:
+    """Read a table by its words and what its cells can be."""
+    found = read_found(table.path, table.grid, options)
+    kind, reach = ("rates", ranges(found.rates)) if found.rates else ("trials", "")
+    summary = f"{table.path.name}: {'; '.join(filter(None, (reach, *found.notes)))}"
+    return Taken(
+        path=table.path, kind=kind, summary=summary, trials=found.trials, rates=found.rates
+    )
+
+
+def ranges(rates: Sequence[RateRecord]) -> str:
+    """Say in a few words what rates were understood: groups, and how far each side reaches."""
+    groups = len({(r.task, r.condition, r.policy) for r in rates})
+    parts = []
+    for side in dict.fromkeys(r.side for r in rates):
+        shares = [100 * float(r.rate) for r in rates if r.side == side]
+        low, high = (f"{end:.3g}" for end in (min(shares), max(shares)))
+        parts.append(f"{side} {low} to {high} %" if low != high else f"{side} {low} %")
+    without = sum(r.n is None for r in rates)
+    lacks = f"; {without} of {len(rates)} rates without n" if without else ""
+    return f"{groups} group{'' if groups == 1 else 's'}; {', '.join(parts)}{lacks}"
 
 
 def _refuse_unknown(options: TableOptions, known: Sequence[str]) -> None:
@@ -106,18 +166,9 @@ def _refuse_unknown(options: TableOptions, known: Sequence[str]) -> None:
             raise UsageError(f"--map {name}=...: no such column.{hint} There are: {names}.")
 
 
-def _unknown_table(table: TableText) -> str:
-    return (
-        f"{table.path} is neither a trials CSV (no column trial_id, nor task with recorded or "
-        "sim_planned) nor a rates CSV (no column side); its columns are: "
-        f"{', '.join(table.header) or 'none'}. "
-        'Say which is which: --map "task=...,recorded=...,sim_planned=..."'
-    )
-
-
 def _taken_rates(path: Path, records: Sequence[RateRecord], options: TableOptions) -> Taken:
     table = open_table(path, RATE_COLUMNS, options)
-    understood = table.understood("rates", len(records))
+    understood = f"{table.understood('rates', len(records))}; {ranges(records)}"
     return Taken(path=path, kind="rates", summary=understood, rates=tuple(records))
 
 

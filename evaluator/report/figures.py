@@ -1,0 +1,217 @@
+"""The two figures of a report, written as SVG: rates beside each other, and sim against recorded.
+
+Text stays text, and the same numbers give the same bytes. A file has the colours of print; a page
+gives the names of colours its own values.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+
+from bridge.media import palette
+from evaluator.compare.rows import Comparison, RateGroup
+from evaluator.compare.success import WITH
+from evaluator.result import Measurement
+
+NAMES = {
+    "soft": "quiet",
+    "line": "edge",
+    "sim": "twin-planned",
+    "executed": "twin-executed",
+    "rec": "recorded",
+}
+"""Short names of colours, and what they mean in the palette."""
+LIGHT = {**palette.LIGHT, **{name: palette.LIGHT[meaning] for name, meaning in NAMES.items()}}
+"""Colours of the files."""
+DARK = {**palette.DARK, **{name: palette.DARK[meaning] for name, meaning in NAMES.items()}}
+"""The same names on a dark page."""
+WIDTH = 440
+MOST = 40
+"""Groups drawn; a longer figure would not fit a page."""
+NAMED = 6
+"""Groups that the words for those who cannot see it name one by one."""
+
+Px = float | int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawing:
+    """One figure."""
+
+    id: str
+    """File name without its ending."""
+    title: str
+    caption: str
+    """What the marks mean and what the figure does not say."""
+    alt: str
+    """What it shows, for someone who cannot see it."""
+    height: int
+    marks: tuple[str, ...]
+    """SVG elements; a colour is the name of one in braces."""
+
+    @property
+    def svg(self) -> str:
+        """A file of its own, in the colours of print."""
+        style = '<style>text{font:12px "DejaVu Sans",Arial,sans-serif}</style>'
+        attributes = 'xmlns="http://www.w3.org/2000/svg"'
+        return self._written(attributes, style, {name: LIGHT[name] for name in LIGHT})
+
+    @property
+    def inline(self) -> str:
+        """For a page that defines the colours; its ids start with the figure's."""
+        attributes = f'role="img" aria-labelledby="{self.id}-title {self.id}-alt"'
+        style = '<g style="font:12px var(--figure-font)">'
+        return self._written(attributes, style, {name: f"var(--{name})" for name in LIGHT})
+
+    def _written(self, attributes: str, style: str, colours: dict[str, str]) -> str:
+        body = "\n".join(self.marks)
+        for name, colour in colours.items():
+            body = body.replace(f"{{{name}}}", colour)
+        end = "</g>" if style.startswith("<g") else ""
+        return (
+            f'<svg class="fig" {attributes} viewBox="0 0 {WIDTH} {self.height}" width="{WIDTH}" '
+            f'height="{self.height}"><title id="{self.id}-title">{escape(self.title)}</title>'
+            f'<desc id="{self.id}-alt">{escape(self.alt)}</desc>{style}{body}{end}</svg>'
+        )
+
+
+def drawings_of(comparison: Comparison) -> list[Drawing]:
+    """Return the figures that have data, in the order of the report."""
+    groups, word = comparison.groups, comparison.recorded_word
+    return [each for each in (success(groups, word), scatter(groups, word)) if each is not None]
+
+
+def success(groups: Sequence[RateGroup], word: str) -> Drawing | None:
+    """Draw both rates of every group, one group below the other, with their intervals."""
+    known = [g for g in groups if g.shown_sim.value is not None or g.recorded.value is not None]
+    if not known:
+        return None
+    shown = known[:MOST]
+    bottom = 40 + 52 * len(shown)
+    marks = [*_axis(12, 340, bottom, 30), *_key(word)]
+    for index, group in enumerate(shown):
+        y = 50 + 52 * index
+        marks.append(_text(12, y, _words(group.task, group.condition, group.policy), "ink"))
+        for rate, below, name in ((group.shown_sim, 14, "sim"), (group.recorded, 30, "rec")):
+            marks += _rate(rate, y + below, name)
+    more = len(known) - len(shown)
+    rest = f" The first {MOST} of {len(known)} groups; the table has all." if more else ""
+    side = "planned" if any(group.executed is None for group in known) else "executed"
+    return Drawing(
+        id="success",
+        title=f"Success rates in the twin and {word}",
+        caption=f"Circle: {side}-in-twin; square: as labelled. Bars are 95 % intervals; the counts "
+        f"stand at the right.{rest}",
+        alt=_alt("Rates", word, [(g.label, g.shown_sim, g.recorded) for g in known]),
+        height=bottom + 42,
+        marks=tuple(marks),
+    )
+
+
+def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
+    """Draw sim against recorded rates with both intervals and the identity line."""
+    drawn = [group for group in groups if all(rate.value is not None for rate in group.pair)]
+    if not drawn:
+        return None
+    left, top, side = 56, 12, 340
+    marks = [
+        *_axis(left, side, top + side, top, "success rate in the twin (%)"),
+        *(
+            _text(left - 6, top + side * (1 - s / 4) + 4, f"{25 * s}", "soft", "end")
+            for s in range(5)
+        ),
+        f'<text transform="translate(14 {top + side // 2}) rotate(-90)" text-anchor="middle" '
+        f'fill="{{ink}}">{escape(word)} success rate (%)</text>',
+        f'<line x1="{left}" y1="{top + side}" x2="{left + side}" y2="{top}" stroke="{{soft}}" '
+        'stroke-dasharray="4 3"/>',
+    ]
+    taken: dict[tuple[float, float], int] = {}
+    for group in drawn:
+        sim, real = group.pair
+        at = (sim.value or 0.0, real.value or 0.0)
+        nudge = 0.026 * taken.get(at, 0) * (-1 if at[0] >= 0.5 else 1)
+        taken[at] = taken.get(at, 0) + 1
+        x, y = left + side * (at[0] + nudge), top + side * (1 - at[1] + nudge)
+        if sim.interval is not None:
+            marks.append(
+                _line(left + side * sim.interval.low, y, left + side * sim.interval.high, y)
+            )
+        if real.interval is not None:
+            ends = [top + side * (1 - end) for end in (real.interval.low, real.interval.high)]
+            marks.append(_line(x, ends[0], x, ends[1]))
+        fill = "{sim}" if group.condition == WITH else "{paper}"
+        marks.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{fill}" stroke="{{sim}}" '
+            f'stroke-width="2"><title>{escape(group.label)}</title></circle>'
+        )
+    with_too = any(group.condition == WITH for group in drawn)
+    filled = " Hollow: without replanning; solid: with." if with_too else ""
+    return Drawing(
+        id="scatter",
+        title=f"Success in the twin against {word} success",
+        caption="One mark per group (task, condition, policy), over the trials where both sides "
+        "are known; bars are 95 % intervals of both rates. Below the dashed line the twin is "
+        f"optimistic. Marks that coincide are set apart.{filled}",
+        alt=_alt("Scatter", word, [(group.label, *group.pair) for group in drawn]),
+        height=top + side + 48,
+        marks=tuple(marks),
+    )
+
+
+def _axis(left: int, side: int, y: int, top: int, name: str = "success rate (%)") -> Iterable[str]:
+    for step in range(5):
+        x = left + side * step / 4
+        yield _line(x, top, x, y, "line", 1)
+        yield _text(x, y + 16, f"{25 * step}", "soft", "middle")
+    yield _text(left + side / 2, y + 34, name, "ink", "middle")
+
+
+def _key(word: str) -> Iterable[str]:
+    yield '<circle cx="17" cy="16" r="5" fill="{sim}"/>' + _text(28, 20, "twin", "ink")
+    yield '<rect x="78" y="11" width="10" height="10" fill="{rec}"/>' + _text(94, 20, word, "ink")
+
+
+def _rate(rate: Measurement, y: Px, name: str) -> Iterable[str]:
+    if rate.value is None:
+        yield _text(12, y + 4, "undefined", "soft")
+        return
+    x = 12 + 340 * rate.value
+    if rate.interval is not None:
+        yield _line(12 + 340 * rate.interval.low, y, 12 + 340 * rate.interval.high, y, name, 2.5)
+    if name == "sim":
+        yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{{sim}}"/>'
+    else:
+        yield f'<rect x="{x - 5:.1f}" y="{y - 5:.1f}" width="10" height="10" fill="{{rec}}"/>'
+    yield _text(366, y + 4, _counted(rate), "ink")
+
+
+def _line(x1: Px, y1: Px, x2: Px, y2: Px, name: str = "soft", width: Px = 1.2) -> str:
+    return (
+        f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{{{name}}}" '
+        f'stroke-width="{width}"/>'
+    )
+
+
+def _text(x: Px, y: Px, text: str, name: str, anchor: str = "start") -> str:
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{{{name}}}">'
+        f"{escape(text)}</text>"
+    )
+
+
+def _words(*parts: str) -> str:
+    return ", ".join(part.replace("_", " ") for part in parts if part)
+
+
+def _counted(rate: Measurement) -> str:
+    if rate.value is None:
+        return "undefined"
+    return f"{100 * rate.value:.0f} %" if rate.k is None or not rate.n else f"{rate.k}/{rate.n}"
+
+
+def _alt(kind: str, word: str, pairs: Sequence[tuple[str, Measurement, Measurement]]) -> str:
+    named = [f"{label}: twin {_counted(a)}, {word} {_counted(b)}" for label, a, b in pairs[:NAMED]]
+    more = f"; and {len(pairs) - NAMED} more" if len(pairs) > NAMED else ""
+    return (
+        f"{kind} of {len(pairs)} group{'' if len(pairs) == 1 else 's'}: {'; '.join(named)}{more}."
+    )

@@ -1,1 +1,0 @@
-"""One module per subject: it chooses numbers, puts them in a table, and says how to draw them."""
