@@ -15,8 +15,8 @@ from itertools import combinations
 from typing import TypeVar
 
 import numpy as np
-from bridge.episode.catalogue_store import UNLABELLED
 
+from bridge.episode.catalogue_query import UNLABELLED
 from bridge.task.protocol import VOID_CAUSES, Protocol
 from evaluator.compare.measure import Part, ends, measured
 from evaluator.compare.rows import RateGroup, TrialRow, in_order

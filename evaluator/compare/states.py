@@ -261,7 +261,6 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
                 n=len(values),
                 counted="object",
                 episodes=list(dict.fromkeys(episodes)),
-                interval_n=len(of_episode),
                 reason_without_interval=interval_or_reason(median_interval, of_episode)[1],
             )
         )
