@@ -260,9 +260,10 @@ def _judge_topics(
                     f"the drop log lists {result.declared_losses}"
                 )
                 report.find("drops_not_logged", topic, text)
-        if result.declared_losses:
-            report.find("drops_logged", topic, f"{result.declared_losses} messages")
     report.findings += decoder.findings
+    for topic, lost in sorted(decoder.drop_log.items()):  # also of topics without any message
+        if lost:
+            report.find("drops_logged", topic, f"{lost} messages")
     report.declared_losses = sum(decoder.drop_log.values())
     report.notes += unseen_losses(decoder.unnumbered)
     unused = ", ".join(f"{topic} ({what})" for topic, what in sorted(decoder.unused.items()))
