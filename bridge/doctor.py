@@ -35,7 +35,7 @@ EXTRAS = {
     ),
     "report": Extra(
         "evaluate: tables, figures, report",
-        ("jinja2", "pandas", "pyarrow", "scipy", "matplotlib", "pillow"),
+        ("jinja2", "pandas", "pyarrow", "scipy", "openpyxl", "pillow"),
     ),
     "dashboard": Extra(
         "review pages, Rerun view", ("starlette", "uvicorn", "rerun-sdk", "simplejpeg")

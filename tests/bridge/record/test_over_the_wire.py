@@ -136,7 +136,7 @@ def test_ctl_sends_the_task_file_that_a_person_names(
 
 def test_a_bad_task_file_in_a_request_begins_no_episode(joined: Joined) -> None:
     client = RecorderClient(joined.client, timeout_s=10.0)
-    with pytest.raises(RemoteError, match="'objects' is a required property"):
+    with pytest.raises(RemoteError, match='"objects" is a required property'):
         client.ask("start", {"id": "t1", "task_file": 'schema_version = 1\nname = "x"'})
     assert client.status()["state"] == "idle"
     assert list(joined.run.episodes_dir.iterdir()) == []

@@ -175,7 +175,7 @@ def test_a_yes_that_knows_less_than_a_scene_could_tell_says_what_is_missing(
     said = answer(question_of(run))
     assert said.accepted is True
     assert said.warnings == (
-        "sloth: shape of the task file (the scene has no lattice of it)",
+        "sloth: shape of the task file (not scanned)",
         "the scene has no sdf.npz: only the table and the containers are in the way",
     )
     assert said.reason == said.warnings[0]
