@@ -176,8 +176,8 @@ def test_numbers_no_plan_can_mean_are_refused_in_a_sentence() -> None:
 @pytest.mark.parametrize(
     ("before", "after", "found"),
     [
-        ('<box size="0.01 0.01 0.01"/>', '<box size="0 0 0"/>', "without volume at ee_link"),
-        ('<box size="0.01 0.01 0.01"/>', '<box size="0.01 0 0.01"/>', "without volume at ee_link"),
+        ('<box size="0.01 0.01 0.01"/>', '<box size="0 0 0"/>', "a box of size 0 0 0"),
+        ('<box size="0.01 0.01 0.01"/>', '<box size="0.01 0 0.01"/>', "a box of size 0.01 0 0.01"),
         ('<joint name="ee_fixed_joint"', '<joint name=""', "has a joint without a name"),
         ('<link name="ee_link">', "<link>", "has a link without a name"),
         ('<link name="ee_link">', '<link name="tool0">', "more than one link named tool0"),
