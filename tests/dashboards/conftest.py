@@ -2,7 +2,6 @@
 
 import asyncio
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -11,7 +10,6 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from coarse_model import coarse_model
 from joint_samples import at_positions
 from starlette.applications import Starlette
 
@@ -394,8 +392,7 @@ def make_run(folder: Path) -> RunFolder:
         writer.describe(EpisodeInfo(id="scan", kind="scan", cell="standin", stand_in=True))
         _Log(writer).image("/standin/cam/side/color/image", picture(0.0, 0), START_NS)
     write_views(run)
-    with coarse_model():
-        write_results(compare_run(run).results(), run.results_dir / "results.json")
+    write_results(compare_run(run).results(), run.results_dir / "results.json")
     return run
 
 
@@ -408,13 +405,6 @@ def synthetic() -> ModuleType:
 @pytest.fixture(scope="session")
 def shared_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return make_run(tmp_path_factory.mktemp("runs") / "monday")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_nodes() -> Iterator[None]:
-    """Be coarse wherever a page evaluates a run: pages are tested for what they show."""
-    with coarse_model():
-        yield
 
 
 class Browser:

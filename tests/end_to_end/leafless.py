@@ -28,7 +28,7 @@ for line in (
     ["check", run],
     ["rebuild", run + "_scan", "--iterations", "3"],
     ["replay", run, "--force", "--workers", "1"],
-    ["evaluate", run, "--force"],
+    ["evaluate", run],
 ):
     codes[line[0]] = robot_gst.run([*line, "--quiet"])
 with TestClient(create_app(Library.open([Path(run)])), base_url="http://127.0.0.1") as pages:

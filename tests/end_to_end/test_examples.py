@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import robot_gst
 from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -101,7 +102,10 @@ def test_agreement_is_computed_from_a_table(
         "1,cube,without,failure,failure\n2,cube,without,success,failure\n"
         "3,cube,with,success,success\n4,cube,with,,success\n"
     )
-    example("agreement")(table)
+    out = ["--out", str(tmp_path / "results"), "--quiet"]
+    assert robot_gst.run(["evaluate", str(table), *out]) == 0
+    capsys.readouterr()
+    example("agreement")(tmp_path)
     printed = capsys.readouterr().out
     assert "agree: 2/3 = 0.667" in printed
     assert "bias (sim - recorded): -25.0 pp" in printed

@@ -268,7 +268,8 @@ class CameraInfo:
         elif not (np.isfinite(k).all() and min(k[0], k[4]) > 0):
             found = f"focal lengths of {k[0]:g} and {k[4]:g} pixels; calibrate the camera"
         if found:
-            raise codec.MalformedMessageError(type_name=schema.CAMERA_INFO, found=found)
+            hint = "Mend what publishes it."
+            raise codec.MalformedMessageError(type_name=schema.CAMERA_INFO, found=found, hint=hint)
         camera = Camera.from_ros(
             width=message["width"],
             height=message["height"],

@@ -107,14 +107,6 @@ def check_camera(episode: Episode, camera_id: str) -> None:
         except BridgeError as error:
             message = f"{name_of(episode, camera_id)} cannot be used: {error}"
             raise UnusableCameraError(message) from error
-        numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        if not np.isfinite(numbers).all() or min(camera.fx, camera.fy) <= 0:
-            message = (
-                f"{name_of(episode, camera_id)} states focal lengths of {camera.fx:g} and "
-                f"{camera.fy:g} pixels on {stream}/info: it was not calibrated. Record it again "
-                "with its intrinsics."
-            )
-            raise UnusableCameraError(message)
         if size is not None and size != (camera.width, camera.height):
             message = (
                 f"{name_of(episode, camera_id)} sends {stream} images of {size[0]} x {size[1]} "

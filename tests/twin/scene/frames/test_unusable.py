@@ -105,7 +105,7 @@ def other_info(
     [
         (lambda c: replace(c, width=128, height=96), "images of 64 x 48 pixels.*for 128 x 96"),
         (lambda c: replace(c, width=32, height=24), "images of 64 x 48 pixels.*for 32 x 24"),
-        (lambda c: replace(c, fx=0.0, fy=0.0), "focal lengths of 0 and 0 pixels on color/info"),
+        (lambda c: replace(c, fx=0.0, fy=0.0), "camera wrist.*focal lengths of 0 and 0 pixels"),
         (lambda c: replace(c, fx=float("nan")), "focal lengths of nan"),
     ],
 )
