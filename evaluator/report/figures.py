@@ -129,9 +129,10 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
     for group in drawn:
         sim, real = group.pair
         at = (sim.value or 0.0, real.value or 0.0)
-        nudge = 0.026 * taken.get(at, 0) * (-1 if at[0] >= 0.5 else 1)
+        nudge = 0.026 * taken.get(at, 0)  # towards the middle, so that none leaves the picture
+        inwards = [nudge if value < 0.5 else -nudge for value in at]
         taken[at] = taken.get(at, 0) + 1
-        x, y = left + side * (at[0] + nudge), top + side * (1 - at[1] + nudge)
+        x, y = left + side * (at[0] + inwards[0]), top + side * (1 - at[1] - inwards[1])
         if sim.interval is not None:
             marks.append(
                 _line(left + side * sim.interval.low, y, left + side * sim.interval.high, y)

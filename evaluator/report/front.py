@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from evaluator.compare.conclusions import direction
 from evaluator.compare.policies import ALL_TASKS
 from evaluator.quantity import noun
-from evaluator.report.wording import agreeing_side
+from evaluator.report.wording import HEADLINES, agreeing_side
 from evaluator.result import Cell, Measurement, Results, Table
 
 SHOWN_TASKS = 8
@@ -244,7 +244,7 @@ def _number(cell: Cell) -> float | None:
 
 def _about(name: str) -> str:
     """Write what a note is about in words."""
-    return "Pearson r" if name == "agreement.pearson_r" else name.replace("_", " ")
+    return dict(HEADLINES).get(name, name.replace("_", " "))
 
 
 def _short(text: str, longest: int = LONGEST) -> str:
