@@ -6,19 +6,18 @@ a cell that fits no reading is refused by its row.
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from fractions import Fraction
 from pathlib import Path
 
 from bridge.errors import UsageError
-from bridge.exchange.table_text import SourceRow, TableError, TableOptions, plain_name
-from bridge.exchange.trials_csv import TrialRecord, trials_of
-from bridge.exchange.trials_rates import RateRecord, rates_of
+from bridge.exchange.table_text import SourceRow, TableOptions, plain_name
+from bridge.exchange.trials_csv import trials_of
+from bridge.exchange.trials_rates import rates_of
+from evaluator.compare.found_rates import rate_rows
+from evaluator.compare.found_sheet import NAMED, Found, Line, Sheet, Value, key_of, two_of
 from evaluator.compare.table_words import (
     CellError,
     Column,
     DoubtfulTableError,
-    Figure,
     folded,
     is_summary,
     read_cell,
@@ -27,68 +26,8 @@ from evaluator.compare.table_words import (
     side_within,
 )
 
-Line = tuple[int, list[str]]
 HEADERS = 3
 """Rows of names at the most."""
-NAMED = ("task", "policy", "condition")
-SMALL = 50
-"""Whole numbers without n up to here may as well be counts."""
-
-
-@dataclass(kw_only=True)
-class Found:
-    """What a table was read as."""
-
-    trials: tuple[TrialRecord, ...] = ()
-    rates: tuple[RateRecord, ...] = ()
-    notes: list[str] = field(default_factory=list)
-    doubts: list[str] = field(default_factory=list)
-    """Readings that are likely, and not the only ones."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Value:
-    """One figure with whom it is about."""
-
-    row: int
-    labels: dict[str, str]
-    side: str
-    column: Column
-    figure: Figure | None
-
-
-@dataclass(kw_only=True)
-class _Sheet:
-    """A table cut into names of columns and rows below."""
-
-    path: Path
-    columns: list[Column]
-    lines: list[Line]
-    found: Found
-    read: set[int] = field(default_factory=set)
-    """Columns that were used."""
-    labels: set[str] = field(default_factory=set)
-    """Labels that have a column."""
-
-    def labelled(self, label: str) -> Column | None:
-        """Return the column of one label.
-
-        Raises:
-            TableError: When there are two of them.
-        """
-        these = [column for column in self.columns if column.label == label]
-        if len(these) > 1:
-            raise self.refuse(None, _two(these, label), f'Say which: --map "{label}=..."')
-        self.read |= {column.place for column in these}
-        return these[0] if these else None
-
-    def refuse(self, row: int | None, found: str, hint: str) -> TableError:
-        """Build the error that names a place."""
-        return TableError(path=self.path, row=row, found=found, hint=hint)
-
-    def cells(self, column: Column) -> list[str]:
-        """Return what a column holds."""
-        return [cells[column.place] for _, cells in self.lines]
 
 
 def read_found(path: Path, grid: Sequence[Line], options: TableOptions) -> Found:
@@ -110,7 +49,7 @@ def read_found(path: Path, grid: Sequence[Line], options: TableOptions) -> Found
     if _are_trials(sheet, values):
         found.trials = tuple(trials_of(_trial_rows(sheet, values)))
     else:
-        found.rates = tuple(rates_of(_rate_rows(sheet, values)))
+        found.rates = tuple(rates_of(rate_rows(sheet, values)))
     unread = [c.name for c in sheet.columns if c.name and c.place not in sheet.read]
     found.notes += [f"not read: {', '.join(map(repr, unread))}"] if unread else []
     if found.doubts and not options.yes:
@@ -122,11 +61,7 @@ def read_found(path: Path, grid: Sequence[Line], options: TableOptions) -> Found
     return found
 
 
-def _two(columns: Sequence[Column], what: str) -> str:
-    return f"{' and '.join(repr(column.name) for column in columns)} may both be the {what}"
-
-
-def _nothing(sheet: _Sheet) -> str:
+def _nothing(sheet: Sheet) -> str:
     names = ", ".join(column.name for column in sheet.columns if column.name) or "none"
     return (
         f"{sheet.path} is neither a table of trials (no column with an outcome, such as outcome "
@@ -138,7 +73,7 @@ def _nothing(sheet: _Sheet) -> str:
 # From lines to columns and rows.
 
 
-def _sheet(path: Path, grid: Sequence[Line], options: TableOptions) -> _Sheet:
+def _sheet(path: Path, grid: Sequence[Line], options: TableOptions) -> Sheet:
     width = max((len(cells) for _, cells in grid), default=0)
     lines = [(n, [_plain(c) for c in cells] + [""] * (width - len(cells))) for n, cells in grid]
     lines = [line for line in lines if not all(set(cell) <= set(":-") for cell in line[1])]
@@ -155,13 +90,13 @@ def _sheet(path: Path, grid: Sequence[Line], options: TableOptions) -> _Sheet:
     for place, names in enumerate(zip(*levels, strict=True) if levels else ()):
         mapped = next((theirs[plain_name(n)] for n in names if plain_name(n) in theirs), "")
         columns.append(read_name(place, [mapped] if mapped else names))
-    sheet = _Sheet(path=path, columns=columns, lines=[], found=found)
+    sheet = Sheet(path=path, columns=columns, lines=[], found=found)
     _refuse_unnamed(sheet, lines[last + 1 :])
     sheet.lines = _body(sheet, lines[last + 1 :], levels)
     return sheet
 
 
-def _refuse_unnamed(sheet: _Sheet, lines: Sequence[Line]) -> None:
+def _refuse_unnamed(sheet: Sheet, lines: Sequence[Line]) -> None:
     """Refuse figures in a column without a name: behind the last one a cell was cut in two."""
     unnamed = [column.place for column in sheet.columns[1:] if not column.name]
     for number, cells in lines:
@@ -229,7 +164,7 @@ def _spread(level: list[str], lowest: Sequence[str]) -> None:
             level[place] = above
 
 
-def _body(sheet: _Sheet, lines: Sequence[Line], levels: Sequence[list[str]]) -> list[Line]:
+def _body(sheet: Sheet, lines: Sequence[Line], levels: Sequence[list[str]]) -> list[Line]:
     """Leave out summaries, notes and repeated names; let a section's side stand in its rows."""
     named = [column.place for column in sheet.columns if column.label in NAMED] or [0]
     body: list[Line] = []
@@ -273,7 +208,7 @@ def _continued(cells: list[str], before: Sequence[str], named: Sequence[int]) ->
 # Which side each figure is about.
 
 
-def _settle_sides(sheet: _Sheet) -> None:
+def _settle_sides(sheet: Sheet) -> None:
     """Find the column that says real or sim: by its name, its cells, a section, or inside names."""
     width = len(sheet.columns)
     if any(cells[width] for _, cells in sheet.lines):
@@ -307,7 +242,7 @@ def _settle_sides(sheet: _Sheet) -> None:
 # Figures with whom they are about.
 
 
-def _values(sheet: _Sheet) -> list[_Value]:
+def _values(sheet: Sheet) -> list[Value]:
     labels = {label: sheet.labelled(label) for label in (*NAMED, "trial", "start_id", "side")}
     sheet.labels |= {label for label, column in labels.items() if column}
     blank = next((c for c in sheet.columns if not c.name and not c.label), None)
@@ -325,14 +260,14 @@ def _values(sheet: _Sheet) -> list[_Value]:
     return values
 
 
-def _is_text(sheet: _Sheet, column: Column) -> bool:
+def _is_text(sheet: Sheet, column: Column) -> bool:
     texts = [text for text in sheet.cells(column) if text]
     return bool(texts) and not any(_is_figure(text) for text in texts)
 
 
 def _value(
-    sheet: _Sheet, row: int, cells: list[str], column: Column, about: dict[str, str], rest_is: str
-) -> _Value:
+    sheet: Sheet, row: int, cells: list[str], column: Column, about: dict[str, str], rest_is: str
+) -> Value:
     labels = dict(about)
     word = labels.pop("side")
     side = column.side or (side_of(word) if word else "")
@@ -345,10 +280,10 @@ def _value(
     except CellError as error:
         text = cells[column.place]
         raise sheet.refuse(row, f"{column.name} is {text!r}, which {error}", "Correct it") from None
-    return _Value(row=row, labels=labels, side=side, column=column, figure=figure)
+    return Value(row=row, labels=labels, side=side, column=column, figure=figure)
 
 
-def _value_columns(sheet: _Sheet, labels: dict[str, Column | None]) -> tuple[list[Column], str]:
+def _value_columns(sheet: Sheet, labels: dict[str, Column | None]) -> tuple[list[Column], str]:
     """Return the columns of figures, and what the rest of their names says: a task or a policy."""
     free = [c for c in sheet.columns if not c.label and c.place not in sheet.read and c.name]
     free = [c for c in free if not is_summary(c.rest) and not c.is_beside]
@@ -371,7 +306,7 @@ def _value_columns(sheet: _Sheet, labels: dict[str, Column | None]) -> tuple[lis
 
 
 def _sided(
-    sheet: _Sheet,
+    sheet: Sheet,
     sided: list[Column],
     shared: list[Column],
     labels: dict[str, Column | None],
@@ -393,7 +328,7 @@ def _sided(
     return [*sided, *shared], rest_is
 
 
-def _refuse_doubled(sheet: _Sheet, columns: Sequence[Column]) -> None:
+def _refuse_doubled(sheet: Sheet, columns: Sequence[Column]) -> None:
     """Refuse two columns that say the same of one side of one task or policy."""
     seen: dict[tuple[str, ...], Column] = {}
     for column in columns:
@@ -401,11 +336,11 @@ def _refuse_doubled(sheet: _Sheet, columns: Sequence[Column]) -> None:
         first = seen.setdefault((column.side, column.rest, kind), column)
         if first is not column:
             hint = f'Leave one out, or say which: --map "{kind}={first.name}"'
-            raise sheet.refuse(None, _two([first, column], f"{column.side} {kind}".strip()), hint)
+            raise sheet.refuse(None, two_of([first, column], f"{column.side} {kind}".strip()), hint)
 
 
 def _unnamed(
-    sheet: _Sheet, others: list[Column], plain: list[Column], rest_is: str
+    sheet: Sheet, others: list[Column], plain: list[Column], rest_is: str
 ) -> tuple[list[Column], str]:
     """Columns of figures under names that we do not know: trials by number, or tasks."""
     numbered = [c for c in others if c.name.split()[-1].isdigit() and not c.figure]
@@ -430,7 +365,7 @@ def _all_answers(texts: Iterable[str]) -> bool:
 # Trials.
 
 
-def _are_trials(sheet: _Sheet, values: Sequence[_Value]) -> bool:
+def _are_trials(sheet: Sheet, values: Sequence[Value]) -> bool:
     """Whether each cell is how one trial ended: yes or no, of one trial and no rate of several."""
     told = [v for v in values if v.column.figure != "n"]
     known = [v.figure for v in told if v.figure is not None]
@@ -443,17 +378,13 @@ def _are_trials(sheet: _Sheet, values: Sequence[_Value]) -> bool:
             hint = "Write success, failure or unknown in every row"
             raise sheet.refuse(bad.row, f"{bad.text!r} stands among yes and no", hint)
         return False
-    keys = Counter((*_key(v), v.column.place) for v in told)
+    keys = Counter((*key_of(v), v.column.place) for v in told)
     of_outcomes = all(v.column.figure == "outcome" or not v.column.side for v in told)
     has_trials = any(column.label in ("trial", "start_id") for column in sheet.columns)
     return words or of_outcomes or has_trials or max(keys.values()) > 1
 
 
-def _key(value: _Value) -> tuple[str, ...]:
-    return (*(value.labels[name] for name in NAMED), value.side)
-
-
-def _trial_rows(sheet: _Sheet, values: Sequence[_Value]) -> list[SourceRow]:
+def _trial_rows(sheet: Sheet, values: Sequence[Value]) -> list[SourceRow]:
     """Write each trial with our names; both sides of one row are one trial."""
     told = [value for value in values if value.column.figure != "n"]
     sides = {value.side for value in told}
@@ -476,234 +407,3 @@ def _trial_rows(sheet: _Sheet, values: Sequence[_Value]) -> list[SourceRow]:
         texts[side] = "" if answer is None else "yes" if answer else "no"
     sheet.found.notes.insert(0, f"{len(rows):,} trials")
     return [SourceRow(path=sheet.path, row=row, values=texts) for (row, _), texts in rows.items()]
-
-
-# Rates.
-
-
-def _rate_rows(sheet: _Sheet, values: Sequence[_Value]) -> list[SourceRow]:
-    """Gather count, n and rate of each group and side, and settle what plain numbers are."""
-    cells: dict[tuple[str, ...], list[_Value]] = {}
-    shared: dict[tuple[str, ...], str] = {}
-    for value in values:
-        alone = value.column.figure == "n" and not value.column.side and value.figure is not None
-        if alone and value.figure is not None:
-            shared[(*_key(value)[:3], str(value.row))] = value.figure.number
-            sheet.found.notes.append(f"n from {value.column.name!r}")
-        elif value.figure is not None:
-            key = (*_key(value), str(value.row))
-            cells.setdefault(key, []).append(value)
-    sheet.found.notes[:] = dict.fromkeys(sheet.found.notes)
-    groups = [_Group.of(key, members, _shared_n(shared, key)) for key, members in cells.items()]
-    groups = [group for group in groups if group.figure is not None or group.k]
-    if groups and all(not group.key[3] for group in groups):
-        sheet.found.doubts.append("no word says real or sim, so all rates are read as real")
-    _settle_numbers(sheet, groups)
-    return [group.row(sheet) for group in groups]
-
-
-def _shared_n(shared: dict[tuple[str, ...], str], key: tuple[str, ...]) -> str:
-    """Return n of the same row; the header may have given the row other names."""
-    same_row = [n for known, n in shared.items() if known[-1] == key[-1]]
-    return same_row[0] if same_row else ""
-
-
-@dataclass(kw_only=True)
-class _Group:
-    """One rate of one side before it is settled what its number is."""
-
-    key: tuple[str, ...]
-    """Task, condition-less names in the order of ``NAMED``, side, row."""
-    figure: Figure | None
-    column: Column | None
-    k: str
-    n: str
-    unit: str = ""
-    """k, rate or rate_percent, once it is settled."""
-
-    @staticmethod
-    def of(key: tuple[str, ...], members: Sequence[_Value], n: str) -> "_Group":
-        """Join the columns of one group."""
-        by_figure = {v.column.figure: v for v in members if v.figure is not None}
-        k = by_figure.get("k")
-        own_n = by_figure.get("n")
-        main = next((v for v in members if v.column.figure not in ("k", "n")), None)
-        head = main or k
-        inside = str(head.column.n) if head and head.column.n else ""
-        return _Group(
-            key=key,
-            figure=main.figure if main else None,
-            column=main.column if main else None,
-            k=k.figure.number if k and k.figure else "",
-            n=(own_n.figure.number if own_n and own_n.figure else "") or inside or n,
-        )
-
-    @property
-    def is_open(self) -> bool:
-        """Whether its number may be a count, a share of 1 or percent."""
-        return self.figure is not None and not self.figure.is_certain and not self.k
-
-    def may_be(self, unit: str) -> bool:
-        """Whether the number is possible as this."""
-        if self.figure is None:
-            return True
-        value = Fraction(self.figure.number)
-        n = int(float(self.n)) if self.n else 0
-        if unit == "k":
-            return bool(n) and value.denominator == 1 and 0 <= value <= n
-        rate = value if unit == "rate" else value / 100
-        if not 0 <= rate <= 1:
-            return False
-        digits = len(self.figure.number.partition(".")[2])
-        half = Fraction(1, 2 * 10**digits) / (1 if unit == "rate" else 100)
-        half += Fraction(1, 10**6) if digits > 6 else 0
-        return not n or abs(round(rate * n) - rate * n) <= half * n
-
-    def row(self, sheet: _Sheet) -> SourceRow:
-        """Write it with our names."""
-        task, policy, condition, side, row = self.key
-        values = {
-            "task": task or sheet.path.stem,
-            "policy": policy,
-            "condition": condition,
-            "side": side or "real",
-            "n": self.n,
-            "k": self.k,
-        }
-        figure = self.figure
-        if figure is not None and figure.n is not None:
-            values |= {"k": str(figure.k), "n": str(figure.n), "rate_percent": figure.number}
-        elif figure is not None:
-            unit = "rate_percent" if figure.percent else self.unit or "rate"
-            values[unit] = figure.number
-        return SourceRow(path=sheet.path, row=int(row), values=values)
-
-
-def _settle_numbers(sheet: _Sheet, groups: Sequence[_Group]) -> None:
-    """Settle what plain numbers are, all columns of a like name alike."""
-    certain = any(g.figure is not None and g.figure.percent for g in groups)
-    kinds: dict[str, list[_Group]] = {}
-    for group in groups:
-        if group.is_open and group.column is not None:
-            kinds.setdefault(group.column.figure, []).append(group)
-    for figure, members in kinds.items():
-        if figure == "percent":
-            _settle_percent(sheet, members)
-        elif certain:
-            _settle_beside_signs(sheet, members)
-        else:
-            _settle_pool(sheet, members, counts=figure != "rate")
-
-
-def _numbers(groups: Sequence[_Group]) -> list[float]:
-    return [group.figure.value for group in groups if group.figure is not None]
-
-
-def _settle_percent(sheet: _Sheet, groups: Sequence[_Group]) -> None:
-    small = holds_fractions(_numbers(groups))
-    names = dict.fromkeys(repr(group.column.name) for group in groups if group.column)
-    if small:
-        sheet.found.doubts.append(f"{', '.join(names)} says percent, and is read as shares of 1")
-    for group in groups:
-        group.unit = "rate" if small else "rate_percent"
-
-
-def holds_fractions(numbers: Sequence[float]) -> bool:
-    """Whether numbers under a name that says percent look like shares of 1."""
-    others = [number for number in numbers if number]
-    return bool(others) and all(number <= 1 for number in others)
-
-
-def _settle_beside_signs(sheet: _Sheet, groups: Sequence[_Group]) -> None:
-    """Plain numbers beside cells with a percent sign."""
-    by_column: dict[int, list[_Group]] = {}
-    for group in groups:
-        by_column.setdefault(group.column.place if group.column else -1, []).append(group)
-    signed = {id(group) for group in groups}
-    for members in by_column.values():
-        alone = all(id(group) in signed for group in members) and len(members) == len(sheet.lines)
-        for group in members:
-            value = group.figure.value if group.figure else 0.0
-            if not alone and 0 < value <= 1:
-                found = f"{group.figure.text if group.figure else ''!r} stands among percent"
-                hint = "Write the percent sign in every cell, or in none"
-                raise sheet.refuse(int(group.key[-1]), found, hint)
-            group.unit = "rate_percent" if not alone or value > 1 else "rate"
-        if alone:
-            _settle_pool(sheet, members, counts=True)
-
-
-UNITS = ("k", "rate_percent", "rate")
-WORDS = {"k": "counts", "rate_percent": "percent", "rate": "shares of 1"}
-
-
-def _settle_pool(sheet: _Sheet, groups: Sequence[_Group], *, counts: bool) -> None:
-    """Take the only reading that all numbers allow, the first of several with a doubt."""
-    numbers = _numbers(groups)
-    beyond = next((g for g in groups if g.figure and g.figure.value > 100 and not g.may_be("k")), 0)
-    if isinstance(beyond, _Group) and beyond.figure is not None:
-        raise sheet.refuse(int(beyond.key[-1]), f"a rate is {beyond.figure.text!r}", "Correct it")
-    if any(0 < v < 1 for v in numbers) and any(v > 1 for v in numbers):
-        _settle_by_side(sheet, groups, counts=counts)
-        return
-    units = [u for u in UNITS if (u != "k" or counts) and all(g.may_be(u) for g in groups)]
-    if any(v > 1 for v in numbers):
-        units = [u for u in units if u != "rate"]
-    elif any(0 < v < 1 for v in numbers):
-        units = ["rate"] if "rate" in units else []
-    if not units:
-        bad = (
-            next(g for g in groups if not any(g.may_be(u) for u in UNITS))
-            if all(not any(g.may_be(u) for u in UNITS) for g in groups[:1])
-            else groups[0]
-        )
-        text = bad.figure.text if bad.figure else ""
-        of_n = f" of {bad.n}" if bad.n else ""
-        found = f"{text!r} is neither a count{of_n} nor a rate{of_n}"
-        raise sheet.refuse(int(bad.key[-1]), found, "Write 7/10, or 70 %")
-    _take_first(sheet, groups, units, counts=counts)
-
-
-def _settle_by_side(sheet: _Sheet, groups: Sequence[_Group], *, counts: bool) -> None:
-    """Shares of 1 on one side, percent on the other; in one side it is a slip."""
-    sides: dict[str, list[_Group]] = {}
-    for group in groups:
-        sides.setdefault(group.key[3], []).append(group)
-    for members in sides.values():
-        numbers = _numbers(members)
-        if any(0 < v < 1 for v in numbers) and any(v > 1 for v in numbers):
-            bad = next(g for g in members if g.figure and 0 < g.figure.value < 1)
-            text = bad.figure.text if bad.figure else ""
-            hint = "Write 7/10, or 70 %"
-            raise sheet.refuse(int(bad.key[-1]), f"{text!r} stands among percent or counts", hint)
-    sheet.found.doubts.append("one side is read as shares of 1 and the other one is not")
-    for members in sides.values():
-        _settle_pool(sheet, members, counts=counts)
-
-
-def _take_first(
-    sheet: _Sheet, groups: Sequence[_Group], units: Sequence[str], *, counts: bool
-) -> None:
-    numbers = set(_numbers(groups))
-    unit = units[0]
-    differ = {tuple(round(_share(group, each), 9) for group in groups) for each in units}
-    without_n = all(not group.n for group in groups)
-    if numbers <= {0.0, 1.0} and 1.0 in numbers:
-        unit = "rate" if "rate" in units else unit
-        sheet.found.doubts.append(f"0 and 1 are read as {WORDS[unit]}, not as percent or trials")
-    elif len(differ) > 1:
-        names = " or ".join(WORDS[each] for each in units)
-        sheet.found.doubts.append(f"plain numbers may be {names}; they are read as {WORDS[unit]}")
-    elif without_n and counts and unit == "rate_percent" and _are_small_counts(numbers):
-        sheet.found.doubts.append("plain numbers may be counts; they are read as percent")
-    for group in groups:
-        group.unit = unit
-
-
-def _are_small_counts(numbers: Iterable[float]) -> bool:
-    return all(number <= SMALL and number.is_integer() for number in numbers)
-
-
-def _share(group: _Group, unit: str) -> float:
-    value = group.figure.value if group.figure else 0.0
-    return value / float(group.n) if unit == "k" else value / (1 if unit == "rate" else 100)

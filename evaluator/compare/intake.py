@@ -41,7 +41,8 @@ from bridge.exchange.trials_csv import (
 )
 from bridge.exchange.trials_rates import COLUMNS as RATE_COLUMNS
 from bridge.exchange.trials_rates import RateRecord, rates_of
-from evaluator.compare.found_table import holds_fractions, read_found
+from evaluator.compare.found_rates import holds_fractions
+from evaluator.compare.found_table import read_found
 from evaluator.compare.table_words import KNOWN, DoubtfulTableError
 
 PUBLISHED = "a published table"
