@@ -186,7 +186,7 @@ def _settle_pool(sheet: Sheet, groups: Sequence[_Group], *, counts: bool) -> Non
     elif any(0 < v < 1 for v in numbers):
         units = ["rate"] if "rate" in units else []
     if not units:
-        bad = groups[0]
+        bad = next((g for g in groups if not any(map(g.may_be, UNITS))), groups[0])
         text = bad.figure.text if bad.figure else ""
         of_n = f" of {bad.n}" if bad.n else ""
         found = f"{text!r} is neither a count{of_n} nor a rate{of_n}"

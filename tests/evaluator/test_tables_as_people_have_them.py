@@ -435,3 +435,8 @@ def test_nothing_read_ends_with_2(tmp_path: Path, text: str) -> None:
         evaluate(write(tmp_path, text), out=tmp_path / "out")
     assert caught.value.exit_code == 2
     assert not (tmp_path / "out").exists()
+
+
+def test_the_cell_that_fits_no_reading_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BridgeError, match=r"row 3: '12\.5' is neither a count of 10"):
+        take(write(tmp_path, "task,n,real\na,10,3\nb,10,12.5\n"), YES)
