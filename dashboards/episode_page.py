@@ -154,8 +154,7 @@ def build_page(
     shown = shown_replays(replays, sent_plan)
     known = (t for t in (t_s, divergence_t_s, failure_t_s) if t is not None)
     cursor = clock.clamp(next(known, clock.end_s))
-    nothing: list[str] = []
-    not_scanned = problems.attempt(lambda: not_scanned_in(run, Episode.open(path)), nothing)
+    not_scanned = problems.attempt(lambda: not_scanned_in(run, Episode.open(path)), list[str]())
     return EpisodePage(
         recording=recording,
         replays=replays,

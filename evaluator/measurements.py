@@ -14,7 +14,7 @@ from evaluator.metrics import image
 from evaluator.metrics.image_protocol import ImageMetric
 from evaluator.metrics.image_scores import METRICS
 from evaluator.quantity import REGISTRY as REGISTRY
-from evaluator.quantity import SIGNED, UP, Better, with_tables
+from evaluator.quantity import SIGNED, UP, with_tables
 from evaluator.quantity import Defined as Defined
 from evaluator.quantity import Quantity as Quantity
 from evaluator.quantity import new_quantity as _new
@@ -118,19 +118,8 @@ GAIN_RELATIVE_AVERAGE = _new(
 )
 # Agreement over groups. ``{what}`` says over which.
 
-
-def _agreement(
-    name: str,
-    unit: str,
-    better: Better,
-    definition: str,
-    allowed: tuple[float, float] | None = None,
-) -> Quantity:
-    return _new(f"agreement.{name}", unit, better, f"{definition}{{resampled}}", allowed)
-
-
-PEARSON_R = _agreement(
-    "pearson_r",
+PEARSON_R = _new(
+    "agreement.pearson_r",
     "1",
     "higher",
     "Pearson r of the twin's and the recorded success rates {what}",
@@ -175,34 +164,34 @@ WRONG_BY = _new(
     "mean recorded difference of the pairs that the twin orders wrongly{words}",
     (0.0, 100.0),
 )
-SPEARMAN = _agreement(
-    "spearman_rho",
+SPEARMAN = _new(
+    "agreement.spearman_rho",
     "1",
     "higher",
     "Spearman rank correlation of the same rates {what}; average ranks",
     SIGNED,
 )
-BIAS = _agreement(
-    "bias_pp",
+BIAS = _new(
+    "agreement.bias_pp",
     "pp",
     "none",
     "mean of sim rate - recorded rate {what}; above 0 the twin is optimistic",
 )
-MAE = _agreement(
-    "mae_pp",
+MAE = _new(
+    "agreement.mae_pp",
     "pp",
     "lower",
     "mean size of sim rate - recorded rate {what}",
     (0.0, 100.0),
 )
-ORDER_ACCURACY = _agreement(
-    "order_accuracy",
+ORDER_ACCURACY = _new(
+    "agreement.order_accuracy",
     "1",
     "higher",
     "pairs of groups that the twin orders as the recorded rates do / pairs whose recorded rates differ; a tie in the twin counts 1/2; {what}",
 )
-MMRV_RECORDED = _agreement(
-    "mmrv_recorded_gap",
+MMRV_RECORDED = _new(
+    "agreement.mmrv_recorded_gap",
     "1",
     "lower",
     "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of groups",

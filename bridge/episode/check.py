@@ -25,7 +25,7 @@ from bridge.episode.contract import (
     learn_contract,
     unseen_losses,
 )
-from bridge.episode.health import HealthFinding, in_order, in_words
+from bridge.episode.health import HealthFinding, drops_logged, in_order, in_words, unreadable
 from bridge.episode.metadata import BY_DISK
 from bridge.episode.reader import Episode, name_of_part, record_of
 from bridge.episode.run_folder import part_name
@@ -242,11 +242,10 @@ def _judge_topics(
         result.declared_losses = decoder.drop_log.get(topic, 0)
         result.unnumbered = decoder.unnumbered.get(topic, 0)
         if result.undecodable:
-            count = f"{result.undecodable} of {result.messages} messages"
-            text = f"{count} cannot be read: {result.first_fault}"
-            report.find("unreadable", topic, text)
+            found = unreadable(topic, result.undecodable, result.messages, result.first_fault)
+            report.findings.append(found)
             if ours:
-                faults.add(f"{topic}: {text}")
+                faults.add(f"{topic}: {found.text}")
         report.findings += topic_watch.findings(is_derived=episode is None or bool(episode.derived))
         if result.time_steps_back:
             text = f"{topic}: its log time steps back {result.time_steps_back} times"
@@ -263,7 +262,7 @@ def _judge_topics(
     report.findings += decoder.findings
     for topic, lost in sorted(decoder.drop_log.items()):  # also of topics without any message
         if lost:
-            report.find("drops_logged", topic, f"{lost} messages")
+            report.findings.append(drops_logged(topic, lost))
     report.declared_losses = sum(decoder.drop_log.values())
     report.notes += unseen_losses(decoder.unnumbered)
     unused = ", ".join(f"{topic} ({what})" for topic, what in sorted(decoder.unused.items()))

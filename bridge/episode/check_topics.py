@@ -20,7 +20,7 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.episode.check_file import ScannedMessage
 from bridge.episode.contract import Presence, Spans, TopicReport
-from bridge.episode.health import ContentWatch, HealthFinding, of_event
+from bridge.episode.health import ContentWatch, HealthFinding, mixed_types, of_event
 from bridge.episode.schema import DEFINITIONS
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
@@ -275,9 +275,7 @@ class TopicWatch:
         for content in () if is_derived else self.contents.values():
             yield from content.findings.values()
         span = {"first_ns": self.presence.first_ns, "last_ns": self.presence.last_ns}
-        if len(self.contents) > 1:
-            text = " and ".join(sorted(name or "no type" for name in self.contents))
-            yield HealthFinding(name="mixed_types", about=self.topic, text=text, **span)
+        yield from mixed_types(self.topic, self.contents, **span)
         years = (span["last_ns"] - span["first_ns"]) // YEAR_NS
         if self.odd or years > MOST_YEARS:
             text = f"{len(self.odd)} times after the year 2200" if self.odd else f"{years} years"

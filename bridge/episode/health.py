@@ -4,7 +4,7 @@ The recorder fills the record while it records and keeps it in the episode; ``ch
 by reading. Status, stop, ``info`` and ``ls`` show it; exit codes follow from its severities.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +49,24 @@ class HealthFinding:
         first_s, last_s = (s_from_ns(at - start_ns) for at in (self.first_ns, self.last_ns))
         more = "" if first_s == last_s else f" to {last_s:.1f}"
         return f"{text} (at {first_s:.1f}{more} s)"
+
+
+def drops_logged(topic: str, lost: int) -> HealthFinding:
+    """Say what of a topic was lost, and is in the drop log."""
+    return HealthFinding(name="drops_logged", about=topic, text=f"{lost} messages")
+
+
+def unreadable(topic: str, count: int, messages: int, why: str) -> HealthFinding:
+    """Say how many of a topic's messages cannot be read."""
+    text = f"{count} of {messages} messages cannot be read: {why}"
+    return HealthFinding(name="unreadable", about=topic, text=text)
+
+
+def mixed_types(topic: str, types: Collection[str], **span: int) -> Iterator[HealthFinding]:
+    """Say that a topic carries several types, if it does."""
+    if len(types) > 1:
+        text = " and ".join(sorted(name or "no type" for name in types))
+        yield HealthFinding(name="mixed_types", about=topic, text=text, **span)
 
 
 def in_order(findings: Iterable[HealthFinding]) -> list[HealthFinding]:

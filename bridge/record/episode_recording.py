@@ -116,9 +116,7 @@ class Channels:
             types.setdefault(topic, set()).add(type_name)
             yield from list(channel.content.findings.values())
         for topic, names in types.items():
-            if len(names) > 1:
-                text = " and ".join(sorted(name or "no type" for name in names))
-                yield HealthFinding(name="mixed_types", about=topic, text=text)
+            yield from health.mixed_types(topic, names)
 
     def _schema(self, sample: WireSample, type_name: str) -> tuple[schema.Schema | None, bool]:
         """The schema to register: a known one, one with a name only, or none; and if it is strange.
@@ -299,13 +297,10 @@ class EpisodeRecording:
         found = [*self._channels.findings(), *self._noted]
         for topic, tally in self.ledger.totals().items():
             if tally.lost:
-                found.append(
-                    HealthFinding(name="drops_logged", about=topic, text=f"{tally.lost} messages")
-                )
+                found.append(health.drops_logged(topic, tally.lost))
             if tally.undecodable:
-                count = f"{tally.undecodable} of {tally.received} messages"
-                text = f"{count} cannot be read: {self._unreadable.get(topic, '')}"
-                found.append(HealthFinding(name="unreadable", about=topic, text=text))
+                why = self._unreadable.get(topic, "")
+                found.append(health.unreadable(topic, tally.undecodable, tally.received, why))
         return in_order([*found, *self._of_presence])
 
     def _append(

@@ -43,6 +43,11 @@ def sides(groups: Sequence[RateGroup]) -> tuple[list[Fraction], list[Fraction]]:
     return recorded, [c.sim_rate for c in groups if c.sim_rate is not None]
 
 
+def says_nothing(r: Measurement) -> bool:
+    """Whether the interval of a correlation is too wide to say anything."""
+    return r.interval is not None and r.interval.high - r.interval.low >= SAYS_NOTHING
+
+
 def counts_of(groups: Sequence[RateGroup]) -> tuple[GroupCounts, ...]:
     """Return what was counted in each group, paired trials apart from those without a partner.
 
@@ -106,23 +111,14 @@ def group_agreement(groups: Sequence[RateGroup]) -> list[Measurement]:
         episodes=episodes,
         reason_without_interval="it is of these groups; r and the bias have intervals over others",
     )
-    points = 100.0
     return [
-        _over_others(PEARSON_R.of(what=what, resampled=""), usable, "r"),
+        _over_others(PEARSON_R.of(what=what), usable, "r"),
         *_by_condition(usable),
-        make(SPEARMAN.of(what=what, resampled=""), lambda: agreement.spearman(recorded, sim)),
-        _over_others(BIAS.of(what=what, resampled=""), usable, "bias"),
-        make(
-            MAE.of(what=what, resampled=""), lambda: points * agreement.mean_absolute_error(**both)
-        ),
-        make(
-            ORDER_ACCURACY.of(what=what, resampled=""),
-            lambda: agreement.order_accuracy(**both).value,
-        ),
-        make(
-            MMRV_RECORDED.of(what=what, resampled=""),
-            lambda: agreement.mmrv(**both, gap="recorded"),
-        ),
+        make(SPEARMAN.of(what=what), lambda: agreement.spearman(recorded, sim)),
+        _over_others(BIAS.of(what=what), usable, "bias"),
+        make(MAE.of(what=what), lambda: 100 * agreement.mean_absolute_error(**both)),
+        make(ORDER_ACCURACY.of(what=what), lambda: agreement.order_accuracy(**both).value),
+        make(MMRV_RECORDED.of(what=what), lambda: agreement.mmrv(**both, gap="recorded")),
         *_blind(usable),
     ]
 
@@ -162,9 +158,7 @@ def _by_condition(groups: Sequence[RateGroup]) -> list[Measurement]:
     found = []
     for name in conditions:
         mine = [group for group in groups if group.condition == name]
-        defined = PEARSON_R_OF_CONDITION.of(
-            what=f"over groups {name} only", condition=name, resampled=""
-        )
+        defined = PEARSON_R_OF_CONDITION.of(what=f"over groups {name} only", condition=name)
         found.append(_over_others(defined, mine, "r"))
     return found
 

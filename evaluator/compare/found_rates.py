@@ -4,7 +4,7 @@ A plain number may be any of them. The only reading that all numbers of like nam
 of several the first one, with a doubt.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -19,28 +19,24 @@ SMALL = 50
 def rate_rows(sheet: Sheet, values: Sequence[Value]) -> list[SourceRow]:
     """Gather count, n and rate of each group and side, and settle what plain numbers are."""
     cells: dict[tuple[str, ...], list[Value]] = {}
-    shared: dict[tuple[str, ...], str] = {}
+    shared: dict[int, str] = {}  # by row: the header may give the cells of one row other names
     for value in values:
-        alone = value.column.figure == "n" and not value.column.side and value.figure is not None
-        if alone and value.figure is not None:
-            shared[(*key_of(value)[:3], str(value.row))] = value.figure.number
+        if value.figure is None:
+            continue
+        if value.column.figure == "n" and not value.column.side:
+            shared.setdefault(value.row, value.figure.number)
             sheet.found.notes.append(f"n from {value.column.name!r}")
-        elif value.figure is not None:
-            key = (*key_of(value), str(value.row))
-            cells.setdefault(key, []).append(value)
+        else:
+            cells.setdefault((*key_of(value), str(value.row)), []).append(value)
     sheet.found.notes[:] = dict.fromkeys(sheet.found.notes)
-    groups = [_Group.of(key, members, _shared_n(shared, key)) for key, members in cells.items()]
+    groups = [
+        _Group.of(key, members, shared.get(members[0].row, "")) for key, members in cells.items()
+    ]
     groups = [group for group in groups if group.figure is not None or group.k]
     if groups and all(not group.key[3] for group in groups):
         sheet.found.doubts.append("no word says real or sim, so all rates are read as real")
     _settle_numbers(sheet, groups)
     return [group.row(sheet) for group in groups]
-
-
-def _shared_n(shared: dict[tuple[str, ...], str], key: tuple[str, ...]) -> str:
-    """Return n of the same row; the header may have given the row other names."""
-    same_row = [n for known, n in shared.items() if known[-1] == key[-1]]
-    return same_row[0] if same_row else ""
 
 
 @dataclass(kw_only=True)
@@ -217,21 +213,18 @@ def _take_first(
     numbers = set(_numbers(groups))
     unit = units[0]
     differ = {tuple(round(_share(group, each), 9) for group in groups) for each in units}
-    without_n = all(not group.n for group in groups)
+    may_be_counts = counts and all(v <= SMALL and v.is_integer() for v in numbers)
+    may_be_counts &= all(not group.n for group in groups)
     if numbers <= {0.0, 1.0} and 1.0 in numbers:
         unit = "rate" if "rate" in units else unit
         sheet.found.doubts.append(f"0 and 1 are read as {WORDS[unit]}, not as percent or trials")
     elif len(differ) > 1:
         names = " or ".join(WORDS[each] for each in units)
         sheet.found.doubts.append(f"plain numbers may be {names}; they are read as {WORDS[unit]}")
-    elif without_n and counts and unit == "rate_percent" and _are_small_counts(numbers):
+    elif may_be_counts and unit == "rate_percent":
         sheet.found.doubts.append("plain numbers may be counts; they are read as percent")
     for group in groups:
         group.unit = unit
-
-
-def _are_small_counts(numbers: Iterable[float]) -> bool:
-    return all(number <= SMALL and number.is_integer() for number in numbers)
 
 
 def _share(group: _Group, unit: str) -> float:

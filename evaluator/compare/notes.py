@@ -6,7 +6,7 @@ from fractions import Fraction
 from itertools import chain, groupby
 from typing import Any
 
-from evaluator.compare.agreement import SAYS_NOTHING
+from evaluator.compare.agreement import says_nothing
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.trial import Trial
 from evaluator.errors import UndefinedStatisticError
@@ -88,8 +88,7 @@ def _says_nothing(by_id: dict[str, Measurement]) -> list[Note]:
     return [
         (name, f"the interval of r is {i.high - i.low:.2f} wide, of 2 possible: it says nothing")
         for name, m in by_id.items()
-        if name.startswith("agreement.pearson_r") and (i := m.interval) is not None
-        if i.high - i.low >= SAYS_NOTHING
+        if name.startswith("agreement.pearson_r") and says_nothing(m) and (i := m.interval)
     ]
 
 

@@ -24,7 +24,7 @@ from evaluator.compare.success import CONDITION_OF_ARM, WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
 from evaluator.quantity import noun
 from evaluator.result import Cell, Interval, Measurement, Table
-from evaluator.statistics.sequential import Evidence, Look, Plan, Stratum
+from evaluator.statistics.sequential import Evidence, Look, Plan, Stratum, pairs_equivalent
 from evaluator.study_measurements import COMPARED, COMPARED_IN_TASK
 
 Item = TypeVar("Item")
@@ -256,8 +256,7 @@ def _pairs_after(tries: Sequence[Try]) -> list[float]:
                 shared[each.task] += 1
                 others[0] -= 1
                 others[1] -= 1
-        n, m = others
-        now = shared[each.task] + (2 * n * m / (n + m) if n and m else 0.0)
+        now = shared[each.task] + pairs_equivalent(*others)
         total += now - counted.get(each.task, 0.0)
         counted[each.task] = now
         found.append(total)

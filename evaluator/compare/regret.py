@@ -108,15 +108,11 @@ def _with_the_best(choice: Choice, first: Sequence[int]) -> Interval | None:
     z = normal_quantile(1 - ALPHA / (2 * (len(choice.names) - 1)))
     lows, highs = [], []
     for mine in first:
-        ends = [
-            found
-            for other in range(len(choice.names))
-            if other != mine
-            for found in (_difference(choice.members[mine], choice.members[other], z),)
-        ]
-        if None in ends:
-            return None
+        others = [place for place in range(len(choice.names)) if place != mine]
+        ends = [_difference(choice.members[mine], choice.members[place], z) for place in others]
         known = [each for each in ends if each is not None]
+        if len(known) < len(ends):
+            return None
         lows.append(max(0.0, *(each.low for each in known)))
         highs.append(max(0.0, *(each.high for each in known)))
     return Interval(low=100 * min(lows), high=100 * max(highs), level=LEVEL, method=METHOD)

@@ -54,7 +54,7 @@ class Drawing:
         """A file of its own, in the colours of print."""
         style = '<style>text{font:12px "DejaVu Sans",Arial,sans-serif}</style>'
         attributes = 'xmlns="http://www.w3.org/2000/svg"'
-        return self._written(attributes, style, {name: LIGHT[name] for name in LIGHT})
+        return self._written(attributes, style, LIGHT)
 
     @property
     def inline(self) -> str:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from evaluator.compare.agreement import says_nothing
 from evaluator.compare.conclusions import direction
 from evaluator.compare.policies import ALL_TASKS
 from evaluator.quantity import noun
@@ -177,21 +178,13 @@ def _summary(results: Results, num_tasks: int) -> str:
     if r is not None and r.value is not None:
         parts.append(
             f"r = {r.value:.2f}{_ends(r, '.2f')} says nothing: its interval is too wide."
-            if _is_void(r)
+            if says_nothing(r)
             else f"Its rates follow them with r = {r.value:.2f}{_ends(r, '.2f')}."
             if not r.is_beyond
             else f"Measured r = {r.value:.2f}; without the noise of counting r lies"
             f" in{_ends(r, '.2f')}."
         )
     return " ".join(parts)
-
-
-WIDE = 1.5
-"""An interval of r wider than this, of at most 2, says nothing."""
-
-
-def _is_void(r: Measurement) -> bool:
-    return r.interval is not None and r.interval.high - r.interval.low > WIDE
 
 
 def _all_alike(results: Results) -> list[str]:

@@ -68,8 +68,7 @@ class Stratum:
     @property
     def others(self) -> float:
         """Pairs that the trials without a shared start are worth."""
-        n, m = self.first[1], self.second[1]
-        return 2 * n * m / (n + m) if n and m else 0.0
+        return pairs_equivalent(self.first[1], self.second[1])
 
     @property
     def score(self) -> float:
@@ -93,6 +92,11 @@ class Stratum:
             p, q = _restricted(k / n, j / m, n / m, d)
             found += self.others**2 * (p * (1 - p) / n + q * (1 - q) / m)
         return found
+
+
+def pairs_equivalent(n: int, m: int) -> float:
+    """Pairs that so many trials of either candidate are worth: as many as say as much."""
+    return 2 * n * m / (n + m) if n and m else 0.0
 
 
 def _restricted(first: float, second: float, ratio: float, d: float) -> tuple[float, float]:

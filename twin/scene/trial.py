@@ -30,7 +30,7 @@ from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import Mesh, read_mesh
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene
-from twin.scene.store.library import NOT_SCANNED, Library, task_of
+from twin.scene.store.library import NOT_SCANNED, Library, objects_folder, task_of
 
 FIRST_FRAMES = 8
 """Of each camera before the first motion, for the colours of what was not scanned."""
@@ -62,11 +62,11 @@ class TrialInScene:
 
     def meshes(self, run: RunFolder) -> dict[str, Mesh]:
         """Surfaces of the objects that are drawn, each in its own frame."""
-        library, task = Library.of(run, None).folder, task_of(self.recorded)
+        folder, task = objects_folder(run), task_of(self.recorded)
         return {
             name: shape_mesh(task.objects[name])
             if name in self.parts.not_scanned and task is not None
-            else read_mesh(library / name / MESH)
+            else read_mesh(folder / name / MESH)
             for name in self.parts.objects
         }
 

@@ -210,10 +210,9 @@ class JointLayout:
         for values in (first.velocity, first.effort):
             ends.append(_aligned(ends[-1] + 4, 8) + values.nbytes if len(values) else ends[-1] + 4)
         velocity, effort, end = ends
-        self.numbers: tuple[Span, ...] = (
-            *((at, velocity), (effort - first.velocity.nbytes, effort)),
-            (end - first.effort.nbytes, end),
-        )
+        velocities = (effort - first.velocity.nbytes, effort)
+        efforts = (end - first.effort.nbytes, end)
+        self.numbers: tuple[Span, ...] = ((at, velocity), velocities, efforts)
         self.is_of_use = data[1] == _LITTLE_ENDIAN and count > 0
         self._fixed = ((0, 4), (12, at), (velocity, velocity + 4), (effort, effort + 4))
         self._size, self._bytes = len(data), [data[a:b] for a, b in self._fixed]

@@ -47,6 +47,7 @@ from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.store.folder import UnreadableSceneError
+from twin.scene.store.library import objects_folder
 
 SPACING_M = 0.004
 GROWN_M = 0.018
@@ -215,7 +216,7 @@ class Decomposition:
         views_of: Callable[[Episode], Sequence[TrainingView]],
     ) -> dict[str, Any]:
         """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them."""
-        folder = run.scene_dir / "objects"
+        folder = objects_folder(run)
         shutil.rmtree(folder, ignore_errors=True)
         scans = [
             ObjectViews(views=views_of(item.episode), task=item.task, Ts_base_object=item.poses)
@@ -325,7 +326,7 @@ def read_objects(
     """Load objects that ``scene.json`` lists, or the wanted ones, each in its own frame."""
     objects = {}
     for key in record.get("objects", {}) if wanted is None else wanted:
-        folder = run.scene_dir / "objects" / check_episode_id(key)
+        folder = objects_folder(run) / check_episode_id(key)
         has_sdf = SDF in record["objects"][key].get("files", {})
         objects[key] = ObjectSplats(
             cloud=read_ply(folder / "gaussians.ply"),

@@ -21,6 +21,11 @@ NOT_SCANNED = "not scanned"
 FROM_TASK = f"{NOT_SCANNED}: drawn from the task's shape, with colours from before the first motion"
 
 
+def objects_folder(run: RunFolder) -> Path:
+    """Where each object of a run's scene has a folder of its own."""
+    return run.scene_dir / "objects"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Library:
     """The objects of a run's scene."""
@@ -37,7 +42,7 @@ class Library:
         """The library that ``scene.json`` lists; an empty one without a scene."""
         known = record or {}
         return cls(
-            folder=run.scene_dir / "objects",
+            folder=objects_folder(run),
             objects=known.get("objects", {}),
             remark=known.get("objects_remark", ""),
         )
