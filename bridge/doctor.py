@@ -40,6 +40,9 @@ EXTRAS = {
     "dashboard": Extra(
         "review pages, Rerun view", ("starlette", "uvicorn", "rerun-sdk", "simplejpeg")
     ),
+    "policies": Extra(
+        "policies in the loop", ("gymnasium", "websockets", "pillow"), is_optional=True
+    ),
     "cluster": Extra("replays on Ray", ("ray",), is_optional=True),
     "standin": Extra(
         "the stand-in cell of the demo", ("mujoco", "open3d", "pin", "example-robot-data", "scipy")

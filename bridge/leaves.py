@@ -85,6 +85,20 @@ LEAVES: dict[str, Leaf] = {
             "name_things": "twin.scene.foundation.things:write_scene_semantics",
         },
     ),
+    "policies": Leaf(
+        modules=("twin.policies",),
+        extra="policies",
+        purpose="policies in the loop",
+        commands=(
+            *commands_of(
+                EVALUATE,
+                "twin.policies.cli",
+                """
+                rollout | Let a policy act in the twin. | runs/x --policy ws://127.0.0.1:8000
+                """,
+            ),
+        ),
+    ),
     "soft": Leaf(
         modules=(
             "twin.physics.soft",

@@ -156,9 +156,9 @@ def simulate(
     widths = path.width_at(times_ns).tolist()
     stamps = times_ns.tolist()
     soft = soft_models(scene)
-    samples = _Samples(scene, soft)
+    samples = Samples(scene, soft)
     engine = config.engines()[0]
-    with open_world(engine, hulls.robot.urdf, _mesh_hulls(hulls), config.physics) as world:
+    with open_world(engine, hulls.robot.urdf, mesh_hulls(hulls), config.physics) as world:
         spawn(world, scene, soft)
         world.reset_robot(postures[0], widths[0])
         world.robot.command(targets[0], [0.0] * len(targets[0]), widths[0])
@@ -174,7 +174,8 @@ def simulate(
 
 
 @lru_cache(maxsize=4)
-def _mesh_hulls(hulls: RobotHulls) -> dict[str, list[Float[np.ndarray, "num_points 3"]]]:
+def mesh_hulls(hulls: RobotHulls) -> dict[str, list[Float[np.ndarray, "num_points 3"]]]:
+    """Hulls of links' meshes, as an engine takes them."""
     found: dict[str, list[Float[np.ndarray, "num_points 3"]]] = {}
     for hull in hulls.hulls:
         if hull.from_mesh:
@@ -182,10 +183,11 @@ def _mesh_hulls(hulls: RobotHulls) -> dict[str, list[Float[np.ndarray, "num_poin
     return found
 
 
-class _Samples:
+class Samples:
     """Collects states while a world runs."""
 
     def __init__(self, scene: ReplayScene, soft: dict[str, SoftShape]) -> None:
+        """Begin without any."""
         self._objects = list(scene.movable())
         self._soft = list(soft)
         self._fixed = scene.containers()
@@ -226,6 +228,7 @@ class _Samples:
         return True
 
     def states(self, world: PhysicsWorld) -> States:
+        """All that was kept."""
         poses = {name: self._Ts_base_object(name) for name in self._objects}
         poses |= {
             name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._fixed.items()

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from bridge.episode import streams
 from bridge.episode.cdr.messages import CompressedColor, color_from_message
@@ -42,26 +42,27 @@ MAX_IMAGES = 300
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Stage:
+class Drawable:
     """Everything that can be drawn, ready to be moved."""
 
     parts: MovableScene
     bindings: Mapping[str, Binding]
     """Of soft ones: which nodes carry which Gaussians."""
+    urdf: str
 
-    def at(self, result: ReplayResult, scene: ReplayScene, index: int) -> GaussianCloud:
-        """The scene at one of the replay's states."""
-        places, bent = {}, {}
-        for name, item in self.parts.objects.items():
-            Ts = result.Ts_base_object.get(name)
-            T = scene.Ts_base_object[name] if Ts is None else Ts[index]
-            nodes = result.nodes_m.get(name)
-            if nodes is not None and name in self.bindings:
-                bent[name] = pose_cloud(item.cloud, self.bindings[name], nodes[index])
-            else:
-                places[name] = T
-        posture = Posture(joints_rad=result.joints_rad[index], width_m=float(result.width_m[index]))
-        return self.parts.at(places, posture, scene.urdf, bent)
+    def at(
+        self,
+        Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
+        nodes_m: Mapping[str, Float32[np.ndarray, "num_nodes 3"]],
+        posture: Posture,
+    ) -> GaussianCloud:
+        """The scene in one state."""
+        bent = {
+            name: pose_cloud(self.parts.objects[name].cloud, binding, nodes_m[name])
+            for name, binding in self.bindings.items()
+            if name in nodes_m
+        }
+        return self.parts.at(Ts_base_object, posture, self.urdf, bent)
 
 
 def render_replay(
@@ -80,7 +81,7 @@ def render_replay(
         start_ns: Source time that is the replay's time 0.
         executed: Whether the plan was executed then, so that there are instants to compare with.
     """
-    stage = _set_up(run, episode, scene, result)
+    stage = set_up(run, episode, scene)
     rasteriser = open_rasteriser()
     tree, calibration = base_tree(episode), read_calibration(run)
     places = {} if calibration is None else calibration.cameras
@@ -105,7 +106,7 @@ def render_replay(
                 T = seen.T_root_frame(info.frame_id, stamp_ns)
             else:
                 T = result.Ts_base_tcp[index] @ T_tcp_camera
-            cloud = stage.at(result, scene, index)
+            cloud = stage.at(*_state(result, scene, index))
             drawn = stage.parts.draw(rasteriser, cloud, info.camera, T)
             yield (
                 camera_id,
@@ -118,17 +119,26 @@ def render_replay(
             )
 
 
-def _set_up(run: RunFolder, episode: Episode, scene: ReplayScene, result: ReplayResult) -> _Stage:
+def set_up(run: RunFolder, episode: Episode, scene: ReplayScene) -> Drawable:
+    """Read what a start shows."""
     parts, _ = trial_parts(run, read_scene(run), episode, scene.task, scene.Ts_base_object)
     soft = {name: body for name, body in soft_models(scene).items() if name in parts.objects}
-    return _Stage(
-        parts=parts,
-        bindings={
-            name: bind(parts.objects[name].cloud.means_m, body.nodes_m)
-            for name, body in soft.items()
-            if name in result.nodes_m and len(parts.objects[name].cloud)
-        },
-    )
+    bindings = {
+        name: bind(parts.objects[name].cloud.means_m, body.nodes_m)
+        for name, body in soft.items()
+        if len(parts.objects[name].cloud)
+    }
+    return Drawable(parts=parts, bindings=bindings, urdf=scene.urdf)
+
+
+def _state(
+    result: ReplayResult, scene: ReplayScene, index: int
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Posture]:
+    """Places, nodes and posture at one of a replay's states."""
+    places = scene.Ts_base_object | {n: Ts[index] for n, Ts in result.Ts_base_object.items()}
+    nodes = {name: rows[index] for name, rows in result.nodes_m.items()}
+    posture = Posture(joints_rad=result.joints_rad[index], width_m=float(result.width_m[index]))
+    return places, nodes, posture
 
 
 def _stamps(

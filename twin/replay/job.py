@@ -111,7 +111,7 @@ class ReplayJob:
 
     def settings(self) -> dict[str, Any]:
         """What the settings hash covers: settings, inputs, engine and code version."""
-        return {
+        found: dict[str, Any] = {
             "replay_version": REPLAY_VERSION,
             "engine": " and ".join(
                 engine_of(self.task, replace(self.config, engine=each)) for each in self.engines()
@@ -126,23 +126,12 @@ class ReplayJob:
             "shapes": dict(self.shapes),
             "calibration_id": self.calibration_id,
             "render": self.render,
-            **self._named_robot(),
-            **self._sampled_from(),
-            **self._compared_with(),
         }
-
-    def _named_robot(self) -> dict[str, Any]:
-        if not self.robot:
-            return {}
-        return {"robot": hash_settings({"urdf": read_robot(self.robot).description()})}
-
-    def _sampled_from(self) -> dict[str, Any]:
-        if not self.config.samples:
-            return {}
-        spreads = self.start.covariances
-        return {"covariances": {name: spreads[name].tolist() for name in sorted(spreads)}}
-
-    def _compared_with(self) -> dict[str, Any]:
-        if self.trajectory != "executed":
-            return {}
-        return {"end": {name: T.tolist() for name, T in self.end.Ts_base_object.items()}}
+        if self.robot:
+            found["robot"] = hash_settings({"urdf": read_robot(self.robot).description()})
+        if self.config.samples:
+            spreads = self.start.covariances
+            found["covariances"] = {name: spreads[name].tolist() for name in sorted(spreads)}
+        if self.trajectory == "executed":
+            found["end"] = {name: T.tolist() for name, T in self.end.Ts_base_object.items()}
+        return found

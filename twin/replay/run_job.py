@@ -114,21 +114,13 @@ def _write(
         compared = compare(job, engine, result, _recording(source), source.end_ns)
         divergence = compared.to_record()
     if source.is_same_engine(result):
-        result = replace(result, verdict=_marked(result.verdict))
+        told, why = (*result.verdict.warnings, SAME_ENGINE), result.verdict.reason or SAME_ENGINE
+        result = replace(result, verdict=replace(result.verdict, warnings=told, reason=why))
     images = _images(source, result) if job.render else ()
     path = job.path(engine)
     path.unlink(missing_ok=True)
     write_replay(path, result, source.plan, _origin(source, engine, result, divergence, images))
     return result.verdict, divergence
-
-
-def _marked(verdict: Verdict) -> Verdict:
-    """Say that the cell was moved by the same engine."""
-    return replace(
-        verdict,
-        warnings=(*verdict.warnings, SAME_ENGINE),
-        reason=verdict.reason or SAME_ENGINE,
-    )
 
 
 def _open(job: ReplayJob) -> _Source:

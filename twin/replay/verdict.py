@@ -85,7 +85,9 @@ def terminal_factor(
     findings = evaluate_success(scene.task, result.rollout())
     value = all_hold(findings)
     if value is True:
-        return Factor(value=True, detail=_why_true(findings))
+        many = len(findings) > MANY
+        why = "every object is where it belongs" if many else _once(f.detail for f in findings)
+        return Factor(value=True, detail=why)
     if value is None:
         return Factor(value=None, detail=_why_open(findings, scene))
     index = next(i for i, finding in enumerate(findings) if finding.value is False)
@@ -97,12 +99,6 @@ def terminal_factor(
         bodies=tuple(spec[key] for key in REFERENCES if key in spec),
         detail=_once(finding.detail for finding in findings if finding.value is False),
     )
-
-
-def _why_true(findings: list[PredicateResult]) -> str:
-    if len(findings) > MANY:
-        return "every object is where it belongs"
-    return _once(finding.detail for finding in findings)
 
 
 def _why_open(findings: list[PredicateResult], scene: ReplayScene) -> str:
@@ -256,7 +252,33 @@ def _replay(
     if config.mode == "dynamic":
         scene = free_start(scene, soft_models(scene))
     moved = _move(commanded, plan, scene, config, refuse_early=refuse_early)
-    states = moved.states
+    return _result(commanded, moved, plan, scene, config)
+
+
+def judge_states(
+    commanded: Commanded, states: States, plan: Plan, scene: ReplayScene, config: ReplayConfig
+) -> ReplayResult:
+    """Judge what physics did while somebody else steered, as a replay of it would be judged.
+
+    Args:
+        plan: What was done, in a plan's words.
+    """
+    hulls = hulls_of(load_robot(scene.urdf))
+    monitor = ClearanceMonitor(scene, plan, hulls, config)
+    moved = Moved(
+        states=states,
+        clearance_m=_clearance_m(monitor, states, list(scene.movable())),
+        monitor=monitor,
+        by_physics=True,
+        measured=True,
+    )
+    return _result(commanded, moved, plan, scene, config)
+
+
+def _result(
+    commanded: Commanded, moved: Moved, plan: Plan, scene: ReplayScene, config: ReplayConfig
+) -> ReplayResult:
+    robot, states = load_robot(scene.urdf), moved.states
     result = ReplayResult(
         verdict=_undecided(plan, commanded.trajectory, config, scene),
         stamps_ns=states.stamps_ns,

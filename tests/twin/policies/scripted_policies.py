@@ -1,0 +1,51 @@
+"""Policies for tests: one that does the task, and some that do not."""
+
+from typing import Any
+
+import numpy as np
+from scripted_plans import pick_and_place, scene_of_test, with_joints
+
+from twin.replay.path import path_of_plan
+from twin.robot.model import load_robot
+
+
+class Scripted:
+    """Picks the cube and puts it into the box, in chunks of ten rows; it sees nothing."""
+
+    seeds: list[int] = []  # noqa: RUF012  # of all of them
+    metadata = {"name": "scripted"}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        """Solve the plan once."""
+        scene = scene_of_test()
+        plan = with_joints(pick_and_place(scene), scene)
+        self.path, _, _ = path_of_plan(plan, load_robot(scene.urdf))
+        self.t_ns = 0
+
+    def reset(self, seed: int) -> None:
+        self.t_ns = 0
+        Scripted.seeds.append(seed)
+
+    def infer(self, observation: dict[str, Any]) -> dict[str, Any]:
+        if set(observation["pixels"]) != {"side", "wrist"}:
+            raise ValueError("two cameras were expected")
+        times = self.t_ns + 100_000_000 * (1 + np.arange(10))
+        self.t_ns = int(times[-1])
+        joints, widths = self.path.joints_at(times), self.path.width_at(times - 100_000_000)
+        return {"actions": np.column_stack([joints, widths])}
+
+
+def still(observation: dict[str, Any]) -> np.ndarray:
+    return np.asarray(observation["agent_pos"])
+
+
+def reckless(observation: dict[str, Any]) -> np.ndarray:
+    return np.asarray(observation["agent_pos"]) + 1.0
+
+
+def broken(observation: dict[str, Any]) -> np.ndarray:
+    return np.full(7, np.nan)
+
+
+def raising(observation: dict[str, Any]) -> np.ndarray:
+    raise KeyError("wrist")

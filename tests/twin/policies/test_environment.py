@@ -1,0 +1,100 @@
+"""The twin as Gymnasium has it."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import UsageError
+from twin.policies.environment import ID, TwinEnv
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*WARN.*")
+
+
+def states(env: TwinEnv, actions: list[np.ndarray], **options: str) -> list[bytes]:
+    env.reset(options=options)
+    found = []
+    for action in actions:
+        observation, _, _, _, _ = env.step(action)
+        pixels = observation["pixels"]
+        found.append(b"".join(pixels[name].tobytes() for name in sorted(pixels)))
+        found.append(observation["agent_pos"].tobytes())
+    return found
+
+
+def test_gymnasium_finds_nothing_wrong(run: RunFolder) -> None:
+    env = gymnasium.make(ID, run=str(run.path), size=(32, 32), render_mode="rgb_array")
+    check_env(env.unwrapped, skip_render_check=True)
+    observation, info = env.reset(seed=3)
+    assert observation["pixels"]["side"].shape == (24, 32, 3)
+    assert info["start_id"] == "drawn_3_0"
+    picture = env.render()
+    assert isinstance(picture, np.ndarray)
+    np.testing.assert_array_equal(picture, observation["pixels"]["side"])
+    env.close()
+
+
+def test_the_same_actions_give_the_same_bytes(run: RunFolder) -> None:
+    env = TwinEnv(run.path, size=(32, 32))
+    start = env.reset()[0]["agent_pos"].astype(float)
+    rng = np.random.default_rng(1)
+    actions = [start + np.append(rng.normal(0, 0.02, 6), 0.0) for _ in range(4)]
+    first = states(env, actions, start_id="start 2")
+    assert states(env, actions, start_id="start 2") == first
+    assert states(env, actions[::-1], start_id="start 2") != first
+    env.close()
+
+
+def test_an_action_takes_effect_after_the_latency(run: RunFolder) -> None:
+    env = TwinEnv(run.path, cameras=["side"], latency_s=0.2)
+    start = env.reset()[0]["agent_pos"].astype(float)
+    turned = start + np.array([0.1, 0, 0, 0, 0, 0, 0])
+    went = [env.step(turned)[0]["agent_pos"][0] - start[0] for _ in range(4)]
+    assert np.abs(went[:2]).max() < 0.005
+    assert went[3] > 0.09
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("control", "action"),
+    [
+        ("joint_velocity", [1.0, 0, 0, 0, 0, 0, 0.08]),
+        ("joint_delta", [0.1, 0, 0, 0, 0, 0, 0.08]),
+    ],
+)
+def test_kinds_of_control_mean_the_same(run: RunFolder, control: str, action: list[float]) -> None:
+    env = TwinEnv(run.path, cameras=["side"], control=control)  # type: ignore[arg-type]
+    before = env.reset()[0]["agent_pos"]
+    for _ in range(3):
+        found = env.step(np.array(action))[0]["agent_pos"]
+    assert found[0] - before[0] == pytest.approx(0.3, abs=0.03)
+    assert env.action_space.shape == (7,)
+    env.close()
+
+
+def test_a_limit_ends_the_episode_with_its_name(run: RunFolder) -> None:
+    env = TwinEnv(run.path, cameras=["side"])
+    start = env.reset()[0]["agent_pos"].astype(float)
+    _, reward, over, cut, info = env.step(start + np.array([3.0, 0, 0, 0, 0, 0, 0]))
+    assert (reward, over, cut) == (0.0, True, False)
+    assert info["stopped"].startswith("limits: shoulder_pan_joint would need 30.00 rad/s")
+    assert info["is_success"] is False
+    env.close()
+
+
+def test_time_is_up(run: RunFolder) -> None:
+    env = TwinEnv(run.path, cameras=["side"], max_s=0.3)
+    action = env.reset()[0]["agent_pos"]
+    assert [env.step(action)[3] for _ in range(3)] == [False, False, True]
+    env.close()
+
+
+def test_what_is_not_there_is_told(run: RunFolder) -> None:
+    with pytest.raises(Exception, match="no camera top in trial_1; it has: side, wrist"):
+        TwinEnv(run.path, cameras=["top"])
+    env = TwinEnv(run.path, cameras=["side"])
+    with pytest.raises(UsageError, match=r"call reset\(\) before step"):
+        env.step(np.zeros(7))
+    with pytest.raises(UsageError, match=r"no start 'x' in .*; there are: start 1, start 2"):
+        env.reset(options={"start_id": "x"})

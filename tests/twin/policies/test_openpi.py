@@ -1,0 +1,156 @@
+"""The websocket protocol, against a server written from its description with ``msgpack``."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from websockets.sync.server import ServerConnection, serve
+
+from twin.policies.errors import PolicyError
+from twin.policies.openpi import KEY_VARIABLE, ServedPolicy, decode, encode
+
+Answer = Callable[[bytes], bytes | str]
+
+
+def pack(value: Any) -> bytes:
+    """As openpi's server packs: arrays are maps with keys of bytes."""
+
+    def array(item: Any) -> Any:
+        return {
+            b"__ndarray__": True, b"data": item.tobytes(), b"dtype": item.dtype.str,
+            b"shape": item.shape,
+        }  # fmt: skip
+
+    return bytes(msgpack.packb(value, default=array))
+
+
+def unpack(data: bytes) -> Any:
+    def array(item: dict[Any, Any]) -> Any:
+        if b"__ndarray__" not in item:
+            return item
+        return np.ndarray(buffer=item[b"data"], dtype=item[b"dtype"], shape=item[b"shape"])
+
+    return msgpack.unpackb(data, object_hook=array)
+
+
+@contextmanager
+def served(answer: Answer, metadata: bytes | str = b"\x80") -> Iterator[tuple[str, list[str]]]:
+    """A server on the loopback address; yields its address and the keys that were sent."""
+    keys: list[str] = []
+
+    def talk(socket: ServerConnection) -> None:
+        assert socket.request is not None
+        keys.append(socket.request.headers.get("Authorization", ""))
+        socket.send(metadata)
+        for message in socket:
+            assert isinstance(message, bytes)
+            socket.send(answer(message))
+
+    with serve(talk, "127.0.0.1", 0, compression=None, max_size=None) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}", keys
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_a_thousand_frames_there_and_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(KEY_VARIABLE, "s3cret")
+    rng = np.random.default_rng(0)
+    sent: list[Any] = []
+
+    def answer(data: bytes) -> bytes:
+        sent.append(unpack(data))
+        return pack({"actions": sent[-1]["state"] * 2, "server_timing": {"infer_ms": 1.5}})
+
+    with served(answer, pack({"name": "stub", "chunk": 8})) as (address, keys):
+        policy = ServedPolicy(address, 5.0)
+        assert policy.metadata == {"name": "stub", "chunk": 8}
+        assert keys == ["Api-Key s3cret"]
+        for number in range(1000):
+            state = rng.normal(size=(number % 5, 7)).astype(np.float32)
+            image = rng.integers(0, 255, (12, 16, 3), dtype=np.uint8)
+            found = policy.infer({"state": state, "image": image, "prompt": "put", "n": number})
+            np.testing.assert_array_equal(found["actions"], state * 2)
+            np.testing.assert_array_equal(sent[-1]["image"], image)
+            assert sent[-1]["prompt"] == "put"
+            assert sent[-1]["n"] == number
+        policy.close()
+
+
+def array(**change: object) -> bytes:
+    fields = {"__ndarray__": True, "data": b"\0" * 24, "dtype": "<f8", "shape": [3]} | change
+    return bytes(msgpack.packb({"actions": {k.encode(): v for k, v in fields.items()}}))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"", b"\xc1", b"\x81", b"\x80\x80", b"\xdd\xff\xff\xff\xff", b"\x91" * 5000 + b"\x90",
+        array(dtype="O"), array(dtype="|V8"), array(dtype="<c16"), array(dtype="<m8[ns]"),
+        array(dtype="no type"), array(dtype=3), array(shape=[4]), array(shape=[-1, -1]),
+        array(shape="3"), array(shape=[2**40]), array(data=b"\0" * 23), array(data=7),
+        bytes(msgpack.packb({b"__ndarray__": True})), bytes(msgpack.packb([[[[]]]])) * 2,
+    ],
+)  # fmt: skip
+def test_what_is_no_answer_is_refused(data: bytes) -> None:
+    with pytest.raises(PolicyError):
+        decode(data)
+
+
+def test_every_cut_of_an_answer_is_refused() -> None:
+    whole = pack({"actions": np.arange(14.0).reshape(2, 7), "t": 1})
+    np.testing.assert_array_equal(decode(whole)["actions"], np.arange(14.0).reshape(2, 7))
+    for end in range(len(whole)):
+        with pytest.raises(PolicyError):
+            decode(whole[:end])
+
+
+def test_what_cannot_be_sent_is_not() -> None:
+    for value in (np.array([None]), np.array([1j]), object()):
+        with pytest.raises(TypeError):
+            encode({"x": value})
+
+
+def test_text_is_the_servers_error() -> None:
+    with served(lambda _: "Traceback ...\nValueError: no camera named wrist\n") as (address, _):
+        policy = ServedPolicy(address, 5.0)
+        with pytest.raises(PolicyError, match="failed: ValueError: no camera named wrist"):
+            policy.infer({})
+
+
+def test_a_silent_server_is_not_waited_for() -> None:
+    gone = threading.Event()
+
+    def never(_: bytes) -> bytes:
+        gone.wait(30)
+        return b"\x80"
+
+    with served(never) as (address, _):
+        policy = ServedPolicy(address, 0.3)
+        with pytest.raises(PolicyError, match=r"said nothing for 0\.3 s"):
+            policy.infer({})
+        gone.set()
+        policy.close()
+
+
+def test_more_than_64_mb_end_the_connection() -> None:
+    with served(lambda _: b"\0" * (65 << 20)) as (address, _):
+        policy = ServedPolicy(address, 10.0)
+        with pytest.raises(PolicyError, match="closed the connection"):
+            policy.infer({})
+        with pytest.raises(PolicyError, match="closed the connection"):
+            policy.infer({})
+
+
+def test_nobody_there() -> None:
+    with served(lambda _: b"\x80") as (address, _):
+        pass
+    with pytest.raises(PolicyError, match="no policy answers at"):
+        ServedPolicy(address, 2.0)

@@ -1,0 +1,133 @@
+"""Rollouts from recorded starts: judged, kept, told in a table; policies that fail are marked."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from scripted_policies import Scripted
+
+from bridge.episode.catalogue import label_episode
+from bridge.episode.metadata import Outcome
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError, UsageError
+from bridge.exchange.trials_csv import read_trials
+from bridge.terminal import Output
+from twin.policies.check import check_policy, describe_check
+from twin.policies.config import RolloutConfig
+from twin.policies.policy import open_policy
+from twin.policies.runs import TABLE, describe_rollouts, roll_out_run
+
+QUIET = Output(quiet=True)
+
+
+def config(policy: str, **more: Any) -> RolloutConfig:
+    address = f"scripted_policies:{policy}"
+    return RolloutConfig(policy=address, name=policy, workers=1, **{"max_s": 2.0, **more})
+
+
+def test_a_policy_that_does_the_task_is_judged_kept_and_compared(run: RunFolder) -> None:
+    label_episode(run, "trial_1", Outcome(result="success"))
+    label_episode(run, "trial_2", Outcome(result="failure"))
+    Scripted.seeds.clear()
+    found = roll_out_run(run, config("Scripted", max_s=30.0, seed=7, times=2), QUIET)
+    assert [row["success"] for row in found["rows"]] == [True] * 4
+    assert Scripted.seeds == [7, 8, 7, 8]
+    assert "cube_into_box: 4 of 4 rollouts succeed" in describe_rollouts(found)
+    trials = read_trials(run.path / TABLE)
+    assert [(t.start_id, t.policy, t.recorded, t.sim_planned) for t in trials] == [
+        ("start 1", "Scripted", True, True),
+        ("start 1", "Scripted", None, True),
+        ("start 2", "Scripted", False, True),
+        ("start 2", "Scripted", None, True),
+    ]
+    made = Episode.open(run.derived_dir / found["rows"][0]["file"])
+    assert made.derived is not None
+    assert made.derived.kind == "rollout"
+    assert made.info.policy == "Scripted"
+    pictures = [topic for topic in made.topics() if "rendered" in topic]
+    assert len(pictures) == 2
+    before = {path: path.stat().st_mtime_ns for path in run.derived("*.rollout.*")}
+    again = roll_out_run(run, config("Scripted", max_s=30.0, seed=7, times=2), QUIET)
+    assert again == found
+    assert before == {path: path.stat().st_mtime_ns for path in run.derived("*.rollout.*")}
+
+
+@pytest.mark.parametrize(
+    ("policy", "success", "words"),
+    [
+        ("still", False, "cube centre is .* outside box"),
+        ("reckless", False, "limits: .* would need 10.00 rad/s"),
+        ("broken", None, "not finite from row 0 on"),
+        ("raising", None, "the policy failed: KeyError: 'wrist'"),
+    ],
+)
+def test_what_a_policy_does_wrong_is_told(
+    run: RunFolder, policy: str, success: bool | None, words: str
+) -> None:
+    found = roll_out_run(run, config(policy), QUIET)
+    assert [row["success"] for row in found["rows"]] == [success] * 2
+    assert all(re.search(words, row["detail"]) for row in found["rows"])
+    rows = (run.path / TABLE).read_text().splitlines()[1:]
+    assert len(rows) == (0 if success is None else 2)
+
+
+def test_the_clock_runs_on_while_it_thinks(run: RunFolder) -> None:
+    """Held for 0.5 s before each chunk of 1 s, the plan takes half as long again."""
+    prompt = roll_out_run(run, config("Scripted", max_s=30.0), QUIET)["rows"][0]
+    late = roll_out_run(run, config("Scripted", max_s=30.0, latency_s=0.5), QUIET)["rows"][0]
+    assert late["asked"] == prompt["asked"]
+    assert late["seconds"] == pytest.approx(prompt["seconds"] + 0.5 * prompt["asked"], abs=0.6)
+
+
+def test_starts_are_drawn_as_the_task_says(run: RunFolder) -> None:
+    found = roll_out_run(run, config("still", starts="3", seed=5), QUIET)
+    assert [row["start_id"] for row in found["rows"]] == ["drawn_5_0", "drawn_5_1", "drawn_5_2"]
+    assert len({row["detail"] for row in found["rows"]}) == 3
+    for wrong in ("none", "0", "-1", "99999"):
+        with pytest.raises(UsageError, match="neither 'recorded' nor a number"):
+            roll_out_run(run, config("still", starts=wrong), QUIET)
+
+
+def test_a_check_explains_one_answer_and_writes_nothing(run: RunFolder) -> None:
+    found = check_policy(run, config("Scripted"))
+    text = describe_check(found)
+    assert "pixels.side: 48 x 64 x 3 uint8" in text
+    assert "answered: 10 x 7 float64" in text
+    assert "followed for 10 rows, 1.00 s" in text
+    assert found["refused"] == ""
+    refused = check_policy(run, config("reckless"))
+    assert refused["followed"] == 0
+    assert "then refused: limits" in describe_check(refused)
+    assert run.derived() == []
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("http://127.0.0.1:1", "neither ws://HOST:PORT nor module:function"),
+        ("no_such_module:act", "No module named 'no_such_module'"),
+        ("scripted_policies:nothing", "has no attribute 'nothing'"),
+        ("scripted_policies", "neither ws://"),
+        ("math:pi", "float cannot be asked for actions"),
+    ],
+)
+def test_a_policy_that_is_none_is_told(address: str, words: str) -> None:
+    with pytest.raises(GstError, match=words):
+        open_policy(address, 1.0)
+
+
+def test_a_run_without_trials_of_the_task_says_so(run: RunFolder) -> None:
+    with pytest.raises(GstError, match="no trial of task 'fold'"):
+        roll_out_run(run, config("still", task="fold"), QUIET)
+
+
+def test_lerobots_policies_are_asked_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Acts:
+        def select_action(self, observation: dict[str, Any]) -> np.ndarray:
+            return np.asarray(observation["agent_pos"])
+
+    monkeypatch.setattr("scripted_policies.Acts", Acts, raising=False)
+    policy = open_policy("scripted_policies:Acts", 1.0)
+    assert policy.infer({"agent_pos": [1.0]}).tolist() == [1.0]

@@ -1,0 +1,229 @@
+"""Physics of the cell between two targets of a policy, and the limits at which it would stop."""
+
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.streams import JointTrack
+from bridge.robots.robot import GRIPPER_WIDTH
+from bridge.task.plan import Plan
+from bridge.task.predicate import Rollout, all_hold, evaluate_success
+from twin.physics.engines import PhysicsWorld, open_world
+from twin.policies.errors import StoppedError
+from twin.policies.starts import Start
+from twin.replay.dynamics import Samples, free_start, mesh_hulls, soft_models, spawn
+from twin.replay.observed import observed_plan
+from twin.replay.path import JointPath
+from twin.replay.result import ReplayResult
+from twin.replay.verdict import Commanded, judge_states
+from twin.robot.collision import hulls_of
+from twin.robot.model import check_dynamics, load_robot
+
+TOLERANCE = 1e-6
+"""Share by which a number may be beyond its limit: what a policy wrote as the limit is allowed."""
+
+
+class TwinCell:
+    """One cell in physics, from a start on. Close it at the end.
+
+    A target is gone to in a straight line in joint space, as a controller interpolates it.
+    """
+
+    def __init__(self, start: Start) -> None:
+        """Put the robot and the objects where they started, and let them come to rest."""
+        self.robot = load_robot(start.scene.urdf)
+        check_dynamics(self.robot)
+        self.start = start
+        self._hulls = hulls_of(self.robot)
+        self._soft = soft_models(start.scene)
+        self.scene = free_start(start.scene, self._soft)
+        self._rate_hz = start.config.physics.rate_hz
+        self._stride = self._rate_hz // start.config.sample_rate_hz
+        self._world: PhysicsWorld = open_world(
+            start.config.engines()[0],
+            self._hulls.robot.urdf,
+            mesh_hulls(self._hulls),
+            start.config.physics,
+        )
+        spawn(self._world, self.scene, self._soft)
+        self._world.reset_robot(start.joints_rad, start.width_m)
+        self.target_rad = np.array(start.joints_rad, dtype=np.float64)
+        self.target_width_m = float(start.width_m)
+        self._world.robot.command(
+            self.target_rad.tolist(), [0.0] * len(self.target_rad), self.target_width_m
+        )
+        for _ in range(round(start.config.settle_before_s * self._rate_hz)):
+            self._world.step()
+        self._steps = 0
+        self._samples = Samples(self.scene, self._soft)
+        self._samples.take(self._world, 0)
+        self._knots = [(0, self.target_rad)]
+        self._widths = [(0, self.target_width_m)]
+        self.burst = False
+
+    def steps_of(self, duration_s: float) -> int:
+        """Physics steps in a stretch of time; at least one."""
+        return max(1, round(duration_s * self._rate_hz))
+
+    @property
+    def t_ns(self) -> int:
+        """Since the start."""
+        return round(self._steps * 1e9 / self._rate_hz)
+
+    def posture(self) -> tuple[Float[np.ndarray, " num_joints"], float]:
+        """Joints [rad] and the distance between the pads [m], as encoders would say."""
+        return self._world.robot.posture()
+
+    def places(self) -> dict[str, Float[np.ndarray, "4 4"]]:
+        """Where the objects are, ``T_base_object``."""
+        moving = {name: self._world.T_base_object(name) for name in self.scene.movable()}
+        return {**self.scene.Ts_base_object, **moving}
+
+    def nodes_m(self) -> dict[str, Float32[np.ndarray, "num_nodes 3"]]:
+        """Where the nodes of soft objects are, base frame [m]."""
+        return {
+            name: self._world.soft_bodies().nodes_m(name).astype(np.float32) for name in self._soft
+        }
+
+    def go(
+        self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float, duration_s: float
+    ) -> None:
+        """Go to a target in a stretch of time.
+
+        Raises:
+            StoppedError: A limit of the robot refuses the target, or stops the arm on the way.
+        """
+        joints_rad = np.asarray(joints_rad, dtype=np.float64)
+        count = self.steps_of(duration_s)
+        self._refuse(joints_rad, width_m, count / self._rate_hz)
+        velocity = ((joints_rad - self.target_rad) / count * self._rate_hz).tolist()
+        self.target_width_m = float(width_m)
+        self._follow(count, joints_rad, velocity)
+        self.target_rad = joints_rad
+        self._knots.append((self.t_ns, joints_rad))
+        if width_m != self._widths[-1][1]:
+            self._widths.append((self._knots[-2][0], float(width_m)))
+        self._stop_where_the_arm_would()
+
+    def _follow(
+        self, count: int, joints_rad: Float[np.ndarray, " num_joints"], velocity: list[float]
+    ) -> None:
+        """So many steps of physics, in a straight line from the target before."""
+        first, way = self.target_rad, joints_rad - self.target_rad
+        for index in range(1, count + 1):
+            target = joints_rad if index == count else first + way * (index / count)
+            self._world.robot.command(target.tolist(), velocity, self.target_width_m)
+            self._world.step()
+            self._steps += 1
+            if self._steps % self._stride == 0 and not self._samples.take(self._world, self.t_ns):
+                self.burst = True
+                return
+
+    def _refuse(
+        self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float, duration_s: float
+    ) -> None:
+        robot = self.robot
+        if joints_rad.shape != self.target_rad.shape or not (
+            np.isfinite(joints_rad).all() and np.isfinite(width_m)
+        ):
+            raise StoppedError(
+                name="target",
+                detail=f"{len(robot.joints)} joints and a width were expected, all of them finite; "
+                f"got {np.array2string(joints_rad, precision=3)} and {width_m}",
+            )
+        beyond = np.maximum(robot.lower_rad - joints_rad, joints_rad - robot.upper_rad)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > TOLERANCE:
+            raise StoppedError(
+                name="limits",
+                detail=f"{robot.joints[worst]} at {joints_rad[worst]:.3f} rad is "
+                f"{beyond[worst]:.3f} rad beyond its range "
+                f"[{robot.lower_rad[worst]:.3f}, {robot.upper_rad[worst]:.3f}]",
+            )
+        speed = np.abs(joints_rad - self.target_rad) / duration_s
+        share = speed / robot.velocity_limit_rad_s
+        worst = int(np.argmax(share))
+        if share[worst] > 1 + TOLERANCE:
+            raise StoppedError(
+                name="limits",
+                detail=f"{robot.joints[worst]} would need {speed[worst]:.2f} rad/s, its limit is "
+                f"{robot.velocity_limit_rad_s[worst]:.2f}: go {share[worst]:.1f} x slower",
+            )
+        self._refuse_tool_speed(joints_rad, duration_s)
+
+    def _refuse_tool_speed(
+        self, joints_rad: Float[np.ndarray, " num_joints"], duration_s: float
+    ) -> None:
+        limit = self.robot.record.tool_speed_m_s
+        if limit is None:
+            return
+        Ts = self.robot.Ts_base_tcp(np.stack([self.target_rad, joints_rad]))
+        speed = float(np.linalg.norm(Ts[1, :3, 3] - Ts[0, :3, 3])) / duration_s
+        if speed > limit * (1 + TOLERANCE):
+            detail = f"the tool would go {speed:.2f} m/s, its limit is {limit:.2f}"
+            raise StoppedError(name="limits", detail=detail)
+
+    def _stop_where_the_arm_would(self) -> None:
+        record, found = self.robot.record, self.posture()[0]
+        off = np.abs(found - self.target_rad)
+        worst = int(np.argmax(off))
+        if record.tracking_error_rad is not None and off[worst] > record.tracking_error_rad:
+            detail = f"{self.robot.joints[worst]} is {off[worst]:.3f} rad from where it was sent"
+            raise StoppedError(name="tracking", detail=detail)
+        force_N = self._world.arm_force_N()
+        if record.contact_force_N is not None and force_N > record.contact_force_N:
+            detail = f"{force_N:.0f} N on the arm, it stops at {record.contact_force_N:.0f} N"
+            raise StoppedError(name="force", detail=detail)
+
+    def hold(self, duration_s: float) -> None:
+        """Stay where the last target was."""
+        self.go(self.target_rad, self.target_width_m, duration_s)
+
+    def rest(self, duration_s: float) -> None:
+        """Let everything settle, with the motors where they were sent; nothing stops that."""
+        none = [0.0] * len(self.target_rad)
+        self._follow(self.steps_of(duration_s), self.target_rad, none)
+
+    def succeeds(self) -> bool:
+        """Whether the task is done, as far as the states up to now tell."""
+        states = self._samples.states(self._world)
+        rollout = Rollout(
+            stamps_ns=states.stamps_ns,
+            Ts_base_object=states.Ts_base_object,
+            finger_contact=states.finger_contact,
+            extents_m=states.extents_m,
+            broken=states.broken,
+        )
+        return all_hold(evaluate_success(self.scene.task, rollout)) is True
+
+    def judged(self, info: EpisodeInfo) -> tuple[ReplayResult, Plan]:
+        """Judge all that happened, and tell it in a plan's words."""
+        states = self._samples.states(self._world)
+        arm = JointTrack(
+            names=self.robot.joints, stamps_ns=states.stamps_ns, position=states.joints_rad
+        )
+        widths = JointTrack(
+            names=(GRIPPER_WIDTH,), stamps_ns=states.stamps_ns, position=states.width_m[:, None]
+        )
+        plan = observed_plan(arm, widths, self.robot, self.scene.task, info)
+        commanded = Commanded(path=self._path(), trajectory="rollout")
+        return judge_states(commanded, states, plan, self.scene, self.start.config), plan
+
+    def _path(self) -> JointPath:
+        times, joints = zip(*self._knots, strict=True)
+        width_times, widths = zip(*self._widths, strict=True)
+        return JointPath(
+            times_ns=np.array(times, dtype=np.int64),
+            joints_rad=np.stack(joints),
+            width_times_ns=np.array(width_times, dtype=np.int64),
+            width_m=np.array(widths),
+            first_close_ns=next(
+                (t for (_, was), (t, w) in pairwise(self._widths) if w < was), None
+            ),
+        )
+
+    def close(self) -> None:
+        """Free the engine."""
+        self._world.__exit__(None, None, None)

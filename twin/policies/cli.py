@@ -1,0 +1,33 @@
+"""The command ``robot-gst rollout``; imports stay late so that --help is quick."""
+
+from pathlib import Path
+
+from bridge.terminal import Output
+from twin.policies.config import RolloutConfig
+
+OUTPUT = Output()
+
+
+def rollout(run: Path, /, *, config: RolloutConfig, output: Output = OUTPUT) -> int:
+    """Let a policy act in the twin from recorded starts, and compare with the cell.
+
+    Writes RUN/rollouts.csv, which ``robot-gst evaluate`` reads. Exit code 2 where a rollout says
+    nothing of the policy, with the reason.
+    Example: robot-gst rollout runs/monday --policy ws://127.0.0.1:8000 --map droid.toml
+    Example: robot-gst rollout runs/monday --policy my_policy:make --check
+
+    Args:
+        run: Run folder.
+    """
+    from bridge.episode.run_folder import RunFolder
+    from twin.policies.check import check_policy, describe_check
+    from twin.policies.runs import describe_rollouts, roll_out_run
+
+    folder = RunFolder.open(run)
+    if config.check:
+        found = check_policy(folder, config)
+        output.result(found, describe_check(found))
+        return 0
+    summary = roll_out_run(folder, config, output)
+    output.result(summary, describe_rollouts(summary))
+    return 2 if any(row["problem"] for row in summary["rows"]) else 0

@@ -1,0 +1,97 @@
+"""Open a policy by what it is called: ``ws://HOST:PORT``, or ``module:function`` in this Python."""
+
+import importlib
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+from twin.policies.errors import PolicyError
+from twin.policies.openpi import ServedPolicy
+
+WORDS = ("ws://", "wss://")
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """What acts in the cell."""
+
+    metadata: dict[str, Any]
+    """What it says of itself."""
+
+    def infer(self, observation: dict[str, Any]) -> Any:
+        """Answer an observation with rows of actions, or a map that holds them."""
+
+    def reset(self, seed: int) -> None:
+        """A new rollout begins."""
+
+    def close(self) -> None:
+        """Nothing more is asked."""
+
+
+@dataclass
+class ImportedPolicy:
+    """A function of this Python, or what it made."""
+
+    act: Callable[[dict[str, Any]], Any]
+    again: Callable[..., Any] | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def infer(self, observation: dict[str, Any]) -> Any:
+        """Call it; whatever it raises is the policy's failure."""
+        try:
+            return self.act(observation)
+        except Exception as error:  # whatever another's code raises
+            raise PolicyError(f"the policy failed: {type(error).__name__}: {error}") from error
+
+    def reset(self, seed: int) -> None:
+        """Tell it, where it has a ``reset``; the seed, where that takes one."""
+        if self.again is None:
+            return
+        if "seed" in inspect.signature(self.again).parameters:
+            self.again(seed=seed)
+        else:
+            self.again()
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def open_policy(address: str, timeout_s: float) -> Policy:
+    """Open a policy.
+
+    Args:
+        address: ``ws://HOST:PORT``, or ``module:name``: a factory without arguments, a function of
+            an observation, or an object with ``infer`` or ``select_action``.
+    """
+    if address.startswith(WORDS):
+        return ServedPolicy(address, timeout_s)
+    module, colon, name = address.partition(":")
+    if not colon or not name or "/" in address:
+        raise PolicyError(
+            f"--policy {address!r} is neither ws://HOST:PORT nor module:function of this Python"
+        )
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise PolicyError(f"--policy {address}: {error}") from error
+    if callable(found) and not _takes_one(found):
+        found = found()
+    for method in ("infer", "select_action"):
+        if callable(getattr(found, method, None)):
+            about = getattr(found, "metadata", {})
+            return ImportedPolicy(
+                act=getattr(found, method),
+                again=getattr(found, "reset", None),
+                metadata=dict(about) if isinstance(about, dict) else {},
+            )
+    if not callable(found):
+        raise PolicyError(f"--policy {address}: {type(found).__name__} cannot be asked for actions")
+    return ImportedPolicy(act=found)
+
+
+def _takes_one(found: Callable[..., Any]) -> bool:
+    if inspect.isclass(found):
+        return False
+    needed = [p for p in inspect.signature(found).parameters.values() if p.default is p.empty]
+    return len(needed) == 1

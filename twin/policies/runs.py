@@ -1,0 +1,138 @@
+"""Rollouts of one policy from many starts, and the table of all policies that were rolled out."""
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bridge.episode.catalogue import outcome_of
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError, UsageError
+from bridge.process_pool import Failed, runner_of
+from bridge.terminal import Output
+from bridge.whole_file import write_whole
+from twin.policies.config import RolloutConfig
+from twin.policies.rollout import ROLLOUT, RolloutJob, roll_out, row_of_file
+from twin.policies.starts import trial_episodes
+
+TABLE = "rollouts.csv"
+COLUMNS = ("trial_id", "task", "policy", "start_id", "recorded", "sim_planned", "stand_in")
+"""As ``robot-gst evaluate`` reads them; ``sim_planned`` is the rollout in the twin."""
+
+
+def jobs_of(run: RunFolder, config: RolloutConfig) -> Iterator[RolloutJob]:
+    """List the rollouts that are asked for."""
+    episodes = trial_episodes(run, config.task)
+    for episode, drawn in _starts(episodes, config.starts):
+        for number in range(config.times):
+            yield RolloutJob(
+                run_path=run.path.resolve(),
+                episode_path=episode.path.resolve(),
+                drawn=drawn,
+                seed=config.seed,
+                number=number,
+                policy=config.policy,
+                name=config.name or config.policy,
+                map_path=config.map,
+                max_s=config.max_s,
+                latency_s=config.latency_s,
+                timeout_s=config.timeout_s,
+            )
+
+
+def _starts(episodes: Sequence[Episode], starts: str) -> Iterator[tuple[Episode, int | None]]:
+    if starts == "recorded":
+        yield from ((episode, None) for episode in episodes)
+        return
+    if not starts.isdigit() or not 1 <= int(starts) <= 10_000:
+        raise UsageError(f"--starts {starts!r} is neither 'recorded' nor a number from 1 to 10000")
+    first = {episode.info.task: episode for episode in reversed(episodes)}
+    yield from ((episode, number) for episode in first.values() for number in range(int(starts)))
+
+
+def roll_out_run(run: RunFolder, config: RolloutConfig, output: Output) -> dict[str, Any]:
+    """Do what is not there yet, and write the table.
+
+    Returns:
+        ``rows`` of these rollouts and the ``table``.
+    """
+    run.refuse_empty()
+    rows, todo = [], []
+    for job in jobs_of(run, config):
+        row = None if config.force else row_of_file(job.path())
+        if row is None:
+            todo.append(job)
+        else:
+            rows.append(row)
+    with output.progress("rollout", len(todo)) as advance, runner_of(config.workers) as runner:
+        for done, (job, answer) in enumerate(runner.run(roll_out, todo, RolloutJob.cost), start=1):
+            if isinstance(answer, Failed):
+                output.detail(answer.trace)
+                raise UsageError(f"{job.episode_path.stem}: {answer.message}")
+            rows.append(answer)
+            advance(done, job.episode_path.stem)
+    for reason in dict.fromkeys(row["problem"] for row in rows if row["problem"]):
+        output.say(reason)
+    rows.sort(key=lambda row: (row["task"], row["start_id"], row["number"]))
+    return {"run": str(run.path), "rows": rows, "table": str(write_table(run))}
+
+
+def write_table(run: RunFolder) -> Path:
+    """Write every rollout of a run beside what was recorded of the same policy from its start."""
+    recorded = _recorded(run)
+    rows = []
+    for path in run.derived(f"*.{ROLLOUT}.*"):
+        row = row_of_file(path)
+        if row is None or row["success"] is None:
+            continue
+        key = (row["policy"], row["task"], row["start_id"])
+        outcome, stand_in = recorded.get(key, ("", _stand_in(path)))
+        name = f"{row['policy']} {row['start_id']} {row['number']}"
+        about = (row["task"], row["policy"], row["start_id"])
+        outcome = "" if row["number"] else outcome  # one trial in the cell counts once
+        rows.append((name, *about, outcome, int(row["success"]), stand_in))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([COLUMNS, *sorted(rows)])
+    path = run.path / TABLE
+    write_whole(path, text.getvalue().encode())
+    return path
+
+
+def _stand_in(path: Path) -> str:
+    return str(Episode.open(path).info.stand_in).lower()
+
+
+def _recorded(run: RunFolder) -> dict[tuple[str, str, str], tuple[str, str]]:
+    """By policy, task and start: the outcome in the cell, and whether that is a stand-in."""
+    found = {}
+    for path in run.episodes():
+        try:
+            episode = Episode.open(path)
+            info, outcome = episode.info, outcome_of(run, episode)
+        except GstError:  # which `check` names
+            continue
+        if info.kind == "trial" and outcome is not None and outcome.result != "unknown":
+            key = (info.policy, info.task, info.start_id or info.id)
+            found[key] = (str(int(outcome.result == "success")), str(info.stand_in).lower())
+    return found
+
+
+def describe_rollouts(summary: Mapping[str, Any]) -> str:
+    """What became of a policy, task by task, and what to do next."""
+    rows: list[dict[str, Any]] = summary["rows"]
+    lines = []
+    for task in dict.fromkeys(row["task"] for row in rows):
+        mine = [row for row in rows if row["task"] == task]
+        judged = [row for row in mine if row["success"] is not None]
+        done = sum(row["success"] for row in judged)
+        stopped = sum(bool(row["stopped"]) for row in judged)
+        line = f"{task or 'no start'}: {done} of {len(judged)} rollouts succeed"
+        line += f", {stopped} stopped by a limit" if stopped else ""
+        line += f"; {len(mine) - len(judged)} say nothing" if len(judged) < len(mine) else ""
+        lines.append(line)
+        lines += [f"  {row['start_id']}: {row['detail']}" for row in mine if not row["success"]]
+    lines.append(f"next: robot-gst evaluate {summary['table']}")
+    return "\n".join(lines)

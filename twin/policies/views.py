@@ -1,0 +1,121 @@
+"""What the cell's cameras see of the twin while a policy acts."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.policies.cell import TwinCell
+from twin.policies.errors import PolicyError
+from twin.policies.mapping import fitting
+from twin.policies.starts import Start
+from twin.replay.images import Drawable, set_up
+from twin.robot.model import load_robot
+from twin.robot.posture import Posture
+from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
+from twin.scene.raster.backend import open_rasteriser
+from twin.scene.render import carried_camera, sized_camera
+from twin.scene.store.calibration import read_calibration
+
+Pictures = Mapping[str, UInt8[np.ndarray, "height width 3"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Viewpoint:
+    """One camera: where it stands, or where it sits in the hand."""
+
+    camera: Camera
+    T_base_camera: Float[np.ndarray, "4 4"]
+    """At the start; for good, where it stands still."""
+    T_tcp_camera: Float[np.ndarray, "4 4"] | None = None
+
+    def T(self, T_base_tcp: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """``T_base_camera`` with the hand at a pose."""
+        if self.T_tcp_camera is not None:
+            return np.asarray(T_base_tcp @ self.T_tcp_camera)
+        return self.T_base_camera
+
+
+class TwinCameras:
+    """Draws a cell through the cameras that recorded one of its episodes."""
+
+    def __init__(
+        self,
+        run: RunFolder,
+        start: Start,
+        cameras: Sequence[str] = (),
+        sizes: Mapping[str, tuple[int, int]] | None = None,
+    ) -> None:
+        """Read the scene.
+
+        Args:
+            cameras: Ids; none: all that the episode has.
+            sizes: Width and height in which the picture of a camera is to fit; others are drawn
+                as they were recorded.
+        """
+        episode = Episode.open(start.episode_path)
+        known = streams.camera_ids(episode)
+        unknown = [name for name in cameras if name not in known]
+        if unknown:
+            raise PolicyError(
+                f"no camera {', '.join(unknown)} in {episode.info.id}; it has: "
+                f"{', '.join(known) or 'none'}"
+            )
+        self._drawable: Drawable = set_up(run, episode, start.scene)
+        self._rasteriser = open_rasteriser()
+        self.viewpoints = {
+            name: _viewpoint(run, episode, start, name, (sizes or {}).get(name))
+            for name in cameras or known
+        }
+
+    def draw(self, cell: TwinCell) -> Pictures:
+        """One picture for each camera."""
+        joints_rad, width_m = cell.posture()
+        cloud = self._drawable.at(
+            cell.places(), cell.nodes_m(), Posture(joints_rad=joints_rad, width_m=width_m)
+        )
+        T_base_tcp = cell.robot.T_base_tcp(joints_rad)
+        pictures = {}
+        for name, place in self.viewpoints.items():
+            T = place.T(T_base_tcp)
+            view = self._rasteriser.view(cloud, place.camera, T)
+            if self._drawable.parts.backdrop is not None:
+                view = self._drawable.parts.backdrop.behind(view, place.camera, T)
+            pictures[name] = view.image_u8()
+        return pictures
+
+
+def _viewpoint(
+    run: RunFolder, episode: Episode, start: Start, camera_id: str, size: tuple[int, int] | None
+) -> Viewpoint:
+    info = streams.camera_info(episode, camera_id)
+    camera = info.camera if size is None else _fitted_in(info.camera, size)
+    calibration, tree = read_calibration(run), base_tree(episode)
+    place = None if calibration is None else calibration.cameras.get(camera_id)
+    if place is not None:
+        stamps_ns = np.array([start.stamp_ns], dtype=np.int64)
+        tree = calibrated_tree_at(episode, camera_id, place, stamps_ns)
+    base = streams.recorded_robot(episode).base_frame
+    if info.frame_id not in tree.frames() or tree.root_of(info.frame_id) != base:
+        raise PolicyError(
+            f"nobody recorded where camera {camera_id} was in {base}; calibrate it "
+            "(robot-gst calibrate RUN --cameras) or leave it out"
+        )
+    carried = carried_camera(episode, info.frame_id, start.joints_rad, tree)
+    if carried is None:
+        T = tree.T_root_frame(info.frame_id, start.stamp_ns)
+        return Viewpoint(camera=camera, T_base_camera=T)
+    hand = load_robot(start.scene.urdf).T_base_tcp(start.joints_rad)
+    return Viewpoint(camera=camera, T_base_camera=carried, T_tcp_camera=se3.invert(hand) @ carried)
+
+
+def _fitted_in(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The same view, as large as fits."""
+    width, height = fitting(camera.width, camera.height, size)
+    return sized_camera(camera, f"{width}x{height}")
