@@ -149,7 +149,8 @@ class Interpreter:
             share = width_m / self._max_width_m if self._max_width_m else 0.0
             return np.array([1.0 - share if value == "closed" else share])
         q_wxyz, p_m = se3.split(self._robot.T_base_tcp(joints_rad))
-        return p_m if value == "tool_m" else q_wxyz
+        found: Float[np.ndarray, " num_values"] = p_m if value == "tool_m" else q_wxyz
+        return found
 
     def rows(self, answer: object) -> Float[np.ndarray, "num_rows num_values"]:
         """Take the rows out of an answer.

@@ -19,8 +19,11 @@ from twin.replay.images import Drawable, set_up
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
+from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
 from twin.scene.raster.backend import open_rasteriser
+from twin.scene.raster.rasteriser import View
 from twin.scene.render import carried_camera, sized_camera
+from twin.scene.robot.splats import posed
 from twin.scene.store.calibration import read_calibration
 
 Pictures = Mapping[str, UInt8[np.ndarray, "height width 3"]]
@@ -69,6 +72,7 @@ class TwinCameras:
             )
         self._drawable: Drawable = set_up(run, episode, start.scene)
         self._rasteriser = open_rasteriser()
+        self._kept: tuple[bytes, GaussianCloud] | None = None
         self.viewpoints = {
             name: _viewpoint(run, episode, start, name, (sizes or {}).get(name))
             for name in cameras or known
@@ -77,18 +81,41 @@ class TwinCameras:
     def draw(self, cell: TwinCell) -> Pictures:
         """One picture for each camera."""
         joints_rad, width_m = cell.posture()
-        cloud = self._drawable.at(
-            cell.places(), cell.nodes_m(), Posture(joints_rad=joints_rad, width_m=width_m)
-        )
+        posture = Posture(joints_rad=joints_rad, width_m=width_m)
+        cloud = self._cloud(cell, posture)
         T_base_tcp = cell.robot.T_base_tcp(joints_rad)
-        pictures = {}
-        for name, place in self.viewpoints.items():
-            T = place.T(T_base_tcp)
-            view = self._rasteriser.view(cloud, place.camera, T)
-            if self._drawable.parts.backdrop is not None:
-                view = self._drawable.parts.backdrop.behind(view, place.camera, T)
-            pictures[name] = view.image_u8()
-        return pictures
+        return {
+            name: self._picture(cloud, place.camera, place.T(T_base_tcp))
+            for name, place in self.viewpoints.items()
+        }
+
+    def _cloud(self, cell: TwinCell, posture: Posture) -> GaussianCloud:
+        """Everything where it is now; what stood still is kept from the last picture."""
+        places, nodes = cell.places(), cell.nodes_m()
+        key = b"".join(T.round(6).tobytes() for T in places.values())
+        key += b"".join(rows.tobytes() for rows in nodes.values())
+        if self._kept is None or self._kept[0] != key:
+            self._kept = key, self._drawable.at(places, nodes, None)
+        parts = self._drawable.parts
+        if not parts.links:
+            return self._kept[1]
+        urdf = self._drawable.urdf
+        robot = posed(
+            parts.links, posture.joints_rad, urdf, width_m=posture.width_m, lighting=parts.lighting
+        )
+        return concatenate([self._kept[1], moved_cloud(robot, parts.T_root_base)])
+
+    def _picture(
+        self, cloud: GaussianCloud, camera: Camera, T: Float[np.ndarray, "4 4"]
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Colours alone: depth costs as much again, and no policy is sent it."""
+        planes = self._rasteriser.draw_planes(cloud, camera, T)
+        image = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))
+        view = View(image=image, depth_m=np.zeros_like(planes[4]), alpha=planes[4])
+        backdrop = self._drawable.parts.backdrop
+        if backdrop is not None:
+            view = backdrop.behind(view, camera, T)
+        return view.image_u8()
 
 
 def _viewpoint(

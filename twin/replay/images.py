@@ -54,7 +54,7 @@ class Drawable:
         self,
         Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
         nodes_m: Mapping[str, Float32[np.ndarray, "num_nodes 3"]],
-        posture: Posture,
+        posture: Posture | None,
     ) -> GaussianCloud:
         """The scene in one state."""
         bent = {
