@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.episode.catalogue import outcome_of
+from bridge.episode.metadata import WITH
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
@@ -88,10 +89,11 @@ def write_table(run: RunFolder) -> Path:
         if row is None or row["success"] is None:
             continue
         key = (row["policy"], row["task"], row["start_id"])
-        outcome, stand_in = recorded.get(key, ("", _stand_in(path)))
-        name = f"{row['policy']} {row['start_id']} {row['number']}"
+        outcomes, number = recorded.get(key, []), row["number"]
+        outcome = int(outcomes[number]) if number < len(outcomes) else ""  # each counts once
+        name = f"{row['policy']} {row['start_id']} {number}"
+        stand_in = str(Episode.open(path).info.stand_in).lower()
         about = (row["task"], row["policy"], row["start_id"])
-        outcome = "" if row["number"] else outcome  # one trial in the cell counts once
         rows.append((name, *about, outcome, int(row["success"]), stand_in))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -101,22 +103,20 @@ def write_table(run: RunFolder) -> Path:
     return path
 
 
-def _stand_in(path: Path) -> str:
-    return str(Episode.open(path).info.stand_in).lower()
-
-
-def _recorded(run: RunFolder) -> dict[tuple[str, str, str], tuple[str, str]]:
-    """By policy, task and start: the outcome in the cell, and whether that is a stand-in."""
-    found = {}
+def _recorded(run: RunFolder) -> dict[tuple[str, str, str], list[bool]]:
+    """By policy, task and start: the outcomes in the cell, without what replanning added."""
+    found: dict[tuple[str, str, str], list[bool]] = {}
     for path in run.episodes():
         try:
             episode = Episode.open(path)
             info, outcome = episode.info, outcome_of(run, episode)
         except GstError:  # which `check` names
             continue
-        if info.kind == "trial" and outcome is not None and outcome.result != "unknown":
+        if info.kind != "trial" or info.condition == WITH or outcome is None:
+            continue
+        if outcome.result != "unknown":
             key = (info.policy, info.task, info.start_id or info.id)
-            found[key] = (str(int(outcome.result == "success")), str(info.stand_in).lower())
+            found.setdefault(key, []).append(outcome.result == "success")
     return found
 
 

@@ -8,9 +8,10 @@ import pytest
 from scripted_policies import Scripted
 
 from bridge.episode.catalogue import label_episode
-from bridge.episode.metadata import Outcome
+from bridge.episode.metadata import WITH, EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
 from bridge.errors import GstError, UsageError
 from bridge.exchange.trials_csv import read_trials
 from bridge.terminal import Output
@@ -22,14 +23,23 @@ from twin.policies.runs import TABLE, describe_rollouts, roll_out_run
 QUIET = Output(quiet=True)
 
 
+def write_trial(run: RunFolder, name: str, start_id: str, **more: str) -> None:
+    """A further trial, of which only the metadata counts."""
+    with EpisodeWriter(run.episodes_dir / f"{name}.mcap") as writer:
+        about = {"task": "cube_into_box", "policy": "Scripted", **more}
+        writer.describe(EpisodeInfo(id=name, kind="trial", start_id=start_id, **about))
+
+
 def config(policy: str, **more: Any) -> RolloutConfig:
     address = f"scripted_policies:{policy}"
     return RolloutConfig(policy=address, name=policy, workers=1, **{"max_s": 2.0, **more})
 
 
 def test_a_policy_that_does_the_task_is_judged_kept_and_compared(run: RunFolder) -> None:
-    label_episode(run, "trial_1", Outcome(result="success"))
-    label_episode(run, "trial_2", Outcome(result="failure"))
+    write_trial(run, "trial_3", "start 1", condition=WITH)  # another condition: not compared
+    write_trial(run, "trial_4", "start 1")
+    for name, result in (("1", "success"), ("2", "failure"), ("3", "failure"), ("4", "failure")):
+        label_episode(run, f"trial_{name}", Outcome(result=result))
     Scripted.seeds.clear()
     found = roll_out_run(run, config("Scripted", max_s=30.0, seed=7, times=2), QUIET)
     assert [row["success"] for row in found["rows"]] == [True] * 4
@@ -38,7 +48,7 @@ def test_a_policy_that_does_the_task_is_judged_kept_and_compared(run: RunFolder)
     trials = read_trials(run.path / TABLE)
     assert [(t.start_id, t.policy, t.recorded, t.sim_planned) for t in trials] == [
         ("start 1", "Scripted", True, True),
-        ("start 1", "Scripted", None, True),
+        ("start 1", "Scripted", False, True),
         ("start 2", "Scripted", False, True),
         ("start 2", "Scripted", None, True),
     ]
