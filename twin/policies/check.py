@@ -9,6 +9,7 @@ from bridge.episode.run_folder import RunFolder
 from twin.policies.cell import TwinCell
 from twin.policies.config import RolloutConfig
 from twin.policies.errors import PolicyError, StoppedError
+from twin.policies.gap import describe_gap, visual_gap
 from twin.policies.mapping import Interpreter, read_mapping
 from twin.policies.policy import open_policy
 from twin.policies.starts import open_start, trial_episodes
@@ -20,7 +21,7 @@ def check_policy(run: RunFolder, config: RolloutConfig) -> dict[str, Any]:
 
     Returns:
         ``sent`` and ``answered``: shape, type and range by key; ``first``: the first target, how
-        far it is from where the arm stands, and what refuses it.
+        far it is from where the arm stands, and what refuses it; ``gap``: the visual gap.
     """
     episode = trial_episodes(run, config.task)[0]
     start = open_start(run, episode)
@@ -41,7 +42,8 @@ def check_policy(run: RunFolder, config: RolloutConfig) -> dict[str, Any]:
             "kind": mapping.actions.kind,
             "rate_hz": mapping.rate_hz,
         }
-        return found | _first(speak, cell, rows)
+        found |= _first(speak, cell, rows)
+        return found | {"gap": visual_gap(run, episode, policy, speak, config.seed)}
     finally:
         policy.close()
         cell.close()
@@ -96,4 +98,4 @@ def describe_check(found: Mapping[str, Any]) -> str:
     )
     if found["refused"]:
         lines.append(f"then refused: {found['refused']}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *describe_gap(found["gap"])])

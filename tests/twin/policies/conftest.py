@@ -27,6 +27,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.media.color import encode_png
 from bridge.robots.default import ARM_JOINTS
 from twin.policies import starts
 from twin.policies.starts import Start
@@ -105,9 +106,6 @@ def write_trial(run: RunFolder, name: str, start_id: str, joints: np.ndarray) ->
         for camera in ("side", "wrist"):
             about = CameraInfo(stamp_ns=T0, frame_id=camera, camera=CAMERA)
             say(f"/cell/cam/{camera}/color/info", about.to_cdr(), schema.CAMERA_INFO, T0)
-            image = CompressedColor(stamp_ns=T0, frame_id=camera, format="jpeg", data=b"-")
-            topic = f"/cell/cam/{camera}/color/image"
-            say(topic, image.to_cdr(), schema.COMPRESSED_IMAGE, T0)
         for index in range(11):
             stamp, now = T0 + index * 100_000_000, joints + index * np.array([0.05, 0, 0, 0, 0, 0])
             poses = {"side": T_BASE_SIDE, "wrist": robot.T_base_tcp(now) @ T_TCP_WRIST}
@@ -116,6 +114,13 @@ def write_trial(run: RunFolder, name: str, start_id: str, joints: np.ndarray) ->
                 for child, T in poses.items()
             ]
             say("/tf", transforms_to_cdr(transforms), schema.TF_MESSAGE, stamp)
+            for camera in poses:  # grey that gets lighter
+                shade = np.full((CAMERA.height, CAMERA.width, 3), 20 * index, dtype=np.uint8)
+                image = CompressedColor(
+                    stamp_ns=stamp, frame_id=camera, format="png", data=encode_png(shade)
+                )
+                topic = f"/cell/cam/{camera}/color/image"
+                say(topic, image.to_cdr(), schema.COMPRESSED_IMAGE, stamp)
             for topic, names, values in (
                 ("joint_states", ARM_JOINTS, now),
                 ("gripper/state", ("gripper_width",), np.array([0.085])),

@@ -1,0 +1,150 @@
+"""The visual gap: how a policy acts on the cell's pictures, and on the twin's of the same states.
+
+A policy that acts otherwise because it sees something else is no judge of the twin's physics. The
+yardstick is the policy itself: how much its answer changes from one recorded picture to the next,
+and when it is asked the same thing twice.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import streams
+from bridge.episode.cdr.messages import CompressedColor, RawColor, color_from_message
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from twin.policies.errors import PolicyError
+from twin.policies.mapping import Interpreter
+from twin.policies.policy import Policy
+from twin.policies.views import Pictures
+from twin.robot.posture import Posture
+from twin.scene.raster.backend import open_rasteriser
+from twin.scene.render import poses_in_scene
+from twin.scene.sequence import Artist, Frame
+from twin.scene.store.folder import read_scene
+from twin.scene.trial import TrialInScene, open_trial
+
+INSTANTS = 12
+"""So many states of a trial are looked at."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _State:
+    """One recorded instant, and the picture that came next."""
+
+    posture: Posture
+    recorded: Pictures
+    following: Pictures
+    rendered: Pictures
+
+
+def visual_gap(
+    run: RunFolder, episode: Episode, policy: Policy, speak: Interpreter, seed: int
+) -> dict[str, Any]:
+    """Ask a policy about recorded states, in pictures of the cell and of the twin.
+
+    Returns:
+        Root mean squares over an answer's numbers, the gripper's left out, and over instants:
+        ``rendered`` pictures instead of recorded ones (all, and of each camera alone), the
+        ``following`` picture, and the same one ``again``; empty where nothing was recorded.
+    """
+    names = speak.cameras() or tuple(streams.camera_ids(episode))
+    states = list(_states(run, episode, names))
+    if not states:
+        return {}
+
+    def answer(pictures: Pictures, posture: Posture) -> Float[np.ndarray, "num_rows num_values"]:
+        policy.reset(seed)
+        told = speak.observation(pictures, posture.joints_rad, posture.width_m)
+        rows = speak.rows(policy.infer(told))[: speak.mapping.horizon or None]
+        return rows[:, : speak.num_values() - (speak.mapping.actions.gripper != "none")]
+
+    squares: dict[str, list[float]] = {}
+    for state in states:
+        first = answer(state.recorded, state.posture)
+        others = {"again": state.recorded, "following": state.following, "all": state.rendered}
+        others |= {name: {**state.recorded, name: state.rendered[name]} for name in names}
+        for what, pictures in others.items():
+            rows = answer(pictures, state.posture)
+            if rows.shape != first.shape:
+                shapes = f"{first.shape} and {rows.shape}"
+                raise PolicyError(f"the policy's answers differ in length: {shapes}")
+            squares.setdefault(what, []).append(float(np.mean((rows - first) ** 2)))
+    found = {what: float(np.sqrt(np.mean(values))) for what, values in squares.items()}
+    return {
+        "episode": episode.info.id,
+        "instants": len(states),
+        "again": found.pop("again"),
+        "following": found.pop("following"),
+        "rendered": found,
+    }
+
+
+def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[_State]:
+    trial = open_trial(run, read_scene(run), episode)
+    pictures = {name: _recorded(episode, name) for name in names}
+    if trial.postures is None or not all(len(items) > 1 for items in pictures.values()):
+        return
+    clock = [item.stamp_ns for item in pictures[names[0]][:-1]]
+    seen = [t for t in clock if trial.postures.covers(t)]
+    chosen = np.unique(np.linspace(0, len(seen) - 1, INSTANTS).round().astype(int)) if seen else []
+    artists = {name: _artist(trial, episode, name) for name in names}
+    stamps = np.array([seen[k] for k in chosen], dtype=np.int64)
+    trees = {name: poses_in_scene(run, read_scene(run), episode, name, stamps) for name in names}
+    for stamp_ns in stamps.tolist():
+        places, posture = trial.places(stamp_ns), trial.postures.at(stamp_ns)
+        frames = {
+            name: Frame(
+                stamp_ns=stamp_ns,
+                T_base_camera=tree.T_root_frame(_frame_id(episode, name), stamp_ns),
+                Ts_base_object=places,
+                posture=posture,
+            )
+            for name, tree in trees.items()
+        }
+        near = {
+            name: min(range(len(items) - 1), key=lambda k: abs(items[k].stamp_ns - stamp_ns))
+            for name, items in pictures.items()
+        }
+        yield _State(
+            posture=posture,
+            recorded={name: pictures[name][k].image_u8() for name, k in near.items()},
+            following={name: pictures[name][k + 1].image_u8() for name, k in near.items()},
+            rendered={name: artists[name].draw(frame).image_u8 for name, frame in frames.items()},
+        )
+
+
+def _recorded(episode: Episode, camera_id: str) -> list[CompressedColor | RawColor]:
+    topic = streams.find_camera_topic(episode, camera_id, "color/image")
+    messages = episode.messages([] if topic is None else [topic])
+    return [color_from_message(message.type_name, message.data) for message in messages]
+
+
+def _artist(trial: TrialInScene, episode: Episode, camera_id: str) -> Artist:
+    return Artist(
+        rasteriser=open_rasteriser(),
+        parts=trial.parts,
+        urdf=trial.postures.urdf if trial.postures is not None else "",
+        camera=streams.camera_info(episode, camera_id).camera,
+    )
+
+
+def _frame_id(episode: Episode, camera_id: str) -> str:
+    return streams.camera_info(episode, camera_id).frame_id
+
+
+def describe_gap(gap: Mapping[str, Any]) -> list[str]:
+    """What the twin's pictures change, beside what the cell's own do."""
+    if not gap:
+        return ["visual gap: not measured, the trial has no pictures and joints of its motion"]
+    rendered, step = gap["rendered"], max(gap["following"], gap["again"])
+    times = f", {rendered['all'] / step:.1f} x as much" if step > 0 else ""
+    alone = ", ".join(f"{name} {value:.3g}" for name, value in rendered.items() if name != "all")
+    return [
+        f"visual gap: the twin's pictures of {gap['instants']} states of {gap['episode']} change "
+        f"its actions by {rendered['all']:.3g} (rms; {alone}); the next recorded picture does by "
+        f"{gap['following']:.3g}, asking again by {gap['again']:.3g}{times}"
+    ]
