@@ -2,8 +2,10 @@
 
 import importlib
 import inspect
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from twin.policies.errors import PolicyError
@@ -71,6 +73,8 @@ def open_policy(address: str, timeout_s: float) -> Policy:
         raise PolicyError(
             f"--policy {address!r} is neither ws://HOST:PORT nor module:function of this Python"
         )
+    if not any(Path(place or ".").resolve() == Path.cwd() for place in sys.path):
+        sys.path.append(str(Path.cwd()))  # a file beside the run, after all that is installed
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:

@@ -63,7 +63,7 @@ def roll_out_run(run: RunFolder, config: RolloutConfig, output: Output) -> dict[
     rows, todo = [], []
     for job in jobs_of(run, config):
         row = None if config.force else row_of_file(job.path())
-        if row is None:
+        if row is None or row["problem"]:
             todo.append(job)
         else:
             rows.append(row)

@@ -74,7 +74,7 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
         raise PolicyError(f"{episode.path}: nobody recorded which robot it is (robot_description)")
     task = streams.task_file(episode).task()
     begun_ns = first_execution_ns(episode)
-    stamp_ns = episode.start_ns if begun_ns is None else begun_ns
+    stamp_ns = begun_ns or streams.first_stamp_ns(episode) or episode.start_ns
     found = localised_starts(run, episode, task, scene_hash=scene_hash_of(run)).at(stamp_ns)
     rebuilt = read_rebuilt_scene(run, task)
     scene = rebuilt.scene(task, urdf, found.Ts_base_object, reasons=found.reasons)
@@ -82,11 +82,13 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
         raise PolicyError(f"{episode.info.id} gives no start: {scene.describe_missing()}")
     robot = load_robot(urdf)
     joints_rad = recorded_start(episode, stamp_ns, robot.joints)
+    if joints_rad is None:
+        raise PolicyError(f"{episode.info.id} gives no start: nobody recorded where the arm was")
     return Start(
         id=episode.info.start_id or episode.info.id,
         episode_path=episode.path,
         scene=scene,
-        joints_rad=robot.home_rad if joints_rad is None else joints_rad,
+        joints_rad=joints_rad,
         width_m=_width_m(episode, urdf, stamp_ns),
         stamp_ns=stamp_ns,
         config=for_task(ReplayConfig(), read_calibration(run), task),

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from bridge.errors import GstError
-from twin.policies.errors import PolicyError
+from twin.policies.errors import PolicyError, StoppedError
 from twin.policies.mapping import Actions, Interpreter, PolicyMap, fitted, read_mapping
 from twin.policies.starts import Start
 from twin.robot.model import RobotModel, load_robot
@@ -110,7 +110,7 @@ def test_the_tool_goes_where_it_is_sent(robot: RobotModel, start: Start) -> None
     target, _ = speaker(robot, kind="ee_pose", gripper="none").target(pose, start.joints_rad, 0.0)
     np.testing.assert_allclose(robot.T_base_tcp(target)[:3, 3], pose[:3], atol=6e-4)
     far = np.array([5.0, 0, 0, 0, 0, 0])
-    with pytest.raises(PolicyError, match=r"does not reach the tool at .*mm and"):
+    with pytest.raises(StoppedError, match=r"reach: the arm does not bring the tool to .*mm and"):
         speak.target(far, start.joints_rad, 0.0)
 
 

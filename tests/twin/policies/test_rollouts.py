@@ -1,6 +1,8 @@
 """Rollouts from recorded starts: judged, kept, told in a table; policies that fail are marked."""
 
 import re
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -81,6 +83,10 @@ def test_what_a_policy_does_wrong_is_told(
     assert all(re.search(words, row["detail"]) for row in found["rows"])
     rows = (run.path / TABLE).read_text().splitlines()[1:]
     assert len(rows) == (0 if success is None else 2)
+    made = {path: path.stat().st_mtime_ns for path in run.derived("*.rollout.*")}
+    roll_out_run(run, config(policy), QUIET)
+    again = {path: path.stat().st_mtime_ns for path in run.derived("*.rollout.*")}
+    assert (again == made) is (success is not None)  # what says nothing is asked anew
 
 
 def test_the_clock_runs_on_while_it_thinks(run: RunFolder) -> None:
@@ -100,7 +106,7 @@ def test_starts_are_drawn_as_the_task_says(run: RunFolder) -> None:
             roll_out_run(run, config("still", starts=wrong), QUIET)
 
 
-def test_a_check_explains_one_answer_and_writes_nothing(run: RunFolder) -> None:
+def test_a_check_explains_one_answer_and_rolls_nothing_out(run: RunFolder) -> None:
     found = check_policy(run, config("Scripted"))
     text = describe_check(found)
     assert "pixels.side: 48 x 64 x 3 uint8" in text
@@ -110,7 +116,14 @@ def test_a_check_explains_one_answer_and_writes_nothing(run: RunFolder) -> None:
     refused = check_policy(run, config("reckless"))
     assert refused["followed"] == 0
     assert "then refused: limits" in describe_check(refused)
-    assert run.derived() == []
+    assert run.derived("*.rollout.*") == []
+
+
+def test_a_file_beside_the_run_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine_alone.py").write_text("def act(observation):\n    return [7.0]\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    assert open_policy("mine_alone:act", 1.0).infer({}) == [7.0]
 
 
 @pytest.mark.parametrize(
