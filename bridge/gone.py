@@ -53,6 +53,10 @@ GONE: dict[str, str] = {
         ("rebuild --align-poses", "rebuild --refine-poses", "rebuild --align-holdout"),
         "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them.",
     ),
+    **dict.fromkeys(
+        ("rebuild --features", "rebuild --feature-channels", "rebuild --feature-stride"),
+        "Nothing read DINOv3's features; --clip lets robot-gst find go by meaning.",
+    ),
     "rebuild --depth-model": "rebuild needs depth images: it finds no depth of its own.",
     **dict.fromkeys(
         ("rebuild --generator", "rebuild --generator-timeout-s"),

@@ -82,8 +82,17 @@ LEAVES: dict[str, Leaf] = {
         purpose="naming the things of a scene",
         entries={
             "check_models": "twin.scene.foundation.stage:check_models",
-            "name_things": "twin.scene.foundation.things:write_scene_semantics",
+            "name_things": "twin.scene.foundation.stage:write_scene_semantics",
         },
+        commands=(
+            *commands_of(
+                REBUILD,
+                "twin.scene.foundation.cli",
+                """
+                find | Find things of the scene by words. | runs/x "the box's rim"
+                """,
+            ),
+        ),
     ),
     "soft": Leaf(
         modules=(

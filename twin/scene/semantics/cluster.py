@@ -1,7 +1,6 @@
 """Divide points into things: connected voxels, cut along valleys and where colours differ."""
 
 import heapq
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from twin.naming.colours import lab_from_srgb, without_shading
-from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_shape
+from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,47 +235,6 @@ def _merged(
             root = owner[root]
         owner[patch] = root
     return numbered(np.array(owner, dtype=np.int64))
-
-
-def joined_by_outline(
-    pieces: Sequence[Int[np.ndarray, " _"]],
-    voxels: Voxels,
-    height_m: Float[np.ndarray, " num_voxels"],
-    voxel_m: float,
-    config: ValleySplitConfig,
-) -> list[Int[np.ndarray, " _"]]:
-    """Join pieces of one colour of which one lies over the other, or that make a container.
-
-    What one camera sees of a thing may fall into pieces: the far wall of a box behind the near
-    one, a head in front of its body.
-    """
-    xyh = np.concatenate([voxels.p_m[:, :2], height_m[:, None]], axis=1)
-    left = sorted(pieces, key=len)
-    colours = [
-        np.median(without_shading(voxels.lab[ids], config.lightness_weight), axis=0) for ids in left
-    ]
-    joined: list[np.ndarray] = []
-    for index, ids in enumerate(left):
-        for other in range(index + 1, len(left)):
-            alike = np.linalg.norm(colours[index] - colours[other]) < config.min_colour_gap
-            if alike and _belong_together(xyh[ids], xyh[left[other]], voxel_m, config):
-                left[other] = np.concatenate([left[other], ids])
-                break
-        else:
-            joined.append(ids)
-    return joined
-
-
-def _belong_together(
-    a: np.ndarray, b: np.ndarray, voxel_m: float, config: ValleySplitConfig
-) -> bool:
-    """Whether one lies over the other, or both are beside each other and hold a cavity."""
-    if _overlap(a, b) > config.max_overlap_fraction:
-        return True
-    gap = np.maximum(a.min(axis=0), b.min(axis=0)) - np.minimum(a.max(axis=0), b.max(axis=0))
-    if max(gap[:2]) > 2 * voxel_m:
-        return False
-    return measure_shape(np.concatenate([a, b]), voxel_m).cavity is not None
 
 
 def _first_dependent(

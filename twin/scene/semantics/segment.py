@@ -1,9 +1,13 @@
 """The default segmenter: no weights, only geometry and colour.
 
 Things are what stands on the largest level plane and hangs together, cut where colour or shape
-says that two things touch. Works on the points of one RGB-D view and on a fused cloud.
+says that two things touch. Where one thing ends and the next begins is decided by thresholds, and a
+grid that lies a little differently decides otherwise: so the segmenter looks several times, with
+voxels of other sizes, and what it finds again most times is a thing (as Matas et al. 2002 choose
+regions that stay when a threshold moves).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,7 +22,6 @@ from twin.scene.semantics.cluster import (
     ValleySplitConfig,
     Voxels,
     extents_m,
-    joined_by_outline,
     make_voxels,
     neighbour_pairs,
     pairs_among,
@@ -27,7 +30,7 @@ from twin.scene.semantics.cluster import (
 )
 from twin.scene.semantics.height_tree import branches
 from twin.scene.semantics.patches import PatchConfig, cut_into_patches
-from twin.scene.semantics.shape_descriptors import ShapeDescriptors, measure_shape
+from twin.scene.semantics.shape_descriptors import measure_shape
 from twin.scene.semantics.support import (
     NoSupportError,
     SupportConfig,
@@ -46,6 +49,12 @@ FINE_M = 0.01
 """A plane that asks for a larger least height is rough."""
 PLANE_COLOURS = 0.75
 """This share of the plane's points says how much its colour varies."""
+VOXEL_SCALES = (1.0, 1.2, 1.45)
+"""Of the voxels that the spacing of the points asks for."""
+SAME_IOU = 0.6
+"""Two things are one when they share this much of their union."""
+MAX_TAKEN = 0.3
+"""Share of a thing that a stabler one may have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +98,6 @@ class Thing:
 
     label: str
     """Colour and shape, for example "red cube"."""
-    shape: ShapeDescriptors
     score: float
     """Share of its points that are firmly above the plane, 0..1."""
 
@@ -118,16 +126,49 @@ class Look:
     """Cells in which the shape of a thing is measured."""
 
 
-def ground_of(
-    points: SurfacePoints,
-    config: SegmentConfig,
-) -> "OverPlane | WithoutPlane":
-    """Find what things stand on, how high everything is over it, and what is free to be a thing."""
+def segment(points: SurfacePoints, config: SegmentConfig) -> Segmentation:
+    """Find the things that most sizes of voxels find, the largest first."""
+    ground: OverPlane | WithoutPlane
     try:
-        plane = find_support(points.p_m, points.normals, config.support)
+        ground = OverPlane(points, find_support(points.p_m, points.normals, config.support), config)
     except NoSupportError:
-        return WithoutPlane(points, config)
-    return OverPlane(points, plane, config)
+        ground = WithoutPlane(points, config)
+    looks = [ground.look(scale) for scale in VOXEL_SCALES]
+    kept = stable(looks)
+    labels = np.zeros(len(points), dtype=np.int64)
+    for number, (mask, _) in enumerate(kept, start=1):
+        labels[mask] = number
+    things = tuple(ground.thing(mask, voxel_m) for mask, voxel_m in kept)
+    remark = "" if things else ground.nothing
+    if not things and looks[0].labels.any():
+        remark = f"of what stands out, no two of {len(looks)} sizes of voxels find the same"
+    return Segmentation(labels=labels, things=things, plane=ground.plane, remark=remark)
+
+
+def stable(looks: Sequence[Look]) -> list[tuple[Bool[np.ndarray, " num_points"], float]]:
+    """What at least half the other looks find again, with the voxels it was found with."""
+    found = []
+    for look in looks:
+        others = [other for other in looks if other is not look]
+        for number in range(1, int(look.labels.max(initial=0)) + 1):
+            mask = look.labels == number
+            best = np.array([_best_iou(mask, other.labels) for other in others])
+            share = float((best >= SAME_IOU).mean())
+            if share >= 0.5:
+                found.append((share + float(best.mean()), mask, look.voxel_m))
+    kept: list[tuple[np.ndarray, float]] = []
+    taken = np.zeros(len(looks[0].labels), dtype=bool)
+    for _, mask, voxel_m in sorted(found, key=lambda item: -item[0]):
+        if taken[mask].mean() <= MAX_TAKEN:
+            kept.append((mask & ~taken, voxel_m))
+            taken |= mask
+    return sorted(kept, key=lambda pair: -int(pair[0].sum()))
+
+
+def _best_iou(mask: np.ndarray, labels: np.ndarray) -> float:
+    sizes = np.bincount(labels)
+    shared = np.bincount(labels[mask], minlength=len(sizes))
+    return float((shared / (mask.sum() + sizes - shared))[1:].max(initial=0.0))
 
 
 class OverPlane:
@@ -254,7 +295,7 @@ def _things(
     for ids in parts.groups:
         pieces += _pieces(voxels, ids, height, pairs, voxel_m, config)
     found = 0
-    for piece in joined_by_outline(pieces, voxels, height, voxel_m, config.split):
+    for piece in pieces:
         extent = extents_m(voxels.p_m[piece])
         if len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
             found += 1
@@ -377,7 +418,7 @@ def _thing(
     shape = measure_shape(xyh, voxel_m)
     color = np.median(points.colors, axis=0).astype(np.float64)
     score = _firmness(height_m, config)
-    return Thing(label=f"{colour_name(color)} {shape.word}", shape=shape, score=score)
+    return Thing(label=f"{colour_name(color)} {shape.word}", score=score)
 
 
 MIN_OPACITY = 0.3

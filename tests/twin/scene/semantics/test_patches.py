@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from one_look import segment_points
 
 from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.patches import PatchConfig, cut_into_patches
-from twin.scene.semantics.segment import SegmentConfig
+from twin.scene.semantics.segment import SegmentConfig, segment
 
 WOOD, RED, BLUE = (0.55, 0.42, 0.30), (0.8, 0.1, 0.1), (0.1, 0.25, 0.75)
 SPACING_M = 0.004
@@ -64,7 +63,7 @@ def test_a_box_against_a_wall_is_a_thing_and_a_poster_on_it_is_none() -> None:
     labels = cut_into_patches(points, SPACING_M, PatchConfig())
     assert labels.max() == 1
     assert share(labels, is_parcel) > 0.85
-    found = segment_points(points, SegmentConfig())
+    found = segment(points, SegmentConfig())
     assert found.plane is None
     assert [thing.label.split()[0] for thing in found.things] == ["red"]
 
