@@ -53,10 +53,9 @@ GONE: dict[str, str] = {
         ("rebuild --align-poses", "rebuild --refine-poses", "rebuild --align-holdout"),
         "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them.",
     ),
-    **dict.fromkeys(
-        ("rebuild --features", "rebuild --feature-channels", "rebuild --feature-stride"),
-        "Nothing read DINOv3's features; --clip lets robot-gst find go by meaning.",
-    ),
+    "rebuild --features": "Nothing read them; with --clip robot-gst find goes by meaning.",
+    "rebuild --feature-channels": "Nothing read features; see rebuild --clip.",
+    "rebuild --feature-stride": "Nothing read features; see rebuild --clip.",
     "rebuild --depth-model": "rebuild needs depth images: it finds no depth of its own.",
     **dict.fromkeys(
         ("rebuild --generator", "rebuild --generator-timeout-s"),

@@ -32,6 +32,8 @@ NEARLY = 0.7
 """Score of a thing whose colour only nearly has that name."""
 SAYS_YES = 0.5
 """Activation from which a model means a thing."""
+CUPS, CUP_M = ("mug", "cup"), (0.07, 0.17)
+"""And their longest extents."""
 PLACES = {"left": (0, 1), "leftmost": (0, 1), "right": (0, -1), "rightmost": (0, -1),
           "front": (2, 1), "nearest": (2, 1), "back": (2, -1), "rear": (2, -1)}  # fmt: skip
 """Words for the first along an axis of the camera."""
@@ -104,7 +106,7 @@ class Asker:
             return Answer(why=what.why or beside.why or f"{anchor!r} names nothing")
         way = str(relation.lastgroup)
         pairs = [
-            (self._apart_m(one.item, other.item), index)
+            (self._gap_m(one.item, other.item), index)
             for index, one in enumerate(what.found)
             for other in beside.found
             if one.item.id != other.item.id and self._holds(way, one.item, other.item)
@@ -173,7 +175,8 @@ class Asker:
         own = [item for item in items if nouns <= set(words_of(item.label))]
         named = [item for item in own if item.source == NAMED]
         shaped = [item for item in items if nouns <= names_of(item.label)]
-        return [named, own, shaped] if nouns else [shaped]
+        cups = [item for item in items if nouns <= set(CUPS) and _is_cup_sized(item)]
+        return [named, own, shaped, cups] if nouns else [shaped]
 
     def _has_size(self, item: Instance, word: str, pool: Sequence[Instance]) -> bool:
         """Sizes compare with others of that name, or else with all; "open" and "flat" with it."""
@@ -193,7 +196,7 @@ class Asker:
         center = item.T_base_instance[None, :3, 3]
         return np.asarray(se3.apply(se3.invert(self.T_base_camera), center)[0])
 
-    def _apart_m(self, a: Instance, b: Instance) -> float:
+    def _gap_m(self, a: Instance, b: Instance) -> float:
         """How far their boxes are apart, about."""
         gap = np.abs(_in_box(a, b)) - (np.array(a.size_m) + np.array(b.size_m)) / 2
         return float(np.linalg.norm(np.maximum(gap, 0.0)))
@@ -203,7 +206,7 @@ class Asker:
         if way == "under":
             return self._holds("on", b, a)
         if way == "beside":
-            return self._apart_m(a, b) < BESIDE_M
+            return self._gap_m(a, b) < BESIDE_M
         if way in ("left", "right", "front", "behind"):
             axis, sign = {"left": (0, -1), "right": (0, 1), "front": (2, -1), "behind": (2, 1)}[way]
             offset = self._seen_m(a) - self._seen_m(b)
@@ -214,6 +217,13 @@ class Asker:
         if way == "on":
             return over and bool(abs(bottom_m - half[2]) < TOUCH_M)
         return over and bool(-half[2] - TOUCH_M < bottom_m < half[2] - TOUCH_M)
+
+
+def _is_cup_sized(item: Instance) -> bool:
+    """A box or less of this size, as noisy depth shows it, may be a cup."""
+    short, long = min(item.size_m), max(item.size_m)
+    is_unsure = item.source != NAMED and words_of(item.label)[-1] in ("box", "block", "thing")
+    return is_unsure and CUP_M[0] < long < CUP_M[1] and short > 0.6 * long
 
 
 def _is_plural(text: str) -> bool:

@@ -13,7 +13,6 @@ def find(
     /,
     *,
     clip: Path | None = None,
-    out: Path | None = None,
     output: Output = OUTPUT,
 ) -> int:
     """Find what words mean in a rebuilt scene: objects and parts, with masks, poses and a picture.
@@ -25,7 +24,6 @@ def find(
         run: Run folder with a rebuilt scene.
         words: Colours, sizes, nouns, parts, and where: "the red cube left of the box".
         clip: Folder of CLIP, where the scene was rebuilt with it; without, a lexicon answers.
-        out: Picture to write; default: RUN/results/find.png. The mask lies beside it.
     """
     import numpy as np
 
@@ -42,7 +40,7 @@ def find(
         meaning=None if clip is None else meaning_of(folder, looked.scene, clip),
     )
     answer = asker.find(words)
-    path = out or folder.results_dir / "find.png"
+    path = folder.results_dir / "find.png"
     data = {"words": words, "found": [about(item) for item in answer.found], "why": answer.why}
     if answer.found:
         view = looked.view_of(answer)

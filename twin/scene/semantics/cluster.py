@@ -268,10 +268,11 @@ def _first_dependent(
 
 def _overlap(a_m: np.ndarray, b_m: np.ndarray) -> float:
     """Share of one set of points within the other's outline seen from above, the larger."""
-    return max(float(_within_outline(a_m, b_m).mean()), float(_within_outline(b_m, a_m).mean()))
+    return max(float(within_outline(a_m, b_m).mean()), float(within_outline(b_m, a_m).mean()))
 
 
-def _within_outline(points: np.ndarray, outline: np.ndarray) -> Bool[np.ndarray, " num_points"]:
+def within_outline(points: np.ndarray, outline: np.ndarray) -> Bool[np.ndarray, " num_points"]:
+    """Which points lie within the convex outline of others, seen from above."""
     try:
         hull = Delaunay(outline[:, :2])
     except (QhullError, ValueError):
@@ -390,7 +391,7 @@ def _is_set_in(inner: np.ndarray, outer: np.ndarray, voxels: Voxels, height_m: n
     """Whether one piece lies in the other's surface, seen from above, and does not stand on it."""
     if np.quantile(height_m[inner], 0.1) > np.quantile(height_m[outer], STANDS_ON):
         return False
-    return bool(_within_outline(voxels.p_m[inner], voxels.p_m[outer]).mean() > SET_IN_SHARE)
+    return bool(within_outline(voxels.p_m[inner], voxels.p_m[outer]).mean() > SET_IN_SHARE)
 
 
 def _lies_in(inner: np.ndarray, outer: np.ndarray, voxels: Voxels, height_m: np.ndarray) -> bool:

@@ -2,10 +2,10 @@
 
 Neighbouring voxels that face the same way and have one colour grow into patches, cheapest border
 first, as long as a border is not clearly more than what varies within (Felzenszwalb and
-Huttenlocher 2004, on the graph of voxels instead of pixels). Patches in one plane are one, whatever
-is printed on them. What is then still large is structure (walls, cupboards), and so is what touches
-it and has its colour. The rest is joined over outward bends, and what stands out is a thing: most
-of its border is an edge, not a line drawn on a surface that goes on.
+Huttenlocher 2004, on the graph of voxels instead of pixels). What is then still large is structure
+(walls, cupboards), and so is what touches it and has its colour. The rest is joined over outward
+bends, and what stands out is a thing: most of its border is an edge, not a line drawn on a surface
+that goes on.
 """
 
 from dataclasses import dataclass
@@ -49,10 +49,6 @@ class PatchConfig:
     """Smaller patches join the neighbour with the cheapest border."""
     lightness_weight: float = 0.3
     """Shading changes lightness, not the ratios of a and b to it."""
-    flat_voxels: float = 0.5
-    """Patches whose common plane they leave by less (root mean square) are one surface."""
-    parallel_rad: float = 0.17
-    """Patches of one plane face the same way within this angle."""
     least_bend: float = -0.1
     """Mean (n_j - n_i) . d over a border from which two patches are one thing."""
     least_contact: float = 0.2
@@ -89,7 +85,6 @@ def cut_into_patches(
     normals, colour = _smoothed(voxels, voxel_m, config)
     border = _borders(voxels.p_m, normals, colour, pairs, config)
     patch = _grown(len(voxels), pairs, border.cost, config)
-    patch = _one_plane_one_patch(patch, voxels.p_m, normals, pairs, voxel_m, config)
     num = int(patch.max(initial=-1)) + 1
     middle = np.array([np.median(colour[patch == k], axis=0) for k in range(num)])
     structure = _structure(patch, num, middle, voxels.p_m, config)
@@ -190,55 +185,6 @@ def _grown(num: int, pairs: np.ndarray, cost: np.ndarray, config: PatchConfig) -
             owner[b] = a
             size[a] += size[b]
     return numbered(np.array([root(node) for node in range(num)], dtype=np.int64))
-
-
-def _one_plane_one_patch(
-    patch: np.ndarray,
-    p_m: np.ndarray,
-    normals: np.ndarray,
-    pairs: np.ndarray,
-    voxel_m: float,
-    config: PatchConfig,
-) -> np.ndarray:
-    """Join neighbours that lie in one plane together, the flattest pair first."""
-    p = p_m - p_m.mean(axis=0)
-    num = int(patch.max(initial=-1)) + 1
-    # Count, sum and sum of squares of each patch: those of a union are their sums.
-    rows = np.concatenate(
-        [np.ones((len(p), 1)), p, (p[:, :, None] * p[:, None]).reshape(-1, 9), normals], axis=1
-    )
-    moments = np.stack([np.bincount(patch, column, minlength=num) for column in rows.T], axis=1)
-    owner = np.arange(num)
-    links = np.unique(np.sort(patch[pairs], axis=1), axis=0)
-    while True:
-        links = np.unique(np.sort(owner[links], axis=1), axis=0)
-        links = links[links[:, 0] != links[:, 1]]
-        first, second = moments[links[:, 0]], moments[links[:, 1]]
-        off = np.where(
-            _cosine(first[:, 13:], second[:, 13:]) > np.cos(config.parallel_rad),
-            _off_plane_m(first + second),
-            np.inf,
-        )
-        if not (off < config.flat_voxels * voxel_m).any():
-            return numbered(owner[patch])
-        kept, gone = links[int(np.argmin(off))]
-        moments[kept] += moments[gone]
-        owner[owner == gone] = kept
-
-
-def _cosine(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, " num_pairs"]:
-    length = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    return np.asarray((a * b).sum(axis=1) / np.maximum(length, 1e-9))
-
-
-def _off_plane_m(moments: np.ndarray) -> Float[np.ndarray, " num_pairs"]:
-    """Root mean square distance from the plane through points with these moments."""
-    count = moments[:, :1]
-    mean = moments[:, 1:4] / count
-    scatter = (
-        moments[:, 4:13].reshape(-1, 3, 3) / count[..., None] - mean[:, :, None] * mean[:, None]
-    )
-    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(scatter)[:, 0], 0.0)))
 
 
 def _structure(

@@ -27,6 +27,7 @@ from twin.scene.semantics.cluster import (
     pairs_among,
     split_by_colour,
     split_by_valleys,
+    within_outline,
 )
 from twin.scene.semantics.height_tree import branches
 from twin.scene.semantics.patches import PatchConfig, cut_into_patches
@@ -42,13 +43,12 @@ from twin.scene.semantics.support import (
 )
 
 SOURCE = "default segmenter"
-MAX_FOOT_ROUNDS = 8
 MIN_FRAGMENT = 8
 """Voxels of the smallest fragment that may be joined to a thing."""
-FINE_M = 0.01
-"""A plane that asks for a larger least height is rough."""
 PLANE_COLOURS = 0.75
 """This share of the plane's points says how much its colour varies."""
+FLOOR_M2, FURNITURE = 2.5, 3.0
+"""A larger plane is a floor, and what stands on it may be so many times larger than on a table."""
 VOXEL_SCALES = (1.0, 1.2, 1.45)
 """Of the voxels that the spacing of the points asks for."""
 SAME_IOU = 0.6
@@ -66,9 +66,7 @@ class SegmentConfig:
     split: ValleySplitConfig = field(default_factory=ValleySplitConfig)
     """When things touch."""
     min_height_m: float = 0.007
-    """Above the plane; lower points belong to a thing only by colour."""
-    relief_factor: float = 2.5
-    """On a rough plane, what has its colour is a thing only from so many least heights on."""
+    """Above the plane."""
     roughness_factor: float = 3.0
     """And above so many times the roughness of the plane, as it was measured."""
     max_height_m: float = 0.6
@@ -85,8 +83,8 @@ class SegmentConfig:
     """Larger groups are furniture, the robot, or things that touch a wall: they are cut."""
     patches: PatchConfig = field(default_factory=PatchConfig)
     """How."""
-    foot_colour_gap: float = 12.0
-    """Lab distance up to which low points belong to the thing above them."""
+    plane_colour_gap: float = 12.0
+    """Lab distance up to which a colour is the plane's."""
     relief_score: float = 0.25
     """What rises so little (``Thing.score``) and has the plane's own colour is the plane: noise of
     its depth, not a thing. So is a flat thing of exactly the plane's colour."""
@@ -184,15 +182,20 @@ class OverPlane:
         plane = as_measured(plane, points.p_m, points.normals, config.support)
         roughness = roughness_m(points.p_m, points.normals, plane, config.support)
         least = max(config.min_height_m, config.roughness_factor * roughness)
-        self._config = config = replace(config, min_height_m=least)
+        self._is_rough = least > config.min_height_m
+        large = FURNITURE if plane.area_m2 > FLOOR_M2 else 1.0
+        self._config = config = replace(
+            config,
+            min_height_m=least,
+            max_height_m=large * config.max_height_m,
+            max_size_m=large * config.max_size_m,
+        )
         self._points, self.plane = points, plane
         self._height = height = plane.height_m(points.p_m)
         under = plane.under(points.p_m)
         self._lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
         free = under & (height < config.max_height_m)
         raised = free & (height > config.min_height_m)
-        if least > FINE_M:
-            raised &= ~_is_relief(self._lab, height, under, config)
         self._low = free & (np.abs(height) <= config.min_height_m)
         self._above = np.flatnonzero(raised)
         self._voxel_m = max(config.voxel_m, 2.0 * _spacing(points.p_m[self._above]))
@@ -213,24 +216,14 @@ class OverPlane:
         labels = np.zeros(len(points), dtype=np.int64)
         labels[above] = _things(points.take(above), height[above], voxel_m, config)
         labels = _largest_first(labels)
-        _add_feet(labels, points.p_m, self._lab, self._low, height, voxel_m, config)
+        _add_floors(labels, points.p_m, self._lab, self._low, config)
         labels = _without_relief(labels, self._lab, self._low, height, config)
         return Look(labels=labels, voxel_m=voxel_m)
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""
-        return _thing(self._points.take(mask), self._height[mask], voxel_m, self._config)
-
-
-def _is_relief(
-    lab: np.ndarray, height_m: np.ndarray, under: np.ndarray, config: SegmentConfig
-) -> Bool[np.ndarray, " num_points"]:
-    """Where a rough plane bulges: low and of its colour."""
-    plane = under & (np.abs(height_m) < config.min_height_m)
-    middle = np.median(lab[plane], axis=0)
-    away = np.linalg.norm(lab - middle, axis=1)
-    own = max(float(np.quantile(away[plane], PLANE_COLOURS)), config.foot_colour_gap)
-    return np.asarray((height_m < config.relief_factor * config.min_height_m) & (away < own))
+        mine, height = self._points.take(mask), self._height[mask]
+        return _thing(mine, height, voxel_m, self._config, self._is_rough)
 
 
 class WithoutPlane:
@@ -261,7 +254,7 @@ class WithoutPlane:
         """Describe the points of one thing."""
         mine = self._points.take(mask)
         height = mine.p_m[:, 2] - float(np.quantile(mine.p_m[:, 2], 0.01))
-        return _thing(mine, height, voxel_m, self._config)
+        return _thing(mine, height, voxel_m, self._config, rough=True)
 
 
 def _spacing(p_m: np.ndarray) -> float:
@@ -348,39 +341,24 @@ def _largest_first(labels: np.ndarray) -> np.ndarray:
     return np.asarray(rank[labels])
 
 
-def _add_feet(
-    labels: np.ndarray,
+def _add_floors(
+    labels: Int[np.ndarray, " num_points"],
     p_m: Float[np.ndarray, "num_points 3"],
     lab: Float[np.ndarray, "num_points 3"],
     low: Bool[np.ndarray, " num_points"],
-    height_m: np.ndarray,
-    voxel_m: float,
     config: SegmentConfig,
 ) -> None:
-    """Give low points to the thing close by whose colour they have and the plane has not.
-
-    Repeated, so that the floor of a box is reached from its walls.
-    """
-    plane = low & (np.abs(height_m) < 0.5 * config.min_height_m)
-    if not plane.any():
+    """Give low points to the thing around them whose colour they have and the plane has not."""
+    free = np.flatnonzero(low & (labels == 0))
+    if not len(free):
         return
-    to_plane = np.linalg.norm(lab - np.median(lab[plane], axis=0), axis=1)
-    reach = config.min_height_m + 1.5 * voxel_m
-    for _ in range(MAX_FOOT_ROUNDS):
-        firm, feet = np.flatnonzero(labels > 0), np.flatnonzero(low & (labels == 0))
-        if not len(firm) or not len(feet):
-            return
-        gap, nearest = cKDTree(p_m[firm]).query(p_m[feet], distance_upper_bound=reach)
-        near = np.isfinite(gap)
-        feet, thing = feet[near], firm[nearest[near]]
-        to_thing = np.linalg.norm(lab[feet] - lab[thing], axis=1)
-        clear = (to_thing < config.foot_colour_gap) & (to_thing < 0.5 * to_plane[feet])
-        # Where thing and plane look alike, height decides: half the least height is no noise.
-        raised = (height_m[feet] > 0.5 * config.min_height_m) & (to_thing < to_plane[feet])
-        mine = clear | raised
-        if not mine.any():
-            return
-        labels[feet[mine]] = labels[thing[mine]]
+    to_plane = np.linalg.norm(lab[free] - np.median(lab[free], axis=0), axis=1)
+    for number in range(1, int(labels.max(initial=0)) + 1):
+        mine = labels == number
+        to_thing = np.linalg.norm(lab[free] - np.median(lab[mine], axis=0), axis=1)
+        clear = (to_thing < config.plane_colour_gap) & (to_thing < 0.5 * to_plane)
+        clear[clear] = within_outline(p_m[free[clear]], p_m[mine])
+        labels[free[clear]] = number
 
 
 def _without_relief(
@@ -401,7 +379,7 @@ def _without_relief(
         mine = labels == number
         away = float(np.linalg.norm(np.median(lab[mine], axis=0) - middle))
         is_flat = _firmness(height_m[mine], config) < config.relief_score
-        if not (is_flat and away < max(own, config.foot_colour_gap)):
+        if not (is_flat and away < max(own, config.plane_colour_gap)):
             kept[mine] = kept.max() + 1
     return kept
 
@@ -412,10 +390,14 @@ def _firmness(height_m: np.ndarray, config: SegmentConfig) -> float:
 
 
 def _thing(
-    points: SurfacePoints, height_m: np.ndarray, voxel_m: float, config: SegmentConfig
+    points: SurfacePoints,
+    height_m: np.ndarray,
+    voxel_m: float,
+    config: SegmentConfig,
+    rough: bool,
 ) -> Thing:
     xyh = np.concatenate([points.p_m[:, :2], height_m[:, None]], axis=1)
-    shape = measure_shape(xyh, voxel_m)
+    shape = measure_shape(xyh, voxel_m, rough=rough)
     color = np.median(points.colors, axis=0).astype(np.float64)
     score = _firmness(height_m, config)
     return Thing(label=f"{colour_name(color)} {shape.word}", score=score)
