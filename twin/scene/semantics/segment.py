@@ -18,8 +18,8 @@ from bridge.geometry import se3
 from twin.naming.colours import colour_name, lab_from_srgb, without_shading
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.semantics.cluster import (
+    LIGHTNESS_WEIGHT,
     SurfacePoints,
-    ValleySplitConfig,
     Voxels,
     extents_m,
     make_voxels,
@@ -30,7 +30,7 @@ from twin.scene.semantics.cluster import (
     within_outline,
 )
 from twin.scene.semantics.height_tree import branches
-from twin.scene.semantics.patches import PatchConfig, cut_into_patches
+from twin.scene.semantics.patches import VOXEL_M, cut_into_patches
 from twin.scene.semantics.shape_descriptors import measure_shape
 from twin.scene.semantics.support import (
     NoSupportError,
@@ -63,8 +63,6 @@ class SegmentConfig:
 
     support: SupportConfig = field(default_factory=SupportConfig)
     """The plane that things stand on."""
-    split: ValleySplitConfig = field(default_factory=ValleySplitConfig)
-    """When things touch."""
     min_height_m: float = 0.007
     """Above the plane."""
     roughness_factor: float = 3.0
@@ -80,9 +78,7 @@ class SegmentConfig:
     min_size_m: float = 0.012
     """Things have at least this extent in two directions."""
     max_size_m: float = 0.45
-    """Larger groups are furniture, the robot, or things that touch a wall: they are cut."""
-    patches: PatchConfig = field(default_factory=PatchConfig)
-    """How."""
+    """Larger groups are furniture, the robot, a wall."""
     plane_colour_gap: float = 12.0
     """Lab distance up to which a colour is the plane's."""
     relief_score: float = 0.25
@@ -193,7 +189,7 @@ class OverPlane:
         self._points, self.plane = points, plane
         self._height = height = plane.height_m(points.p_m)
         under = plane.under(points.p_m)
-        self._lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
+        self._lab = without_shading(lab_from_srgb(points.colors), LIGHTNESS_WEIGHT)
         free = under & (height < config.max_height_m)
         raised = free & (height > config.min_height_m)
         self._low = free & (np.abs(height) <= config.min_height_m)
@@ -243,12 +239,10 @@ class WithoutPlane:
 
     def look(self, scale: float) -> Look:
         """Cut them, with voxels so many times as large as their spacing asks for."""
-        patches = self._config.patches
-        scaled = replace(patches, voxel_m=scale * patches.voxel_m)
-        labels = cut_into_patches(self._points, scale * self._spacing_m, scaled)
+        labels = cut_into_patches(self._points, self._spacing_m, scale)
         if not labels.any():
             raise NoSupportError(self.nothing)
-        return Look(labels=_largest_first(labels), voxel_m=patches.voxel_m)
+        return Look(labels=_largest_first(labels), voxel_m=VOXEL_M)
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""
@@ -276,7 +270,7 @@ def _things(
     height = np.bincount(voxels.of_point, weights=height_m) / voxels.count
     pairs = neighbour_pairs(voxels.p_m, config.reach_voxels * voxel_m)
     labels = np.zeros(len(voxels), dtype=np.int64)
-    parts = branches(
+    groups = branches(
         voxels.p_m,
         height,
         pairs,
@@ -285,20 +279,16 @@ def _things(
         min_voxels=MIN_FRAGMENT,
     )
     pieces: list[np.ndarray] = []
-    for ids in parts.groups:
+    for ids in groups:
         pieces += _pieces(voxels, ids, height, pairs, voxel_m, config)
     found = 0
     for piece in pieces:
         extent = extents_m(voxels.p_m[piece])
-        if len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
+        stands = np.quantile(height[piece], 0.03) < config.max_height_m / 3
+        if stands and len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
             found += 1
             labels[piece] = found
-    of_points = np.asarray(labels[voxels.of_point])
-    left = np.flatnonzero(parts.too_large[voxels.of_point])
-    if len(left):
-        cut = cut_into_patches(points.take(left), voxel_m / 2, config.patches)
-        of_points[left] = np.where(cut > 0, cut + found, 0)
-    return of_points
+    return np.asarray(labels[voxels.of_point])
 
 
 def _pieces(
@@ -312,11 +302,11 @@ def _pieces(
     """Cut one connected group by colour, and each piece of it along valleys."""
     pieces = []
     by_colour = _within(voxels, ids, pairs)
-    colours = split_by_colour(by_colour[0], height_m[ids], by_colour[1], config.split)
+    colours = split_by_colour(by_colour[0], height_m[ids], by_colour[1])
     for colour in range(int(colours.max()) + 1):
         part = ids[colours == colour]
         own, own_pairs = _within(voxels, part, pairs)
-        cut = split_by_valleys(own, height_m[part], own_pairs, voxel_m, config.split)
+        cut = split_by_valleys(own, height_m[part], own_pairs, voxel_m)
         pieces += [part[cut == number] for number in range(int(cut.max()) + 1)]
     return pieces
 

@@ -185,7 +185,7 @@ def _rectangle(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
     return centre, sides, yaw, float(hull.volume / max(areas[best], 1e-12))
 
 
-SLAB, BLOCK = 0.2, 0.3
+SLAB, BLOCK = 0.2, 0.4
 """Shortest over middle extent: less is a slab, more may be a block."""
 BLOCK_FILL = 0.55
 """Of the box around it, that a block's hull fills."""
