@@ -2,9 +2,11 @@
 
 The real shelf with its supplied masks, and the real kitchen with the list
 ``semantics/kitchen_objects.json``, which was made by eye and committed before the search was run on
-it; what counts as found or false is in ``semantics/seen_objects.py``. Both are rebuilt by the
-command's own code, for a number of images. A scene's name as an argument measures that one only and
-stores nothing; with ``--keep FOLDER`` the rebuilt runs stay there and are used again.
+it; what counts as found or false is in ``semantics/seen_objects.py``. And 60 questions for ``find``
+about these, a study room and a run of ``robot-gst demo`` (``--demo RUN``), a third about what is
+not there: ``semantics/questions.json``, committed before the command existed. Scenes are rebuilt by
+the command's own code, for a number of images. A scene's name as an argument measures that one only
+and stores nothing; with ``--keep FOLDER`` the rebuilt runs stay there and are used again.
 """
 
 import os
@@ -12,12 +14,14 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
+import json
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from measure import ROOT, Target, print_targets, report_targets
@@ -25,14 +29,16 @@ from measure import ROOT, Target, print_targets, report_targets
 sys.path.insert(0, str(ROOT / "benchmarks" / "semantics"))
 
 import shelf
-from seen_objects import Judged, SeenObject, judge, read_list
+from seen_objects import MIN_IOU, Judged, SeenObject, judge, read_list
 from splat.kitchen import kitchen_folder
 from splat.scans import QUIET, shelf_folder, shelf_scan
 
 from bridge.episode.run_folder import RunFolder
 from bridge.sources.folder.messages import read_index
+from twin.naming.phrases import Asker, Found
 from twin.naming.scene_file import BACKGROUND_KEY, read_semantics
 from twin.naming.things import SemanticScene
+from twin.scene.foundation.find import View, look_at, viewed
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.rebuild.run import rebuild
 from twin.scene.semantics.lift import Viewpoint, render_labels
@@ -40,12 +46,18 @@ from twin.scene.settings import FitConfig, FrameConfig, RebuildConfig
 from twin.scene.store.folder import read_scene
 
 IMAGES = 100
-MIN_FOUND, MAX_FALSE = 0.7, 0.3
+MIN_FOUND, MAX_FALSE, MIN_RIGHT = 0.7, 0.3, 0.65
+FOLDERS = {
+    "kitchen": "rgbd_7scenes_redkitchen_a",
+    "shelf": "rgbd_apc_shelf_wristcam",
+    "study": "rgbd_sun3d_studyroom_a",
+}
+NO_IMAGE = np.zeros((1, 1, 3), dtype=np.uint8)
 FRAMES = {
-    "kitchen": FrameConfig(train_every=5, holdout_every=5, holdout_offset=2, max_holdout_frames=4),
-    "shelf": FrameConfig(),
+    "kitchen": FrameConfig(train_every=5, holdout_every=5, holdout_offset=2, max_holdout_frames=4)
 }
 LIST = ROOT / "benchmarks" / "semantics" / "kitchen_objects.json"
+QUESTIONS = LIST.with_name("questions.json")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,16 +70,21 @@ class Truth:
 
 def kitchen_truth(folder: Path) -> Truth:
     """The list, and the colour cameras of its frames."""
-    objects, index = read_list(LIST), read_index(folder)
-    wanted = {frame for item in objects for frame in item.boxes}
-    views = {}
+    objects = read_list(LIST)
+    views = marked_views(folder, {frame for item in objects for frame in item.boxes})
+    return Truth(objects=objects, views=views)
+
+
+def marked_views(folder: Path, frames: set[int]) -> dict[int, Viewpoint]:
+    """Where the colour camera of a recording stood in frames of these numbers."""
+    index, views = read_index(folder), {}
     for frame in index.frames:
         number = int(frame.color_path.name.split(".")[0].split("-")[1])
-        if number in wanted:
+        if number in frames:
             T = frame.T_world_depth @ index.T_depth_color
             camera = index.color_camera or index.depth_camera
             views[number] = Viewpoint(camera=camera, T_base_camera=T)
-    return Truth(objects=objects, views=views)
+    return views
 
 
 def shelf_truth(_folder: Path) -> Truth:
@@ -94,10 +111,72 @@ def rebuilt(name: str, source: Path, folder: Path) -> tuple[RunFolder, SemanticS
     """Import and rebuild; the things found, and the CPU seconds of all of it."""
     began = time.process_time()
     run = RunFolder.open(folder) if folder.is_dir() else shelf_scan(source, folder)
-    config = RebuildConfig(frames=FRAMES[name], fit=FitConfig(iterations=IMAGES, threads=1))
-    record = rebuild(run, config, QUIET)
+    frames, fit = FRAMES.get(name, FrameConfig()), FitConfig(iterations=IMAGES, threads=1)
+    record = rebuild(run, RebuildConfig(frames=frames, fit=fit), QUIET)
     rows = {BACKGROUND_KEY: record["background"]["num_splats"]}
     return run, read_semantics(run.scene_dir, rows), time.process_time() - began
+
+
+def is_right(
+    found: Sequence[Found], wanted: Sequence[SeenObject], views: Mapping[Any, View]
+) -> bool:
+    """Whether answers and wanted things pair up one to one."""
+    scores = np.zeros((len(wanted), len(found)))
+    for column, item in enumerate(found):
+        drawn = {key: view.mask(item) for key, view in views.items()}
+        scores[:, column] = [each.agreement(drawn) for each in wanted]
+    fits = scores >= MIN_IOU
+    return len(found) == len(wanted) and bool(fits.any(axis=1).all() and fits.any(axis=0).all())
+
+
+def asked(about: Mapping[str, Any], run: RunFolder, source: Path | None) -> list[tuple[bool, bool]]:
+    """For each question whether it is about what is there, and whether the answer is right."""
+    things = {
+        key: SeenObject(name=key, group="asked", boxes=boxes)
+        for key, boxes in about["things"].items()
+    }
+    for item in read_list(LIST) if "list" in about else ():
+        boxes = {str(key): box for key, box in item.boxes.items()}
+        things[item.name] = replace(item, boxes=boxes)
+    frames = {key for item in things.values() for key in item.boxes}
+    if source is None:
+        views = {view.name: view for view in look_at(run, holdout=True).views}
+    else:
+        places = marked_views(source, set(map(int, frames)))
+        marked = {str(key): place for key, place in places.items()}
+        views = {v.name: v for v in viewed(run, marked, dict.fromkeys(marked, NO_IMAGE)).views}
+    looked, rows = look_at(run), []
+    asker = Asker(scene=looked.scene, T_base_camera=looked.best.T_base_camera)
+    for question in about["questions"]:
+        answer = asker.find(question["ask"])
+        right = is_right(answer.found, [things[key] for key in question["is"]], views)
+        told = "; ".join(f"{each.part} {each.item.name}" for each in answer.found) or answer.why
+        print(f"  {'right' if right else 'WRONG'} {question['ask']!r}: {told}")
+        rows.append((bool(question["is"]), right))
+    return rows
+
+
+def question_rows(keep: Path, demo: Path | None) -> list[Target]:
+    """Two rows over all questions whose scenes are here."""
+    answers, told = [], []
+    for name, about in json.loads(QUESTIONS.read_text())["scenes"].items():
+        source = None if name == "demo" else shelf.DATA / FOLDERS[name]
+        if (demo if source is None else source.is_dir() or None) is None:
+            print(f"splat_foreign: no {name} here (GST_SHARED_DATA, --demo); not asked about")
+            continue
+        run = RunFolder.open(demo) if source is None else rebuilt(name, source, keep / name)[0]
+        own = asked(about, run, source)
+        present = [right for is_there, right in own if is_there]
+        told.append(f"{name} {sum(present)} of {len(present)}")
+        answers += own
+    present, absent = ([r for is_there, r in answers if is_there is kind] for kind in (True, False))
+    rate, yes = sum(present) / max(len(present), 1), float(len(absent) - sum(absent))
+    what, of = "find: questions about what is there, answered right", ", ".join(told)
+    of_none = "find: questions about what is not there, answered with something"
+    return [
+        Target(what=what, measured=rate, limit=MIN_RIGHT, at_most=False, reference=of),
+        Target(what=of_none, measured=yes, limit=0.0, reference=f"of {len(absent)}"),
+    ]
 
 
 def judged(run: RunFolder, scene: SemanticScene, truth: Truth) -> Judged:
@@ -159,6 +238,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", nargs="?", choices=[*TRUTHS], help="default: both")
     parser.add_argument("--keep", type=Path, help="where the rebuilt runs stay")
+    parser.add_argument("--demo", type=Path, help="a run that robot-gst demo made")
     given = parser.parse_args()
     rows: list[Target] = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -169,6 +249,8 @@ def main() -> None:
                 print(f"splat_foreign: no {name} here (GST_SHARED_DATA); its rows are left out")
                 continue
             rows += rows_of(name, source, (given.keep or Path(scratch)) / name)
+        if not given.scene:
+            rows += question_rows(given.keep or Path(scratch), given.demo)
     if given.scene:
         print_targets(rows)
     else:

@@ -53,7 +53,7 @@ EXTRAS = {
     "mujoco": Extra("replay --engine mujoco or both", ("mujoco",), is_optional=True),
     "twin": Extra("what needs torch in the twin", ("torch",), is_optional=True),
     "foundation": Extra(
-        "SAM 3, DINOv3, CLIP from folders of weights",
+        "SAM 3, CLIP from folders of weights",
         ("transformers", "safetensors"),
         is_optional=True,
     ),

@@ -53,6 +53,9 @@ GONE: dict[str, str] = {
         ("rebuild --align-poses", "rebuild --refine-poses", "rebuild --align-holdout"),
         "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them.",
     ),
+    "rebuild --features": "Nothing read them; with --clip robot-gst find goes by meaning.",
+    "rebuild --feature-channels": "Nothing read features; see rebuild --clip.",
+    "rebuild --feature-stride": "Nothing read features; see rebuild --clip.",
     "rebuild --depth-model": "rebuild needs depth images: it finds no depth of its own.",
     **dict.fromkeys(
         ("rebuild --generator", "rebuild --generator-timeout-s"),

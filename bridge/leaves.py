@@ -29,7 +29,6 @@ class Command(NamedTuple):
     name: str
     """As it is typed: ``record``, ``publish ur``."""
     target: str
-    """``module:function``."""
     text: str
     example: str
     """What may follow the name."""
@@ -44,7 +43,6 @@ class Leaf:
     modules: tuple[str, ...]
     """Packages and modules that go with it."""
     extra: str
-    """Brings what it needs."""
     purpose: str
     """What one wants it for, as a message ends."""
     entries: Mapping[str, str] = field(default_factory=dict)
@@ -66,14 +64,12 @@ LEAVES: dict[str, Leaf] = {
         modules=("twin.plan",),
         extra="replay",
         purpose="planning",
-        commands=(
-            *commands_of(
-                PLAN,
-                "twin.plan.cli",
-                """
-                plan | Plan from words, or for a cell. | runs/x --task 'put the cube into the box'
-                """,
-            ),
+        commands=commands_of(
+            PLAN,
+            "twin.plan.cli",
+            """
+            plan | Plan from words, or for a cell. | runs/x --task 'put the cube into the box'
+            """,
         ),
     ),
     "perception": Leaf(
@@ -82,8 +78,15 @@ LEAVES: dict[str, Leaf] = {
         purpose="naming the things of a scene",
         entries={
             "check_models": "twin.scene.foundation.stage:check_models",
-            "name_things": "twin.scene.foundation.things:write_scene_semantics",
+            "name_things": "twin.scene.foundation.stage:write_scene_semantics",
         },
+        commands=commands_of(
+            REBUILD,
+            "twin.scene.foundation.cli",
+            """
+            find | Find things of the scene by words. | runs/x "the box's rim"
+            """,
+        ),
     ),
     "policies": Leaf(
         modules=("twin.policies",),
@@ -153,43 +156,37 @@ LEAVES: dict[str, Leaf] = {
         modules=("bridge.sources.ur",),
         extra="ur",
         purpose="publishing a UR arm",
-        commands=(
-            *commands_of(
-                RECORD,
-                "bridge.sources.ur.cli",
-                """
-                publish ur | A UR arm: joints, tool, gripper, modes. | 192.168.1.10 --cell lab
-                """,
-            ),
+        commands=commands_of(
+            RECORD,
+            "bridge.sources.ur.cli",
+            """
+            publish ur | A UR arm: joints, tool, gripper, modes. | 192.168.1.10 --cell lab
+            """,
         ),
     ),
     "realsense": Leaf(
         modules=("bridge.sources.realsense",),
         extra="realsense",
         purpose="publishing RealSense cameras",
-        commands=(
-            *commands_of(
-                RECORD,
-                "bridge.sources.realsense.cli",
-                """
-                publish realsense | RealSense cameras: colour, depth. | --camera side=123622270224
-                """,
-            ),
+        commands=commands_of(
+            RECORD,
+            "bridge.sources.realsense.cli",
+            """
+            publish realsense | RealSense cameras: colour, depth. | --camera side=123622270224
+            """,
         ),
     ),
     "lerobot": Leaf(
         modules=("bridge.exchange.lerobot",),
         extra="video",
         purpose="exchange with LeRobot",
-        commands=(
-            *commands_of(
-                EXCHANGE,
-                "bridge.exchange.lerobot.cli",
-                """
-                import lerobot | A LeRobotDataset v3.0. | DIR runs/x --episodes 0-9
-                export lerobot | Trials as a LeRobotDataset v3.0. | runs/x DIR
-                """,
-            ),
+        commands=commands_of(
+            EXCHANGE,
+            "bridge.exchange.lerobot.cli",
+            """
+            import lerobot | A LeRobotDataset v3.0. | DIR runs/x --episodes 0-9
+            export lerobot | Trials as a LeRobotDataset v3.0. | runs/x DIR
+            """,
         ),
     ),
 }

@@ -1,4 +1,4 @@
-"""The real wrist-camera set: its own masks lifted, and the default segmenter on it."""
+"""The real wrist-camera set and its own masks."""
 
 import json
 import os
@@ -6,21 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from measure import ROOT, Target
-from overlap import mask_iou
+from measure import ROOT
 from PIL import Image
 from scipy import ndimage
 
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry.camera import Camera
-from twin.naming.things import Mask, MaskSet
-from twin.scene.fit.initialise import fuse
-from twin.scene.frames.rgbd import DepthLimits, FrameSurface
-from twin.scene.gaussians import GaussianCloud
-from twin.scene.raster.rasteriser import Rasteriser
-from twin.scene.semantics.describe import scene_by_default, scene_from_masks
-from twin.scene.semantics.lift import Viewpoint, render_labels
-from twin.scene.settings import InitialiseConfig
+from twin.scene.frames.rgbd import DepthLimits
+from twin.scene.semantics.lift import Viewpoint
 
 DATA = Path(os.environ.get("GST_SHARED_DATA", ROOT.parent / "shared" / "data"))
 FOLDER = DATA / "rgbd_apc_shelf_wristcam"
@@ -80,66 +73,3 @@ def filled(depth_m: np.ndarray) -> np.ndarray:
     mean = mean / np.maximum(share, 1e-9)
     spread = np.sqrt(np.maximum(square / np.maximum(share, 1e-9) - mean**2, 0.0))
     return np.where(enough & (spread < 0.012), mean, 0.0).astype(np.float32)
-
-
-def fused(shots: list[ShelfShot]) -> GaussianCloud:
-    """Gaussians of the training frames as they come out of the depth, not fitted."""
-    points = [FrameSurface(shot.frame, LIMITS).points() for shot in shots]
-    return fuse(points, InitialiseConfig(max_splats=120_000))
-
-
-def supplied(shot: ShelfShot) -> MaskSet:
-    """The supplied masks of a frame."""
-    masks = [
-        Mask(image=shot.ids == number, label=f"object {number}")
-        for number in np.unique(shot.ids)
-        if number
-    ]
-    return MaskSet(camera_id="wrist", stamp_ns=shot.frame.stamp_ns, masks=masks, source="supplied")
-
-
-def targets(rasteriser: Rasteriser) -> list[Target]:
-    """Mean IoU over objects and frames; nothing where the data are missing."""
-    if not FOLDER.is_dir():
-        print(f"shelf left out: {FOLDER} is not there (GST_SHARED_DATA)")
-        return []
-    shots = load_shots()
-    train = [s for k, s in enumerate(shots) if k % HELD_OUT_EVERY != HELD_OUT_EVERY - 1]
-    held_out = [s for k, s in enumerate(shots) if k % HELD_OUT_EVERY == HELD_OUT_EVERY - 1]
-    cloud = fused(train)
-    lifted = scene_from_masks(cloud, [(s.viewpoint, supplied(s)) for s in train], rasteriser)
-    names = {item.label: item.id for item in lifted.instances}
-    rows = []
-    for what, some in (("all", shots), ("held-out", held_out)):
-        scores = []
-        for shot in some:
-            ids = render_labels(rasteriser, cloud, lifted.labels, shot.viewpoint)
-            for mask in supplied(shot).masks:
-                found = ids == names.get(mask.label, -1)
-                scores.append(mask_iou(found, mask.image) or 0.0)
-        rows.append(
-            Target(
-                what=f"shelf: lifted supplied masks, {what} views, mean IoU",
-                measured=float(np.mean(scores)),
-                limit=0.8,
-                at_most=False,
-                reference=f"{len(scores)} masks, worst {min(scores):.2f}",
-            )
-        )
-    default = scene_by_default(cloud, [s.viewpoint for s in train], rasteriser)
-    scores = []
-    for shot in held_out:
-        ids = render_labels(rasteriser, cloud, default.labels, shot.viewpoint)
-        for mask in supplied(shot).masks:
-            options = [mask_iou(ids == k, mask.image) or 0.0 for k in np.unique(ids) if k]
-            scores.append(max(options, default=0.0))
-    rows.append(
-        Target(
-            what="shelf: default segmenter, held-out views, mean IoU (reported)",
-            measured=float(np.mean(scores)),
-            limit=0.0,
-            at_most=False,
-            reference=default.remark or f"{len(default.instances)} instances",
-        )
-    )
-    return rows

@@ -1,5 +1,8 @@
 """Colours as people see and name them: CIE Lab and a dozen names."""
 
+import colorsys
+from itertools import product
+
 import numpy as np
 from jaxtyping import Float
 
@@ -16,6 +19,7 @@ _XYZ_FROM_RGB = np.array(
 _WHITE = _XYZ_FROM_RGB.sum(axis=1)
 GREY_CHROMA = 11.0
 """Less colourful is black, grey or white."""
+GREYS = ("black", "grey", "white")
 DULL_CHROMA = 42.0
 """Warm colours below this are brown or beige."""
 _HUES = (
@@ -71,6 +75,23 @@ def colour_name(color: Float[np.ndarray, "3"]) -> str:
         if lightness < 52 or chroma < DULL_CHROMA:
             return "brown"
     return name
+
+
+def near_colours(color_srgb: tuple[int, int, int]) -> set[str]:
+    """Names of a colour, and of what it may be in other light: a white cup in shade is grey."""
+    if colour_name(np.array(color_srgb) / 255) in GREYS:
+        values = np.clip(max(color_srgb) / 255 * np.array([0.75, 1.0, 1.4]), 0.0, 1.0)
+        return {colour_name(np.full(3, value)) for value in values}
+    hue, saturation, value = colorsys.rgb_to_hsv(*(channel / 255 for channel in color_srgb))
+    shades = product((-0.04, 0.0, 0.04), (0.75, 1.0, 1.3), (0.75, 1.0, 1.4))
+    return {
+        colour_name(
+            np.array(
+                colorsys.hsv_to_rgb((hue + h) % 1.0, min(saturation * s, 1), min(value * v, 1))
+            )
+        )
+        for h, s, v in shades
+    }
 
 
 def without_shading(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 
 from bridge.episode import provenance
 from bridge.errors import InvalidRecordError, PathNotFoundError
@@ -18,6 +18,7 @@ from twin.naming.things import Instance, SemanticScene, SemanticsError
 from twin.npz import UnreadableArraysError, read_npz
 
 SEMANTICS_FILE = "semantics.npz"
+VECTORS_FILE = "features.npz"
 FORMAT_VERSION = 1
 MAX_BYTES = 8 << 30
 """Unpacked; a file that claims more is refused."""
@@ -87,7 +88,6 @@ def _about(item: Instance, rows: Mapping[str, int]) -> dict[str, Any]:
         "T_base_instance": se3.pose_record(item.T_base_instance),
         "size_m": list(item.size_m),
         "parts": list(item.parts),
-        "keypoints_m": {name: point.tolist() for name, point in item.keypoints_m.items()},
     }
 
 
@@ -165,13 +165,45 @@ def _instance(
         parts={
             str(name): mask & (codes == code) for code, name in enumerate(about["parts"], start=1)
         },
-        keypoints_m={name: _vector(p, 3) for name, p in about["keypoints_m"].items()},
     )
 
 
-def _vector(values: Any, length: int) -> Float[np.ndarray, " length"]:
-    vector = np.array(values, dtype=np.float64)
-    if vector.shape != (length,) or not np.isfinite(vector).all():
-        message = f"a vector that is none: {values}"
-        raise ValueError(message)
-    return vector
+def write_vectors(
+    folder: Path,
+    scene: SemanticScene,
+    vectors: Float32[np.ndarray, "num_instances num_channels"],
+    source: str,
+) -> dict[str, Any]:
+    """Write a vector for each instance, in the space of a model's words; what to record of it.
+
+    Args:
+        source: The model, and the beginning of its weights' SHA-256.
+    """
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        instance_ids=np.array([item.id for item in scene.instances], dtype=np.int32),
+        instance_embeddings=vectors,
+        source=np.frombuffer(source.encode(), dtype=np.uint8),
+    )
+    write_whole(folder / VECTORS_FILE, buffer.getvalue())
+    return {"file": VECTORS_FILE, "source": source, "num_channels": vectors.shape[1]}
+
+
+def read_vectors(
+    folder: Path, scene: SemanticScene
+) -> tuple[Float32[np.ndarray, "num_instances num_channels"], str] | None:
+    """What ``write_vectors`` wrote, in the order of the instances; None where there are none."""
+    path = folder / VECTORS_FILE
+    if not path.is_file():
+        return None
+    try:
+        names = ("instance_ids", "instance_embeddings", "source")
+        arrays = read_npz(path, names, MAX_BYTES)
+    except UnreadableArraysError as error:
+        raise UnreadableSemanticsError(path=path, found=f"unreadable ({error.found})") from error
+    ids, vectors = arrays["instance_ids"].tolist(), arrays["instance_embeddings"]
+    of_scene = ids == [item.id for item in scene.instances]
+    if not of_scene or vectors.ndim != 2 or len(vectors) != len(ids):
+        raise UnreadableSemanticsError(path=path, found="made for another scene")
+    return vectors.astype(np.float32), arrays["source"].astype(np.uint8).tobytes().decode()

@@ -1,15 +1,19 @@
-"""What segmentation gives: masks in images, instances in the scene, feature maps."""
+"""What segmentation gives: masks in images, instances in the scene."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt16
+from jaxtyping import Bool, Float, UInt16
 
 from twin.errors import TwinError
 
-UNKNOWN_SHAPE = "toy"
+UNKNOWN_SHAPE = "thing"
 """Word in labels for a shape that is no box, cylinder, ball or container."""
+
+
+NAMED = "task"
+"""Source of an instance that is an object of the task."""
 
 
 class SemanticsError(TwinError):
@@ -40,15 +44,6 @@ class MaskSet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeatureMap:
-    """Features of one image at a fraction of its resolution."""
-
-    values: Float32[np.ndarray, "num_channels map_height map_width"]
-    stride: int
-    """Image pixels per feature cell, along rows and along columns."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Instance:
     """One thing of the scene, as a set of its Gaussians."""
 
@@ -63,22 +58,20 @@ class Instance:
     score: float
     """0..1: mean confidence of its masks; of the default segmenter the share of firm points."""
     source: str
-    color_srgb: tuple[int, int, int]
+    color_srgb: tuple[int, int, int] = (0, 0, 0)
     """Median colour of its Gaussians."""
-    T_base_instance: Float[np.ndarray, "4 4"]
+    T_base_instance: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     """Centre and axes of its box: z up, x along the longer side, see ``size_m``."""
-    size_m: tuple[float, float, float]
+    size_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Extents of its box along those axes."""
     parts: Mapping[str, Bool[np.ndarray, " num_splats"]] = field(default_factory=dict)
-    keypoints_m: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
-    """Named points in the root frame."""
 
     @property
     def name(self) -> str:
         """What people are told: size and number too, and no shape where none is known."""
         size = " x ".join(f"{100 * extent:.0f}" for extent in self.size_m)
         colour, _, shape = self.label.rpartition(" ")
-        known = self.label if shape != UNKNOWN_SHAPE else colour
+        known = colour if shape in (UNKNOWN_SHAPE, "toy") else self.label
         return f"object {self.id}, {known or 'no name'}, {size} cm"
 
 
@@ -93,12 +86,3 @@ class SemanticScene:
     """Who says so."""
     remark: str = ""
     """Why there is nothing, or what was left out; empty when there is nothing to say."""
-
-    def instance(self, number: int) -> Instance:
-        """Return the instance with an id."""
-        for item in self.instances:
-            if item.id == number:
-                return item
-        known = ", ".join(f"{item.id} ({item.label})" for item in self.instances) or "none"
-        message = f"the scene has no instance {number}; it has {known}."
-        raise SemanticsError(message)

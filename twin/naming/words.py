@@ -1,7 +1,6 @@
 """Which words mean the same, what things look like and what parts they have."""
 
 import re
-from collections.abc import Iterable
 
 from twin.naming.colours import COLOUR_NAMES
 
@@ -15,30 +14,23 @@ SHAPE_WORDS = {
     "flat box": ("box", "book", "card", "plate", "board", "tablet"),
     "cylinder": ("cylinder", "can", "cup", "mug", "bottle", "tube", "jar"),
     "ball": ("ball", "sphere", "orange", "apple"),
-    "toy": ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll"),
+    "slab": ("book", "board", "magazine", "plate", "card", "tablet", "picture"),
+    "block": ("box", "package", "parcel", "case", "carton"),
+    "thing": (),
 }  # fmt: skip
 """What a thing of a shape may be called."""
-ANY_THING = ("object", "thing", "item", "stuff")
-ANIMALS = SHAPE_WORDS["toy"]
+ANY_THING = ("thing", "object", "item", "stuff", "everything", "anything")
+ANIMALS = ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll")
 KIND_NAMES = {"container": ("container",), "animal": ("toy", "animal", "plush"), "other": ()}
 """What every thing of a kind may be called, see ``kind_of``."""
-TYPICAL_COLOURS = {
-    "duck": ("yellow", "orange"),
-    "sloth": ("brown", "beige", "grey"),
-    "teddy": ("brown", "beige"),
-    "orange": ("orange",),
-    "apple": ("red", "green"),
-}
-"""A shape alone does not tell a duck from a sloth; its colour may."""
 PART_WORDS = {
     "rim": ("rim", "edge", "lip"),
     "floor": ("floor", "bottom", "inside", "cavity"),
     "walls": ("wall", "side"),
     "handle": ("handle", "grip", "ear"),
-    "body": ("body", "torso", "belly", "trunk"),
-    "head": ("head", "face", "beak"),
-    "limbs": ("limb", "leg", "arm", "foot", "hand", "paw", "wing"),
 }
+ALONE = ("rim", "lip", "handle", "grip")
+"""Parts that need no thing named with them; a wall or a floor alone is no part."""
 SAME_COLOURS = {
     "gray": "grey", "silver": "grey", "charcoal": "grey",
     "violet": "purple", "lilac": "purple", "mauve": "purple",
@@ -113,20 +105,12 @@ def names_of(label: str) -> set[str]:
     """Nouns that a label answers to: its own words, its kind, what its shape may be called."""
     names = set(words_of(label)) | set(ANY_THING) | set(KIND_NAMES[kind_of(label)])
     shape = shape_in(label)
-    if shape is not None:
-        colours = {colour_of(word) for word in words_of(label)} - {None}
-        names |= {
-            name
-            for name in SHAPE_WORDS[shape]
-            if name not in TYPICAL_COLOURS or not colours or colours & set(TYPICAL_COLOURS[name])
-        }
-    return names
+    return names | set(SHAPE_WORDS[shape] if shape is not None else ())
 
 
 def known_words() -> set[str]:
     """Every noun the lexicon has."""
-    nouns: Iterable[tuple[str, ...]] = (*SHAPE_WORDS.values(), ANY_THING, ANIMALS)
-    return {name for group in nouns for name in group}
+    return {name for group in (*SHAPE_WORDS.values(), ANY_THING, ANIMALS) for name in group}
 
 
 def kind_of(label: str) -> str:
@@ -136,7 +120,7 @@ def kind_of(label: str) -> str:
         shape is None and _any_of(words, SHAPE_WORDS["open container"])
     ):
         return "container"
-    if shape == "toy" or (shape is None and _any_of(words, ANIMALS)):
+    if shape is None and _any_of(words, ANIMALS):
         return "animal"
     return "other"
 

@@ -215,14 +215,8 @@ class ModelConfig:
     """Find things in images with sam3:FOLDER instead of the default segmenter."""
     prompt: tuple[str, ...] = ()
     """What the segmenter looks for, once for each; default: the names of the task's objects."""
-    features: str = ""
-    """Put features of dinov3:FOLDER on the Gaussians."""
-    feature_channels: Annotated[int, RARE] = 16
-    """Principal components that are kept of each feature."""
-    feature_stride: Annotated[int | None, RARE] = None
-    """Image pixels per feature; default: the model's own, 16. Less costs more."""
     clip: str = ""
-    """Folder of CLIP: things are found by meaning, not by the words of the lexicon."""
+    """Folder of CLIP: find --clip then finds by meaning, not by the words of the lexicon."""
     model_frames: Annotated[int, RARE] = 12
     """Training frames the models look at, spread evenly."""
     device: str = "auto"
@@ -230,14 +224,12 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Refuse to look at nothing."""
-        _refuse_below(1, feature_channels=self.feature_channels, model_frames=self.model_frames)
-        if self.feature_stride is not None:
-            _refuse_below(1, feature_stride=self.feature_stride)
+        _refuse_below(1, model_frames=self.model_frames)
 
     @property
     def any_named(self) -> bool:
         """Whether a model is to be asked at all."""
-        return bool(self.segmenter or self.features or self.clip)
+        return bool(self.segmenter or self.clip)
 
 
 @Parameter(name="*")

@@ -1,61 +1,44 @@
-"""What ``rebuild`` asks the models: masks and features of training frames, vectors of things."""
+"""Semantics as a stage of ``rebuild``: ask the models, find what is what, write it down."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float, Float32
 
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import UsageError
 from bridge.task.task_file import Task
-from bridge.terminal import Advance
-from twin.naming.things import MaskSet, SemanticScene
+from bridge.terminal import Advance, Output
+from twin.naming.scene_file import (
+    BACKGROUND_KEY,
+    SEMANTICS_FILE,
+    VECTORS_FILE,
+    write_semantics,
+    write_vectors,
+)
+from twin.naming.things import MaskSet, SemanticScene, SemanticsError
 from twin.naming.words import spoken_name
-from twin.scene.foundation import models
-from twin.scene.foundation.loading import (
-    Placement,
-    WeightsKind,
-    check_folder,
-    import_transformers,
-    weights_hash,
-)
-from twin.scene.foundation.models import (
-    FEATURES,
-    SEGMENTERS,
-    ClipEmbedder,
-    DinoFeatures,
-    Sam3Segmenter,
-    split_spec,
-)
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.foundation.loading import check_folder, device_of, import_transformers
+from twin.scene.foundation.models import ClipEmbedder, Sam3Segmenter, sam3_folder
+from twin.scene.frames.rgbd import TrainingView
+from twin.scene.frames.selection import FrameChoice, load, spread
+from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
+from twin.scene.objects.decompose import Decomposition
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.semantics.features import (
-    FeatureBasis,
-    SceneFeatures,
-    fit_basis,
-    lift_reduced,
-    save_features,
-)
+from twin.scene.semantics.describe import scene_by_default, scene_from_masks
 from twin.scene.semantics.lift import Viewpoint, render_labels
+from twin.scene.semantics.segment import SOURCE
 from twin.scene.settings import ModelConfig
 
+MAX_VIEWPOINTS = 24
+"""Frames that count support; more are thinned out evenly."""
 MIN_SHOWN_PX = 64
 """A thing is cut out of frames that show at least this much of it."""
 MAX_CROPS = 5
 """Frames whose vectors of one thing are averaged: those that show most of it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelFindings:
-    """What the models say about the frames."""
-
-    masks: list[tuple[Viewpoint, MaskSet]]
-    """Empty without a segmenter."""
-    features: SceneFeatures | None
-    """None without a feature model."""
 
 
 def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
@@ -67,32 +50,22 @@ def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
     Raises:
         UsageError: When an option or a folder cannot be used, or nothing says what to look for.
     """
-    named: list[tuple[str, Path, WeightsKind]] = []
+    hashes = {}
     if config.segmenter:
         prompts_of(config, task)
-        _, folder = split_spec(config.segmenter, "--segmenter", SEGMENTERS)
-        named.append(("segmenter", folder, models.SAM3_KIND))
-    if config.features:
-        _, folder = split_spec(config.features, "--features", FEATURES)
-        named.append(("features", folder, models.DINOV3_KIND))
+        hashes["segmenter"] = check_folder(sam3_folder(config.segmenter), Sam3Segmenter.kind)
     if config.clip:
-        named.append(("clip", Path(config.clip).expanduser(), models.CLIP_KIND))
-    hashes = {}
-    for option, folder, kind in named:
-        check_folder(folder, kind)
-        hashes[option] = weights_hash(folder, kind)
+        hashes["clip"] = check_folder(Path(config.clip).expanduser(), ClipEmbedder.kind)
     if hashes:
-        Placement(device=config.device).resolve()
+        device_of(config.device)
         import_transformers()
     return hashes
 
 
 def prompts_of(config: ModelConfig, task: Task | None) -> list[str]:
     """What to look for: the prompts given, else the names of the task's objects."""
-    if config.prompt:
-        return list(config.prompt)
     names = [] if task is None else [spoken_name(key) for key in task.objects]
-    prompts = list(dict.fromkeys(name for name in names if name))
+    prompts = list(config.prompt) or list(dict.fromkeys(name for name in names if name))
     if not prompts:
         message = (
             "--segmenter needs words to look for, and the run's episodes name no task with "
@@ -102,87 +75,21 @@ def prompts_of(config: ModelConfig, task: Task | None) -> list[str]:
     return prompts
 
 
-def ask_models(
+def masks_in(
     config: ModelConfig,
     frames: Sequence[RgbdFrame],
-    cloud: GaussianCloud,
     task: Task | None,
-    *,
-    threads: int = 0,
     advance: Advance = lambda done, note: None,
-) -> ModelFindings:
-    """Run segmenter and feature model over frames, one model in memory at a time.
-
-    Args:
-        cloud: The Gaussians that features are lifted to, in the frames' root frame.
-    """
-    placement = Placement(device=config.device)
-    masks: list[tuple[Viewpoint, MaskSet]] = []
-    if config.segmenter:
-        _, folder = split_spec(config.segmenter, "--segmenter", SEGMENTERS)
-        segmenter = Sam3Segmenter.load(folder, placement)
-        prompts = prompts_of(config, task)
-        for done, frame in enumerate(frames, 1):
-            found = segmenter.segment(
-                frame.image_u8, prompts, camera_id=frame.camera_id, stamp_ns=frame.stamp_ns
-            )
-            masks.append((viewpoint_of(frame), found))
-            advance(done, segmenter.source)
-        del segmenter
-    features = None
-    if config.features and frames:
-        _, folder = split_spec(config.features, "--features", FEATURES)
-        source = DinoFeatures.load(folder, placement)
-        maps = []
-        for done, frame in enumerate(frames, 1):
-            maps += source.features([frame.image_u8], stride=config.feature_stride)
-            advance(len(masks) + done, source.source)
-        basis = fit_basis(maps, config.feature_channels)
-        pairs = zip((viewpoint_of(frame) for frame in frames), maps, strict=True)
-        rasteriser = Rasteriser(RasterConfig(threads=threads))
-        features = lift_reduced(rasteriser, cloud, pairs, basis, source=source.source)
-    return ModelFindings(masks=masks, features=features)
-
-
-def embed_things(
-    folder: Path,
-    scene: SemanticScene,
-    cloud: GaussianCloud,
-    frames: Sequence[RgbdFrame],
-    features: SceneFeatures | None,
-    config: ModelConfig,
-    *,
-    threads: int = 0,
-    advance: Advance = lambda done, note: None,
-) -> dict[str, Any]:
-    """Give every thing of a scene its CLIP vector and write ``features.npz``.
-
-    Returns:
-        What ``scene.json`` says about the vectors.
-    """
-    if not config.clip:
-        message = "no folder of CLIP is named; give --clip FOLDER."
-        raise UsageError(message)
-    placement = Placement(device=config.device)
-    embedder = ClipEmbedder.load(Path(config.clip).expanduser(), placement)
-    rasteriser = Rasteriser(RasterConfig(threads=threads))
-    vectors, shown = thing_vectors(embedder, scene, cloud, frames, rasteriser, advance)
-    held = features or _no_features(len(cloud))
-    sources = [name for name in (held.source, embedder.source) if name]
-    with_vectors = replace(
-        held,
-        instance_ids=np.array([item.id for item in scene.instances], dtype=np.int32),
-        instance_embeddings=vectors,
-        source=", ".join(sources),
-    )
-    path = save_features(folder, with_vectors)
-    unseen = [item.label for item, count in zip(scene.instances, shown, strict=True) if not count]
-    return {
-        "file": path.name,
-        "source": embedder.source,
-        "num_channels": embedder.num_channels,
-        "never_shown": unseen,
-    }
+) -> list[tuple[Viewpoint, MaskSet]]:
+    """Run the segmenter over frames."""
+    segmenter = Sam3Segmenter(sam3_folder(config.segmenter), config.device)
+    prompts = prompts_of(config, task)
+    masks = []
+    for done, frame in enumerate(frames, 1):
+        where = {"camera_id": frame.camera_id, "stamp_ns": frame.stamp_ns}
+        masks.append((viewpoint_of(frame), segmenter.segment(frame.image_u8, prompts, **where)))
+        advance(done, segmenter.kind.name)
+    return masks
 
 
 def thing_vectors(
@@ -225,17 +132,144 @@ def viewpoint_of(frame: RgbdFrame) -> Viewpoint:
     return Viewpoint(camera=frame.color_camera, T_base_camera=frame.T_base_color)
 
 
-def _no_features(num_splats: int) -> SceneFeatures:
-    basis = FeatureBasis(
-        mean=np.zeros(0, dtype=np.float32),
-        components=np.zeros((0, 0), dtype=np.float32),
-        explained_fraction=1.0,
+def find_things(
+    background: GaussianCloud,
+    objects: Mapping[str, GaussianCloud],
+    viewpoints: Sequence[Viewpoint],
+    *,
+    masks: Sequence[tuple[Viewpoint, MaskSet]] = (),
+    surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
+    fused: GaussianCloud | None = None,
+    rasteriser: Rasteriser,
+    advance: Advance = lambda done, note: None,
+) -> SemanticScene:
+    """Say what is what among the Gaussians of the background and of the objects, in this order.
+
+    Nothing found, or masks that do not fit, is a remark, not an error: the scene is good without.
+
+    Args:
+        background: Those that nobody measured are guessed surfaces: without masks no thing is
+            looked for in them.
+        objects: Moved to where they were scanned; without masks each is an instance of that name.
+        masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
+        surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
+            told apart on these.
+        fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
+    """
+    cloud = concatenate([background, *objects.values()])
+    sizes = [len(background), *(len(part) for part in objects.values())]
+    try:
+        if masks:
+            return scene_from_masks(cloud, masks, rasteriser, advance=advance)
+        owner = np.repeat(np.arange(len(sizes)), sizes)
+        measured = np.ones(len(cloud), dtype=bool)
+        measured[: len(background)] = ~background.completed
+        scene = scene_by_default(
+            cloud.take(measured),
+            viewpoints[:: -(-len(viewpoints) // MAX_VIEWPOINTS) or 1],
+            rasteriser,
+            known={key: (owner == n)[measured] for n, key in enumerate(objects, start=1)},
+            surfaces_m=surfaces_m,
+            fused=fused,
+            advance=advance,
+        )
+        return _among_all(scene, measured)
+    except SemanticsError as error:
+        nothing = np.zeros(len(cloud), dtype=np.uint16)
+        source = masks[0][1].source if masks else SOURCE
+        return SemanticScene(instances=(), labels=nothing, source=source, remark=str(error))
+
+
+def _among_all(scene: SemanticScene, measured: Bool[np.ndarray, " num_splats"]) -> SemanticScene:
+    """The same things among all Gaussians; only the measured ones were looked at."""
+
+    def spread_out(values: np.ndarray) -> np.ndarray:
+        spread_values = np.zeros(len(measured), dtype=values.dtype)
+        spread_values[measured] = values
+        return spread_values
+
+    things = tuple(
+        replace(
+            item,
+            mask=spread_out(item.mask),
+            parts={name: spread_out(mask) for name, mask in item.parts.items()},
+        )
+        for item in scene.instances
     )
-    return SceneFeatures(
-        basis=basis,
-        features=np.zeros((num_splats, 0), dtype=np.float32),
-        weight=np.zeros(num_splats, dtype=np.float32),
-        instance_ids=np.zeros(0, dtype=np.int32),
-        instance_embeddings=np.zeros((0, 0), dtype=np.float32),
-        source="",
+    return replace(scene, instances=things, labels=spread_out(scene.labels))
+
+
+def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFrame]:
+    """Read at most ``count`` training frames, spread evenly over episodes, cameras and time."""
+    numbered = [(index, ns) for index, each in enumerate(choices) for ns in sorted(each.train_ns)]
+    chosen = {numbered[index] for index in spread(np.arange(len(numbered)), count)}
+    frames: list[RgbdFrame] = []
+    for index, each in enumerate(choices):
+        frames += load(each, frozenset(ns for owner, ns in chosen if owner == index))
+    return frames
+
+
+def write_scene_semantics(
+    folder: Path,
+    decomposed: Decomposition,
+    views: Sequence[TrainingView],
+    threads: int,
+    output: Output,
+    *,
+    fused: GaussianCloud | None = None,
+    models: ModelConfig | None = None,
+    choices: Sequence[FrameChoice] = (),
+    task: Task | None = None,
+) -> dict[str, Any]:
+    """Say what is what in a decomposed scene, and write it into the scene's folder.
+
+    Args:
+        fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
+        models: Large models to ask beside the default segmenter; None: none.
+
+    Returns:
+        What ``scene.json`` says about it.
+    """
+    models, objects = models or ModelConfig(), decomposed.objects
+    placed = {key: moved_cloud(item.cloud, item.T_base_object) for key, item in objects.items()}
+    rasteriser = Rasteriser(RasterConfig(threads=threads))
+    num = len(decomposed.background) + sum(len(part) for part in placed.values())
+    output.say(f"name what is in the scene: {num} Gaussians, {len(objects)} objects known")
+    frames = training_frames(choices, models.model_frames) if models.any_named else []
+    masks: list[tuple[Viewpoint, MaskSet]] = []
+    if models.segmenter:
+        with output.progress("ask the segmenter", len(frames)) as advance:
+            masks = masks_in(models, frames, task, advance)
+        num_masks = sum(len(found.masks) for _, found in masks)
+        output.say(f"{num_masks} masks in {len(frames)} frames")
+    with output.progress("name things", 100) as advance:
+        scene = find_things(
+            decomposed.background,
+            placed,
+            [Viewpoint(camera=v.half.camera, T_base_camera=v.T_base_color) for v in views],
+            masks=masks,
+            surfaces_m=decomposed.surfaces_m(),
+            fused=fused,
+            rasteriser=rasteriser,
+            advance=advance,
+        )
+    for name in (SEMANTICS_FILE, VECTORS_FILE):
+        (folder / name).unlink(missing_ok=True)
+    rows = {BACKGROUND_KEY: len(decomposed.background)}
+    rows |= {key: len(part) for key, part in placed.items()}
+    record = write_semantics(folder, scene, rows)
+    if models.clip:
+        cloud = concatenate([decomposed.background, *placed.values()])
+        embedder = ClipEmbedder(Path(models.clip).expanduser(), models.device)
+        with output.progress("give things vectors", len(scene.instances)) as advance:
+            vectors, shown = thing_vectors(embedder, scene, cloud, frames, rasteriser, advance)
+        source = f"{embedder.kind.name} {embedder.hash[:12]}"
+        unseen = [scene.instances[row].label for row, count in enumerate(shown) if not count]
+        record["vectors"] = write_vectors(folder, scene, vectors, source) | {"never_shown": unseen}
+    names = "; ".join(item["name"] for item in record["instances"])
+    output.say(
+        f"{len(record['instances'])} things ({record['source']}): {names}"
+        if names
+        else f"no things named: {record['remark']}"
     )
+    return {"semantics": record}

@@ -267,7 +267,7 @@ def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
     needed += [run.scene_dir / item["file"] for item in links.values()]
     if "semantics" in record:
         about = record["semantics"]
-        named = [about, about.get("features") or {}, about.get("vectors") or {}]
+        named = [about, about.get("vectors") or {}]
         needed += [run.scene_dir / item["file"] for item in named if "file" in item]
     static = (record.get("sdf") or {}).get("file")
     needed += [run.scene_dir / static] if static else []

@@ -1,7 +1,6 @@
 """Divide points into things: connected voxels, cut along valleys and where colours differ."""
 
 import heapq
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from twin.naming.colours import lab_from_srgb, without_shading
-from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_shape
+from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,32 +141,28 @@ def make_patches(
     return patch, means_of(voxels.p_m, patch, num), normals / np.maximum(length, 1e-9)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ValleySplitConfig:
-    """When one connected group is several things."""
-
-    max_colours: int = 4
-    """Colours to look for in one group."""
-    lightness_weight: float = 0.3
-    """Shading changes lightness, not the ratios of a and b to it."""
-    colour_noise: float = 5.0
-    """Spread of one colour, in Lab units; groups tighter than this gain nothing by a cut."""
-    min_colour_gap: float = 20.0
-    """Distance between two colours that may be two things."""
-    samples_per_voxel: float = 0.05
-    """Neighbouring voxels are alike: so many independent samples each counts for."""
-    min_piece_fraction: float = 0.25
-    """Of the larger neighbour; smaller pieces are its markings, unless they lie in its cavity."""
-    valley: float = 0.3
-    """(n_j - n_i) . d below minus this is a valley: 0.3 is an edge of about 17 degrees."""
-    patch_voxels: float = 3.0
-    """Size of the patches between which valleys are looked for."""
-    min_valley_fraction: float = 0.15
-    """Smallest share of a piece that is cut off along a valley."""
-    touch_m: float = 0.015
-    """A piece whose lowest points are below this stands on the plane."""
-    max_overlap_fraction: float = 0.35
-    """Of a piece's outline seen from above, within the other's."""
+MAX_COLOURS = 4
+"""Colours to look for in one group."""
+LIGHTNESS_WEIGHT = 0.3
+"""Shading changes lightness, not the ratios of a and b to it."""
+COLOUR_NOISE = 5.0
+"""Spread of one colour, in Lab units; groups tighter than this gain nothing by a cut."""
+MIN_COLOUR_GAP = 20.0
+"""Distance between two colours that may be two things."""
+SAMPLES_PER_VOXEL = 0.05
+"""Neighbouring voxels are alike: so many independent samples each counts for."""
+MIN_PIECE_FRACTION = 0.25
+"""Of the larger neighbour; smaller pieces are its markings, unless they lie in its cavity."""
+VALLEY = 0.3
+"""(n_j - n_i) . d below minus this is a valley: 0.3 is an edge of about 17 degrees."""
+PATCH_VOXELS = 3.0
+"""Size of the patches between which valleys are looked for."""
+MIN_VALLEY_FRACTION = 0.15
+"""Smallest share of a piece that is cut off along a valley."""
+TOUCH_M = 0.015
+"""A piece whose lowest points are below this stands on the plane."""
+MAX_OVERLAP_FRACTION = 0.35
+"""Of a piece's outline seen from above, within the other's."""
 
 
 def split_by_valleys(
@@ -175,7 +170,6 @@ def split_by_valleys(
     height_m: Float[np.ndarray, " num_voxels"],
     pairs: Int[np.ndarray, "num_pairs 2"],
     voxel_m: float,
-    config: ValleySplitConfig,
 ) -> Int[np.ndarray, " num_voxels"]:
     """Number the pieces of one connected group that valleys separate.
 
@@ -183,15 +177,15 @@ def split_by_valleys(
     a valley too, so a cut counts only between pieces that each stand on the plane and whose
     outlines seen from above hardly overlap: heads, handles and the floor of a box stay.
     """
-    patch, p, normals = make_patches(voxels, config.patch_voxels * voxel_m)
+    patch, p, normals = make_patches(voxels, PATCH_VOXELS * voxel_m)
     links = np.sort(patch[pairs], axis=1)
     links = np.unique(links[links[:, 0] != links[:, 1]], axis=0)
     away = p[links[:, 1]] - p[links[:, 0]]
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
     bend = ((normals[links[:, 1]] - normals[links[:, 0]]) * away).sum(axis=1)
-    pieces = _merged(len(p), links, bend, -config.valley)[patch]
+    pieces = _merged(len(p), links, bend, -VALLEY)[patch]
     while True:
-        merge = _first_dependent(pieces, voxels.p_m, height_m, pairs, config)
+        merge = _first_dependent(pieces, voxels.p_m, height_m, pairs)
         if merge is None:
             return numbered(pieces)
         pieces = np.where(pieces == merge[0], merge[1], pieces)
@@ -238,57 +232,12 @@ def _merged(
     return numbered(np.array(owner, dtype=np.int64))
 
 
-def joined_by_outline(
-    pieces: Sequence[Int[np.ndarray, " _"]],
-    voxels: Voxels,
-    height_m: Float[np.ndarray, " num_voxels"],
-    voxel_m: float,
-    config: ValleySplitConfig,
-) -> list[Int[np.ndarray, " _"]]:
-    """Join pieces of one colour of which one lies over the other, or that make a container.
-
-    What one camera sees of a thing may fall into pieces: the far wall of a box behind the near
-    one, a head in front of its body.
-    """
-    xyh = np.concatenate([voxels.p_m[:, :2], height_m[:, None]], axis=1)
-    left = sorted(pieces, key=len)
-    colours = [
-        np.median(without_shading(voxels.lab[ids], config.lightness_weight), axis=0) for ids in left
-    ]
-    joined: list[np.ndarray] = []
-    for index, ids in enumerate(left):
-        for other in range(index + 1, len(left)):
-            alike = np.linalg.norm(colours[index] - colours[other]) < config.min_colour_gap
-            if alike and _belong_together(xyh[ids], xyh[left[other]], voxel_m, config):
-                left[other] = np.concatenate([left[other], ids])
-                break
-        else:
-            joined.append(ids)
-    return joined
-
-
-def _belong_together(
-    a: np.ndarray, b: np.ndarray, voxel_m: float, config: ValleySplitConfig
-) -> bool:
-    """Whether one lies over the other, or both are beside each other and hold a cavity."""
-    if _overlap(a, b) > config.max_overlap_fraction:
-        return True
-    gap = np.maximum(a.min(axis=0), b.min(axis=0)) - np.minimum(a.max(axis=0), b.max(axis=0))
-    if max(gap[:2]) > 2 * voxel_m:
-        return False
-    return measure_shape(np.concatenate([a, b]), voxel_m).cavity is not None
-
-
 def _first_dependent(
-    pieces: np.ndarray,
-    p_m: np.ndarray,
-    height_m: np.ndarray,
-    pairs: np.ndarray,
-    config: ValleySplitConfig,
+    pieces: np.ndarray, p_m: np.ndarray, height_m: np.ndarray, pairs: np.ndarray
 ) -> tuple[int, int] | None:
     """The smallest piece that is not a thing of its own, and the neighbour it belongs to."""
     counts = np.bincount(pieces)
-    touch = max(config.touch_m, 0.25 * float(height_m.max()))
+    touch = max(TOUCH_M, 0.25 * float(height_m.max()))
     for piece in np.argsort(counts, kind="stable"):
         if counts[piece] == 0:
             continue
@@ -299,21 +248,22 @@ def _first_dependent(
         others, strength = np.unique(links[links != piece], return_counts=True)
         strongest = int(others[np.argmax(strength)])
         own = pieces == piece
-        small = counts[piece] < config.min_valley_fraction * len(pieces)
+        small = counts[piece] < MIN_VALLEY_FRACTION * len(pieces)
         if small or np.quantile(height_m[own], 0.03) > touch:
             return int(piece), strongest
         for other in others:
-            if _overlap(p_m[own], p_m[pieces == other]) > config.max_overlap_fraction:
+            if _overlap(p_m[own], p_m[pieces == other]) > MAX_OVERLAP_FRACTION:
                 return int(piece), int(other)
     return None
 
 
 def _overlap(a_m: np.ndarray, b_m: np.ndarray) -> float:
     """Share of one set of points within the other's outline seen from above, the larger."""
-    return max(float(_within_outline(a_m, b_m).mean()), float(_within_outline(b_m, a_m).mean()))
+    return max(float(within_outline(a_m, b_m).mean()), float(within_outline(b_m, a_m).mean()))
 
 
-def _within_outline(points: np.ndarray, outline: np.ndarray) -> Bool[np.ndarray, " num_points"]:
+def within_outline(points: np.ndarray, outline: np.ndarray) -> Bool[np.ndarray, " num_points"]:
+    """Which points lie within the convex outline of others, seen from above."""
     try:
         hull = Delaunay(outline[:, :2])
     except (QhullError, ValueError):
@@ -325,7 +275,6 @@ def split_by_colour(
     voxels: Voxels,
     height_m: Float[np.ndarray, " num_voxels"],
     pairs: Int[np.ndarray, "num_pairs 2"],
-    config: ValleySplitConfig,
 ) -> Int[np.ndarray, " num_voxels"]:
     """Number the pieces of one connected group that differ in colour.
 
@@ -333,28 +282,28 @@ def split_by_colour(
     pieces of one colour. A piece much smaller than its neighbour is a marking (a beak, a label)
     and joins it, unless it lies in the neighbour's cavity.
     """
-    colour = without_shading(voxels.lab, config.lightness_weight)
-    classes = _colour_classes(colour, config)
+    colour = without_shading(voxels.lab, LIGHTNESS_WEIGHT)
+    classes = _colour_classes(colour)
     if classes.max(initial=0) == 0:
         return classes
     same = classes[pairs[:, 0]] == classes[pairs[:, 1]]
     pieces = components(len(voxels), pairs[same])
     while True:
-        small = _smallest_marking(pieces, voxels, height_m, pairs, colour, config)
+        small = _smallest_marking(pieces, voxels, height_m, pairs, colour)
         if small is None:
             return numbered(pieces)
         pieces = np.where(pieces == small[0], small[1], pieces)
 
 
-def _colour_classes(colour: np.ndarray, config: ValleySplitConfig) -> np.ndarray:
-    samples = max(config.samples_per_voxel * len(colour), 2.0)
+def _colour_classes(colour: np.ndarray) -> np.ndarray:
+    samples = max(SAMPLES_PER_VOXEL * len(colour), 2.0)
     best, best_cost = np.zeros(len(colour), dtype=np.int64), np.inf
-    for num in range(1, config.max_colours + 1):
+    for num in range(1, MAX_COLOURS + 1):
         classes, centres = _k_means(colour, num)
-        if num > 1 and _closest(centres) < config.min_colour_gap:
+        if num > 1 and _closest(centres) < MIN_COLOUR_GAP:
             continue
         spread = np.square(colour - centres[classes]).sum(axis=1).mean() / 3
-        variance = max(float(spread), config.colour_noise**2)
+        variance = max(float(spread), COLOUR_NOISE**2)
         cost = 3 * samples * np.log(variance) + 4 * num * np.log(samples)
         if cost < best_cost - 1e-9:
             best, best_cost = classes, float(cost)
@@ -386,12 +335,7 @@ def _k_means(values: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _smallest_marking(
-    pieces: np.ndarray,
-    voxels: Voxels,
-    height_m: np.ndarray,
-    pairs: np.ndarray,
-    colour: np.ndarray,
-    config: ValleySplitConfig,
+    pieces: np.ndarray, voxels: Voxels, height_m: np.ndarray, pairs: np.ndarray, colour: np.ndarray
 ) -> tuple[int, int] | None:
     """The smallest piece that is no thing of its own, and the neighbour it belongs to."""
     counts = np.bincount(pieces)
@@ -404,12 +348,12 @@ def _smallest_marking(
         own = colour[pieces == piece].mean(axis=0)
         gaps = [np.linalg.norm(own - colour[pieces == other].mean(axis=0)) for other in neighbours]
         largest = int(neighbours[np.argmax(counts[neighbours])])
-        if min(gaps) < config.min_colour_gap:
+        if min(gaps) < MIN_COLOUR_GAP:
             return int(piece), int(neighbours[int(np.argmin(gaps))])
         if counts[piece] >= 20 and _lies_in(pieces == piece, pieces == largest, voxels, height_m):
             continue
         inside = _is_set_in(pieces == piece, pieces == largest, voxels, height_m)
-        if counts[piece] >= config.min_piece_fraction * counts[largest] and not inside:
+        if counts[piece] >= MIN_PIECE_FRACTION * counts[largest] and not inside:
             continue
         return int(piece), largest
     return None
@@ -432,7 +376,7 @@ def _is_set_in(inner: np.ndarray, outer: np.ndarray, voxels: Voxels, height_m: n
     """Whether one piece lies in the other's surface, seen from above, and does not stand on it."""
     if np.quantile(height_m[inner], 0.1) > np.quantile(height_m[outer], STANDS_ON):
         return False
-    return bool(_within_outline(voxels.p_m[inner], voxels.p_m[outer]).mean() > SET_IN_SHARE)
+    return bool(within_outline(voxels.p_m[inner], voxels.p_m[outer]).mean() > SET_IN_SHARE)
 
 
 def _lies_in(inner: np.ndarray, outer: np.ndarray, voxels: Voxels, height_m: np.ndarray) -> bool:

@@ -1,4 +1,4 @@
-"""From sets of Gaussians to instances: colour, box, parts and keypoints."""
+"""From sets of Gaussians to instances: colour, box and parts."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -11,24 +11,23 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from bridge.terminal import Advance
 from twin.naming.colours import colour_name
-from twin.naming.things import Instance, MaskSet, SemanticScene
+from twin.naming.things import NAMED, Instance, MaskSet, SemanticScene
 from twin.naming.words import kind_of, label_of
 from twin.scene.frames.rgbd import NEAR_M
 from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.raster.rasteriser import Rasteriser
-from twin.scene.semantics.associate import AssociateConfig, SmoothConfig, associate, smooth_shares
-from twin.scene.semantics.language import NAMED, Numbered, numbered
-from twin.scene.semantics.lift import Viewpoint, observe, visible_weight
-from twin.scene.semantics.part_segmentation import Parts, PartsConfig, find_parts
+from twin.scene.semantics.lift import Viewpoint, visible_weight
+from twin.scene.semantics.masks import associate, observe
+from twin.scene.semantics.part_segmentation import find_parts
 from twin.scene.semantics.segment import (
     SOURCE,
     SegmentConfig,
     Thing,
     points_of,
+    segment,
     solid_splats,
 )
 from twin.scene.semantics.shape_descriptors import CONTAINER, measure_shape
-from twin.scene.semantics.stable_things import segment_stably
 from twin.scene.semantics.support import (
     NoSupportError,
     SupportConfig,
@@ -37,6 +36,8 @@ from twin.scene.semantics.support import (
     level_frame,
 )
 
+MIN_SPLATS = 20
+"""Of a known object with fewer Gaussians nothing can be said."""
 NEAR_POINT_M = 0.02
 """Gaussians farther from all points of the fused surface belong to no thing."""
 CELL_M = 0.004
@@ -60,7 +61,6 @@ def scene_from_masks(
     cloud: GaussianCloud,
     frames: Iterable[tuple[Viewpoint, MaskSet]],
     rasteriser: Rasteriser,
-    config: AssociateConfig | None = None,
     advance: Advance = lambda done, note: None,
 ) -> SemanticScene:
     """Fuse the masks of a 2D segmenter into the Gaussians of a scene."""
@@ -69,39 +69,33 @@ def scene_from_masks(
         observations.append(observe(rasteriser, cloud, viewpoint, masks))
         sources.append(masks.source)
     source = ", ".join(dict.fromkeys(sources)) or "no masks"
-    found = associate(
-        observations,
-        len(cloud),
-        config or AssociateConfig(),
-        smooth=lambda share: smooth_shares(share, cloud, SmoothConfig()),
-    )
+    tracks, labels = associate(observations, len(cloud))
     plane = support_of(cloud)
     instances = tuple(
         describe(
             cloud,
-            number=number,
-            mask=track.mask,
-            label=track.label,
-            support=track.support,
-            seen=track.seen,
-            score=track.score,
-            source=source,
-            plane=plane,
+            Instance(
+                id=number,
+                label=track.label,
+                mask=track.mask,
+                support=track.support,
+                seen=track.seen,
+                score=track.score,
+                source=source,
+            ),
+            plane,
         )
         for number, track in enumerate(
-            _told(found.tracks, SHOWN, 100, advance, "things measured"), start=1
+            _told(tracks, SHOWN, 100, advance, "things measured"), start=1
         )
     )
     num_masks = sum(len(item.labels) for item in observations)
     remark = (
-        ""
-        if instances
-        else (
-            f"{num_masks} masks in {len(observations)} frames gave no instance: each needs "
-            "matching masks in several frames"
-        )
+        f"{num_masks} masks in {len(observations)} frames gave no instance: each needs matching "
+        "masks in several frames"
     )
-    return SemanticScene(instances=instances, labels=found.labels, source=source, remark=remark)
+    remark = "" if instances else remark
+    return SemanticScene(instances=instances, labels=labels, source=source, remark=remark)
 
 
 def scene_by_default(
@@ -129,9 +123,9 @@ def scene_by_default(
         fused: The surface as it was measured, evenly sampled: things are looked for in it. None:
             in the scene's Gaussians, which a fit put where colours change.
     """
-    frames = list(viewpoints)
-    ids = np.flatnonzero(solid_splats(cloud))
+    frames, surfaces_m = list(viewpoints), surfaces_m or {}
     config = config or SegmentConfig()
+    ids = np.flatnonzero(solid_splats(cloud))
     searched = cloud.take(ids) if fused is None else fused
     points = points_of(searched)
     Ts = [frame.T_base_camera for frame in frames]
@@ -141,26 +135,51 @@ def scene_by_default(
         cloud, searched = (moved_cloud(item, T_level_base) for item in (cloud, searched))
         points = points_of(searched)
         frames = [replace(f, T_base_camera=T_level_base @ f.T_base_camera) for f in frames]
-        surfaces_m = {key: se3.apply(T_level_base, p) for key, p in (surfaces_m or {}).items()}
+        surfaces_m = {key: se3.apply(T_level_base, p) for key, p in surfaces_m.items()}
     labels = np.zeros(len(cloud), dtype=np.uint16)
     things: tuple[Thing, ...] = ()
     plane: SupportPlane | None = None
     try:
-        found = segment_stably(points, config)
+        found = segment(points, config)
     except NoSupportError as error:
         remark = str(error)
     else:
         labels[ids] = _nearest_label(found.labels, points.p_m, cloud.means_m[ids])
         things, plane, remark = found.things, found.plane, found.remark
     advance(FOUND, f"{len(things)} things found")
-    instances, numbers = _seen_instances(
-        cloud, frames, rasteriser, labels, things, known or {}, surfaces_m or {}, plane, advance
-    )
+    keys, others, labels = numbered(labels, known or {})
+    named = [(key, "", 1.0, NAMED) for key in keys]
+    named += [("", things[n - 1].label, things[n - 1].score, SOURCE) for n in others]
+    looked = _told(frames, FOUND, SHOWN, advance, "frames looked at")
+    shown, whole = _num_shown(cloud, labels, len(named), looked, rasteriser)
+    least = min(MIN_WHOLE, len(frames))
+    kept = [
+        n
+        for n, (key, *_) in enumerate(named, start=1)
+        if key or whole[n] >= max(least, MIN_WHOLE_SHARE * shown[n])
+    ]
+    new_number = np.zeros(len(named) + 1, dtype=np.uint16)
+    new_number[kept] = np.arange(1, len(kept) + 1)
+    labels = new_number[labels]
+    instances = []
+    for old in _told(kept, SHOWN, 100, advance, "things measured"):
+        key, label, score, source = named[old - 1]
+        item = Instance(
+            id=int(new_number[old]),
+            label=label,
+            mask=labels == new_number[old],
+            support=shown[old],
+            seen=shown[old],
+            score=score,
+            source=source,
+        )
+        item = describe(cloud, item, plane, key, surfaces_m.get(key))
+        T = se3.invert(T_level_base) @ item.T_base_instance
+        instances.append(item if is_level else replace(item, T_base_instance=T))
     if not is_level:
         up = ", ".join(f"{value:.2f}" for value in T_level_base[2, :3])
         remark = " ".join(filter(None, [remark, f"z does not point up here, ({up}) does"]))
-        instances = tuple(_moved(item, se3.invert(T_level_base)) for item in instances)
-    return SemanticScene(instances=instances, labels=numbers, source=SOURCE, remark=remark)
+    return SemanticScene(instances=tuple(instances), labels=labels, source=SOURCE, remark=remark)
 
 
 def _nearest_label(
@@ -174,62 +193,33 @@ def _nearest_label(
     return np.asarray(np.where(np.isfinite(far_m), known[nearest], 0), dtype=np.uint16)
 
 
-def _seen_instances(
-    cloud: GaussianCloud,
-    frames: Sequence[Viewpoint],
-    rasteriser: Rasteriser,
+def numbered(
     labels: UInt16[np.ndarray, " num_splats"],
-    things: Sequence[Thing],
     known: Mapping[str, Bool[np.ndarray, " num_splats"]],
-    surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]],
-    plane: SupportPlane | None,
-    advance: Advance,
-) -> tuple[tuple[Instance, ...], UInt16[np.ndarray, " num_splats"]]:
-    """Describe what is known and the things that enough frames show whole; their labels, too."""
-    final = numbered(labels, known)
-    total = len(final.keys) + len(final.others)
-    looked = _told(frames, FOUND, SHOWN, advance, "frames looked at")
-    shown, whole = _num_shown(cloud, final.labels, total, looked, rasteriser)
-    final, kept = _seen_whole(final, shown, whole, min(MIN_WHOLE, len(frames)))
-    named = [(key, "", 1.0, NAMED) for key in final.keys]
-    named += [("", things[n - 1].label, things[n - 1].score, SOURCE) for n in final.others]
-    reporting = _told(named, SHOWN, 100, advance, "things measured")
-    instances = tuple(
-        describe(
-            cloud,
-            number=number,
-            mask=final.labels == number,
-            key=key,
-            label=label,
-            support=shown[kept[number - 1]],
-            seen=shown[kept[number - 1]],
-            score=score,
-            source=source,
-            plane=plane,
-            surface_m=surfaces_m.get(key),
-        )
-        for number, (key, label, score, source) in enumerate(reporting, start=1)
-    )
-    return instances, final.labels
+) -> tuple[list[str], list[int], UInt16[np.ndarray, " num_splats"]]:
+    """Let the known objects have their Gaussians, and what the segmenter joined with them.
 
+    A thing of which at least half belongs to one known object is that object: its rest is what
+    was left in the background when the object was cut out.
 
-def _moved(item: Instance, T: Float[np.ndarray, "4 4"]) -> Instance:
-    """The same instance in another frame."""
-    keypoints = {name: se3.apply(T, point[None])[0] for name, point in item.keypoints_m.items()}
-    return replace(item, T_base_instance=T @ item.T_base_instance, keypoints_m=keypoints)
-
-
-def _seen_whole(
-    found: Numbered, shown: Sequence[int], whole: Sequence[int], least: int
-) -> tuple[Numbered, list[int]]:
-    """Drop what too few frames show whole; known objects stay. Also the old number of each."""
-    others = range(len(found.keys) + 1, len(found.keys) + len(found.others) + 1)
-    firm = [n for n in others if whole[n] >= max(least, MIN_WHOLE_SHARE * shown[n])]
-    kept = [*range(1, len(found.keys) + 1), *firm]
-    new_number = np.zeros(len(whole), dtype=np.uint16)
-    new_number[kept] = np.arange(1, len(kept) + 1)
-    things = tuple(found.others[n - 1 - len(found.keys)] for n in kept[len(found.keys) :])
-    return replace(found, labels=new_number[found.labels], others=things), kept
+    Returns:
+        Known objects, from number 1 on; the segmenter's numbers of the other things, which follow
+        them; the new labels.
+    """
+    keys = [key for key, mask in known.items() if int(mask.sum()) >= MIN_SPLATS]
+    sizes = np.bincount(labels, minlength=1)
+    new_number, most = np.zeros((2, len(sizes)), dtype=np.int64)
+    for number, key in enumerate(keys, start=1):
+        held = np.bincount(labels[known[key]], minlength=len(sizes))
+        mine = (2 * held >= sizes) & (held > most)
+        new_number[mine], most[mine] = number, held[mine]
+    new_number[0] = 0
+    others = [n for n in range(1, len(sizes)) if not new_number[n] and sizes[n]]
+    new_number[others] = np.arange(len(keys) + 1, len(keys) + len(others) + 1)
+    joined = new_number.astype(np.uint16)[labels]
+    for number, key in enumerate(keys, start=1):
+        joined[known[key]] = number
+    return keys, others, joined
 
 
 def _told(
@@ -248,20 +238,17 @@ def _num_shown(
     num_things: int,
     viewpoints: Iterable[Viewpoint],
     rasteriser: Rasteriser,
-) -> tuple[list[int], list[int]]:
+) -> tuple[Sequence[int], Sequence[int]]:
     """For each label the number of viewpoints that show it, and of those that show it whole."""
-    shown = np.zeros(num_things + 1, dtype=np.int64)
-    whole = np.zeros(num_things + 1, dtype=np.int64)
+    shown, whole = np.zeros((2, num_things + 1), dtype=np.int64)
     size = np.maximum(np.bincount(labels, minlength=num_things + 1), 1)
-    if num_things:
-        for viewpoint in viewpoints:
-            weight: Float32[np.ndarray, " num_splats"]
-            weight = visible_weight(rasteriser, cloud, viewpoint)
-            pixels = np.bincount(labels, weights=weight, minlength=num_things + 1)
-            inside = _within_edges(cloud.means_m, viewpoint)
-            share = np.bincount(labels, weights=inside, minlength=num_things + 1) / size
-            shown += pixels >= MIN_SHOWN_PX
-            whole += (pixels >= MIN_SHOWN_PX) & (share >= WHOLE_SHARE)
+    for viewpoint in viewpoints if num_things else ():
+        weight = visible_weight(rasteriser, cloud, viewpoint)
+        pixels = np.bincount(labels, weights=weight, minlength=num_things + 1)
+        inside = _within_edges(cloud.means_m, viewpoint)
+        share = np.bincount(labels, weights=inside, minlength=num_things + 1) / size
+        shown += pixels >= MIN_SHOWN_PX
+        whole += (pixels >= MIN_SHOWN_PX) & (share >= WHOLE_SHARE)
     return shown.tolist(), whole.tolist()
 
 
@@ -289,59 +276,47 @@ def support_of(cloud: GaussianCloud) -> SupportPlane | None:
 
 def describe(
     cloud: GaussianCloud,
-    *,
-    number: int,
-    mask: Bool[np.ndarray, " num_splats"],
-    label: str,
-    support: int,
-    seen: int,
-    score: float,
-    source: str,
+    item: Instance,
     plane: SupportPlane | None,
     key: str = "",
     surface_m: Float[np.ndarray, "_ 3"] | None = None,
 ) -> Instance:
-    """Measure one instance: colour, box, parts, keypoints.
+    """Measure one instance: colour, box, parts.
 
     Without a plane, or where it lies above the thing, heights count from its lowest Gaussian. An
     object of a task is called by its ``key`` and its colour, whatever the label.
 
     Args:
-        score: Confidence, 0..1.
         key: Id of the object in the task; empty: none.
-        surface_m: Points of its reconstructed surface, where there is one.
+        surface_m: Points of its reconstructed surface, where there is one: parts are told apart on
+            these.
     """
-    ids = np.flatnonzero(mask)
+    ids = np.flatnonzero(item.mask)
     p = cloud.means_m[ids].astype(np.float64)
     up = np.array([0.0, 0.0, _ground_m(p, plane)])
-    xyh = p - up
-    measured = measure_shape(xyh, CELL_M)
+    measured = measure_shape(p - up, CELL_M)
     color = np.clip(np.rint(np.median(cloud.colors[ids], axis=0) * 255), 0, 255)
+    label = item.label
     if key:
         is_open = measured.cavity is not None
         label = label_of(key, colour_name(color / 255), is_open=is_open, shape=measured.word)
-    is_nameless_container = kind_of(label) == "other" and measured.word == CONTAINER
-    called = CONTAINER if is_nameless_container else label
-    parts = _parts_of(xyh, called, None if surface_m is None else surface_m - up)
+    parts = {}
+    if kind_of(label) == "container" or measured.word == CONTAINER:
+        surface = p if surface_m is None else surface_m
+        nearest = np.arange(len(p)) if surface_m is None else cKDTree(surface).query(p)[1]
+        for name, part in find_parts(surface - up, CELL_M).items():
+            parts[name] = np.isin(np.arange(len(cloud)), ids[part[nearest]])
     T = np.eye(4)
-    T[:2, :2] = [
-        [np.cos(measured.yaw_rad), -np.sin(measured.yaw_rad)],
-        [np.sin(measured.yaw_rad), np.cos(measured.yaw_rad)],
-    ]
+    cos, sin = np.cos(measured.yaw_rad), np.sin(measured.yaw_rad)
+    T[:2, :2] = [[cos, -sin], [sin, cos]]
     T[:3, 3] = measured.centre_m + up
-    return Instance(
-        id=number,
+    return replace(
+        item,
         label=label,
-        mask=mask,
-        support=support,
-        seen=seen,
-        score=score,
-        source=source,
         color_srgb=(int(color[0]), int(color[1]), int(color[2])),
         T_base_instance=T,
         size_m=measured.size_m,
-        parts={name: _among(ids, part, len(cloud)) for name, part in parts.masks.items()},
-        keypoints_m={name: point + up for name, point in parts.keypoints.items()},
+        parts=parts,
     )
 
 
@@ -352,23 +327,3 @@ def _ground_m(p: Float[np.ndarray, "num_points 3"], plane: SupportPlane | None) 
         return lowest
     under = float(np.median(p[:, 2] - plane.height_m(p) / plane.normal[2]))
     return under if -0.02 < lowest - under < 0.05 else lowest
-
-
-def _parts_of(
-    xyh: Float[np.ndarray, "num_points 3"],
-    called: str,
-    surface: Float[np.ndarray, "_ 3"] | None,
-) -> Parts:
-    """Parts of a thing's Gaussians, told apart on its reconstructed surface where there is one."""
-    if surface is None:
-        return find_parts(xyh, called, CELL_M, PartsConfig())
-    found = find_parts(surface, called, CELL_M, PartsConfig())
-    nearest = cKDTree(surface).query(xyh)[1]
-    masks = {name: part[nearest] for name, part in found.masks.items()}
-    return Parts(masks=masks, keypoints=found.keypoints)
-
-
-def _among(ids: np.ndarray, part: np.ndarray, num_splats: int) -> np.ndarray:
-    mask = np.zeros(num_splats, dtype=bool)
-    mask[ids[part]] = True
-    return mask

@@ -5,10 +5,9 @@ small enough for things (Jones 1999 on component trees). What lies below a branc
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from twin.scene.semantics.cluster import components, extents_m, pairs_among
@@ -21,14 +20,6 @@ BELOW = 2.0
 """And no higher over its lowest voxel than so many voxels."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Branches:
-    """Groups of voxels that are small enough, and what no level parts."""
-
-    groups: list[Int[np.ndarray, " num_members"]]
-    too_large: Bool[np.ndarray, " num_voxels"]
-
-
 def branches(
     p_m: Float[np.ndarray, "num_voxels 3"],
     height_m: Float[np.ndarray, " num_voxels"],
@@ -37,10 +28,9 @@ def branches(
     voxel_m: float,
     max_size_m: float,
     min_voxels: int,
-) -> Branches:
-    """Part the connected groups of voxels."""
+) -> list[Int[np.ndarray, " num_members"]]:
+    """Groups of connected voxels that are small enough; what no level parts is left out."""
     groups: list[np.ndarray] = []
-    too_large = np.zeros(len(p_m), dtype=bool)
     group = components(len(p_m), pairs)
     large = np.flatnonzero(np.bincount(group, minlength=1) >= min_voxels)
     todo: list[tuple[np.ndarray, tuple[float, ...]]]
@@ -52,11 +42,7 @@ def branches(
             continue
         parts, left = _parted(ids, p_m, height_m, pairs, levels, max_size_m, min_voxels)
         todo[:0] = [(part, left) for part in parts]
-        too_large[ids] = not parts
-    grown = _with_what_lies_below(groups, p_m, height_m, voxel_m)
-    for ids in grown:
-        too_large[ids] = False
-    return Branches(groups=grown, too_large=too_large)
+    return _with_what_lies_below(groups, p_m, height_m, voxel_m)
 
 
 def _parted(

@@ -2,10 +2,10 @@
 
 Neighbouring voxels that face the same way and have one colour grow into patches, cheapest border
 first, as long as a border is not clearly more than what varies within (Felzenszwalb and
-Huttenlocher 2004, on the graph of voxels instead of pixels). Patches in one plane are one, whatever
-is printed on them. What is then still large is structure (walls, cupboards), and so is what touches
-it and has its colour. The rest is joined over outward bends, and what stands out is a thing: most
-of its border is an edge, not a line drawn on a surface that goes on.
+Huttenlocher 2004, on the graph of voxels instead of pixels). What is then still large is structure
+(walls, cupboards), and so is what touches it and has its colour. The rest is joined over outward
+bends, and what stands out is a thing: most of its border is an edge, not a line drawn on a surface
+that goes on.
 """
 
 from dataclasses import dataclass
@@ -24,101 +24,91 @@ from twin.scene.semantics.cluster import (
     numbered,
 )
 
-
-@dataclass(frozen=True, kw_only=True)
-class PatchConfig:
-    """What belongs to one patch, and which patches are things."""
-
-    voxel_m: float = 0.008
-    """Least size of the voxels: on finer ones noise of depth bends every surface."""
-    max_voxel_m: float = 0.04
-    """Sparser points show no surface."""
-    colour_gap: float = 12.0
-    """Lab distance, shading taken out, that costs as much as ``angle_rad``."""
-    reach_voxels: float = 1.8
-    """Voxels nearer than this are neighbours."""
-    angle_rad: float = 0.44
-    """Bend between neighbours that costs 1; an outward one costs ``convex_share`` of that."""
-    convex_share: float = 0.4
-    """Things bend outwards, and meet others at inward bends."""
-    step_slope: float = 0.4
-    """Neighbours of one surface are not farther apart across it than this share along it."""
-    looseness: float = 6.0
-    """Cost times voxels up to which small patches join (k of the paper)."""
-    min_voxels: int = 25
-    """Smaller patches join the neighbour with the cheapest border."""
-    lightness_weight: float = 0.3
-    """Shading changes lightness, not the ratios of a and b to it."""
-    flat_voxels: float = 0.5
-    """Patches whose common plane they leave by less (root mean square) are one surface."""
-    parallel_rad: float = 0.17
-    """Patches of one plane face the same way within this angle."""
-    least_bend: float = -0.1
-    """Mean (n_j - n_i) . d over a border from which two patches are one thing."""
-    least_contact: float = 0.2
-    """And which is at least this share of the whole border of one of the two."""
-    max_size_m: float = 0.45
-    """Larger is no thing."""
-    min_area_m2: float = 0.01
-    """Smaller surfaces are fragments."""
-    dark: float = 18.0
-    """Below this lightness (L) a colour says nothing: what is so dark and near structure is its
-    shadow."""
-    wall_m: tuple[float, float] = (0.25, 0.2)
-    """What is at least this long and wide is structure."""
-    near_wall_m: float = 0.05
-    """What is this near to structure and has its colour is structure, hidden in between."""
-    min_width_m: float = 0.03
-    """Things have at least this extent in two directions."""
-    max_drawn_share: float = 0.7
-    """Of a thing's border, where the surface just goes on."""
+VOXEL_M = 0.008
+"""Least size of the voxels: on finer ones noise of depth bends every surface."""
+MAX_VOXEL_M = 0.04
+"""Sparser points show no surface."""
+COLOUR_GAP = 12.0
+"""Lab distance, shading taken out, that costs as much as ``ANGLE_RAD``."""
+REACH_VOXELS = 1.8
+"""Voxels nearer than this are neighbours."""
+ANGLE_RAD = 0.44
+"""Bend between neighbours that costs 1; an outward one costs ``CONVEX_SHARE`` of that."""
+CONVEX_SHARE = 0.4
+"""Things bend outwards, and meet others at inward bends."""
+STEP_SLOPE = 0.4
+"""Neighbours of one surface are not farther apart across it than this share along it."""
+LOOSENESS = 6.0
+"""Cost times voxels up to which small patches join (k of the paper)."""
+MIN_VOXELS = 25
+"""Smaller patches join the neighbour with the cheapest border."""
+LIGHTNESS_WEIGHT = 0.3
+"""Shading changes lightness, not the ratios of a and b to it."""
+LEAST_BEND = -0.1
+"""Mean (n_j - n_i) . d over a border from which two patches are one thing."""
+LEAST_CONTACT = 0.2
+"""And which is at least this share of the whole border of one of the two."""
+MAX_SIZE_M = 0.45
+"""Larger is no thing."""
+MIN_AREA_M2 = 0.01
+"""Smaller surfaces are fragments."""
+DARK = 18.0
+"""Below this lightness (L) a colour says nothing: what is so dark and near structure is its
+shadow."""
+WALL_M = (0.25, 0.2)
+"""What is at least this long and wide is structure."""
+NEAR_WALL_M = 0.05
+"""What is this near to structure and has its colour is structure, hidden in between."""
+MIN_WIDTH_M = 0.03
+"""Things have at least this extent in two directions."""
+MAX_DRAWN_SHARE = 0.7
+"""Of a thing's border, where the surface just goes on."""
 
 
 def cut_into_patches(
-    points: SurfacePoints, spacing_m: float, config: PatchConfig
+    points: SurfacePoints, spacing_m: float, scale: float = 1.0
 ) -> Int[np.ndarray, " num_points"]:
     """Number the things in one large group from 1; 0 is the rest."""
-    voxel_m = max(config.voxel_m, 2.0 * spacing_m)
-    if voxel_m > config.max_voxel_m:
+    voxel_m = scale * max(VOXEL_M, 2.0 * spacing_m)
+    if voxel_m > MAX_VOXEL_M:
         return np.zeros(len(points), dtype=np.int64)
     voxels = make_voxels(points, voxel_m)
-    pairs = neighbour_pairs(voxels.p_m, config.reach_voxels * voxel_m)
+    pairs = neighbour_pairs(voxels.p_m, REACH_VOXELS * voxel_m)
     labels = np.zeros(len(voxels), dtype=np.int64)
-    if len(voxels) < config.min_voxels or not len(pairs):
+    if len(voxels) < MIN_VOXELS or not len(pairs):
         return np.asarray(labels[voxels.of_point])
-    normals, colour = _smoothed(voxels, voxel_m, config)
-    border = _borders(voxels.p_m, normals, colour, pairs, config)
-    patch = _grown(len(voxels), pairs, border.cost, config)
-    patch = _one_plane_one_patch(patch, voxels.p_m, normals, pairs, voxel_m, config)
+    normals, colour = _smoothed(voxels, voxel_m)
+    border = _borders(voxels.p_m, normals, colour, pairs)
+    patch = _grown(len(voxels), pairs, border.cost)
     num = int(patch.max(initial=-1)) + 1
     middle = np.array([np.median(colour[patch == k], axis=0) for k in range(num)])
-    structure = _structure(patch, num, middle, voxels.p_m, config)
-    joined = _joined_outwards(patch, structure, voxels.p_m, pairs, border, config)
+    structure = _structure(patch, num, middle, voxels.p_m)
+    joined = _joined_outwards(patch, structure, voxels.p_m, pairs, border)
     links = joined[pairs]
     found = 0
     for number in np.unique(joined[~structure[patch]]):
         ids = np.flatnonzero(joined == number)
         around = (links == number).sum(axis=1) == 1
         drawn = float(border.is_flat[around].mean()) if around.any() else 0.0
-        wide = _extents(voxels.p_m[ids])[1] >= config.min_width_m
-        large = len(ids) * voxel_m**2 >= config.min_area_m2
-        if large and wide and drawn <= config.max_drawn_share:
+        wide = _extents(voxels.p_m[ids])[1] >= MIN_WIDTH_M
+        large = len(ids) * voxel_m**2 >= MIN_AREA_M2
+        if large and wide and drawn <= MAX_DRAWN_SHARE:
             found += 1
             labels[ids] = found
     return np.asarray(labels[voxels.of_point])
 
 
 def _smoothed(
-    voxels: Voxels, voxel_m: float, config: PatchConfig
+    voxels: Voxels, voxel_m: float
 ) -> tuple[Float[np.ndarray, "num_voxels 3"], Float[np.ndarray, "num_voxels 3"]]:
     """Normals and colours averaged over neighbours that face the same way and look alike."""
-    normals, colour = voxels.normals, without_shading(voxels.lab, config.lightness_weight)
+    normals, colour = voxels.normals, without_shading(voxels.lab, LIGHTNESS_WEIGHT)
     pairs, itself = neighbour_pairs(voxels.p_m, 2.6 * voxel_m), np.arange(len(voxels))
     a = np.concatenate([pairs[:, 0], pairs[:, 1], itself])
     b = np.concatenate([pairs[:, 1], pairs[:, 0], itself])
     for _ in range(2):
         alike = np.clip((normals[a] * normals[b]).sum(axis=1), 0.0, 1.0) ** 4
-        gap = np.linalg.norm(colour[a] - colour[b], axis=1) / config.colour_gap
+        gap = np.linalg.norm(colour[a] - colour[b], axis=1) / COLOUR_GAP
         weight = alike * np.exp(-0.5 * gap**2) + 1e-6
         spread = csr_matrix((weight, (a, b)), shape=(len(voxels), len(voxels)))
         normals = spread @ normals
@@ -141,11 +131,7 @@ class _Borders:
 
 
 def _borders(
-    p_m: np.ndarray,
-    normals: np.ndarray,
-    colour: np.ndarray,
-    pairs: np.ndarray,
-    config: PatchConfig,
+    p_m: np.ndarray, normals: np.ndarray, colour: np.ndarray, pairs: np.ndarray
 ) -> _Borders:
     """Compare the two of each pair."""
     a, b = pairs.T
@@ -155,20 +141,20 @@ def _borders(
     bent = ((normals[b] - normals[a]) * away).sum(axis=1)
     mean = normals[a] + normals[b]
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
-    step = np.maximum(np.abs((mean * away).sum(axis=1)) - config.step_slope, 0.0)
-    bend = np.where(bent > 0, config.convex_share, 1.0) * angle / config.angle_rad + 2 * step
-    gap = np.linalg.norm(colour[a] - colour[b], axis=1) / config.colour_gap
+    step = np.maximum(np.abs((mean * away).sum(axis=1)) - STEP_SLOPE, 0.0)
+    bend = np.where(bent > 0, CONVEX_SHARE, 1.0) * angle / ANGLE_RAD + 2 * step
+    gap = np.linalg.norm(colour[a] - colour[b], axis=1) / COLOUR_GAP
     return _Borders(
         cost=np.hypot(bend, gap),
         bend=bent,
-        is_flat=(angle < config.angle_rad) & (step == 0),
+        is_flat=(angle < ANGLE_RAD) & (step == 0),
         is_step=step > 0,
     )
 
 
-def _grown(num: int, pairs: np.ndarray, cost: np.ndarray, config: PatchConfig) -> np.ndarray:
+def _grown(num: int, pairs: np.ndarray, cost: np.ndarray) -> np.ndarray:
     """Join along the cheapest borders first; then give small patches to a neighbour."""
-    owner, size, limit = list(range(num)), [1] * num, [config.looseness] * num
+    owner, size, limit = list(range(num)), [1] * num, [LOOSENESS] * num
 
     def root(node: int) -> int:
         while owner[node] != node:
@@ -183,83 +169,30 @@ def _grown(num: int, pairs: np.ndarray, cost: np.ndarray, config: PatchConfig) -
         if a != b and value <= min(limit[a], limit[b]):
             owner[b] = a
             size[a] += size[b]
-            limit[a] = value + config.looseness / size[a]
+            limit[a] = value + LOOSENESS / size[a]
     for left, right in links:
         a, b = root(left), root(right)
-        if a != b and min(size[a], size[b]) < config.min_voxels:
+        if a != b and min(size[a], size[b]) < MIN_VOXELS:
             owner[b] = a
             size[a] += size[b]
     return numbered(np.array([root(node) for node in range(num)], dtype=np.int64))
 
 
-def _one_plane_one_patch(
-    patch: np.ndarray,
-    p_m: np.ndarray,
-    normals: np.ndarray,
-    pairs: np.ndarray,
-    voxel_m: float,
-    config: PatchConfig,
-) -> np.ndarray:
-    """Join neighbours that lie in one plane together, the flattest pair first."""
-    p = p_m - p_m.mean(axis=0)
-    num = int(patch.max(initial=-1)) + 1
-    # Count, sum and sum of squares of each patch: those of a union are their sums.
-    rows = np.concatenate(
-        [np.ones((len(p), 1)), p, (p[:, :, None] * p[:, None]).reshape(-1, 9), normals], axis=1
-    )
-    moments = np.stack([np.bincount(patch, column, minlength=num) for column in rows.T], axis=1)
-    owner = np.arange(num)
-    links = np.unique(np.sort(patch[pairs], axis=1), axis=0)
-    while True:
-        links = np.unique(np.sort(owner[links], axis=1), axis=0)
-        links = links[links[:, 0] != links[:, 1]]
-        first, second = moments[links[:, 0]], moments[links[:, 1]]
-        off = np.where(
-            _cosine(first[:, 13:], second[:, 13:]) > np.cos(config.parallel_rad),
-            _off_plane_m(first + second),
-            np.inf,
-        )
-        if not (off < config.flat_voxels * voxel_m).any():
-            return numbered(owner[patch])
-        kept, gone = links[int(np.argmin(off))]
-        moments[kept] += moments[gone]
-        owner[owner == gone] = kept
-
-
-def _cosine(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, " num_pairs"]:
-    length = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    return np.asarray((a * b).sum(axis=1) / np.maximum(length, 1e-9))
-
-
-def _off_plane_m(moments: np.ndarray) -> Float[np.ndarray, " num_pairs"]:
-    """Root mean square distance from the plane through points with these moments."""
-    count = moments[:, :1]
-    mean = moments[:, 1:4] / count
-    scatter = (
-        moments[:, 4:13].reshape(-1, 3, 3) / count[..., None] - mean[:, :, None] * mean[:, None]
-    )
-    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(scatter)[:, 0], 0.0)))
-
-
 def _structure(
-    patch: np.ndarray,
-    num: int,
-    colour: np.ndarray,
-    p_m: np.ndarray,
-    config: PatchConfig,
+    patch: np.ndarray, num: int, colour: np.ndarray, p_m: np.ndarray
 ) -> Bool[np.ndarray, " num_patches"]:
     """Patches that are walls, or near one and of its colour."""
     extents = np.array([_extents(p_m[patch == k])[:2] for k in range(num)]).reshape(num, 2)
-    found = np.all(extents >= config.wall_m, axis=1)
+    found = np.all(extents >= WALL_M, axis=1)
     trees = [cKDTree(p_m[patch == k]) for k in range(num)]
-    is_dark = colour[:, 0] < config.lightness_weight * config.dark
+    is_dark = colour[:, 0] < LIGHTNESS_WEIGHT * DARK
     todo = list(np.flatnonzero(found))
     while todo:
         wall = todo.pop()
-        alike = np.linalg.norm(colour - colour[wall], axis=1) < config.colour_gap
+        alike = np.linalg.norm(colour - colour[wall], axis=1) < COLOUR_GAP
         for other in np.flatnonzero((alike | is_dark) & ~found):
             small, large = sorted((trees[wall], trees[other]), key=lambda tree: tree.n)
-            gap = large.query(small.data, distance_upper_bound=config.near_wall_m)[0].min()
+            gap = large.query(small.data, distance_upper_bound=NEAR_WALL_M)[0].min()
             if np.isfinite(gap):
                 found[other] = True
                 todo.append(other)
@@ -267,12 +200,7 @@ def _structure(
 
 
 def _joined_outwards(
-    patch: np.ndarray,
-    structure: np.ndarray,
-    p_m: np.ndarray,
-    pairs: np.ndarray,
-    border: _Borders,
-    config: PatchConfig,
+    patch: np.ndarray, structure: np.ndarray, p_m: np.ndarray, pairs: np.ndarray, border: _Borders
 ) -> Int[np.ndarray, " num_voxels"]:
     """Join patches that are no structure where their border bends outwards, the sharpest first."""
     joined = patch.copy()
@@ -287,13 +215,11 @@ def _joined_outwards(
         steps = np.bincount(index, weights=border.is_step[open_], minlength=len(keys)) / count
         outer = np.bincount(links[links[:, 0] != links[:, 1]].reshape(-1), minlength=len(patch))
         contact = count / np.maximum(outer[keys].min(axis=1), 1)
-        fits = (contact >= config.least_contact) & (steps < config.max_drawn_share)
-        fits &= bend > config.least_bend
+        fits = (contact >= LEAST_CONTACT) & (steps < MAX_DRAWN_SHARE)
+        fits &= bend > LEAST_BEND
         for number in np.argsort(-bend, kind="stable"):
             a, b = keys[number]
-            if fits[number] and (
-                _extents(p_m[(joined == a) | (joined == b)])[0] <= config.max_size_m
-            ):
+            if fits[number] and (_extents(p_m[(joined == a) | (joined == b)])[0] <= MAX_SIZE_M):
                 joined = np.where(joined == b, a, joined)
                 break
         else:

@@ -1,9 +1,13 @@
 """The default segmenter: no weights, only geometry and colour.
 
 Things are what stands on the largest level plane and hangs together, cut where colour or shape
-says that two things touch. Works on the points of one RGB-D view and on a fused cloud.
+says that two things touch. Where one thing ends and the next begins is decided by thresholds, and a
+grid that lies a little differently decides otherwise: so the segmenter looks several times, with
+voxels of other sizes, and what it finds again most times is a thing (as Matas et al. 2002 choose
+regions that stay when a threshold moves).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,20 +18,20 @@ from bridge.geometry import se3
 from twin.naming.colours import colour_name, lab_from_srgb, without_shading
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.semantics.cluster import (
+    LIGHTNESS_WEIGHT,
     SurfacePoints,
-    ValleySplitConfig,
     Voxels,
     extents_m,
-    joined_by_outline,
     make_voxels,
     neighbour_pairs,
     pairs_among,
     split_by_colour,
     split_by_valleys,
+    within_outline,
 )
 from twin.scene.semantics.height_tree import branches
-from twin.scene.semantics.patches import PatchConfig, cut_into_patches
-from twin.scene.semantics.shape_descriptors import ShapeDescriptors, measure_shape
+from twin.scene.semantics.patches import VOXEL_M, cut_into_patches
+from twin.scene.semantics.shape_descriptors import measure_shape
 from twin.scene.semantics.support import (
     NoSupportError,
     SupportConfig,
@@ -39,13 +43,18 @@ from twin.scene.semantics.support import (
 )
 
 SOURCE = "default segmenter"
-MAX_FOOT_ROUNDS = 8
 MIN_FRAGMENT = 8
 """Voxels of the smallest fragment that may be joined to a thing."""
-FINE_M = 0.01
-"""A plane that asks for a larger least height is rough."""
 PLANE_COLOURS = 0.75
 """This share of the plane's points says how much its colour varies."""
+FLOOR_M2, FURNITURE = 2.5, 3.0
+"""A larger plane is a floor, and what stands on it may be so many times larger than on a table."""
+VOXEL_SCALES = (1.0, 1.2, 1.45)
+"""Of the voxels that the spacing of the points asks for."""
+SAME_IOU = 0.6
+"""Two things are one when they share this much of their union."""
+MAX_TAKEN = 0.3
+"""Share of a thing that a stabler one may have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,12 +63,8 @@ class SegmentConfig:
 
     support: SupportConfig = field(default_factory=SupportConfig)
     """The plane that things stand on."""
-    split: ValleySplitConfig = field(default_factory=ValleySplitConfig)
-    """When things touch."""
     min_height_m: float = 0.007
-    """Above the plane; lower points belong to a thing only by colour."""
-    relief_factor: float = 2.5
-    """On a rough plane, what has its colour is a thing only from so many least heights on."""
+    """Above the plane."""
     roughness_factor: float = 3.0
     """And above so many times the roughness of the plane, as it was measured."""
     max_height_m: float = 0.6
@@ -73,11 +78,9 @@ class SegmentConfig:
     min_size_m: float = 0.012
     """Things have at least this extent in two directions."""
     max_size_m: float = 0.45
-    """Larger groups are furniture, the robot, or things that touch a wall: they are cut."""
-    patches: PatchConfig = field(default_factory=PatchConfig)
-    """How."""
-    foot_colour_gap: float = 12.0
-    """Lab distance up to which low points belong to the thing above them."""
+    """Larger groups are furniture, the robot, a wall."""
+    plane_colour_gap: float = 12.0
+    """Lab distance up to which a colour is the plane's."""
     relief_score: float = 0.25
     """What rises so little (``Thing.score``) and has the plane's own colour is the plane: noise of
     its depth, not a thing. So is a flat thing of exactly the plane's colour."""
@@ -89,7 +92,6 @@ class Thing:
 
     label: str
     """Colour and shape, for example "red cube"."""
-    shape: ShapeDescriptors
     score: float
     """Share of its points that are firmly above the plane, 0..1."""
 
@@ -118,16 +120,49 @@ class Look:
     """Cells in which the shape of a thing is measured."""
 
 
-def ground_of(
-    points: SurfacePoints,
-    config: SegmentConfig,
-) -> "OverPlane | WithoutPlane":
-    """Find what things stand on, how high everything is over it, and what is free to be a thing."""
+def segment(points: SurfacePoints, config: SegmentConfig) -> Segmentation:
+    """Find the things that most sizes of voxels find, the largest first."""
+    ground: OverPlane | WithoutPlane
     try:
-        plane = find_support(points.p_m, points.normals, config.support)
+        ground = OverPlane(points, find_support(points.p_m, points.normals, config.support), config)
     except NoSupportError:
-        return WithoutPlane(points, config)
-    return OverPlane(points, plane, config)
+        ground = WithoutPlane(points, config)
+    looks = [ground.look(scale) for scale in VOXEL_SCALES]
+    kept = stable(looks)
+    labels = np.zeros(len(points), dtype=np.int64)
+    for number, (mask, _) in enumerate(kept, start=1):
+        labels[mask] = number
+    things = tuple(ground.thing(mask, voxel_m) for mask, voxel_m in kept)
+    remark = "" if things else ground.nothing
+    if not things and looks[0].labels.any():
+        remark = f"of what stands out, no two of {len(looks)} sizes of voxels find the same"
+    return Segmentation(labels=labels, things=things, plane=ground.plane, remark=remark)
+
+
+def stable(looks: Sequence[Look]) -> list[tuple[Bool[np.ndarray, " num_points"], float]]:
+    """What at least half the other looks find again, with the voxels it was found with."""
+    found = []
+    for look in looks:
+        others = [other for other in looks if other is not look]
+        for number in range(1, int(look.labels.max(initial=0)) + 1):
+            mask = look.labels == number
+            best = np.array([_best_iou(mask, other.labels) for other in others])
+            share = float((best >= SAME_IOU).mean())
+            if share >= 0.5:
+                found.append((share + float(best.mean()), mask, look.voxel_m))
+    kept: list[tuple[np.ndarray, float]] = []
+    taken = np.zeros(len(looks[0].labels), dtype=bool)
+    for _, mask, voxel_m in sorted(found, key=lambda item: -item[0]):
+        if taken[mask].mean() <= MAX_TAKEN:
+            kept.append((mask & ~taken, voxel_m))
+            taken |= mask
+    return sorted(kept, key=lambda pair: -int(pair[0].sum()))
+
+
+def _best_iou(mask: np.ndarray, labels: np.ndarray) -> float:
+    sizes = np.bincount(labels)
+    shared = np.bincount(labels[mask], minlength=len(sizes))
+    return float((shared / (mask.sum() + sizes - shared))[1:].max(initial=0.0))
 
 
 class OverPlane:
@@ -143,15 +178,20 @@ class OverPlane:
         plane = as_measured(plane, points.p_m, points.normals, config.support)
         roughness = roughness_m(points.p_m, points.normals, plane, config.support)
         least = max(config.min_height_m, config.roughness_factor * roughness)
-        self._config = config = replace(config, min_height_m=least)
+        self._is_rough = least > config.min_height_m
+        large = FURNITURE if plane.area_m2 > FLOOR_M2 else 1.0
+        self._config = config = replace(
+            config,
+            min_height_m=least,
+            max_height_m=large * config.max_height_m,
+            max_size_m=large * config.max_size_m,
+        )
         self._points, self.plane = points, plane
         self._height = height = plane.height_m(points.p_m)
         under = plane.under(points.p_m)
-        self._lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
+        self._lab = without_shading(lab_from_srgb(points.colors), LIGHTNESS_WEIGHT)
         free = under & (height < config.max_height_m)
         raised = free & (height > config.min_height_m)
-        if least > FINE_M:
-            raised &= ~_is_relief(self._lab, height, under, config)
         self._low = free & (np.abs(height) <= config.min_height_m)
         self._above = np.flatnonzero(raised)
         self._voxel_m = max(config.voxel_m, 2.0 * _spacing(points.p_m[self._above]))
@@ -172,24 +212,14 @@ class OverPlane:
         labels = np.zeros(len(points), dtype=np.int64)
         labels[above] = _things(points.take(above), height[above], voxel_m, config)
         labels = _largest_first(labels)
-        _add_feet(labels, points.p_m, self._lab, self._low, height, voxel_m, config)
+        _add_floors(labels, points.p_m, self._lab, self._low, config)
         labels = _without_relief(labels, self._lab, self._low, height, config)
         return Look(labels=labels, voxel_m=voxel_m)
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""
-        return _thing(self._points.take(mask), self._height[mask], voxel_m, self._config)
-
-
-def _is_relief(
-    lab: np.ndarray, height_m: np.ndarray, under: np.ndarray, config: SegmentConfig
-) -> Bool[np.ndarray, " num_points"]:
-    """Where a rough plane bulges: low and of its colour."""
-    plane = under & (np.abs(height_m) < config.min_height_m)
-    middle = np.median(lab[plane], axis=0)
-    away = np.linalg.norm(lab - middle, axis=1)
-    own = max(float(np.quantile(away[plane], PLANE_COLOURS)), config.foot_colour_gap)
-    return np.asarray((height_m < config.relief_factor * config.min_height_m) & (away < own))
+        mine, height = self._points.take(mask), self._height[mask]
+        return _thing(mine, height, voxel_m, self._config, self._is_rough)
 
 
 class WithoutPlane:
@@ -209,18 +239,16 @@ class WithoutPlane:
 
     def look(self, scale: float) -> Look:
         """Cut them, with voxels so many times as large as their spacing asks for."""
-        patches = self._config.patches
-        scaled = replace(patches, voxel_m=scale * patches.voxel_m)
-        labels = cut_into_patches(self._points, scale * self._spacing_m, scaled)
+        labels = cut_into_patches(self._points, self._spacing_m, scale)
         if not labels.any():
             raise NoSupportError(self.nothing)
-        return Look(labels=_largest_first(labels), voxel_m=patches.voxel_m)
+        return Look(labels=_largest_first(labels), voxel_m=VOXEL_M)
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""
         mine = self._points.take(mask)
         height = mine.p_m[:, 2] - float(np.quantile(mine.p_m[:, 2], 0.01))
-        return _thing(mine, height, voxel_m, self._config)
+        return _thing(mine, height, voxel_m, self._config, rough=True)
 
 
 def _spacing(p_m: np.ndarray) -> float:
@@ -242,7 +270,7 @@ def _things(
     height = np.bincount(voxels.of_point, weights=height_m) / voxels.count
     pairs = neighbour_pairs(voxels.p_m, config.reach_voxels * voxel_m)
     labels = np.zeros(len(voxels), dtype=np.int64)
-    parts = branches(
+    groups = branches(
         voxels.p_m,
         height,
         pairs,
@@ -251,20 +279,16 @@ def _things(
         min_voxels=MIN_FRAGMENT,
     )
     pieces: list[np.ndarray] = []
-    for ids in parts.groups:
+    for ids in groups:
         pieces += _pieces(voxels, ids, height, pairs, voxel_m, config)
     found = 0
-    for piece in joined_by_outline(pieces, voxels, height, voxel_m, config.split):
+    for piece in pieces:
         extent = extents_m(voxels.p_m[piece])
-        if len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
+        stands = np.quantile(height[piece], 0.03) < config.max_height_m / 3
+        if stands and len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
             found += 1
             labels[piece] = found
-    of_points = np.asarray(labels[voxels.of_point])
-    left = np.flatnonzero(parts.too_large[voxels.of_point])
-    if len(left):
-        cut = cut_into_patches(points.take(left), voxel_m / 2, config.patches)
-        of_points[left] = np.where(cut > 0, cut + found, 0)
-    return of_points
+    return np.asarray(labels[voxels.of_point])
 
 
 def _pieces(
@@ -278,11 +302,11 @@ def _pieces(
     """Cut one connected group by colour, and each piece of it along valleys."""
     pieces = []
     by_colour = _within(voxels, ids, pairs)
-    colours = split_by_colour(by_colour[0], height_m[ids], by_colour[1], config.split)
+    colours = split_by_colour(by_colour[0], height_m[ids], by_colour[1])
     for colour in range(int(colours.max()) + 1):
         part = ids[colours == colour]
         own, own_pairs = _within(voxels, part, pairs)
-        cut = split_by_valleys(own, height_m[part], own_pairs, voxel_m, config.split)
+        cut = split_by_valleys(own, height_m[part], own_pairs, voxel_m)
         pieces += [part[cut == number] for number in range(int(cut.max()) + 1)]
     return pieces
 
@@ -307,39 +331,24 @@ def _largest_first(labels: np.ndarray) -> np.ndarray:
     return np.asarray(rank[labels])
 
 
-def _add_feet(
-    labels: np.ndarray,
+def _add_floors(
+    labels: Int[np.ndarray, " num_points"],
     p_m: Float[np.ndarray, "num_points 3"],
     lab: Float[np.ndarray, "num_points 3"],
     low: Bool[np.ndarray, " num_points"],
-    height_m: np.ndarray,
-    voxel_m: float,
     config: SegmentConfig,
 ) -> None:
-    """Give low points to the thing close by whose colour they have and the plane has not.
-
-    Repeated, so that the floor of a box is reached from its walls.
-    """
-    plane = low & (np.abs(height_m) < 0.5 * config.min_height_m)
-    if not plane.any():
+    """Give low points to the thing around them whose colour they have and the plane has not."""
+    free = np.flatnonzero(low & (labels == 0))
+    if not len(free):
         return
-    to_plane = np.linalg.norm(lab - np.median(lab[plane], axis=0), axis=1)
-    reach = config.min_height_m + 1.5 * voxel_m
-    for _ in range(MAX_FOOT_ROUNDS):
-        firm, feet = np.flatnonzero(labels > 0), np.flatnonzero(low & (labels == 0))
-        if not len(firm) or not len(feet):
-            return
-        gap, nearest = cKDTree(p_m[firm]).query(p_m[feet], distance_upper_bound=reach)
-        near = np.isfinite(gap)
-        feet, thing = feet[near], firm[nearest[near]]
-        to_thing = np.linalg.norm(lab[feet] - lab[thing], axis=1)
-        clear = (to_thing < config.foot_colour_gap) & (to_thing < 0.5 * to_plane[feet])
-        # Where thing and plane look alike, height decides: half the least height is no noise.
-        raised = (height_m[feet] > 0.5 * config.min_height_m) & (to_thing < to_plane[feet])
-        mine = clear | raised
-        if not mine.any():
-            return
-        labels[feet[mine]] = labels[thing[mine]]
+    to_plane = np.linalg.norm(lab[free] - np.median(lab[free], axis=0), axis=1)
+    for number in range(1, int(labels.max(initial=0)) + 1):
+        mine = labels == number
+        to_thing = np.linalg.norm(lab[free] - np.median(lab[mine], axis=0), axis=1)
+        clear = (to_thing < config.plane_colour_gap) & (to_thing < 0.5 * to_plane)
+        clear[clear] = within_outline(p_m[free[clear]], p_m[mine])
+        labels[free[clear]] = number
 
 
 def _without_relief(
@@ -360,7 +369,7 @@ def _without_relief(
         mine = labels == number
         away = float(np.linalg.norm(np.median(lab[mine], axis=0) - middle))
         is_flat = _firmness(height_m[mine], config) < config.relief_score
-        if not (is_flat and away < max(own, config.foot_colour_gap)):
+        if not (is_flat and away < max(own, config.plane_colour_gap)):
             kept[mine] = kept.max() + 1
     return kept
 
@@ -371,13 +380,17 @@ def _firmness(height_m: np.ndarray, config: SegmentConfig) -> float:
 
 
 def _thing(
-    points: SurfacePoints, height_m: np.ndarray, voxel_m: float, config: SegmentConfig
+    points: SurfacePoints,
+    height_m: np.ndarray,
+    voxel_m: float,
+    config: SegmentConfig,
+    rough: bool,
 ) -> Thing:
     xyh = np.concatenate([points.p_m[:, :2], height_m[:, None]], axis=1)
-    shape = measure_shape(xyh, voxel_m)
+    shape = measure_shape(xyh, voxel_m, rough=rough)
     color = np.median(points.colors, axis=0).astype(np.float64)
     score = _firmness(height_m, config)
-    return Thing(label=f"{colour_name(color)} {shape.word}", shape=shape, score=score)
+    return Thing(label=f"{colour_name(color)} {shape.word}", score=score)
 
 
 MIN_OPACITY = 0.3

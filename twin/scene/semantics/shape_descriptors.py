@@ -53,7 +53,7 @@ class ShapeDescriptors:
     """What a thing looks like, in numbers and in a word."""
 
     word: str
-    """cube, box, flat box, cylinder, ball, open container or toy."""
+    """One of ``SHAPE_WORDS``."""
     centre_m: Float[np.ndarray, "3"]
     """Of the box around it: x, y, height above the plane."""
     size_m: tuple[float, float, float]
@@ -119,8 +119,14 @@ def find_height_map_cavity(
     return HeightMapCavity(mask=pool, rim_m=rim, floor_m=floor, volume_m3=volume)
 
 
-def measure_shape(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> ShapeDescriptors:
-    """Measure a thing from the points of its visible surface."""
+def measure_shape(
+    xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float, *, rough: bool = False
+) -> ShapeDescriptors:
+    """Measure a thing from the points of its visible surface.
+
+    Args:
+        rough: They lie so far off it that flat and round look alike.
+    """
     low, high = np.quantile(xyh_m, [0.005, 0.995], axis=0)
     extent = float((high - low).max())
     heights = height_map(xyh_m, max(cell_m, extent / 48))
@@ -131,7 +137,7 @@ def measure_shape(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> Sh
     cavity = find_height_map_cavity(heights)
     size = (float(sides[0]), float(sides[1]), top)
     return ShapeDescriptors(
-        word=_word(xyh_m, heights, size, fill, ratio, cavity),
+        word=_word(xyh_m, heights, size, fill, ratio, None if rough else cavity, rough),
         centre_m=np.array([*centre_xy, top / 2]),
         size_m=size,
         yaw_rad=float(yaw),
@@ -179,6 +185,12 @@ def _rectangle(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
     return centre, sides, yaw, float(hull.volume / max(areas[best], 1e-12))
 
 
+SLAB, BLOCK = 0.2, 0.4
+"""Shortest over middle extent: less is a slab, more may be a block."""
+BLOCK_FILL = 0.55
+"""Of the box around it, that a block's hull fills."""
+BLOCK_M = (0.1, 0.6)
+"""Longest extent of what may be called so."""
 LEAST_OF_A_BALL = 0.5
 """Shortest over longest side of what may be a ball, of which little more than half is seen."""
 
@@ -190,19 +202,34 @@ def _word(
     fill: float,
     ratio: float,
     cavity: HeightMapCavity | None,
+    rough: bool,
 ) -> str:
     if cavity is not None and ratio > CONTAINER_RATIO:
         return CONTAINER
     long, short, height = size_m
     plateau = float((heights.top_m[heights.footprint] > 0.85 * height).mean())
-    if plateau > 0.68:
+    if plateau > 0.68 and not rough:
         if fill > 0.88 or long > 1.25 * short:
             if height < 0.35 * short:
                 return "flat box"
             return "cube" if max(size_m) < 1.3 * min(size_m) else "box"
         return "cylinder"
-    is_round = min(size_m) > LEAST_OF_A_BALL * long and _is_ball(xyh_m, long)
-    return "ball" if is_round else UNKNOWN_SHAPE
+    if not rough and min(size_m) > LEAST_OF_A_BALL * long and _is_ball(xyh_m, long):
+        return "ball"
+    return _bulk(xyh_m)
+
+
+def _bulk(points: np.ndarray) -> str:
+    """Of a shape that stands askew, or is half seen: thin, or filling its box, or neither."""
+    away = points - points.mean(axis=0)
+    along = away @ np.linalg.eigh(away.T @ away)[1]
+    low, high = np.quantile(along, [0.02, 0.98], axis=0)
+    short, middle, long = np.sort(high - low)
+    if short < SLAB * middle:
+        return "slab"
+    hull = _hull_volume(along[((along > low) & (along < high)).all(axis=1)])
+    is_block = hull > BLOCK_FILL * short * middle * long and short > BLOCK * middle
+    return "block" if is_block and BLOCK_M[0] < long < BLOCK_M[1] else UNKNOWN_SHAPE
 
 
 def _is_ball(points: np.ndarray, diameter_m: float) -> bool:

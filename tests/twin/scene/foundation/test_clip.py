@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model_inputs import CPU, picture
+from model_inputs import picture
 
 from bridge.errors import UsageError
 from twin.scene.foundation.models import ClipEmbedder, masked_crop
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
 def test_clip_gives_unit_vectors_and_a_batch_is_as_good_as_one_by_one(
     saved: Callable[[str], Path],
 ) -> None:
-    embedder = ClipEmbedder.load(saved("clip"), CPU)
+    embedder = ClipEmbedder(saved("clip"), "cpu")
     texts = embedder.encode(["red cube", "a yellow duck", "robot"])
     assert texts.shape == (3, embedder.num_channels) == (3, 16)
     np.testing.assert_allclose(np.linalg.norm(texts, axis=1), 1.0, atol=1e-5)
@@ -34,7 +34,7 @@ def test_clip_gives_unit_vectors_and_a_batch_is_as_good_as_one_by_one(
 
 
 def test_clip_sees_only_what_the_mask_shows(saved: Callable[[str], Path]) -> None:
-    embedder = ClipEmbedder.load(saved("clip"), CPU)
+    embedder = ClipEmbedder(saved("clip"), "cpu")
     mask = np.zeros((60, 80), dtype=bool)
     mask[20:40, 30:50] = True
     inside, outside = picture(seed=1), picture(seed=2)

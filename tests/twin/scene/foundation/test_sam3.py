@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model_inputs import ALL_QUERIES, CPU, picture
+from model_inputs import picture, sam3
 
 from bridge.errors import UsageError
-from twin.scene.foundation.models import Sam3Config, Sam3Segmenter
+from twin.scene.foundation.models import Sam3Config
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
 def test_sam3_gives_masks_of_the_image_s_size_with_scores_from_0_to_1(
     saved: Callable[[str], Path],
 ) -> None:
-    segmenter = Sam3Segmenter.load(saved("sam3"), CPU, ALL_QUERIES)
+    segmenter = sam3(saved("sam3"))
     found = segmenter.segment(picture(), ["red cube", "duck"], camera_id="wrist", stamp_ns=7)
     assert (found.camera_id, found.stamp_ns, found.source) == ("wrist", 7, "SAM 3")
     assert len(found.masks) == 20  # ten queries each
@@ -32,13 +32,13 @@ def test_sam3_gives_masks_of_the_image_s_size_with_scores_from_0_to_1(
 
 
 def test_sam3_drops_what_is_unlikely_or_small(saved: Callable[[str], Path]) -> None:
-    everything = Sam3Segmenter.load(saved("sam3"), CPU, ALL_QUERIES)
+    everything = sam3(saved("sam3"))
     where = {"camera_id": "c", "stamp_ns": 0}
     masks = everything.segment(picture(), ["duck"], **where).masks
     cut, least = masks[4].score, sorted(int(mask.image.sum()) for mask in masks)[5]
-    likely = Sam3Segmenter.load(saved("sam3"), CPU, Sam3Config(min_score=cut, min_pixels=0))
+    likely = sam3(saved("sam3"), Sam3Config(min_score=cut, min_pixels=0))
     assert len(likely.segment(picture(), ["duck"], **where).masks) == 5
-    large = Sam3Segmenter.load(saved("sam3"), CPU, Sam3Config(min_score=0.0, min_pixels=least))
+    large = sam3(saved("sam3"), Sam3Config(min_score=0.0, min_pixels=least))
     kept = large.segment(picture(), ["duck"], **where).masks
     assert 0 < len(kept) < 10
     assert min(int(mask.image.sum()) for mask in kept) >= least
@@ -57,7 +57,7 @@ def test_sam3_drops_what_is_unlikely_or_small(saved: Callable[[str], Path]) -> N
 def test_sam3_refuses_prompts_it_cannot_read_whole(
     saved: Callable[[str], Path], prompts: list[str], said: str
 ) -> None:
-    segmenter = Sam3Segmenter.load(saved("sam3"), CPU)
+    segmenter = sam3(saved("sam3"))
     with pytest.raises(UsageError, match=said):
         segmenter.segment(picture(), prompts, camera_id="c", stamp_ns=0)
 
@@ -82,8 +82,7 @@ def test_sam3_is_read_in_the_form_it_is_published_in(
     save_file(named, tmp_path / "model.safetensors", metadata={"format": "pt"})
     where = {"camera_id": "c", "stamp_ns": 0}
     plain, video = (
-        Sam3Segmenter.load(folder, CPU, ALL_QUERIES).segment(picture(), ["duck"], **where)
-        for folder in (saved("sam3"), tmp_path)
+        sam3(folder).segment(picture(), ["duck"], **where) for folder in (saved("sam3"), tmp_path)
     )
     for one, other in zip(plain.masks, video.masks, strict=True):
         assert one.score == other.score

@@ -10,13 +10,11 @@ import pytest
 from small_files import write_safetensors
 
 from twin.scene.foundation.loading import (
-    IMAGENET,
     WeightsError,
     WeightsKind,
     check_folder,
     read_normalisation,
     weight_files,
-    weights_hash,
 )
 
 KIND = WeightsKind(
@@ -24,7 +22,8 @@ KIND = WeightsKind(
     model_types=("owl",),
     origin="makers/owl",
     licence="Owl License, access on request",
-    speaks=True,
+    class_name="OwlModel",
+    colours=((0.4, 0.5, 0.6), (0.2, 0.2, 0.3)),
 )
 
 
@@ -47,7 +46,7 @@ def split_in_two(folder: Path) -> None:
 
 
 def test_a_whole_folder_is_accepted_in_one_file_or_in_parts(folder: Path) -> None:
-    assert check_folder(folder, KIND)["size"] == 3
+    check_folder(folder, KIND)
     split_in_two(folder)
     check_folder(folder, KIND)
     assert [path.name for path in weight_files(folder, KIND)] == [
@@ -132,20 +131,20 @@ def test_checksums_that_agree_are_accepted(folder: Path) -> None:
 
 
 def test_the_hash_changes_with_the_numbers_alone(folder: Path) -> None:
-    before = weights_hash(folder, KIND)
+    before = check_folder(folder, KIND)
     write_safetensors(folder / "model.safetensors", {"a": np.full((2, 3), 2.0), "b": np.zeros(4)})
-    assert weights_hash(folder, KIND) != before
+    assert check_folder(folder, KIND) != before
 
 
 def test_colours_are_normalised_as_the_folder_says(folder: Path) -> None:
-    assert read_normalisation(folder, KIND, IMAGENET) == IMAGENET
+    assert read_normalisation(folder, KIND) == KIND.colours
     about = folder / "preprocessor_config.json"
     about.write_text(json.dumps({"image_mean": [0.1, 0.2, 0.3], "size": 4}))
-    assert read_normalisation(folder, KIND, IMAGENET) == ((0.1, 0.2, 0.3), IMAGENET[1])
+    assert read_normalisation(folder, KIND) == ((0.1, 0.2, 0.3), KIND.colours[1])
     for broken in ([0.1], "x", [0.1, None, 0.2], [1, 2, 300]):
         about.write_text(json.dumps({"image_std": broken}))
         with pytest.raises(WeightsError, match="image_std is"):
-            read_normalisation(folder, KIND, IMAGENET)
+            read_normalisation(folder, KIND)
     about.write_text(json.dumps({"image_std": [0.5, 0.0, 0.5]}))
     with pytest.raises(WeightsError, match="holds a 0"):
-        read_normalisation(folder, KIND, IMAGENET)
+        read_normalisation(folder, KIND)

@@ -85,17 +85,3 @@ def save_clip(folder: Path) -> None:
     )
     transformers.CLIPModel(config).eval().save_pretrained(folder)
     save_tokenizer(folder)
-
-
-def save_dino_vit(folder: Path) -> None:
-    torch.manual_seed(2)
-    config = transformers.DINOv3ViTConfig(
-        hidden_size=32,
-        intermediate_size=64,
-        num_hidden_layers=2,
-        num_attention_heads=4,
-        num_register_tokens=4,
-        patch_size=16,
-        image_size=64,
-    )
-    transformers.DINOv3ViTModel(config).eval().save_pretrained(folder)

@@ -227,7 +227,7 @@ def tabletop_pieces() -> list[Piece]:
     ]
 
 
-TABLETOP_NAMES = {1: "red cube", 2: "blue open container", 3: "green ball", 4: "yellow toy"}
+TABLETOP_NAMES = {1: "red cube", 2: "blue open container", 3: "green ball", 4: "yellow thing"}
 
 
 def look(angle: float, height_m: float, radius_m: float = 0.42) -> np.ndarray:

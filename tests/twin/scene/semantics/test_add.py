@@ -1,5 +1,6 @@
 """What rebuild calls: files in the scene folder, and the record that names them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +8,18 @@ import pytest
 from table_scene import World, make_world, table
 
 from bridge.geometry import se3
-from twin.naming.scene_file import UnreadableSemanticsError, read_semantics
+from twin.naming.phrases import Asker
+from twin.naming.scene_file import (
+    UnreadableSemanticsError,
+    read_semantics,
+    read_vectors,
+    write_semantics,
+    write_vectors,
+)
 from twin.naming.things import Mask, MaskSet
-from twin.scene.foundation.things import add_semantics
-from twin.scene.gaussians import concatenate, moved_cloud
-from twin.scene.semantics.features import FeatureBasis, SceneFeatures
-from twin.scene.semantics.language import query
+from twin.scene.foundation.stage import find_things
+from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 
 T_ABOVE = se3.transform_from(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.1, 0.02]))
 
@@ -20,14 +27,21 @@ T_ABOVE = se3.transform_from(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.1,
 def added(folder: Path, world: World, **options: object) -> dict[str, object]:
     """Take the red cube out as an object, as rebuild does."""
     cube = world.true_instances() == 1
-    return add_semantics(
-        folder,
-        world.cloud.take(~cube),
-        {"red_cube": world.cloud.take(cube)},
+    return written(folder, world.cloud.take(~cube), world.cloud.take(cube), world, **options)
+
+
+def written(
+    folder: Path, background: GaussianCloud, cube: GaussianCloud, world: World, **options: object
+) -> dict[str, object]:
+    scene = find_things(
+        background,
+        {"red_cube": cube} if len(cube) else {},
         [shot.viewpoint for shot in world.train],
-        threads=1,
+        rasteriser=Rasteriser(RasterConfig(threads=1)),
         **options,  # type: ignore[arg-type]
     )
+    rows = {"background": len(background)} | ({"red_cube": len(cube)} if len(cube) else {})
+    return write_semantics(folder, scene, rows)
 
 
 def rows_of(world: World) -> dict[str, int]:
@@ -50,8 +64,8 @@ def test_what_is_written_comes_back(tabletop: World, tmp_path: Path) -> None:
     box = next(item for item in scene.instances if item.label == "blue open container")
     assert set(box.parts) == {"rim", "floor", "walls"}
     assert not any((mask & ~box.mask).any() for mask in box.parts.values())
-    np.testing.assert_allclose(box.keypoints_m["opening"][:2], [0.10, 0.08], atol=0.005)
-    assert query(scene, "rim of the box").parts == {(box.id, "rim"): 1.0}
+    rim = Asker(scene=scene).find("rim of the box").found
+    assert [(each.item.id, each.part) for each in rim] == [(box.id, "rim")]
     np.testing.assert_allclose(
         box.T_base_instance[:3, :3] @ box.T_base_instance[:3, :3].T, np.eye(3), atol=1e-9
     )
@@ -83,8 +97,7 @@ def test_completed_gaussians_are_nothing_and_change_no_thing(
         folder.mkdir()
         whole = concatenate([background, *more])
         cube = tabletop.cloud.take(is_cube)
-        viewpoints = [shot.viewpoint for shot in tabletop.train]
-        add_semantics(folder, whole, {"red_cube": cube}, viewpoints, threads=1)
+        written(folder, whole, cube, tabletop)
         rows = {"background": len(whole), "red_cube": len(cube)}
         labels.append(read_semantics(folder, rows).labels)
     plain, ghostly = labels
@@ -96,7 +109,7 @@ def test_completed_gaussians_are_nothing_and_change_no_thing(
 
 def test_an_empty_table_is_a_remark_not_an_error(tmp_path: Path) -> None:
     world = make_world([table()], num_train=4, num_held_out=0)
-    record = add_semantics(tmp_path, world.cloud, {}, [], threads=1)
+    record = written(tmp_path, world.cloud, world.cloud.take(np.zeros(0, dtype=int)), world)
     assert record["instances"] == []
     assert str(record["remark"]).startswith("nothing stands on the level plane")
     scene = read_semantics(tmp_path, {"background": len(world.cloud)})
@@ -105,7 +118,7 @@ def test_an_empty_table_is_a_remark_not_an_error(tmp_path: Path) -> None:
 
 def test_an_empty_scene_is_a_remark_too(tabletop: World, tmp_path: Path) -> None:
     nothing = tabletop.cloud.take(np.zeros(0, dtype=int))
-    record = add_semantics(tmp_path, nothing, {}, [tabletop.train[0].viewpoint], threads=1)
+    record = written(tmp_path, nothing, nothing, tabletop)
     assert "no level plane among 0 points" in str(record["remark"])
 
 
@@ -122,24 +135,17 @@ def test_masks_that_do_not_fit_are_a_remark(tabletop: World, tmp_path: Path) -> 
     assert "5 x 5 pixels" in str(record["remark"])
 
 
-def test_features_lie_beside_the_labels(tabletop: World, tmp_path: Path) -> None:
-    num = len(tabletop.cloud)
-    features = SceneFeatures(
-        basis=FeatureBasis(
-            mean=np.zeros(4, dtype=np.float32),
-            components=np.eye(2, 4, dtype=np.float32),
-            explained_fraction=0.9,
-        ),
-        features=np.ones((num, 2), dtype=np.float32),
-        weight=np.ones(num, dtype=np.float32),
-        instance_ids=np.zeros(0, dtype=np.int32),
-        instance_embeddings=np.zeros((0, 0), dtype=np.float32),
-        source="made model",
-    )
-    record = added(tmp_path, tabletop, features=features)
-    assert record["features"]["num_kept"] == 2  # type: ignore[index]
-    with np.load(tmp_path / "features.npz") as written:
-        assert written["features"].shape == (num, 2)
-        assert written["source"].tobytes() == b"made model"
+def test_vectors_lie_beside_the_labels_and_fit_this_scene_only(
+    tabletop: World, tmp_path: Path
+) -> None:
     added(tmp_path, tabletop)
-    assert not (tmp_path / "features.npz").exists()
+    scene = read_semantics(tmp_path, rows_of(tabletop))
+    assert read_vectors(tmp_path, scene) is None
+    vectors = np.random.default_rng(0).normal(size=(len(scene.instances), 3)).astype(np.float32)
+    write_vectors(tmp_path, scene, vectors, "made model")
+    back = read_vectors(tmp_path, scene)
+    assert back is not None
+    np.testing.assert_array_equal(back[0], vectors)
+    assert back[1] == "made model"
+    with pytest.raises(UnreadableSemanticsError, match="made for another scene"):
+        read_vectors(tmp_path, replace(scene, instances=scene.instances[1:]))

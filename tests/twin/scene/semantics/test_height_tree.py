@@ -15,7 +15,7 @@ def block(corner_m: tuple[float, float, float], size_m: tuple[float, float, floa
     return np.asarray(corner_m) + (cells + 0.5) * VOXEL_M
 
 
-def parted(p_m: np.ndarray, max_size_m: float = 0.45) -> tuple[list[set[int]], np.ndarray]:
+def parted(p_m: np.ndarray, max_size_m: float = 0.45) -> list[set[int]]:
     found = branches(
         p_m,
         p_m[:, 2],
@@ -24,13 +24,13 @@ def parted(p_m: np.ndarray, max_size_m: float = 0.45) -> tuple[list[set[int]], n
         max_size_m=max_size_m,
         min_voxels=8,
     )
-    return [set(ids.tolist()) for ids in found.groups], found.too_large
+    return [set(ids.tolist()) for ids in found]
 
 
 def test_mugs_on_one_paper_are_two_things_each_with_the_paper_below_it() -> None:
     paper = block((0.0, 0.0, 0.0), (0.6, 0.2, 0.01))
     mugs = [block((x, 0.05, 0.01), (0.08, 0.08, 0.09)) for x in (0.1, 0.4)]
-    groups, too_large = parted(np.concatenate([paper, *mugs]))
+    groups = parted(np.concatenate([paper, *mugs]))
     assert len(groups) == 2
     first = len(paper)
     for number, mug in enumerate(mugs):
@@ -40,28 +40,24 @@ def test_mugs_on_one_paper_are_two_things_each_with_the_paper_below_it() -> None
         assert below <= set(range(len(paper)))
         assert 64 <= len(below) <= 120  # what it stands on, and one voxel around
         first += len(mug)
-    assert not too_large[list(groups[0] | groups[1])].any()
 
 
 def test_what_is_small_enough_is_left_whole_however_it_rises() -> None:
     foot, tower = block((0.0, 0.0, 0.0), (0.3, 0.3, 0.01)), block((0.1, 0.1, 0.01), (0.1, 0.1, 0.1))
-    groups, too_large = parted(np.concatenate([foot, tower]))
+    groups = parted(np.concatenate([foot, tower]))
     assert groups == [set(range(len(foot) + len(tower)))]
-    assert not too_large.any()
 
 
-def test_a_wall_that_no_level_parts_is_left_to_others() -> None:
+def test_a_wall_that_no_level_parts_is_left_out() -> None:
     wall = block((0.0, 0.0, 0.0), (0.7, 0.02, 0.3))
-    groups, too_large = parted(wall)
-    assert groups == []
-    assert too_large.all()
+    assert parted(wall) == []
 
 
 def test_groups_do_not_share_voxels_and_turn_with_the_scene() -> None:
     rng = np.random.default_rng(0)
     cells = np.unique(rng.integers(0, [90, 90, 9], (9000, 3)), axis=0)
     p_m = (cells + 0.5) * VOXEL_M
-    groups, _ = parted(p_m)
+    groups = parted(p_m)
     assert sum(map(len, groups)) == len(set().union(*groups))
-    turned, _ = parted(p_m[:, [1, 0, 2]])
+    turned = parted(p_m[:, [1, 0, 2]])
     assert sorted(map(sorted, turned)) == sorted(map(sorted, groups))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from table_scene import World
 
-from twin.naming.things import SemanticScene
+from twin.naming.phrases import Asker
+from twin.naming.things import NAMED, SemanticScene
 from twin.naming.words import kind_of, label_of, names_of
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.semantics.describe import scene_by_default
-from twin.scene.semantics.language import MIN_SPLATS, NAMED, numbered, query
+from twin.scene.semantics.describe import MIN_SPLATS, numbered, scene_by_default
 
 
 def test_a_known_object_takes_what_the_segmenter_joined_with_it_and_no_more() -> None:
@@ -20,35 +20,35 @@ def test_a_known_object_takes_what_the_segmenter_joined_with_it_and_no_more() ->
     duck[10:20] = True  # the segmenter saw background here
     duck[40:75] = True
     duck[90:100] = True
-    found = numbered(labels, {"duck": duck, "nowhere": np.zeros(180, dtype=bool)})
-    assert (found.keys, found.others) == (("duck",), (2, 3))
-    assert np.all(found.labels[duck] == 1)
-    assert np.all(found.labels[40:90] == 1)
-    assert np.all(found.labels[100:150] == 2)
-    assert np.all(found.labels[150:] == 3)
-    assert not found.labels[:10].any()
+    keys, others, found = numbered(labels, {"duck": duck, "nowhere": np.zeros(180, dtype=bool)})
+    assert (keys, others) == (["duck"], [2, 3])
+    assert np.all(found[duck] == 1)
+    assert np.all(found[40:90] == 1)
+    assert np.all(found[100:150] == 2)
+    assert np.all(found[150:] == 3)
+    assert not found[:10].any()
 
 
 def test_two_known_objects_in_one_thing_share_it_by_their_own_gaussians() -> None:
     labels = np.ones(100, dtype=np.uint16)
     first, second = np.arange(100) < 55, np.arange(100) >= 70
-    found = numbered(labels, {"a": first, "b": second})
-    assert found.others == ()
-    assert np.bincount(found.labels).tolist() == [0, 70, 30]
+    keys, others, found = numbered(labels, {"a": first, "b": second})
+    assert (keys, others) == (["a", "b"], [])
+    assert np.bincount(found).tolist() == [0, 70, 30]
 
 
 def test_without_known_objects_nothing_changes() -> None:
     labels = np.array([0, 2, 1, 2], dtype=np.uint16)
-    found = numbered(labels, {})
-    np.testing.assert_array_equal(found.labels, labels)
-    assert found.others == (1, 2)
+    keys, others, found = numbered(labels, {})
+    np.testing.assert_array_equal(found, labels)
+    assert (keys, others) == ([], [1, 2])
 
 
 def test_a_handful_of_gaussians_is_no_object() -> None:
     few = np.arange(60) < MIN_SPLATS - 1
-    found = numbered(np.zeros(60, dtype=np.uint16), {"duck": few})
-    assert found.keys == ()
-    assert not found.labels.any()
+    keys, others, found = numbered(np.zeros(60, dtype=np.uint16), {"duck": few})
+    assert (keys, others) == ([], [])
+    assert not found.any()
 
 
 @pytest.mark.parametrize(
@@ -96,20 +96,21 @@ def test_known_things_come_first_and_the_others_are_still_found(
     assert all(item.seen == 2 for item in scene.instances[:2])
 
 
+def meant(scene: SemanticScene, text: str) -> list[int]:
+    return [each.item.id for each in Asker(scene=scene).find(text).found]
+
+
 def test_a_question_finds_the_task_s_own_words(scene: SemanticScene) -> None:
-    cube = scene.instances[1]
-    assert query(scene, "the cube").objects[cube.id] == 1.0
-    assert query(scene, "tub").best() == scene.instances[0].id
+    assert meant(scene, "the cube") == [scene.instances[1].id]
+    assert meant(scene, "tub") == [scene.instances[0].id]
 
 
 def test_what_the_task_names_is_meant_and_not_what_looks_like_it(scene: SemanticScene) -> None:
     cube = scene.instances[1]
     double = replace(cube, id=99, source="default segmenter")
     both = replace(scene, instances=(*scene.instances, double))
-    assert query(both, "the red cube").objects == {
-        item.id: float(item.id == cube.id) for item in both.instances
-    }
-    assert query(both, "red thing").objects[99] == 1.0
+    assert meant(both, "the red cube") == [cube.id]
+    assert meant(both, "red thing") == [cube.id, 99]
 
 
 def test_a_known_thing_without_a_table_is_named_all_the_same(tabletop: World) -> None:

@@ -3,16 +3,12 @@ import pytest
 from table_scene import World, iou
 
 from bridge.geometry.camera import Camera
-from twin.naming.things import FeatureMap, Mask, MaskSet, SemanticsError
+from twin.naming.things import Mask, MaskSet, SemanticsError
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_from_masks
-from twin.scene.semantics.lift import (
-    Viewpoint,
-    lift_features,
-    observe,
-    render_labels,
-)
+from twin.scene.semantics.lift import Viewpoint, render_labels
+from twin.scene.semantics.masks import observe
 
 SMALL = Viewpoint(
     camera=Camera(width=24, height=16, fx=20.0, fy=20.0, cx=12.0, cy=8.0), T_base_camera=np.eye(4)
@@ -33,39 +29,6 @@ def few_gaussians(count: int = 30) -> GaussianCloud:
 @pytest.fixture
 def rasteriser() -> Rasteriser:
     return Rasteriser(RasterConfig(threads=1))
-
-
-def test_a_constant_map_gives_every_gaussian_that_is_seen_the_constant(
-    rasteriser: Rasteriser,
-) -> None:
-    values = np.full((5, 4, 6), 0.7, dtype=np.float32)
-    features, weight = lift_features(
-        rasteriser, few_gaussians(), [(SMALL, FeatureMap(values=values, stride=4))] * 2
-    )
-    np.testing.assert_allclose(features[weight > 0], 0.7, rtol=1e-4)
-    assert (weight > 0).sum() > 20
-
-
-def test_features_of_two_frames_are_their_weighted_mean(rasteriser: Rasteriser) -> None:
-    cloud, rng = few_gaussians(), np.random.default_rng(2)
-    maps = [
-        FeatureMap(values=rng.normal(size=(4, 16, 24)).astype(np.float32), stride=1)
-        for _ in range(2)
-    ]
-    (a, wa), (b, wb) = (lift_features(rasteriser, cloud, [(SMALL, item)]) for item in maps)
-    both, weight = lift_features(rasteriser, cloud, [(SMALL, item) for item in maps])
-    seen = (wa > 0.01) & (wb > 0.01)
-    np.testing.assert_allclose(weight, wa + wb, rtol=1e-5, atol=1e-3)
-    mean = (a * wa[:, None] + b * wb[:, None])[seen] / weight[seen, None]
-    np.testing.assert_allclose(both[seen], mean, rtol=1e-3, atol=1e-3)
-
-
-def test_a_map_that_does_not_fit_its_camera_is_refused(rasteriser: Rasteriser) -> None:
-    wrong = FeatureMap(values=np.zeros((2, 5, 5), dtype=np.float32), stride=2)
-    with pytest.raises(SemanticsError, match="5 x 5 cells, 2 pixels each, does not fit"):
-        lift_features(rasteriser, few_gaussians(), [(SMALL, wrong)])
-    with pytest.raises(SemanticsError, match="no frame"):
-        lift_features(rasteriser, few_gaussians(), [])
 
 
 def test_a_mask_of_another_size_is_refused(rasteriser: Rasteriser) -> None:
@@ -98,7 +61,6 @@ def test_instances_know_their_box_colour_and_support(
     np.testing.assert_allclose(cube.T_base_instance[:3, 3], [-0.13, -0.10, 0.02], atol=0.004)
     np.testing.assert_allclose(cube.size_m, [0.04, 0.04, 0.04], atol=0.007)
     assert cube.color_srgb[0] > 2 * cube.color_srgb[1]
-    np.testing.assert_allclose(cube.keypoints_m["top"], [-0.13, -0.10, 0.04], atol=0.005)
 
 
 def test_no_masks_give_no_instance_and_say_so(tabletop: World, rasteriser: Rasteriser) -> None:

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from one_look import segment_points
 
 from twin.scene.semantics.cluster import SurfacePoints
-from twin.scene.semantics.patches import PatchConfig, cut_into_patches
-from twin.scene.semantics.segment import SegmentConfig
+from twin.scene.semantics.patches import cut_into_patches
+from twin.scene.semantics.segment import SegmentConfig, segment
 
 WOOD, RED, BLUE = (0.55, 0.42, 0.30), (0.8, 0.1, 0.1), (0.1, 0.25, 0.75)
 SPACING_M = 0.004
@@ -61,10 +60,10 @@ def test_a_box_against_a_wall_is_a_thing_and_a_poster_on_it_is_none() -> None:
     points = together(wall, *PARCEL, POSTER)
     is_parcel = np.zeros(len(points), dtype=bool)
     is_parcel[len(wall) : len(points) - len(POSTER)] = True
-    labels = cut_into_patches(points, SPACING_M, PatchConfig())
+    labels = cut_into_patches(points, SPACING_M)
     assert labels.max() == 1
     assert share(labels, is_parcel) > 0.85
-    found = segment_points(points, SegmentConfig())
+    found = segment(points, SegmentConfig())
     assert found.plane is None
     assert [thing.label.split()[0] for thing in found.things] == ["red"]
 
@@ -74,15 +73,15 @@ def test_a_box_of_the_colour_of_the_wall_is_part_of_it() -> None:
         SurfacePoints(p_m=f.p_m, normals=f.normals, colors=np.tile(WOOD, (len(f), 1)))
         for f in PARCEL
     ]
-    assert not cut_into_patches(together(WALL, *painted), SPACING_M, PatchConfig()).any()
+    assert not cut_into_patches(together(WALL, *painted), SPACING_M).any()
 
 
 @pytest.mark.parametrize("num", [0, 1, 30])
 def test_next_to_nothing_holds_no_thing(num: int) -> None:
-    labels = cut_into_patches(WALL.take(np.arange(num)), SPACING_M, PatchConfig())
+    labels = cut_into_patches(WALL.take(np.arange(num)), SPACING_M)
     assert labels.shape == (num,)
     assert not labels.any()
 
 
 def test_points_too_sparse_for_a_surface_hold_no_thing() -> None:
-    assert not cut_into_patches(together(WALL, *PARCEL), 0.05, PatchConfig()).any()
+    assert not cut_into_patches(together(WALL, *PARCEL), 0.05).any()

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 import table_scene
-from one_look import segment_points
 from table_scene import BLUE, GREEN, RED, World, box, duck, ellipsoid, iou, make_world, table
 
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -12,13 +11,14 @@ from twin.scene.semantics.segment import (
     Segmentation,
     SegmentConfig,
     points_of,
+    segment,
 )
 from twin.scene.semantics.support import NoSupportError
 
 
 def segmented(pieces: list[table_scene.Piece], num: int = 8) -> tuple[World, Segmentation]:
     world = make_world(pieces, num_train=num, num_held_out=0)
-    return world, segment_points(points_of(world.cloud), SegmentConfig())
+    return world, segment(points_of(world.cloud), SegmentConfig())
 
 
 def matched(world: World, found: Segmentation) -> dict[int, tuple[str, float]]:
@@ -33,7 +33,7 @@ def matched(world: World, found: Segmentation) -> dict[int, tuple[str, float]]:
 
 
 def test_everything_on_the_table_is_found_and_named(tabletop: World) -> None:
-    found = segment_points(points_of(tabletop.cloud), SegmentConfig())
+    found = segment(points_of(tabletop.cloud), SegmentConfig())
     best = matched(tabletop, found)
     assert {number: label for number, (label, _) in best.items()} == tabletop.names
     assert all(score > 0.85 for _, score in best.values())
@@ -47,7 +47,7 @@ def test_the_fused_scene_gives_masks_of_every_frame(tabletop: World) -> None:
     assert all(item.support == len(viewpoints) for item in scene.instances)
     names = {item.label: item.name.split(", ")[1:] for item in scene.instances}
     assert names["red cube"] == ["red cube", "4 x 4 x 4 cm"]
-    assert names["yellow toy"][0] == "yellow"  # a shape nobody knows is not called one
+    assert names["yellow thing"][0] == "yellow"  # a shape nobody knows is not called one
     shot = tabletop.held_out[0]
     ids = render_labels(rasteriser, tabletop.cloud, scene.labels, shot.viewpoint)
     for index, item in enumerate(scene.instances, start=1):
@@ -60,7 +60,7 @@ def test_ducks_that_touch_are_two_and_keep_their_heads() -> None:
     world, found = segmented([table(), *duck(1, 0.0, 0.036, 0.3), *duck(2, 0.0, -0.036, 2.8)])
     best = matched(world, found)
     assert len(found.things) == 2
-    assert all(score > 0.85 and label == "yellow toy" for label, score in best.values())
+    assert all(score > 0.85 and label == "yellow thing" for label, score in best.values())
 
 
 @pytest.mark.slow
@@ -104,7 +104,7 @@ def test_without_a_level_plane_it_says_what_is_missing() -> None:
     p = rng.normal(size=(len(ball), 3))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     with pytest.raises(NoSupportError, match="needs a table in view, or things"):
-        segment_points(type(ball)(p_m=5.0 * p, normals=p, colors=ball.colors), SegmentConfig())
+        segment(type(ball)(p_m=5.0 * p, normals=p, colors=ball.colors), SegmentConfig())
 
 
 def test_the_answer_does_not_depend_on_where_the_table_stands(tabletop: World) -> None:
@@ -118,7 +118,7 @@ def test_the_answer_does_not_depend_on_where_the_table_stands(tabletop: World) -
         normals=points.normals @ turn.T,
         colors=points.colors,
     )
-    first, second = (segment_points(item, SegmentConfig()) for item in (points, moved))
+    first, second = (segment(item, SegmentConfig()) for item in (points, moved))
     assert [t.label for t in first.things] == [t.label for t in second.things]
     assert (first.labels == second.labels).mean() > 0.99
 
@@ -136,8 +136,8 @@ def test_relief_of_the_table_is_no_thing_and_a_flat_card_is_one() -> None:
         normals=np.tile([0.0, 0.0, 1.0], (len(xy), 1)),
         colors=np.clip(np.where(card[:, None], [0.8, 0.1, 0.1], wood), 0, 1),
     )
-    found = segment_points(points, SegmentConfig())
+    found = segment(points, SegmentConfig())
     assert [thing.label.split()[0] for thing in found.things] == ["red"]
     assert iou(found.labels == 1, card) > 0.9
-    everything = segment_points(points, SegmentConfig(relief_score=0.0))
+    everything = segment(points, SegmentConfig(relief_score=0.0))
     assert len(everything.things) == 3

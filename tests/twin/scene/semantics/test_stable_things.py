@@ -3,72 +3,45 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from table_scene import World, iou
 
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.semantics import stable_things
-from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.describe import scene_by_default
-from twin.scene.semantics.segment import Look, Segmentation, SegmentConfig, Thing, points_of
-from twin.scene.semantics.shape_descriptors import measure_shape
-from twin.scene.semantics.stable_things import VOXEL_SCALES, segment_stably
+from twin.scene.semantics.segment import Look, SegmentConfig, points_of, segment, stable
 
 
-def looks_like(
-    monkeypatch: pytest.MonkeyPatch, found: list[list[range]], num_points: int
-) -> Segmentation:
-    """The outcome where each look finds these things."""
-    shape = measure_shape(np.random.default_rng(0).uniform(0.0, 0.04, (500, 3)), 0.004)
-    pending = iter(found)
-
-    class Ground:
-        plane = None
-        nothing = "nothing is there"
-
-        def look(self, scale: float) -> Look:
-            labels = np.zeros(num_points, dtype=np.int64)
-            for number, members in enumerate(next(pending), start=1):
-                labels[list(members)] = number
-            return Look(labels=labels, voxel_m=0.004 * scale)
-
-        def thing(self, mask: np.ndarray, voxel_m: float) -> Thing:
-            first, *_, last = np.flatnonzero(mask).tolist()
-            return Thing(label=str(range(first, last + 1)), shape=shape, score=1.0)
-
-    monkeypatch.setattr(stable_things, "ground_of", lambda *_: Ground())
-    none = np.zeros((num_points, 3))
-    return segment_stably(SurfacePoints(p_m=none, normals=none, colors=none), SegmentConfig())
+def looked(*found: list[range]) -> list[Look]:
+    """Looks that find these things among 100 points."""
+    looks = []
+    for things in found:
+        labels = np.zeros(100, dtype=np.int64)
+        for number, members in enumerate(things, start=1):
+            labels[list(members)] = number
+        looks.append(Look(labels=labels, voxel_m=0.004))
+    return looks
 
 
-def test_most_looks_decide(monkeypatch: pytest.MonkeyPatch) -> None:
+def kept(looks: list[Look]) -> list[list[int]]:
+    return [np.flatnonzero(mask).tolist() for mask, _ in stable(looks)]
+
+
+def test_most_looks_decide() -> None:
     firm, rare = range(50), range(60, 90)
-    found = [[firm, rare], [firm], [range(48)], [firm], [range(30)], [firm]]
-    assert len(found) == len(VOXEL_SCALES)
-    result = looks_like(monkeypatch, found, 100)
-    assert [thing.label for thing in result.things] == [str(firm)]
-    assert np.flatnonzero(result.labels).tolist() == list(firm)
-    assert result.remark == ""
+    assert kept(looked([firm, rare], [firm], [range(48)], [firm], [range(30)])) == [list(firm)]
 
 
-def test_a_thing_and_its_pieces_are_not_both_things(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thing_and_its_pieces_are_not_both_things() -> None:
     whole, left, right = range(100), range(50), range(50, 100)
-    found = [[whole]] * 4 + [[left, right]] * 2
-    result = looks_like(monkeypatch, found, 100)
-    assert [thing.label for thing in result.things] == [str(whole)]
+    assert kept(looked([whole], [whole], [whole], [left, right])) == [list(whole)]
 
 
-def test_looks_that_do_not_agree_give_nothing_and_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = [[range(10 * k, 10 * k + 10)] for k in range(6)]
-    result = looks_like(monkeypatch, found, 100)
-    assert result.things == ()
-    assert not result.labels.any()
-    assert "no two of 6 sizes" in result.remark
+def test_looks_that_do_not_agree_give_nothing() -> None:
+    assert kept(looked(*[[range(10 * k, 10 * k + 10)] for k in range(6)])) == []
 
 
 def test_things_are_those_of_the_table_largest_first(tabletop: World) -> None:
-    found = segment_stably(points_of(tabletop.cloud), SegmentConfig())
+    found = segment(points_of(tabletop.cloud), SegmentConfig())
     truth = tabletop.true_instances()
     sizes = [int((found.labels == k).sum()) for k in range(1, len(found.things) + 1)]
     assert sizes == sorted(sizes, reverse=True)

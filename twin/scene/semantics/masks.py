@@ -1,0 +1,190 @@
+"""One thing, many masks: lift the masks of all frames, group them, and decide each Gaussian.
+
+Ids of masks differ from frame to frame, masks bleed, shift, are missing or carry a wrong name.
+Whether two masks mean the same thing is decided on the Gaussians that both frames show.
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, UInt16
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import squareform
+
+from twin.naming.things import MaskSet, SemanticsError
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.raster.rasteriser import Rasteriser
+from twin.scene.semantics.lift import Viewpoint, lifted
+
+MIN_WEIGHT = 0.05
+"""A Gaussian that gives a frame less than this share of one pixel is not seen in it."""
+INSIDE = 0.5
+"""A Gaussian belongs to a mask that covers more than this of what it shows."""
+MIN_IOU = 0.25
+"""Of the masks of one thing on average, over the Gaussians that both frames show."""
+VISIBLE = 0.2
+"""A frame sees a thing when it shows at least this share of its Gaussians."""
+MIN_HITS = 0.4
+"""Frames with a mask of a thing, of those that see it."""
+MIN_SUPPORT = 3
+"""Frames with a mask of a thing."""
+MIN_SPLATS = 10
+"""A mask or a thing of fewer Gaussians is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """What the masks of one frame say about the Gaussians it shows."""
+
+    splat_ids: Int[np.ndarray, " num_visible"]
+    weight: Float32[np.ndarray, " num_visible"]
+    """Pixels' worth of the image that each gives."""
+    inside: Float32[np.ndarray, "num_visible num_masks"]
+    """Share of that within each mask, 0..1."""
+    labels: tuple[str, ...]
+    scores: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """One thing that several frames agree on."""
+
+    label: str
+    score: float
+    support: int
+    """Frames with a mask of it."""
+    seen: int
+    """Frames that show enough of it."""
+    mask: Bool[np.ndarray, " num_splats"]
+
+
+def observe(
+    rasteriser: Rasteriser, cloud: GaussianCloud, viewpoint: Viewpoint, masks: MaskSet
+) -> Observation:
+    """Carry the masks of one frame to the Gaussians."""
+    camera = viewpoint.camera
+    for number, mask in enumerate(masks.masks):
+        if mask.image.shape != (camera.height, camera.width):
+            message = (
+                f"mask {number} ({mask.label!r}) of camera {masks.camera_id} at "
+                f"{masks.stamp_ns} ns is {mask.image.shape[1]} x {mask.image.shape[0]} pixels, "
+                f"the camera's image {camera.width} x {camera.height}. Give masks of the image's "
+                "own size."
+            )
+            raise SemanticsError(message)
+    whole = np.ones((camera.height, camera.width), dtype=bool)
+    stack = np.stack([whole, *(mask.image for mask in masks.masks)]).astype(np.float32)
+    shown = lifted(rasteriser, cloud, viewpoint, stack)
+    ids = np.flatnonzero(shown[:, 0] > MIN_WEIGHT)
+    weight = shown[ids, 0]
+    return Observation(
+        splat_ids=ids,
+        weight=weight,
+        inside=as_float32(np.clip(shown[ids, 1:] / weight[:, None], 0.0, 1.0)),
+        labels=tuple(mask.label for mask in masks.masks),
+        scores=tuple(float(mask.score) for mask in masks.masks),
+    )
+
+
+def associate(
+    observations: Sequence[Observation], num_splats: int, background_bias: float = 0.0
+) -> tuple[tuple[Track, ...], UInt16[np.ndarray, " num_splats"]]:
+    """Find the things that the masks of many frames agree on, the largest first.
+
+    Masks are clustered by the mean of their IoU. A Gaussian goes to the thing with the largest
+    share of its light inside the thing's masks, if that is more than the background's share plus
+    the bias. Frames whose mask of the thing is missing do not count against it: a dropped mask says
+    nothing about the edge.
+
+    Args:
+        background_bias: Positive where masks bleed, negative where they shrink.
+    """
+    masks = [
+        (frame, int(column))
+        for frame, item in enumerate(observations)
+        for column in np.flatnonzero((item.inside > INSIDE).sum(axis=0) >= MIN_SPLATS)
+    ]
+    groups: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for pair, group in zip(masks, _clusters(observations, num_splats, masks), strict=True):
+        groups[int(group)].append(pair)
+    kept, share = [], [np.zeros(num_splats, dtype=np.float32)]
+    for members in groups.values():
+        of_thing = _share(observations, members, num_splats)
+        support, seen = _counts(observations, members, of_thing > INSIDE)
+        if support >= MIN_SUPPORT and support > MIN_HITS * seen:
+            kept.append((members, support, seen))
+            share.append(of_thing)
+    best = np.max(share, axis=0)
+    owner = np.where(best > 1.0 - best + background_bias, np.argmax(share, axis=0), 0)
+    tracks = [
+        _track(observations, members, support, seen, owner == number)
+        for number, (members, support, seen) in enumerate(kept, start=1)
+        if int((owner == number).sum()) >= MIN_SPLATS
+    ]
+    tracks.sort(key=lambda item: (-int(item.mask.sum()), item.label, int(item.mask.argmax())))
+    labels = np.zeros(num_splats, dtype=np.uint16)
+    for number, track in enumerate(tracks, start=1):
+        labels[track.mask] = number
+    return tuple(tracks), labels
+
+
+def _clusters(
+    observations: Sequence[Observation], num_splats: int, masks: Sequence[tuple[int, int]]
+) -> Int[np.ndarray, " num_masks"]:
+    """A number for each mask; those of one thing have the same."""
+    if len(masks) < 2:
+        return np.arange(len(masks))
+    sets = np.zeros((len(masks), num_splats), dtype=np.float32)
+    shown = np.zeros((len(masks), num_splats), dtype=np.float32)
+    for row, (frame, column) in enumerate(masks):
+        item = observations[frame]
+        shown[row, item.splat_ids] = 1.0
+        sets[row, item.splat_ids] = item.inside[:, column] > INSIDE
+    both, common = sets @ sets.T, sets @ shown.T
+    iou = both / np.maximum(common + common.T - both, 1.0)
+    distance = squareform(1.0 - np.clip((iou + iou.T) / 2, 0.0, 1.0), checks=False)
+    return np.asarray(fcluster(linkage(distance, "average"), 1.0 - MIN_IOU, "distance"))
+
+
+def _share(
+    observations: Sequence[Observation], members: Sequence[tuple[int, int]], num_splats: int
+) -> Float32[np.ndarray, " num_splats"]:
+    """Share of each Gaussian's light within the masks of a thing, over frames with a mask."""
+    inside, total = np.zeros((2, num_splats), dtype=np.float32)
+    for frame in {frame for frame, _ in members}:
+        item = observations[frame]
+        columns = [column for owner, column in members if owner == frame]
+        total[item.splat_ids] += item.weight
+        inside[item.splat_ids] += item.weight * item.inside[:, columns].max(axis=1)
+    return inside / np.maximum(total, 1e-9)
+
+
+def _counts(
+    observations: Sequence[Observation],
+    members: Sequence[tuple[int, int]],
+    of_thing: Bool[np.ndarray, " num_splats"],
+) -> tuple[int, int]:
+    """Frames with a mask of a thing, and frames that see it."""
+    hit, least = {frame for frame, _ in members}, VISIBLE * max(int(of_thing.sum()), 1)
+    shown = {k for k, item in enumerate(observations) if of_thing[item.splat_ids].sum() >= least}
+    return len(hit), len(hit | shown)
+
+
+def _track(
+    observations: Sequence[Observation],
+    members: Sequence[tuple[int, int]],
+    support: int,
+    seen: int,
+    mask: Bool[np.ndarray, " num_splats"],
+) -> Track:
+    """What most of its masks are called, and how sure they are."""
+    names: dict[str, float] = defaultdict(float)
+    scores = []
+    for frame, column in members:
+        score = observations[frame].scores[column]
+        names[observations[frame].labels[column]] += score
+        scores.append(score)
+    label = max(sorted(names), key=lambda name: names[name])
+    return Track(label=label, score=float(np.mean(scores)), support=support, seen=seen, mask=mask)
