@@ -27,7 +27,6 @@ from twin.scene.fit.densify import densify, score
 from twin.scene.fit.exposure import solve_exposures
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32, with_harmonics
-from twin.scene.harmonics import NUM_FIRST
 from twin.scene.raster.rasteriser import (
     SAME_EXPOSURE,
     FitSession,
@@ -36,6 +35,9 @@ from twin.scene.raster.rasteriser import (
     psnr_db,
 )
 from twin.scene.settings import FitConfig
+
+SLAB = 0.5
+"""How far a Gaussian may leave the surface that depth fused, along its normal, in its size."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,14 +70,10 @@ class SurfacePrior:
             sizes_m=self.sizes_m[parents],
         )
 
-    def hold(self, cloud: GaussianCloud, slab: float) -> None:
-        """Move centres that left the slab back to its border, in place.
-
-        Args:
-            slab: Half its thickness, in the Gaussian's size at the start.
-        """
+    def hold(self, cloud: GaussianCloud) -> None:
+        """Move centres that left the slab back to its border, in place."""
         off_m = np.einsum("ni,ni->n", self.normals, cloud.means_m) - self.heights_m
-        limit_m = np.float32(slab) * self.sizes_m
+        limit_m = np.float32(SLAB) * self.sizes_m
         beyond_m = off_m - np.clip(off_m, -limit_m, limit_m)
         cloud.means_m[:] -= beyond_m[:, None] * self.normals
 
@@ -198,13 +196,10 @@ class Events:
     @cached_property
     def _schedule(self) -> list[Event]:
         config, events = self._config, []
-        if config.densify:
-            events += [Event(at=at, share=SPLIT_SHARE, act=self._densify) for at in SPLIT_AT]
-        if config.exposure != "none":
-            events += [
-                Event(at=at, share=EXPOSURES_SHARE, act=self._solve_exposures)
-                for at in EXPOSURES_AT
-            ]
+        events += [Event(at=at, share=SPLIT_SHARE, act=self._densify) for at in SPLIT_AT]
+        events += [
+            Event(at=at, share=EXPOSURES_SHARE, act=self._solve_exposures) for at in EXPOSURES_AT
+        ]
         if config.appearance_steps:
             events += [Event(at=at, share=SOLVE_SHARE, act=self._solve_colours) for at in SOLVE_AT]
         return sorted(events, key=lambda event: event.at)
@@ -231,13 +226,9 @@ class Events:
         ]
 
     def _solve_exposures(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
-        if self._config.exposure != "none":
-            state.exposures = solve_exposures(
-                state.session.cloud,
-                self._observations(state, coarse),
-                self._rasteriser,
-                allowance,
-            )
+        seen = self._observations(state, coarse)
+        cloud = state.session.cloud
+        state.exposures = solve_exposures(cloud, seen, self._rasteriser, allowance)
 
     def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         self._solve_exposures(state, coarse, allowance)
@@ -348,14 +339,12 @@ def fit(
     between two images: nothing that decides the result depends on it until it strikes.
 
     Args:
-        views: Training images; never the held-out ones.
         max_splats: Budget of Gaussians; none: as many as there are at the start.
         spent_s: How much of the budget initialisation has used up; up to half of it counts.
     """
     learner = _Learner(views, config)
     events = Events(views, config, max_splats or len(cloud), learner.rasteriser)
-    harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
-    state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
+    state = first_state(learner.session(with_harmonics(cloud)), len(views))
     state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
     cpu_start = time.process_time()
     for at in _steps(config, state, clock):
@@ -363,7 +352,7 @@ def fit(
         learner.step(state, at)
         advance(round(100 * at.fraction), _note(state, at, len(views)))
     state.last.put_mean_into(state.session.cloud)
-    learner.hold(state)
+    state.surface.hold(state.session.cloud)
     return FitResult(
         cloud=state.session.cloud,
         iterations=state.session.steps,
@@ -423,11 +412,6 @@ class _Learner:
             depth_weight=config.depth_weight,
         )
 
-    def hold(self, state: FitState) -> None:
-        """Keep Gaussians near the surface they began on, where that is to be trusted."""
-        if self._config.slab:
-            state.surface.hold(state.session.cloud, self._config.slab)
-
     def step(self, state: FitState, at: Progress) -> None:
         """Draw one image and follow its gradient."""
         epoch, place = divmod(state.session.steps, len(self._views))
@@ -443,7 +427,7 @@ class _Learner:
         )
         keep_colors_in_range(state.session.cloud)
         if state.session.steps % HOLD_EVERY == 0:
-            self.hold(state)
+            state.surface.hold(state.session.cloud)
             if at.fraction >= MEAN_FROM:
                 state.last.add(state.session.cloud)
         if report.mse is not None:

@@ -24,9 +24,10 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
-from bridge.task.task_file import ObjectModel
+from bridge.task.task_file import SCANNED, ObjectModel
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
+from twin.scene.fit.lighting import EVEN, Lighting
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import (
     GaussianCloud,
@@ -39,7 +40,6 @@ from twin.scene.gaussians import (
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.closing import closed_object
 from twin.scene.objects.placement import Placements
-from twin.scene.settings import InitialiseConfig
 from twin.scene.shape.files import MESH, SDF, TASK_SHAPE, write_shape
 from twin.scene.shape.from_training import ObjectViews, shapes_of, write_static
 from twin.scene.shape.known import shape_mesh
@@ -257,15 +257,9 @@ def decompose(
     cloud: GaussianCloud,
     views_of: Callable[[Episode], Sequence[TrainingView]],
     output: Output,
-    config: InitialiseConfig,
+    lighting: Lighting = EVEN,
 ) -> Decomposition:
-    """Make each object from the first episode that shows it, and fill the table underneath.
-
-    Args:
-        cloud: Fitted to what shows no object.
-        views_of: The training views of an episode, objects and all.
-        config: The shape of new Gaussians.
-    """
+    """Make each object from the first episode that shows it, and fill the table underneath."""
     library: dict[str, LibraryObject] = {}
     placed = list(placements.by_episode.values())
     left = np.ones(len(cloud), dtype=bool)  # but what the fit left where pixels were masked
@@ -282,7 +276,7 @@ def decompose(
         with output.progress("reconstruct objects", len(wanted)) as advance:
             shapes = shapes_of(views, models, poses, wanted, advance=advance)
         for key in wanted:
-            splats = object_splats(models[key], shapes[key], views, poses[key], config)
+            splats = object_splats(models[key], shapes[key], views, poses[key], lighting)
             if splats is not None:
                 library[key] = LibraryObject(
                     model=models[key],
@@ -309,11 +303,19 @@ def object_splats(
     shape: ObjectShape | str,
     views: Sequence[TrainingView],
     T_base_object: Float[np.ndarray, "4 4"],
-    config: InitialiseConfig,
+    lighting: Lighting = EVEN,
 ) -> ObjectSplats | None:
-    """Gaussians on all of an object's surface; None where no view shows it."""
-    mesh = shape_mesh(model) if isinstance(shape, str) else (shape.vertices_m, shape.faces)
-    cloud = closed_object(mesh, views, T_base_object, config)
+    """Gaussians on all of an object's surface; None where no view shows it.
+
+    On the task's shape of what is rigid: views leave rims ragged. On what was reconstructed of the
+    rest.
+    """
+    is_known = model.shape != SCANNED and model.soft is None
+    if is_known or isinstance(shape, str):
+        mesh = shape_mesh(model)
+    else:
+        mesh = shape.vertices_m, shape.faces
+    cloud = closed_object(mesh, views, T_base_object, lighting)
     if cloud is None:
         return None
     sdf = None if isinstance(shape, str) else shape.sdf

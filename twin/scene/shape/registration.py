@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
+from twin.scene.frames.rgbd import NORMAL_REACH_PX, oriented
 from twin.scene.least_squares import normal_equations
 from twin.scene.shape.carve import MaskedView
 
@@ -15,8 +16,6 @@ MAX_POINTS = 500
 """Points of one view that are compared."""
 MAX_HEIGHTS = 400
 """Points of the plane that one view contributes."""
-NORMAL_PX = 2
-"""Normals come from pixels this far to each side."""
 FLAT_M = 0.015
 """Pixels whose neighbours differ by more have no normal."""
 BENT_M = 0.004
@@ -37,35 +36,19 @@ class SeenSurface:
 
 
 def seen_surface(view: MaskedView, *, with_plane: bool) -> SeenSurface:
-    """Pick the object's oriented points evenly, and what was measured around it.
-
-    Args:
-        with_plane: There is a plane; otherwise no points around the object are returned.
-    """
-    camera, depth = view.camera, view.known_depth_m().astype(np.float64)
-    p = camera.unproject(depth)
-    n = NORMAL_PX
-    inner = (slice(n, -n), slice(n, -n))
-    ok = view.mask[inner] & (depth[inner] > 0)
-    ends, seen = [], []
-    for rows, columns in ((0, n), (0, -n), (n, 0), (-n, 0)):
-        part = (
-            slice(n + rows, camera.height - n + rows),
-            slice(n + columns, camera.width - n + columns),
-        )
-        ok &= view.mask[part] & (np.abs(depth[part] - depth[inner]) < FLAT_M)
-        ends.append(p[part])
-        seen.append(depth[part])
-    for before, after in ((0, 1), (2, 3)):
-        ok &= np.abs(seen[before] + seen[after] - 2 * depth[inner]) < BENT_M
-    row, column = np.nonzero(ok)
-    step = max(1, len(row) // MAX_POINTS)
-    row, column = row[::step], column[::step]
-    right, left, below, above = (end[row, column] for end in ends)
-    normals = np.cross(below - above, right - left)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    points = p[inner][row, column]
-    normals[np.einsum("ni,ni->n", normals, points) > 0] *= -1
+    """Pick the object's oriented points evenly, and what was measured around it."""
+    depth = view.known_depth_m().astype(np.float64)
+    p = view.camera.unproject(depth)
+    seen = view.mask & (depth > 0)
+    row, column, towards = oriented(np.moveaxis(p, -1, 0), seen, seen)
+    n, own = NORMAL_REACH_PX, depth[row, column]
+    ok = np.ones(len(row), dtype=bool)
+    for down, right in ((0, n), (n, 0)):
+        ends = [depth[row + sign * down, column + sign * right] - own for sign in (-1, 1)]
+        ok &= (np.abs(ends) < FLAT_M).all(axis=0) & (np.abs(ends[0] + ends[1]) < BENT_M)
+    chosen = np.flatnonzero(ok)
+    chosen = chosen[:: max(1, len(chosen) // MAX_POINTS)]
+    points, normals = p[row[chosen], column[chosen]], towards[:, chosen].T
     plane = np.zeros((0, 3))
     if with_plane and len(points):
         plane = _around(view, p, points)
