@@ -95,7 +95,7 @@ def work() -> None:
     cloud = fuse(points, config, views)
     seconds = time.process_time() - start
     points.clear()
-    steps = FitConfig(iterations=11, coarse_fraction=0.3, appearance_steps=1)
+    steps = FitConfig(iterations=11)
     fit(cloud, views, steps, lambda *_: None, max_splats=NUM_SPLATS)
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     print(peak_gb, len(cloud), seconds)

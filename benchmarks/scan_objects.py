@@ -69,8 +69,7 @@ def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = 
     if iterations:
         settings = FitConfig(iterations=iterations, threads=1)
         cloud = fit(cloud, views, settings, lambda *_: None, max_splats=config.max_splats).cloud
-    num = MAX_VIEWS
-    chosen = [wrist[k] for k in np.linspace(0, len(wrist) - 1, num).round().astype(int)]
+    chosen = [wrist[k] for k in np.linspace(0, len(wrist) - 1, MAX_VIEWS).round().astype(int)]
     localised = localise_objects([*chosen, *others], start.task)
     poses = {
         k: item.T_base_object for k, item in localised.items() if item.T_base_object is not None

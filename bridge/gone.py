@@ -94,6 +94,8 @@ GONE: dict[str, str] = {
             *(f"publish standin --{name}" for name in ("real-time", "execute-unverified")),
             *(f"publish standin --{name}" for name in ("scan-id", "first-probe", "gate-cell")),
             *(f"rebuild --{name}" for name in ("slab", "harmonics", "exposure", "densify")),
+            *(f"rebuild --{name}" for name in ("loss", "depth-weight", "coarse-fraction")),
+            "rebuild --appearance-steps",
             *(f"rebuild --{name}" for name in ("flatness", "opacity", "footprint-factor")),
             "rebuild --no-densify",
             "gate --frames",

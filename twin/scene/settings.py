@@ -14,7 +14,6 @@ from bridge.terminal import RARE
 
 _DURATION = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(s|sec|min|m|h)?\s*$")
 _SECONDS = {None: 1.0, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
-MAX_APPEARANCE_STEPS = 6
 MOST_S = 1e6
 """Eleven days: longer is a number gone wrong."""
 DEFAULT_BUDGET_S = 60.0
@@ -133,15 +132,6 @@ class FitConfig:
     come on top; scene.json says how long each took."""
     iterations: int = 0
     """Fit exactly this many images: the result is then reproducible, on slow machines too."""
-    loss: Annotated[Literal["3dgs", "paper"], RARE] = "3dgs"
-    """3dgs: 0.8 L1 + 0.2 (1 - SSIM); paper: squared error (Eq. 3). Both with depth L1."""
-    depth_weight: Annotated[float, RARE] = 0.5
-    """Weight of the L1 depth term (the paper's lambda_d), relative to depth."""
-    coarse_fraction: Annotated[float, RARE] = 0.6
-    """Share of the budget spent at half resolution."""
-    appearance_steps: Annotated[int, RARE] = 4
-    """Conjugate gradient steps whenever the colours are solved in closed form; 0: never. More
-    than six follow the noise."""
     seed: int = 0
     """Order of the frames, and nothing else: the rest leaves nothing to chance."""
     threads: int = 0
@@ -150,13 +140,6 @@ class FitConfig:
     def __post_init__(self) -> None:
         """Refuse a fit that never ends, or never begins."""
         _refuse_below(0, iterations=self.iterations, seed=self.seed, threads=self.threads)
-        refuse_outside(self, {"depth_weight": (0.0, 1000.0), "coarse_fraction": (0.0, 1.0)})
-        if not 0 <= self.appearance_steps <= MAX_APPEARANCE_STEPS:
-            message = (
-                f"--appearance-steps {self.appearance_steps} lies outside 0 to "
-                f"{MAX_APPEARANCE_STEPS}: more steps follow the noise."
-            )
-            raise UsageError(message)
         if self.budget_s is not None and not 0 < self.budget_s <= MOST_S:
             message = f"--budget {self.budget_s:g} s is no time to fit in; give more than 0."
             raise UsageError(message)

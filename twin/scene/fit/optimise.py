@@ -135,6 +135,12 @@ def first_state(session: FitSession, num_views: int) -> FitState:
     )
 
 
+COARSE = 0.6
+"""Share of the budget spent at half resolution."""
+APPEARANCE_STEPS = 4
+"""Conjugate gradient steps whenever the colours are solved; more than six follow the noise."""
+DEPTH_WEIGHT = 0.5
+"""Of the L1 depth term (the paper's lambda_d), relative to depth."""
 SOLVE_AT = (0.9,)
 """Shares of the budget at which colours are solved. Not at the start: a sharp solution for blurred
 Gaussians leads Adam astray (0.4 dB of 34 on the clean tabletop); near the end it adds 0.2 dB."""
@@ -183,30 +189,27 @@ class Events:
     def __init__(
         self,
         views: list[TrainingView],
-        config: FitConfig,
         max_splats: int,
         rasteriser: Rasteriser,
     ) -> None:
         """Plan; nothing is done yet."""
         self._views = views
-        self._config = config
         self._max_splats = max_splats
         self._rasteriser = rasteriser
 
     @cached_property
     def _schedule(self) -> list[Event]:
-        config, events = self._config, []
+        events = []
         events += [Event(at=at, share=SPLIT_SHARE, act=self._densify) for at in SPLIT_AT]
         events += [
             Event(at=at, share=EXPOSURES_SHARE, act=self._solve_exposures) for at in EXPOSURES_AT
         ]
-        if config.appearance_steps:
-            events += [Event(at=at, share=SOLVE_SHARE, act=self._solve_colours) for at in SOLVE_AT]
+        events += [Event(at=at, share=SOLVE_SHARE, act=self._solve_colours) for at in SOLVE_AT]
         return sorted(events, key=lambda event: event.at)
 
     def keep(self, state: FitState, at: Progress) -> None:
         """Do what is due; what is already behind is not done again."""
-        coarse = at.fraction < self._config.coarse_fraction
+        coarse = at.fraction < COARSE
         while (
             state.events_done < len(self._schedule)
             and self._schedule[state.events_done].at <= at.fraction
@@ -237,7 +240,7 @@ class Events:
             cloud,
             self._observations(state, coarse),
             self._rasteriser,
-            steps=self._config.appearance_steps,
+            steps=APPEARANCE_STEPS,
             allowance=allowance,
         )
         keep_colors_in_range(solved.cloud)
@@ -343,7 +346,7 @@ def fit(
         spent_s: How much of the budget initialisation has used up; up to half of it counts.
     """
     learner = _Learner(views, config)
-    events = Events(views, config, max_splats or len(cloud), learner.rasteriser)
+    events = Events(views, max_splats or len(cloud), learner.rasteriser)
     state = first_state(learner.session(with_harmonics(cloud)), len(views))
     state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
     cpu_start = time.process_time()
@@ -404,19 +407,17 @@ class _Learner:
 
     def session(self, cloud: GaussianCloud) -> FitSession:
         """What draws, compares and learns, from a cloud on."""
-        config = self._config
         return FitSession(
             cloud,
             self.rasteriser.config,
-            loss=config.loss,
-            depth_weight=config.depth_weight,
+            depth_weight=DEPTH_WEIGHT,
         )
 
     def step(self, state: FitState, at: Progress) -> None:
         """Draw one image and follow its gradient."""
         epoch, place = divmod(state.session.steps, len(self._views))
         index = int(order_of_views(self._config.seed, epoch, len(self._views))[place])
-        coarse = at.fraction < self._config.coarse_fraction
+        coarse = at.fraction < COARSE
         state.coarse_steps += coarse
         view = self._views[index]
         decay = DECAY**at.fraction

@@ -24,7 +24,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
-from bridge.task.task_file import SCANNED, ObjectModel
+from bridge.task.task_file import ObjectModel
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
 from twin.scene.fit.lighting import EVEN, Lighting
@@ -41,7 +41,7 @@ from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.closing import closed_object
 from twin.scene.objects.placement import Placements
 from twin.scene.shape.files import MESH, SDF, TASK_SHAPE, write_shape
-from twin.scene.shape.from_training import ObjectViews, shapes_of, write_static
+from twin.scene.shape.from_training import ObjectViews, is_known, shapes_of, write_static
 from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
@@ -173,7 +173,8 @@ class LibraryObject:
         """Write the reconstructed shape, or the known one with the reason why."""
         if not isinstance(self.shape, str):
             names, geometry = write_shape(place, self.shape, soft=self.model.soft is not None)
-            source = f"reconstructed from {self.shape.num_views} views"
+            made = "stated by the task, seen in" if is_known(self.model) else "reconstructed from"
+            source = f"{made} {self.shape.num_views} views"
             return names, {"shape_source": source, "geometry": geometry}
         write_whole(place / MESH, mesh_ply(*shape_mesh(self.model)))
         return [MESH], {"shape_source": TASK_SHAPE, "shape_remark": self.shape}
@@ -310,8 +311,7 @@ def object_splats(
     On the task's shape of what is rigid: views leave rims ragged. On what was reconstructed of the
     rest.
     """
-    is_known = model.shape != SCANNED and model.soft is None
-    if is_known or isinstance(shape, str):
+    if is_known(model) or isinstance(shape, str):
         mesh = shape_mesh(model)
     else:
         mesh = shape.vertices_m, shape.faces

@@ -22,8 +22,8 @@ from bridge.terminal import Advance
 from twin.errors import TwinError
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import spread
-from twin.scene.shape.carve import MaskedView
-from twin.scene.shape.known import surface_distances
+from twin.scene.shape.carve import MaskedView, ShapeError
+from twin.scene.shape.known import shape_mesh, surface_distances
 from twin.scene.shape.reconstruct import (
     ObjectShape,
     moved_views,
@@ -41,7 +41,6 @@ STANDING_M = 0.008
 """An object whose underside is at most this far from the table stands on it."""
 UPRIGHT_COSINE, LEANING_COSINE = 0.999, 0.95
 """Above the first an object's own frame is level; a toy may rest leaning, down to the second."""
-ALIGN_ROUNDS = 8
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 
@@ -53,7 +52,10 @@ def shapes_of(
     wanted: Iterable[str] | None = None,
     advance: Advance = lambda done, note: None,
 ) -> dict[str, ObjectShape | str]:
-    """Reconstruct objects in their own frames, or say why not."""
+    """Shapes of objects in their own frames, or why there is none.
+
+    What is rigid and known has the task's shape: views leave it ragged, and thin walls too thick.
+    """
     found: dict[str, ObjectShape | str] = {}
     for done, key in enumerate(Ts_base_object if wanted is None else wanted):
         advance(done, key)
@@ -65,17 +67,32 @@ def shapes_of(
         useful, support = [v for v in masked if v.mask.any()], support_z_m(models[key], T)
         make = reconstruct if T[2, 2] >= UPRIGHT_COSINE else partial(_leaning, T_base_object=T)
         try:
-            found[key] = make(useful, support, align_rounds=ALIGN_ROUNDS)
+            if is_known(models[key]):
+                found[key] = _as_stated(useful, models[key])
+            else:
+                found[key] = make(useful, support)
         except TwinError as error:
             found[key] = str(error)
     return found
 
 
+def is_known(model: ObjectModel) -> bool:
+    """Whether the task states the shape that an object has now."""
+    return model.shape != SCANNED and model.soft is None
+
+
+def _as_stated(views: Sequence[MaskedView], model: ObjectModel) -> ObjectShape:
+    """The task's shape; what no view measured of it is marked."""
+    vertices, faces = shape_mesh(model)
+    if not views:
+        message = f"no view shows {model.id}: all masks are empty."
+        raise ShapeError(message)
+    shape = shape_of_mesh(vertices, faces, np.concatenate([view.points_m() for view in views]))
+    return replace(shape, num_views=len(views))
+
+
 def _leaning(
-    views: Sequence[MaskedView],
-    support: float | None,
-    T_base_object: Float[np.ndarray, "4 4"],
-    align_rounds: int,
+    views: Sequence[MaskedView], support: float | None, T_base_object: Float[np.ndarray, "4 4"]
 ) -> ObjectShape:
     """Reconstruct in a level frame, where the table is a plane of the grid; then lean it."""
     T_base_level = np.eye(4)
@@ -83,11 +100,11 @@ def _leaning(
     T_base_level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     T_base_level[:3, 3] = T_base_object[:3, 3]
     T_level_object = se3.invert(T_base_level) @ T_base_object
-    level = reconstruct(moved_views(views, T_level_object), support, align_rounds=align_rounds)
+    level = reconstruct(moved_views(views, T_level_object), support)
     vertices = se3.apply(se3.invert(T_level_object), level.vertices_m)
     points = np.concatenate([view.points_m() for view in views])
     leant = shape_of_mesh(vertices, level.faces, points)
-    return replace(leant, num_views=level.num_views, view_shift_m=level.view_shift_m)
+    return replace(leant, num_views=level.num_views)
 
 
 def support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:
@@ -135,7 +152,6 @@ def masked_view(
         T_base_camera=se3.invert(T) @ view.T_base_color,
         depth_m=depth,
         mask=mask,
-        sensor=view.camera_id,
     )
 
 

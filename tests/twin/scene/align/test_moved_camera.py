@@ -78,9 +78,8 @@ def test_a_bumped_camera_is_registered_again(
 
 
 def test_a_camera_before_another_room_is_lost_and_said_to_be(background: GaussianCloud) -> None:
-    said = textured_room.camera_pose(2, 5)
     other = replace(
-        seen_from(said),
+        seen_from(textured_room.camera_pose(2, 5)),
         depth_m=np.full((240, 320), 0.45, dtype=np.float32),
         image_u8=np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8),
     )

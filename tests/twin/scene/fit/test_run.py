@@ -115,10 +115,10 @@ def test_a_number_of_images_repeats_bit_for_bit_with_any_threads(
 
 
 def test_pixels_that_are_passed_over_do_not_make_the_fit_look_better(
-    room: tuple[GaussianCloud, list[TrainingView]],
+    room: tuple[GaussianCloud, list[TrainingView]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start, views = room
-    config = replace(ADAM_ALONE, coarse_fraction=0.0)
+    monkeypatch.setattr(optimise, "COARSE", 0.0)
 
     def masked(view: TrainingView, shown: slice) -> TrainingView:
         mask = np.zeros_like(view.full.static_mask)
@@ -126,11 +126,11 @@ def test_pixels_that_are_passed_over_do_not_make_the_fit_look_better(
         return replace(view, full=replace(view.full, static_mask=mask))
 
     halves = [
-        fit(start, [masked(views[0], side)], config, lambda *_: None).train_psnr_db
+        fit(start, [masked(views[0], side)], ADAM_ALONE, lambda *_: None).train_psnr_db
         for side in (slice(None, 32), slice(32, None))
     ]
-    whole = fit(start, views[:1], config, lambda *_: None).train_psnr_db
-    nothing = fit(start, [masked(views[0], slice(0, 0))], config, lambda *_: None)
+    whole = fit(start, views[:1], ADAM_ALONE, lambda *_: None).train_psnr_db
+    nothing = fit(start, [masked(views[0], slice(0, 0))], ADAM_ALONE, lambda *_: None)
     mse = np.mean([10 ** (-half / 10) for half in halves])
     assert whole == pytest.approx(psnr_db(float(mse)), abs=1e-3)
     assert nothing.train_psnr_db is None

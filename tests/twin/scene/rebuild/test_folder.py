@@ -174,8 +174,6 @@ def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(
         (lambda: FitConfig(budget_s=float("inf")), "--budget"),
         (lambda: FitConfig(seed=-1), "--seed"),
         (lambda: FitConfig(threads=-2), "--threads"),
-        (lambda: FitConfig(depth_weight=-0.1), "--depth-weight"),
-        (lambda: FitConfig(coarse_fraction=float("nan")), "--coarse-fraction"),
         (lambda: FrameConfig(max_depth_m=float("nan")), "--max-depth-m"),
         (lambda: FrameConfig(max_depth_m=-1.0), "--max-depth-m"),
         (lambda: InitialiseConfig(flying_fraction=float("nan")), "--flying-fraction"),
