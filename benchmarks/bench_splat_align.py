@@ -17,8 +17,9 @@ def main() -> None:
     sys.path.insert(0, str(ROOT / "tests" / "twin" / "scene" / "align"))
     import cell_views
 
-    from twin.robot.surface import sample_surface
-    from twin.scene.align.align import AlignConfig, RobotNotAlignedError, align_robot
+    from twin.robot.surface import PosedSurface, sample_surface
+    from twin.scene.align.align import RobotNotAlignedError, align_robot
+    from twin.scene.align.refine import FINE, ScenePose, refine
 
     robot = cell_views.robot()
 
@@ -49,8 +50,9 @@ def main() -> None:
         cell_views.POSTURES, np.eye(4), cell_views.CellErrors(depth_scale=BIAS)
     )
     points = sample_surface(robot, views[0].posture, 500, seed=3)
-    loose = AlignConfig(with_scale=False, max_residual_m=1.0, min_fitness=0.0)
-    rigid = align_robot(views, robot, start=np.eye(4), config=loose)
+    surfaces = [PosedSurface(robot, view.posture) for view in views]
+    start = ScenePose(T_base_source=np.eye(4))
+    rigid, _ = refine(views, surfaces, start, stages=FINE, num_points=6000, with_scale=False)
     rigid_m = cell_views.surface_error_m(rigid.T_base_source, np.eye(4), points)
     icp_m = cell_views.surface_error_m(open3d_icp(views, robot), np.eye(4), points)
     plain, seconds, margins = measure(cell_views.CellErrors(depth_scale=BIAS))

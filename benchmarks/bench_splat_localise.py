@@ -38,23 +38,22 @@ def measure(
 
     from bridge.sources.standin.cell_file import load_cell
     from bridge.task.task_file import load_task
-    from twin.scene.localise.objects import LocaliseConfig, localise_objects
+    from twin.scene.localise.objects import localise_objects
     from twin.scene.localise.points import fuse_stationary, object_points
     from twin.scene.shape.known import yaw_period_rad
 
-    config = LocaliseConfig()
     first = load_cell(load_task(task_name).cell).development_seeds[0]
     errors: dict[str, list[tuple[float, float, float]]] = {}
     seconds, extents_mm = [], []
     for seed in range(first, first + trials):
         start = look_at_start(task_name, seed)
         before = time.monotonic()
-        found = localise_objects(start.frames, start.task, config)
+        found = localise_objects(start.frames, start.task)
         seconds.append(time.monotonic() - before)
-        views = fuse_stationary(start.frames, 3, 8, start.task, config.points)
+        views = fuse_stationary(start.frames, 3, 8, start.task)
         for key, T_true in start.Ts_base_object.items():
             model, item = start.task.objects[key], found[key]
-            groups = object_points(views, model, config.points, config.colour)
+            groups = object_points(views, model)
             middle = np.median(groups[0].p_base, axis=0) if groups else np.full(3, np.nan)
             plain = float(np.linalg.norm(middle[:2] - T_true[:2, 3])) * 1e3
             if item.T_base_object is None:

@@ -91,11 +91,11 @@ def work() -> None:
         points.append(surface.points(stride))
         views.append(training_view(surface))
     start = time.process_time()
-    config = InitialiseConfig(max_splats=NUM_SPLATS, growth=0.0, footprint_factor=1.2)
+    config = InitialiseConfig(max_splats=NUM_SPLATS, growth=0.0)
     cloud = fuse(points, config, views)
     seconds = time.process_time() - start
     points.clear()
-    steps = FitConfig(iterations=11, coarse_fraction=0.3, appearance_steps=1, exposure="none")
+    steps = FitConfig(iterations=11)
     fit(cloud, views, steps, lambda *_: None, max_splats=NUM_SPLATS)
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     print(peak_gb, len(cloud), seconds)

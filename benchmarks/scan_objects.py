@@ -16,7 +16,7 @@ from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud, moved_cloud
-from twin.scene.localise.objects import LocaliseConfig, localise_objects
+from twin.scene.localise.objects import MAX_VIEWS, localise_objects
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import ObjectSplats, object_splats
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -49,7 +49,7 @@ class Scanned:
     def closed(self, key: str) -> ObjectSplats | None:
         """An object's Gaussians, on all of its surface."""
         model, T = self.start.task.objects[key], self.poses[key]
-        return object_splats(model, self.shapes[key], self.views, T, InitialiseConfig())
+        return object_splats(model, self.shapes[key], self.views, T)
 
 
 def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = False) -> Scanned:
@@ -69,8 +69,7 @@ def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = 
     if iterations:
         settings = FitConfig(iterations=iterations, threads=1)
         cloud = fit(cloud, views, settings, lambda *_: None, max_splats=config.max_splats).cloud
-    num = LocaliseConfig().max_views
-    chosen = [wrist[k] for k in np.linspace(0, len(wrist) - 1, num).round().astype(int)]
+    chosen = [wrist[k] for k in np.linspace(0, len(wrist) - 1, MAX_VIEWS).round().astype(int)]
     localised = localise_objects([*chosen, *others], start.task)
     poses = {
         k: item.T_base_object for k, item in localised.items() if item.T_base_object is not None

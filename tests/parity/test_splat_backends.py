@@ -63,7 +63,7 @@ def pose() -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("num_harmonics", [0, 3, 8, 15])
+@pytest.mark.parametrize("num_harmonics", [0, 3])
 def test_both_draw_the_same_planes(cuda: CudaRasteriser, num_harmonics: int) -> None:
     cloud = cloud_of(1, num_harmonics=num_harmonics)
     theirs = cuda.draw_planes(cloud, CAMERA, pose())

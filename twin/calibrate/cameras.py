@@ -25,7 +25,7 @@ from twin.calibrate.hand_eye import TargetCamera, find_camera
 from twin.calibrate.pairs import PosePairs, recorded_pairs, target_cameras
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture, PostureTrack, distinct_postures, posture_track
-from twin.scene.align.align import AlignConfig, Alignment, RobotNotAlignedError, align_robot
+from twin.scene.align.align import Alignment, RobotNotAlignedError, align_robot
 from twin.scene.align.view import RobotView
 from twin.scene.frames.camera_poses import base_tree, same_pose
 from twin.scene.store.calibration import CALIBRATION_FILE, write_calibration
@@ -116,13 +116,12 @@ def find_fixed_camera(episodes: Sequence[Episode], camera_id: str, *, seed: int)
     views = [view for episode in episodes for view in _load(episode, camera_id, chosen)]
     robot = load_robot(tracks[str(chosen[0].episode.path)].urdf)
     nominal = _nominal_pose(chosen[0], camera_id)
-    config = AlignConfig(seed=seed)
     try:
-        alignment = align_robot(views, robot, start=nominal, config=config)
+        alignment = align_robot(views, robot, start=nominal, seed=seed)
     except RobotNotAlignedError:
         if nominal is None:
             raise
-        alignment = align_robot(views, robot, config=config)
+        alignment = align_robot(views, robot, seed=seed)
     return FixedCamera(
         alignment=alignment,
         T_base_nominal=nominal,

@@ -65,11 +65,10 @@ def get_ready(_: None) -> None:
 def look(item: Look) -> dict[str, Any]:
     """Find the objects."""
     from twin.scene.localise.mesh_fit import scanned_surfaces  # noqa: PLC0415
-    from twin.scene.localise.objects import LocaliseConfig, localise_objects  # noqa: PLC0415
+    from twin.scene.localise.objects import localise_objects  # noqa: PLC0415
 
-    config = LocaliseConfig()
-    scanned = scanned_surfaces(RunFolder.open(item.run_path), item.task, config.mesh.num_samples)
-    found = localise_objects(item.frames, item.task, config, surfaces=scanned.surfaces)
+    scanned = scanned_surfaces(RunFolder.open(item.run_path), item.task)
+    found = localise_objects(item.frames, item.task, surfaces=scanned.surfaces)
     return dict(found)
 
 

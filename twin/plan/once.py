@@ -40,7 +40,6 @@ from twin.replay.run_job import cell_of, planned_grips
 from twin.replay.verdict import replay_plan
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces
-from twin.scene.localise.objects import LocaliseConfig
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.localise.stationary_frames import calibrated_cameras
 from twin.scene.store.calibration import read_calibration
@@ -125,10 +124,9 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
 
 
 def _localised(run: RunFolder, episode: Episode, task: Task) -> dict[str, LocalisedObject]:
-    config = LocaliseConfig()
-    surfaces = scanned_surfaces(run, task, config.mesh.num_samples).surfaces
+    surfaces = scanned_surfaces(run, task).surfaces
     poses = calibrated_cameras(episode, read_calibration(run))
-    return localise_episode(episode, task, config, surfaces=surfaces, poses=poses)
+    return localise_episode(episode, task, surfaces=surfaces, poses=poses)
 
 
 def _start(

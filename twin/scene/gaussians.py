@@ -14,7 +14,7 @@ from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from bridge.whole_file import write_whole
 from twin.errors import TwinError, UnreadableFileError
-from twin.scene.harmonics import HIGHEST, NUM_FIRST, NUM_HARMONICS, turned_harmonics
+from twin.scene.harmonics import NUM_FIRST, turned_harmonics
 
 SH_DC = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); PLY files store (c - 0.5) / SH_DC."""
@@ -39,8 +39,8 @@ class GaussianCloud:
     harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"] = field(
         default_factory=lambda: np.zeros((0, 0, 3), dtype=np.float32)
     )
-    """How colour changes with the direction it is seen along: coefficients of the real spherical
-    harmonics up to degree 3 (``harmonics.py``): 0, 3, 8 or 15 for each colour."""
+    """How colour changes with the direction it is seen along: coefficients of the three real
+    spherical harmonics of degree 1 (``harmonics.py``) for each colour, or none."""
     completed: Bool[np.ndarray, " num_splats"] = field(
         default_factory=lambda: np.zeros(0, dtype=bool)
     )
@@ -49,11 +49,9 @@ class GaussianCloud:
 
     def __post_init__(self) -> None:
         """A cloud made without harmonics has rows of none, and one without marks was measured."""
-        if self.harmonics.shape[1] not in NUM_HARMONICS:
-            message = (
-                f"a cloud with {self.harmonics.shape[1]} harmonics per colour: give all up to a "
-                f"degree, {', '.join(map(str, NUM_HARMONICS[:-1]))} or {NUM_HARMONICS[-1]}."
-            )
+        if self.harmonics.shape[1] not in (0, NUM_FIRST):
+            found = f"{self.harmonics.shape[1]} harmonics per colour"
+            message = f"a cloud with {found}: give none, or the {NUM_FIRST} of degree 1."
             raise TwinError(message)
         if len(self.harmonics) == 0 and len(self.means_m) > 0:
             none = np.zeros((len(self.means_m), 0, 3), dtype=np.float32)
@@ -67,7 +65,7 @@ class GaussianCloud:
 
     @property
     def num_harmonics(self) -> int:
-        """Coefficients of each colour beside the constant: 0, 3, 8 or 15."""
+        """Coefficients of each colour beside the constant: 0 or 3."""
         return int(self.harmonics.shape[1])
 
     def take(self, index: np.ndarray) -> "GaussianCloud":
@@ -110,10 +108,10 @@ def concatenate(clouds: list[GaussianCloud]) -> GaussianCloud:
 
 
 def with_harmonics(cloud: GaussianCloud, num_harmonics: int = NUM_FIRST) -> GaussianCloud:
-    """The same Gaussians with this many harmonics: zeros added, or those beyond cut off."""
-    kept = min(num_harmonics, cloud.num_harmonics)
+    """The same Gaussians with this many harmonics: zeros added, or all left out."""
+    if num_harmonics == cloud.num_harmonics:
+        return cloud
     harmonics = np.zeros((len(cloud), num_harmonics, 3), dtype=np.float32)
-    harmonics[:, :kept] = cloud.harmonics[:, :kept]
     return replace(cloud, harmonics=harmonics)
 
 
@@ -140,11 +138,7 @@ def _spread_bits(values: np.ndarray) -> np.ndarray:
 
 
 def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:
-    """The same Gaussians after a rigid motion; what their colour owes to direction turns along.
-
-    Args:
-        T_new_old: The motion, or the pose of their frame in another.
-    """
+    """The same Gaussians after a rigid motion; what their colour owes to direction turns along."""
     q, _ = se3.split(T_new_old)
     w, x, y, z = q
     w2, x2, y2, z2 = cloud.quats_wxyz.astype(np.float64).T
@@ -171,8 +165,8 @@ COLUMNS = (
     *("scale_0", "scale_1", "scale_2"),
     *("rot_0", "rot_1", "rot_2", "rot_3"),
 )
-REST_COLUMNS = tuple(f"f_rest_{index}" for index in range(3 * NUM_HARMONICS[HIGHEST]))
-"""Harmonics, lowest degree first: all of red, then green, then blue. Only as many as there are."""
+REST_COLUMNS = tuple(f"f_rest_{index}" for index in range(3 * NUM_FIRST))
+"""Harmonics: all of red, then green, then blue. Only where there are any."""
 COMPLETED_COLUMN = "completed"
 """1 where nobody measured what a Gaussian stands for; written only where there are any."""
 MAX_SPLATS = 50_000_000
@@ -188,9 +182,9 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
     """Write a cloud; the file appears under its name only when it is complete.
 
     Scales are natural logarithms, opacities logits, rotations wxyz, colours the constant
-    spherical harmonic with the higher ones as ``f_rest_0..8``, ``..23`` or ``..44`` where the cloud
-    has them. Metres, in the frame that ``scene.json`` names. A last column ``completed``, 0 or 1,
-    where some are; other viewers pass it over. A file that is there is replaced.
+    spherical harmonic with those of degree 1 as ``f_rest_0..8`` where the cloud has them. Metres,
+    in the frame that ``scene.json`` names. A last column ``completed``, 0 or 1, where some are;
+    other viewers pass it over. A file that is there is replaced.
     """
     quats = cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)
     table = np.concatenate(
@@ -212,7 +206,7 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
 
 
 def read_ply(path: Path) -> GaussianCloud:
-    """Read a splat PLY. Harmonics above degree 3 and unknown columns are ignored."""
+    """Read a splat PLY. Harmonics above degree 1 and unknown columns are ignored."""
     if not path.is_file():
         hint = "robot-gst rebuild RUN makes it."
         raise PathNotFoundError(path=path, what="splat file", hint=hint)
@@ -262,8 +256,7 @@ def _harmonics(names: list[str], table: np.ndarray) -> np.ndarray:
     if total != 3 * ((degree + 1) ** 2 - 1) or any(name not in names for name in rest):
         return np.zeros((len(table), 0, 3), dtype=np.float32)
     by_color = table[:, [names.index(name) for name in rest]].reshape(len(table), 3, total // 3)
-    kept = by_color[:, :, : NUM_HARMONICS[min(degree, HIGHEST)]]
-    return as_float32(np.swapaxes(kept, 1, 2))
+    return as_float32(np.swapaxes(by_color[:, :, :NUM_FIRST], 1, 2))
 
 
 def _header(path: Path, lines: list[str]) -> tuple[list[str], int]:

@@ -30,8 +30,6 @@ def part_masks(
 
     Args:
         robot: Its surface as it stands then; None: it is not known.
-        meshes: Of objects, each in its own frame.
-        Ts_base_object: Where they are; those without a pose are not there.
         not_scanned: Objects that no scan saw: they are objects, and a kind of their own besides.
     """
     rays = camera.rays()

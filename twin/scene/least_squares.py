@@ -7,11 +7,7 @@ from jaxtyping import Float
 def tukey_weights(
     residuals: Float[np.ndarray, " num_residuals"], bound: float
 ) -> Float[np.ndarray, " num_residuals"]:
-    """Biweights (Beaton and Tukey 1974): 1 at zero, 0 from the bound on.
-
-    Args:
-        bound: From here on a residual counts nothing, same unit.
-    """
+    """Biweights (Beaton and Tukey 1974): 1 at zero, 0 from the bound on."""
     return np.asarray(np.maximum(1.0 - np.square(residuals / bound), 0.0) ** 2)
 
 

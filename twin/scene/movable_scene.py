@@ -13,11 +13,11 @@ from bridge.geometry.camera import Camera
 from bridge.media.palette import rgb
 from twin.robot.posture import Posture
 from twin.scene.backdrop import Backdrop, read_backdrop
+from twin.scene.fit.lighting import EVEN, Lighting, read_lighting
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
 from twin.scene.objects.decompose import ObjectSplats, read_objects, read_pose, uncovered
 from twin.scene.raster.backend import CudaRasteriser
 from twin.scene.raster.rasteriser import Rasteriser
-from twin.scene.robot.lighting import EVEN, Lighting, read_lighting
 from twin.scene.robot.splats import posed, read_links
 from twin.scene.store.folder import SCENE_FILE, Scene
 from twin.scene.store.library import NOT_SCANNED
@@ -139,8 +139,6 @@ class MovableScene:
         ordered by their centres, so a table 6 mm below the floor of a box would show through it.
 
         Args:
-            Ts_base_object: Where objects are; the others are where they were scanned.
-            posture: Of the robot; None: it is not drawn.
             bent: Objects that are no rigid bodies, already in the base frame.
         """
         bent = {} if bent is None else bent

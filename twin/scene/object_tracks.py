@@ -4,8 +4,9 @@ A trial is localised while nothing is executed. In between nobody looks, but the
 fingers say what happened: an object between the fingers when they stop closing goes with the tool
 until they open. Closing, they push a box until it fits between the pads, as far apart as recorded.
 What localisation and joints disagree about is spread evenly over the carry, so that nothing jumps
-where it is put down. An object that is found far from where it was let go fell,
-and one that was never held was moved by something else: both change place when that is known.
+where it is put down; but for its height: what was let go above where it is found fell there. An
+object that is found far from where it was let go fell as well; one that was never held was moved by
+something else, and changes place when that is known.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,6 +34,7 @@ MOVED_M = 0.005
 """Less than this is the scatter of localisation."""
 EMPTY_M = 0.002
 """Fingers that close to less have nothing between them."""
+GRAVITY_M_S2 = 9.81
 PAD_M = 0.0015
 """So much more or less than the recorded opening a box between the pads may measure."""
 _TURNS_RAD = np.radians(sorted(np.arange(-45.0, 45.5, 0.5), key=abs))
@@ -79,6 +81,15 @@ class _Push(_Change):
     """The closing fingers push it; poses ``T_base_object``."""
 
 
+class _Fall(_Push):
+    """It was let go; poses ``T_base_object``."""
+
+    def pose(self, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
+        """Where it is then, ever faster."""
+        share = (stamp_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
+        return _between(self.T_start, self.T_end, float(np.clip(share, 0.0, 1.0)) ** 2)
+
+
 class _Carry(_Change):
     """It moves with the tool; poses ``T_tcp_object``."""
 
@@ -107,7 +118,6 @@ class ObjectTracks:
         """Poses ``T_base_object`` at one instant.
 
         Args:
-            stamp_ns: Source time.
             T_base_tcp: Of the tool then; None where no joints are known: what is carried then
                 stays where it was taken.
         """
@@ -157,7 +167,6 @@ def carried_tracks(
     Args:
         localised: The gst localisation v1 records of one episode, each with its ``phase`` and the
             ``plan_id`` after whose execution it grasps.
-        executions_ns: When each plan was executed, by its id.
         track: Joints and fingers; None where nobody recorded them: objects then change place at
             the end of an execution.
     """
@@ -253,13 +262,14 @@ def _moved(
     away_m = float(np.linalg.norm(after[:3, 3] - T[:3, 3]))
     if away_m <= MOVED_M:
         return added, ""
-    fell_ns = grasps[-1].grip.end_ns if grasps else end_ns
     note = (
         f"lay {away_m * 100:.0f} cm from where it was let go: drawn there from then on"
         if grasps
         else f"was moved by {away_m * 100:.0f} cm without being held: drawn there afterwards"
     )
-    return [*added, _Rest(start_ns=fell_ns, T_base_object=after)], note
+    if not grasps:
+        return [_Rest(start_ns=end_ns, T_base_object=after)], note
+    return [*added[:-2], *_fallen(grasps[-1].grip.end_ns, T, after)], note
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,8 +316,9 @@ def _put(
 
 
 def _carried(grasp: _Grasp, T_base_put: Float[np.ndarray, "4 4"]) -> list[_Span]:
-    """Pushed by the closing fingers, carried, and put down."""
-    grip = grasp.grip
+    """Pushed by the closing fingers, carried, let go, and fallen as low as it is found then."""
+    grip, T_let_go = grasp.grip, T_base_put.copy()
+    T_let_go[2, 3] = max(T_base_put[2, 3], grasp.T_base_put[2, 3])
     return [
         _Push(
             start_ns=grip.closing_ns,
@@ -319,10 +330,20 @@ def _carried(grasp: _Grasp, T_base_put: Float[np.ndarray, "4 4"]) -> list[_Span]
             start_ns=grip.start_ns,
             end_ns=grip.end_ns,
             T_start=grasp.T_tcp_object,
-            T_end=se3.invert(grip.T_base_tcp_end) @ T_base_put,
+            T_end=se3.invert(grip.T_base_tcp_end) @ T_let_go,
         ),
-        _Rest(start_ns=grip.end_ns, T_base_object=T_base_put),
+        *_fallen(grip.end_ns, T_let_go, T_base_put),
     ]
+
+
+def _fallen(
+    start_ns: int, T_start: Float[np.ndarray, "4 4"], T_end: Float[np.ndarray, "4 4"]
+) -> list[_Span]:
+    """From one place to another, as long as a free fall takes."""
+    fall_m = max(float(T_start[2, 3] - T_end[2, 3]), 0.0)
+    end_ns = start_ns + round(1e9 * float(np.sqrt(2 * fall_m / GRAVITY_M_S2)))
+    fall = _Fall(start_ns=start_ns, end_ns=end_ns, T_start=T_start, T_end=T_end)
+    return [fall, _Rest(start_ns=end_ns, T_base_object=T_end)]
 
 
 def _between_pads(

@@ -166,6 +166,8 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     moved = object_places(config.object, list(trial.parts.objects))
     posture, urdf, robot = posture_of(trial, stamp_ns, config)
     camera, T_base_camera = _view_of(run, scene, episode, camera_id, stamp_ns, config)
+    if chosen_view(config) is None:
+        T_base_camera = trial.registered(camera_id, T_base_camera)
     places = trial.places(stamp_ns) | moved
     cloud = trial.parts.at(places, posture, urdf)
     drawn = trial.parts.draw(rasteriser, cloud, camera, T_base_camera)
@@ -268,11 +270,7 @@ def chosen_view(config: RenderConfig) -> Float[np.ndarray, "4 4"] | None:
 
 
 def sized_camera(camera: Camera, size: str) -> Camera:
-    """The same view as an image of another size: all of it is seen, more only beside it.
-
-    Args:
-        size: ``WIDTHxHEIGHT``; empty: as recorded.
-    """
+    """The same view as an image of another size: all of it is seen, more only beside it."""
     if not size:
         return camera
     words = size.lower().split("x")
@@ -298,11 +296,7 @@ def poses_in_scene(
     camera_id: str,
     stamps_ns: Int[np.ndarray, " num_stamps"],
 ) -> TransformTree:
-    """Poses of a camera in the scene's frame, from where the scene has its own.
-
-    Args:
-        scene: Its record says in which frame it is, and where it has poses from.
-    """
+    """Poses of a camera in the scene's frame, from where the scene has its own."""
     tree = _tree_of(run, scene, episode, camera_id, stamps_ns)
     frame_id = streams.camera_info(episode, camera_id).frame_id
     root = tree.root_of(frame_id) if frame_id in tree.frames() else None

@@ -66,12 +66,7 @@ class Frame:
 def frames_of(
     run: RunFolder, scene: Scene, episode: TrialInScene, camera_id: str, config: RenderConfig
 ) -> Iterator[Frame]:
-    """Yield the instants to be drawn, in the order of time.
-
-    Args:
-        scene: In whose frame the camera must be known.
-        camera_id: From where; ``eye`` and ``target`` of the settings go before.
-    """
+    """Yield the instants to be drawn, in the order of time."""
     stamps = _stamps(episode, camera_id)
     T_chosen = chosen_view(config)
     frame_id = streams.camera_info(episode.recorded, camera_id).frame_id
@@ -89,7 +84,7 @@ def frames_of(
             posture = episode.postures.at(stamp_ns)
         T = T_chosen
         if T is None and tree is not None:
-            T = tree.T_root_frame(frame_id, stamp_ns)
+            T = episode.registered(camera_id, tree.T_root_frame(frame_id, stamp_ns))
         if T is not None:
             yield Frame(
                 stamp_ns=stamp_ns,

@@ -14,7 +14,6 @@ from bridge.terminal import RARE
 
 _DURATION = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(s|sec|min|m|h)?\s*$")
 _SECONDS = {None: 1.0, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
-MAX_APPEARANCE_STEPS = 6
 MOST_S = 1e6
 """Eleven days: longer is a number gone wrong."""
 DEFAULT_BUDGET_S = 60.0
@@ -22,11 +21,7 @@ DEFAULT_BUDGET_S = 60.0
 
 
 def parse_duration_s(text: str) -> float:
-    """Read ``60s``, ``2min``, ``1h`` or plain seconds.
-
-    Raises:
-        UsageError: When the text is none of these.
-    """
+    """Read ``60s``, ``2min``, ``1h`` or plain seconds."""
     match = _DURATION.match(text)
     if match is None:
         message = f"{text!r} is not a duration. Write 60s, 2min, 1h or plain seconds."
@@ -110,12 +105,6 @@ class InitialiseConfig:
     growth: Annotated[float, RARE] = 0.5
     """Share of the budget left to the fit, which splits Gaussians where the error is large;
     voxels grow until the first Gaussians fit in the others."""
-    footprint_factor: Annotated[float, RARE] = 1.6
-    """Voxel size in pixel footprints z/f."""
-    flatness: Annotated[float, RARE] = 0.1
-    """Standard deviation along the normal, as a fraction of the one in the plane."""
-    opacity: Annotated[float, RARE] = 0.95
-    """Opacity of a new Gaussian."""
     completion: Annotated[float, RARE] = 0.1
     """Share of ``max_splats`` that may be added for what was seen in colour but never measured;
     0: such holes stay black."""
@@ -123,22 +112,11 @@ class InitialiseConfig:
     """A pixel whose depth differs from a neighbour's by more than this share is dropped."""
 
     def __post_init__(self) -> None:
-        """Refuse an empty budget, a growth of everything, Gaussians without a size or a logit."""
+        """Refuse an empty budget and a growth of everything."""
         _refuse_below(1, max_splats=self.max_splats)
-        refuse_outside(
-            self,
-            {
-                "footprint_factor": (0.1, 100.0),
-                "flatness": (1e-3, 1.0),
-                "completion": (0.0, 1.0),
-                "flying_fraction": (1e-3, 10.0),
-            },
-        )
+        refuse_outside(self, {"completion": (0.0, 1.0), "flying_fraction": (1e-3, 10.0)})
         if not 0 <= self.growth < 1:
             message = f"--growth {self.growth:g} is no share: 0 up to, not including, 1."
-            raise UsageError(message)
-        if not 0 < self.opacity < 1:
-            message = f"--opacity {self.opacity:g} does not lie between 0 and 1."
             raise UsageError(message)
 
 
@@ -154,25 +132,6 @@ class FitConfig:
     come on top; scene.json says how long each took."""
     iterations: int = 0
     """Fit exactly this many images: the result is then reproducible, on slow machines too."""
-    loss: Annotated[Literal["3dgs", "paper"], RARE] = "3dgs"
-    """3dgs: 0.8 L1 + 0.2 (1 - SSIM); paper: squared error (Eq. 3). Both with depth L1."""
-    depth_weight: Annotated[float, RARE] = 0.5
-    """Weight of the L1 depth term (the paper's lambda_d), relative to depth."""
-    slab: Annotated[float, RARE] = 0.5
-    """How far a Gaussian may leave the surface that depth fused, along its normal and in units of
-    its own size; 0: as far as it likes."""
-    coarse_fraction: Annotated[float, RARE] = 0.6
-    """Share of the budget spent at half resolution."""
-    appearance_steps: Annotated[int, RARE] = 4
-    """Conjugate gradient steps whenever the colours are solved in closed form; 0: never. More
-    than six follow the noise."""
-    harmonics: Annotated[Literal[0, 1], RARE] = 1
-    """Degree of the spherical harmonics of colour; 0: one colour from everywhere."""
-    exposure: Annotated[Literal["gain", "none"], RARE] = "gain"
-    """What is solved for each frame. gain: a brightness per channel (exposure, white balance), on
-    average none."""
-    densify: Annotated[bool, RARE] = True
-    """Split Gaussians where the error is large, drop those that show nothing."""
     seed: int = 0
     """Order of the frames, and nothing else: the rest leaves nothing to chance."""
     threads: int = 0
@@ -181,16 +140,6 @@ class FitConfig:
     def __post_init__(self) -> None:
         """Refuse a fit that never ends, or never begins."""
         _refuse_below(0, iterations=self.iterations, seed=self.seed, threads=self.threads)
-        refuse_outside(self, {"depth_weight": (0.0, 1000.0), "coarse_fraction": (0.0, 1.0)})
-        if not 0 <= self.appearance_steps <= MAX_APPEARANCE_STEPS:
-            message = (
-                f"--appearance-steps {self.appearance_steps} lies outside 0 to "
-                f"{MAX_APPEARANCE_STEPS}: more steps follow the noise."
-            )
-            raise UsageError(message)
-        if not 0 <= self.slab < math.inf:
-            message = f"--slab {self.slab:g} is no thickness: 0 or more."
-            raise UsageError(message)
         if self.budget_s is not None and not 0 < self.budget_s <= MOST_S:
             message = f"--budget {self.budget_s:g} s is no time to fit in; give more than 0."
             raise UsageError(message)

@@ -74,9 +74,6 @@ def pose_cloud(
 
     A rigid motion of all nodes moves and turns every Gaussian by it. Rotations are blended as
     quaternions (Kavan et al. 2007 without the dual part), colours turn along.
-
-    Returns:
-        The Gaussians in the nodes' frame.
     """
     rest, nodes = binding.rest_nodes_m, np.asarray(nodes_m, dtype=np.float64)
     if len(cloud) != binding.weights.shape[0] or nodes.shape != rest.shape:

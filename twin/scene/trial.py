@@ -6,6 +6,7 @@ shape, coloured by frames from before the first motion: what is compared later m
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
@@ -17,9 +18,17 @@ from bridge.errors import GstError
 from bridge.task.task_file import Task
 from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack, posture_track
+from twin.scene.align.moved_camera import MovedCamera, MovedCameraError
+from twin.scene.fit.lighting import Lighting
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
-from twin.scene.localise.episode import first_execution_ns, write_localised
-from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
+from twin.scene.localise.episode import (
+    MOVED,
+    first_execution_ns,
+    moved_cameras,
+    trial_cameras,
+    write_localised,
+)
+from twin.scene.localise.stationary_frames import Poses, stationary_frames
 from twin.scene.movable_scene import MovableScene, read_movable_scene
 from twin.scene.object_tracks import ObjectTracks, localised_tracks
 from twin.scene.objects.closing import closed_object
@@ -28,7 +37,6 @@ from twin.scene.settings import FrameConfig, InitialiseConfig
 from twin.scene.shape.files import MESH
 from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import Mesh, read_mesh
-from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene
 from twin.scene.store.library import NOT_SCANNED, Library, objects_folder, task_of
 
@@ -49,6 +57,8 @@ class TrialInScene:
     """How the robot stands, or why it is not drawn."""
     notes: tuple[str, ...]
     """What nobody saw, and what was not scanned."""
+    moved: Mapping[str, MovedCamera] = field(default_factory=dict)
+    """Cameras that are elsewhere than their poses say, by id."""
     unposed: list[int] = field(default_factory=list)
     """Instants left out because nobody knows where the camera was."""
 
@@ -59,6 +69,23 @@ class TrialInScene:
             joints_rad = self.postures.at(stamp_ns).joints_rad
             T_base_tcp = load_robot(self.postures.urdf).T_base_tcp(joints_rad)
         return self.tracks.at(stamp_ns, T_base_tcp)
+
+    def registered(
+        self, camera_id: str, T_base_camera: Float[np.ndarray, "4 4"]
+    ) -> Float[np.ndarray, "4 4"]:
+        """Where a camera is that its poses put there.
+
+        Raises:
+            MovedCameraError: When it was moved, and nobody knows where to.
+        """
+        moved = self.moved.get(camera_id)
+        if moved is None:
+            return T_base_camera
+        if moved.T_said_true is None:
+            found = moved.describe(camera_id)
+            message = f"{self.recorded.info.id} is not rendered from there: {found}."
+            raise MovedCameraError(message)
+        return np.asarray(T_base_camera @ moved.T_said_true)
 
     def meshes(self, run: RunFolder) -> dict[str, Mesh]:
         """Surfaces of the objects that are drawn, each in its own frame."""
@@ -85,29 +112,41 @@ def open_trial(run: RunFolder, scene: Scene, recorded: Episode) -> TrialInScene:
         remark = scene.record.get("robot", {}).get("remark")
         reason = f" ({remark})" if remark else ""
         robot = f"not drawn: the scene has no robot splats{reason}"
-    tracks = _recorded_tracks(run, scene, recorded, postures)
-    parts, notes = trial_parts(run, scene, recorded, task_of(recorded), tracks.first())
+    tracks, moved = _recorded_tracks(run, scene, recorded, postures)
+    parts, notes = trial_parts(run, scene, recorded, task_of(recorded), tracks.first(), moved)
     return TrialInScene(
         recorded=recorded,
         parts=parts,
         tracks=tracks,
         postures=postures,
         robot=robot,
-        notes=(*tracks.notes, *notes),
+        notes=(*(item.describe(key) for key, item in moved.items()), *tracks.notes, *notes),
+        moved=moved,
     )
 
 
 def _recorded_tracks(
     run: RunFolder, scene: Scene, episode: Episode, postures: PostureTrack | None
-) -> ObjectTracks:
-    """Where a recorded episode's objects were: localised, and carried in between."""
+) -> tuple[ObjectTracks, dict[str, MovedCamera]]:
+    """Where a recorded episode's objects were, localised and carried, and which cameras moved."""
     try:
         task = streams.task_file(episode).task()
         path = write_localised(run, episode, task, scene_hash=scene.scene_hash)
-        records = streams.localisations(Episode.open(path))
+        localised = Episode.open(path)
+        records, about = streams.localisations(localised), localised.derived
     except GstError as error:
-        return ObjectTracks(notes=(f"objects are drawn where they were scanned: {error}",))
-    return localised_tracks(episode, records, task, postures)
+        tracks = ObjectTracks(notes=(f"objects are drawn where they were scanned: {error}",))
+        return tracks, _moved_cameras(run, episode)
+    found = {} if about is None else about.settings.get(MOVED, {})
+    moved = {key: MovedCamera.from_record(value) for key, value in found.items()}
+    return localised_tracks(episode, records, task, postures), moved
+
+
+def _moved_cameras(run: RunFolder, episode: Episode) -> dict[str, MovedCamera]:
+    try:
+        return moved_cameras(run, episode)
+    except GstError:  # no camera that could say it
+        return {}
 
 
 def trial_parts(
@@ -116,11 +155,11 @@ def trial_parts(
     episode: Episode,
     task: Task | None,
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]] | None,
+    moved: Mapping[str, MovedCamera] = MappingProxyType({}),
 ) -> tuple[MovableScene, list[str]]:
     """What is drawn of a scene in one episode, and what has to be said of it.
 
     Args:
-        task: The episode's; None: all that was scanned is drawn.
         Ts_base_object: Where its objects were before the first motion; those without a pose are
             not drawn. None: nobody localised them, and they stand where they were scanned.
     """
@@ -130,7 +169,8 @@ def trial_parts(
         return read_movable_scene(run, scene, scanned), library.notes(task)
     parts = read_movable_scene(run, scene, [name for name in scanned if name in Ts_base_object])
     others = {name: Ts_base_object[name] for name in missing if name in Ts_base_object}
-    made = _from_task(run, episode, task, others) if others else {}
+    poses, light = trial_cameras(run, episode, moved), parts.lighting
+    made = _from_task(episode, task, others, poses, light) if others else {}
     notes = [
         note if name in made else f"{name} was {NOT_SCANNED} and is not drawn: nobody saw it"
         for name, note in zip(missing, library.notes(task), strict=True)
@@ -140,26 +180,22 @@ def trial_parts(
 
 
 def _from_task(
-    run: RunFolder,
     episode: Episode,
     task: Task,
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
+    poses: Poses,
+    lighting: Lighting,
 ) -> dict[str, ObjectSplats]:
     """Objects in the task's shape and in the colours that they had before the first motion."""
-    config = InitialiseConfig()
     limits = DepthLimits(
-        max_depth_m=FrameConfig().max_depth_m, flying_fraction=config.flying_fraction
+        max_depth_m=FrameConfig().max_depth_m, flying_fraction=InitialiseConfig().flying_fraction
     )
-    frames = stationary_frames(
-        episode,
-        FIRST_FRAMES,
-        before_ns=first_execution_ns(episode),
-        poses=calibrated_cameras(episode, read_calibration(run)),
-    )
+    before_ns = first_execution_ns(episode)
+    frames = stationary_frames(episode, FIRST_FRAMES, before_ns=before_ns, poses=poses)
     views = [training_view(FrameSurface(frame, limits)) for frame in frames]
     made = {}
     for name, T in Ts_base_object.items():
-        cloud = closed_object(shape_mesh(task.objects[name]), views, T, config)
+        cloud = closed_object(shape_mesh(task.objects[name]), views, T, lighting)
         if cloud is not None:
             made[name] = ObjectSplats(cloud=cloud, T_base_object=T)
     return made

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.harmonics import harmonic_basis
+from twin.scene.harmonics import harmonic_terms
 
 
 def effective_colors(
@@ -13,7 +13,7 @@ def effective_colors(
     """Colour of each Gaussian as seen from a point of the cloud's frame, not clipped."""
     if cloud.num_harmonics == 0:
         return cloud.colors
-    basis = harmonic_basis(view_directions(cloud.means_m, camera_centre_m), cloud.num_harmonics)
+    basis = np.stack(harmonic_terms(*view_directions(cloud.means_m, camera_centre_m).T), axis=1)
     return as_float32(cloud.colors + np.einsum("nk,nkc->nc", basis, cloud.harmonics))
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -24,9 +23,8 @@ CONFIG = RebuildConfig(
 @contextmanager
 def coarse_distances() -> Iterator[None]:
     """Let scenes have few voxels: their distances are tested beside what makes them."""
-    few = partial(static.StaticConfig, max_voxels=30_000)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(static, "StaticConfig", few)
+        patch.setattr(static, "MAX_GRID", 30_000)
         yield
 
 

@@ -77,11 +77,7 @@ def depth_errors(
 def resample(
     equations: Equations, p_base: Float[np.ndarray, "num_points 3"], *, seed: int = 0
 ) -> Confidence:
-    """Draw blocks of points with replacement and solve the linearised fit again (Efron, 1979).
-
-    Args:
-        p_base: Points of the robot's surface, to say how far it moves [m].
-    """
+    """Draw blocks of points with replacement and solve the linearised fit again (Efron, 1979)."""
     rng = np.random.default_rng(seed)
     count = len(equations.weight)
     drawn = rng.multinomial(count, np.full(count, 1 / count), size=NUM_RESAMPLES)
@@ -262,28 +258,16 @@ def _place(yaw_rad: float, p_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 
 COARSE_POINTS = 1000
 MAX_COARSE = 6
 NUM_SURFACE = 400
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlignConfig:
-    """When an alignment is accepted, and what it estimates."""
-
-    min_fitness: float = 0.8
-    """Share of the robot's pixels that must show it within 15 mm."""
-    max_residual_m: float = 0.006
-    """Root mean square distance of matched points to the surface."""
-    max_scale_error: float = 0.05
-    """No depth camera is that wrong; a scale farther from 1 hides a wrong place."""
-    min_margin: float = 1.3
-    """The second-best place must cost this many times as much as the best."""
-    min_points: int = 300
-    """Matched points."""
-    num_points: int = 6000
-    """Points used, of all views together."""
-    with_scale: bool = True
-    """Estimate the depth scale; off, the fit is rigid, for comparison."""
-    seed: int = 0
-    """Of sampling and resampling."""
+MIN_FITNESS = 0.8
+"""Share of the robot's pixels that must show it within 15 mm."""
+MAX_RESIDUAL_M = 0.006
+"""Root mean square distance of matched points to the surface."""
+MAX_SCALE_ERROR = 0.05
+"""No depth camera is that wrong; a scale farther from 1 hides a wrong place."""
+MIN_MARGIN = 1.3
+"""The second-best place must cost this many times as much as the best."""
+MIN_POINTS, NUM_POINTS = 300, 6000
+"""Points that must match, and points used, of all views together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,7 +324,7 @@ def align_robot(
     robot: RobotModel,
     *,
     start: Float[np.ndarray, "4 4"] | None = None,
-    config: AlignConfig = AlignConfig(),
+    seed: int = 0,
 ) -> Alignment:
     """Find the pose ``T_base_source`` of a scene in which a robot stands, and the depth scale.
 
@@ -360,18 +344,20 @@ def align_robot(
     else:  # nearest points alone get stuck beside the start: the best of what lies around it, too
         around = search_near(views, robot, start)
         starts = [ScenePose(T_base_source=T) for T in (start, around.T_base_source)]
-    coarse = [_refined(views, surfaces, pose, config, fine=False) for pose in starts]
+    coarse = [_refined(views, surfaces, pose, fine=False, seed=seed) for pose in starts]
     best, others = _ranked(coarse)
-    finals = [_refined(views, surfaces, item.pose, config, fine=True) for item in (best, *others)]
+    finals = [
+        _refined(views, surfaces, item.pose, fine=True, seed=seed) for item in (best, *others)
+    ]
     best, others = _ranked(finals)
     margin = None
     if start is None:
         least = max(len(item.looked.errors_m) for item in finals) // 2
         costs = sorted(item.looked.cost_m(least) for item in finals)
         margin = costs[1] / max(costs[0], 1e-9) if others else float("inf")
-    _accept(best, margin, len(views), config)
+    _accept(best, margin, len(views))
     surface_m = np.concatenate(
-        [sample_surface(robot, view.posture, NUM_SURFACE, seed=config.seed) for view in views]
+        [sample_surface(robot, view.posture, NUM_SURFACE, seed=seed) for view in views]
     )
     return Alignment(
         T_base_source=best.pose.T_base_source,
@@ -379,7 +365,7 @@ def align_robot(
         fitness=best.looked.fitness,
         residual_m=best.equations.residual_m(),
         margin=margin,
-        sureness=resample(best.equations, surface_m, seed=config.seed),
+        sureness=resample(best.equations, surface_m, seed=seed),
         num_points=best.equations.num_points,
         num_views=len(views),
     )
@@ -400,9 +386,9 @@ def _refined(
     views: Sequence[RobotView],
     surfaces: Sequence[PosedSurface],
     pose: ScenePose,
-    config: AlignConfig,
     *,
     fine: bool,
+    seed: int,
 ) -> _Candidate:
     """Coarse without the scale, which a wrong place would abuse; fine with it."""
     refined, equations = refine(
@@ -410,9 +396,9 @@ def _refined(
         surfaces,
         pose,
         stages=FINE if fine else COARSE,
-        num_points=config.num_points if fine else COARSE_POINTS,
-        with_scale=fine and config.with_scale,
-        seed=config.seed,
+        num_points=NUM_POINTS if fine else COARSE_POINTS,
+        with_scale=fine,
+        seed=seed,
     )
     return _Candidate(
         pose=refined, looked=depth_errors(views, surfaces, refined), equations=equations
@@ -435,32 +421,32 @@ def _differ(a: ScenePose, b: ScenePose) -> bool:
     return turn > APART_RAD / 2 or float(np.linalg.norm(base)) > APART_M / 2
 
 
-def _accept(best: _Candidate, margin: float | None, num_views: int, config: AlignConfig) -> None:
+def _accept(best: _Candidate, margin: float | None, num_views: int) -> None:
     fitness, residual = best.looked.fitness, best.equations.residual_m()
     more = "Record the robot in another posture, arm stretched out to one side, and use both."
-    if best.equations.num_points < config.min_points or fitness < config.min_fitness:
+    if best.equations.num_points < MIN_POINTS or fitness < MIN_FITNESS:
         raise RobotNotAlignedError(
             found=f"at the best place found only {fitness:.0%} of the pixels that should show the "
             f"robot do ({best.equations.num_points} points match, {num_views} posture(s))",
             hint="Check that the camera sees the robot, that joints and depth were recorded "
             f"together, and that the description is this robot's. {more}",
         )
-    if residual > config.max_residual_m:
+    if residual > MAX_RESIDUAL_M:
         raise RobotNotAlignedError(
             found=f"the robot's surface is missed by {residual * 1e3:.1f} mm (at most "
-            f"{config.max_residual_m * 1e3:.0f} mm)",
+            f"{MAX_RESIDUAL_M * 1e3:.0f} mm)",
             hint="Check depth calibration, joint zero positions and the description's meshes.",
         )
     scale = best.pose.depth_scale
-    if abs(scale - 1.0) > config.max_scale_error:
+    if abs(scale - 1.0) > MAX_SCALE_ERROR:
         raise RobotNotAlignedError(
             found=f"the best place found needs the depth scaled by {scale:.3f}, more than the "
-            f"{config.max_scale_error:.0%} a depth camera can be wrong",
+            f"{MAX_SCALE_ERROR:.0%} a depth camera can be wrong",
             hint=f"Check that depth is in millimetres. {more}",
         )
-    if margin is not None and margin < config.min_margin:
+    if margin is not None and margin < MIN_MARGIN:
         raise RobotNotAlignedError(
             found=f"another place fits almost as well: it costs {margin:.2f} times the best, "
-            f"{config.min_margin:g} times is needed",
+            f"{MIN_MARGIN:g} times is needed",
             hint=more,
         )

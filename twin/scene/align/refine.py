@@ -84,9 +84,6 @@ def refine(
     Args:
         num_points: At most this many points of all views, at least 200 of each visible link.
         with_scale: Whether the depth scale is estimated; otherwise the fit is rigid.
-
-    Returns:
-        The place, and the equations of the last iteration.
     """
     rng = np.random.default_rng(seed)
     pose = start

@@ -11,7 +11,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.robot.posture import Posture
-from twin.scene.frames.rgbd import NORMAL_REACH_PX, DepthLimits, trusted_depth_mask
+from twin.scene.frames.rgbd import DepthLimits, oriented, trusted_depth_mask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,12 +29,7 @@ class RobotView:
     def from_frame(
         frame: RgbdFrame, posture: Posture, T_source_camera: Float[np.ndarray, "4 4"]
     ) -> "RobotView":
-        """Take the depth image of a frame.
-
-        Args:
-            frame: Colour is not used.
-            T_source_camera: Pose of the depth camera in the frame that is to be aligned.
-        """
+        """Take the depth image of a frame."""
         return RobotView(
             camera=frame.depth_camera,
             depth_m=np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0),
@@ -62,36 +57,11 @@ class ViewCloud:
 
 
 def _cloud(view: RobotView) -> ViewCloud:
-    points = view.camera.unproject(view.depth_m.astype(np.float64))
-    inner = _interior(
-        trusted_depth_mask(view.depth_m, DepthLimits(max_depth_m=6.0, flying_fraction=0.03))
-    )
-    row, column = np.nonzero(inner)
-    reach = NORMAL_REACH_PX
-    across = points[row, column + reach] - points[row, column - reach]
-    down = points[row + reach, column] - points[row - reach, column]
-    normals = np.cross(down, across)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    p = points[row, column]
-    away = np.einsum("ij,ij->i", normals, p) > 0
-    normals[away] *= -1.0
-    return ViewCloud(p_m=p, normals=normals)
-
-
-def _interior(trusted: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """Trusted pixels whose neighbours at the normal's reach are trusted too."""
-    reach = NORMAL_REACH_PX
-    inner = np.zeros_like(trusted)
-    middle = (slice(reach, -reach), slice(reach, -reach))
-    inner[middle] = trusted[middle]
-    for rows, columns in (
-        (slice(2 * reach, None), middle[1]),
-        (slice(None, -2 * reach), middle[1]),
-        (middle[0], slice(2 * reach, None)),
-        (middle[0], slice(None, -2 * reach)),
-    ):
-        inner[middle] &= trusted[rows, columns]
-    return inner
+    p = np.moveaxis(view.camera.unproject(view.depth_m.astype(np.float64)), -1, 0)
+    limits = DepthLimits(max_depth_m=6.0, flying_fraction=0.03)
+    trusted = trusted_depth_mask(view.depth_m, limits)
+    row, column, normals = oriented(p, trusted, trusted)
+    return ViewCloud(p_m=p[:, row, column].T, normals=normals.T)
 
 
 def thin(views: Sequence[RobotView], count: int) -> list[ViewCloud]:

@@ -16,7 +16,7 @@ from bridge.episode import streams
 from bridge.geometry import se3
 from twin.errors import TwinError
 from twin.scene.dataset.scan_check import CLEARLY_BETTER, CameraCheck, ScanReport
-from twin.scene.frames.downscaled import DownscaledDepth, thinned_camera
+from twin.scene.frames.downscaled import DownscaledDepth, pixels_of, thinned_camera
 from twin.scene.frames.pairing import paired_stamps_ns
 from twin.scene.frames.selection import FrameChoice, spread
 from twin.scene.settings import FrameConfig
@@ -94,7 +94,6 @@ def search_geometry(
     Args:
         images: Small depth images of one moving camera in time order, with poses as recorded.
         pose_at: Where the camera was at other instants; None: no delay is looked for.
-        frame_ns: Time from one frame of the camera to the next.
     """
     pairs = _pairs([_thinned(image) for image in images])
     if len(pairs) < 3:
@@ -133,15 +132,12 @@ class _Pair:
         camera = replace(first, fx=first.fx * focal, fy=first.fy * focal)
         z = depth * self.first.depth_m.astype(np.float64)
         p = se3.apply(T_second_first, camera.unproject(z)[z > 0])
-        front = p[:, 2] > 0.02
-        uv, z_second = camera.project(np.where(front[:, None], p, 1.0))
-        u, v = (np.floor(np.clip(uv[:, k], -1, 1e6)).astype(np.int64) for k in (0, 1))
-        inside = front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        measured = depth * self.second.depth_m[v[inside], u[inside]]
+        row, column, inside = pixels_of(camera, p)
+        measured = depth * self.second.depth_m[row[inside], column[inside]]
         met = measured > 0
         if not met.any():
             return 0.0, 0.0
-        off = z_second[inside][met] / measured[met] - 1.0
+        off = p[inside, 2][met] / measured[met] - 1.0
         return float(np.exp(-0.5 * (off / SIGMA) ** 2).mean()), float(met.sum() / len(p))
 
 
@@ -288,9 +284,6 @@ def check_geometry(
     cameras: Sequence[CameraCheck], report: ScanReport, config: FrameConfig
 ) -> tuple[ScanReport, list[FrameChoice]]:
     """Look for a wrong number in each moving camera; refuse, remark, or correct it.
-
-    Returns:
-        The report with what was found, and the choices, corrected where that was asked for.
 
     Raises:
         WrongGeometryError: When depth agrees much better with another number and nobody said what

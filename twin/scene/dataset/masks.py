@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from twin.scene.frames.camera_poses import same_pose
+from twin.scene.frames.downscaled import pixels_of
 from twin.scene.frames.rgbd import PointSet, Target, TrainingView
 from twin.scene.frames.selection import spread
 
@@ -115,16 +116,12 @@ class ReferenceView:
         self, p_base: Float[np.ndarray, "num_points 3"]
     ) -> tuple[Bool[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
         """Say which points it looks through, and which it sees where they should be."""
-        target = self.view.half
-        camera = target.camera
         p_camera = se3.apply(se3.invert(self.view.T_base_color), p_base)
-        front = p_camera[:, 2] > MARGIN_M
-        uv, z = camera.project(np.where(front[:, None], p_camera, 1.0))
-        column, row = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
-        inside = front & (column >= 0) & (column < camera.width)
-        inside &= (row >= 0) & (row < camera.height)
+        row, column, inside = pixels_of(self.view.half.camera, p_camera)
+        z = p_camera[:, 2]
+        inside &= z > MARGIN_M
         measured, nearest = np.zeros(len(p_base)), np.zeros(len(p_base))
-        measured[inside] = target.depth_m[row[inside], column[inside]]
+        measured[inside] = self.view.half.depth_m[row[inside], column[inside]]
         nearest[inside] = self.nearest_m[row[inside], column[inside]]
         margin = MARGIN_M + MARGIN_FRACTION * z
         known = measured > 0
@@ -280,12 +277,10 @@ class EgoMask:
 
     def drop_from(self, points: PointSet, view: TrainingView) -> PointSet:
         """Return a frame's points without those that lie in these pixels."""
-        camera = view.half.camera
         p_camera = se3.apply(se3.invert(view.T_base_color), points.p_m.astype(np.float64))
-        uv, _ = camera.project(np.where(p_camera[:, 2:] > 0, p_camera, 1.0))
-        column = np.clip(np.floor(uv[:, 0]).astype(int), 0, camera.width - 1)
-        row = np.clip(np.floor(uv[:, 1]).astype(int), 0, camera.height - 1)
-        return points.take(~self.half[row, column])
+        row, column, inside = pixels_of(view.half.camera, p_camera)
+        inside[inside] = self.half[row[inside], column[inside]]
+        return points.take(~inside)
 
     def mask_in(self, view: TrainingView) -> TrainingView:
         """Return a view with these pixels passed over."""

@@ -164,11 +164,7 @@ def best_of(
 
 
 def is_clearly_better(agreement: float, recorded: PoseReport) -> bool:
-    """Whether poses fit with this agreement, and clearly better than as they were recorded.
-
-    Args:
-        agreement: Under another reading of the poses, 0..1.
-    """
+    """Whether poses fit with this agreement, and clearly better than as they were recorded."""
     return agreement >= GOOD and agreement >= (recorded.agreement or 0.0) + CLEARLY_BETTER
 
 

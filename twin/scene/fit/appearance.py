@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32
 
 from twin.scene.frames.rgbd import Target
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.harmonics import harmonic_basis
+from twin.scene.harmonics import harmonic_terms
 from twin.scene.raster.rasteriser import Rasteriser
 
 
@@ -88,7 +88,6 @@ def solve_appearance(
     Gaussians that no pixel shows keep their colours.
 
     Args:
-        cloud: Where to start; its harmonics are solved too if it has any.
         steps: Conjugate gradient steps, at most; more than six follow the noise.
         allowance: Fewer steps are made, or none, when so many do not fit; what is begun and does
             not end in time is dropped.
@@ -122,7 +121,6 @@ def conjugate_gradients(
 
     Args:
         apply: The symmetric matrix times a vector; None when there is no time for it.
-        diagonal: Of the matrix, above zero.
     """
     x = np.zeros_like(right)
     residual = right.copy()
@@ -223,7 +221,7 @@ class _ImageModel:
         if basis.shape[1] > 1:
             ray = self._cloud.means_m - item.T_base_camera[:3, 3].astype(np.float32)
             ray /= np.sqrt(np.einsum("ni,ni->n", ray, ray))[:, None] + np.float32(1e-12)
-            basis[:, 1:] = harmonic_basis(ray, basis.shape[1] - 1)
+            basis[:, 1:] = np.stack(harmonic_terms(*ray.T), axis=1)
         return basis
 
     def _draw(self, x: np.ndarray, item: ImageObservation) -> np.ndarray:

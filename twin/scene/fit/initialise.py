@@ -20,6 +20,10 @@ from twin.scene.settings import InitialiseConfig
 
 MAX_LEVEL = 6
 INDEX_BITS = 19
+FOOTPRINTS = 1.6
+"""Size of a voxel in pixel footprints z/f."""
+FLATNESS, OPACITY = 0.1, 0.95
+"""Of a new Gaussian: deviation along the normal, in that in the plane; opacity."""
 IN_PLANE_SIGMA = 0.55
 """Standard deviation in the plane, in voxels (measured best for a closed surface)."""
 MIN_POINTS = 2
@@ -49,8 +53,6 @@ def fuse(
     grow together until the budget, less what is left to the fit, holds.
 
     Args:
-        points: What each frame measured, all in one frame.
-        config: Voxel size, budget and the shape of new Gaussians.
         views: Whose depth says where the surface is on average; none: voxels stay where they are.
     """
     p = np.concatenate([item.p_m for item in points])
@@ -58,9 +60,7 @@ def fuse(
         raise NoSurfaceError(_no_surface(len(p)))
     origin = p.min(axis=0)
     p -= origin
-    wanted = np.float32(config.footprint_factor) * np.concatenate(
-        [item.footprint_m for item in points]
-    )
+    wanted = np.float32(FOOTPRINTS) * np.concatenate([item.footprint_m for item in points])
     base = float(np.quantile(wanted, 0.05))
     level = np.clip(np.rint(np.log2(wanted / np.float32(base))), 0, MAX_LEVEL).astype(np.int8)
     budget = max(round(config.max_splats * (1 - config.growth)), 1)
@@ -79,7 +79,7 @@ def fuse(
     voxels = _Voxels(means=means, normals=normals, colors=colors, count=count, sizes=sizes[kept])
     if len(views) > 0:
         voxels = voxels.settled(views).merged(origin)
-    cloud = flat_gaussians(voxels.means, voxels.normals, voxels.colors, voxels.sizes, config)
+    cloud = flat_gaussians(voxels.means, voxels.normals, voxels.colors, voxels.sizes)
     return cloud.take(morton_order(cloud.means_m))
 
 
@@ -241,19 +241,17 @@ def flat_gaussians(
     normals: np.ndarray,
     colors: np.ndarray,
     sizes: np.ndarray,
-    config: InitialiseConfig,
 ) -> GaussianCloud:
     """Gaussians as wide as what they stand for, flat along their normals.
 
     Args:
-        means: Where they are [m].
         normals: Along which they are flat; any length.
         colors: sRGB, 0..1.
         sizes: Edge of the square or voxel each stands for [m].
     """
     sigma = IN_PLANE_SIGMA * sizes
-    scales = np.stack([sigma, sigma, config.flatness * sigma], axis=1)
-    logit = np.log(config.opacity / (1 - config.opacity))
+    scales = np.stack([sigma, sigma, FLATNESS * sigma], axis=1)
+    logit = np.log(OPACITY / (1 - OPACITY))
     return GaussianCloud(
         means_m=as_float32(means),
         quats_wxyz=_quats_with_z_along(normals),

@@ -27,7 +27,6 @@ from twin.scene.fit.densify import densify, score
 from twin.scene.fit.exposure import solve_exposures
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32, with_harmonics
-from twin.scene.harmonics import NUM_FIRST
 from twin.scene.raster.rasteriser import (
     SAME_EXPOSURE,
     FitSession,
@@ -36,6 +35,9 @@ from twin.scene.raster.rasteriser import (
     psnr_db,
 )
 from twin.scene.settings import FitConfig
+
+SLAB = 0.5
+"""How far a Gaussian may leave the surface that depth fused, along its normal, in its size."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,14 +70,10 @@ class SurfacePrior:
             sizes_m=self.sizes_m[parents],
         )
 
-    def hold(self, cloud: GaussianCloud, slab: float) -> None:
-        """Move centres that left the slab back to its border, in place.
-
-        Args:
-            slab: Half its thickness, in the Gaussian's size at the start.
-        """
+    def hold(self, cloud: GaussianCloud) -> None:
+        """Move centres that left the slab back to its border, in place."""
         off_m = np.einsum("ni,ni->n", self.normals, cloud.means_m) - self.heights_m
-        limit_m = np.float32(slab) * self.sizes_m
+        limit_m = np.float32(SLAB) * self.sizes_m
         beyond_m = off_m - np.clip(off_m, -limit_m, limit_m)
         cloud.means_m[:] -= beyond_m[:, None] * self.normals
 
@@ -137,6 +135,12 @@ def first_state(session: FitSession, num_views: int) -> FitState:
     )
 
 
+COARSE = 0.6
+"""Share of the budget spent at half resolution."""
+APPEARANCE_STEPS = 4
+"""Conjugate gradient steps whenever the colours are solved; more than six follow the noise."""
+DEPTH_WEIGHT = 0.5
+"""Of the L1 depth term (the paper's lambda_d), relative to depth."""
 SOLVE_AT = (0.9,)
 """Shares of the budget at which colours are solved. Not at the start: a sharp solution for blurred
 Gaussians leads Adam astray (0.4 dB of 34 on the clean tabletop); near the end it adds 0.2 dB."""
@@ -185,33 +189,27 @@ class Events:
     def __init__(
         self,
         views: list[TrainingView],
-        config: FitConfig,
         max_splats: int,
         rasteriser: Rasteriser,
     ) -> None:
         """Plan; nothing is done yet."""
         self._views = views
-        self._config = config
         self._max_splats = max_splats
         self._rasteriser = rasteriser
 
     @cached_property
     def _schedule(self) -> list[Event]:
-        config, events = self._config, []
-        if config.densify:
-            events += [Event(at=at, share=SPLIT_SHARE, act=self._densify) for at in SPLIT_AT]
-        if config.exposure != "none":
-            events += [
-                Event(at=at, share=EXPOSURES_SHARE, act=self._solve_exposures)
-                for at in EXPOSURES_AT
-            ]
-        if config.appearance_steps:
-            events += [Event(at=at, share=SOLVE_SHARE, act=self._solve_colours) for at in SOLVE_AT]
+        events = []
+        events += [Event(at=at, share=SPLIT_SHARE, act=self._densify) for at in SPLIT_AT]
+        events += [
+            Event(at=at, share=EXPOSURES_SHARE, act=self._solve_exposures) for at in EXPOSURES_AT
+        ]
+        events += [Event(at=at, share=SOLVE_SHARE, act=self._solve_colours) for at in SOLVE_AT]
         return sorted(events, key=lambda event: event.at)
 
     def keep(self, state: FitState, at: Progress) -> None:
         """Do what is due; what is already behind is not done again."""
-        coarse = at.fraction < self._config.coarse_fraction
+        coarse = at.fraction < COARSE
         while (
             state.events_done < len(self._schedule)
             and self._schedule[state.events_done].at <= at.fraction
@@ -231,13 +229,9 @@ class Events:
         ]
 
     def _solve_exposures(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
-        if self._config.exposure != "none":
-            state.exposures = solve_exposures(
-                state.session.cloud,
-                self._observations(state, coarse),
-                self._rasteriser,
-                allowance,
-            )
+        seen = self._observations(state, coarse)
+        cloud = state.session.cloud
+        state.exposures = solve_exposures(cloud, seen, self._rasteriser, allowance)
 
     def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         self._solve_exposures(state, coarse, allowance)
@@ -246,7 +240,7 @@ class Events:
             cloud,
             self._observations(state, coarse),
             self._rasteriser,
-            steps=self._config.appearance_steps,
+            steps=APPEARANCE_STEPS,
             allowance=allowance,
         )
         keep_colors_in_range(solved.cloud)
@@ -348,14 +342,12 @@ def fit(
     between two images: nothing that decides the result depends on it until it strikes.
 
     Args:
-        views: Training images; never the held-out ones.
         max_splats: Budget of Gaussians; none: as many as there are at the start.
         spent_s: How much of the budget initialisation has used up; up to half of it counts.
     """
     learner = _Learner(views, config)
-    events = Events(views, config, max_splats or len(cloud), learner.rasteriser)
-    harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
-    state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
+    events = Events(views, max_splats or len(cloud), learner.rasteriser)
+    state = first_state(learner.session(with_harmonics(cloud)), len(views))
     state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
     cpu_start = time.process_time()
     for at in _steps(config, state, clock):
@@ -363,7 +355,7 @@ def fit(
         learner.step(state, at)
         advance(round(100 * at.fraction), _note(state, at, len(views)))
     state.last.put_mean_into(state.session.cloud)
-    learner.hold(state)
+    state.surface.hold(state.session.cloud)
     return FitResult(
         cloud=state.session.cloud,
         iterations=state.session.steps,
@@ -415,24 +407,17 @@ class _Learner:
 
     def session(self, cloud: GaussianCloud) -> FitSession:
         """What draws, compares and learns, from a cloud on."""
-        config = self._config
         return FitSession(
             cloud,
             self.rasteriser.config,
-            loss=config.loss,
-            depth_weight=config.depth_weight,
+            depth_weight=DEPTH_WEIGHT,
         )
-
-    def hold(self, state: FitState) -> None:
-        """Keep Gaussians near the surface they began on, where that is to be trusted."""
-        if self._config.slab:
-            state.surface.hold(state.session.cloud, self._config.slab)
 
     def step(self, state: FitState, at: Progress) -> None:
         """Draw one image and follow its gradient."""
         epoch, place = divmod(state.session.steps, len(self._views))
         index = int(order_of_views(self._config.seed, epoch, len(self._views))[place])
-        coarse = at.fraction < self._config.coarse_fraction
+        coarse = at.fraction < COARSE
         state.coarse_steps += coarse
         view = self._views[index]
         decay = DECAY**at.fraction
@@ -443,7 +428,7 @@ class _Learner:
         )
         keep_colors_in_range(state.session.cloud)
         if state.session.steps % HOLD_EVERY == 0:
-            self.hold(state)
+            state.surface.hold(state.session.cloud)
             if at.fraction >= MEAN_FROM:
                 state.last.add(state.session.cloud)
         if report.mse is not None:

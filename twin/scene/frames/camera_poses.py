@@ -19,7 +19,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.terminal import Output
-from twin.scene.frames.odometry import CameraPath, TrackConfig, follow_camera
+from twin.scene.frames.odometry import CameraPath, follow_camera
 from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamps_ns
 from twin.scene.settings import FrameConfig
 from twin.scene.store.calibration import Calibration, MountedCamera, calibrated_tree, without_joints
@@ -100,11 +100,7 @@ def _gaps_ns(
 
 
 def never_moves(tree: TransformTree, frame: str, posed_ns: Int[np.ndarray, " num_poses"]) -> bool:
-    """Say whether a frame stays where it is in its root frame.
-
-    Args:
-        posed_ns: When it was posed, at least once; some of these are compared.
-    """
+    """Say whether a frame stays where it is in its root frame."""
     some = posed_ns[np.unique(np.linspace(0, len(posed_ns) - 1, LOOKS).round().astype(int))]
     Ts = tree.Ts_root_frame(frame, some)
     return all(same_pose(Ts[0], T, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD) for T in Ts)
@@ -225,7 +221,7 @@ def find_poses(
         path = follow_camera(
             streams.rgbd_frames(episode, camera_id, bare),
             held_out_ns,
-            TrackConfig(max_depth_m=config.max_depth_m),
+            config.max_depth_m,
             advance,
             name=name_of(episode, camera_id),
         )
@@ -265,6 +261,30 @@ def calibrated_poses(
         unposed_ns=without_joints(episode, mount, stamps_ns),
         depth_scale=mount.depth_scale,
     )
+
+
+def poses_shifted(
+    poses: CameraPoses,
+    episode: Episode,
+    camera_id: str,
+    T_said_true: Float[np.ndarray, "4 4"] | None,
+) -> CameraPoses:
+    """Poses of a camera that is elsewhere than they say.
+
+    Args:
+        T_said_true: Its colour frame, seen from where it was said to be; None: nobody knows.
+    """
+    stamps = paired_stamps_ns(episode, camera_id)
+    if T_said_true is None:
+        return replace(poses, unposed_ns=frozenset(stamps.tolist()))
+    (color, depth), tree, edges = _frame_ids(episode, camera_id), poses.tree, []
+    for stamp in (t for t in stamps.tolist() if t not in poses.unposed_ns):
+        T_said = tree.T_root_frame(color, stamp)
+        T_new_old = T_said @ T_said_true @ se3.invert(T_said)
+        for frame in {color, depth}:
+            T = T_new_old @ tree.T_root_frame(frame, stamp)
+            edges.append(_edge(tree.root_of(color), frame, T, stamp))
+    return replace(poses, tree=TransformTree(edges))
 
 
 def calibrated_tree_at(

@@ -75,7 +75,7 @@ def colors_in_depth(frame: RgbdFrame, step: int) -> UInt8[np.ndarray, "height wi
     depth = np.nan_to_num(frame.depth_m[::step, ::step], posinf=0.0)
     p_depth = thinned_camera(frame.depth_camera, step).unproject(depth)
     p_color = se3.apply(se3.invert(frame.T_base_color) @ frame.T_base_depth, p_depth)
-    row, column, inside = _lookup(frame.color_camera, p_color)
+    row, column, inside = pixels_of(frame.color_camera, p_color)
     colors = np.zeros((*depth.shape, 3), dtype=np.uint8)
     colors[inside] = frame.image_u8[row[inside], column[inside]]
     return colors
@@ -84,15 +84,11 @@ def colors_in_depth(frame: RgbdFrame, step: int) -> UInt8[np.ndarray, "height wi
 def meet(
     first: DownscaledDepth, second: DownscaledDepth, T_second_first: Float[np.ndarray, "4 4"]
 ) -> Meeting:
-    """Carry the first image's points into the second and compare depths, and greys if there.
-
-    Args:
-        T_second_first: Pose of the first camera in the frame of the second.
-    """
+    """Carry the first image's points into the second and compare depths, and greys if there."""
     measured = first.depth_m > 0
     p = first.camera.unproject(first.depth_m.astype(np.float64))[measured]
     p_second = se3.apply(T_second_first, p)
-    row, column, inside = _lookup(second.camera, p_second)
+    row, column, inside = pixels_of(second.camera, p_second)
     z = p_second[inside, 2]
     found = second.depth_m[row[inside], column[inside]]
     met = found > 0
@@ -115,7 +111,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float((a * b).sum()) / power if power > 0 else 0.0
 
 
-def _lookup(
+def pixels_of(
     camera: Camera, p_camera: Float[np.ndarray, "*batch 3"]
 ) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, "*batch"]]:
     """Row and column of the pixel each point falls on, and which points do."""

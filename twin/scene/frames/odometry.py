@@ -20,33 +20,26 @@ from bridge.terminal import Advance
 from twin.scene.frames.downscaled import DownscaledDepth, colors_in_depth, downscaled_depth, meet
 from twin.scene.frames.pairing import UnusableCameraError
 
-
-@dataclass(frozen=True, kw_only=True)
-class TrackConfig:
-    """How a camera is followed."""
-
-    max_depth_m: float
-    """Depth beyond is not used."""
-    width_px: int = 320
-    """Images are thinned to about this width."""
-    depth_difference_m: float = 0.07
-    """Pixels whose depths differ by more under the present guess are not the same point."""
-    key_shift_m: float = 0.12
-    key_turn_rad: float = 0.2
-    """A camera that has come this far from its keyframe gets a new one."""
-    min_overlap: float = 0.3
-    min_agreement: float = 0.5
-    min_likeness: float = 0.6
-    """A pose is accepted when two images meet and agree by these shares, and their brightness
-    correlates: depth alone lets a plane slide along itself."""
-    pyramid: tuple[int, ...] = (20, 20, 10, 5)
-    """Iterations per level, the coarsest first."""
-    loop_shift_m: float = 0.6
-    loop_turn_rad: float = 0.6
-    """Keyframes nearer to each other than both are tied."""
-    max_loops: int = 30
-    min_placed: float = 0.5
-    """With a smaller share of frames placed, the camera counts as lost."""
+WIDTH_PX = 320
+"""Images are thinned to about this width."""
+DEPTH_DIFFERENCE_M = 0.07
+"""Pixels whose depths differ by more under the present guess are not the same point."""
+KEY_SHIFT_M = 0.12
+KEY_TURN_RAD = 0.2
+"""A camera that has come this far from its keyframe gets a new one."""
+MIN_OVERLAP = 0.3
+MIN_AGREEMENT = 0.5
+MIN_LIKENESS = 0.6
+"""A pose is accepted when two images meet and agree by these shares, and their brightness
+correlates: depth alone lets a plane slide along itself."""
+PYRAMID = (20, 20, 10, 5)
+"""Iterations per level, the coarsest first."""
+LOOP_SHIFT_M = 0.6
+LOOP_TURN_RAD = 0.6
+"""Keyframes nearer to each other than both are tied."""
+MAX_LOOPS = 30
+MIN_PLACED = 0.5
+"""With a smaller share of frames placed, the camera counts as lost."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +63,7 @@ class Look:
 class Aligner:
     """Lays one RGB-D image onto another."""
 
-    def __init__(self, config: TrackConfig) -> None:
+    def __init__(self, max_depth_m: float) -> None:
         """Load Open3D."""
         try:
             import open3d  # noqa: PLC0415  # heavy, and only scans without poses need it
@@ -78,19 +71,19 @@ class Aligner:
             raise MissingDependencyError(
                 package="open3d", extra="replay", purpose="following a camera without poses"
             ) from error
-        self.config = config
+        self.max_depth_m = max_depth_m
         self.open3d: Any = open3d
         self._term = open3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm()
         self._option = open3d.pipelines.odometry.OdometryOption(
-            iteration_number_per_pyramid_level=open3d.utility.IntVector(config.pyramid),
-            depth_diff_max=config.depth_difference_m,
+            iteration_number_per_pyramid_level=open3d.utility.IntVector(PYRAMID),
+            depth_diff_max=DEPTH_DIFFERENCE_M,
             depth_min=0.05,
-            depth_max=config.max_depth_m,
+            depth_max=max_depth_m,
         )
 
     def look(self, frame: RgbdFrame) -> Look:
         """Thin a frame; colour is looked up for each depth pixel."""
-        small = downscaled_depth(frame, self.config.width_px)
+        small = downscaled_depth(frame, WIDTH_PX)
         step = round(frame.depth_camera.fx / small.camera.fx)
         colors = np.ascontiguousarray(colors_in_depth(frame, step))
         small = replace(small, grey=colors.mean(axis=2, dtype=np.float32))
@@ -98,7 +91,7 @@ class Aligner:
             self.open3d.geometry.Image(colors),
             self.open3d.geometry.Image(np.ascontiguousarray(small.depth_m)),
             depth_scale=1.0,
-            depth_trunc=self.config.max_depth_m,
+            depth_trunc=self.max_depth_m,
             convert_rgb_to_intensity=True,
         )
         return Look(small=small, image=image)
@@ -117,10 +110,9 @@ class Aligner:
         if not success or not np.isfinite(T).all():
             return None
         met = meet(source.small, target.small, T)
-        config = self.config
-        if met.overlap < config.min_overlap or met.agreement < config.min_agreement:
+        if met.overlap < MIN_OVERLAP or met.agreement < MIN_AGREEMENT:
             return None
-        if met.likeness < config.min_likeness:
+        if met.likeness < MIN_LIKENESS:
             return None
         score = met.agreement * met.likeness
         return Step(T_target_source=T, information=np.array(information), score=score)
@@ -230,16 +222,15 @@ class _Follower:
         self._last = None
 
     def _is_far(self, T_key_frame: np.ndarray) -> bool:
-        config = self.aligner.config
         turn = float(se3.rotation_angle_rad(T_key_frame[:3, :3]))
         shift = float(np.linalg.norm(T_key_frame[:3, 3]))
-        return turn > config.key_turn_rad or shift > config.key_shift_m
+        return turn > KEY_TURN_RAD or shift > KEY_SHIFT_M
 
 
 def follow_camera(
     frames: Iterable[RgbdFrame],
     held_out_ns: frozenset[int],
-    config: TrackConfig,
+    max_depth_m: float,
     advance: Advance,
     *,
     name: str = "this camera",
@@ -249,13 +240,13 @@ def follow_camera(
     Args:
         frames: In time order; their poses are not looked at, except how colour lies to depth.
     """
-    aligner = Aligner(config)
+    aligner = Aligner(max_depth_m)
     follower = _Follower(aligner)
     total = 0
     for total, frame in enumerate(frames, start=1):
         follower.take(aligner.look(frame), held_out=frame.stamp_ns in held_out_ns)
         advance(total, f"{len(follower.keys)} keyframes")
-    if not follower.keys or len(follower.places) < max(2, config.min_placed * total):
+    if not follower.keys or len(follower.places) < max(2, MIN_PLACED * total):
         message = (
             f"/tf has no poses for {name}, and RGB-D odometry could place only "
             f"{len(follower.places)} of its {total} frames. Record the camera's poses on /tf, or "
@@ -293,18 +284,17 @@ class _Loop:
 
 def _find_loops(keys: list[Keyframe], aligner: Aligner) -> list[_Loop]:
     """Tie keyframes that see the same place, but do not follow each other; nearest first."""
-    config = aligner.config
     near = []
     for target in range(len(keys)):
         for source in range(target + 2, len(keys)):
             guess = se3.invert(keys[target].T_first_key) @ keys[source].T_first_key
             shift = float(np.linalg.norm(guess[:3, 3]))
             turn = float(se3.rotation_angle_rad(guess[:3, :3]))
-            if shift < config.loop_shift_m and turn < config.loop_turn_rad:
+            if shift < LOOP_SHIFT_M and turn < LOOP_TURN_RAD:
                 near.append((shift + 0.5 * turn, source, target, guess))
     near.sort(key=lambda item: item[:3])
     loops = []
-    for _, source, target, guess in near[: config.max_loops]:
+    for _, source, target, guess in near[:MAX_LOOPS]:
         step = aligner.lay(keys[source].look, keys[target].look, guess)
         if step is not None:
             loops.append(_Loop(source=source, target=target, step=step))
@@ -330,7 +320,7 @@ def _solve(
         tools.GlobalOptimizationLevenbergMarquardt(),
         tools.GlobalOptimizationConvergenceCriteria(),
         tools.GlobalOptimizationOption(
-            max_correspondence_distance=aligner.config.depth_difference_m,
+            max_correspondence_distance=DEPTH_DIFFERENCE_M,
             edge_prune_threshold=0.25,
             reference_node=0,
         ),

@@ -62,7 +62,6 @@ def trusted_depth_mask(
 
     Args:
         depth_m: Along the optical axis; 0 is "not measured".
-        limits: How far is too far, and what counts as flying.
     """
     trusted = (depth_m > NEAR_M) & (depth_m < limits.max_depth_m)
     for before, after in (
@@ -126,8 +125,7 @@ class FrameSurface:
         Depth and colour cameras may differ; points outside the colour image, or hidden from the
         colour camera by a nearer surface, are left out.
         """
-        row, column = self._interior(stride)
-        normals = self._normals(row, column)
+        row, column, normals = oriented(self._p_depth, self.trusted, self._backed, stride)
         p_depth = self._p_depth[:, row, column]
         p_color = _carry(self._T_color_depth(), p_depth)
         u, v = _pixels(self.frame.color_camera, p_color)
@@ -162,25 +160,30 @@ class FrameSurface:
     def _T_color_depth(self) -> Float[np.ndarray, "4 4"]:
         return np.asarray(se3.invert(self.frame.T_base_color) @ self.frame.T_base_depth)
 
-    def _interior(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
-        """Trusted pixels on the grid whose neighbours at the normal's reach are trusted too."""
-        inner = self.trusted[NORMAL_REACH_PX:-NORMAL_REACH_PX, NORMAL_REACH_PX:-NORMAL_REACH_PX]
-        row, column = np.nonzero(inner[::stride, ::stride])
-        row, column = row * stride + NORMAL_REACH_PX, column * stride + NORMAL_REACH_PX
-        ok = np.ones(len(row), dtype=bool)
-        for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            ok &= self._backed[row + down * NORMAL_REACH_PX, column + right * NORMAL_REACH_PX]
-        return row[ok], column[ok]
 
-    def _normals(self, row: np.ndarray, column: np.ndarray) -> Float32[np.ndarray, "3 num_points"]:
-        """Cross product of central differences, unit length, facing the depth camera."""
-        p, reach = self._p_depth, NORMAL_REACH_PX
-        ax, ay, az = p[:, row, column + reach] - p[:, row, column - reach]
-        bx, by, bz = p[:, row + reach, column] - p[:, row - reach, column]
-        n = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-        n /= np.maximum(np.sqrt(np.square(n).sum(axis=0)), np.float32(1e-12))
-        away = (n * p[:, row, column]).sum(axis=0) > 0
-        return np.asarray(np.where(away, -n, n))
+def oriented(
+    p: Float[np.ndarray, "3 height width"],
+    trusted: Bool[np.ndarray, "height width"],
+    backed: Bool[np.ndarray, "height width"],
+    stride: int = 1,
+) -> tuple[np.ndarray, np.ndarray, Float[np.ndarray, "3 num_points"]]:
+    """Trusted pixels on a grid whose neighbours at the normal's reach are backed, and normals.
+
+    Cross products of central differences, of unit length, facing the camera.
+    """
+    reach = NORMAL_REACH_PX
+    row, column = np.nonzero(trusted[reach:-reach:stride, reach:-reach:stride])
+    row, column = row * stride + reach, column * stride + reach
+    ok = np.ones(len(row), dtype=bool)
+    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        ok &= backed[row + down * reach, column + right * reach]
+    row, column = row[ok], column[ok]
+    ax, ay, az = p[:, row, column + reach] - p[:, row, column - reach]
+    bx, by, bz = p[:, row + reach, column] - p[:, row - reach, column]
+    n = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    n /= np.maximum(np.sqrt(np.square(n).sum(axis=0)), np.float32(1e-12))
+    away = (n * p[:, row, column]).sum(axis=0) > 0
+    return row, column, np.where(away, -n, n)
 
 
 def _turn(T: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -292,7 +292,6 @@ def choose_frames(
     Which frames are held out depends on their number alone, never on what they show.
 
     Args:
-        output: Told which cameras are left out, and why.
         calibration: Where cameras are mounted; None: they are where ``/tf`` or odometry says.
     """
     found = [

@@ -1,7 +1,7 @@
 """Localise the objects of a recorded episode, and keep the answer as a derived episode."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,11 @@ from bridge.episode.topics import LOCALISATION, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
 from bridge.task.task_file import Task
+from twin.scene.align.moved_camera import MovedCamera, moved_camera
+from twin.scene.frames.camera_poses import CameraPoses, base_tree, poses_shifted
 from twin.scene.frames.selection import rgbd_camera_ids
 from twin.scene.localise.mesh_fit import MeshSurface, ScannedSurfaces, scanned_surfaces
-from twin.scene.localise.objects import LocaliseConfig, localise_objects
+from twin.scene.localise.objects import MAX_FRAMES, MAX_VIEWS, localise_objects
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.localise.stationary_frames import (
     HeldOut,
@@ -29,8 +31,15 @@ from twin.scene.localise.stationary_frames import (
     stationary_frames,
 )
 from twin.scene.store.calibration import Calibration, read_calibration
+from twin.scene.store.folder import read_record, read_scene
 
 NO_SCENE = "noscene"
+MOVED = "moved"
+"""In the settings of a localisation: cameras that were found to have moved since the scan."""
+STILL_FRAMES = 3
+"""Of each camera, for that."""
+LOCALISE_VERSION = 2
+"""Counts changes of method that make older localisations out of date."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +56,6 @@ class Phase:
 def localise_episode(
     episode: Episode,
     task: Task,
-    config: LocaliseConfig | None = None,
     *,
     after_ns: int | None = None,
     before_ns: int | None = None,
@@ -63,22 +71,19 @@ def localise_episode(
 
     Args:
         after_ns: Only frames later than this source time; then ``before_ns`` counts alone.
-        before_ns: Only frames earlier than this source time.
-        held_out_ns: Frames that must not be looked at.
         last_seen_m: Where objects were seen before; tells equal ones apart.
     """
-    config = LocaliseConfig() if config is None else config
     if after_ns is None and before_ns is None:
         before_ns = first_execution_ns(episode)
     if after_ns is None and before_ns is None:
         frames = stationary_frames(
-            episode, config.max_views, evenly=True, held_out_ns=held_out_ns, poses=poses
+            episode, MAX_VIEWS, evenly=True, held_out_ns=held_out_ns, poses=poses
         )
     else:
         frames = stationary_frames(
-            episode, config.max_frames, after_ns, before_ns, held_out_ns=held_out_ns, poses=poses
+            episode, MAX_FRAMES, after_ns, before_ns, held_out_ns=held_out_ns, poses=poses
         )
-    return localise_objects(frames, task, config, last_seen_m, surfaces)
+    return localise_objects(frames, task, last_seen_m, surfaces)
 
 
 MOTION_MARGIN_NS = 80_000_000
@@ -127,7 +132,6 @@ def write_localised(
     run: RunFolder,
     episode: Episode,
     task: Task,
-    config: LocaliseConfig | None = None,
     *,
     scene_hash: str | None = None,
     force: bool = False,
@@ -142,9 +146,8 @@ def write_localised(
     Args:
         scene_hash: The scene the poses are meant for; its first twelve digits name the file.
     """
-    config = LocaliseConfig() if config is None else config
     calibration = read_calibration(run)
-    scanned = scanned_surfaces(run, task, config.mesh.num_samples)
+    scanned = scanned_surfaces(run, task)
     scene = scene_hash[:12] if scene_hash else NO_SCENE
     path = run.derived_dir / f"{episode.path.stem}.localised.{scene}.mcap"
     derived = Derived(
@@ -153,15 +156,18 @@ def write_localised(
         source_sha256=episode.sha256(),
         scene_hash=scene_hash,
         engine="colour_shape_fit",
-        settings={"task": asdict(task), **asdict(config)}
+        settings={"task": asdict(task), "method": LOCALISE_VERSION}
         | ({"meshes": scanned.hashes} if scanned.hashes else {})
         | _mounts(calibration, rgbd_camera_ids(episode)),
     )
     if path.exists() and not force and _made_from(path, derived):
         return path
     base_frame = streams.recorded_robot(episode).base_frame
-    poses = calibrated_cameras(episode, calibration)
-    phases = _localised_phases(episode, task, config, scanned, poses)
+    moved = moved_cameras(run, episode)
+    if moved:
+        about = {key: item.to_record() for key, item in moved.items()}
+        derived = replace(derived, settings={**derived.settings, MOVED: about})
+    phases = _localised_phases(episode, task, scanned, trial_cameras(run, episode, moved))
     path.unlink(missing_ok=True)
     with EpisodeWriter(path) as writer:
         writer.describe(episode.info, derived=derived)
@@ -170,10 +176,38 @@ def write_localised(
     return path
 
 
+def moved_cameras(run: RunFolder, episode: Episode) -> dict[str, MovedCamera]:
+    """Cameras of an episode that were moved since the scan, by its still frames before any motion.
+
+    None where there is no scene, or where it is in another frame than these cameras.
+    """
+    record = read_record(run)
+    if record is None or record["frame"] != streams.recorded_robot(episode).base_frame:
+        return {}
+    poses, before_ns = trial_cameras(run, episode, {}), first_execution_ns(episode)
+    frames = stationary_frames(episode, STILL_FRAMES, before_ns=before_ns, poses=poses)
+    background = read_scene(run).background if frames else None
+    found = {}
+    for camera_id in {frame.camera_id for frame in frames} if background is not None else ():
+        own = [frame for frame in frames if frame.camera_id == camera_id]
+        moved = moved_camera(own, background)
+        if moved is not None:
+            found[camera_id] = moved
+    return found
+
+
+def trial_cameras(run: RunFolder, episode: Episode, moved: Mapping[str, MovedCamera]) -> Poses:
+    """Where cameras of an episode are, as far as something else than ``/tf`` says it."""
+    poses = dict(calibrated_cameras(episode, read_calibration(run)))
+    for camera_id, item in moved.items():
+        known = poses.get(camera_id) or CameraPoses(tree=base_tree(episode), source="tf")
+        poses[camera_id] = poses_shifted(known, episode, camera_id, item.T_said_true)
+    return poses
+
+
 def _localised_phases(
     episode: Episode,
     task: Task,
-    config: LocaliseConfig,
     scanned: ScannedSurfaces,
     poses: Poses,
 ) -> list[tuple[Phase, dict[str, LocalisedObject]]]:
@@ -184,7 +218,6 @@ def _localised_phases(
         found = localise_episode(
             episode,
             task,
-            config,
             after_ns=phase.after_ns,
             before_ns=phase.before_ns,
             last_seen_m=last_seen_m,
@@ -219,7 +252,8 @@ def _made_from(path: Path, derived: Derived) -> bool:
             derived.source_sha256,
             derived.scene_hash,
         )
-        and provenance.hash_settings(found.settings) == provenance.hash_settings(derived.settings)
+        and provenance.hash_settings({k: v for k, v in found.settings.items() if k != MOVED})
+        == provenance.hash_settings(derived.settings)
     )
 
 

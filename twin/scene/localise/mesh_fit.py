@@ -22,15 +22,26 @@ from bridge.geometry import se3
 from bridge.geometry.mesh import sample_triangles
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task
+from twin.scene.frames.downscaled import pixels_of
 from twin.scene.least_squares import normal_equations, tukey_weights
 from twin.scene.localise.points import CameraView, Cluster
-from twin.scene.localise.shape_fit import ShapeFitConfig
+from twin.scene.localise.shape_fit import (
+    CAMERA_SIGMA_M,
+    CAMERA_SIGMA_RAD,
+    ITERATIONS,
+    MAX_POINTS,
+    POINT_SIGMA_M,
+    SHARED_ERROR,
+    TUKEY_M,
+)
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.mesh import read_mesh
 from twin.scene.store.folder import UnreadableSceneError, read_record
 from twin.scene.store.library import Library
 
+NUM_SAMPLES = 2500
+"""Points on the surface of a mesh."""
 FACING = 0.15
 """Cosine below which a camera hardly sees a surface."""
 
@@ -46,12 +57,11 @@ class MeshSurface:
 def mesh_surface(
     vertices_m: Float[np.ndarray, "num_vertices 3"],
     triangles: Int[np.ndarray, "num_faces 3"],
-    num_samples: int,
+    num_samples: int = NUM_SAMPLES,
 ) -> MeshSurface:
     """Spread points over a mesh, each triangle by its area; the same each time.
 
     Args:
-        vertices_m: Of the known or a reconstructed mesh, in the object frame.
         triangles: Counter-clockwise seen from outside.
     """
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
@@ -64,7 +74,7 @@ def mesh_surface(
 
 
 @cache
-def known_surface(model: ObjectModel, num_samples: int) -> MeshSurface:
+def known_surface(model: ObjectModel, num_samples: int = NUM_SAMPLES) -> MeshSurface:
     """Surface of the mesh that the task file names."""
     mesh = object_mesh(model)
     return mesh_surface(mesh.vertices_m, mesh.triangles, num_samples)
@@ -95,7 +105,6 @@ def seen_through(
     """Share of the mesh's facing surface behind which cameras measured something.
 
     Args:
-        T: ``T_base_object``.
         shifts_m: Of the object in each view, x and y; None: where ``T`` says.
     """
     looked = []
@@ -133,12 +142,8 @@ def _looked_at(
     """Depth that a camera measured (0: none) and has, where it looks at the facing surface [m]."""
     p = se3.apply(T, surface.p_m[facing(T_object_base, view, surface)])
     p = se3.apply(se3.invert(view.T_base_depth), p)
-    p = p[p[:, 2] > 0.05]
-    uv, _ = view.depth_camera.project(p)
-    size = (view.depth_camera.width, view.depth_camera.height)
-    inside = np.all((uv >= 0) & (uv < size), axis=1)
-    column, row = uv[inside].astype(np.int64).T
-    return view.depth_m[row, column], p[inside, 2]
+    row, column, inside = pixels_of(view.depth_camera, p)
+    return view.depth_m[row[inside], column[inside]], p[inside, 2]
 
 
 def _share(part: int, whole: int) -> float:
@@ -155,12 +160,8 @@ class ScannedSurfaces:
     """SHA-256 of the mesh each was read from."""
 
 
-def scanned_surfaces(run: RunFolder, task: Task, num_samples: int) -> ScannedSurfaces:
-    """Read the meshes of a task's scanned objects, as far as the scene has reconstructed them.
-
-    Args:
-        task: Other objects have a shape of their own there.
-    """
+def scanned_surfaces(run: RunFolder, task: Task) -> ScannedSurfaces:
+    """Read the meshes of a task's scanned objects, as far as the scene has reconstructed them."""
     found, library = ScannedSurfaces(), Library.of(run, read_record(run))
     for key in library.scanned(task):
         folder = library.folder / key
@@ -174,7 +175,7 @@ def scanned_surfaces(run: RunFolder, task: Task, num_samples: int) -> ScannedSur
             raise UnreadableSceneError(path=about, found=found_) from error
         if source == TASK_SHAPE:
             continue
-        found.surfaces[key] = mesh_surface(*read_mesh(folder / MESH), num_samples)
+        found.surfaces[key] = mesh_surface(*read_mesh(folder / MESH))
         found.hashes[key] = provenance.hash_file(folder / MESH)
     return found
 
@@ -187,23 +188,17 @@ _SIDES = [
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeshFitConfig:
-    """How a known mesh is laid onto points; what is not here is as in ``ShapeFitConfig``."""
-
-    num_starts: int = 12
-    """Turns about the vertical that are tried."""
-    num_refined: int = 3
-    """Of them, the best are followed to the end."""
-    coarse_points: int = 150
-    """Points of the first steps."""
-    num_samples: int = 2500
-    """Points on the surface of the mesh."""
-    see_through_m: float = 0.012
-    """A camera that measures this much behind the mesh sees through it."""
-    ambiguous: float = 1.2
-    """A second pose whose score, cameras put right, is within this factor of the best is as good:
-    the covariance then covers both."""
+NUM_STARTS = 12
+"""Turns about the vertical that are tried."""
+NUM_REFINED = 3
+"""Of them, the best are followed to the end."""
+COARSE_POINTS = 150
+"""Points of the first steps."""
+SEE_THROUGH_M = 0.012
+"""A camera that measures this much behind the mesh sees through it."""
+AMBIGUOUS = 1.2
+"""A second pose whose score, cameras put right, is within this factor of the best is as good:
+the covariance then covers both."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +224,6 @@ class _Problem:
     points: Sequence[Float[np.ndarray, "_ 3"]]
     """Those of the cluster that each view saw."""
     views: Sequence[CameraView]
-    fit: ShapeFitConfig
     tilt_sigma_rad: float
     prior: Float[np.ndarray, " num_shifts"]
     """Information of each view's shift in x and y."""
@@ -239,8 +233,6 @@ def fit_mesh(
     cluster: Cluster,
     views: Sequence[CameraView],
     surface: MeshSurface,
-    fit: ShapeFitConfig,
-    config: MeshFitConfig,
     *,
     tilt_sigma_rad: float,
     yaw_period_rad: float = 2 * np.pi,
@@ -254,21 +246,21 @@ def fit_mesh(
     Args:
         views: What the cameras saw, in the order of the cluster's ``view_ids``.
         tilt_sigma_rad: Prior of roll and pitch: small for what stands, large for what may lie.
+        lying: Try all six sides, each in half as many turns.
     """
-    cluster = cluster.thinned(fit.max_points)
+    cluster = cluster.thinned(MAX_POINTS)
     centre = cluster.p_base.mean(axis=0)
     prior = []
     for view in views:
         distance = float(np.linalg.norm(view.T_base_depth[:3, 3] - centre))
-        sigma = np.hypot(fit.camera_sigma_m, fit.camera_sigma_rad * distance)
+        sigma = np.hypot(CAMERA_SIGMA_M, CAMERA_SIGMA_RAD * distance)
         prior += [1 / sigma**2] * _PER_VIEW
-    few = cluster.thinned(config.coarse_points)
+    few = cluster.thinned(COARSE_POINTS)
     problem = _Problem(
         surface=surface,
         cluster=cluster,
         points=cluster.by_view(len(views)),
         views=views,
-        fit=fit,
         tilt_sigma_rad=tilt_sigma_rad,
         prior=np.array(prior),
     )
@@ -278,14 +270,14 @@ def fit_mesh(
         cluster=few,
         points=few.by_view(len(views)),
     )
-    sides = _SIDES if lying else _SIDES[:1]
-    first = [T for side in sides for T in _starts(problem, config.num_starts, side, yaw_period_rad)]
+    sides, count = (_SIDES, NUM_STARTS // 2) if lying else (_SIDES[:1], NUM_STARTS)
+    first = [T for side in sides for T in _starts(problem, count, side, yaw_period_rad)]
     tried = [_icp(T, coarse, iterations=6, wide=4.0)[0] for T in first]
     unshifted = np.zeros((len(coarse.views), _PER_VIEW))
-    scores = [_score(T, unshifted, coarse, config)[0] for T in tried]
-    best = [tried[index] for index in np.argsort(scores)[: config.num_refined]]
-    ends = [_icp(T, problem, iterations=fit.iterations, wide=2.0) for T in best]
-    return _choose(ends, problem, config, yaw_period_rad)
+    scores = [_score(T, unshifted, coarse)[0] for T in tried]
+    best = [tried[index] for index in np.argsort(scores)[:NUM_REFINED]]
+    ends = [_icp(T, problem, iterations=ITERATIONS, wide=2.0) for T in best]
+    return _choose(ends, problem, yaw_period_rad)
 
 
 def _starts(
@@ -325,7 +317,7 @@ def _residuals(
         r = np.einsum("ij,ij->i", gap, n)
         # Beside the mesh the plane is no surface: the plain distance counts there.
         far = lengths(gap)
-        r = np.where(far > 2 * np.abs(r) + problem.fit.tukey_m, far, r)
+        r = np.where(far > 2 * np.abs(r) + TUKEY_M, far, r)
         rows.append(r)
         jacobians.append(_derivatives(p - moved[:3, 3], n @ T[:3, :3].T))
         ids.append(np.full(len(r), view_id))
@@ -357,7 +349,7 @@ def _pose_equations(
     J[:, :_POSE] = J8[:, :_POSE]
     for axis in range(_PER_VIEW):
         J[np.arange(len(r)), _POSE + _PER_VIEW * ids + axis] = J8[:, _POSE + axis]
-    weight = tukey_weights(r, bound_m) / problem.fit.point_sigma_m**2 / problem.fit.shared_error
+    weight = tukey_weights(r, bound_m) / POINT_SIGMA_M**2 / SHARED_ERROR
     H, gradient = normal_equations(J, r, weight)
     H += np.diag(np.concatenate([damping, problem.prior]))
     gradient[_POSE:] += problem.prior * shifts.ravel()
@@ -376,7 +368,7 @@ def _icp(
     shifts = np.zeros((len(problem.views), _PER_VIEW))
     damping = 1 / np.array([0.03, 0.03, 0.03, 0.3, 0.3, 0.3]) ** 2
     for iteration in range(iterations):
-        bound = problem.fit.tukey_m * max(1.0, wide * (1 - iteration / max(iterations - 2, 1)))
+        bound = TUKEY_M * max(1.0, wide * (1 - iteration / max(iterations - 2, 1)))
         H, gradient, _ = _pose_equations(T, shifts, problem, bound, damping)
         step = np.clip(-np.linalg.solve(H, gradient), -0.3, 0.3)
         T = T.copy()
@@ -392,39 +384,37 @@ def _score(
     T: Float[np.ndarray, "4 4"],
     shifts: Float[np.ndarray, "num_views 2"],
     problem: _Problem,
-    config: MeshFitConfig,
 ) -> tuple[float, float]:
     """Return the mean bounded distance in bounds plus the share seen through, and that share."""
     r, _, _ = _residuals(T, shifts, problem)
-    misfit = float(np.minimum(np.abs(r) / problem.fit.tukey_m, 1.0).mean()) if len(r) else 1.0
-    through = seen_through(T, problem.surface, problem.views, config.see_through_m, shifts)
+    misfit = float(np.minimum(np.abs(r) / TUKEY_M, 1.0).mean()) if len(r) else 1.0
+    through = seen_through(T, problem.surface, problem.views, SEE_THROUGH_M, shifts)
     return misfit + through, through
 
 
 def _choose(
     ends: Sequence[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "num_views 2"]]],
     problem: _Problem,
-    config: MeshFitConfig,
     period_rad: float,
 ) -> MeshFit:
     # With each camera where the fit found it: what cameras are off by makes every pose look bad,
     # the right one too. With it, one that is turned by 50 degrees scores within a tenth of the
     # right one; without, four times as high.
-    compared = [(_score(T, shifts, problem, config)[0], T, shifts) for T, shifts in ends]
+    compared = [(_score(T, shifts, problem)[0], T, shifts) for T, shifts in ends]
     compared.sort(key=lambda item: item[0])
     least, T, shifts = compared[0]
     # Limits on what is told were set with the cameras where they are said to be.
-    score, through = _score(T, np.zeros_like(shifts), problem, config)
+    score, through = _score(T, np.zeros_like(shifts), problem)
     others = [(value, _turn(T[:3, :3].T @ R[:3, :3], period_rad)) for value, R, _ in compared[1:]]
     rivals = [(value, angle) for value, angle in others if angle > np.radians(30)]
     weak = 1 / np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0]) ** 2
-    H, _, r = _pose_equations(T, shifts, problem, problem.fit.tukey_m, weak)
+    H, _, r = _pose_equations(T, shifts, problem, TUKEY_M, weak)
     covariance = np.linalg.inv(H)[:_POSE, :_POSE].copy()
-    covariance[2, 2] += problem.fit.camera_sigma_m**2
+    covariance[2, 2] += CAMERA_SIGMA_M**2
     for value, angle in rivals:
-        if value < config.ambiguous * least:
+        if value < AMBIGUOUS * least:
             covariance[5, 5] += (angle / 2) ** 2
-    near = np.abs(r) < problem.fit.tukey_m
+    near = np.abs(r) < TUKEY_M
     return MeshFit(
         T_base_object=T,
         covariance=(covariance + covariance.T) / 2,

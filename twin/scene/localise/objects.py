@@ -10,7 +10,7 @@ prior on each shares the blame (maximum a posteriori, linearised about the recor
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,13 @@ from jaxtyping import Float
 from bridge.episode.streams import RgbdFrame
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.scene.least_squares import normal_equations, tukey_weights
-from twin.scene.localise.mesh_fit import MeshFitConfig, MeshSurface, fit_mesh, known_surface
+from twin.scene.localise.mesh_fit import MeshSurface, fit_mesh, known_surface
 from twin.scene.localise.points import (
+    MIN_HEIGHT_M,
+    MIN_LIKENESS,
+    MIN_POINTS,
     CameraView,
     Cluster,
-    ColourConfig,
-    PointConfig,
     fuse_stationary,
     likeness,
     moved,
@@ -33,33 +34,27 @@ from twin.scene.localise.points import (
 from twin.scene.localise.result import (
     LocalisedObject,
     found_by_box,
-    found_by_mesh,
-    found_by_shape,
+    found_by_fit,
     missing,
 )
-from twin.scene.localise.shape_fit import ShapeFitConfig, fit_shape
-from twin.scene.localise.soft import SoftConfig, SoftFit, fit_toys
+from twin.scene.localise.shape_fit import UPRIGHT_SIGMA_RAD, fit_shape
+from twin.scene.localise.soft import LEAST_HEIGHT_M, SoftFit, fit_toys
 from twin.scene.shape.known import yaw_period_rad
 
-
-@dataclass(frozen=True, kw_only=True)
-class TableConfig:
-    """How far the seen table may correct the cameras."""
-
-    band_m: float = 0.025
-    """Points this far above or below z = 0 may be table."""
-    min_points: int = 300
-    """With fewer the camera is left as it is."""
-    max_points: int = 6000
-    """Enough to average the noise; more are thinned out evenly."""
-    depth_scale_sigma: float = 0.005
-    """Prior of the relative depth error."""
-    height_sigma_m: float = 0.002
-    """Prior of the camera height error."""
-    tilt_sigma_rad: float = 0.006
-    """Prior of the camera tilt error about each horizontal axis."""
-    noise_sigma_m: float = 0.002
-    """Of one table point."""
+BAND_M = 0.025
+"""Points this far above or below z = 0 may be table."""
+MIN_TABLE_POINTS = 300
+"""With fewer the camera is left as it is."""
+MAX_TABLE_POINTS = 6000
+"""Enough to average the noise; more are thinned out evenly."""
+DEPTH_SCALE_SIGMA = 0.005
+"""Prior of the relative depth error."""
+HEIGHT_SIGMA_M = 0.002
+"""Prior of the camera height error."""
+TILT_SIGMA_RAD = 0.006
+"""Prior of the camera tilt error about each horizontal axis."""
+NOISE_SIGMA_M = 0.002
+"""Of one table point."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,66 +88,52 @@ class TableFit:
 def correct_for_table(
     views: Sequence[CameraView],
     task: Task,
-    config: TableConfig,
-    points: PointConfig,
-    colour: ColourConfig,
 ) -> tuple[list[CameraView], dict[str, TableFit]]:
     """Move each view so that its table lies at z = 0; views that see too little stay.
 
-    Args:
-        task: Its objects do not count as table.
-        points: From half its ``min_likeness`` on, a point is the object's and not the table's.
+    Points of the task's objects do not count as table.
     """
     corrected, fits = [], {}
     for view in views:
-        p = _table_points(view, task, config, points, colour)
-        if len(p) < config.min_points:
+        p = _table_points(view, task)
+        if len(p) < MIN_TABLE_POINTS:
             corrected.append(view)
             continue
-        fit = fit_table(p, view.T_base_depth[:3, 3], view.camera_id, config)
+        fit = fit_table(p, view.T_base_depth[:3, 3], view.camera_id)
         corrected.append(moved(view, fit.T_new_old, fit.depth_factor))
         fits[view.camera_id] = fit
     return corrected, fits
 
 
-def _table_points(
-    view: CameraView, task: Task, config: TableConfig, points: PointConfig, colour: ColourConfig
-) -> Float[np.ndarray, "num_points 3"]:
-    wanted = np.abs(view.p_base[:, 2]) < config.band_m
-    step = max(1, int(wanted.sum()) // config.max_points)
+def _table_points(view: CameraView, task: Task) -> Float[np.ndarray, "num_points 3"]:
+    wanted = np.abs(view.p_base[:, 2]) < BAND_M
+    step = max(1, int(wanted.sum()) // MAX_TABLE_POINTS)
     ids = everything = np.flatnonzero(wanted)[::step]
     for model in task.objects.values():
-        like = likeness(view.color_linear[ids], model.color_srgb, colour)
-        ids = ids[like < points.min_likeness / 2]
+        like = likeness(view.color_linear[ids], model.color_srgb)
+        ids = ids[like < MIN_LIKENESS / 2]
     # A table of the objects' own colour: most points of the band are table all the same.
-    return view.p_base[ids if len(ids) >= config.min_points else everything]
+    return view.p_base[ids if len(ids) >= MIN_TABLE_POINTS else everything]
 
 
 def fit_table(
     p_base: Float[np.ndarray, "num_points 3"],
     p_base_camera: Float[np.ndarray, "3"],
     camera_id: str,
-    config: TableConfig,
 ) -> TableFit:
     """Find the correction that best lays table points on z = 0.
 
     Unknowns: relative depth error, camera height error, rotation about base x and y; least squares
     with Tukey weights and Gaussian priors. The rotation is about the camera.
-
-    Args:
-        p_base: Points of the table, as the camera says now [m].
-        p_base_camera: Where the camera is [m].
     """
     d = p_base - p_base_camera
     # z after the correction: p_z - s d_z + h + (rotation x d)_z. On the table d_z is minus the
     # camera height; the measured d_z would let s shrink the noise.
     height = np.full(len(d), p_base_camera[2])
     A = np.stack([height, np.ones(len(d)), d[:, 1], -d[:, 0]], axis=1)
-    sigma = np.array(
-        [config.depth_scale_sigma, config.height_sigma_m, *[config.tilt_sigma_rad] * 2]
-    )
+    sigma = np.array([DEPTH_SCALE_SIGMA, HEIGHT_SIGMA_M, *[TILT_SIGMA_RAD] * 2])
     # Neighbouring pixels share their error: count the points as at most a few hundred.
-    weight = np.ones(len(d)) * min(1.0, 500 / len(d)) / config.noise_sigma_m**2
+    weight = np.ones(len(d)) * min(1.0, 500 / len(d)) / NOISE_SIGMA_M**2
     x = np.zeros(4)
     spread = 0.0
     for _ in range(8):
@@ -193,36 +174,19 @@ def _small_motion(
     return T
 
 
-@dataclass(frozen=True, kw_only=True)
-class LocaliseConfig:
-    """How objects are found; the defaults suit a table seen from about a metre."""
-
-    colour: ColourConfig = field(default_factory=ColourConfig)
-    """Which pixels have an object's colour."""
-    points: PointConfig = field(default_factory=PointConfig)
-    """Which points belong to an object."""
-    table: TableConfig = field(default_factory=TableConfig)
-    """How far the seen table may correct the cameras."""
-    fit: ShapeFitConfig = field(default_factory=ShapeFitConfig)
-    """How a known shape is laid onto points and outlines."""
-    mesh: MeshFitConfig = field(default_factory=MeshFitConfig)
-    """How a known mesh is laid onto points."""
-    soft: SoftConfig = field(default_factory=SoftConfig)
-    """How soft toys are found."""
-    max_frames: int = 3
-    """Frames of one camera pose that are averaged."""
-    max_views: int = 8
-    """Poses of one camera that are used, for example of a wrist camera during a scan."""
-    min_explained: float = 0.6
-    """Share of an object's points that its shape must explain."""
-    rest_tolerance_m: float = 0.006
-    """Nearer than this to standing on the table counts as standing on it."""
+MAX_FRAMES = 3
+"""Frames of one camera pose that are averaged."""
+MAX_VIEWS = 8
+"""Poses of one camera that are used, for example of a wrist camera during a scan."""
+MIN_EXPLAINED = 0.6
+"""Share of an object's points that its shape must explain."""
+REST_TOLERANCE_M = 0.006
+"""Nearer than this to standing on the table counts as standing on it."""
 
 
 def localise_objects(
     frames: Sequence[RgbdFrame],
     task: Task,
-    config: LocaliseConfig | None = None,
     last_seen_m: Mapping[str, Float[np.ndarray, "3"]] | None = None,
     surfaces: Mapping[str, MeshSurface] | None = None,
 ) -> dict[str, LocalisedObject]:
@@ -240,11 +204,10 @@ def localise_objects(
         One entry per object of the task; ``found`` is False, with a reason, where it was not
         seen. Never a guess.
     """
-    config = LocaliseConfig() if config is None else config
-    views = fuse_stationary(frames, config.max_frames, config.max_views, task, config.points)
-    views, tables = correct_for_table(views, task, config.table, config.points, config.colour)
+    views = fuse_stationary(frames, MAX_FRAMES, MAX_VIEWS, task)
+    views, tables = correct_for_table(views, task)
     objects = {
-        object_id: _localise_one(views, model, config, tables, (surfaces or {}).get(object_id))
+        object_id: _localise_one(views, model, tables, (surfaces or {}).get(object_id))
         for object_id, model in task.objects.items()
         if model.soft is None or not views
     }
@@ -254,14 +217,13 @@ def localise_objects(
             for key, s in task.start.items()
         }
         expected_m = starts_m | dict(last_seen_m or {})
-        objects |= _localise_toys(views, task, config, tables, objects, expected_m)
+        objects |= _localise_toys(views, task, tables, objects, expected_m)
     return {key: objects[key] for key in task.objects}
 
 
 def _localise_toys(
     views: Sequence[CameraView],
     task: Task,
-    config: LocaliseConfig,
     tables: Mapping[str, TableFit],
     rigid: Mapping[str, LocalisedObject],
     expected_m: Mapping[str, Float[np.ndarray, "3"]],
@@ -278,20 +240,9 @@ def _localise_toys(
     }
     found = {}
     for models in groups.values():
-        fits = fit_toys(
-            models,
-            views,
-            blocked,
-            expected_m,
-            points=config.points,
-            colour=config.colour,
-            fit=config.fit,
-            mesh=config.mesh,
-            soft=config.soft,
-            min_explained=config.min_explained,
-        )
+        fits = fit_toys(models, views, blocked, expected_m, min_explained=MIN_EXPLAINED)
         for model in models:
-            found[model.id] = _toy(model, fits[model.id], views, config, tables, len(models))
+            found[model.id] = _toy(model, fits[model.id], views, tables, len(models))
     return found
 
 
@@ -299,7 +250,6 @@ def _toy(
     model: ObjectModel,
     toy: SoftFit,
     views: Sequence[CameraView],
-    config: LocaliseConfig,
     tables: Mapping[str, TableFit],
     equals: int,
 ) -> LocalisedObject:
@@ -309,7 +259,7 @@ def _toy(
         detail |= {"equal_objects": equals, "assignment_margin_m": toy.margin_m}
     if toy.fit is None or toy.shape is None:
         return missing(model, stamp_ns, str(toy.reason), detail)
-    found = found_by_mesh(model, toy.fit, stamp_ns, config.rest_tolerance_m, detail)
+    found = found_by_fit(model, toy.fit, stamp_ns, REST_TOLERANCE_M, detail)
     reasons = [text for text in (found.reason, toy.reason) if text]
     return replace(
         found,
@@ -332,7 +282,6 @@ def _detail(
 def _localise_one(
     views: Sequence[CameraView],
     model: ObjectModel,
-    config: LocaliseConfig,
     tables: Mapping[str, TableFit],
     scanned: MeshSurface | None,
 ) -> LocalisedObject:
@@ -340,54 +289,51 @@ def _localise_one(
     if not views:
         return missing(model, stamp_ns, "no frames with colour, depth and a pose were given", {})
     is_box = model.mesh is None and scanned is None
-    low_m = config.points.min_height_m if is_box else config.soft.min_height_m
-    points = replace(config.points, min_height_m=low_m)
-    groups = object_points(views, model, points, config.colour)
+    low_m = MIN_HEIGHT_M if is_box else LEAST_HEIGHT_M
+    groups = object_points(views, model, low_m)
     seen = len(groups[0]) if groups else 0
     detail = _detail(views, seen, tables)
-    if seen < config.points.min_points:
+    if seen < MIN_POINTS:
         reason = (
             f"{seen} points have the colour of {model.id} above the table, "
-            f"{config.points.min_points} are needed (cameras {', '.join(detail['cameras'])})"
+            f"{MIN_POINTS} are needed (cameras {', '.join(detail['cameras'])})"
         )
         return missing(model, stamp_ns, reason, detail)
     if model.mesh is not None:
-        scanned = known_surface(model, config.mesh.num_samples)
+        scanned = known_surface(model)
     if scanned is not None:
-        return _localise_mesh(groups[0], views, model, scanned, stamp_ns, config, detail)
+        return _localise_mesh(groups[0], views, model, scanned, stamp_ns, detail)
     if model.shape == SCANNED:
-        return _boxed_in(groups[0], model, stamp_ns, config, detail)
-    fit = fit_shape(groups[0], views, model, config.colour, config.fit)
+        return _boxed_in(groups[0], model, stamp_ns, detail)
+    fit = fit_shape(groups[0], views, model)
     detail |= {
-        "residual_m": fit.residual_m,
         "outline_residual_m": fit.outline_residual_m,
         "num_edges": fit.num_edges,
         "other_points": sum(len(group) for group in groups[1:]),
         "camera_shift_m": _by_view(views, fit.camera_shift_m),
     }
-    if fit.explained < config.min_explained:
+    if fit.explained < MIN_EXPLAINED:
         reason = (
             f"only {fit.explained:.0%} of {seen} points fit the shape of {model.id}, "
-            f"{config.min_explained:.0%} are needed"
+            f"{MIN_EXPLAINED:.0%} are needed"
         )
         return missing(model, stamp_ns, reason, detail)
-    return found_by_shape(model, fit, stamp_ns, config.rest_tolerance_m, detail)
+    return found_by_fit(model, fit, stamp_ns, REST_TOLERANCE_M, detail)
 
 
 def _boxed_in(
     group: Cluster,
     model: ObjectModel,
     stamp_ns: int,
-    config: LocaliseConfig,
     detail: dict[str, Any],
 ) -> LocalisedObject:
     """A rough place for what no scan has shown yet."""
     boxed = found_by_box(model, group.p_base, stamp_ns, detail)
-    if boxed.confidence >= config.min_explained:
+    if boxed.confidence >= MIN_EXPLAINED:
         return boxed
     reason = (
         f"only {boxed.confidence:.0%} of {len(group)} points fit into the box of {model.id}, "
-        f"{config.min_explained:.0%} are needed"
+        f"{MIN_EXPLAINED:.0%} are needed"
     )
     return missing(model, stamp_ns, reason, detail)
 
@@ -398,7 +344,6 @@ def _localise_mesh(
     model: ObjectModel,
     surface: MeshSurface,
     stamp_ns: int,
-    config: LocaliseConfig,
     detail: dict[str, Any],
 ) -> LocalisedObject:
     """Lay the mesh of a rigid object that stands onto its points."""
@@ -406,18 +351,16 @@ def _localise_mesh(
         group,
         views,
         surface,
-        config.fit,
-        config.mesh,
-        tilt_sigma_rad=config.fit.upright_sigma_rad,
+        tilt_sigma_rad=UPRIGHT_SIGMA_RAD,
         yaw_period_rad=yaw_period_rad(model),
     )
-    if fit.explained < config.min_explained:
+    if fit.explained < MIN_EXPLAINED:
         reason = (
             f"only {fit.explained:.0%} of {len(group)} points fit the mesh of {model.id}, "
-            f"{config.min_explained:.0%} are needed"
+            f"{MIN_EXPLAINED:.0%} are needed"
         )
         return missing(model, stamp_ns, reason, detail)
-    return found_by_mesh(model, fit, stamp_ns, config.rest_tolerance_m, detail)
+    return found_by_fit(model, fit, stamp_ns, REST_TOLERANCE_M, detail)
 
 
 def _by_view(views: Sequence[CameraView], values: Sequence[float]) -> dict[str, list[float]]:

@@ -17,18 +17,15 @@ from bridge.geometry.camera import Camera
 from bridge.media.color import linear_from_srgb
 from bridge.task.task_file import ObjectModel, Task
 from twin.scene.frames.camera_poses import same_pose
+from twin.scene.frames.downscaled import pixels_of
 
 _LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ColourConfig:
-    """Which pixels have an object's colour."""
-
-    max_hue_difference_rad: float = 0.4
-    """Between a pixel's hue and the object's, around the grey axis."""
-    min_luminance: float = 0.003
-    """Darker pixels, in linear light of 0 to 1, have no dependable hue."""
+MAX_HUE_DIFFERENCE_RAD = 0.4
+"""Between a pixel's hue and the object's, around the grey axis."""
+MIN_LUMINANCE = 0.003
+"""Darker pixels, in linear light of 0 to 1, have no dependable hue."""
 
 
 def linear_image(
@@ -41,7 +38,6 @@ def linear_image(
 def likeness(
     image_linear: Float[np.ndarray, "*batch 3"],
     color_srgb: tuple[int, int, int],
-    config: ColourConfig,
 ) -> Float[np.ndarray, "*batch"]:
     """Tell how much each pixel has a colour: 1 the object's chroma, 0 grey or another hue.
 
@@ -50,14 +46,14 @@ def likeness(
     Range: 0 and up, about 1 on the object.
     """
     total = image_linear.sum(axis=-1)
-    dark = total < 3 * config.min_luminance
+    dark = total < 3 * MIN_LUMINANCE
     chroma = image_linear / np.where(dark, 1.0, total)[..., None] - 1 / 3
     wanted = _LINEAR[np.array(color_srgb)]
     wanted = wanted / wanted.sum() - 1 / 3
     strength = float(np.linalg.norm(wanted))
     along = chroma @ (wanted / strength)
     across = np.sqrt(np.maximum((chroma * chroma).sum(axis=-1) - along * along, 0.0))
-    other_hue = across > along * np.tan(config.max_hue_difference_rad)
+    other_hue = across > along * np.tan(MAX_HUE_DIFFERENCE_RAD)
     return np.where(dark | other_hue | (along <= 0), 0.0, along / strength)
 
 
@@ -65,24 +61,20 @@ SAME_POSE_M = 5e-4
 SAME_POSE_RAD = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True)
-class PointConfig:
-    """Which points belong to an object."""
-
-    min_likeness: float = 0.6
-    """Of a point's colour, see ``likeness``."""
-    min_height_m: float = 0.003
-    """Above the table; lower points may be a reflection or a shadow's fringe."""
-    max_height_m: float = 0.5
-    """Above the table."""
-    margin_m: float = 0.25
-    """How far beyond its start range an object is looked for."""
-    voxel_m: float = 0.002
-    """Points of one voxel are averaged."""
-    cluster_gap_m: float = 0.008
-    """Wider gaps separate clusters."""
-    min_points: int = 40
-    """Fewer voxels than this do not make an object."""
+MIN_LIKENESS = 0.6
+"""Of a point's colour, see ``likeness``."""
+MIN_HEIGHT_M = 0.003
+"""Above the table; lower points may be a reflection or a shadow's fringe."""
+MAX_HEIGHT_M = 0.5
+"""Above the table."""
+MARGIN_M = 0.25
+"""How far beyond its start range an object is looked for."""
+VOXEL_M = 0.002
+"""Points of one voxel are averaged."""
+CLUSTER_GAP_M = 0.008
+"""Wider gaps separate clusters."""
+MIN_POINTS = 40
+"""Fewer voxels than this do not make an object."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +97,7 @@ class CameraView:
 
 
 def fuse_stationary(
-    frames: Sequence[RgbdFrame], max_frames: int, max_views: int, task: Task, config: PointConfig
+    frames: Sequence[RgbdFrame], max_frames: int, max_views: int, task: Task
 ) -> list[CameraView]:
     """Average the last frames of each camera that were taken from one pose.
 
@@ -123,7 +115,7 @@ def fuse_stationary(
     views: list[CameraView] = []
     for group in groups:
         if sum(view.camera_id == group[0].camera_id for view in views) < max_views:
-            views.append(_view(group[:max_frames], task, config))
+            views.append(_view(group[:max_frames], task))
     return sorted(views, key=lambda view: (view.camera_id, view.stamp_ns))
 
 
@@ -138,7 +130,7 @@ def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
     )
 
 
-def _view(frames: Sequence[RgbdFrame], task: Task, config: PointConfig) -> CameraView:
+def _view(frames: Sequence[RgbdFrame], task: Task) -> CameraView:
     newest = frames[0]
     depths = np.stack([frame.depth_m for frame in frames]).astype(np.float64)
     measured = np.isfinite(depths) & (depths > 0)
@@ -147,7 +139,7 @@ def _view(frames: Sequence[RgbdFrame], task: Task, config: PointConfig) -> Camer
     depth[2 * count < len(frames)] = 0.0
     image = np.mean([linear_image(frame.image_u8) for frame in frames], axis=0)
     p_base = se3.apply(newest.T_base_depth, newest.depth_camera.unproject(depth)[depth > 0])
-    p_base = p_base[_in_search_area(p_base, task, config)]
+    p_base = p_base[_in_search_area(p_base, task)]
     return CameraView(
         camera_id=newest.camera_id,
         stamp_ns=newest.stamp_ns,
@@ -170,22 +162,14 @@ def _sample(
     p_base: Float[np.ndarray, "num_points 3"],
 ) -> Float[np.ndarray, "num_points 3"]:
     """Nearest pixel's colour of each point; 0 outside the image."""
-    p_camera = se3.apply(se3.invert(T_base_camera), p_base)
-    ahead = p_camera[:, 2] > 1e-6
-    p_camera[~ahead, 2] = 1.0
-    uv, _ = camera.project(p_camera)
-    inside = ahead & np.all((uv >= 0) & (uv < (camera.width, camera.height)), axis=1)
-    column_row = np.where(inside[:, None], uv, 0.0).astype(np.int64)
-    return np.where(inside[:, None], image[column_row[:, 1], column_row[:, 0]], 0.0)
+    row, column, inside = pixels_of(camera, se3.apply(se3.invert(T_base_camera), p_base))
+    colors = np.zeros_like(p_base)
+    colors[inside] = image[row[inside], column[inside]]
+    return colors
 
 
 def moved(view: CameraView, T_new_old: Float[np.ndarray, "4 4"], depth_factor: float) -> CameraView:
-    """The same view with its cameras moved in the base frame and its depth scaled.
-
-    Args:
-        T_new_old: Correction of that pose, base frame.
-        depth_factor: True depth divided by measured depth.
-    """
+    """The same view with its cameras moved in the base frame and its depth scaled."""
     T_base_depth = T_new_old @ view.T_base_depth
     p_depth = se3.apply(se3.invert(view.T_base_depth), view.p_base) * depth_factor
     return replace(
@@ -198,15 +182,15 @@ def moved(view: CameraView, T_new_old: Float[np.ndarray, "4 4"], depth_factor: f
 
 
 def _in_search_area(
-    p_base: Float[np.ndarray, "num_points 3"], task: Task, config: PointConfig
+    p_base: Float[np.ndarray, "num_points 3"], task: Task
 ) -> Bool[np.ndarray, " num_points"]:
     """Points over the part of the table where any object of the task may be."""
-    wanted: Bool[np.ndarray, " num_points"] = np.abs(p_base[:, 2]) < config.max_height_m
+    wanted: Bool[np.ndarray, " num_points"] = np.abs(p_base[:, 2]) < MAX_HEIGHT_M
     starts = task.start.values()
     for axis, limits in enumerate(([s.x_m for s in starts], [s.y_m for s in starts])):
         if limits:
-            low = min(limit[0] for limit in limits) - config.margin_m
-            high = max(limit[1] for limit in limits) + config.margin_m
+            low = min(limit[0] for limit in limits) - MARGIN_M
+            high = max(limit[1] for limit in limits) + MARGIN_M
             wanted &= (p_base[:, axis] >= low) & (p_base[:, axis] <= high)
     return wanted
 
@@ -233,20 +217,20 @@ class Cluster:
 
 
 def object_points(
-    views: Sequence[CameraView], model: ObjectModel, config: PointConfig, colour: ColourConfig
+    views: Sequence[CameraView], model: ObjectModel, min_height_m: float = MIN_HEIGHT_M
 ) -> list[Cluster]:
     """Clusters of voxel-averaged points of an object's colour, largest first."""
     parts = []
     for view in views:
         p = view.p_base
-        wanted = p[:, 2] > config.min_height_m
+        wanted = p[:, 2] > min_height_m
         p, color = p[wanted], view.color_linear[wanted]
-        alike = likeness(color, model.color_srgb, colour) >= config.min_likeness
-        parts.append(voxel_mean(p[alike], config.voxel_m))
+        alike = likeness(color, model.color_srgb) >= MIN_LIKENESS
+        parts.append(voxel_mean(p[alike], VOXEL_M))
     if not parts:
         return []
     view_ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return clusters(np.concatenate(parts), view_ids, config.cluster_gap_m)
+    return clusters(np.concatenate(parts), view_ids, CLUSTER_GAP_M)
 
 
 def voxel_mean(

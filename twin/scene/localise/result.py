@@ -85,29 +85,30 @@ def missing(
     )
 
 
-def found_by_mesh(
+def found_by_fit(
     model: ObjectModel,
-    fit: MeshFit,
+    fit: MeshFit | ShapeFit,
     stamp_ns: int,
     rest_tolerance_m: float,
     detail: dict[str, Any],
 ) -> LocalisedObject:
-    """Turn a fitted mesh into a result; what nearly stands on the table stands on it.
+    """Turn a fitted mesh or shape into a result; what nearly stands on the table stands on it.
 
     Args:
         rest_tolerance_m: Height over or under its rest that still counts as standing.
-        detail: Numbers for the record; those of the fit are added.
     """
     T = fit.T_base_object.copy()
     lift_m = float(T[2, 3]) - model.rest_height_m
-    detail |= {
-        "residual_m": fit.residual_m,
-        "seen_through_fraction": fit.seen_through,
-        "lift_m": lift_m,
-    }
+    detail |= {"residual_m": fit.residual_m, "lift_m": lift_m}
+    confidence, method = fit.explained, METHOD
+    if isinstance(fit, MeshFit):
+        detail["seen_through_fraction"] = fit.seen_through
+        confidence, method = fit.explained * (1 - fit.seen_through), MESH_METHOD
+    is_upright = bool(T[2, 2] > UPRIGHT)
+    if model.soft is None and is_upright:
+        T = reduce_by_symmetry(T, model)
     reason = None
-    stands = bool(T[2, 2] > UPRIGHT) and abs(lift_m) <= rest_tolerance_m
-    if stands:
+    if is_upright and abs(lift_m) <= rest_tolerance_m:
         T[2, 3] = model.rest_height_m
     else:
         tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1, 1)))
@@ -115,51 +116,13 @@ def found_by_mesh(
             f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table, "
             f"tilted by {tilt:.0f} degrees"
         )
-    if model.soft is None and stands:
-        T = reduce_by_symmetry(T, model)
     return LocalisedObject(
         object_id=model.id,
         found=True,
         T_base_object=T,
         covariance=fit.covariance,
-        confidence=fit.explained * (1 - fit.seen_through),
-        method=MESH_METHOD,
-        reason=reason,
-        stamp_ns=stamp_ns,
-        symmetry=model.symmetry,
-        detail=detail,
-    )
-
-
-def found_by_shape(
-    model: ObjectModel,
-    fit: ShapeFit,
-    stamp_ns: int,
-    rest_tolerance_m: float,
-    detail: dict[str, Any],
-) -> LocalisedObject:
-    """Turn a fitted shape into a result; what nearly stands on the table stands on it.
-
-    Args:
-        fit: Its shape laid onto points and outlines.
-        rest_tolerance_m: Height over or under its rest that still counts as standing.
-        detail: Numbers for the record; the lift is added.
-    """
-    T = reduce_by_symmetry(fit.T_base_object, model)
-    lift_m = float(T[2, 3]) - model.rest_height_m
-    detail["lift_m"] = lift_m
-    reason = None
-    if abs(lift_m) <= rest_tolerance_m:
-        T[2, 3] = model.rest_height_m
-    else:
-        reason = f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table"
-    return LocalisedObject(
-        object_id=model.id,
-        found=True,
-        T_base_object=T,
-        covariance=fit.covariance,
-        confidence=fit.explained,
-        method=METHOD,
+        confidence=confidence,
+        method=method,
         reason=reason,
         stamp_ns=stamp_ns,
         symmetry=model.symmetry,
@@ -178,10 +141,6 @@ def found_by_box(
     The box of the stated size lies over the middle of the points, along the smallest rectangle
     around them. Its frame is a name for the place, good enough to reconstruct the thing in: which
     side is the front is whatever came out.
-
-    Args:
-        model: The object that was looked for; only its size is known.
-        points: What was seen of it, base frame [m].
     """
     yaw = rectangle_yaw_rad(points[:, :2])
     c, s = np.cos(yaw), np.sin(yaw)

@@ -17,8 +17,9 @@ from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
+from twin.scene.frames.downscaled import pixels_of
 from twin.scene.least_squares import normal_equations, tukey_weights
-from twin.scene.localise.points import CameraView, Cluster, ColourConfig, likeness
+from twin.scene.localise.points import CameraView, Cluster, likeness
 from twin.scene.shape.known import pose_of, starts, surface_distances
 
 EDGE_LIKENESS = 0.5
@@ -53,18 +54,12 @@ def find_outlines(
     views: Sequence[CameraView],
     model: ObjectModel,
     T_base_object: Float[np.ndarray, "4 4"],
-    colour: ColourConfig,
-    *,
     window_m: float,
-    sigma_px: float,
 ) -> list[Outline]:
     """Collect the edge points near the nominal pose of the object.
 
     Points at the image border and points beside something nearer are left out: there the object
     goes on.
-
-    Args:
-        sigma_px: Standard error of one edge point.
     """
     outlines = []
     for view_id, view in enumerate(views):
@@ -77,7 +72,7 @@ def find_outlines(
         if window is None:
             continue
         rows, columns = window
-        score = likeness(view.image_linear[rows, columns], model.color_srgb, colour)
+        score = likeness(view.image_linear[rows, columns], model.color_srgb)
         edge, outward = _crossings(np.minimum(score, 1.0))
         edge = edge + np.array([columns.start, rows.start])
         free = ~_occluded(view, edge + BESIDE_PX * outward, float(z.min()))
@@ -87,7 +82,7 @@ def find_outlines(
                     view_id=view_id,
                     view=view,
                     edge_px=edge[free],
-                    sigma_m=sigma_px * px_m,
+                    sigma_m=OUTLINE_SIGMA_PX * px_m,
                     px_m=px_m,
                 )
             )
@@ -135,12 +130,10 @@ def _occluded(
         ]
     )
     T_depth_color = se3.invert(view.T_base_depth) @ view.T_base_color
-    uv, _ = view.depth_camera.project(se3.apply(T_depth_color, ray * nearest_m))
-    height, width = view.depth_m.shape
-    inside = np.all((uv >= 0) & (uv < (width, height)), axis=1)
+    p_depth = se3.apply(T_depth_color, ray * nearest_m)
+    row, column, inside = pixels_of(view.depth_camera, p_depth)
     inside &= np.all((beside_px >= 0) & (beside_px < (camera.width, camera.height)), axis=1)
-    column_row = np.where(inside[:, None], uv, 0.0).astype(np.int64)
-    depth = view.depth_m[column_row[:, 1], column_row[:, 0]]
+    depth = view.depth_m[np.where(inside, row, 0), np.where(inside, column, 0)]
     return np.asarray(~inside | ((depth > 0) & (depth < nearest_m - OCCLUDER_M)))
 
 
@@ -162,29 +155,25 @@ _PER_VIEW = 3
 _STEPS = (1e-4, 1e-4, 1e-4, 1e-3)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShapeFitConfig:
-    """How a known shape is laid onto points and outlines."""
-
-    point_sigma_m: float = 0.002
-    """Standard error of one voxel-averaged point."""
-    outline_sigma_px: float = 0.7
-    """Standard error of one edge point."""
-    outline_window_m: float = 0.012
-    """Edges farther than this from the nominal outline belong to something else."""
-    tukey_m: float = 0.008
-    """Residuals beyond this have no say."""
-    iterations: int = 12
-    shared_error: float = 9.0
-    """Neighbouring pixels share their error: this many count as one."""
-    camera_sigma_m: float = 0.002
-    """Prior of a camera's position error, per axis."""
-    camera_sigma_rad: float = 0.004
-    """Prior of a camera's rotation error, per axis; it acts through the distance."""
-    upright_sigma_rad: float = 0.02
-    """Prior of roll and pitch, which are not estimated."""
-    max_points: int = 1500
-    """Enough for the fit; more are thinned out evenly."""
+POINT_SIGMA_M = 0.002
+"""Standard error of one voxel-averaged point."""
+OUTLINE_SIGMA_PX = 0.7
+"""Standard error of one edge point."""
+OUTLINE_WINDOW_M = 0.012
+"""Edges farther than this from the nominal outline belong to something else."""
+TUKEY_M = 0.008
+"""Residuals beyond this have no say."""
+ITERATIONS = 12
+SHARED_ERROR = 9.0
+"""Neighbouring pixels share their error: this many count as one."""
+CAMERA_SIGMA_M = 0.002
+"""Prior of a camera's position error, per axis."""
+CAMERA_SIGMA_RAD = 0.004
+"""Prior of a camera's rotation error, per axis; it acts through the distance."""
+UPRIGHT_SIGMA_RAD = 0.02
+"""Prior of roll and pitch, which are not estimated."""
+MAX_POINTS = 1500
+"""Enough for the fit; more are thinned out evenly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,7 +200,6 @@ class _Problem:
     cluster: Cluster
     outlines: Sequence[Outline]
     model: ObjectModel
-    config: ShapeFitConfig
     prior_sigma: Float[np.ndarray, "num_views 3"]
     """Of each view's shift in x and y and of its turn."""
 
@@ -230,43 +218,34 @@ def fit_shape(
     cluster: Cluster,
     views: Sequence[CameraView],
     model: ObjectModel,
-    colour: ColourConfig,
-    config: ShapeFitConfig,
 ) -> ShapeFit:
     """Find the pose whose surface and outline best agree with what was seen.
 
     Several starts (yaw from the smallest rectangle, centre from each visible side) are fitted to
     the points; the best one is refined with the outlines, looked for in a shrinking window.
-
-    Args:
-        views: Those the points come from; their images have the outlines.
     """
-    cluster = cluster.thinned(config.max_points)
+    cluster = cluster.thinned(MAX_POINTS)
     centre = cluster.p_base.mean(axis=0)
     distances = [float(np.linalg.norm(view.T_base_depth[:3, 3] - centre)) for view in views]
-    sideways = [np.hypot(config.camera_sigma_m, config.camera_sigma_rad * d) for d in distances]
-    prior = np.array([[s, s, config.camera_sigma_rad] for s in sideways])
-    problem = _Problem(cluster=cluster, outlines=(), model=model, config=config, prior_sigma=prior)
+    sideways = [np.hypot(CAMERA_SIGMA_M, CAMERA_SIGMA_RAD * d) for d in distances]
+    prior = np.array([[s, s, CAMERA_SIGMA_RAD] for s in sideways])
+    problem = _Problem(cluster=cluster, outlines=(), model=model, prior_sigma=prior)
     free = np.zeros(_PER_VIEW * len(views))
     candidates = [
         _solve(np.concatenate([state, free]), problem) for state in starts(cluster.p_base, model)
     ]
     best = min(
         candidates,
-        key=lambda state: np.minimum(np.abs(_system(state, problem).r), config.tukey_m).mean(),
+        key=lambda state: np.minimum(np.abs(_system(state, problem).r), TUKEY_M).mean(),
     )
-    for window_m in (2 * config.outline_window_m, config.outline_window_m):
+    for window_m in (2 * OUTLINE_WINDOW_M, OUTLINE_WINDOW_M):
         outlines = find_outlines(
             views,
             model,
             pose_of(best[:_POSE]),
-            colour,
-            window_m=window_m,
-            sigma_px=config.outline_sigma_px,
+            window_m,
         )
-        problem = _Problem(
-            cluster=cluster, outlines=outlines, model=model, config=config, prior_sigma=prior
-        )
+        problem = _Problem(cluster=cluster, outlines=outlines, model=model, prior_sigma=prior)
         best = _solve(best, problem)
     return _summary(best, problem)
 
@@ -279,7 +258,7 @@ def _in_view(state: Float[np.ndarray, " num_unknowns"], view_id: int) -> Float[n
 
 
 def _system(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> _System:
-    config, model, cluster = problem.config, problem.model, problem.cluster
+    model, cluster = problem.model, problem.cluster
     blocks = []
     for view_id in range(len(problem.prior_sigma)):
         points = cluster.p_base[cluster.view_ids == view_id]
@@ -289,7 +268,7 @@ def _system(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> _Sy
         # Moving the shape by d changes the distance by -gradient . d; yaw moves by z x offset.
         yaw = gradient[:, 0] * offset[:, 1] - gradient[:, 1] * offset[:, 0]
         J = np.column_stack([-gradient, yaw])
-        blocks.append((view_id, r, J, config.point_sigma_m))
+        blocks.append((view_id, r, J, POINT_SIGMA_M))
     num_points = sum(len(block[1]) for block in blocks)
     for outline in problem.outlines:
         own = _in_view(state, outline.view_id)
@@ -323,7 +302,7 @@ def _pose_equations(
     damping: Float[np.ndarray, "4"],
 ) -> tuple[Float[np.ndarray, "num_unknowns num_unknowns"], Float[np.ndarray, " num_unknowns"]]:
     """Return H and the gradient, with the views' priors and damping on the pose."""
-    information = weight / system.sigma**2 / problem.config.shared_error
+    information = weight / system.sigma**2 / SHARED_ERROR
     prior = 1 / problem.prior_sigma.ravel() ** 2
     H, gradient = normal_equations(system.J, system.r, information)
     H += np.diag(np.concatenate([damping, prior]))
@@ -336,8 +315,8 @@ def _solve(
 ) -> Float[np.ndarray, " num_unknowns"]:
     """Gauss-Newton with Tukey weights whose bound shrinks to ``tukey_m``."""
     damping = 1 / np.array([0.05, 0.05, 0.05, 0.5]) ** 2
-    for iteration in range(problem.config.iterations):
-        bound = problem.config.tukey_m * max(1.0, 3.0 - 0.5 * iteration)
+    for iteration in range(ITERATIONS):
+        bound = TUKEY_M * max(1.0, 3.0 - 0.5 * iteration)
         system = _system(state, problem)
         weight = tukey_weights(system.r, bound)
         H, gradient = _pose_equations(state, system, weight, problem, damping)
@@ -349,17 +328,16 @@ def _solve(
 
 
 def _summary(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> ShapeFit:
-    config = problem.config
     system = _system(state, problem)
-    near = np.abs(system.r) < config.tukey_m
+    near = np.abs(system.r) < TUKEY_M
     on_points, on_edges = near[: system.num_points], near[system.num_points :]
     weak = 1 / np.array([0.05, 0.05, 0.05, 1.0]) ** 2
     H, _ = _pose_equations(state, system, near.astype(np.float64), problem, weak)
     covariance = np.zeros((6, 6))
     pose_ids = [0, 1, 2, 5]
     covariance[np.ix_(pose_ids, pose_ids)] = np.linalg.inv(H)[:_POSE, :_POSE]
-    covariance[2, 2] += config.camera_sigma_m**2
-    covariance[[3, 4], [3, 4]] = config.upright_sigma_rad**2
+    covariance[2, 2] += CAMERA_SIGMA_M**2
+    covariance[[3, 4], [3, 4]] = UPRIGHT_SIGMA_RAD**2
     points_r = system.r[: system.num_points][on_points]
     edges_r = system.r[system.num_points :][on_edges]
     shifts = state[_POSE:].reshape(-1, _PER_VIEW)[:, :2]

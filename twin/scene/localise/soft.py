@@ -6,7 +6,7 @@ Equal toys are told apart by where each is expected: its start range, or where i
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from twin.scene.localise.mesh_fit import (
+    SEE_THROUGH_M,
     MeshFit,
-    MeshFitConfig,
     MeshSurface,
     agreeing,
     facing,
@@ -26,56 +26,52 @@ from twin.scene.localise.mesh_fit import (
     known_surface,
 )
 from twin.scene.localise.points import (
+    CLUSTER_GAP_M,
+    MIN_LIKENESS,
+    MIN_POINTS,
+    VOXEL_M,
     CameraView,
     Cluster,
-    ColourConfig,
-    PointConfig,
     clusters,
     likeness,
     voxel_mean,
 )
-from twin.scene.localise.shape_fit import ShapeFitConfig
 from twin.scene.shape.known import surface_distances
 
-
-@dataclass(frozen=True, kw_only=True)
-class SoftConfig:
-    """How soft toys are found."""
-
-    min_height_m: float = 0.006
-    """Lower points may be table."""
-    clear_m: float = 0.009
-    """Points nearer than this to a rigid object that was found belong to it."""
-    growth: float = 1.2
-    """A cluster with a longer diagonal than the toy's times this holds more than one thing."""
-    shrink: float = 0.35
-    """One shorter than the toy's shortest extent times this is not the toy."""
-    fill: float = 0.7
-    """A toy covers this share of the rectangle around it, seen from above."""
-    stretch_m: float = 0.012
-    """Points nearer than this to the fitted surface show how the toy is deformed."""
-    tilt_sigma_rad: float = 0.1
-    """Prior of roll and pitch of a toy that stands."""
-    well_explained: float = 0.9
-    """With less it may lie on another side: more starts are tried."""
-    well_seen_through: float = 0.12
-    """So they are with more of its surface seen through."""
-    hopeless: float = 0.5
-    """With less it is no such toy on any side: one on a wrong side explains two thirds."""
-    turned_share: float = 0.1
-    """Clusters with fewer points than this share of the largest show too little of a toy to tell
-    its sides apart."""
-    max_seen_through: float = 0.3
-    """With more of its surface seen through it is something else."""
-    min_agreeing: float = 0.35
-    """Some camera must measure this share of the surface that faces it where the toy is."""
-    moved_m: float = 0.05
-    """Equal toys farther from where they are expected were moved, no matter how far: those that
-    stayed keep their names."""
-    score_m: float = 0.2
-    """In the assignment, a point of score counts like this distance."""
-    min_margin_m: float = 0.02
-    """Equal toys whose exchange would cost less are reported as hardly told apart."""
+LEAST_HEIGHT_M = 0.006
+"""Lower points may be table."""
+CLEAR_M = 0.009
+"""Points nearer than this to a rigid object that was found belong to it."""
+GROWTH = 1.2
+"""A cluster with a longer diagonal than the toy's times this holds more than one thing."""
+SHRINK = 0.35
+"""One shorter than the toy's shortest extent times this is not the toy."""
+FILL = 0.7
+"""A toy covers this share of the rectangle around it, seen from above."""
+STRETCH_M = 0.012
+"""Points nearer than this to the fitted surface show how the toy is deformed."""
+TILT_SIGMA_RAD = 0.1
+"""Prior of roll and pitch of a toy that stands."""
+WELL_EXPLAINED = 0.9
+"""With less it may lie on another side: more starts are tried."""
+WELL_SEEN_THROUGH = 0.12
+"""So they are with more of its surface seen through."""
+HOPELESS = 0.5
+"""With less it is no such toy on any side: one on a wrong side explains two thirds."""
+TURNED_SHARE = 0.1
+"""Clusters with fewer points than this share of the largest show too little of a toy to tell
+its sides apart."""
+MAX_SEEN_THROUGH = 0.3
+"""With more of its surface seen through it is something else."""
+MIN_AGREEING = 0.35
+"""Some camera must measure this share of the surface that faces it where the toy is."""
+MOVED_M = 0.05
+"""Equal toys farther from where they are expected were moved, no matter how far: those that
+stayed keep their names."""
+SCORE_M = 0.2
+"""In the assignment, a point of score counts like this distance."""
+MIN_MARGIN_M = 0.02
+"""Equal toys whose exchange would cost less are reported as hardly told apart."""
 
 
 STANDS = 0.9
@@ -106,8 +102,6 @@ def soft_shape(
     surface: MeshSurface,
     model: ObjectModel,
     fit: MeshFit,
-    points: PointConfig,
-    soft: SoftConfig,
 ) -> SoftShape:
     """Extents along the axes of the fitted pose: those at rest, plus how far the seen ends moved.
 
@@ -115,12 +109,12 @@ def soft_shape(
     """
     T = fit.T_base_object
     T_object_base = se3.invert(T)
-    above = [view.p_base[view.p_base[:, 2] > soft.min_height_m] for view in views]
+    above = [view.p_base[view.p_base[:, 2] > LEAST_HEIGHT_M] for view in views]
     local = se3.apply(T_object_base, np.concatenate(above))
-    reach = np.array(model.size_m) / 2 + soft.stretch_m
-    local = voxel_mean(local[np.all(np.abs(local) < reach, axis=1)], points.voxel_m)
+    reach = np.array(model.size_m) / 2 + STRETCH_M
+    local = voxel_mean(local[np.all(np.abs(local) < reach, axis=1)], VOXEL_M)
     distance, _ = cKDTree(surface.p_m).query(local)
-    local = local[distance < soft.stretch_m]
+    local = local[distance < STRETCH_M]
     # An end that every camera looks at from behind was not seen; it is taken as at rest.
     centres = se3.apply(T_object_base, np.array([view.T_base_depth[:3, 3] for view in views]))
     directions = centres / np.linalg.norm(centres, axis=1, keepdims=True)
@@ -151,34 +145,28 @@ def candidates(
     count: int,
     views: Sequence[CameraView],
     blocked: Mapping[ObjectModel, Float[np.ndarray, "4 4"]],
-    points: PointConfig,
-    colour: ColourConfig,
-    soft: SoftConfig,
 ) -> list[Cluster]:
     """Clusters that may be one toy each; what touches is cut apart.
 
     Args:
-        count: How many equal ones there are at most.
         blocked: Rigid objects with their poses; their points do not count.
     """
     parts = []
     for view in views:
         p = view.p_base
-        alike = p[:, 2] > soft.min_height_m
-        alike[alike] = likeness(view.color_linear[alike], model.color_srgb, colour) >= (
-            points.min_likeness
-        )
-        p = voxel_mean(p[alike], points.voxel_m)
-        parts.append(p[~_on_others(p, blocked, soft.clear_m)])
+        alike = p[:, 2] > LEAST_HEIGHT_M
+        alike[alike] = likeness(view.color_linear[alike], model.color_srgb) >= (MIN_LIKENESS)
+        p = voxel_mean(p[alike], VOXEL_M)
+        parts.append(p[~_on_others(p, blocked, CLEAR_M)])
     ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     everything = np.concatenate(parts) if parts else np.zeros((0, 3))
     single = []
-    for group in clusters(everything, ids, points.cluster_gap_m):
-        if len(group) < points.min_points:
+    for group in clusters(everything, ids, CLUSTER_GAP_M):
+        if len(group) < MIN_POINTS:
             continue
-        for piece in _cut(group, model, count, soft):
+        for piece in _cut(group, model, count):
             extent = np.ptp(np.percentile(piece.p_base, [2, 98], axis=0), axis=0).max()
-            if len(piece) >= points.min_points and extent > soft.shrink * min(model.size_m):
+            if len(piece) >= MIN_POINTS and extent > SHRINK * min(model.size_m):
                 single.append(piece)
     return single
 
@@ -200,13 +188,13 @@ def _on_others(
     return mask
 
 
-def _cut(group: Cluster, model: ObjectModel, count: int, soft: SoftConfig) -> list[Cluster]:
+def _cut(group: Cluster, model: ObjectModel, count: int) -> list[Cluster]:
     """Cut a cluster that is too large for one toy into as many as would cover its area."""
     low, high = np.percentile(group.p_base[:, :2], [1, 99], axis=0)
-    if float(np.linalg.norm(high - low)) <= soft.growth * float(np.linalg.norm(model.size_m[:2])):
+    if float(np.linalg.norm(high - low)) <= GROWTH * float(np.linalg.norm(model.size_m[:2])):
         return [group]
     cells = np.unique(np.floor(group.p_base[:, :2] / CELL_M).astype(np.int64), axis=0)
-    one = soft.fill * model.size_m[0] * model.size_m[1]
+    one = FILL * model.size_m[0] * model.size_m[1]
     number = round(len(cells) * CELL_M**2 / one)
     if not 2 <= number <= count:
         return []
@@ -235,38 +223,26 @@ def fit_toys(
     blocked: Mapping[ObjectModel, Float[np.ndarray, "4 4"]],
     expected_m: Mapping[str, Float[np.ndarray, "3"]],
     *,
-    points: PointConfig,
-    colour: ColourConfig,
-    fit: ShapeFitConfig,
-    mesh: MeshFitConfig,
-    soft: SoftConfig,
     min_explained: float,
 ) -> dict[str, SoftFit]:
     """Find toys that all look the same.
 
     Args:
         expected_m: Where each toy is expected, by id; those without are taken as they come.
-        min_explained: Share of a cluster's points that the toy must explain.
-
-    Returns:
-        By id; a reason where a toy was not found.
     """
     model = models[0]
-    groups = candidates(model, len(models), views, blocked, points, colour, soft)
-    surface = known_surface(model, mesh.num_samples)
-    enough = soft.turned_share * max((len(group) for group in groups), default=0)
-    fits = [
-        fit_toy(group, views, surface, fit, mesh, soft, turn=len(group) >= enough)
-        for group in groups
-    ]
+    groups = candidates(model, len(models), views, blocked)
+    surface = known_surface(model)
+    enough = TURNED_SHARE * max((len(group) for group in groups), default=0)
+    fits = [fit_toy(group, views, surface, turn=len(group) >= enough) for group in groups]
     good = [
         index
         for index, item in enumerate(fits)
         if item.explained >= min_explained
-        and item.seen_through <= soft.max_seen_through
-        and agreeing(item.T_base_object, surface, views, mesh.see_through_m) >= soft.min_agreeing
+        and item.seen_through <= MAX_SEEN_THROUGH
+        and agreeing(item.T_base_object, surface, views, SEE_THROUGH_M) >= MIN_AGREEING
     ]
-    cost = _costs(models, [fits[index] for index in good], expected_m, soft)
+    cost = _costs(models, [fits[index] for index in good], expected_m)
     rows, columns = linear_sum_assignment(cost)
     taken = dict(zip(rows.tolist(), columns.tolist(), strict=True))
     margins = _margins(cost, taken)
@@ -281,10 +257,10 @@ def fit_toys(
         index = good[taken[row]]
         margin = margins.get(row)
         found[item.id] = SoftFit(
-            reason=_doubt(item, margin, soft),
+            reason=_doubt(item, margin),
             num_points=len(groups[index]),
             fit=fits[index],
-            shape=soft_shape(views, surface, model, fits[index], points, soft),
+            shape=soft_shape(views, surface, model, fits[index]),
             margin_m=margin,
         )
     return found
@@ -294,20 +270,16 @@ def fit_toy(
     group: Cluster,
     views: Sequence[CameraView],
     surface: MeshSurface,
-    fit: ShapeFitConfig,
-    mesh: MeshFitConfig,
-    soft: SoftConfig,
     *,
     turn: bool,
 ) -> MeshFit:
     """Lay a toy's mesh onto points, standing first, on its other sides if that explains little."""
-    standing = fit_mesh(group, views, surface, fit, mesh, tilt_sigma_rad=soft.tilt_sigma_rad)
-    doubtful = standing.seen_through > soft.well_seen_through
-    doubtful |= standing.explained < soft.well_explained
-    if not turn or not doubtful or standing.explained < soft.hopeless:
+    standing = fit_mesh(group, views, surface, tilt_sigma_rad=TILT_SIGMA_RAD)
+    doubtful = standing.seen_through > WELL_SEEN_THROUGH
+    doubtful |= standing.explained < WELL_EXPLAINED
+    if not turn or not doubtful or standing.explained < HOPELESS:
         return standing
-    few = replace(mesh, num_starts=max(mesh.num_starts // 2, 1))
-    lying = fit_mesh(group, views, surface, fit, few, tilt_sigma_rad=10.0, lying=True)
+    lying = fit_mesh(group, views, surface, tilt_sigma_rad=10.0, lying=True)
     return min((standing, lying), key=lambda item: item.score)
 
 
@@ -315,27 +287,21 @@ def _costs(
     models: Sequence[ObjectModel],
     fits: Sequence[MeshFit],
     expected_m: Mapping[str, Float[np.ndarray, "3"]],
-    soft: SoftConfig,
 ) -> Float[np.ndarray, "num_models num_candidates"]:
     """What it costs to say that a fit is a toy [m]."""
     cost = [
-        [
-            _displacement(expected_m.get(item.id), fit, soft) + soft.score_m * fit.score
-            for fit in fits
-        ]
+        [_displacement(expected_m.get(item.id), fit) + SCORE_M * fit.score for fit in fits]
         for item in models
     ]
     return np.array(cost).reshape(len(models), len(fits))
 
 
-def _displacement(
-    expected_m: Float[np.ndarray, "3"] | None, fit: MeshFit, soft: SoftConfig
-) -> float:
+def _displacement(expected_m: Float[np.ndarray, "3"] | None, fit: MeshFit) -> float:
     """Distance to where a toy is expected; beyond ``moved_m`` it hardly grows [m]."""
     if expected_m is None:
         return 0.0
     distance = float(np.linalg.norm(fit.T_base_object[:3, 3] - expected_m))
-    return soft.moved_m * (1.0 - float(np.exp(-distance / soft.moved_m)))
+    return MOVED_M * (1.0 - float(np.exp(-distance / MOVED_M)))
 
 
 def _margins(
@@ -355,8 +321,8 @@ def _margins(
     return margins
 
 
-def _doubt(model: ObjectModel, margin_m: float | None, soft: SoftConfig) -> str | None:
-    if margin_m is None or margin_m >= soft.min_margin_m:
+def _doubt(model: ObjectModel, margin_m: float | None) -> str | None:
+    if margin_m is None or margin_m >= MIN_MARGIN_M:
         return None
     return (
         f"{model.id} is hardly told apart from an equal object: exchanging them costs "

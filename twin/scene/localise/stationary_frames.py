@@ -49,10 +49,7 @@ def stationary_frames(
     place in the robot's base nobody knows, is passed over as long as another one can.
 
     Args:
-        after_ns: Only frames later than this source time.
-        before_ns: Only frames earlier than this source time.
         evenly: Spread them evenly over the interval instead of taking the last ones.
-        held_out_ns: Frames that must not be looked at.
     """
     tree = base_tree(episode)
     failed: list[GstError] = []

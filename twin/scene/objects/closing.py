@@ -4,7 +4,7 @@ What a fit leaves of an object is a ragged shell: open where nobody looked, mixe
 object and table touch. Here Gaussians are set evenly on the closed mesh. Each takes the colour it
 shows in the training views, away from the object's outline and from edges, where a camera that
 stands a few millimetres wrong sees something else. What no view shows takes the colour of the
-surface next to it that was seen, and is marked as completed.
+surface next to it that was seen, in the light that falls on it, and is marked as completed.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.scene.fit.initialise import flat_gaussians
-from twin.scene.fit.on_mesh import WIDER, Triangles, even_points, surface_area_m2
+from twin.scene.fit.lighting import EVEN, Lighting
+from twin.scene.fit.on_mesh import WIDER, Triangles, even_points, surface_area_m2, within_edges
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.settings import InitialiseConfig
 from twin.scene.shape.from_training import image_window
 from twin.scene.shape.mesh import first_hit
 
@@ -51,20 +51,16 @@ def closed_object(
     mesh: Triangles,
     views: Sequence[TrainingView],
     T_base_object: Float[np.ndarray, "4 4"],
-    config: InitialiseConfig,
+    lighting: Lighting = EVEN,
 ) -> GaussianCloud | None:
-    """Gaussians on a closed mesh in the object's frame; None where no view shows it.
-
-    Args:
-        mesh: In the object's frame, closed.
-        views: What the scene was fitted to, in the base frame.
-    """
+    """Gaussians on a closed mesh in the object's frame; None where no view shows it."""
     looks = [_Look.of(view, mesh, T_base_object) for view in views]
     looks = [look for look in looks if look.shown.any()]
     if not looks:
         return None
     spacing_m = _spacing_m(mesh, looks)
     p, normals = even_points([mesh], spacing_m)
+    p = within_edges(p, normals, [mesh], spacing_m)
     colors, weights = (
         np.stack(rows) for rows in zip(*(look.at(p, normals) for look in looks), strict=True)
     )
@@ -74,8 +70,9 @@ def closed_object(
         return None
     known = is_own if is_own.any() else is_seen
     color = weighted_median(colors, weights)
-    color[~known] = _beside(p, normals, known, color)
-    cloud = flat_gaussians(p, normals, color, np.full(len(p), WIDER * spacing_m), config)
+    light = lighting.brightness(normals @ T_base_object[:3, :3].T)[:, None]
+    color[~known] = _beside(p, normals, known, color / light) * light[~known]
+    cloud = flat_gaussians(p, normals, color, np.full(len(p), WIDER * spacing_m))
     return replace(cloud, completed=~is_seen)
 
 
@@ -169,11 +166,7 @@ def weighted_median(
     values: Float[np.ndarray, "num_views num_points num_channels"],
     weights: Float[np.ndarray, "num_views num_points"],
 ) -> Float[np.ndarray, "num_points num_channels"]:
-    """Median over views of each channel; 0 where nothing has weight.
-
-    Args:
-        weights: How much it counts, at least 0.
-    """
+    """Median over views of each channel; 0 where nothing has weight."""
     order = np.argsort(values, axis=0)
     ranked = np.take_along_axis(values, order, axis=0)
     heavy = np.take_along_axis(np.broadcast_to(weights[..., None], values.shape), order, axis=0)

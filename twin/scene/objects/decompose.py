@@ -27,6 +27,7 @@ from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
+from twin.scene.fit.lighting import EVEN, Lighting
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import (
     GaussianCloud,
@@ -39,9 +40,8 @@ from twin.scene.gaussians import (
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.closing import closed_object
 from twin.scene.objects.placement import Placements
-from twin.scene.settings import InitialiseConfig
 from twin.scene.shape.files import MESH, SDF, TASK_SHAPE, write_shape
-from twin.scene.shape.from_training import ObjectViews, shapes_of, write_static
+from twin.scene.shape.from_training import ObjectViews, is_known, shapes_of, write_static
 from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
@@ -173,7 +173,8 @@ class LibraryObject:
         """Write the reconstructed shape, or the known one with the reason why."""
         if not isinstance(self.shape, str):
             names, geometry = write_shape(place, self.shape, soft=self.model.soft is not None)
-            source = f"reconstructed from {self.shape.num_views} views"
+            made = "stated by the task, seen in" if is_known(self.model) else "reconstructed from"
+            source = f"{made} {self.shape.num_views} views"
             return names, {"shape_source": source, "geometry": geometry}
         write_whole(place / MESH, mesh_ply(*shape_mesh(self.model)))
         return [MESH], {"shape_source": TASK_SHAPE, "shape_remark": self.shape}
@@ -257,15 +258,9 @@ def decompose(
     cloud: GaussianCloud,
     views_of: Callable[[Episode], Sequence[TrainingView]],
     output: Output,
-    config: InitialiseConfig,
+    lighting: Lighting = EVEN,
 ) -> Decomposition:
-    """Make each object from the first episode that shows it, and fill the table underneath.
-
-    Args:
-        cloud: Fitted to what shows no object.
-        views_of: The training views of an episode, objects and all.
-        config: The shape of new Gaussians.
-    """
+    """Make each object from the first episode that shows it, and fill the table underneath."""
     library: dict[str, LibraryObject] = {}
     placed = list(placements.by_episode.values())
     left = np.ones(len(cloud), dtype=bool)  # but what the fit left where pixels were masked
@@ -282,7 +277,7 @@ def decompose(
         with output.progress("reconstruct objects", len(wanted)) as advance:
             shapes = shapes_of(views, models, poses, wanted, advance=advance)
         for key in wanted:
-            splats = object_splats(models[key], shapes[key], views, poses[key], config)
+            splats = object_splats(models[key], shapes[key], views, poses[key], lighting)
             if splats is not None:
                 library[key] = LibraryObject(
                     model=models[key],
@@ -309,11 +304,18 @@ def object_splats(
     shape: ObjectShape | str,
     views: Sequence[TrainingView],
     T_base_object: Float[np.ndarray, "4 4"],
-    config: InitialiseConfig,
+    lighting: Lighting = EVEN,
 ) -> ObjectSplats | None:
-    """Gaussians on all of an object's surface; None where no view shows it."""
-    mesh = shape_mesh(model) if isinstance(shape, str) else (shape.vertices_m, shape.faces)
-    cloud = closed_object(mesh, views, T_base_object, config)
+    """Gaussians on all of an object's surface; None where no view shows it.
+
+    On the task's shape of what is rigid: views leave rims ragged. On what was reconstructed of the
+    rest.
+    """
+    if is_known(model) or isinstance(shape, str):
+        mesh = shape_mesh(model)
+    else:
+        mesh = shape.vertices_m, shape.faces
+    cloud = closed_object(mesh, views, T_base_object, lighting)
     if cloud is None:
         return None
     sdf = None if isinstance(shape, str) else shape.sdf

@@ -222,9 +222,8 @@ class CudaRasteriser:
             return leaves["colors"]
         ray = leaves["means_m"] - centre
         x, y, z = (ray / ray.norm(dim=1, keepdim=True).clamp(min=1e-12)).unbind(dim=1)
-        harmonics = leaves["harmonics"]
-        basis = self._torch.stack(harmonic_terms(x, y, z, harmonics.shape[1]), dim=1)
-        return leaves["colors"] + (basis[:, :, None] * harmonics).sum(dim=1)
+        basis = self._torch.stack(harmonic_terms(x, y, z), dim=1)
+        return leaves["colors"] + (basis[:, :, None] * leaves["harmonics"]).sum(dim=1)
 
     def _last(self) -> _Drawn:
         if self._drawn is None:

@@ -58,11 +58,7 @@ def make_record(
     num_completed: int,
     cost: Cost,
 ) -> dict[str, Any]:
-    """Put together the content of ``scene.json``.
-
-    Args:
-        key: Names the inputs and settings; a rebuild with the same key is not repeated.
-    """
+    """Put together the content of ``scene.json``."""
     settings = asdict(config)
     settings.pop("force")
     settings["fit"]["budget_s"] = None if math.isinf(config.fit.limit_s) else config.fit.limit_s

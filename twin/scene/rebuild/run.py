@@ -43,7 +43,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 26
+METHOD_VERSION = 27
 """Counts changes of method that make older scenes out of date."""
 SEARCHED_SPLATS = 80_000
 """Points of the fused surface in which things are looked for, at most."""
@@ -104,9 +104,9 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     fitted = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
-    decomposed = decompose(placements, fitted.cloud, training.views_of, output, config.initialise)
-    write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
+    decomposed = decompose(placements, fitted.cloud, training.views_of, output, links.lighting)
+    write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     clock.end("decompose")
     backdrop = backdrop_of(fitted.cloud, training.bare_views, Rasteriser(raster))
     views = _hold_out(run, training, fitted, backdrop, decomposed, links, config, clock, output)

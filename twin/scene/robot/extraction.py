@@ -25,11 +25,11 @@ from twin.robot.surface import PosedSurface, link_poses, link_surfaces
 from twin.scene.align.align import Alignment, align_robot
 from twin.scene.align.view import RobotView
 from twin.scene.fit.initialise import NoSurfaceError, fuse
+from twin.scene.fit.lighting import EVEN, Lighting
 from twin.scene.fit.on_mesh import Triangles, surface_area_m2
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
-from twin.scene.robot.lighting import EVEN, Lighting
 from twin.scene.robot.link_surface import SeenLink, link_lighting, on_surface, own_colors
 from twin.scene.robot.splats import posed, surface_links, write_links
 from twin.scene.settings import InitialiseConfig
@@ -42,6 +42,8 @@ MIN_POINTS = 60
 """A link seen by fewer points is not kept."""
 ROBOT_SHARE = 0.25
 """Of the budget of Gaussians, for the robot's links."""
+FEWEST = 400
+"""Gaussians that a link has at least: a finger of few would be all edge."""
 UNUSED = 0.25
 """Share of a link's Gaussians that fusing leaves unused; nothing splits them later."""
 
@@ -73,7 +75,6 @@ class RobotFrames:
         """Read joints and descriptions; an episode without them is passed over, with a remark.
 
         Args:
-            episodes: Whose frames will be given.
             T_base_root: Where the frames' root lies in the robot's base; None: it is the base.
         """
         self.T_base_root = np.eye(4) if T_base_root is None else T_base_root
@@ -176,7 +177,8 @@ class RobotFrames:
             if count < MIN_POINTS:
                 continue
             own = shapes.get(link)
-            cloud = None if own is None else on_surface(own, sets, spacing_m, config)
+            finest_m = float(np.sqrt(surface_area_m2(own or []) / FEWEST))
+            cloud = None if own is None else on_surface(own, sets, min(spacing_m, finest_m))
             if cloud is not None:
                 clouds[link] = cloud
                 continue
@@ -229,7 +231,6 @@ def robot_mask(
     """Pixels that show the posed robot, grown by two; not those with something in front of it.
 
     Args:
-        surface: The robot as it stood, base frame.
         depth_m: What the camera measured; 0 is "not measured" and hides nothing.
     """
     expected = surface.depth_along(camera.rays(), T_base_camera)
@@ -270,9 +271,6 @@ def find_robot(choices: Sequence[FrameChoice], output: Output) -> FoundRobot:
 
     Where the frames' root is the robot's base, the joints say it. In another root frame (poses
     from odometry, another world) scene and robot are aligned by what the training frames show.
-
-    Args:
-        choices: Cameras whose training frames are used; their root frame decides how to look.
     """
     root = root_frame(choices[0])
     episodes = list({choice.episode.path: choice.episode for choice in choices}.values())
@@ -299,10 +297,6 @@ def look_closer(
 
     A few of their frames are enough for the background. The robot shows another side in each
     posture, so up to two dozen postures far from each other are read for its links.
-
-    Args:
-        choices: Only cameras that stand still, and their spare frames, are read.
-        stride: Pixels from one that becomes a point to the next, along rows and columns.
     """
     for choice in choices:
         postures = found.frames.stationary_postures(choice.episode, choice.spare_ns)
@@ -329,11 +323,7 @@ def _aligned(choices: Sequence[FrameChoice]) -> Alignment:
 
 
 def write_robot(run: RunFolder, found: FoundRobot, links: LitLinks) -> dict[str, Any]:
-    """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot.
-
-    Args:
-        links: Gaussians of each link, in its own frame, and the light on them.
-    """
+    """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot."""
     record: dict[str, Any] = {
         "remark": found.remark,
         "links": write_links(run, links.clouds),

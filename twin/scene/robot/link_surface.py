@@ -14,11 +14,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from twin.scene.fit.initialise import flat_gaussians
-from twin.scene.fit.on_mesh import WIDER, Triangles, even_points
+from twin.scene.fit.lighting import EVEN, Lighting, Patches, fit_lighting
+from twin.scene.fit.on_mesh import WIDER, Triangles, even_points, within_edges
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.robot.lighting import EVEN, Lighting, Patches, fit_lighting
-from twin.scene.settings import InitialiseConfig
 
 FITS_M = 0.006
 """Half of the measured points lie nearer to a shape that is the link's."""
@@ -112,10 +111,7 @@ def _pieces(
 
 
 def on_surface(
-    shapes: Sequence[Triangles],
-    sets: Sequence[PointSet],
-    spacing_m: float,
-    config: InitialiseConfig,
+    shapes: Sequence[Triangles], sets: Sequence[PointSet], spacing_m: float
 ) -> GaussianCloud | None:
     """Gaussians on a link's shapes, in its frame; None where these do not fit what was measured."""
     p, normals = even_points(shapes, spacing_m)
@@ -125,9 +121,10 @@ def on_surface(
     )
     if not _fits(p, seen_m, spacing_m):
         return None
+    p = within_edges(p, normals, shapes, spacing_m)
     colors = _colors(p, normals, seen_m, seen_normals, seen_colors)
     sizes = np.full(len(p), WIDER * spacing_m)
-    return flat_gaussians(p, normals, colors, sizes, config)
+    return flat_gaussians(p, normals, colors, sizes)
 
 
 def _fits(

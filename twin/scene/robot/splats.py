@@ -15,8 +15,8 @@ from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.surface import PosedSurface, fixed_links
+from twin.scene.fit.lighting import EVEN, Lighting
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud, read_ply, write_ply
-from twin.scene.robot.lighting import EVEN, Lighting
 
 FOLDER = "robot"
 BOUND_M = 0.015
@@ -34,9 +34,6 @@ def posed(
     lighting: Lighting = EVEN,
 ) -> GaussianCloud:
     """Put the Gaussians of all links where forward kinematics puts the links.
-
-    Args:
-        links: Per link its Gaussians in the link's frame, as ``read_links`` gives them.
 
     Returns:
         One cloud in the base frame, links in the order of the mapping; empty without links.
@@ -62,9 +59,6 @@ def surface_links(
     must lie along its own normal from the link.
 
     Args:
-        robot: Says which links never move.
-        surface: The robot as it stood, base frame.
-        p_base: Points that were measured [m].
         normals: Unit vectors out of the surface at the points, base frame.
     """
     near = surface.near_box(p_base, BOUND_M)
@@ -82,12 +76,7 @@ def surface_links(
 
 
 def write_links(run: RunFolder, links: Mapping[str, GaussianCloud]) -> dict[str, Any]:
-    """Write ``robot/<link>.ply`` and return what ``scene.json`` says about them.
-
-    Args:
-        run: Whose scene folder is written; links that are not given are deleted there.
-        links: Gaussians of each link, in its own frame.
-    """
+    """Write ``robot/<link>.ply`` and return what ``scene.json`` says about them."""
     folder = run.scene_dir / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     for path in folder.glob("*.ply"):

@@ -34,8 +34,6 @@ class MaskedView:
     """Along the optical axis; 0, negative or not finite is "not measured"."""
     mask: Bool[np.ndarray, "mask_height mask_width"]
     """True where the object is seen."""
-    sensor: str = ""
-    """Which camera it is: views of one camera share the errors of its depth."""
 
     def __post_init__(self) -> None:
         """Refuse images that do not belong together."""
@@ -269,11 +267,7 @@ def solid_of(
     low_m: Float[np.ndarray, "3"],
     high_m: Float[np.ndarray, "3"],
 ) -> Bool[np.ndarray, "num_x num_y num_z"]:
-    """Voxels of the object: its largest piece above the plane, without hollows nobody sees.
-
-    Args:
-        support_z_m: Height of the plane it stands on; nothing of it is below. None without one.
-    """
+    """Voxels of the object: its largest piece above the plane, without hollows nobody sees."""
     box = evidence.box
     solid = ~evidence.empty
     for axis in range(3):
@@ -320,9 +314,6 @@ def signed_distances(
     beside it have that distance, all others the Euclidean distance to the nearest of them, plus
     what that one has left (the faces between voxels where nobody measured, as in
     ``distances_of_solid``).
-
-    Args:
-        solid: True inside; with at least one voxel of each kind.
     """
     voxel = evidence.box.voxel_m
     seen = evidence.weight >= MIN_WEIGHT

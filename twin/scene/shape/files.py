@@ -17,11 +17,7 @@ TASK_SHAPE = "task file"
 def write_shape(
     folder: Path, shape: ObjectShape, *, soft: bool
 ) -> tuple[list[str], dict[str, Any]]:
-    """Write the geometry of one object, in the frame of its mesh.
-
-    Returns:
-        Names of the files, and what ``object.json`` says of them.
-    """
+    """Write the geometry of one object, in the frame of its mesh."""
     write_whole(folder / MESH, mesh_ply(shape.vertices_m, shape.faces))
     shape.sdf.save(folder / SDF)
     names, about = [MESH, SDF], describe_shape(shape)
@@ -51,5 +47,4 @@ def describe_shape(shape: ObjectShape) -> dict[str, Any]:
         "voxel_m": shape.sdf.voxel_m,
         "truncation_m": shape.truncation_m,
         "num_views": shape.num_views,
-        "view_shift_m": shape.view_shift_m,
     }

@@ -22,16 +22,15 @@ from bridge.terminal import Advance
 from twin.errors import TwinError
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import spread
-from twin.scene.shape.carve import MaskedView
-from twin.scene.shape.known import surface_distances
+from twin.scene.shape.carve import MaskedView, ShapeError
+from twin.scene.shape.known import shape_mesh, surface_distances
 from twin.scene.shape.reconstruct import (
     ObjectShape,
-    ShapeConfig,
     moved_views,
     reconstruct,
     shape_of_mesh,
 )
-from twin.scene.shape.static import StaticConfig, everything_in, static_sdf
+from twin.scene.shape.static import everything_in, static_sdf
 
 STATIC_FILE = "sdf.npz"
 MASK_MARGIN_M = 0.008
@@ -42,7 +41,6 @@ STANDING_M = 0.008
 """An object whose underside is at most this far from the table stands on it."""
 UPRIGHT_COSINE, LEANING_COSINE = 0.999, 0.95
 """Above the first an object's own frame is level; a toy may rest leaning, down to the second."""
-ALIGN_ROUNDS = 8
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 
@@ -52,19 +50,12 @@ def shapes_of(
     models: Mapping[str, ObjectModel],
     Ts_base_object: Poses,
     wanted: Iterable[str] | None = None,
-    config: ShapeConfig | None = None,
     advance: Advance = lambda done, note: None,
 ) -> dict[str, ObjectShape | str]:
-    """Reconstruct objects in their own frames, or say why not.
+    """Shapes of objects in their own frames, or why there is none.
 
-    Args:
-        views: What the scene was fitted to, in ``base_link`` whose z = 0 is the table.
-        models: Known shapes: they say which pixels are the object's, nothing more.
-        Ts_base_object: Where the objects were; others are left out.
-        wanted: Those to reconstruct; None: all that have a place.
-        config: Settings; the defaults, with eight rounds of view alignment, when None.
+    What is rigid and known has the task's shape: views leave it ragged, and thin walls too thick.
     """
-    config = ShapeConfig(align_rounds=ALIGN_ROUNDS) if config is None else config
     found: dict[str, ObjectShape | str] = {}
     for done, key in enumerate(Ts_base_object if wanted is None else wanted):
         advance(done, key)
@@ -76,17 +67,32 @@ def shapes_of(
         useful, support = [v for v in masked if v.mask.any()], support_z_m(models[key], T)
         make = reconstruct if T[2, 2] >= UPRIGHT_COSINE else partial(_leaning, T_base_object=T)
         try:
-            found[key] = make(useful, support, config)
+            if is_known(models[key]):
+                found[key] = _as_stated(useful, models[key])
+            else:
+                found[key] = make(useful, support)
         except TwinError as error:
             found[key] = str(error)
     return found
 
 
+def is_known(model: ObjectModel) -> bool:
+    """Whether the task states the shape that an object has now."""
+    return model.shape != SCANNED and model.soft is None
+
+
+def _as_stated(views: Sequence[MaskedView], model: ObjectModel) -> ObjectShape:
+    """The task's shape; what no view measured of it is marked."""
+    vertices, faces = shape_mesh(model)
+    if not views:
+        message = f"no view shows {model.id}: all masks are empty."
+        raise ShapeError(message)
+    shape = shape_of_mesh(vertices, faces, np.concatenate([view.points_m() for view in views]))
+    return replace(shape, num_views=len(views))
+
+
 def _leaning(
-    views: Sequence[MaskedView],
-    support: float | None,
-    config: ShapeConfig,
-    T_base_object: Float[np.ndarray, "4 4"],
+    views: Sequence[MaskedView], support: float | None, T_base_object: Float[np.ndarray, "4 4"]
 ) -> ObjectShape:
     """Reconstruct in a level frame, where the table is a plane of the grid; then lean it."""
     T_base_level = np.eye(4)
@@ -94,18 +100,17 @@ def _leaning(
     T_base_level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     T_base_level[:3, 3] = T_base_object[:3, 3]
     T_level_object = se3.invert(T_base_level) @ T_base_object
-    level = reconstruct(moved_views(views, T_level_object), support, config)
+    level = reconstruct(moved_views(views, T_level_object), support)
     vertices = se3.apply(se3.invert(T_level_object), level.vertices_m)
     points = np.concatenate([view.points_m() for view in views])
-    leant = shape_of_mesh(vertices, level.faces, points, config)
-    return replace(leant, num_views=level.num_views, view_shift_m=level.view_shift_m)
+    leant = shape_of_mesh(vertices, level.faces, points)
+    return replace(leant, num_views=level.num_views)
 
 
 def support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:
     """Height of the table in the object's frame [m]; None when it does not stand on it.
 
     Args:
-        model: The object; its lowest panel stands on the table or does not.
         T_base_object: Where it is; the table is at z = 0 of the base.
     """
     underside = float(min((centre - extents / 2)[2] for centre, extents in model.panels()))
@@ -147,7 +152,6 @@ def masked_view(
         T_base_camera=se3.invert(T) @ view.T_base_color,
         depth_m=depth,
         mask=mask,
-        sensor=view.camera_id,
     )
 
 
@@ -208,9 +212,6 @@ def rim_height_m(
 
     What is published of a container may be wrong, and a plan that passes low over the rim hangs on
     it. None where the views show too little of the walls.
-
-    Args:
-        model: A container; where its walls stand is taken from it.
     """
     half, wall = np.array(model.size_m[:2]) / 2, model.wall_m
     low_m, high_m = (share * model.size_m[2] for share in HEIGHTS)
@@ -242,11 +243,7 @@ def _rim_heights_m(scans: Sequence["ObjectViews"]) -> dict[str, float]:
 
 
 def with_heights(task: Task, heights_m: Mapping[str, float]) -> Task:
-    """A task whose containers are as high as they were seen to be.
-
-    Args:
-        heights_m: Of rims over the origin, by container; what is missing stays.
-    """
+    """A task whose containers are as high as they were seen to be."""
     objects = {
         key: replace(model, size_m=(*model.size_m[:2], heights_m[key]))
         if key in heights_m
@@ -269,15 +266,10 @@ def write_static(
     folder: Path,
     views: Sequence[TrainingView],
     scans: Sequence[ObjectViews],
-    config: StaticConfig | None = None,
 ) -> dict[str, Any]:
     """Write ``sdf.npz``, the static scene without the objects, and return its record.
 
     Only a task says that z = 0 is a table; without one nothing closes the scene below.
-
-    Args:
-        views: All training views.
-        scans: Those of episodes whose objects are known, each with the objects in its views.
     """
     path = folder / STATIC_FILE
     path.unlink(missing_ok=True)
@@ -289,7 +281,7 @@ def write_static(
         for key, T in scan.Ts_base_object.items()
     ]
     try:
-        static = static_sdf(views, 0.0 if scans else None, objects, config)
+        static = static_sdf(views, 0.0 if scans else None, objects)
     except TwinError as error:
         return {"file": None, "remark": str(error), "rim_height_m": heights_m}
     static.save(path)

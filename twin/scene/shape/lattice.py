@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 from scipy import ndimage
 
-from bridge.errors import refuse_outside
 from twin.npz import UnreadableArraysError, read_npz, write_npz
 from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.reconstruct import ObjectShape
@@ -25,18 +24,8 @@ _EVEN = ((0, 3, 5, 6), (1, 0, 3, 5), (2, 0, 3, 6), (4, 0, 5, 6), (7, 3, 5, 6))
 _ODD = ((1, 2, 4, 7), (0, 1, 2, 4), (3, 1, 2, 7), (5, 1, 4, 7), (6, 2, 4, 7))
 MIN_VOLUME_SHARE = 0.2
 """A tetrahedron keeps at least this share of its volume when nodes are drawn to the surface."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LatticeConfig:
-    """How fine the lattice is."""
-
-    spacing_m: float = 0.009
-    """Distance of neighbouring nodes."""
-
-    def __post_init__(self) -> None:
-        """Refuse lattices that are none."""
-        refuse_outside(self, {"spacing_m": (1e-3, 0.1)})
+SPACING_M = 0.009
+"""Distance of neighbouring nodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,24 +63,19 @@ class Lattice:
 def tet_volumes_m3(
     nodes_m: Float[np.ndarray, "num_nodes 3"], tets: Int[np.ndarray, "num_tets 4"]
 ) -> Float[np.ndarray, " num_tets"]:
-    """Signed volumes.
-
-    Args:
-        tets: Node indices of each tetrahedron; their order decides the sign.
-    """
+    """Signed volumes."""
     a, b, c, d = (nodes_m[tets[:, k]] for k in range(4))
     return np.asarray(np.einsum("ni,ni->n", np.cross(b - a, c - a), d - a) / 6)
 
 
-def lattice(shape: ObjectShape, config: LatticeConfig | None = None) -> Lattice:
+def lattice(shape: ObjectShape, spacing_m: float = SPACING_M) -> Lattice:
     """Fill a shape with a lattice."""
-    config = LatticeConfig() if config is None else config
-    cells, first = _cells(shape, config.spacing_m)
+    cells, first = _cells(shape, spacing_m)
     corners = cells[:, None] + _CORNERS
     index, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     number = number.reshape(-1, 8)
     tets = _tets(cells, number)
-    regular = first + config.spacing_m * index.astype(np.float64)
+    regular = first + spacing_m * index.astype(np.float64)
     nodes = _drawn_in(regular, tets, shape.sdf)
     shares = np.zeros(len(nodes))
     np.add.at(shares, tets, tet_volumes_m3(nodes, tets)[:, None] / 4)
@@ -99,7 +83,7 @@ def lattice(shape: ObjectShape, config: LatticeConfig | None = None) -> Lattice:
         nodes_m=nodes.astype(np.float32),
         tets=tets.astype(np.int32),
         mass_fraction=(shares / shares.sum()).astype(np.float32),
-        spacing_m=config.spacing_m,
+        spacing_m=spacing_m,
     )
 
 

@@ -116,11 +116,7 @@ def first_hit(
     meshes: Mapping[str, Mesh],
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
 ) -> tuple[Float32[np.ndarray, "height width"], Float32[np.ndarray, "height width 3"]]:
-    """Where a camera's rays meet the first of some meshes: depth, infinite beside them, and normal.
-
-    Args:
-        Ts_base_object: Where the meshes are; those without a pose are not there.
-    """
+    """Where rays of a camera meet the first mesh: depth, infinite beside them, and normal."""
     import open3d  # noqa: PLC0415  # loads 300 modules; who only reads meshes needs none
 
     make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from bridge.errors import refuse_outside
 from twin.scene.shape.carve import (
     Evidence,
     MaskedView,
@@ -20,7 +19,6 @@ from twin.scene.shape.carve import (
 )
 from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.mesh import Faces, Vertices, face_normals, is_watertight, volume_m3
-from twin.scene.shape.registration import laid_together
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
 
 PAD_VOXELS = 4
@@ -35,44 +33,16 @@ THIN_M = 0.004
 LEAST_BEHIND_VOXELS = 1.6
 """A surface speaks for what is this far behind it, if two voxels are more: walls may be thin. With
 less than 1.6 voxels a basket of 3.5 mm voxels gets a hole where noise meets."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShapeConfig:
-    """How a shape is made."""
-
-    min_voxel_m: float = 0.0015
-    """Finest voxel."""
-    voxels_along: int = 100
-    """Voxels along the longest side, unless that makes them too fine."""
-    truncation_voxels: float = 4.0
-    """Depth within this many voxels of a surface says how far the surface is."""
-    min_truncation_m: float = 0.006
-    """At least this: a few standard deviations of the camera's noise."""
-    min_free_views: int = 2
-    """Views that must look through a voxel before it is free."""
-    smoothing_voxels: float = 0.5
-    """Standard deviation of the mean over distances that takes the stairs off."""
-    max_views: int = 40
-    """More views than this are thinned out evenly."""
-    align_rounds: int = 0
-    """Steps in which every view is shifted onto what the others saw."""
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot make a shape."""
-        refuse_outside(
-            self,
-            {
-                "min_voxel_m": (1e-4, 0.1),
-                "voxels_along": (8, 256),
-                "truncation_voxels": (1.0, 20.0),
-                "min_truncation_m": (0.0, 0.1),
-                "min_free_views": (1, 20),
-                "smoothing_voxels": (0.3, 2.0),
-                "max_views": (2, 1000),
-                "align_rounds": (0, 50),
-            },
-        )
+MIN_VOXEL_M, VOXELS_ALONG = 0.0015, 100
+"""Finest voxel, and voxels along the longest side, unless that makes them finer."""
+TRUNCATION_VOXELS, MIN_TRUNCATION_M = 4.0, 0.006
+"""Depth this near to a surface, the larger of both, says how far the surface is."""
+MIN_FREE_VIEWS = 2
+"""Views that must look through a voxel before it is free."""
+SMOOTHING_VOXELS = 0.5
+"""Standard deviation of the mean over distances that takes the stairs off."""
+MAX_VIEWS = 40
+"""More views than this are thinned out evenly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,13 +61,9 @@ class ObjectShape:
     volume_m3: float
     num_views: int
     truncation_m: float
-    view_shift_m: float = 0.0
-    """Root mean square of the shifts that laid the views together; 0 without rounds."""
 
 
-def reconstruct(
-    views: Sequence[MaskedView], support_z_m: float | None, config: ShapeConfig | None = None
-) -> ObjectShape:
+def reconstruct(views: Sequence[MaskedView], support_z_m: float | None) -> ObjectShape:
     """Carve an object out of the views that see it, close it, and mesh it.
 
     Args:
@@ -109,13 +75,11 @@ def reconstruct(
         ShapeError: When fewer than two views show the object, all from one side, or nothing
             is left after carving.
     """
-    config = ShapeConfig() if config is None else config
-    useful = _useful(views, config.max_views)
-    useful, shift = laid_together(useful, support_z_m, config.align_rounds)
-    return replace(_carved(useful, support_z_m, config), view_shift_m=shift)
+    useful = _useful(views)
+    return _carved(useful, support_z_m)
 
 
-def _useful(views: Sequence[MaskedView], max_views: int) -> list[MaskedView]:
+def _useful(views: Sequence[MaskedView]) -> list[MaskedView]:
     """Views with enough measured pixels of the object; says what is wrong when too few."""
     if not any(view.mask.any() for view in views):
         message = f"none of {len(views)} views shows the object: all masks are empty."
@@ -127,8 +91,8 @@ def _useful(views: Sequence[MaskedView], max_views: int) -> list[MaskedView]:
             "object, and at least 2 from different directions are needed. Scan it from more sides."
         )
         raise ShapeError(message)
-    if len(useful) > max_views:
-        ids = np.linspace(0, len(useful) - 1, max_views).round().astype(int)
+    if len(useful) > MAX_VIEWS:
+        ids = np.linspace(0, len(useful) - 1, MAX_VIEWS).round().astype(int)
         useful = [useful[index] for index in ids]
     middle = np.mean([view.points_m().mean(axis=0) for view in useful], axis=0)
     rays = np.array([view.T_base_camera[:3, 3] - middle for view in useful])
@@ -143,30 +107,22 @@ def _useful(views: Sequence[MaskedView], max_views: int) -> list[MaskedView]:
     return useful
 
 
-def _carved(
-    views: Sequence[MaskedView], support_z_m: float | None, config: ShapeConfig
-) -> ObjectShape:
+def _carved(views: Sequence[MaskedView], support_z_m: float | None) -> ObjectShape:
     low, high = _extent(views, support_z_m)
-    box, truncation = voxel_box(low, high, config)
+    box, truncation = voxel_box(low, high)
     behind = max(min(2 * box.voxel_m, THIN_M), LEAST_BEHIND_VOXELS * box.voxel_m)
-    evidence = gather(box, views, truncation, config.min_free_views, behind)
+    evidence = gather(box, views, truncation, MIN_FREE_VIEWS, behind)
     solid = solid_of(evidence, support_z_m, low - box.voxel_m, high + box.voxel_m)
     distances = signed_distances(solid, evidence, truncation)
-    values = smoothed(distances, box.voxel_m, config.smoothing_voxels)
+    values = smoothed(distances, box.voxel_m, SMOOTHING_VOXELS)
     grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
     return describe_solid(grid, evidence, len(views), truncation)
 
 
-def voxel_box(
-    low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], config: ShapeConfig
-) -> tuple[VoxelBox, float]:
-    """Voxels around an extent, and the truncation that goes with their size [m].
-
-    Args:
-        low: Lower corner of the extent; on the plane that something stands on, where it does.
-    """
-    voxel = max(config.min_voxel_m, float((high - low).max()) / config.voxels_along)
-    truncation = max(config.truncation_voxels * voxel, config.min_truncation_m)
+def voxel_box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> tuple[VoxelBox, float]:
+    """Voxels around an extent, and the truncation that goes with their size [m]."""
+    voxel = max(MIN_VOXEL_M, float((high - low).max()) / VOXELS_ALONG)
+    truncation = max(TRUNCATION_VOXELS * voxel, MIN_TRUNCATION_M)
     # Faces between voxels lie on the plane: half a voxel above and below it are the centres.
     origin = low - (PAD_VOXELS - 0.5) * voxel
     num_x, num_y, num_z = (np.ceil((high - low) / voxel).astype(int) + 2 * PAD_VOXELS).tolist()
@@ -256,7 +212,6 @@ def shape_of_mesh(
     vertices_m: Vertices,
     faces: Faces,
     points_m: Float[np.ndarray, "num_points 3"],
-    config: ShapeConfig | None = None,
 ) -> ObjectShape:
     """Fill a mesh and describe it like a reconstructed shape.
 
@@ -266,17 +221,15 @@ def shape_of_mesh(
     Args:
         vertices_m: In the frame that is wanted, z up.
         points_m: What was measured on the object, in the same frame.
-        config: Size of the voxels; the defaults when None.
     """
-    config = ShapeConfig() if config is None else config
     low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
-    box, truncation = voxel_box(low, high, config)
+    box, truncation = voxel_box(low, high)
     solid = _filled(vertices_m, faces, box)
     if int(solid.sum()) < 1:
         message = f"{len(faces)} triangles enclose no voxel of {box.voxel_m * 1e3:.1f} mm."
         raise ShapeError(message)
     distances = distances_of_solid(solid, box.voxel_m)
-    values = smoothed(distances, box.voxel_m, config.smoothing_voxels)
+    values = smoothed(distances, box.voxel_m, SMOOTHING_VOXELS)
     grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
     weight = _near_points(points_m, box).astype(np.float32)
     evidence = Evidence(

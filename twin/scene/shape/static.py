@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from bridge.errors import refuse_outside
 from twin.npz import UnreadableArraysError, read_npz, write_npz
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import spread
@@ -30,41 +29,14 @@ VOXELS_AT_ONCE = 100_000
 """Looked up in the objects' distances together: some 300 bytes each."""
 
 Distance = Callable[[Float[np.ndarray, "num_points 3"]], Float[np.ndarray, " num_points"]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class StaticConfig:
-    """Size and fineness of the static scene's grid."""
-
-    voxel_m: float = 0.008
-    """Wanted voxel; larger when the scene would need too many."""
-    max_voxels: int = 2_000_000
-    """Most voxels: bounds memory and time."""
-    height_m: float = 0.7
-    """How far above the table the grid reaches."""
-    below_m: float = 0.04
-    """How far below the table."""
-    max_side_m: float = 2.0
-    """Longest side of the grid, around the middle of what was seen."""
-    truncation_voxels: float = 3.0
-    """Depth within this many voxels of a surface says how far the surface is."""
-    max_views: int = 40
-    """More views than this are thinned out evenly."""
-
-    def __post_init__(self) -> None:
-        """Refuse grids that are none."""
-        refuse_outside(
-            self,
-            {
-                "voxel_m": (1e-3, 0.2),
-                "max_voxels": (1000, MAX_VOXELS),
-                "height_m": (0.01, 5.0),
-                "below_m": (0.0, 1.0),
-                "max_side_m": (0.1, 20.0),
-                "truncation_voxels": (1.0, 20.0),
-                "max_views": (1, 1000),
-            },
-        )
+VOXEL_M, MAX_GRID = 0.008, 2_000_000
+"""Wanted voxel, and most voxels: larger ones where the scene would need more."""
+HEIGHT_M, BELOW_M, MAX_SIDE_M = 0.7, 0.04, 2.0
+"""How far above and below the table the grid reaches; its longest side."""
+TRUNCATION_VOXELS = 3.0
+"""Depth within this many voxels of a surface says how far the surface is."""
+MAX_VIEWS = 40
+"""More views than this are thinned out evenly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +106,6 @@ def static_sdf(
     views: Sequence[TrainingView],
     table_z_m: float | None,
     objects: Sequence[Distance] = (),
-    config: StaticConfig | None = None,
 ) -> StaticSdf:
     """Fuse the training views into signed distances to what stands still.
 
@@ -143,10 +114,9 @@ def static_sdf(
         table_z_m: Height of the table: all below is solid. None when there is none.
         objects: Distances to the things that may be moved: the scene is made free of them.
     """
-    config = StaticConfig() if config is None else config
-    masked = [everything_in(views[k]) for k in spread(np.arange(len(views)), config.max_views)]
-    box = _box(masked, table_z_m, config)
-    truncation = config.truncation_voxels * box.voxel_m
+    masked = [everything_in(views[k]) for k in spread(np.arange(len(views)), MAX_VIEWS)]
+    box = _box(masked, table_z_m)
+    truncation = TRUNCATION_VOXELS * box.voxel_m
     evidence = gather(box, masked, truncation, min_free_views=2)
     free = evidence.empty.ravel()
     taken = np.flatnonzero(~free if objects else [])
@@ -183,14 +153,14 @@ def everything_in(view: TrainingView) -> MaskedView:
     )
 
 
-def _box(views: Sequence[MaskedView], table_z_m: float | None, config: StaticConfig) -> VoxelBox:
+def _box(views: Sequence[MaskedView], table_z_m: float | None) -> VoxelBox:
     """The box of what was seen, without the outermost hundredth, in voxels that fit the budget."""
     points = [view.points_m() for view in views]
     rows = [p[:: max(1, len(p) // POINTS_PER_VIEW)] for p in points if len(p)]
     seen = np.concatenate(rows) if rows else np.zeros((0, 3))
     if table_z_m is not None:
         height = seen[:, 2] - table_z_m
-        seen = seen[(height > -config.below_m) & (height < config.height_m)]
+        seen = seen[(height > -BELOW_M) & (height < HEIGHT_M)]
     if len(seen) < MIN_POINTS:
         message = (
             f"{len(views)} views measured {len(seen)} points of the static scene, at least "
@@ -199,15 +169,15 @@ def _box(views: Sequence[MaskedView], table_z_m: float | None, config: StaticCon
         raise ShapeError(message)
     low, high = np.percentile(seen, [1, 99], axis=0)
     if table_z_m is not None:
-        low[2], high[2] = table_z_m - config.below_m, table_z_m + config.height_m
-    middle, half = (low + high) / 2, np.minimum((high - low) / 2, config.max_side_m / 2)
-    half = np.maximum(half, 2 * config.voxel_m)
-    voxel = max(config.voxel_m, float(np.cbrt(np.prod(2 * half) / config.max_voxels)))
+        low[2], high[2] = table_z_m - BELOW_M, table_z_m + HEIGHT_M
+    middle, half = (low + high) / 2, np.minimum((high - low) / 2, MAX_SIDE_M / 2)
+    half = np.maximum(half, 2 * VOXEL_M)
+    voxel = max(VOXEL_M, float(np.cbrt(np.prod(2 * half) / MAX_GRID)))
     counts = np.maximum(np.floor(2 * half / voxel), 2).astype(int)
     origin = middle - half + voxel / 2
     if table_z_m is not None:
         # The table top is a face between two layers, not the middle of one.
-        layers = np.floor(config.below_m / voxel)
+        layers = np.floor(BELOW_M / voxel)
         origin[2] = table_z_m - (layers - 0.5) * voxel
     num_x, num_y, num_z = counts.tolist()
     return VoxelBox(origin_m=origin, voxel_m=voxel, counts=(num_x, num_y, num_z))

@@ -223,11 +223,7 @@ def _links(
 def without_joints(
     episode: Episode, mount: MountedCamera, stamps_ns: Int[np.ndarray, " num_frames"]
 ) -> frozenset[int]:
-    """Those of some instants at which nobody recorded where the hand that carries a camera was.
-
-    Args:
-        mount: A fixed camera needs no joints: the answer is empty.
-    """
+    """Those of some instants at which nobody recorded where the hand that carries a camera was."""
     return unknown_postures(None if mount.fixed else posture_track(episode), stamps_ns)
 
 

@@ -9,13 +9,13 @@ import pytest
 from bridge.geometry import se3
 from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface, sample_surface
+from twin.scene.align import align
 from twin.scene.align.align import (
-    AlignConfig,
     RobotNotAlignedError,
     align_robot,
     depth_errors,
 )
-from twin.scene.align.refine import ScenePose
+from twin.scene.align.refine import FINE, ScenePose, refine
 from twin.scene.align.view import RobotView, find_planes
 
 TWO = cell_views.POSTURES[:2]
@@ -73,12 +73,9 @@ def test_the_depth_scale_is_recovered_where_a_rigid_fit_goes_astray(
     biased: list[RobotView],
 ) -> None:
     points = surface_points(biased[0].posture)
-    rigid = align_robot(
-        biased,
-        cell_views.robot(),
-        start=nearby(5),
-        config=AlignConfig(with_scale=False, max_residual_m=0.05, min_fitness=0.0),
-    )
+    surfaces = [PosedSurface(cell_views.robot(), view.posture) for view in biased]
+    start = ScenePose(T_base_source=nearby(5))
+    rigid, _ = refine(biased, surfaces, start, stages=FINE, num_points=6000, with_scale=False)
     free = align_robot(biased, cell_views.robot(), start=nearby(5))
     assert free.depth_scale == pytest.approx(1 / 1.01, abs=0.002)
     error = cell_views.surface_error_m(free.T_base_source, np.eye(4), points)
@@ -130,8 +127,9 @@ def test_two_places_that_fit_alike_are_refused(
     biased: list[RobotView], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a margin no scene can give, the sentence asks for another posture."""
+    monkeypatch.setattr(align, "MIN_MARGIN", 1e6)
     with pytest.raises(RobotNotAlignedError, match=r"another place fits.*another posture"):
-        align_robot(biased, cell_views.robot(), config=AlignConfig(min_margin=1e6))
+        align_robot(biased, cell_views.robot())
 
 
 def test_a_place_that_shows_little_does_not_win(exact: list[RobotView]) -> None:

@@ -20,7 +20,7 @@ from twin.scene.gaussians import (
     as_float32,
     with_harmonics,
 )
-from twin.scene.harmonics import harmonic_basis
+from twin.scene.harmonics import harmonic_terms
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 
@@ -79,7 +79,7 @@ def dense_solution(start: GaussianCloud, observations: list[ImageObservation]) -
         towards = view_directions(start.means_m, item.T_base_camera[:3, 3])
         basis = np.ones((count, terms))
         if terms > 1:
-            basis[:, 1:] = harmonic_basis(towards, terms - 1)
+            basis[:, 1:] = np.stack(harmonic_terms(*towards.T), axis=1)
         seen = item.target.static_mask.ravel()
         blocks = np.concatenate([A * basis[:, term] for term in range(terms)], axis=1)[seen]
         M, offset = item.exposure[:, :3], item.exposure[:, 3]

@@ -9,7 +9,7 @@ import pytest
 import textured_room
 
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.optimise import FitResult, fit
+from twin.scene.fit.optimise import APPEARANCE_STEPS, FitResult, fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import FitSession, Rasteriser
@@ -83,8 +83,8 @@ def test_colours_are_solved_with_as_many_steps_as_there_is_time_for(
     for draw_s in (0.0, 0.0018, 0.3):
         clock.draw_s = draw_s
         steps[draw_s] = fitted(room, clock).colour_steps
-    assert steps[0.0] == BUDGET.appearance_steps
-    assert 2 <= steps[0.0018] < BUDGET.appearance_steps
+    assert steps[0.0] == APPEARANCE_STEPS
+    assert 2 <= steps[0.0018] < APPEARANCE_STEPS
     assert steps[0.3] == 0
 
 

@@ -1,4 +1,4 @@
-"""Holes of missing depth are closed where views agree, and never before what was measured."""
+"""Holes of missing depth are closed as smoothly as can be, and never before what was measured."""
 
 from dataclasses import replace
 
@@ -49,8 +49,8 @@ def test_a_hole_is_closed_at_its_true_distance_and_in_a_view_that_taught_nothing
     added = complete_holes(cloud, views, CONFIG, RASTER)
     inside = np.linalg.norm(added.means_m[:, :2] - HOLE_M, axis=1) < RADIUS_M
     on_table = inside & (np.abs(added.means_m[:, 2]) < 0.1)
-    assert on_table.sum() > 15
-    assert np.median(np.abs(added.means_m[on_table, 2])) < 0.03  # half a pixel of disparity here
+    assert on_table.sum() > 10
+    assert np.median(np.abs(added.means_m[on_table, 2])) < 0.005
     depth_m = FrameSurface(held_out, LIMITS).depth_in_color_camera()
     p = se3.apply(held_out.T_base_color, held_out.color_camera.unproject(depth_m))
     near = np.linalg.norm(p[..., :2] - HOLE_M, axis=-1) < 0.8 * RADIUS_M
@@ -77,4 +77,4 @@ def test_what_was_measured_stays_visible(
         shares.append(before.mean())
     # At the rim of the hole pixels show half of each; what is opaque is the nearer.
     assert np.mean(shares) < 0.01
-    assert max(shares) < 0.02
+    assert max(shares) < 0.025

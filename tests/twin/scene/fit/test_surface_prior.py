@@ -29,7 +29,7 @@ def test_what_left_the_slab_comes_back_to_its_border_and_nothing_else_moves(
     off = rng.normal(scale=2.0, size=len(cloud)) * prior.sizes_m
     along = np.cross(prior.normals, rng.normal(size=prior.normals.shape)) * 0.01
     moved = replace(cloud, means_m=as_float32(cloud.means_m + off[:, None] * prior.normals + along))
-    prior.hold(moved, 0.5)
+    prior.hold(moved)
     left = np.einsum("ni,ni->n", moved.means_m - cloud.means_m, prior.normals)
     half = 0.5 * prior.sizes_m
     np.testing.assert_allclose(left, np.clip(off, -half, half), atol=1e-5)

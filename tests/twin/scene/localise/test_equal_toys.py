@@ -30,7 +30,7 @@ def test_toys_that_stayed_keep_their_names_when_another_one_was_moved(
     task = only(DUCKS, "duck_1", "duck_2", "duck_3")
     now = [PLACES[0], PLACES[2], *ducks_at((0.50, 0.0, 0.4))]
     last = {f"duck_{index + 1}": T[:3, 3] for index, T in enumerate(PLACES)}
-    found = localise_objects(shoot(table_with(stage, *[(DUCK, T) for T in now])), task, None, last)
+    found = localise_objects(shoot(table_with(stage, *[(DUCK, T) for T in now])), task, last)
     for name, T in (("duck_1", now[0]), ("duck_3", now[1]), ("duck_2", now[2])):
         assert off(found[name].T_base_object, T)[0] < 2.5
 

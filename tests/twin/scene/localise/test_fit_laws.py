@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
+from twin.scene.localise import shape_fit
 from twin.scene.localise.points import Cluster
-from twin.scene.localise.shape_fit import ShapeFitConfig, _crossings, _Problem, _solve
+from twin.scene.localise.shape_fit import _crossings, _Problem, _solve
 from twin.scene.shape.known import pose_of
 
 SIZE_M = (0.09, 0.03, 0.05)
@@ -29,7 +30,10 @@ def surface_points(seed: int, count: int = 900) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("turn_rad", [0.15, -0.15])
-def test_exact_points_give_the_exact_pose_from_a_pose_nearby(seed: int, turn_rad: float) -> None:
+def test_exact_points_give_the_exact_pose_from_a_pose_nearby(
+    seed: int, turn_rad: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shape_fit, "ITERATIONS", 30)
     cube = load_task("cube_into_box").objects["cube"]
     model = replace(cube, size_m=SIZE_M)
     yaw = 0.3 * seed
@@ -38,13 +42,12 @@ def test_exact_points_give_the_exact_pose_from_a_pose_nearby(seed: int, turn_rad
     start = T.copy()
     start[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, turn_rad])) @ T[:3, :3]
     start[:2, 3] += [0.004, -0.003]
-    points, config = se3.apply(T, surface_points(seed)), ShapeFitConfig(iterations=30)
+    points = se3.apply(T, surface_points(seed))
     cluster = Cluster(p_base=points, view_ids=np.zeros(len(points), dtype=np.int64))
     problem = _Problem(
-        cluster=cluster.thinned(config.max_points),
+        cluster=cluster.thinned(shape_fit.MAX_POINTS),
         outlines=(),
         model=model,
-        config=config,
         prior_sigma=np.full((1, 3), 1e-6),  # the points have no shift of their own
     )
     yaw = np.arctan2(start[1, 0], start[0, 0])

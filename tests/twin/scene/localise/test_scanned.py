@@ -90,15 +90,15 @@ def run(tmp_path: Path, known: ToyMesh) -> RunFolder:
 def test_meshes_of_scanned_objects_are_read_from_the_scene(
     run: RunFolder, scanned_task: Task
 ) -> None:
-    found = scanned_surfaces(run, scanned_task, 500)
-    assert found.surfaces["thing"].p_m.shape == (500, 3)
+    found = scanned_surfaces(run, scanned_task)
+    assert found.surfaces["thing"].p_m.shape == (2500, 3)
     assert len(found.hashes["thing"]) == 64
     with_shape = replace(scanned_task, objects={"thing": replace(THING, shape="box")})
-    assert not scanned_surfaces(run, with_shape, 500).surfaces
+    assert not scanned_surfaces(run, with_shape).surfaces
     (run.scene_dir / "objects" / "thing" / "object.json").write_text(
         json.dumps({"shape_source": "task file"})
     )
-    assert not scanned_surfaces(run, scanned_task, 500).hashes
+    assert not scanned_surfaces(run, scanned_task).hashes
 
 
 def test_what_the_scene_does_not_list_was_not_scanned_whatever_lies_about(
@@ -106,7 +106,7 @@ def test_what_the_scene_does_not_list_was_not_scanned_whatever_lies_about(
 ) -> None:
     path = run.scene_dir / "scene.json"
     path.write_text(path.read_text().replace('"thing"', '"duck"'))
-    assert not scanned_surfaces(run, scanned_task, 500).surfaces
+    assert not scanned_surfaces(run, scanned_task).surfaces
 
 
 def test_the_gate_lays_out_scanned_objects_by_the_scene_s_mesh(

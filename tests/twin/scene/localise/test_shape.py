@@ -7,9 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.task.task_file import load_task
-from twin.scene.localise.objects import TableConfig, fit_table
+from twin.scene.localise.objects import fit_table
 from twin.scene.localise.points import (
-    ColourConfig,
     clusters,
     likeness,
     linear_image,
@@ -70,7 +69,7 @@ def test_the_table_fit_finds_a_tilted_and_lifted_plane() -> None:
     z = 0.004 + 0.01 * (xy[:, 0] - 0.5) + rng.normal(0, 0.001, 2000)
     points = np.column_stack([xy, z])
     points[:200, 2] += rng.uniform(0.01, 0.02, 200)  # clutter
-    fit = fit_table(points, np.array([1.2, 0.0, 0.7]), "side", TableConfig())
+    fit = fit_table(points, np.array([1.2, 0.0, 0.7]), "side")
     after = points[200:] @ fit.T_new_old[:3, :3].T + fit.T_new_old[:3, 3]
     camera = fit.T_new_old[:3, :3] @ np.array([1.2, 0.0, 0.7]) + fit.T_new_old[:3, 3]
     after = camera + fit.depth_factor * (after - camera)
@@ -85,7 +84,7 @@ def test_the_table_fit_finds_a_tilted_and_lifted_plane() -> None:
 @given(shade=st.floats(0.15, 1.0))
 def test_likeness_does_not_depend_on_shading(shade: float) -> None:
     albedo = linear_image(np.array([[[200, 45, 40]]], dtype=np.uint8))
-    like = likeness(albedo * shade, (200, 45, 40), ColourConfig())
+    like = likeness(albedo * shade, (200, 45, 40))
     np.testing.assert_allclose(like, 1.0, atol=1e-5)
 
 

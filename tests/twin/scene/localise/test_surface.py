@@ -14,7 +14,6 @@ from twin.scene.localise.mesh_fit import (
     mesh_surface,
     seen_through,
 )
-from twin.scene.localise.objects import LocaliseConfig
 from twin.scene.localise.points import fuse_stationary
 
 
@@ -44,8 +43,8 @@ def test_a_mesh_of_which_no_camera_measures_anything_is_not_believed(
     stage: Callable[..., Any],
 ) -> None:
     task = only(DUCKS, "duck_1")
-    frames, config = shoot(table_with(stage, (DUCK, AT))), LocaliseConfig()
-    views = fuse_stationary(frames, 3, 8, task, config.points)
+    frames = shoot(table_with(stage, (DUCK, AT)))
+    views = fuse_stationary(frames, 3, 8, task)
     surface, below = known_surface(DUCK, 1000), AT.copy()
     below[2, 3] -= 0.2  # hidden by the table, so nothing sees through it either
     assert agreeing(AT, surface, views, 0.012) > 0.8

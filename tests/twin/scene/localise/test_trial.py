@@ -96,7 +96,7 @@ def first_frames(
         return frames
 
     monkeypatch.setattr(trial, "stationary_frames", stationary)
-    monkeypatch.setattr(trial, "calibrated_cameras", lambda *_: {})
+    monkeypatch.setattr(trial, "trial_cameras", lambda *_: {})
     monkeypatch.setattr(trial, "first_execution_ns", lambda _: 77)
     return frames
 

@@ -14,7 +14,6 @@ from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.objects.closing import closed_object, weighted_median
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.settings import InitialiseConfig
 from twin.scene.shape.known import shape_mesh
 
 CAMERA = Camera(width=200, height=160, fx=260.0, fy=260.0, cx=100.0, cy=80.0)
@@ -104,7 +103,7 @@ def views() -> list[TrainingView]:
 
 @pytest.fixture(scope="module")
 def closed(views: Sequence[TrainingView]) -> GaussianCloud:
-    cloud = closed_object(cube(), views, T_BASE_CUBE, InitialiseConfig())
+    cloud = closed_object(cube(), views, T_BASE_CUBE)
     assert cloud is not None
     return cloud
 

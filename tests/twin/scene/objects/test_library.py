@@ -24,7 +24,6 @@ from twin.scene.gaussians import GaussianCloud, as_float32, read_ply
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import Decomposition, decompose, fill_footprint
 from twin.scene.objects.placement import Placement, Placements
-from twin.scene.settings import InitialiseConfig
 from twin.scene.shape.known import pose_of, shape_mesh
 
 QUIET = Output(quiet=True)
@@ -144,7 +143,6 @@ def parts(placements: Placements, views: dict[str, list[TrainingView]]) -> Decom
         cloud_of(table, (150, 140, 128)),
         lambda episode: views[episode.path.stem],
         QUIET,
-        InitialiseConfig(),
     )
 
 

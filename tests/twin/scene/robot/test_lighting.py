@@ -5,11 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from twin.scene.fit.initialise import flat_gaussians
+from twin.scene.fit.lighting import EVEN, Lighting, fit_lighting, read_lighting
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import as_float32
-from twin.scene.robot.lighting import EVEN, Lighting, fit_lighting, read_lighting
 from twin.scene.robot.link_surface import SeenLink, link_lighting, on_surface, own_colors
-from twin.scene.settings import InitialiseConfig
 
 HALF_M = np.array([0.05, 0.04, 0.12])
 TRUE = Lighting(coefficients=(1.0, 0.1, -0.15, 0.35, 0.05, 0.0, 0.03, -0.04, 0.02))
@@ -56,7 +55,7 @@ def test_light_is_found_from_a_link_that_turns_and_its_paint_is_the_same_all_ove
     factor = float((ours * true).sum() / (true * true).sum())  # paint and light share a factor
     np.testing.assert_allclose(ours / factor, true, atol=0.05)
     sets = own_colors([box()], seen(12), found)
-    cloud = on_surface([box()], sets, 0.01, InitialiseConfig())
+    cloud = on_surface([box()], sets, 0.01)
     assert cloud is not None
     p = cloud.means_m / HALF_M
     for side in range(6):
@@ -70,7 +69,7 @@ def test_light_is_found_from_a_link_that_turns_and_its_paint_is_the_same_all_ove
 def test_lit_gaussians_are_as_bright_as_where_they_face() -> None:
     normals = Rotation.random(50, random_state=1).apply([0.0, 0.0, 1.0])
     gray = np.full((50, 3), 0.4)
-    cloud = flat_gaussians(np.zeros((50, 3)), normals, gray, np.ones(50), InitialiseConfig())
+    cloud = flat_gaussians(np.zeros((50, 3)), normals, gray, np.ones(50))
     expected = 0.4 * TRUE.brightness(normals)
     np.testing.assert_allclose(TRUE.on(cloud).colors[:, 1], expected, atol=1e-5)
     assert EVEN.on(cloud) is cloud

@@ -7,7 +7,6 @@ from twin.scene.fit.on_mesh import Triangles
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import as_float32
 from twin.scene.robot.link_surface import on_surface
-from twin.scene.settings import InitialiseConfig
 
 HALF_M = np.array([0.05, 0.04, 0.2])
 RED, GREEN = np.array([0.8, 0.1, 0.1]), np.array([0.1, 0.7, 0.2])
@@ -38,7 +37,7 @@ def seen(noise_m: float = 0.002) -> PointSet:
 
 
 def test_gaussians_lie_on_the_shape_densely_and_keep_the_colour_of_their_side() -> None:
-    cloud = on_surface([box()], [seen()], 0.01, InitialiseConfig())
+    cloud = on_surface([box()], [seen()], 0.01)
     assert cloud is not None
     p = cloud.means_m.astype(np.float64)
     np.testing.assert_allclose(np.max(np.abs(p) / HALF_M, axis=1), 1.0, atol=1e-5)
@@ -61,5 +60,5 @@ def _evenly(surface: Triangles, count: int) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def test_a_shape_that_is_not_the_links_is_not_used() -> None:
-    assert on_surface([box(HALF_M + 0.03)], [seen()], 0.01, InitialiseConfig()) is None
-    assert on_surface([box(HALF_M + 0.003)], [seen()], 0.01, InitialiseConfig()) is not None
+    assert on_surface([box(HALF_M + 0.03)], [seen()], 0.01) is None
+    assert on_surface([box(HALF_M + 0.003)], [seen()], 0.01) is not None

@@ -13,10 +13,7 @@ from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import LibraryObject, ObjectSplats
-from twin.scene.shape.from_training import (
-    masked_view,
-    shapes_of,
-)
+from twin.scene.shape.from_training import masked_view, shapes_of
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.mesh import is_watertight, volume_m3
 from twin.scene.shape.reconstruct import ObjectShape

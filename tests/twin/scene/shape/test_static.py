@@ -11,6 +11,7 @@ from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.npz import UnreadableArraysError
 from twin.scene.frames.rgbd import TrainingView
+from twin.scene.shape import static as made
 from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.from_training import (
     from_outside_m,
@@ -20,10 +21,17 @@ from twin.scene.shape.from_training import (
 )
 from twin.scene.shape.known import pose_of, surface_distances
 from twin.scene.shape.sdf import SdfGrid
-from twin.scene.shape.static import FREE, SURFACE, UNSEEN, StaticConfig, StaticSdf, static_sdf
+from twin.scene.shape.static import FREE, SURFACE, UNSEEN, Distance, StaticSdf, static_sdf
 
 TASK, POSES = cast_views.TASK, cast_views.POSES
-COARSE = StaticConfig(voxel_m=0.012, height_m=0.3)
+
+
+def coarse(views: list[TrainingView], *objects: Distance) -> StaticSdf:
+    """In voxels of 12 mm, up to 30 cm above the table."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(made, "VOXEL_M", 0.012)
+        patch.setattr(made, "HEIGHT_M", 0.3)
+        return static_sdf(views, 0.0, objects)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +39,7 @@ def static(views: list[TrainingView]) -> StaticSdf:
     def cube(points: np.ndarray) -> np.ndarray:
         return surface_distances(points, TASK.objects["cube"], POSES["cube"])[0]
 
-    return static_sdf(views, 0.0, [cube], COARSE)
+    return coarse(views, cube)
 
 
 def test_distances_to_the_table_and_to_what_stands_on_it(static: StaticSdf) -> None:
@@ -50,7 +58,7 @@ def test_a_movable_object_is_not_part_of_the_static_scene(
 ) -> None:
     centre = POSES["cube"][:3, 3] + [0, 0, 0.005]
     assert static.conservative.distance(centre) > 0
-    with_cube = static_sdf(views, 0.0, [], COARSE)
+    with_cube = coarse(views)
     assert with_cube.conservative.distance(centre) < 0
 
 
@@ -116,8 +124,11 @@ def test_a_rim_is_as_high_as_it_is_seen_whatever_is_published(views: list[Traini
     assert seen.objects["cube"] == TASK.objects["cube"]
 
 
-def test_a_budget_of_voxels_makes_them_larger(views: list[TrainingView]) -> None:
-    small = static_sdf(views, 0.0, [], StaticConfig(max_voxels=8000))
+def test_a_budget_of_voxels_makes_them_larger(
+    views: list[TrainingView], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(made, "MAX_GRID", 8000)
+    small = static_sdf(views, 0.0, [])
     assert small.state.size <= 9000
     assert small.conservative.voxel_m > 0.008
 

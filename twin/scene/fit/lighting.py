@@ -1,10 +1,10 @@
-"""The cell's light on the arm: how bright a surface is by the way it faces.
+"""The cell's light on arm and objects: how bright a surface is by the way it faces.
 
 A link that turns shows the same paint in another light. Seen in several postures, its colours are
 paint times light, and light depends on where a surface faces in the robot's base frame: spherical
 harmonics up to degree 2, enough for matte surfaces (Ramamoorthi and Hanrahan 2001). One light for
 all links and all channels; shadows and gloss are left out. Links keep their paint, and are lit
-anew in each posture.
+anew in each posture; sides of objects that nobody saw are as bright as it makes them.
 """
 
 from collections.abc import Mapping, Sequence

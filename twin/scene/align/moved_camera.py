@@ -1,0 +1,135 @@
+"""Cameras that were moved since the scan, found by what stands still before them.
+
+The scene's background is drawn from where a camera's poses say it is. What the camera recorded is
+laid onto that picture by depth and brightness together, as consecutive frames are in ``odometry``.
+What differs by more than a bump explains, such as robot and objects, has no say.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode.streams import RgbdFrame
+from bridge.geometry import se3
+from twin.errors import TwinError
+from twin.scene.frames.odometry import MIN_AGREEMENT, MIN_OVERLAP, Aligner, Look
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+
+MOVED_M, MOVED_RAD = 0.005, np.radians(0.5)
+"""From here on a camera was moved; less is the scatter of poses and of this comparison."""
+APART_M = (0.06, 0.02)
+"""Depths that differ by more, in the first and in the second round, show another thing."""
+LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.03)
+
+
+class MovedCameraError(TwinError):
+    """A camera was moved, and nothing says where to."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovedCamera:
+    """Where a camera is, seen from where its poses say it is."""
+
+    T_said_true: Float[np.ndarray, "4 4"] | None
+    """Of its colour frame; None: it was moved, and its images do not say where to."""
+
+    def to_record(self) -> dict[str, Any]:
+        """What a localisation says of it."""
+        T = self.T_said_true
+        return {"T_said_true": None if T is None else se3.pose_record(T)}
+
+    @staticmethod
+    def from_record(record: Mapping[str, Any]) -> "MovedCamera":
+        """Read what ``to_record`` gave."""
+        T = record["T_said_true"]
+        return MovedCamera(T_said_true=None if T is None else se3.pose_from_record(T))
+
+    def describe(self, camera_id: str) -> str:
+        """What happened to it."""
+        T = self.T_said_true
+        if T is None:
+            return (
+                f"camera {camera_id} does not see the scene where it should, and what it sees does "
+                "not say where it is: it was moved since the scan, or the furniture was. Put it "
+                "back, or scan again"
+            )
+        shift_mm, turn = 1e3 * float(np.linalg.norm(T[:3, 3])), se3.rotation_angle_rad(T[:3, :3])
+        return (
+            f"camera {camera_id} was moved by {shift_mm:.0f} mm and {np.degrees(turn):.1f} degrees "
+            "since the scan: registered again by what stands still before it"
+        )
+
+
+def moved_camera(
+    frames: Sequence[RgbdFrame], background: GaussianCloud, threads: int = 0
+) -> MovedCamera | None:
+    """Compare frames of one camera with the scene; None where it is as its poses say.
+
+    Args:
+        frames: Taken while camera, robot and objects stood still.
+    """
+    rasteriser, aligner = Rasteriser(RasterConfig(threads=threads)), Aligner(LIMITS.max_depth_m)
+    vectors, is_lost = [], False
+    for frame in frames:
+        T, found = np.eye(4), False
+        for apart_m in APART_M:
+            pair = _looks(frame, T, background, rasteriser, aligner, apart_m)
+            if pair.overlap < MIN_OVERLAP:
+                break  # it looks where the scan did not
+            step = aligner.lay(pair.recorded, pair.drawn, np.eye(4))
+            if step is None:
+                is_lost |= not found and pair.agreement < MIN_AGREEMENT
+                break
+            T, found = T @ step.T_target_source, True
+        if found:
+            vectors.append(np.concatenate([T[:3, 3], se3.vector_from_rotation(T[:3, :3])]))
+    if not vectors:
+        return MovedCamera(T_said_true=None) if is_lost else None
+    middle = np.median(vectors, axis=0)
+    shift_m, turn_rad = (float(np.linalg.norm(part)) for part in (middle[:3], middle[3:]))
+    if shift_m < MOVED_M and turn_rad < MOVED_RAD:
+        return None
+    T_said_true = np.eye(4)
+    T_said_true[:3, :3], T_said_true[:3, 3] = se3.rotation_from_vector(middle[3:]), middle[:3]
+    return MovedCamera(T_said_true=T_said_true)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pair:
+    recorded: Look
+    """Without what is no background."""
+    drawn: Look
+    overlap: float
+    """Share of what was measured where the scene has a surface, too."""
+    agreement: float
+    """Share of that which is no more than so far apart."""
+
+
+def _looks(
+    frame: RgbdFrame,
+    T_said_true: Float[np.ndarray, "4 4"],
+    background: GaussianCloud,
+    rasteriser: Rasteriser,
+    aligner: Aligner,
+    apart_m: float,
+) -> _Pair:
+    """What was recorded, and the scene from where the camera is thought to be."""
+    camera, T = frame.color_camera, frame.T_base_color @ T_said_true
+    view = rasteriser.view(background, camera, T)
+    recorded_m = FrameSurface(frame, LIMITS).depth_in_color_camera()
+    both = (recorded_m > 0) & (view.depth_m > 0)
+    apart = both & (np.abs(recorded_m - view.depth_m) > apart_m)
+    overlap = float(both.sum() / max((recorded_m > 0).sum(), 1))
+    recorded_m[apart] = 0.0
+    posed = replace(frame, depth_camera=camera, T_base_color=T, T_base_depth=T)
+    return _Pair(
+        recorded=aligner.look(replace(posed, depth_m=recorded_m)),
+        drawn=aligner.look(replace(posed, depth_m=view.depth_m, image_u8=view.image_u8())),
+        overlap=overlap,
+        agreement=1.0 - float(apart.sum() / max(both.sum(), 1)),
+    )
