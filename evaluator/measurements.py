@@ -11,8 +11,7 @@ from pathlib import Path
 from evaluator import motion_measurements as motion_measurements
 from evaluator import study_measurements as study_measurements
 from evaluator.metrics import image
-from evaluator.metrics.image_protocol import ImageMetric
-from evaluator.metrics.image_scores import METRICS
+from evaluator.metrics.image import METRICS, ImageMetric
 from evaluator.quantity import REGISTRY as REGISTRY
 from evaluator.quantity import SIGNED, UP, with_tables
 from evaluator.quantity import Defined as Defined
@@ -310,7 +309,7 @@ def _image(images: str, metric: ImageMetric, variant: str) -> Quantity:
 _IMAGES = ("views.{part}", "image.{method}")
 VIEWS, RENDERS = (
     {(name, raw): _image(images, metric, "raw" if raw else "{variant}")
-     for name, metric in METRICS.items() for raw in (True, False)}
+     for name, metric in METRICS.items() for raw in (True, False) if raw or not metric.raw_only}
     for images in _IMAGES
 )  # fmt: skip
 """By the metric, and whether the images were compared as they are stored."""
@@ -331,7 +330,6 @@ DEPTHS = {
     for name, words in (
         ("mean_abs_m", "mean absolute"),
         ("median_abs_m", "median absolute"),
-        ("rmse_m", "root mean square"),
     )
 }
 """By the field of ``DepthScore``."""

@@ -14,9 +14,9 @@ from evaluator.cache import SummaryCache
 from evaluator.compare.baselines import with_rule
 from evaluator.compare.end_points import compare_imported
 from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.images.renders import compare_renders
+from evaluator.compare.images.methods import compare_renders
 from evaluator.compare.images.scores import open_nets
-from evaluator.compare.images.views import ViewReport, compare_views
+from evaluator.compare.images.views import compare_views
 from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
 from evaluator.compare.motion import motion_results
@@ -29,13 +29,12 @@ from evaluator.compare.states import state_results
 from evaluator.compare.study import retry_table
 from evaluator.compare.summaries import Summaries, evaluation_pool, sum_up
 from evaluator.compare.trial import Trial, lay_out
-from evaluator.metrics.image_protocol import ImageOptions
+from evaluator.metrics.image_options import ImageOptions
 from evaluator.result import Exclusion
 from evaluator.run_reader.contents import ODD, RunContents, broken, read_contents
 from evaluator.run_reader.episodes import DerivedIndex
 
 Item = TypeVar("Item")
-AnyPart = Part | ViewReport
 
 QUIET = Output(quiet=True)
 
@@ -210,7 +209,7 @@ def _of_protocol(read: ReadRun, method: str) -> Part:
     )
 
 
-def _with_parts(base: Comparison, parts: Sequence[AnyPart]) -> Comparison:
+def _with_parts(base: Comparison, parts: Sequence[Part]) -> Comparison:
     return replace(
         base,
         measurements=_joined(base.measurements, (part.measurements for part in parts)),

@@ -11,10 +11,10 @@ from skimage.metrics import peak_signal_noise_ratio
 
 from bridge.errors import PathNotFoundError, UsageError
 from evaluator.cli import evaluate
-from evaluator.compare.images.renders import compare_folders
+from evaluator.compare.images.methods import compare_folders
 from evaluator.compare.rows import Comparison
 from evaluator.errors import EvaluatorError
-from evaluator.metrics.image_protocol import ImageOptions
+from evaluator.metrics.image_options import ImageOptions
 
 SIZE = (48, 64)
 
@@ -216,7 +216,7 @@ def test_the_command_writes_a_report_of_images_alone(folders: Path) -> None:
 
 
 def test_views_of_a_run_may_be_called_as_export_tum_calls_them() -> None:
-    from evaluator.compare.images.renders import other_names
+    from evaluator.compare.images.methods import other_names
 
     names = other_names(["wrist/1500000000", "side/1500000000", "side/2000000001"])
     assert names["wrist_1500000000"] == "wrist/1500000000"
