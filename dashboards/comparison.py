@@ -15,7 +15,6 @@ from evaluator.cache import FOLDER, SummaryCache
 from evaluator.result import Exclusion, Measurement, Results, load_results
 from evaluator.review_index import (
     RESULTS,
-    IndexedTrial,
     ReviewIndex,
     RunState,
     Selection,
@@ -25,6 +24,7 @@ from evaluator.review_index import (
     stamp_of,
     state_of,
 )
+from evaluator.trial_row import TrialRow
 
 if TYPE_CHECKING:
     from evaluator.compare import Comparison
@@ -67,7 +67,7 @@ class Judgement:
         return any(item.id.startswith(RENDERS) for item in self.measurements)
 
     @property
-    def rows(self) -> tuple[IndexedTrial, ...]:
+    def rows(self) -> tuple[TrialRow, ...]:
         """All recorded trials, disagreements first."""
         return () if self.index is None else self.index.trials(Selection())
 
@@ -126,7 +126,7 @@ class Judgement:
         was, now = (None if side is None else measurement_of(side) for side in found)
         return was, now
 
-    def row(self, episode_id: str) -> IndexedTrial | None:
+    def row(self, episode_id: str) -> TrialRow | None:
         """Return the trial of one episode."""
         return None if self.index is None else self.index.trial(episode_id)
 
@@ -202,7 +202,7 @@ def _open(run: RunFolder, known: _Known) -> ReviewIndex | None:
 
 @lru_cache(maxsize=8)
 def _opened(source: Any, _stamp: str) -> ReviewIndex:
-    return ReviewIndex.open(source)
+    return ReviewIndex(source)
 
 
 def _state(run: RunFolder, known: _Known) -> RunState:

@@ -22,9 +22,9 @@ from evaluator.review_index import (
     FACETS,
     NO_RESULTS,
     IndexedFile,
-    IndexedTrial,
     Selection,
 )
+from evaluator.trial_row import TrialRow
 
 PAGE = 50
 """Trials on one screen."""
@@ -296,7 +296,7 @@ class Facet:
 class TrialList:
     """One screen of the trials of a selection."""
 
-    trials: tuple[IndexedTrial, ...]
+    trials: tuple[TrialRow, ...]
     selected: int
     """How many the selection holds."""
     of: int

@@ -69,7 +69,8 @@ def _to_plain(value: Any) -> Any:
     raise TypeError(type(value).__name__)
 
 
-_encode = msgspec.msgpack.Encoder(enc_hook=_to_plain).encode
+packed = msgspec.msgpack.Encoder(enc_hook=_to_plain).encode
+"""As msgpack; numbers of NumPy become plain ones."""
 
 
 def _digest(body: bytes) -> bytes:
@@ -79,16 +80,16 @@ def _digest(body: bytes) -> bytes:
 def write_rows(path: Path, rows: Rows) -> None:
     """Write summaries, whole or not at all; one that cannot be packed costs only its own place."""
     try:
-        body = _encode(rows)
+        body = packed(rows)
     except (TypeError, ValueError, OverflowError):
-        body = _encode({key: found for key, found in rows.items() if _fits(found)})
+        body = packed({key: found for key, found in rows.items() if _fits(found)})
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, _digest(body) + body)
 
 
 def _fits(found: tuple[Any, ...]) -> bool:
     try:
-        _encode(found)
+        packed(found)
     except (TypeError, ValueError, OverflowError):
         return False
     return True

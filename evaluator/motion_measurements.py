@@ -50,7 +50,7 @@ STATES = {
         f"state.{{by}}_to_{{against}}.{{task}}.{{condition}}.{name}_median_{unit}",
         unit,
         "lower",
-        "{quantity} after its last stage, {who} against {other}, in {where}: median over {count} episodes of each one's mean over its objects",
+        "{quantity} after its last stage, {who} against where it was localised, in {where}: median over {count} episodes of each one's mean over its objects",
     )
-    for name, unit in (("position", "m"), ("rotation", "rad"), ("extents", "m"))
+    for name, unit in (("position", "m"), ("rotation", "rad"))
 }

@@ -13,12 +13,14 @@ from statistics import median
 import numpy as np
 from jaxtyping import Float
 
+from bridge.episode import schema
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.streams import object_pose_topics, pose_track
+from bridge.episode.topics import TCP_POSE
+from bridge.errors import BridgeError
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.measure import Part, ends, interval_or_reason, measured, millimetres
-from evaluator.compare.trial import tcp_track
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Defined
 from evaluator.metrics.trajectory import MOVING_THRESHOLD_M, NORMALISED_SAMPLES, moving_part
@@ -307,7 +309,7 @@ def _runs(
     ]
     found += [(file.episode, _side_name(file.derived), file.derived) for file in _newest(files)]
     for episode, engine, derived in found:
-        track = tcp_track(episode)
+        track = _tcp_track(episode)
         if track is None or len(track) < 2:
             reason = "no end-effector poses (a topic ending with /tcp/pose)"
             left_out.append(Exclusion(episode=episode.info.id, scope="motions", reason=reason))
@@ -328,6 +330,17 @@ def _runs(
             )
         )
     return runs, left_out
+
+
+def _tcp_track(episode: Episode) -> PoseTrajectory | None:
+    """Return the tool centre point's poses, or None where they were not recorded."""
+    topics = [
+        topic for topic in episode.topics_of_type(schema.POSE_STAMPED) if topic.endswith(TCP_POSE)
+    ]
+    try:
+        return pose_track(episode, topics[0]) if topics else None
+    except BridgeError:
+        return None
 
 
 def _fitted_to(derived: Derived) -> frozenset[str]:

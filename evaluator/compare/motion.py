@@ -10,12 +10,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
 from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from bridge.clock import NS_PER_S
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
+from bridge.errors import GstError
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.measure import Part, average, degrees, measured, millimetres, milliseconds
 from evaluator.errors import UndefinedStatisticError
@@ -94,23 +97,49 @@ def summarise_motions(
 
 def compare_tracks(mine: Tracks, other: Tracks) -> MotionSummary:
     """Compare two motions on one clock, or over normalised time where there is none."""
-    mine = mine.cut()
+    aligned_by, mine, other = on_one_clock(mine, other)
     if mine.tool is None or other.tool is None:
-        raise UndefinedStatisticError(statistic="motion", reason="no tool poses on both sides")
-    aligned_by = "normalised"
-    if mine.started_ns is not None:
-        gap_ns = mine.started_ns - int(other.tool.stamps_ns[0])
-        aligned_by = "stamps" if abs(gap_ns) <= SAME_CLOCK_NS else "starts"
-        other = other if aligned_by == "stamps" else other.shifted(gap_ns)
-    else:
-        mine, other = _normalised(mine), _normalised(other.cut())
-    if mine.tool is None or other.tool is None:
-        raise UndefinedStatisticError(statistic="motion", reason="no tool poses on both sides")
+        raise _no_tool()
     errors = pose_errors(mine.tool, other.tool)
     summary = _summary(aligned_by, errors)
     if aligned_by != "normalised":
         summary = _without_lag(summary, mine.tool, other.tool, errors)
     return _with_joints(summary, mine.joints, other.joints)
+
+
+def _no_tool() -> UndefinedStatisticError:
+    return UndefinedStatisticError(statistic="motion", reason="no tool poses on both sides")
+
+
+def on_one_clock(mine: Tracks, other: Tracks) -> tuple[str, Tracks, Tracks]:
+    """Return by what two motions are aligned, and both on one clock, the first cut to its plan."""
+    mine = mine.cut()
+    if mine.tool is None or other.tool is None:
+        raise _no_tool()
+    if mine.started_ns is None:
+        return "normalised", _normalised(mine), _normalised(other.cut())
+    gap_ns = mine.started_ns - int(other.tool.stamps_ns[0])
+    if abs(gap_ns) <= SAME_CLOCK_NS:
+        return "stamps", mine, other
+    return "starts", mine, other.shifted(gap_ns)
+
+
+def distance_over_time(
+    recorded: Path, replay: Path, plan_id: str
+) -> tuple[Float[np.ndarray, " num_samples"], Float[np.ndarray, " num_samples"]] | None:
+    """Return seconds since the start of an execution, and how far the replayed tool was off [m].
+
+    None where the files do not allow it.
+    """
+    try:
+        mine, other = (read_tracks(Episode.open(path), plan_id) for path in (recorded, replay))
+        _, mine, other = on_one_clock(mine, other)
+        if mine.started_ns is None or mine.tool is None or other.tool is None:
+            return None
+        errors = pose_errors(mine.tool, other.tool)
+    except GstError:  # a file has gone or changed since it was listed, or they share no instant
+        return None
+    return (errors.stamps_ns - mine.started_ns) / NS_PER_S, errors.position_m
 
 
 def _normalised(tracks: Tracks) -> Tracks:

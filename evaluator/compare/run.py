@@ -268,9 +268,7 @@ def _marks(read: ReadRun) -> Iterator[bool | None]:
     yield from (each.facts.info.stand_in for each in read.contents.recorded)
     yield from (file.info.stand_in for file in read.contents.derived)
     recorded = {each.facts.info.id for each in read.contents.recorded}
-    yield from (
-        row.stand_in for row in read.rows if row.path is None and row.episode not in recorded
-    )
+    yield from (row.stand_in for row in read.rows if not row.file and row.episode not in recorded)
 
 
 def _provenance(reads: Sequence[ReadRun]) -> dict[str, Any]:

@@ -3,8 +3,7 @@
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
-from functools import cache
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,8 @@ from evaluator.report.page import grid
 from evaluator.report.wording import cell_text
 from evaluator.result import Measurement, Results, Table, load_results
 from evaluator.review_index import (
-    FACETS,
     NO_RESULTS,
     IndexedFile,
-    IndexedTrial,
     index_path,
     plain_record,
     severity,
@@ -103,7 +100,7 @@ def _write(
     regions = start_regions(rows)
     trials = sorted(
         (
-            _trial(row, off.get(row.episode, (None, None)), regions.get(row.episode, ""))
+            _reviewed(row, off.get(row.episode, (None, None)), regions.get(row.episode, ""))
             for row in rows
         ),
         key=severity,
@@ -116,12 +113,8 @@ def _write(
         "outdated": _outdated(stored.results, comparison),
         **_about(comparison, stored, has_trials=bool(rows)),
     }
-    slug_of = cache(slug)
-    content = written_index(
-        ((each, {name: slug_of(getattr(each, name)) for name in FACETS}) for each in trials),
-        _files(run, comparison, {trial.file for trial in trials}),
-        about,
-    )
+    files = _files(run, comparison, {trial.file for trial in trials})
+    content = written_index(trials, files, about)
     path = index_path(run)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -131,12 +124,10 @@ def _write(
     return content
 
 
-def _trial(row: TrialRow, off: tuple[float | None, float | None], region: str) -> IndexedTrial:
+def _reviewed(row: TrialRow, off: tuple[float | None, float | None], region: str) -> TrialRow:
     kind = failure_kind(row)
-    shared = {each.name for each in fields(IndexedTrial)} & vars(row).keys()
-    return IndexedTrial(
-        **{name: getattr(row, name) for name in shared},
-        file="" if row.path is None else row.path.name,
+    return replace(
+        row,
         failed_stage=first_failed_stage(row) if row.recorded is False else "",
         distance_m=off[0],
         lag_s=off[1],

@@ -24,7 +24,7 @@ from bridge.episode.metadata import (
 )
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.streams import events, verdicts
+from bridge.episode.streams import verdicts
 from bridge.errors import GstError
 from bridge.task.plan import SCHEMA_VERSION, Plan
 from bridge.task.record import parse_record
@@ -309,40 +309,11 @@ def _note_event(log: _Log, event: Mapping[str, Any]) -> None:
             log.label = build(Outcome, {**known, "stages": stages})
 
 
-@dataclass(frozen=True, kw_only=True)
-class FirstDivergence:
-    """Where planned, executed and recorded part first, as a replay found it."""
-
-    attribution: str
-    """tracking, perception, contact or predicate."""
-    quantity: str
-    between: str
-    body: str = ""
-    stage: str = ""
-    """The control step of that instant; empty before the first and after the last."""
-
-
-def first_divergence(episode: Episode) -> FirstDivergence | None:
-    """Read what a replay says of it; None where nothing parts, or nothing was compared."""
+def first_divergence(episode: Episode) -> str:
+    """Read what parts planned, executed and recorded first; empty where nothing does."""
     messages = list(episode.messages(episode.topics_of_type(schema.DIVERGENCE)))
     first = parse_record(messages[-1].data, name="divergence")["first"] if messages else None
-    if first is None:
-        return None
-    stage, started_ns = "", None
-    for event in events(episode):
-        if event["type"] == "execution_started":
-            started_ns = int(event["stamp_ns"])
-        if started_ns is None or event["stamp_ns"] > started_ns + first["first_t_ns"]:
-            continue
-        if event["type"] in ("stage_started", "stage_ended"):
-            stage = str(event["stage_id"]) if event["type"] == "stage_started" else ""
-    return FirstDivergence(
-        attribution=first["attribution"],
-        quantity=first["quantity"],
-        between=" and ".join(first["between"]),
-        body=first.get("body", ""),
-        stage=stage,
-    )
+    return "" if first is None else str(first["attribution"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -353,8 +324,8 @@ class DerivedFacts:
     derived: Derived
     verdict: VerdictSummary | None = None
     """Of a dynamic replay: the last verdict on the plan it replays."""
-    divergence: FirstDivergence | None = None
-    """Of a dynamic replay of what was executed."""
+    divergence: str = ""
+    """Of a dynamic replay of what was executed: what parts it first."""
     places: tuple[LocalisedPosition, ...] = ()
     """Of a localisation: where objects were found."""
     broken: str = ""
@@ -440,7 +411,7 @@ def read_derived(path: Path) -> DerivedFacts:
                 decided for _, decided in verdicts(episode) if decided.plan_id == derived.plan_id
             ]
             last = summarise_verdict(mine[-1]) if mine else None
-            first = first_divergence(episode) if derived.trajectory == "executed" else None
+            first = first_divergence(episode) if derived.trajectory == "executed" else ""
             return DerivedFacts(info=info, derived=derived, verdict=last, divergence=first)
         if derived.kind == "localised":
             topics = episode.topics_of_type(schema.LOCALISATION)
