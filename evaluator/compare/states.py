@@ -107,8 +107,8 @@ def summarise_states(
 
 def _read_sent(
     recorded: Episode, plan_id: str
-) -> tuple[Plan, int | None, list[Mapping[str, Any]]] | None:
-    """Find a plan in the recording, without its trajectory, when it ended, and all localisations."""
+) -> tuple[Plan, int | None, list[dict[str, Any]]] | None:
+    """Find a plan without its trajectory in the recording, when it ended, and localisations."""
     names = (schema.PLAN, schema.EVENT, schema.LOCALISATION)
     topics = [topic for name in names for topic in recorded.topics_of_type(name)]
     plan: Plan | None = None
