@@ -106,10 +106,6 @@ def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
     return JointErrors(names=names, stamps_ns=stamps, error_rad=wrapped)
 
 
-NORMALISED_SAMPLES = 101
-"""Samples from start to end for runs without a common clock."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class PoseErrors:
     """Distance between two poses at the same instants."""
@@ -178,28 +174,3 @@ def angles_rad(
     near = np.linalg.norm(q_first_wxyz - q_second_wxyz, axis=1)
     far = np.linalg.norm(q_first_wxyz + q_second_wxyz, axis=1)
     return np.asarray(4.0 * np.arctan2(np.minimum(near, far), np.maximum(near, far)))
-
-
-MOVING_THRESHOLD_M = 0.01
-"""A run waits while it is closer than this to where it started, or will stay."""
-
-
-def moving_part(run: PoseTrajectory, *, threshold_m: float = MOVING_THRESHOLD_M) -> PoseTrajectory:
-    """Cut the waiting at both ends: from leaving the start to staying at the end.
-
-    A run that never leaves its start is returned whole.
-
-    Args:
-        threshold_m: Distance from the start, or the end, up to which the body counts as waiting
-            [m].
-    """
-    away_from_start = np.linalg.norm(run.p_m - run.p_m[0], axis=1) > threshold_m
-    away_from_end = np.linalg.norm(run.p_m - run.p_m[-1], axis=1) > threshold_m
-    if not away_from_start.any() or not away_from_end.any():
-        return run
-    first = max(0, int(np.argmax(away_from_start)) - 1)
-    last = min(len(run) - 1, int(np.flatnonzero(away_from_end)[-1]) + 1)
-    if last <= first:
-        return run
-    keep = slice(first, last + 1)
-    return PoseTrajectory(run.stamps_ns[keep], run.p_m[keep], run.q_wxyz[keep])

@@ -95,7 +95,7 @@ def _write(
     off = {
         motion.episode: (motion.path_max_m, motion.lag_s)
         for motion in motions
-        if (motion.side, motion.against) == ("recorded", "planned")
+        if motion.against == "planned"
     }
     regions = start_regions(rows)
     trials = sorted(
