@@ -167,9 +167,9 @@ def _row(
         failing_bodies=() if failing is None else failing.failing_bodies,
         failing_stage=_stage_at(facts, None if failing is None else failing.failing_t_ns),
         stages=_stages(outcome),
-        planned_replay=replays["planned"].file.file_name if "planned" in replays else None,
+        planned_replay=replays["planned"].file_name if "planned" in replays else None,
         divergence=replays["executed"].facts.divergence if "executed" in replays else "",
-        executed_replay=replays["executed"].file.file_name if "executed" in replays else None,
+        executed_replay=replays["executed"].file_name if "executed" in replays else None,
         began_ns=facts.began_ns,
         start_positions_m=facts.start_positions_m | positions_at_start(places, facts.started_ns),
     )

@@ -1,10 +1,10 @@
 """How far apart two poses of one object are in rotation, modulo its symmetry."""
 
 from functools import cache
-from itertools import permutations, product
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
 from bridge.task.task_file import BASKET, ObjectModel
@@ -35,16 +35,9 @@ def turns_alike(model: ObjectModel) -> Float[np.ndarray, "num_turns 3 3"]:
 
 @cache
 def _box_turns() -> Float[np.ndarray, "24 3 3"]:
-    """Every rotation that lays the axes onto each other: the rotation group of the cube."""
-    turns = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            R = np.zeros((3, 3))
-            R[range(3), order] = signs
-            if np.linalg.det(R) > 0:
-                turns.append(R)
-    turns.sort(key=lambda R: -float(np.trace(R)))
-    return np.stack(turns)
+    """Every rotation that lays the axes onto each other, none first: the group of the cube."""
+    turns = Rotation.create_group("O").as_matrix().round()
+    return np.asarray(turns[np.argsort(-turns.trace(axis1=1, axis2=2), kind="stable")])
 
 
 def turn_between_rad(

@@ -61,41 +61,28 @@ def read_contents(
     run: RunFolder, cache: SummaryCache, output: Output, pool: ProcessPool | Serial = SERIAL
 ) -> RunContents:
     """Read what is new or has changed in a run; a broken file is left out and named."""
-    inventory = take_inventory(run, cache, output)
+    recorded, derived, left_out = take_inventory(run, cache, output)
     labels = _labels(run)
-    recorded, left_out = _read(
-        inventory.recorded,
+    means = _Means(cache=cache, output=output, pool=pool, left_out=left_out)
+    facts = _read(
+        recorded,
         RecordedFacts,
         lambda file: f"{file.name} {file.sha256} {labels.get(file.stem, '')}",
         partial(_recorded, run),
-        cache,
-        output,
-        pool,
+        means,
     )
-    derived, broken = _read(
-        inventory.derived,
-        DerivedFacts,
-        lambda file: f"{file.name} {file.sha256}",
-        _derived,
-        cache,
-        output,
-        pool,
-    )
+    made = _read(derived, DerivedFacts, lambda file: f"{file.name} {file.sha256}", _derived, means)
     found, doubled = _each_once(
-        [
-            RecordedFile(file=file, facts=recorded[file.name])
-            for file in inventory.recorded
-            if file.name in recorded
-        ]
+        [RecordedFile(file=file, facts=facts[file.name]) for file in recorded if file.name in facts]
     )
     return RunContents(
         recorded=tuple(found),
         derived=tuple(
-            DerivedFile(file=file, facts=derived[file.name])
-            for file in inventory.derived
-            if file.name in derived
+            DerivedFile(**vars(file), facts=made[file.name])
+            for file in derived
+            if file.name in made
         ),
-        left_out=(*inventory.left_out, *left_out, *doubled, *broken),
+        left_out=(*left_out, *doubled),
     )
 
 
@@ -154,38 +141,44 @@ def _derived(file: RunFile) -> DerivedFacts | Exclusion:
         return broken(file.path.name, error)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Means:
+    """What reading files takes, and the list of those that cannot be read."""
+
+    cache: SummaryCache
+    output: Output
+    pool: ProcessPool | Serial
+    left_out: list[Exclusion]
+
+
 def _read(
     files: Sequence[RunFile],
     kind: type[Facts],
     key: Callable[[RunFile], str],
     read: Callable[[RunFile], Facts | Exclusion],
-    cache: SummaryCache,
-    output: Output,
-    pool: ProcessPool | Serial,
-) -> tuple[dict[str, Facts], list[Exclusion]]:
-    """Return what the files say of themselves, by name, and the files left out."""
+    means: _Means,
+) -> dict[str, Facts]:
+    """Return what the files say of themselves, by name; a file that is left out is named."""
     facts: dict[str, Facts] = {}
     unknown: list[RunFile] = []
-    left_out: list[Exclusion] = []
     for file in files:
-        kept = cache.find(kind, key(file))
-        if kept:
+        if kept := means.cache.find(kind, key(file)):
             facts[file.name] = kept[0]
         else:
             unknown.append(file)
     if not unknown:
-        return facts, left_out
-    with output.progress("read episodes", len(unknown)) as advance:
-        all_made = zip(unknown, pool.map(read, unknown, each_s=READ_S), strict=True)
+        return facts
+    with means.output.progress("read episodes", len(unknown)) as advance:
+        all_made = zip(unknown, means.pool.map(read, unknown, each_s=READ_S), strict=True)
         for done, (file, made) in enumerate(all_made, start=1):
             if isinstance(made, Exclusion):
-                left_out.append(made)
+                means.left_out.append(made)
             else:
                 facts[file.name] = made
                 if not made.broken:  # a message names the folder, which may move
-                    cache.keep(kind, key(file), (made,))
+                    means.cache.keep(kind, key(file), (made,))
             advance(done, file.path.name)
-    return facts, left_out
+    return facts
 
 
 def broken(name: str, error: Exception, *, scope: str = "everything") -> Exclusion:

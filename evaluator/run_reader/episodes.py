@@ -333,26 +333,10 @@ class DerivedFacts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DerivedFile:
+class DerivedFile(RunFile):
     """One derived episode and what it was made from."""
 
-    file: RunFile
     facts: DerivedFacts
-
-    @property
-    def path(self) -> Path:
-        """Of its first part."""
-        return self.file.path
-
-    @property
-    def name(self) -> str:
-        """Relative to the run folder."""
-        return self.file.name
-
-    @property
-    def sha256(self) -> str:
-        """Of its bytes."""
-        return self.file.sha256
 
     @property
     def info(self) -> EpisodeInfo:

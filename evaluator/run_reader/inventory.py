@@ -7,7 +7,7 @@ that changed within the last two seconds is hashed again next time.
 
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,95 +61,58 @@ class FileHash:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inventory:
-    """Everything a run folder holds."""
+class _Unknown:
+    """A file whose hash is not known."""
 
-    recorded: tuple[RunFile, ...]
-    derived: tuple[RunFile, ...]
-    left_out: tuple[Exclusion, ...]
-    """Files that cannot be read at all."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Seen:
-    folder: Path
-    names: list[str]
-    """Of all parts."""
     name: str
-    is_derived: bool
-    stamp: str
-    """Empty where it cannot be relied on."""
-
-    @property
-    def path(self) -> Path:
-        return self.folder / self.names[0]
-
-    @property
-    def parts(self) -> list[Path]:
-        return [self.folder / name for name in self.names]
+    parts: tuple[Path, ...]
+    key: str
+    """What its hash is kept under; empty where its stamp cannot be relied on."""
 
 
-def take_inventory(run: RunFolder, cache: SummaryCache, output: Output) -> Inventory:
-    """Look at every file of a run, and hash those that are new or have changed."""
-    seen = list(_look(run))
-    hashes, left_out = _hash(seen, cache, output)
-    files: dict[bool, list[RunFile]] = {False: [], True: []}
-    for each in seen:
-        if each.name in hashes:
-            file = RunFile(folder=run.path, name=each.name, sha256=hashes[each.name])
-            files[each.is_derived].append(file)
-    return Inventory(
-        recorded=tuple(files[False]), derived=tuple(files[True]), left_out=tuple(left_out)
-    )
+def take_inventory(
+    run: RunFolder, cache: SummaryCache, output: Output
+) -> tuple[list[RunFile], list[RunFile], list[Exclusion]]:
+    """Look at every file of a run, and hash those that are new or have changed.
 
-
-def _look(run: RunFolder) -> Iterator[_Seen]:
+    Returns:
+        Recorded files, derived ones, and what cannot be read at all.
+    """
     now_ns = time.time_ns()
-    recorded, derived = run.episodes_dir, run.derived_dir
-    groups = [(recorded, parts) for parts in run.episode_parts().values()]
-    groups += [(derived, [path.name]) for path in run.derived()]
-    for folder, names in groups:
-        yield _Seen(
-            folder=folder,
-            names=names,
-            name=f"{folder.name}/{names[0]}",
-            is_derived=folder is derived,
-            stamp=stamp_of([os.path.join(folder, name) for name in names], now_ns),  # noqa: PTH118
-        )
-
-
-def _hash(
-    seen: Iterable[_Seen], cache: SummaryCache, output: Output
-) -> tuple[dict[str, str], list[Exclusion]]:
-    """Return the hashes by name, and what cannot be read."""
-    hashes, unknown = {}, []
-    for each in seen:
-        known = cache.find(FileHash, _key(each)) if each.stamp else None
-        if known:
-            hashes[each.name] = known[0].sha256
-        else:
-            unknown.append(each)
-    left_out = []
+    groups = [(run.episodes_dir, parts) for parts in run.episode_parts().values()]
+    groups += [(run.derived_dir, [path.name]) for path in run.derived()]
+    hashes: dict[str, str | Exception] = {}
+    unknown = []
+    for folder, parts in groups:
+        name = f"{folder.name}/{parts[0]}"
+        stamp = stamp_of([os.path.join(folder, part) for part in parts], now_ns)  # noqa: PTH118
+        key = f"{name} {stamp}" if stamp else ""
+        known = cache.find(FileHash, key) if key else None
+        hashes[name] = known[0].sha256 if known else ""
+        if not known:
+            unknown.append(_Unknown(name=name, parts=tuple(folder / p for p in parts), key=key))
     for each, found in _hashed(unknown, output):
-        if isinstance(found, str):
-            hashes[each.name] = found
-            if each.stamp:
-                cache.keep(FileHash, _key(each), (FileHash(sha256=found),))
-        else:
-            left_out.append(
-                Exclusion(episode=each.path.name, scope="everything", reason=str(found))
-            )
-    return hashes, left_out
+        hashes[each.name] = found
+        if each.key and isinstance(found, str):
+            cache.keep(FileHash, each.key, (FileHash(sha256=found),))
+    left_out = [
+        Exclusion(episode=Path(name).name, scope="everything", reason=str(error))
+        for name, error in hashes.items()
+        if isinstance(error, Exception)
+    ]
+    files = [
+        RunFile(folder=run.path, name=name, sha256=sha256)
+        for name, sha256 in hashes.items()
+        if isinstance(sha256, str)
+    ]
+    recorded = [file for file in files if file.name.startswith(f"{run.episodes_dir.name}/")]
+    return recorded, files[len(recorded) :], left_out
 
 
-def _key(seen: _Seen) -> str:
-    return f"{seen.name} {seen.stamp}"
-
-
-def _hashed(unknown: list[_Seen], output: Output) -> Iterator[tuple[_Seen, str | Exception]]:
+def _hashed(unknown: list[_Unknown], output: Output) -> Iterator[tuple[_Unknown, str | Exception]]:
     if not unknown:
         return
-    sizes = [sum(_size(part) for part in each.parts) for each in unknown]
+    sizes = [sum(map(_size, each.parts)) for each in unknown]
     workers = min(MOST_THREADS, os.cpu_count() or 1)
     done = 0
     with (
@@ -159,17 +122,17 @@ def _hashed(unknown: list[_Seen], output: Output) -> Iterator[tuple[_Seen, str |
         try:
             for each, size, found in zip(unknown, sizes, pool.map(_sha256, unknown), strict=True):
                 done += size
-                advance(done // MEGABYTE, each.path.name)
+                advance(done // MEGABYTE, each.parts[0].name)
                 yield each, found
         except BaseException:
             pool.shutdown(cancel_futures=True)  # gigabytes may be waiting
             raise
 
 
-def _sha256(seen: _Seen) -> str | Exception:
+def _sha256(unknown: _Unknown) -> str | Exception:
     try:
-        parts = seen.parts if len(seen.parts) == 1 else Episode.open(seen.path).parts
-        return hash_files(parts)
+        parts = unknown.parts
+        return hash_files(parts if len(parts) == 1 else Episode.open(parts[0]).parts)
     except (GstError, OSError) as error:
         return error
 
