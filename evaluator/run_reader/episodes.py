@@ -4,11 +4,12 @@ Only its metadata and its few messages about plans, events, verdicts and places 
 arm moved is left to ``motion``.
 """
 
-import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
@@ -257,30 +258,23 @@ def _read_log(episode: Episode) -> _Log:
     return log
 
 
+class _Outline(msgspec.Struct):
+    """A plan without its hundreds of waypoints, which take longer to check than all the rest."""
+
+    schema_version: int
+    id: str
+    stages: tuple[StageTime, ...] = ()
+
+
 def _plan_of(data: bytes) -> tuple[str, tuple[StageTime, ...]]:
-    """Read a plan's id and stages; checking hundreds of waypoints takes longer than the rest."""
+    """Read a plan's id and stages."""
     try:
-        record = json.loads(data)
-    except (ValueError, RecursionError):
-        record = None
-    if isinstance(record, dict) and record.get("schema_version") == SCHEMA_VERSION:
-        plan_id = record.get("id")
-        if isinstance(plan_id, str) and plan_id:
-            return plan_id, tuple(_stages(record.get("stages")))
-    plan = Plan.from_json(data)  # which says what is wrong
-    return plan.id, ()
-
-
-def _stages(records: object) -> Iterator[StageTime]:
-    for stage in records if isinstance(records, list) else ():
-        try:
-            yield StageTime(
-                id=str(stage["id"]),
-                t_start_ns=int(stage["t_start_ns"]),
-                t_end_ns=int(stage["t_end_ns"]),
-            )
-        except (KeyError, TypeError, ValueError):  # the replay says what is wrong with it
-            return
+        outline = msgspec.json.decode(data, type=_Outline)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        outline = None
+    if outline is not None and outline.schema_version == SCHEMA_VERSION and outline.id:
+        return outline.id, outline.stages
+    return Plan.from_json(data).id, ()  # which says what is wrong
 
 
 def _note_verdict(log: _Log, message: RawMessage) -> None:
