@@ -25,6 +25,8 @@ DECIDED_BY_A_LOOK = ("inside", "on", "moved", "shape")
 """Clauses that one localisation decides. Whether something still moves, it cannot say."""
 AWAY_M = 0.12
 """Fingers farther than this from an object's origin do not touch it."""
+TAIL_NS = 2 * NS_PER_S
+"""Read of a recording before all of it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,16 +124,15 @@ def _away(
 
 
 def _tool_m(recorded: Episode, seen_ns: int) -> Float[np.ndarray, "3"] | None:
-    """Where the tool was when the objects were seen; it is asked for near that time first."""
+    """Where the tool was when the objects were seen: at the end of the recording, most often."""
     topics = [t for t in recorded.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE)][:1]
-    for around_ns in (NS_PER_S, None):
-        bounds = (None, None) if around_ns is None else (seen_ns - around_ns, seen_ns + around_ns)
-        found = recorded.messages(topics, start_ns=bounds[0], end_ns=bounds[1])
+    for start_ns in (recorded.end_ns - TAIL_NS, None):
+        found = recorded.messages(topics, start_ns=start_ns)
         try:
             track = streams.pose_track_of([message.data for message in found])
         except MalformedMessageError:
             return None
-        if track is not None:
+        if track is not None and (start_ns is None or track.stamps_ns[0] <= seen_ns):
             return np.asarray(track.at(np.array([seen_ns])).p_m[0])
     return None
 

@@ -23,7 +23,7 @@ from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.task_file import Task
 from evaluator.compare.known_task import recorded_task
-from evaluator.compare.labels import AFTER
+from evaluator.compare.labels import AFTER, TAIL_NS
 from evaluator.compare.measure import (
     Part,
     degrees,
@@ -151,11 +151,15 @@ def _seen(
 def _settled(replay: Episode, wanted: Mapping[str, Any]) -> dict[str, Place]:
     """Return where a replay leaves each object, when all has settled."""
     topics = streams.object_pose_topics(replay)
+    named = [topics[name] for name in wanted if name in topics]
     last: dict[str, RawMessage] = {}
-    for message in replay.messages([topics[name] for name in wanted if name in topics]):
-        held = last.get(message.topic)
-        if held is None or message.publish_time_ns >= held.publish_time_ns:
-            last[message.topic] = message
+    for start_ns in (replay.end_ns - TAIL_NS, None):
+        for message in replay.messages(named, start_ns=start_ns):
+            held = last.get(message.topic)
+            if held is None or message.publish_time_ns >= held.publish_time_ns:
+                last[message.topic] = message
+        if len(last) == len(named):
+            break
     found: dict[str, Place] = {}
     for name in wanted:
         chosen = last.get(topics.get(name, ""))

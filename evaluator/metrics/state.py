@@ -4,7 +4,6 @@ from functools import cache
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
 from bridge.task.task_file import BASKET, ObjectModel
@@ -36,6 +35,8 @@ def turns_alike(model: ObjectModel) -> Float[np.ndarray, "num_turns 3 3"]:
 @cache
 def _box_turns() -> Float[np.ndarray, "24 3 3"]:
     """Every rotation that lays the axes onto each other, none first: the group of the cube."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  # takes half a second to load
+
     turns = Rotation.create_group("O").as_matrix().round()
     return np.asarray(turns[np.argsort(-turns.trace(axis1=1, axis2=2), kind="stable")])
 
