@@ -5,7 +5,7 @@ localised after the execution.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from statistics import median
@@ -20,7 +20,6 @@ from bridge.episode.reader import Episode, RawMessage
 from bridge.errors import BridgeError
 from bridge.geometry import se3
 from bridge.task.plan import Plan
-from bridge.task.record import parse_record
 from bridge.task.task_file import Task
 from evaluator.compare.known_task import recorded_task
 from evaluator.compare.labels import AFTER, TAIL_NS
@@ -77,15 +76,13 @@ def summarise_states(
 
     Nothing is found when the plan predicts no object.
     """
-    sent = _read_sent(recorded, plan_id)
-    if sent is None:
+    plan = _sent_plan(recorded, plan_id)
+    if plan is None:
         return ()
-    plan, ended_ns, records = sent
     info = recorded.info
     task = recorded_task(recorded) if task is None else task
     last = {name: pose for stage in plan.stages for name, pose in stage.predicted_objects.items()}
-    places = records if localised is None else streams.localisations(localised)
-    seen = _seen(places, plan_id, ended_ns)
+    seen = _seen(recorded, localised, plan_id)
     sides: dict[str, Mapping[str, Place]] = {
         PLAN: {name: se3.pose_from_record(pose) for name, pose in last.items()},
         **{side: _settled(replay, last) for side, replay in replays.items()},
@@ -105,36 +102,27 @@ def summarise_states(
     )
 
 
-def _read_sent(
-    recorded: Episode, plan_id: str
-) -> tuple[Plan, int | None, list[dict[str, Any]]] | None:
-    """Find a plan without its trajectory in the recording, when it ended, and localisations."""
-    names = (schema.PLAN, schema.EVENT, schema.LOCALISATION)
-    topics = [topic for name in names for topic in recorded.topics_of_type(name)]
-    plan: Plan | None = None
+def _sent_plan(recorded: Episode, plan_id: str) -> Plan | None:
+    """Find a plan in the recording, without its trajectory."""
     named = json.dumps(plan_id, ensure_ascii=False).encode()  # a plan takes long to parse
-    events, found = [], []
-    for message in recorded.messages(topics):
-        if message.type_name == schema.LOCALISATION:
-            found.append(parse_record(message.data, name="localisation"))
-        elif message.type_name == schema.EVENT:
-            if b"execution_" in message.data:
-                data = message.data
-                events.append(parse_record(data, name="event", package="bridge.episode"))
-        elif named in message.data:
-            candidate = Plan.outline_from_json(message.data)
-            plan = candidate if candidate.id == plan_id else plan
-    if plan is None:
-        return None
-    return plan, streams.execution_ns(events, plan_id)[1], found
+    for message in recorded.messages(recorded.topics_of_type(schema.PLAN)):
+        if named in message.data:
+            plan = Plan.outline_from_json(message.data)
+            if plan.id == plan_id:
+                return plan
+    return None
 
 
-def _seen(
-    records: Iterable[Mapping[str, Any]], plan_id: str, ended_ns: int | None
-) -> dict[str, Place]:
-    """Return where objects were localised after the execution, or that they were not found."""
+def _seen(recorded: Episode, localised: Episode | None, plan_id: str) -> dict[str, Place]:
+    """Return where objects were localised after the execution, or that they were not found.
+
+    By the twin, or else by the cell itself.
+    """
+    ended_ns: int | None = None
+    if localised is None:
+        ended_ns = streams.execution_ns(list(streams.events(recorded)), plan_id)[1]
     states: dict[str, Place] = {}
-    for record in records:
+    for record in streams.localisations(recorded if localised is None else localised):
         if "phase" in record:
             is_after = (record["phase"], record.get("plan_id")) == (AFTER, plan_id)
         else:
