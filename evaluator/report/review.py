@@ -155,7 +155,7 @@ def _about(comparison: Comparison | None, stored: _Stored, *, has_trials: bool) 
         "exclusions": [dict(vars(each)) for each in results.exclusions[:SHOWN_EXCLUSIONS]],
         "num_exclusions": len(results.exclusions),
         "missing": list(results.missing),
-        "summary": first.summary,
+        "summary": " ".join(first.sentences),
         "unseen": first.unseen,
         "notes": [list(note) for note in first.notes],
         "close_pp": CLOSE_PP,

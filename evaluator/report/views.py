@@ -128,13 +128,17 @@ def _number(
         unit, form = " pp", "+.1f"
     elif is_share or is_change:
         factor, unit, form = 100.0, " %", "+.1f" if is_change else ".1f"
-    known = [f"{factor * end:{form}}" for end in ends if _known(end)]
+    known = [_signed(f"{factor * end:{form}}") for end in ends if _known(end)]
     told = Figures(
-        f"{factor * value:{form}}{unit}",
+        _signed(f"{factor * value:{form}}") + unit,
         ", ".join(known),
         f"{count[0]}/{count[1]}" if count and _known(count[0]) else "",
     )
     return f"{told} (no n)" if count and not told.count else told
+
+
+def _signed(text: str) -> str:
+    return text if float(text) else text.lstrip("+-")
 
 
 def _known(value: Any) -> bool:
@@ -165,7 +169,7 @@ def _success(rows: Rows) -> Rows:
 
 def _layout(rows: Rows) -> Rows:
     def share(value: Any) -> Shown:
-        return Figures(f"{100 * value:.1f} %") if _known(value) else "undefined"
+        return Figures(f"{100 * value:.1f} %") if _known(value) else None
 
     rates = list(rows[0])[2:]
     return [row | {name: share(row[name]) for name in rates} for row in rows]

@@ -11,7 +11,7 @@ from evaluator.compare.spreadsheet import record_from_row
 from evaluator.errors import EvaluatorError
 from evaluator.report.figures import drawings_of
 from evaluator.report.page import name_shared, page
-from evaluator.report.ranked import FIGURES, shown_tables
+from evaluator.report.sections import FIGURES, shown_tables
 from evaluator.report.tables import as_csv, as_latex, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results

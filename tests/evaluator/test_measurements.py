@@ -10,8 +10,7 @@ import pytest
 from evaluator.compare import compare_csv, compare_run
 from evaluator.compare.measure import measured
 from evaluator.measurements import BIAS, REGISTRY, quantity_of
-from evaluator.report.sections import SECTIONS
-from evaluator.report.wording import HEADLINES
+from evaluator.report.sections import NAMES, SECTIONS, numbers_of
 from evaluator.result import Interval, Measurement
 from evaluator.thresholds import SHORT
 
@@ -65,10 +64,19 @@ def test_a_table_has_only_registered_measurements(name: str) -> None:
 
 
 def test_what_the_report_shows_is_registered() -> None:
-    named = [*SHORT.values(), *(name for name, _ in HEADLINES)]
-    named += [pattern for section in SECTIONS for pattern, _ in section.numbers]
+    named = [*SHORT.values(), *NAMES]
     unknown = [name for name in named if "*" not in name and quantity_of(name) is None]
     assert unknown == []
+
+
+def test_every_named_number_stands_in_one_part() -> None:
+    numbers = tuple(
+        Measurement(id=name, value=0.0, unit=quantity.unit, definition="d")
+        for name in NAMES
+        if (quantity := quantity_of(name)) is not None
+    )
+    placed = [m.id for section in SECTIONS for _, m in numbers_of(section, numbers)]
+    assert sorted(placed) == sorted(NAMES)
 
 
 def test_a_quantity_finds_its_own_ids() -> None:
