@@ -15,7 +15,7 @@ from evaluator.compare.baselines import with_rule
 from evaluator.compare.end_points import compare_imported
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.images.methods import compare_renders
-from evaluator.compare.images.scores import open_nets
+from evaluator.compare.images.scores import open_net
 from evaluator.compare.images.views import compare_views
 from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
@@ -54,9 +54,9 @@ def compare_run(
     cache = SummaryCache(None) if cache is None else cache
     read = read_run(RunFolder.open(run.path), cache, output)
     contents = read.contents
-    nets = open_nets(images.backbones)
-    views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
-    methods = compare_renders(images, contents.derived, contents.sources, nets=nets)
+    net = open_net(images.lpips_vgg)
+    views = compare_views(contents.derived, contents.sources, net=net, cache=cache)
+    methods = compare_renders(images, contents.derived, contents.sources, net=net)
     motions = _imported_motions(contents)
     base = compare_read([read], name=read.name, method=method)
     # Words of what is missing come first, then those of images and imported motions.

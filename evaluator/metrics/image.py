@@ -1,14 +1,14 @@
 """Two pictures of one view: how alike they are, by every metric, and depth beside it.
 
 LPIPS (Zhang et al. 2018, version 0.1) is the network's own, in ``lpips_torch``; no torch is loaded
-here. Papers on 3D Gaussian splatting feed VGG images in 0..1 and crop no border of SSIM; the
-definitions feed -1..1 and crop. Each number says which it is.
+here. Papers on 3D Gaussian splatting feed its VGG images in 0..1, where the definition has -1..1,
+and crop no border of SSIM. Each number says which it is.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -28,8 +28,6 @@ from bridge.media.image_quality import (
     ssim_maps,
 )
 from evaluator.errors import EvaluatorError, UndefinedStatisticError
-
-NetName = Literal["vgg", "alex"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,19 +89,10 @@ METRICS: dict[str, ImageMetric] = {
             higher_is_better=False,
             raw_only=True,
         ),
-        ImageMetric(
-            id="lpips_alex_pm1",
-            column="LPIPS (alex, -1..1)",
-            definition="LPIPS 0.1 (Zhang 2018), AlexNet, images scaled to -1..1 first (as LPIPS is "
-            "defined)",
-            higher_is_better=False,
-            raw_only=True,
-        ),
     )
 }
 """Every image metric by its id, in the order of a table's columns."""
-LPIPS_OF: dict[NetName, str] = {"vgg": "lpips_vgg_01", "alex": "lpips_alex_pm1"}
-"""The metric that each backbone gives."""
+LPIPS = "lpips_vgg_01"
 LPIPS_NOT_COMPUTED = (
     "not computed: no backbone (its weights are not shipped and nothing is downloaded)"
 )
@@ -112,10 +101,6 @@ LPIPS_NOT_COMPUTED = (
 @runtime_checkable
 class PerceptualNet(Protocol):
     """What scoring needs of a network; the one there is stands in ``lpips_torch``."""
-
-    @property
-    def name(self) -> NetName:
-        """Its backbone."""
 
     @property
     def weights(self) -> str:
@@ -154,7 +139,7 @@ def score_pair(
     ),
     *,
     masks: Mapping[str, Bool[np.ndarray, "height width"]] | None = None,
-    nets: Sequence[PerceptualNet] = (),
+    net: PerceptualNet | None = None,
 ) -> dict[str, ImageScore]:
     """Score one pair in every way, by variant: as stored, after a gain, and inside each mask.
 
@@ -176,13 +161,14 @@ def score_pair(
     for name, mask in (masks or {}).items():
         own = f"mask_{name}" if name in (RAW, GAIN) else name
         found[own] = _scored(recorded, replayed, maps, mask=mask)
-    values, reasons = dict(found[RAW].values), dict(found[RAW].reasons)
-    for net in nets:
+    if net is not None:
+        values, reasons = dict(found[RAW].values), dict(found[RAW].reasons)
         try:
-            values[LPIPS_OF[net.name]] = net.distance(recorded, replayed)
+            values[LPIPS] = net.distance(recorded, replayed)
         except UndefinedStatisticError as error:
-            reasons[LPIPS_OF[net.name]] = error.reason
-    return found | {RAW: ImageScore(values=values, reasons=reasons)}
+            reasons[LPIPS] = error.reason
+        found[RAW] = ImageScore(values=values, reasons=reasons)
+    return found
 
 
 def _ssim(

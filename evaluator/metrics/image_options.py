@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from bridge.errors import UsageError
 from bridge.terminal import RARE
@@ -22,18 +22,7 @@ class ImageOptions:
     split: Annotated[str, RARE] = UNSTATED
     """Which images were held out: "every 8th frame". A run says so itself."""
     lpips_vgg: Annotated[Path | None, RARE] = None
-    """State dict of torchvision's VGG16 (safetensors or torch); makes LPIPS with VGG."""
-    lpips_alex: Annotated[Path | None, RARE] = None
-    """State dict of torchvision's AlexNet (safetensors or torch); makes LPIPS with AlexNet."""
-
-    @property
-    def backbones(self) -> dict[Literal["vgg", "alex"], Path]:
-        """The backbones that were given."""
-        found: dict[Literal["vgg", "alex"], Path | None] = {
-            "vgg": self.lpips_vgg,
-            "alex": self.lpips_alex,
-        }
-        return {net: path for net, path in found.items() if path is not None}
+    """State dict of torchvision's VGG16 (safetensors or torch); makes LPIPS."""
 
     def origin(self) -> dict[str, Any]:
         """Say where the images are, for a page that shows them; nothing without renders."""

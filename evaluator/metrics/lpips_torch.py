@@ -7,7 +7,7 @@ checked, since a wrong network would give a number that looks right.
 
 import pickle
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,42 +22,15 @@ from torch.nn import functional
 from bridge.episode.provenance import hash_file
 from bridge.errors import MissingDependencyError, UsageError
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import NetName
 
-NET_WORDS: dict[NetName, str] = {"vgg": "VGG16", "alex": "AlexNet"}
-MIN_SIDE_PX = 32
-"""Shortest side that AlexNet's two poolings leave something of."""
-PUBLISHED: dict[NetName, str] = {"vgg": "397923af", "alex": "7be5be79"}
-"""How the SHA-256 of torchvision's published files begins; their names carry it."""
-HEADS = ("torchmetrics", "functional/image/lpips_models")
+MIN_SIDE_PX = 16
+"""Shortest side that VGG's four poolings leave something of."""
+PUBLISHED = "397923af"
+"""How the SHA-256 of torchvision's published file begins; its name carries it."""
+HEADS = ("torchmetrics", "functional/image/lpips_models/vgg.pth")
 """Package whose wheel holds the linear heads of version 0.1, and where in it."""
-
-_Layer = tuple[int, tuple[int, int, int, int], int, int, int, bool]
-"""Number in torchvision's ``features``; shape of the weight; stride; padding; size of the
-largest-value pooling before it, with stride 2, 0 for none; whether LPIPS compares what comes out.
-"""
-
-
-def _vgg16() -> Iterator[_Layer]:
-    index, channels = 0, 3
-    for stage, (width, depth) in enumerate(((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))):
-        for place in range(depth):
-            last = place == depth - 1
-            pool = 2 if stage > 0 and place == 0 else 0
-            yield index, (width, channels, 3, 3), 1, 1, pool, last
-            channels, index = width, index + (3 if last else 2)
-
-
-LAYERS: dict[NetName, tuple[_Layer, ...]] = {
-    "vgg": tuple(_vgg16()),
-    "alex": (
-        (0, (64, 3, 11, 11), 4, 2, 0, True),
-        (3, (192, 64, 5, 5), 1, 2, 3, True),
-        (6, (384, 192, 3, 3), 1, 1, 3, True),
-        (8, (256, 384, 3, 3), 1, 1, 0, True),
-        (10, (256, 256, 3, 3), 1, 1, 0, True),
-    ),
-}
+STAGES = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
+"""Channels and convolutions of VGG16 between poolings; LPIPS compares the last of each."""
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 """Mean and spread of ImageNet's channels for images in -1..1, as version 0.1 fixes them."""
@@ -68,11 +41,11 @@ SMALLEST_NORM = 1e-10
 class LpipsWeightsError(UsageError):
     """Weights cannot be used for LPIPS."""
 
-    def __init__(self, *, path: Path, found: str, net: NetName) -> None:
+    def __init__(self, *, path: Path, found: str) -> None:
         """Remember the file."""
         self.path = path
         super().__init__(
-            f"{path}: {found}. It must be the state dict of torchvision's {NET_WORDS[net]} "
+            f"{path}: {found}. It must be the state dict of torchvision's VGG16 "
             "(safetensors or torch.save); docs/metrics.md says where to get it."
         )
 
@@ -80,8 +53,8 @@ class LpipsWeightsError(UsageError):
 class _Weights:
     """A state dict whose tensors are checked when they are taken out."""
 
-    def __init__(self, net: NetName, path: Path) -> None:
-        self.net, self.path = net, path
+    def __init__(self, path: Path) -> None:
+        self.path = path
         if not path.is_file():
             raise self.refused("there is no such file")
         try:
@@ -94,7 +67,7 @@ class _Weights:
         self.state = state
 
     def refused(self, found: str) -> LpipsWeightsError:
-        return LpipsWeightsError(path=self.path, found=found, net=self.net)
+        return LpipsWeightsError(path=self.path, found=found)
 
     def tensor(self, key: str, shape: tuple[int, ...]) -> Tensor:
         tensor = self.state.get(key)
@@ -128,22 +101,21 @@ def _loaded(path: Path) -> Any:
         raise ValueError(message) from error
 
 
-def read_heads(net: NetName) -> tuple[list[Float[Tensor, "_channels 1 1"]], str]:
+def read_heads() -> tuple[list[Float[Tensor, "_channels 1 1"]], str]:
     """Read the linear heads out of an installed wheel, without importing it.
 
     Returns:
-        One weight for each channel of each tap, and where they came from, in words.
+        One weight for each channel of each stage, and where they came from, in words.
     """
-    package, folder = HEADS
+    package, file = HEADS
     spec = find_spec(package)
     for root in (spec.submodule_search_locations or ()) if spec is not None else ():
-        path = Path(root) / folder / f"{net}.pth"
+        path = Path(root) / file
         if path.is_file():
-            weights = _Weights(net, path)
-            taps = [shape[0] for _, shape, *_, tap in LAYERS[net] if tap]
+            weights = _Weights(path)
             heads = [
-                weights.tensor(f"lin{k}.model.1.weight", (1, channels, 1, 1))[0]
-                for k, channels in enumerate(taps)
+                weights.tensor(f"lin{stage}.model.1.weight", (1, channels, 1, 1))[0]
+                for stage, (channels, _) in enumerate(STAGES)
             ]
             return heads, f"{package} {metadata.version(package)}, {hash_file(path)[:16]}"
     raise MissingDependencyError(
@@ -152,30 +124,31 @@ def read_heads(net: NetName) -> tuple[list[Float[Tensor, "_channels 1 1"]], str]
 
 
 class LpipsNet:
-    """One backbone with its linear heads."""
+    """VGG16 with the linear heads."""
 
-    def __init__(self, name: NetName, path: Path) -> None:
+    def __init__(self, path: Path) -> None:
         """Load a backbone from a file, whose other weights are not looked at, and the heads.
 
         Raises:
             LpipsWeightsError: When the file is not there, not a state dict, or another network's.
         """
-        self.name = name
-        backbone = _Weights(name, path)
+        backbone = _Weights(path)
         prefix = "features." if "features.0.weight" in backbone.state else ""
-        self._layers = [
-            (
-                layer,
-                backbone.tensor(f"{prefix}{layer[0]}.weight", layer[1]),
-                backbone.tensor(f"{prefix}{layer[0]}.bias", layer[1][:1]),
-            )
-            for layer in LAYERS[name]
-        ]
-        self._heads, origin = read_heads(name)
+        self._stages: list[list[tuple[Tensor, Tensor]]] = []
+        index, channels = 0, 3
+        for width, depth in STAGES:
+            stage = []
+            for _ in range(depth):
+                weight = backbone.tensor(f"{prefix}{index}.weight", (width, channels, 3, 3))
+                stage.append((weight, backbone.tensor(f"{prefix}{index}.bias", (width,))))
+                channels, index = width, index + 2  # a ReLU has a number of its own
+            self._stages.append(stage)
+            index += 1  # and so has a pooling
+        self._heads, origin = read_heads()
         sha256 = hash_file(path)
         whose = (
             "torchvision's published file"
-            if sha256.startswith(PUBLISHED[name])
+            if sha256.startswith(PUBLISHED)
             else "not torchvision's published file, so its owner must vouch for it"
         )
         self.weights = f"backbone sha256 {sha256[:16]} ({whose}), heads of {origin}"
@@ -185,7 +158,7 @@ class LpipsNet:
         recorded: Float[np.ndarray, "height width 3"],
         replayed: Float[np.ndarray, "height width 3"],
     ) -> float:
-        """Return the distance of a pair in 0..1; AlexNet is given it in -1..1.
+        """Return the distance of a pair in 0..1, which is not scaled to -1..1.
 
         Range: 0 and up, 0 is identical, lower is better. Undefined when: a side is too short.
         """
@@ -194,16 +167,15 @@ class LpipsNet:
             raise UndefinedStatisticError(statistic="LPIPS", reason=reason)
         with torch.inference_mode():
             x = torch.from_numpy(np.stack([recorded, replayed]).astype(np.float32))
-            x = x.permute(0, 3, 1, 2).contiguous()
             shift, scale = (torch.tensor(values).view(1, 3, 1, 1) for values in (SHIFT, SCALE))
-            x = ((2.0 * x - 1.0 if self.name == "alex" else x) - shift) / scale
-            total, heads = 0.0, iter(self._heads)
-            for (_, _, stride, padding, pool, tap), weight, bias in self._layers:
-                if pool:
-                    x = functional.max_pool2d(x, pool, stride=2)
-                x = functional.relu(functional.conv2d(x, weight, bias, stride, padding))
-                if tap:
-                    total += _head_distance(x, next(heads))
+            x = (x.permute(0, 3, 1, 2).contiguous() - shift) / scale
+            total = 0.0
+            for number, (stage, head) in enumerate(zip(self._stages, self._heads, strict=True)):
+                if number:
+                    x = functional.max_pool2d(x, 2, stride=2)
+                for weight, bias in stage:
+                    x = functional.relu(functional.conv2d(x, weight, bias, padding=1))
+                total += _head_distance(x, head)
             return total
 
 

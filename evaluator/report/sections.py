@@ -34,7 +34,6 @@ HEADLINES: dict[str, str] = {
     "views.all.depth_mean_abs_m": "The same, mean error: edges count most",
     "views.all.lpips": "LPIPS of held-out views",
     "views.all.lpips_vgg_01": "LPIPS (VGG, images in 0..1) of held-out views",
-    "views.all.lpips_alex_pm1": "LPIPS (AlexNet, images in -1..1) of held-out views",
 }
 """What to read first, and what to call it."""
 NAMES: dict[str, str] = HEADLINES | {

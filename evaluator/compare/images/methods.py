@@ -18,7 +18,7 @@ from evaluator.compare.images.scores import (
     RENDERED,
     images_of,
     measure_images,
-    open_nets,
+    open_net,
     size_words,
     spread,
 )
@@ -48,8 +48,8 @@ def compare_folders(options: ImageOptions) -> Comparison:
     if options.reference is None or not options.renders:
         message = "images alone need --reference FOLDER and --renders METHOD=FOLDER."
         raise UsageError(message)
-    nets = open_nets(options.backbones)
-    part = compare_renders(options, (), {}, nets=nets)
+    net = open_net(options.lpips_vgg)
+    part = compare_renders(options, (), {}, net=net)
     return Comparison(
         run=options.reference.resolve().name,
         source="images",
@@ -58,7 +58,7 @@ def compare_folders(options: ImageOptions) -> Comparison:
         provenance={
             "software": software(),
             **options.origin(),
-            "weights": [net.weights for net in nets],
+            "weights": None if net is None else net.weights,
         },
     )
 
@@ -68,7 +68,7 @@ def compare_renders(
     files: Sequence[DerivedFile],
     sources: Mapping[str, Source],
     *,
-    nets: Sequence[PerceptualNet] = (),
+    net: PerceptualNet | None = None,
 ) -> Part:
     """Compare folders of renders with the twin's own on the held-out views of a run.
 
@@ -83,7 +83,7 @@ def compare_renders(
         return Part()
     if options.reference is not None:
         reference = folder_set(options.reference.resolve().name, options.reference)
-        return _compare(reference, _methods(options), options.split, nets)
+        return _compare(reference, _methods(options), options.split, net)
     found, _ = newest_views(files, sources)  # what is left out, compare_views says
     recorded, twin = _sets_of(found, sources)
     if not twin.load:
@@ -98,7 +98,7 @@ def compare_renders(
         replace(method, load={names.get(view, view): call for view, call in method.load.items()})
         for method in _methods(options, taken=(TWIN,))
     ]
-    return _compare(recorded, [twin, *others], split, nets)
+    return _compare(recorded, [twin, *others], split, net)
 
 
 def _methods(options: ImageOptions, *, taken: Sequence[str] = ()) -> list[ImageSet]:
@@ -162,12 +162,12 @@ class _View:
 
 
 def _compare(
-    reference: ImageSet, methods: Sequence[ImageSet], split: str, nets: Sequence[PerceptualNet]
+    reference: ImageSet, methods: Sequence[ImageSet], split: str, net: PerceptualNet | None
 ) -> Part:
     """Score every method on every view of the reference, and measure over those in common."""
     wanted = [view for view in sorted(reference.load) if any(view in m.load for m in methods)]
-    work = partial(_score_view, reference, methods, nets)
-    views = dict(zip(wanted, spread(work, wanted, threads=1 if nets else None), strict=True))
+    work = partial(_score_view, reference, methods, net)
+    views = dict(zip(wanted, spread(work, wanted, threads=1 if net else None), strict=True))
     left_out = [gone for method in methods for gone in _unpaired(reference, method)]
     left_out += [
         _gone(f"{method}: {view}" if method else view, reason)
@@ -194,15 +194,15 @@ def _compare(
     for method in scored:
         scores = [views[view].scores[method.name] for view in common]
         protocol = f"{sizes}; split {split}; {method.stored}"
-        found = measure_images(RENDERS, scores, protocol, nets=nets, method=method.name)
+        found = measure_images(RENDERS, scores, protocol, net=net, method=method.name)
         numbers += found
-        rows.append(_row(method.name, found, len(common), protocol, nets))
+        rows.append(_row(method.name, found, len(common), protocol, net))
     origin = ", ".join(f"{method.name} from {method.where}" for method in scored)
     note = f"{_NOTE} Images: {origin}; recorded: {reference.where}."
     title = "Rendering quality on the same views"
     missing = []
-    if not nets:
-        missing.append("LPIPS of renders: no backbone (--lpips-vgg FILE, --lpips-alex FILE)")
+    if net is None:
+        missing.append("LPIPS of renders: no backbone (--lpips-vgg FILE)")
     if split == UNSTATED:
         missing.append("split of renders: nobody said which images were held out (--split TEXT)")
     return Part(
@@ -218,13 +218,13 @@ def _row(
     found: Sequence[Measurement],
     num_views: int,
     protocol: str,
-    nets: Sequence[PerceptualNet],
+    net: PerceptualNet | None,
 ) -> dict[str, Cell]:
     """Lay one method out, by the metrics of papers, with the protocol of the row."""
     values = {each.id.rpartition(".")[2]: each.value for each in found}
     known = {name: round(value, 4) for name, value in values.items() if value is not None}
     undefined = {name: None if name in values else "not computed" for name in HEADLINE}
-    weights = "".join(f"; {net.name} weights {net.weights}" for net in nets)
+    weights = "" if net is None else f"; weights {net.weights}"
     stated = protocol.replace(f"split {UNSTATED}", f"{UNSTATED}: split")
     return {
         "method": method,
@@ -250,7 +250,7 @@ def _unpaired(reference: ImageSet, method: ImageSet) -> list[Exclusion]:
 
 
 def _score_view(
-    reference: ImageSet, methods: Sequence[ImageSet], nets: Sequence[PerceptualNet], view: str
+    reference: ImageSet, methods: Sequence[ImageSet], net: PerceptualNet | None, view: str
 ) -> _View:
     scores: dict[str, Mapping[str, ImageScore]] = {}
     reasons: dict[str, str] = {}
@@ -261,7 +261,7 @@ def _score_view(
     for method in methods:
         if view in method.load:
             try:
-                scores[method.name] = score_pair(recorded, method.load[view](), nets=nets)
+                scores[method.name] = score_pair(recorded, method.load[view](), net=net)
             except GstError as error:
                 reasons[method.name] = str(error)
     size = (recorded.shape[0], recorded.shape[1])

@@ -32,13 +32,12 @@ from evaluator.compare.measure import measured
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Quantity
 from evaluator.metrics.image import (
-    LPIPS_OF,
+    LPIPS,
     METRICS,
     RAW,
     DepthScore,
     ImageMetric,
     ImageScore,
-    NetName,
     PerceptualNet,
     score_depth,
     score_pair,
@@ -47,14 +46,14 @@ from evaluator.metrics.image import (
 from evaluator.result import Measurement
 
 
-def open_nets(backbones: Mapping[NetName, Path]) -> tuple[PerceptualNet, ...]:
-    """Load the networks of LPIPS that were asked for; without one, torch stays out."""
-    if not backbones:
-        return ()
+def open_net(backbone: Path | None) -> PerceptualNet | None:
+    """Load the network of LPIPS where it was asked for; without it, torch stays out."""
+    if backbone is None:
+        return None
     try:
         from evaluator.metrics.lpips_torch import LpipsNet  # noqa: PLC0415  # loads torch
 
-        return tuple(LpipsNet(net, path) for net, path in backbones.items())
+        return LpipsNet(backbone)
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
@@ -132,13 +131,13 @@ class Images:
         return {name: mask for name, mask in found.items() if mask.any()}
 
 
-def score_views(images: Images, *, nets: Sequence[PerceptualNet] = ()) -> tuple[ViewScore, ...]:
+def score_views(images: Images, *, net: PerceptualNet | None = None) -> tuple[ViewScore, ...]:
     """Score every rendered image of a views episode; what cannot be scored has its reason."""
     rendered = sorted(images.color[RENDERED])
     if not rendered:
         return (ViewScore(reason="no topic .../cam/<id>/rendered/image in it"),)
     # A network uses all cores and much memory by itself.
-    return tuple(spread(partial(_score, images, nets), rendered, threads=1 if nets else None))
+    return tuple(spread(partial(_score, images, net), rendered, threads=1 if net else None))
 
 
 def images_of(views: Episode, source: Episode | None) -> Images:
@@ -185,7 +184,7 @@ def _put_depth(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:
     into[camera_id, DepthImage.from_cdr(data).stamp_ns] = data
 
 
-def _score(images: Images, nets: Sequence[PerceptualNet], key: Key) -> ViewScore:
+def _score(images: Images, net: PerceptualNet | None, key: Key) -> ViewScore:
     where = f"camera {key[0]} at {key[1]} ns"
     rendered, recorded = images.color[RENDERED][key], images.color[RECORDED].get(key)
     if recorded is None:
@@ -193,7 +192,7 @@ def _score(images: Images, nets: Sequence[PerceptualNet], key: Key) -> ViewScore
     try:
         recorded_u8 = decode_color(recorded)
         scores = score_pair(
-            recorded_u8, decode_color(rendered), masks=images.masks_of(key), nets=nets
+            recorded_u8, decode_color(rendered), masks=images.masks_of(key), net=net
         )
         depth = _score_depth(images, key)
     except GstError as error:
@@ -239,7 +238,7 @@ def measure_images(
     scores: Sequence[Mapping[str, ImageScore]],
     protocol: str,
     *,
-    nets: Sequence[PerceptualNet] = (),
+    net: PerceptualNet | None = None,
     episodes: Sequence[str] = (),
     **part: str,
 ) -> list[Measurement]:
@@ -249,17 +248,16 @@ def measure_images(
         quantities: By the metric, and whether the images were compared as they are stored.
         protocol: What all numbers about these images have in common.
     """
-    weights = {LPIPS_OF[net.name]: f"; weights {net.weights}" for net in nets}
-    lpips = {name for name in LPIPS_OF.values() if name not in weights}
     variants = {variant: None for score in scores for variant in score} or {RAW: None}
     found = []
     for variant in variants:
         of_variant = [score[variant] for score in scores if variant in score]
         for metric in METRICS.values():
-            if metric.id in lpips or (metric.raw_only and variant != RAW):
+            if (metric.id == LPIPS and net is None) or (metric.raw_only and variant != RAW):
                 continue
-            parts = (variant_words(variant), protocol, _lacking(metric, of_variant))
-            words = "".join(f"; {part}" for part in parts if part) + weights.get(metric.id, "")
+            weights = f"weights {net.weights}" if net is not None and metric.id == LPIPS else ""
+            parts = (variant_words(variant), protocol, _lacking(metric, of_variant), weights)
+            words = "".join(f"; {part}" for part in parts if part)
             values = [s.values[metric.id] for s in of_variant if metric.id in s.values]
             found.append(
                 measured(

@@ -38,7 +38,7 @@ def compare_views(
     files: Sequence[DerivedFile],
     sources: Mapping[str, Source],
     *,
-    nets: Sequence[PerceptualNet] = (),
+    net: PerceptualNet | None = None,
     cache: SummaryCache | None = None,
 ) -> Part:
     """Compute every image metric of every rendered view, per image and mean."""
@@ -55,9 +55,9 @@ def compare_views(
         name, source = file.path.stem, file.derived.source_episode
         recorded = sources.get(source)
         sha256 = "-" if recorded is None else recorded[1]
-        key = " ".join([file.sha256, sha256, *(net.weights for net in nets)])
+        key = " ".join([file.sha256, sha256, *([net.weights] if net else ())])
         try:
-            scores = cache.kept_or_made(ViewScore, key, partial(_scored, file, recorded, nets))
+            scores = cache.kept_or_made(ViewScore, key, partial(_scored, file, recorded, net))
         except GstError as error:
             left_out.append(Exclusion(episode=file.path.name, scope="views", reason=str(error)))
             continue
@@ -70,16 +70,16 @@ def compare_views(
         tables.append(_table(f"views_{len(tables)}", f"Held-out views: {name}", found[source]))
     kept = [file for file in views if file.derived.source_episode in found]
     return Part(
-        measurements=tuple(_measure(found, [file.derived.settings for file in kept], nets)),
+        measurements=tuple(_measure(found, [file.derived.settings for file in kept], net)),
         tables=tuple(tables),
         exclusions=tuple(left_out),
     )
 
 
 def _scored(
-    file: DerivedFile, source: Source | None, nets: Sequence[PerceptualNet]
+    file: DerivedFile, source: Source | None, net: PerceptualNet | None
 ) -> tuple[ViewScore, ...]:
-    return score_views(images_of(file.episode, opened(source)), nets=nets)
+    return score_views(images_of(file.episode, opened(source)), net=net)
 
 
 def newest_views(
@@ -143,7 +143,7 @@ def _rounded(value: float | None, digits: int = 4) -> Cell:
 def _measure(
     found: Mapping[str, Sequence[ViewScore]],
     settings: Sequence[Mapping[str, Any]],
-    nets: Sequence[PerceptualNet],
+    net: PerceptualNet | None,
 ) -> list[Measurement]:
     """All numbers about the views, of all episodes together; the raw ones first."""
     views = [view for of_episode in found.values() for view in of_episode]
@@ -155,7 +155,7 @@ def _measure(
         VIEWS,
         [view.scores for view in views],
         "; ".join(filter(None, parts)),
-        nets=nets,
+        net=net,
         episodes=list(found),
         part="all",
     )
@@ -173,7 +173,7 @@ def _measure(
                 episodes=list(found),
             )
         )
-    if not nets:
+    if net is None:
         lacking = LPIPS_MISSING.of(part="all")
         measurements.append(
             Measurement(**vars(lacking), value=None, reason_if_undefined=LPIPS_NOT_COMPUTED)
