@@ -20,7 +20,6 @@ from evaluator.review_index import (
     Selection,
     UnusableIndexError,
     index_path,
-    measurement_of,
     stamp_of,
     state_of,
 )
@@ -113,18 +112,10 @@ class Judgement:
         found = self.about.get("stand_in")
         return found if isinstance(found, bool) else None
 
-    def outdated(self) -> tuple[Measurement | None, Measurement | None] | None:
-        """Return the first number that differs between ``results.json`` and the files of the run.
-
-        Returns:
-            The stored value and the present one; None on a side that does not have it. None when
-            all numbers are up to date.
-        """
+    def outdated(self) -> str | None:
+        """Say what of a trial is not as it was when the stored numbers were computed."""
         found = self.about.get("outdated")
-        if found is None:
-            return None
-        was, now = (None if side is None else measurement_of(side) for side in found)
-        return was, now
+        return found if isinstance(found, str) else None
 
     def row(self, episode_id: str) -> TrialRow | None:
         """Return the trial of one episode."""

@@ -128,7 +128,7 @@ class Results:
     """run, trials, rates or images."""
     stand_in: bool | None
     """None when the input does not say, as rates of the twin alone."""
-    measurements: tuple[Measurement, ...]
+    measurements: tuple[Measurement, ...] = ()
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     missing: tuple[str, ...] = ()

@@ -25,13 +25,14 @@ from evaluator.compare.measure import (
     ends,
     interval_or_reason,
     measured,
+    median_of,
     millimetres,
     milliseconds,
 )
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.trajectory import find_lag_s, position_errors
 from evaluator.motion_measurements import BODY_DISTANCES
-from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
+from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 from evaluator.statistics.intervals import median_interval
 
@@ -147,21 +148,13 @@ def body_measurements(
         values = [item.distance[name] for item in counted]
         found[name] = measured(
             quantity.of(task=task, engine=engine, body=body, what=words),
-            partial(_median, values),
+            partial(median_of, values, "median", "no recorded run is left to compare with"),
             n=len(values),
             counted="run",
             reason_without_interval=interval_or_reason(median_interval, values)[1],
             episodes=list(dict.fromkeys(episodes)),
         )
     return found
-
-
-def _median(values: Sequence[float]) -> tuple[float, Interval | None]:
-    if not values:
-        raise UndefinedStatisticError(
-            statistic="median", reason="no recorded run is left to compare with"
-        )
-    return float(median(values)), interval_or_reason(median_interval, values)[0]
 
 
 def compare_end_points(

@@ -19,7 +19,15 @@ from bridge.clock import NS_PER_S
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
 from bridge.errors import GstError
-from evaluator.compare.measure import Part, average, degrees, measured, millimetres, milliseconds
+from evaluator.compare.measure import (
+    Part,
+    average,
+    degrees,
+    mean_of,
+    measured,
+    millimetres,
+    milliseconds,
+)
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.trajectory import find_lag_s, joint_errors, pose_errors, position_errors
 from evaluator.motion_measurements import MOTIONS
@@ -228,7 +236,12 @@ def _measure(name: str, motions: Sequence[MotionSummary]) -> list[Measurement]:
         measurements.append(
             measured(
                 quantity.of(against=name, meaning=MEANING[name], how=" or ".join(how) or "stamps"),
-                partial(_mean, known, name),
+                partial(
+                    mean_of,
+                    known,
+                    "motion error",
+                    f"no trial knows it of {MEANING[name].split(' (')[0]}",
+                ),
                 n=len(known),
                 counted="trial",
                 reason_without_interval=SHARED,
@@ -236,11 +249,3 @@ def _measure(name: str, motions: Sequence[MotionSummary]) -> list[Measurement]:
             )
         )
     return measurements
-
-
-def _mean(values: Sequence[float], name: str) -> float:
-    if not values:
-        raise UndefinedStatisticError(
-            statistic="motion error", reason=f"no trial knows it of {MEANING[name].split(' (')[0]}"
-        )
-    return float(np.mean(values))

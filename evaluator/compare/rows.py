@@ -1,12 +1,11 @@
 """What a comparison is made of: one row per recorded trial, with what the twin said of it."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from fractions import Fraction
-from typing import Any
 
 from evaluator.compare.motion import MotionSummary
-from evaluator.result import Exclusion, Measurement, Results, Table
+from evaluator.result import Measurement, Results
 from evaluator.trial_row import RECORDED_WORDS
 from evaluator.trial_row import TrialRow as TrialRow
 
@@ -69,23 +68,13 @@ class RateGroup:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Comparison(Results):
     """Everything ``compare_run`` found; the reports and the dashboard only show it."""
 
-    run: str
-    source: str
-    """run, trials, rates or images."""
-    stand_in: bool | None
     rows: tuple[TrialRow, ...] = ()
     groups: tuple[RateGroup, ...] = ()
-    measurements: tuple[Measurement, ...] = ()
-    tables: tuple[Table, ...] = ()
-    exclusions: tuple[Exclusion, ...] = ()
-    missing: tuple[str, ...] = ()
     motions: tuple[MotionSummary, ...] = ()
     """How far each motion lies from its replays, with its course."""
-    provenance: dict[str, Any] = field(default_factory=dict)
-    """Software, settings, and the content hash of every input file."""
 
     @property
     def recorded_word(self) -> str:
@@ -94,13 +83,4 @@ class Comparison:
 
     def results(self) -> Results:
         """Return what goes into ``results.json``."""
-        return Results(
-            run=self.run,
-            source=self.source,
-            stand_in=self.stand_in,
-            measurements=self.measurements,
-            tables=self.tables,
-            exclusions=self.exclusions,
-            missing=self.missing,
-            provenance=self.provenance,
-        )
+        return Results(**{part.name: getattr(self, part.name) for part in fields(Results)})

@@ -8,7 +8,6 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -29,12 +28,12 @@ from evaluator.compare.measure import (
     ends,
     interval_or_reason,
     measured,
+    median_of,
     millimetres,
 )
-from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.state import turn_between_rad, turns_alike
 from evaluator.motion_measurements import STATES
-from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
+from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.statistics.intervals import cluster_means, median_interval
 
 PLAN, RECORDED = "plan", "recorded"
@@ -42,7 +41,7 @@ PREDICTED_BY = (PLAN, "planned", "executed")
 """Who predicts: the planner, or a dynamic replay of the planned or the executed motion."""
 NOT_LOCALISED = "it was not localised after the execution"
 
-Place = Float[np.ndarray, "4 4"] | str
+Pose = Float[np.ndarray, "4 4"] | str
 """Pose of an object in the robot's base, or why it is not known."""
 
 
@@ -83,7 +82,7 @@ def summarise_states(
     task = recorded_task(recorded) if task is None else task
     last = {name: pose for stage in plan.stages for name, pose in stage.predicted_objects.items()}
     seen = _seen(recorded, localised, plan_id)
-    sides: dict[str, Mapping[str, Place]] = {
+    sides: dict[str, Mapping[str, Pose]] = {
         PLAN: {name: se3.pose_from_record(pose) for name, pose in last.items()},
         **{side: _settled(replay, last) for side, replay in replays.items()},
     }
@@ -113,7 +112,7 @@ def _sent_plan(recorded: Episode, plan_id: str) -> Plan | None:
     return None
 
 
-def _seen(recorded: Episode, localised: Episode | None, plan_id: str) -> dict[str, Place]:
+def _seen(recorded: Episode, localised: Episode | None, plan_id: str) -> dict[str, Pose]:
     """Return where objects were localised after the execution, or that they were not found.
 
     By the twin, or else by the cell itself.
@@ -121,7 +120,7 @@ def _seen(recorded: Episode, localised: Episode | None, plan_id: str) -> dict[st
     ended_ns: int | None = None
     if localised is None:
         ended_ns = streams.execution_ns(list(streams.events(recorded)), plan_id)[1]
-    states: dict[str, Place] = {}
+    states: dict[str, Pose] = {}
     for record in streams.localisations(recorded if localised is None else localised):
         if "phase" in record:
             is_after = (record["phase"], record.get("plan_id")) == (AFTER, plan_id)
@@ -136,7 +135,7 @@ def _seen(recorded: Episode, localised: Episode | None, plan_id: str) -> dict[st
     return states
 
 
-def _settled(replay: Episode, wanted: Mapping[str, Any]) -> dict[str, Place]:
+def _settled(replay: Episode, wanted: Mapping[str, Any]) -> dict[str, Pose]:
     """Return where a replay leaves each object, when all has settled."""
     topics = streams.object_pose_topics(replay)
     named = [topics[name] for name in wanted if name in topics]
@@ -148,7 +147,7 @@ def _settled(replay: Episode, wanted: Mapping[str, Any]) -> dict[str, Place]:
                 last[message.topic] = message
         if len(last) == len(named):
             break
-    found: dict[str, Place] = {}
+    found: dict[str, Pose] = {}
     for name in wanted:
         chosen = last.get(topics.get(name, ""))
         if chosen is None:
@@ -162,7 +161,7 @@ def _settled(replay: Episode, wanted: Mapping[str, Any]) -> dict[str, Place]:
     return found
 
 
-def _difference(first: Place, second: Place, task: Task | None, name: str) -> dict[str, Any]:
+def _difference(first: Pose, second: Pose, task: Task | None, name: str) -> dict[str, Any]:
     """Return position and rotation, as far as both sides know them, or why not."""
     if isinstance(first, str) or isinstance(second, str):
         return {"reason": first if isinstance(first, str) else second}
@@ -272,7 +271,7 @@ def _measure(states: Sequence[StateSummary]) -> list[Measurement]:
                     where=f"{task}, {condition.replace('_', ' ')}",
                     count=len(of_episode),
                 ),
-                partial(_median, of_episode, why),
+                partial(median_of, of_episode, "final state", why),
                 n=len(pairs),
                 counted="object",
                 episodes=list(dict.fromkeys(episode for _, episode in pairs)),
@@ -280,9 +279,3 @@ def _measure(states: Sequence[StateSummary]) -> list[Measurement]:
             )
         )
     return found
-
-
-def _median(values: Sequence[float], why_none: str) -> tuple[float, Interval | None]:
-    if not values:
-        raise UndefinedStatisticError(statistic="final state", reason=why_none)
-    return float(median(values)), interval_or_reason(median_interval, values)[0]

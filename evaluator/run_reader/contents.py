@@ -9,7 +9,6 @@ from typing import TypeVar
 from bridge.episode.assigned import TRIAL_SUFFIX
 from bridge.episode.catalogue_query import LABEL_SUFFIX
 from bridge.episode.provenance import hash_file
-from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.process_pool import SERIAL, ProcessPool, Serial
@@ -68,10 +67,16 @@ def read_contents(
         recorded,
         RecordedFacts,
         lambda file: f"{file.name} {file.sha256} {labels.get(file.stem, '')}",
-        partial(_recorded, run),
+        partial(_tried, partial(read_recorded, run)),
         means,
     )
-    made = _read(derived, DerivedFacts, lambda file: f"{file.name} {file.sha256}", _derived, means)
+    made = _read(
+        derived,
+        DerivedFacts,
+        lambda file: f"{file.name} {file.sha256}",
+        partial(_tried, read_derived),
+        means,
+    )
     found, doubled = _each_once(
         [RecordedFile(file=file, facts=facts[file.name]) for file in recorded if file.name in facts]
     )
@@ -127,16 +132,9 @@ def _labels(run: RunFolder) -> dict[str, str]:
     return found
 
 
-def _recorded(run: RunFolder, file: RunFile) -> RecordedFacts | Exclusion:
+def _tried(read: Callable[[Path], Facts], file: RunFile) -> Facts | Exclusion:
     try:
-        return read_recorded(run, Episode.open(file.path))
-    except ODD as error:
-        return broken(file.path.name, error)
-
-
-def _derived(file: RunFile) -> DerivedFacts | Exclusion:
-    try:
-        return read_derived(file.path)
+        return read(file.path)
     except ODD as error:
         return broken(file.path.name, error)
 

@@ -163,12 +163,13 @@ class _Log:
     localised: list[bytes] = field(default_factory=list)
 
 
-def read_recorded(run: RunFolder, episode: Episode) -> RecordedFacts:
+def read_recorded(run: RunFolder, path: Path) -> RecordedFacts:
     """Sum up a recorded episode; of one that is no trial, only who and what.
 
     Raises:
         EpisodeError: When its metadata was written by another program and cannot be read.
     """
+    episode = Episode.open(path)
     info, outcome = episode.info, episode.outcome
     if info.kind == RETRY:
         return RecordedFacts(info=info, outcome=outcome_of(run, episode))

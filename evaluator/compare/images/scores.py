@@ -28,7 +28,7 @@ from bridge.episode.topics import (
 )
 from bridge.errors import GstError, MissingDependencyError
 from bridge.media.color import JPEG_MAGIC, decode_color
-from evaluator.compare.measure import measured
+from evaluator.compare.measure import mean_of, measured
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Quantity
 from evaluator.metrics.image import (
@@ -264,7 +264,7 @@ def measure_images(
                     quantities[metric.id, variant == RAW].of(
                         variant=variant, protocol=words, **part
                     ),
-                    partial(_mean, metric, values, of_variant),
+                    partial(mean_of, values, metric.column, _first_reason(metric, of_variant)),
                     n=len(values),
                     counted="image",
                     reason_without_interval=NOT_A_SAMPLE,
@@ -274,18 +274,15 @@ def measure_images(
     return found
 
 
-def _mean(metric: ImageMetric, values: Sequence[float], scores: Sequence[ImageScore]) -> float:
-    if not values:
-        reasons = (score.reasons[metric.id] for score in scores if metric.id in score.reasons)
-        reason = next(reasons, "no pair of images has it")
-        raise UndefinedStatisticError(statistic=metric.column, reason=reason)
-    return float(np.mean(values))
+def _first_reason(metric: ImageMetric, scores: Sequence[ImageScore]) -> str:
+    found = (score.reasons[metric.id] for score in scores if metric.id in score.reasons)
+    return next(found, "no pair of images has it")
 
 
 def _lacking(metric: ImageMetric, scores: Sequence[ImageScore]) -> str:
     """Count the images that the mean leaves out, with the first reason."""
-    without = [score for score in scores if metric.id in score.reasons]
-    if not without or len(without) == len(scores):
+    without = sum(metric.id in score.reasons for score in scores)
+    if not 0 < without < len(scores):
         return ""
-    reason = without[0].reasons[metric.id]
-    return f"not in the mean: {len(without)} of {len(scores)} images ({reason})"
+    reason = _first_reason(metric, scores)
+    return f"not in the mean: {without} of {len(scores)} images ({reason})"

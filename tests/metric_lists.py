@@ -1,4 +1,4 @@
-"""Write the lists of ``docs/metrics.md`` from the registry: ``python docs/metric_lists.py``."""
+"""Write the lists of ``docs/metrics.md`` from the registry: ``python tests/metric_lists.py``."""
 
 import math
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 from evaluator.measurements import REGISTRY
 from evaluator.quantity import RANGES, Quantity
 
-PAGE = Path(__file__).with_name("metrics.md")
+PAGE = Path(__file__).parents[1] / "docs" / "metrics.md"
 
 
 def range_text(quantity: Quantity) -> str:
