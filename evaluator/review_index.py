@@ -111,7 +111,11 @@ class _Selected:
 
     def takes(self, trial: TrialRow) -> bool:
         """Say whether a trial is selected."""
-        return self.takes_group(*(_slug(getattr(trial, name)) for name in FACETS))
+        return all(
+            _slug(getattr(trial, name)) == wanted
+            for name in FACETS
+            if (wanted := getattr(self, name))
+        )
 
     def ordered(self, trials: Sequence[TrialRow]) -> list[TrialRow]:
         """Return trials in the order asked for."""
@@ -145,7 +149,7 @@ class Selection(_Selected):
         """Say whether a trial is selected."""
         if not super().takes(trial):
             return False
-        if self.show and not (self.show in _SHOW and _SHOW[self.show](trial)):
+        if self.show and (self.show not in _SHOW or not _SHOW[self.show](trial)):
             return False
         if (self.clause or self.cause) and trial.twin is not False:
             return False

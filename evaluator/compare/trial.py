@@ -15,9 +15,9 @@ from evaluator.run_reader.episodes import (
     DerivedIndex,
     RecordedFacts,
     Replay,
+    RunFile,
     positions_at_start,
 )
-from evaluator.run_reader.inventory import RunFile
 
 TRAJECTORIES = ("planned", "executed")
 CELLS_ENGINE = "cell's own engine"

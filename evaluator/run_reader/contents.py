@@ -1,14 +1,23 @@
-"""What all episodes of a run say of themselves, each read once and then kept."""
+"""What all episodes of a run say of themselves, each read once and then kept.
 
-from collections.abc import Callable, Sequence
+A file is its bytes, and the SHA-256 of them is what everything else goes by. A file whose size,
+both times and inode are those of the last evaluation is taken to hold the bytes it held then; one
+that changed within the last two seconds is hashed again next time.
+"""
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from bridge.episode.assigned import TRIAL_SUFFIX
-from bridge.episode.catalogue_query import LABEL_SUFFIX
-from bridge.episode.provenance import hash_file
+from bridge.episode.catalogue_query import LABEL_SUFFIX, stamp_of
+from bridge.episode.provenance import hash_file, hash_files
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.process_pool import SERIAL, ProcessPool, Serial
@@ -19,14 +28,17 @@ from evaluator.run_reader.episodes import (
     DerivedFacts,
     DerivedFile,
     RecordedFacts,
+    RunFile,
     read_derived,
     read_recorded,
 )
-from evaluator.run_reader.inventory import RunFile, take_inventory
 
 ODD = (GstError, OSError, TypeError, ValueError, KeyError, RecursionError)
 """What one file of another program, or a failing disk, may raise; it costs that file only."""
 
+MOST_THREADS = 4
+"""Hashing waits for the disk or runs outside Python's lock."""
+MEGABYTE = 1_000_000
 READ_S = 0.0015
 """About what reading one file takes [s]."""
 
@@ -60,7 +72,7 @@ def read_contents(
     run: RunFolder, cache: SummaryCache, output: Output, pool: ProcessPool | Serial = SERIAL
 ) -> RunContents:
     """Read what is new or has changed in a run; a broken file is left out and named."""
-    recorded, derived, left_out = take_inventory(run, cache, output)
+    recorded, derived, left_out = _take_inventory(run, cache, output)
     labels = _labels(run)
     means = _Means(cache=cache, output=output, pool=pool, left_out=left_out)
     facts = _read(
@@ -89,6 +101,97 @@ def read_contents(
         ),
         left_out=(*left_out, *doubled),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileHash:
+    """What a file's bytes were when it had a certain size, times and inode."""
+
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Unknown:
+    """A file whose hash is not known."""
+
+    name: str
+    parts: tuple[Path, ...]
+    key: str
+    """What its hash is kept under; empty where its stamp cannot be relied on."""
+
+
+def _take_inventory(
+    run: RunFolder, cache: SummaryCache, output: Output
+) -> tuple[list[RunFile], list[RunFile], list[Exclusion]]:
+    """Look at every file of a run, and hash those that are new or have changed.
+
+    Returns:
+        Recorded files, derived ones, and what cannot be read at all.
+    """
+    now_ns = time.time_ns()
+    groups = [(run.episodes_dir, parts) for parts in run.episode_parts().values()]
+    groups += [(run.derived_dir, [path.name]) for path in run.derived()]
+    hashes: dict[str, str | Exception] = {}
+    unknown = []
+    for folder, parts in groups:
+        name = f"{folder.name}/{parts[0]}"
+        stamp = stamp_of([os.path.join(folder, part) for part in parts], now_ns)  # noqa: PTH118
+        key = f"{name} {stamp}" if stamp else ""
+        known = cache.find(FileHash, key) if key else None
+        hashes[name] = known[0].sha256 if known else ""
+        if not known:
+            unknown.append(_Unknown(name=name, parts=tuple(folder / p for p in parts), key=key))
+    for each, found in _hashed(unknown, output):
+        hashes[each.name] = found
+        if each.key and isinstance(found, str):
+            cache.keep(FileHash, each.key, (FileHash(sha256=found),))
+    left_out = [
+        Exclusion(episode=Path(name).name, scope="everything", reason=str(error))
+        for name, error in hashes.items()
+        if isinstance(error, Exception)
+    ]
+    files = [
+        RunFile(folder=run.path, name=name, sha256=sha256)
+        for name, sha256 in hashes.items()
+        if isinstance(sha256, str)
+    ]
+    recorded = [file for file in files if file.name.startswith(f"{run.episodes_dir.name}/")]
+    return recorded, files[len(recorded) :], left_out
+
+
+def _hashed(unknown: list[_Unknown], output: Output) -> Iterator[tuple[_Unknown, str | Exception]]:
+    if not unknown:
+        return
+    sizes = [sum(map(_size, each.parts)) for each in unknown]
+    workers = min(MOST_THREADS, os.cpu_count() or 1)
+    done = 0
+    with (
+        output.progress("hash files (MB)", -(-sum(sizes) // MEGABYTE)) as advance,
+        ThreadPoolExecutor(workers) as pool,
+    ):
+        try:
+            for each, size, found in zip(unknown, sizes, pool.map(_sha256, unknown), strict=True):
+                done += size
+                advance(done // MEGABYTE, each.parts[0].name)
+                yield each, found
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # gigabytes may be waiting
+            raise
+
+
+def _sha256(unknown: _Unknown) -> str | Exception:
+    try:
+        parts = unknown.parts
+        return hash_files(parts if len(parts) == 1 else Episode.open(parts[0]).parts)
+    except (GstError, OSError) as error:
+        return error
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
 
 
 def _each_once(files: Sequence[RecordedFile]) -> tuple[list[RecordedFile], list[Exclusion]]:

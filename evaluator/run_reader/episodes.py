@@ -31,7 +31,33 @@ from bridge.task.plan import SCHEMA_VERSION, Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import STAND_IN_ENGINE, Verdict
 from evaluator.errors import EvaluatorError
-from evaluator.run_reader.inventory import RunFile
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFile:
+    """One episode of a run, recorded or derived, as it lies on the disk."""
+
+    folder: Path
+    """That ``name`` is relative to: the run's."""
+    name: str
+    """Of its first part, with forward slashes."""
+    sha256: str
+    """Of the bytes of all parts, one after the other."""
+
+    @property
+    def path(self) -> Path:
+        """Its first part; made when asked for, most files of a large run are not opened again."""
+        return self.folder / self.name
+
+    @property
+    def file_name(self) -> str:
+        """The name of the file without folder."""
+        return self.name.rpartition("/")[2]
+
+    @property
+    def stem(self) -> str:
+        """The name of the file without folder and ending."""
+        return self.file_name.rpartition(".")[0]
 
 
 @dataclass(frozen=True, kw_only=True)
