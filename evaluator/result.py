@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +17,8 @@ from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
 from evaluator.errors import EvaluatorError
 
-
-class Unit(StrEnum):
-    """SI units and the few dimensionless ones that measurements carry."""
-
-    METRE = "m"
-    RADIAN = "rad"
-    SECOND = "s"
-    NANOSECOND = "ns"
-    DECIBEL = "dB"
-    FRACTION = "1"
-    COUNT = "count"
-    PERCENTAGE_POINT = "pp"
-
-
+UNITS = ("m", "rad", "s", "ns", "dB", "1", "count", "pp")
+"""SI units and the few dimensionless ones that measurements carry."""
 SCHEMA_VERSION = 2
 
 Cell = str | int | float | bool | None
@@ -76,7 +63,9 @@ class Measurement:
 
     def __post_init__(self) -> None:
         """Refuse NaN, infinity, unknown units, and undefined values without a reason."""
-        Unit(self.unit)
+        if self.unit not in UNITS:
+            message = f"{self.unit!r} is not a unit of a measurement: {', '.join(UNITS)}"
+            raise ValueError(message)
         if self.value is not None and not math.isfinite(self.value):
             message = f"measurement {self.id} is {self.value}; say it is undefined and why"
             raise ValueError(message)
@@ -229,11 +218,7 @@ def write_results(results: Results, path: Path) -> Path:
 
 
 def load_results(path: Path) -> Results:
-    """Read ``results.json``, or the one of a run folder.
-
-    Raises:
-        InvalidRecordError: When it does not fit the schema, or is newer than this reader.
-    """
+    """Read ``results.json``, or the one of a run folder; what does not fit is refused."""
     if path.is_dir():
         path = path / "results" / "results.json"
     if not path.is_file():

@@ -31,11 +31,7 @@ def milliseconds(value_s: float | None) -> float | None:
 
 
 def ends(interval: Interval | None, factor: float = 1.0) -> tuple[float | None, float | None]:
-    """Return both ends of an interval, in another unit by ``factor``; unknown without one.
-
-    Args:
-        factor: Multiplies both ends, for example 1000 from m to mm.
-    """
+    """Return both ends of an interval, multiplied into another unit; unknown without one."""
     return (None, None) if interval is None else (factor * interval.low, factor * interval.high)
 
 
@@ -122,11 +118,8 @@ def measured(
 ) -> Measurement:
     """Compute one statistic; ``compute`` gives a value, or a value with its interval.
 
-    What is not finite is undefined and says so: one broken pose must not end an evaluation.
-
-    Args:
-        compute: Gives the value, or the value with its interval; refuses by
-            ``UndefinedStatisticError``.
+    It refuses by ``UndefinedStatisticError``. What is not finite is undefined and says so: one
+    broken pose must not end an evaluation.
     """
     value: float | None = None
     interval: Interval | None = None

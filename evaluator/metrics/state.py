@@ -49,8 +49,5 @@ def turn_between_rad(
     """Return the smallest angle between two rotations of an object that looks alike after turns.
 
     Range: 0 rad to pi, 0 is perfect.
-
-    Args:
-        turns: What cannot be seen, in the object's frame.
     """
     return float(se3.rotation_angle_rad(R_base_first.T @ (R_base_second @ turns)).min())

@@ -190,11 +190,7 @@ class _Log:
 
 
 def read_recorded(run: RunFolder, path: Path) -> RecordedFacts:
-    """Sum up a recorded episode; of one that is no trial, only who and what.
-
-    Raises:
-        EpisodeError: When its metadata was written by another program and cannot be read.
-    """
+    """Sum up a recorded episode; of one that is no trial, only who and what."""
     episode = Episode.open(path)
     info, outcome = episode.info, episode.outcome
     if info.kind == RETRY:
@@ -251,12 +247,9 @@ def localised_positions(localisations: Iterable[bytes]) -> list[LocalisedPositio
 def positions_at_start(
     places: Iterable[LocalisedPosition], started_ns: int | None
 ) -> dict[str, Position]:
-    """Return the last place of each object that is not younger than the start.
+    """Return the last place of each object that is not younger than the start, where it is known.
 
-    Args:
-        places: Localised objects in the order of time; a later one of an object replaces an earlier
-            one.
-        started_ns: When the execution started; None takes the last place of each.
+    A later one of an object replaces an earlier one.
     """
     return {
         place.object_id: place.p_m
@@ -400,11 +393,7 @@ class Replay:
 
 
 def read_derived(path: Path) -> DerivedFacts:
-    """Sum up a derived episode from its metadata and its few messages about verdicts or places.
-
-    Raises:
-        GstError: When it cannot be opened, or does not say what it was made from.
-    """
+    """Sum up a derived episode from its metadata and its few messages about verdicts or places."""
     episode = Episode.open(path)
     derived = episode.derived
     if derived is None:

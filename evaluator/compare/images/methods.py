@@ -73,11 +73,7 @@ class ImageSet:
 
 
 def folder_set(name: str, folder: Path) -> ImageSet:
-    """List the images of a folder and its subfolders.
-
-    Raises:
-        EvaluatorError: When it holds no image, or two of one name.
-    """
+    """List the images of a folder and its subfolders; none, or two of one name, are refused."""
     if not folder.is_dir():
         raise PathNotFoundError(path=folder, what="folder of images", hint="Name a folder.")
     found: dict[str, Path] = {}
@@ -103,11 +99,7 @@ def folder_set(name: str, folder: Path) -> ImageSet:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read one image of shape (height, width, 3) and 8 bits.
-
-    Raises:
-        ImageRefusedError: When it is not what can be compared; the message says what it is.
-    """
+    """Read one image of shape (height, width, 3) and 8 bits, or refuse what cannot be compared."""
     refused = partial(ImageRefusedError, name=path.name)
     try:
         data = path.read_bytes()
@@ -269,30 +261,24 @@ def _compare(
         for view, seen in views.items()
         for method, reason in seen.reasons.items()
     ]
-    scored = [m for m in methods if any(m.name in seen.scores for seen in views.values())]
-    for method in methods:
-        if method not in scored:
-            why = [e.reason for e in left_out if e.episode.startswith(f"{method.name}: ")]
-            words = f"the whole method: none of its images can be scored ({[*why, '-'][0]})"
-            left_out.append(_gone(method.name, words))
-    common = [v for v, seen in views.items() if all(m.name in seen.scores for m in scored)]
-    if not scored or not common:
-        raise EvaluatorError(_nothing(reference, methods, scored, left_out))
+    common = [v for v, seen in views.items() if all(m.name in seen.scores for m in methods)]
+    if not common:
+        raise EvaluatorError(_nothing(reference, methods, left_out))
     for view, seen in views.items():
-        lacking = [method.name for method in scored if method.name not in seen.scores]
+        lacking = [method.name for method in methods if method.name not in seen.scores]
         if lacking and seen.scores:
             reason = f"left out for every method: no score of {', '.join(lacking)}"
             left_out.append(_gone(view, reason))
     sizes = size_words(views[view].size for view in common)
     numbers: list[Measurement] = []
     rows: list[dict[str, Cell]] = []
-    for method in scored:
+    for method in methods:
         scores = [views[view].scores[method.name] for view in common]
         protocol = f"{sizes}; split {split}; {method.stored}"
         found = measure_images(RENDERS, scores, protocol, net=net, method=method.name)
         numbers += found
         rows.append(_row(method.name, found, len(common), protocol, net))
-    origin = ", ".join(f"{method.name} from {method.where}" for method in scored)
+    origin = ", ".join(f"{method.name} from {method.where}" for method in methods)
     note = f"{_NOTE} Images: {origin}; recorded: {reference.where}."
     title = "Rendering quality on the same views"
     missing = []
@@ -364,19 +350,14 @@ def _score_view(
 
 
 def _nothing(
-    reference: ImageSet,
-    methods: Sequence[ImageSet],
-    scored: Sequence[ImageSet],
-    left_out: Sequence[Exclusion],
+    reference: ImageSet, methods: Sequence[ImageSet], left_out: Sequence[Exclusion]
 ) -> str:
-    """Say why there is nothing to compare."""
-    if scored:
-        names = ", ".join(method.name for method in scored)
-        return f"no view can be scored for all of {names}. Compare fewer methods at once."
+    """Say why there is no view that all methods have."""
     ours = next(iter(sorted(reference.load)), "none")
     theirs = [f"{m.name} has {next(iter(sorted(m.load)), 'none')}" for m in methods]
-    why = left_out[0].reason if left_out else "no image"
+    why = f"{left_out[-1].episode}: {left_out[-1].reason}" if left_out else "no image"
     return (
-        f"no rendered image can be compared with {reference.where} ({why}). The reference "
-        f"has {ours}; {'; '.join(theirs)}. Name renders as the recorded images are named."
+        f"no view can be scored for all of {', '.join(m.name for m in methods)} ({why}). The "
+        f"reference {reference.where} has {ours}; {'; '.join(theirs)}. Name renders as the "
+        "recorded images are named, and leave out a method that cannot be scored."
     )

@@ -72,12 +72,7 @@ MAX_THREADS = 8
 def spread(
     work: Callable[[Item], Result], items: Iterable[Item], *, threads: int | None = None
 ) -> list[Result]:
-    """Call ``work`` on each item and return the results in the order of the items.
-
-    Args:
-        work: Must not share anything that changes.
-        threads: How many at once; as many as there are cores without it.
-    """
+    """Call ``work``, which shares nothing that changes, on each item; results keep their order."""
     count = min(MAX_THREADS, os.cpu_count() or 1) if threads is None else threads
     if count <= 1:
         return [work(item) for item in items]
