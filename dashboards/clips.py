@@ -26,7 +26,8 @@ from dashboards.queue_page import (
     moment_of,
     recorded_ns,
 )
-from evaluator.review_index import IndexedTrial, stamp_of
+from evaluator.review_index import stamp_of
+from evaluator.trial_row import TrialRow
 
 Image = UInt8[np.ndarray, "height width 3"]
 PICTURES, CLIPS = "pairs", "clips"
@@ -82,7 +83,7 @@ def can_film() -> bool:
     return find_spec("av") is not None
 
 
-def footage(run: RunFolder, row: IndexedTrial, config: ClipConfig = CONFIG) -> Footage:
+def footage(run: RunFolder, row: TrialRow, config: ClipConfig = CONFIG) -> Footage:
     """Read the frames around the moment of a trial.
 
     Raises:
@@ -112,7 +113,7 @@ def footage(run: RunFolder, row: IndexedTrial, config: ClipConfig = CONFIG) -> F
     )
 
 
-def _instant(run: RunFolder, row: IndexedTrial) -> tuple[Path, Moment | None, int]:
+def _instant(run: RunFolder, row: TrialRow) -> tuple[Path, Moment | None, int]:
     """The recording, what happened, and when on its clock; without a moment its last picture."""
     path = episode_path(run, row.file.removesuffix(".mcap") or row.episode)
     moment = moment_of(run, row)
@@ -125,7 +126,7 @@ def _instant(run: RunFolder, row: IndexedTrial) -> tuple[Path, Moment | None, in
 
 def _twin_pictures(
     run: RunFolder,
-    row: IndexedTrial,
+    row: TrialRow,
     camera_id: str,
     span_ns: tuple[int, int],
     config: ClipConfig,
@@ -232,7 +233,7 @@ def _rate_hz(times_s: Sequence[float], most_hz: int) -> int:
     return min(most_hz, max(1, round((len(times_s) - 1) / (times_s[-1] - times_s[0]))))
 
 
-def picture(run: RunFolder, row: IndexedTrial) -> bytes:
+def picture(run: RunFolder, row: TrialRow) -> bytes:
     """Return a trial at its moment, recorded beside twin, as JPEG; drawn once."""
 
     def draw() -> bytes:
@@ -242,7 +243,7 @@ def picture(run: RunFolder, row: IndexedTrial) -> bytes:
     return drawn_once(run.results_dir / PICTURES, row.episode, _what(run, row), draw)
 
 
-def clip(run: RunFolder, row: IndexedTrial) -> bytes:
+def clip(run: RunFolder, row: TrialRow) -> bytes:
     """Return a trial around its moment, recorded beside twin, as MP4; made once."""
     return drawn_once(
         run.results_dir / CLIPS,
@@ -253,7 +254,7 @@ def clip(run: RunFolder, row: IndexedTrial) -> bytes:
     )
 
 
-def _what(run: RunFolder, row: IndexedTrial) -> tuple[object, ...]:
+def _what(run: RunFolder, row: TrialRow) -> tuple[object, ...]:
     """Everything that a picture of a trial depends on."""
     path = episode_path(run, row.file.removesuffix(".mcap") or row.episode)
     replays = derived_paths(run, path.stem, "replay")

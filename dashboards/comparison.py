@@ -15,16 +15,15 @@ from evaluator.cache import FOLDER, SummaryCache
 from evaluator.result import Exclusion, Measurement, Results, load_results
 from evaluator.review_index import (
     RESULTS,
-    IndexedTrial,
     ReviewIndex,
     RunState,
     Selection,
     UnusableIndexError,
     index_path,
-    measurement_of,
     stamp_of,
     state_of,
 )
+from evaluator.trial_row import TrialRow
 
 if TYPE_CHECKING:
     from evaluator.compare import Comparison
@@ -67,7 +66,7 @@ class Judgement:
         return any(item.id.startswith(RENDERS) for item in self.measurements)
 
     @property
-    def rows(self) -> tuple[IndexedTrial, ...]:
+    def rows(self) -> tuple[TrialRow, ...]:
         """All recorded trials, disagreements first."""
         return () if self.index is None else self.index.trials(Selection())
 
@@ -113,20 +112,12 @@ class Judgement:
         found = self.about.get("stand_in")
         return found if isinstance(found, bool) else None
 
-    def outdated(self) -> tuple[Measurement | None, Measurement | None] | None:
-        """Return the first number that differs between ``results.json`` and the files of the run.
-
-        Returns:
-            The stored value and the present one; None on a side that does not have it. None when
-            all numbers are up to date.
-        """
+    def outdated(self) -> str | None:
+        """Say what of a trial is not as it was when the stored numbers were computed."""
         found = self.about.get("outdated")
-        if found is None:
-            return None
-        was, now = (None if side is None else measurement_of(side) for side in found)
-        return was, now
+        return found if isinstance(found, str) else None
 
-    def row(self, episode_id: str) -> IndexedTrial | None:
+    def row(self, episode_id: str) -> TrialRow | None:
         """Return the trial of one episode."""
         return None if self.index is None else self.index.trial(episode_id)
 
@@ -202,7 +193,7 @@ def _open(run: RunFolder, known: _Known) -> ReviewIndex | None:
 
 @lru_cache(maxsize=8)
 def _opened(source: Any, _stamp: str) -> ReviewIndex:
-    return ReviewIndex.open(source)
+    return ReviewIndex(source)
 
 
 def _state(run: RunFolder, known: _Known) -> RunState:

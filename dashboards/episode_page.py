@@ -18,7 +18,7 @@ from dashboards.queue_page import Moment, moment_of
 from dashboards.recording import PageClock, Problems, Recording, read_recording
 from dashboards.trial_lanes import Replanned, replans, trial_lanes
 from dashboards.trial_plots import PLANNED, main_plots, plots_of_joints, shown_replays
-from evaluator.review_index import IndexedTrial
+from evaluator.trial_row import TrialRow
 from twin.scene.store.library import not_scanned_in
 
 
@@ -93,7 +93,7 @@ class EpisodePage:
 
     recording: Recording
     replays: tuple[Recording, ...]
-    row: IndexedTrial | None
+    row: TrialRow | None
     label: Outcome | None
     """How it ended; a label given after the fact counts."""
     verdicts: tuple[VerdictView, ...]
@@ -126,7 +126,7 @@ FACTORS = (
 
 
 def build_page(
-    run: RunFolder, episode_id: str, row: IndexedTrial | None, t_s: float | None
+    run: RunFolder, episode_id: str, row: TrialRow | None, t_s: float | None
 ) -> EpisodePage:
     """Gather the page of one episode.
 

@@ -16,10 +16,10 @@ from evaluator.review_index import (
     NOT_KNOWN,
     FailureGroup,
     FailureSelection,
-    IndexedTrial,
     ReviewIndex,
     Selection,
 )
+from evaluator.trial_row import TrialRow
 
 GROUPS, SHOWN, ALONE = 12, 4, 24
 """Kinds on one screen; trials of each; trials on one screen where there is one kind alone."""
@@ -36,7 +36,7 @@ PART_WORDS = {
 class Shot:
     """One trial on the wall."""
 
-    row: IndexedTrial
+    row: TrialRow
     moment: Moment | None
 
 
@@ -144,7 +144,7 @@ def _kind(
     )
 
 
-def _moment(run: RunFolder, row: IndexedTrial) -> Moment | None:
+def _moment(run: RunFolder, row: TrialRow) -> Moment | None:
     try:
         return moment_of(run, row)
     except GstError:  # the trial's own page says what is wrong

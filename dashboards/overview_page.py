@@ -22,9 +22,9 @@ from evaluator.review_index import (
     FACETS,
     NO_RESULTS,
     IndexedFile,
-    IndexedTrial,
     Selection,
 )
+from evaluator.trial_row import TrialRow
 
 PAGE = 50
 """Trials on one screen."""
@@ -296,7 +296,7 @@ class Facet:
 class TrialList:
     """One screen of the trials of a selection."""
 
-    trials: tuple[IndexedTrial, ...]
+    trials: tuple[TrialRow, ...]
     selected: int
     """How many the selection holds."""
     of: int
@@ -546,16 +546,7 @@ def _notices(judgement: Judgement) -> tuple[str, ...]:
 
 def _outdated(judgement: Judgement) -> str | None:
     found = judgement.outdated()
-    if found is None:
-        return None
-    name = next(side.id for side in found if side is not None)
-    was, now = (wording.headline(m) if m else "not measured" for m in found)
-    if was == now:  # they differ beyond the digits that are shown
-        was, now = (repr(m.value) if m else "not measured" for m in found)
-    return (
-        f"The numbers on this page are older than the run: {name} was {was} and is now {now}, "
-        "computed from the present recordings, labels and replays."
-    )
+    return found and f"The numbers on this page are older than the run: {found}."
 
 
 def _next_command(run: RunFolder, judgement: Judgement) -> str | None:

@@ -23,7 +23,8 @@ from dashboards.comparison import Judgement
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, CameraTrack, camera_tracks, read_frame
 from dashboards.library import episode_path
-from evaluator.review_index import IndexedTrial, severity, stamp_of
+from evaluator.review_index import severity, stamp_of
+from evaluator.trial_row import TrialRow
 
 PER_PAGE = 24
 SHOW = {
@@ -70,7 +71,7 @@ class Moment:
 class QueueItem:
     """One trial of the queue."""
 
-    row: IndexedTrial
+    row: TrialRow
     reason: str
     distance_m: float | None
     """Largest distance of the recorded tool from the planned replay's, where it was measured."""
@@ -99,12 +100,12 @@ class QueuePage:
     problems: tuple[str, ...]
 
 
-def rank(row: IndexedTrial) -> int:
+def rank(row: TrialRow) -> int:
     """Place a trial among ``REASONS``, 0 first."""
     return severity(row)[0]
 
 
-def recorded_trials(judgement: Judgement) -> list[IndexedTrial]:
+def recorded_trials(judgement: Judgement) -> list[TrialRow]:
     """Return the trials that have a recording to look at: wrong yes, wrong no, undecided, the rest.
 
     Within each the one whose tool went farthest from its planned replay comes first.
@@ -176,7 +177,7 @@ def is_label(review: Review) -> bool:
     return review.result in ("success", "failure", "unknown")
 
 
-def moment_of(run: RunFolder, row: IndexedTrial) -> Moment | None:
+def moment_of(run: RunFolder, row: TrialRow) -> Moment | None:
     """Find the first divergence that the replays of a trial tell, or the first failing factor."""
     for name in (row.executed_replay, row.planned_replay):
         path = run.derived_dir / name if name else None
@@ -189,7 +190,7 @@ def moment_of(run: RunFolder, row: IndexedTrial) -> Moment | None:
     return None
 
 
-def _page_t_s(run: RunFolder, row: IndexedTrial, moment: Moment) -> float | None:
+def _page_t_s(run: RunFolder, row: TrialRow, moment: Moment) -> float | None:
     """Seconds since the recording's first sample, from where its page counts."""
     try:
         path = episode_path(run, row.episode)
@@ -238,7 +239,7 @@ def _moment(path: Path, _mtime_ns: int, _size: int) -> Moment | None:
     return None
 
 
-def thumbnail(run: RunFolder, row: IndexedTrial) -> bytes:
+def thumbnail(run: RunFolder, row: TrialRow) -> bytes:
     """Draw a trial at the moment of its divergence, as JPEG; drawn once, and kept in the run.
 
     Without such a moment it shows the last picture.

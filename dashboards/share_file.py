@@ -35,7 +35,8 @@ from evaluator.report.front import FIGURES, front
 from evaluator.report.page import SHARED, environment, name_shared
 from evaluator.report.wording import stand_in_sentence
 from evaluator.result import Table
-from evaluator.review_index import IndexedTrial, Selection
+from evaluator.review_index import Selection
+from evaluator.trial_row import TrialRow
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:"
 """The file forbids itself to load anything."""
@@ -91,7 +92,7 @@ class Clip:
 class SharedTrial:
     """One trial of the file."""
 
-    row: IndexedTrial
+    row: TrialRow
     clip: Clip | None
     why_no_clip: str
     plots: tuple[TimePlot, ...]
@@ -178,7 +179,7 @@ def build_share(run: RunFolder, config: ShareConfig, *, report: str = "") -> Sha
     raise UsageError(message)
 
 
-def chosen_trials(judgement: Judgement, names: Sequence[str]) -> list[IndexedTrial]:
+def chosen_trials(judgement: Judgement, names: Sequence[str]) -> list[TrialRow]:
     """Return the trials that were named; without names the worst that have a recording.
 
     Raises:
@@ -239,7 +240,7 @@ def _figure(comparison: Comparison | None) -> Drawing | None:
     return next((each for name in FIGURES for each in drawn if each.id == name), None)
 
 
-def _trial(run: RunFolder, row: IndexedTrial) -> SharedTrial:
+def _trial(run: RunFolder, row: TrialRow) -> SharedTrial:
     """Everything of a trial but its clip."""
     plots: tuple[TimePlot, ...] = ()
     not_scanned: tuple[str, ...] = ()

@@ -16,7 +16,8 @@ from dashboards.comparison import judge
 from dashboards.config import DashboardConfig, ShareConfig
 from dashboards.errors import NotHereError
 from dashboards.loading import LOADING
-from evaluator.review_index import FailureSelection, IndexedTrial
+from evaluator.review_index import FailureSelection
+from evaluator.trial_row import TrialRow
 
 if TYPE_CHECKING:
     from dashboards.live_page import LiveFeed
@@ -157,7 +158,7 @@ class StudyPages:
             raise NotHereError(message)
         return Response(data, media_type="image/jpeg")
 
-    def _trial(self, request: Request) -> IndexedTrial:
+    def _trial(self, request: Request) -> TrialRow:
         row = judge(self._run(request)).row(request.path_params["id"])
         if row is None or not row.file:
             message = "no such recorded trial in this run."

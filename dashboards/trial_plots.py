@@ -14,10 +14,10 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
 from dashboards.figures import Signal, TimePlot, time_plot
 from dashboards.recording import PageClock, Recording
-from evaluator.compare.trial import read_tcp_errors
+from evaluator.compare.motion import distance_over_time
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.trajectory import JointErrors, joint_errors
-from evaluator.review_index import IndexedTrial
+from evaluator.trial_row import TrialRow
 
 RECORDED, PLANNED = "recorded", "planned"
 REPLAY_STYLES = {"planned": "twin-planned", "executed": "twin-executed"}
@@ -40,7 +40,7 @@ def main_plots(
     recording: Recording,
     replays: Sequence[Recording],
     sent_plan: Plan | None,
-    row: IndexedTrial | None,
+    row: TrialRow | None,
     clock: PageClock,
 ) -> tuple[TimePlot, ...]:
     """Tool error, tool position, gripper, clearance and objects; only those that have data.
@@ -75,23 +75,21 @@ def shown_replays(replays: Sequence[Recording], sent_plan: Plan | None) -> dict[
 
 
 def _error_plot(
-    recording: Recording, replays: Sequence[Recording], row: IndexedTrial | None, clock: PageClock
+    recording: Recording, replays: Sequence[Recording], row: TrialRow | None, clock: PageClock
 ) -> TimePlot | None:
     start = None if row is None or row.plan_id is None else clock.of_plan_time(row.plan_id, 0)
-    if row is None or start is None:
+    if row is None or row.plan_id is None or start is None:
         return None
     names = {"planned": row.planned_replay, "executed": row.executed_replay}
     paths = {replay.path.name: replay.path for replay in replays}
     compared = {against: paths[name] for against, name in names.items() if name in paths}
-    signals = [
-        Signal(
-            name=f"to twin, {series.against}",
-            style=REPLAY_STYLES.get(series.against, "twin-executed"),
-            t_s=series.t_s + start,
-            values=MM * series.position_m,
-        )
-        for series in read_tcp_errors(recording.path, row.plan_id, compared)
-    ]
+    signals = []
+    for against, path in compared.items():
+        found = distance_over_time(recording.path, path, row.plan_id)
+        if found is not None:
+            style = REPLAY_STYLES.get(against, "twin-executed")
+            name, t_s = f"to twin, {against}", found[0] + start
+            signals.append(Signal(name=name, style=style, t_s=t_s, values=MM * found[1]))
     title, note = "Tool: recorded to replayed distance", "computed by the evaluator"
     return _plot(title, "mm", signals, clock, level=0.0, note=note)
 

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import msgspec
@@ -24,11 +23,10 @@ import bridge
 import evaluator
 from bridge.episode.provenance import software
 from bridge.whole_file import write_whole
-from evaluator.memory import without_collecting
 
 Say = Callable[[str], None]
-Rows = dict[str, tuple[Any, ...]]
-"""Summaries by the key they are kept under; there may be none or several under one."""
+Rows = dict[str, msgspec.Raw]
+"""Packed summaries by the key they are kept under; there may be none or several under one."""
 Summary = TypeVar("Summary")
 
 FOLDER = "cache"
@@ -69,7 +67,9 @@ def _to_plain(value: Any) -> Any:
     raise TypeError(type(value).__name__)
 
 
-_encode = msgspec.msgpack.Encoder(enc_hook=_to_plain).encode
+packed = msgspec.msgpack.Encoder(enc_hook=_to_plain).encode
+"""As msgpack; numbers of NumPy become plain ones."""
+_rows_of = msgspec.msgpack.Decoder(Rows).decode
 
 
 def _digest(body: bytes) -> bytes:
@@ -77,54 +77,31 @@ def _digest(body: bytes) -> bytes:
 
 
 def write_rows(path: Path, rows: Rows) -> None:
-    """Write summaries, whole or not at all; one that cannot be packed costs only its own place."""
-    try:
-        body = _encode(rows)
-    except (TypeError, ValueError, OverflowError):
-        body = _encode({key: found for key, found in rows.items() if _fits(found)})
+    """Write summaries, whole or not at all."""
+    body = packed(rows)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, _digest(body) + body)
 
 
-def _fits(found: tuple[Any, ...]) -> bool:
-    try:
-        _encode(found)
-    except (TypeError, ValueError, OverflowError):
-        return False
-    return True
-
-
-def read_rows(path: Path, kind: type[Any]) -> Rows:
+def read_rows(path: Path) -> Rows:
     """Read the summaries of a file."""
     data = path.read_bytes()
     head, body = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
     if head != _digest(body):
         message = f"{path.name} is damaged, or another version of this program wrote it"
         raise ValueError(message)
-    try:
-        with without_collecting():
-            rows: Rows = msgspec.msgpack.decode(
-                body,
-                type=dict[str, tuple[kind, ...]],  # type: ignore[valid-type]
-            )
-    except msgspec.MsgspecError as error:
-        message = f"{path.name} holds something else ({error})"
-        raise ValueError(message) from error
-    return rows
+    return _rows_of(body)
 
 
 @dataclass
 class _Kept:
     """All summaries of one kind."""
 
+    unpack: Callable[[msgspec.Raw], tuple[Any, ...]]
     rows: Rows = field(default_factory=dict)
     used: set[str] = field(default_factory=set)
     is_new: bool = False
     """Whether something is not on the disk yet."""
-
-    @property
-    def is_untidy(self) -> bool:
-        return len(self.rows) - len(self.used) > MOST_UNUSED * len(self.rows)
 
 
 class SummaryCache:
@@ -170,16 +147,22 @@ class SummaryCache:
         """Return what is kept under a key, None where nothing is; it counts as used from now on."""
         kept = self._of(kind)
         found = kept.rows.get(key)
-        if found is not None:
-            kept.used.add(key)
-        return found
+        if found is None:
+            return None
+        kept.used.add(key)
+        return kept.unpack(found)
 
     def keep(self, kind: type[Summary], key: str, made: tuple[Summary, ...]) -> None:
-        """Keep summaries under a key; now and then everything new is written."""
+        """Keep summaries under a key, if they can be packed; now and then write what is new."""
         if self._folder is None:
             return
+        try:
+            raw = msgspec.Raw(packed(made))
+            packed(key)
+        except (TypeError, ValueError, OverflowError):  # as a name that is no Unicode
+            return
         kept = self._of(kind)
-        kept.rows[key] = made
+        kept.rows[key] = raw
         kept.used.add(key)
         kept.is_new = True
         if self._monotonic() - self._saved_s > SAVE_PERIOD_S:
@@ -188,14 +171,22 @@ class SummaryCache:
     def save(self) -> None:
         """Write what no file holds yet."""
         for kind, kept in self._kept.items():
-            if kept.is_new:
-                self._write(kind, kept)
+            if kept.is_new and self._folder is not None:
+                try:
+                    write_rows(self._folder / _name(kind), kept.rows)
+                except OSError as error:
+                    self._say(
+                        f"{self._folder} cannot be written ({error.strerror}): the next evaluation "
+                        "reads these files again."
+                    )
+                    self._folder = None
+                kept.is_new = False
         self._saved_s = self._monotonic()
 
     def close(self) -> None:
         """Write what is new, and drop what this evaluation had no use for."""
         for kept in self._kept.values():
-            if kept.is_untidy:
+            if len(kept.rows) - len(kept.used) > MOST_UNUSED * len(kept.rows):
                 kept.rows = {key: found for key, found in kept.rows.items() if key in kept.used}
                 kept.is_new = True
         self.save()
@@ -206,29 +197,14 @@ class SummaryCache:
             rows: Rows = {}
             if self._folder is not None:
                 try:
-                    rows = read_rows(self._path(kind), kind)
+                    rows = read_rows(self._folder / _name(kind))
                 except OSError:  # not there, or not ours to read
                     rows = {}
                 except ValueError as error:
                     self._say(f"In {self._folder}, {error}. The episodes are read again.")
-            self._kept[kind] = _Kept(rows)
+            unpack = msgspec.msgpack.Decoder(tuple[kind, ...]).decode  # type: ignore[valid-type]
+            self._kept[kind] = _Kept(unpack, rows)
         return self._kept[kind]
-
-    def _path(self, kind: type[Any]) -> Path:
-        return (self._folder or Path()) / f"{kind.__name__}.msgpack"
-
-    def _write(self, kind: type[Any], kept: _Kept) -> None:
-        if self._folder is None:
-            return
-        try:
-            write_rows(self._path(kind), kept.rows)
-        except OSError as error:
-            self._say(
-                f"{self._folder} cannot be written ({error.strerror}): the next evaluation reads "
-                "these files again."
-            )
-            self._folder = None
-        kept.is_new = False
 
     def _say(self, text: str) -> None:
         if self._say_once is not None:
@@ -236,28 +212,26 @@ class SummaryCache:
             self._say_once = None
 
     def _sweep(self) -> None:
-        """Delete what killed evaluations left half-written, and files of the edition before."""
-        if self._folder is None:
-            return
-        for path in (*self._folder.glob("*.part"), *self._folder.glob("*.parquet")):
-            try:
-                if time.time() - path.stat().st_mtime > ABANDONED_S:
-                    path.unlink()
-            except OSError:  # its writer has just finished it
-                continue
+        """Delete what killed evaluations left half-written, and files of editions before."""
+        for ending in ("part", "parquet", "sqlite") if self._folder is not None else ():
+            for path in (self._folder or Path()).glob(f"*.{ending}"):
+                try:
+                    if time.time() - path.stat().st_mtime > ABANDONED_S:
+                        path.unlink()
+                except OSError:  # its writer has just finished it
+                    continue
 
     def __enter__(self) -> "SummaryCache":
         """Use as a context manager."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         """Keep what was made; what an interrupted evaluation did not use is not dropped."""
         if kind is None:
             self.close()
         else:
             self.save()
+
+
+def _name(kind: type[Any]) -> str:
+    return f"{kind.__name__}.msgpack"

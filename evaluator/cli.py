@@ -13,7 +13,7 @@ from bridge.terminal import Output
 from evaluator.design.config import StudyOptions, Wanted
 from evaluator.errors import EvaluatorError
 from evaluator.memory import without_collecting
-from evaluator.metrics.image_protocol import ImageOptions
+from evaluator.metrics.image_options import ImageOptions
 from evaluator.review_index import RESULTS
 
 if TYPE_CHECKING:
@@ -270,7 +270,7 @@ def _compare_several(sources: Sequence[Path], asked: _Asked, output: Output) -> 
 
 def _compare_images(images: ImageOptions) -> "tuple[Comparison, Path]":
     """Compare renders with a folder of recorded images, without any run."""
-    from evaluator.compare.images.renders import compare_folders
+    from evaluator.compare.images.methods import compare_folders
 
     comparison = compare_folders(images)
     return comparison, Path(f"{comparison.run}_results")

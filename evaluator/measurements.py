@@ -5,16 +5,13 @@ what a ``Measurement`` is made with, so no other module spells an id.
 """
 
 import math
-import sys
-from pathlib import Path
 
 from evaluator import motion_measurements as motion_measurements
 from evaluator import study_measurements as study_measurements
 from evaluator.metrics import image
-from evaluator.metrics.image_protocol import ImageMetric
-from evaluator.metrics.image_scores import METRICS
+from evaluator.metrics.image import METRICS, ImageMetric
 from evaluator.quantity import REGISTRY as REGISTRY
-from evaluator.quantity import SIGNED, UP, with_tables
+from evaluator.quantity import SIGNED, UP
 from evaluator.quantity import Defined as Defined
 from evaluator.quantity import Quantity as Quantity
 from evaluator.quantity import new_quantity as _new
@@ -287,12 +284,6 @@ LABEL_AGREED = _new(
     "trials{where} where the operator's label and the success predicate on the poses localised after the execution say the same / trials where both are known{without}",
 )
 LABEL_AGREED_OF_TASK = _new("label.localised.{task}.rate", "1", "higher", LABEL_AGREED.definition)
-LABEL_OBJECTS = _new(
-    "label.objects.rate",
-    "1",
-    "higher",
-    "trials where the operator counted as many objects as the predicate on the localised poses / trials labelled by object where both are known",
-)
 
 # Images. A mean over views, before and after an alignment or a mask (``{variant}``).
 
@@ -310,7 +301,7 @@ def _image(images: str, metric: ImageMetric, variant: str) -> Quantity:
 _IMAGES = ("views.{part}", "image.{method}")
 VIEWS, RENDERS = (
     {(name, raw): _image(images, metric, "raw" if raw else "{variant}")
-     for name, metric in METRICS.items() for raw in (True, False)}
+     for name, metric in METRICS.items() for raw in (True, False) if raw or not metric.raw_only}
     for images in _IMAGES
 )  # fmt: skip
 """By the metric, and whether the images were compared as they are stored."""
@@ -331,13 +322,6 @@ DEPTHS = {
     for name, words in (
         ("mean_abs_m", "mean absolute"),
         ("median_abs_m", "median absolute"),
-        ("rmse_m", "root mean square"),
     )
 }
 """By the field of ``DepthScore``."""
-
-
-if __name__ == "__main__":  # python -m evaluator.measurements docs/metrics.md
-    for name in sys.argv[1:]:
-        page = Path(name)
-        page.write_text(with_tables(page.read_text()))

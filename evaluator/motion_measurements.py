@@ -1,6 +1,5 @@
 """Measurements of motions, repeated runs and final states: how far both sides are apart."""
 
-from evaluator.metrics import trajectory
 from evaluator.quantity import new_quantity as _new
 
 # ruff: noqa: E501  # one line for each definition
@@ -26,31 +25,34 @@ MOTIONS = {
 }
 """By the field of ``MotionSummary`` they are the mean of."""
 
-WHOLE = "whole recordings, waiting at their ends included"
-MOVING = f"the moving part only, from leaving the start to arriving at the end, each within {trajectory.MOVING_THRESHOLD_M * 1000:.0f} mm"
 _BODY = "body.{task}.{engine}.{body}."
 BODY_DISTANCES = {
     name: _new(
-        f"{_BODY}{name.removesuffix('_m')}_median_m",
-        "m",
-        "lower",
+        f"{_BODY}{name.rpartition('_')[0]}_median_{unit}",
+        unit,
+        "none" if unit == "s" else "lower",
         f"{{what}}: {words}, median over recorded runs; replays against the run that they were made from, other simulated runs against every recorded one",
+        (-0.2, 0.6) if unit == "s" else None,
     )
-    for name, words in (
-        ("end_point_m", "distance of the end points"),
-        ("displacement_m", "difference of the displacements from start to end"),
-        ("over_time_m", f"mean distance over normalised time, {WHOLE}"),
-        ("moving_over_time_m", f"mean distance over normalised time, {MOVING}"),
+    for name, unit, words in (
+        ("end_point_m", "m", "distance of the end points"),
+        ("displacement_m", "m", "difference of the displacements from start to end"),
+        (
+            "path_mean_m",
+            "m",
+            "mean distance over time, clocks begun where the body leaves its start and the remaining lag taken out",
+        ),
+        ("lag_s", "s", "by how much the recorded body then comes later"),
     )
 }
-"""By the field of ``BodyDistance``."""
+"""By what they measure."""
 
 STATES = {
     name: _new(
         f"state.{{by}}_to_{{against}}.{{task}}.{{condition}}.{name}_median_{unit}",
         unit,
         "lower",
-        "{quantity} after its last stage, {who} against {other}, in {where}: median over {count} episodes of each one's mean over its objects",
+        "{quantity} after its last stage, {who} against where it was localised, in {where}: median over {count} episodes of each one's mean over its objects",
     )
-    for name, unit in (("position", "m"), ("rotation", "rad"), ("extents", "m"))
+    for name, unit in (("position", "m"), ("rotation", "rad"))
 }

@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -60,15 +59,6 @@ class Quantity:
         """Whether a value is possible; what floats round off is not held against it."""
         room = 1e-9 * max(1.0, abs(value))
         return self.low - room <= value <= self.high + room
-
-    @property
-    def range_text(self) -> str:
-        """Write the range as a reader does."""
-        if self.unit == "rad" and self.high == math.pi:
-            return f"{self.low:g} to pi"
-        if math.isinf(self.low):
-            return "any"
-        return f"{self.low:g} and up" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
 
     def of(self, **words: object) -> Defined:
         """Name one measurement."""
@@ -130,38 +120,3 @@ def new_quantity(
     REGISTRY.append(quantity)
     _FAMILIES.setdefault(id.partition(".")[0], []).append(quantity)
     return quantity
-
-
-def registry_table(families: Iterable[str]) -> str:
-    """Write the quantities of some families, the first words of their ids, as a list in markdown.
-
-    Of a definition its first clause; a range where it is not that of the unit.
-    """
-    wanted = set(families)
-    rows: dict[tuple[str, str], list[str]] = {}
-    for each in REGISTRY:
-        if each.id.partition(".")[0] in wanted:
-            words = re.sub(r"\{(protocol|where|without)\}", "", each.definition)
-            words = re.sub(r"[:;,]? ?\{(words|about|after)\}$", "", words)
-            words = _capitals(words).partition("; ")[0].replace("|", "/").strip(" :,;")
-            usual = (each.low, each.high) == RANGES[each.unit]
-            parts = ("" if each.unit == "1" else each.unit, "" if usual else each.range_text)
-            allowed = ", ".join(filter(None, parts))
-            rows.setdefault((words, allowed), []).append(_capitals(each.id))
-    lines = []
-    for (words, allowed), names in rows.items():
-        shown = ", ".join(f"`{name}`" for name in names)
-        lines.append(f"- {shown}: {words}{f' [{allowed}]' if allowed else ''}")
-    return "\n".join(lines)
-
-
-def _capitals(text: str) -> str:
-    return re.sub(r"\{(\w+)(?::\w+)?\}", lambda part: part[1].upper(), text)
-
-
-_BLOCK = re.compile(r"(<!-- registry: ([\w ]+) -->\n).*?(<!-- /registry -->)", re.DOTALL)
-
-
-def with_tables(page: str) -> str:
-    """Return a page whose blocks ``<!-- registry: FAMILIES -->`` hold what is registered now."""
-    return _BLOCK.sub(lambda m: f"{m[1]}{registry_table(m[2].split())}\n{m[3]}", page)

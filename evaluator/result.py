@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +17,8 @@ from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
 from evaluator.errors import EvaluatorError
 
-
-class Unit(StrEnum):
-    """SI units and the few dimensionless ones that measurements carry."""
-
-    METRE = "m"
-    RADIAN = "rad"
-    SECOND = "s"
-    NANOSECOND = "ns"
-    DECIBEL = "dB"
-    FRACTION = "1"
-    COUNT = "count"
-    PERCENTAGE_POINT = "pp"
-
-
+UNITS = ("m", "rad", "s", "ns", "dB", "1", "count", "pp")
+"""SI units and the few dimensionless ones that measurements carry."""
 SCHEMA_VERSION = 2
 
 Cell = str | int | float | bool | None
@@ -76,7 +63,9 @@ class Measurement:
 
     def __post_init__(self) -> None:
         """Refuse NaN, infinity, unknown units, and undefined values without a reason."""
-        Unit(self.unit)
+        if self.unit not in UNITS:
+            message = f"{self.unit!r} is not a unit of a measurement: {', '.join(UNITS)}"
+            raise ValueError(message)
         if self.value is not None and not math.isfinite(self.value):
             message = f"measurement {self.id} is {self.value}; say it is undefined and why"
             raise ValueError(message)
@@ -128,7 +117,7 @@ class Results:
     """run, trials, rates or images."""
     stand_in: bool | None
     """None when the input does not say, as rates of the twin alone."""
-    measurements: tuple[Measurement, ...]
+    measurements: tuple[Measurement, ...] = ()
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     missing: tuple[str, ...] = ()
@@ -167,7 +156,10 @@ class Results:
             "stand_in": self.stand_in,
             "measurements": measurements,
             "episode_lists": [list(episodes) for episodes in lists],
-            "tables": [_table_record(table) for table in self.tables],
+            "tables": [
+                {**vars(table), "columns": list(table.columns), "rows": list(map(list, table.rows))}
+                for table in self.tables
+            ],
             "exclusions": [dict(vars(item)) for item in self.exclusions],
             "missing": list(self.missing),
             "provenance": json.loads(json.dumps(self.provenance)),
@@ -177,18 +169,9 @@ class Results:
 
 
 _PLAIN = tuple(f.name for f in fields(Measurement) if f.name not in ("interval", "episodes"))
-_CELLS = (str, int, float, bool, type(None))
-_EXACT = set(_CELLS)
 _CHECKED_ROWS = 20
 """Rows of a table that the schema sees; the cells of the others are checked by their types."""
-
-
-def _table_record(table: Table) -> dict[str, Any]:
-    rows = [list(row) for row in table.rows]
-    columns = list(table.columns)
-    return {
-        "id": table.id, "title": table.title, "columns": columns, "rows": rows, "note": table.note
-    }  # fmt: skip
+_Rows = list[list[Cell]]
 
 
 def _check(record: dict[str, Any]) -> None:
@@ -198,48 +181,28 @@ def _check(record: dict[str, Any]) -> None:
     shown = {**record, "tables": short, "episode_lists": lists}
     check_record(shown, name="results", package="evaluator")
     for table in record["tables"]:
-        cells = [cell for row in table["rows"] for cell in row]
-        kinds = set(map(type, cells))
-        if kinds <= _EXACT and all(map(math.isfinite, (c for c in cells if type(c) is float))):
-            continue
-        odd = next((cell for cell in cells if _is_odd(cell)), None)
-        if odd is not None:
+        try:
+            msgspec.convert(table["rows"], _Rows)
+            _encode(table["rows"])
+        except ValueError as error:
             where = f"table {table['id']}"
-            raise InvalidRecordError(name="results", where=where, found=f"{odd!r:.60}")
-
-
-def _is_odd(cell: object) -> bool:
-    finite = not isinstance(cell, float) or math.isfinite(cell)
-    return not (finite and isinstance(cell, _CELLS))
+            raise InvalidRecordError(name="results", where=where, found=str(error)) from error
 
 
 _encode = json.JSONEncoder(allow_nan=False).encode
 """As ``json.dumps``, which makes an encoder anew for every call that forbids NaN."""
-_DEEP = {"tables": 3, "provenance": 2}
-"""Levels that are written over several lines, of the parts of a record; 1 for the others."""
 
 
 def _written(record: Mapping[str, Any]) -> str:
-    """Write each number, row and list on one line: quick, and a diff names what changed."""
-    parts = [
-        f" {_encode(name)}: {_lines(value, 1, _DEEP.get(name, 1))}"
-        for name, value in record.items()
-    ]
+    """Write each number, table and list on one line: quick, and a diff names what changed."""
+    parts = []
+    for name, value in record.items():
+        if isinstance(value, list) and value:
+            lines = ",\n  ".join(map(_encode, value))
+            parts.append(f" {_encode(name)}: [\n  {lines}\n ]")
+        else:
+            parts.append(f" {_encode(name)}: {_encode(value)}")
     return "{\n" + ",\n".join(parts) + "\n}\n"
-
-
-def _lines(value: Any, indent: int, deep: int) -> str:
-    if not deep or not value or not isinstance(value, list | dict):
-        return _encode(value)
-    pad = "\n" + " " * (indent + 1)
-    if isinstance(value, list):
-        inner = [_lines(item, indent + 1, deep - 1) for item in value]
-    else:
-        inner = [
-            f"{_encode(name)}: {_lines(item, indent + 1, deep - 1)}" for name, item in value.items()
-        ]
-    first, last = "[]" if isinstance(value, list) else "{}"
-    return f"{first}{pad}{f',{pad}'.join(inner)}{pad[:-1]}{last}"
 
 
 def write_results(results: Results, path: Path) -> Path:
@@ -255,11 +218,7 @@ def write_results(results: Results, path: Path) -> Path:
 
 
 def load_results(path: Path) -> Results:
-    """Read ``results.json``, or the one of a run folder.
-
-    Raises:
-        InvalidRecordError: When it does not fit the schema, or is newer than this reader.
-    """
+    """Read ``results.json``, or the one of a run folder; what does not fit is refused."""
     if path.is_dir():
         path = path / "results" / "results.json"
     if not path.is_file():

@@ -69,10 +69,11 @@ def held_out(run: RunFolder, record: Mapping[str, Any]) -> dict[str, HeldOut]:
     still = {item["id"] for item in record["cameras"] if item["stationary"]}
     found: dict[str, list[tuple[float, float]]] = {}
     for path in run.derived("*.views.*"):
-        for view in score_views(images_of(Episode.open(path), None))[0]:
+        for view in score_views(images_of(Episode.open(path), None)):
             for way, score in view.scores.items() if view.camera_id not in still else ():
-                if score.psnr_db is not None and score.ssim is not None:
-                    found.setdefault(way.name, []).append((score.psnr_db, score.ssim))
+                if {"psnr_db", "ssim"} <= score.values.keys():
+                    pair = score.values["psnr_db"], score.values["ssim"]
+                    found.setdefault(way, []).append(pair)
     return {
         name: HeldOut(psnr_db=float(np.mean(rows, axis=0)[0]), ssim=float(np.mean(rows, axis=0)[1]))
         for name, rows in found.items()

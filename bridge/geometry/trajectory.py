@@ -62,8 +62,3 @@ class PoseTrajectory:
     def transforms(self) -> Float[np.ndarray, "num_poses 4 4"]:
         """Return the poses as matrices."""
         return se3.transform_from(self.q_wxyz, self.p_m)
-
-    def normalised_time(self, num_samples: int) -> "PoseTrajectory":
-        """Resample uniformly from the first to the last stamp; for runs without a common clock."""
-        first, last = int(self.stamps_ns[0]), int(self.stamps_ns[-1])
-        return self.at(np.linspace(first, last, num_samples).round().astype(np.int64))

@@ -1,7 +1,7 @@
 """How much an image is like another one: PSNR and SSIM of RGB images, in float64.
 
-SSIM has three customs at the border of an image; all three are here. Every number is computed on
-8-bit images scaled to 0..1, so that rebuild and evaluation give the same one of the same files.
+SSIM has two customs at the border of an image; both are here. Every number is computed on 8-bit
+images scaled to 0..1, so that rebuild and evaluation give the same one of the same files.
 """
 
 import math
@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.ndimage import correlate1d
 
 from bridge.errors import BridgeError, UndefinedStatisticError
 
@@ -104,24 +103,24 @@ C2 = 0.03**2
 _BELL = np.exp(-0.5 * ((np.arange(WINDOW) - BORDER) / SIGMA) ** 2)
 _WEIGHTS = _BELL / _BELL.sum()
 
-Padding = Literal["valid", "zero", "reflect"]
-"""What a window sees beyond the border: it never reaches there, zeros, or the mirrored image."""
+Padding = Literal["valid", "zero"]
+"""What a window sees beyond the border: it never reaches there, or zeros."""
 
 
 def _map(
     recorded: Float[np.ndarray, "height width channels"],
     replayed: Float[np.ndarray, "height width channels"],
-    mode: Literal["constant", "mirror"],
 ) -> Float[np.ndarray, "height width channels"]:
     """SSIM around each pixel.
 
     Windowed are u = a + b, v = a - b and their squares, for SSIM needs no more: 2 mu_a mu_b is half
     of mu_u^2 - mu_v^2, mu_a^2 + mu_b^2 half of mu_u^2 + mu_v^2, and so on for the variances.
     """
+    from scipy.ndimage import correlate1d  # noqa: PLC0415  # takes half a second to load
 
     def windowed(plane: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-        down = correlate1d(plane, _WEIGHTS, axis=0, mode=mode)
-        return np.asarray(correlate1d(down, _WEIGHTS, axis=1, mode=mode))
+        down = correlate1d(plane, _WEIGHTS, axis=0, mode="constant")
+        return np.asarray(correlate1d(down, _WEIGHTS, axis=1, mode="constant"))
 
     channels = []
     for a, b in zip(np.moveaxis(recorded, -1, 0), np.moveaxis(replayed, -1, 0), strict=True):
@@ -138,16 +137,14 @@ def _map(
 PADDINGS: dict[Padding, str] = {
     "valid": "windows inside the image only",
     "zero": "zeros beyond the border",
-    "reflect": "mirrored beyond the border",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class SsimMaps:
-    """SSIM of every window centre, under every padding, and the part of it without brightness."""
+    """SSIM of every window centre, under either padding."""
 
     zero: Float[np.ndarray, "height width channels"]
-    reflect: Float[np.ndarray, "height width channels"]
 
     @property
     def valid(self) -> Float[np.ndarray, "inner_height inner_width channels"]:
@@ -158,7 +155,7 @@ class SsimMaps:
         self, padding: Padding, *, mask: Bool[np.ndarray, "height width"] | None = None
     ) -> float:
         """Average over pixels and channels; with a mask, over window centres inside it."""
-        values = {"valid": self.valid, "zero": self.zero, "reflect": self.reflect}[padding]
+        values = self.valid if padding == "valid" else self.zero
         if mask is not None:
             inside = mask[BORDER:-BORDER, BORDER:-BORDER] if padding == "valid" else mask
             values = values[inside]
@@ -173,21 +170,15 @@ def ssim_maps(
     recorded: Float[np.ndarray, "height width channels"],
     replayed: Float[np.ndarray, "replayed_height replayed_width channels"],
 ) -> SsimMaps:
-    """Compute SSIM (Wang et al. 2004) around every pixel, for all paddings at once.
+    """Compute SSIM (Wang et al. 2004) around every pixel, for both paddings at once.
 
     Gaussian window of 11 x 11 pixels with sigma 1.5, C1 1e-4, C2 9e-4 for images in 0..1,
     population covariance, each channel alone.
     """
-    _refuse_small(recorded, replayed)
-    return SsimMaps(
-        zero=_map(recorded, replayed, "constant"), reflect=_map(recorded, replayed, "mirror")
-    )
-
-
-def _refuse_small(recorded: np.ndarray, replayed: np.ndarray) -> None:
     check_same_shape(recorded, replayed)
     if min(recorded.shape[:2]) < WINDOW:
         raise UndefinedStatisticError(
             statistic="SSIM",
             reason=f"the image is smaller than the {WINDOW} x {WINDOW} window",
         )
+    return SsimMaps(zero=_map(recorded, replayed))

@@ -26,12 +26,12 @@ def rows(run: RunFolder, count: int) -> list[np.ndarray]:
     found = []
     for path in run.derived("*.views.*"):
         images = images_of(Episode.open(path), None)
-        scores, _ = score_views(images)
+        scores = score_views(images)
         for score in scores:
             key = (score.camera_id, score.stamp_ns)
             pair = [decode_color(images.color[name][key]) for name in (RECORDED, RENDERED)]
             gap = np.full((pair[0].shape[0], GAP_PX, 3), 255, dtype=np.uint8)
-            found.append((score.psnr_db() or 0.0, np.hstack([pair[0], gap, pair[1]])))
+            found.append((score.value("psnr_db") or 0.0, np.hstack([pair[0], gap, pair[1]])))
     found.sort(key=lambda item: item[0])
     places = np.linspace(0, len(found) - 1, 2 * count + 1)[1::2].round().astype(int)
     for place in places:

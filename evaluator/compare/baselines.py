@@ -18,6 +18,7 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from evaluator.compare.gate import confusion_of, unheeded_verdict
 from evaluator.compare.known_task import recorded_task
+from evaluator.compare.labels import AFTER
 from evaluator.compare.measure import ends, measured, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import Answer, names_of
@@ -31,7 +32,6 @@ from evaluator.measurements import (
 )
 from evaluator.metrics.geometric_rule import judge_by_geometry
 from evaluator.result import Cell, Measurement, Table
-from evaluator.run_reader.object_states import AFTER
 from evaluator.statistics.differences import paired_points
 from evaluator.statistics.gate import Confusion
 

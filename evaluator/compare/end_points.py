@@ -1,4 +1,4 @@
-"""Where bodies of imported runs end, the tool and the objects it moves: recorded against simulated.
+"""Where bodies of imported runs go, the tool and the objects it moves: recorded against simulated.
 
 A simulated run that was replayed from one recorded run is compared with that run alone; one that
 belongs to no single recorded run is compared with each of them. It says that it is simulated by its
@@ -6,28 +6,39 @@ belongs to no single recorded run is compared with each of them. It says that it
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import partial
 from statistics import median
 
 import numpy as np
-from jaxtyping import Float
 
+from bridge.clock import NS_PER_S
+from bridge.episode import schema
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.streams import object_pose_topics, pose_track
+from bridge.episode.topics import TCP_POSE
+from bridge.errors import BridgeError
 from bridge.geometry.trajectory import PoseTrajectory
-from evaluator.compare.measure import Part, ends, interval_or_reason, measured, millimetres
-from evaluator.compare.trial import tcp_track
+from evaluator.compare.measure import (
+    Part,
+    ends,
+    interval_or_reason,
+    measured,
+    median_of,
+    millimetres,
+    milliseconds,
+)
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import Defined
-from evaluator.metrics.trajectory import MOVING_THRESHOLD_M, NORMALISED_SAMPLES, moving_part
+from evaluator.metrics.trajectory import find_lag_s, position_errors
 from evaluator.motion_measurements import BODY_DISTANCES
-from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
+from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 from evaluator.statistics.intervals import median_interval
 
 TOOL_BODY = "tool"
+MOVED_M = 0.01
+"""A body has left its start, and counts as moved, beyond this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,38 +49,12 @@ class Run:
     task: str
     engine: str | None
     """None for a recorded run."""
-    track: PoseTrajectory
-    """Of the tool."""
-    objects: Mapping[str, PoseTrajectory] = field(default_factory=dict)
+    bodies: Mapping[str, PoseTrajectory] = field(default_factory=dict)
+    """Motions of the tool and of the objects."""
     replayed_from: str | None = None
     """The recorded run that a replay was made from; None where it belongs to no single one."""
     fitted_to: frozenset[str] = frozenset()
     """Recorded runs from which something was identified that a replay uses."""
-
-    def body(self, name: str) -> PoseTrajectory | None:
-        """Return the motion of the tool or of an object; None where it was not recorded."""
-        return self.track if name == TOOL_BODY else self.objects.get(name)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Side:
-    """Runs of one task that are compared together."""
-
-    name: str
-    """``recorded``, or the engine."""
-    runs: tuple[Run, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BodyDistance:
-    """How far a simulated body is from the recorded one; over several simulated runs the mean."""
-
-    end_point_m: float
-    displacement_m: float
-    """Difference of end minus start: where both began plays no part."""
-    over_time_m: float
-    """Mean over normalised time."""
-    moving_over_time_m: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,84 +63,73 @@ class BodyComparison:
 
     recorded: str
     simulated: tuple[str, ...]
-    distance: BodyDistance
+    distance: Mapping[str, float]
+    """By the name in ``BODY_DISTANCES``; over several simulated runs the mean."""
     fitted: bool
     """Something was fitted to this very run, so it says nothing about other runs."""
 
 
-class _Course:
-    """What of a track enters a distance; resampled once, however often it is compared."""
+def body_distance(recorded: PoseTrajectory, simulated: PoseTrajectory) -> dict[str, float]:
+    """Say how far a simulated body is from the recorded one, by the name in ``BODY_DISTANCES``.
 
-    def __init__(self, track: PoseTrajectory) -> None:
-        self._track = track
-
-    @property
-    def end_m(self) -> Float[np.ndarray, "3"]:
-        return np.asarray(self._track.p_m[-1])
-
-    @property
-    def way_m(self) -> Float[np.ndarray, "3"]:
-        return np.asarray(self._track.p_m[-1] - self._track.p_m[0])
-
-    @cached_property
-    def whole_m(self) -> Float[np.ndarray, "num_samples 3"]:
-        return np.asarray(self._track.normalised_time(NORMALISED_SAMPLES).p_m)
-
-    @cached_property
-    def moving_m(self) -> Float[np.ndarray, "num_samples 3"]:
-        return np.asarray(moving_part(self._track).normalised_time(NORMALISED_SAMPLES).p_m)
-
-    def distance(self, other: "_Course") -> BodyDistance:
-        def between(a: np.ndarray, b: np.ndarray) -> float:
-            return float(np.linalg.norm(a - b, axis=-1).mean())
-
-        return BodyDistance(
-            end_point_m=between(self.end_m, other.end_m),
-            displacement_m=between(self.way_m, other.way_m),
-            over_time_m=between(self.whole_m, other.whole_m),
-            moving_over_time_m=between(self.moving_m, other.moving_m),
-        )
+    Clocks of their own are laid over each other where the body leaves its start; then the lag of
+    least distance is taken out, as for replays. The displacement is the end minus the start, so
+    where both began plays no part in it.
+    """
+    ends_m = recorded.p_m[-1] - simulated.p_m[-1]
+    starts_m = recorded.p_m[0] - simulated.p_m[0]
+    laid = simulated.shifted(_leaves_ns(recorded) - _leaves_ns(simulated))
+    try:
+        lag_s = find_lag_s(recorded.stamps_ns, recorded.p_m, laid)
+        later = laid.shifted(round(lag_s * NS_PER_S))
+        path_m = float(position_errors(recorded.stamps_ns, recorded.p_m, later).mean())
+    except UndefinedStatisticError:
+        lag_s = path_m = float("nan")  # which leaves the mean undefined, with its reason
+    return {
+        "end_point_m": float(np.linalg.norm(ends_m)),
+        "displacement_m": float(np.linalg.norm(ends_m - starts_m)),
+        "path_mean_m": path_m,
+        "lag_s": lag_s,
+    }
 
 
-def moved_bodies(real: Side) -> list[str]:
+def _leaves_ns(track: PoseTrajectory) -> int:
+    """When a body leaves its start; of one that stays, its first instant."""
+    away = np.linalg.norm(track.p_m - track.p_m[0], axis=1) > MOVED_M
+    return int(track.stamps_ns[int(np.argmax(away))])
+
+
+def moved_bodies(real: Sequence[Run]) -> list[str]:
     """List the tool and the objects that recorded runs move: by 10 mm, in the median over runs."""
     found = [TOOL_BODY]
-    for name in sorted({name for run in real.runs for name in run.objects}):
-        ways = [
-            float(np.linalg.norm(run.objects[name].p_m[-1] - run.objects[name].p_m[0]))
-            for run in real.runs
-            if name in run.objects
-        ]
-        if median(ways) > MOVING_THRESHOLD_M:
+    for name in sorted({name for run in real for name in run.bodies} - {TOOL_BODY}):
+        tracks = [run.bodies[name] for run in real if name in run.bodies]
+        if median(float(np.linalg.norm(t.p_m[-1] - t.p_m[0])) for t in tracks) > MOVED_M:
             found.append(name)
     return found
 
 
-def compare_bodies(real: Side, simulated: Side, body: str) -> list[BodyComparison]:
+def compare_bodies(
+    real: Sequence[Run], simulated: Sequence[Run], body: str
+) -> list[BodyComparison]:
     """Compare one body run by run; recorded runs without a counterpart are left out."""
-    courses = {run.episode: _Course(track) for run in simulated.runs if (track := run.body(body))}
     found = []
-    for run in real.runs:
-        mine = run.body(body)
+    for run in real:
         others = [
             other
-            for other in simulated.runs
-            if other.replayed_from in (None, run.episode) and other.episode in courses
+            for other in simulated
+            if other.replayed_from in (None, run.episode) and body in other.bodies
         ]
-        if mine is None or not others:
+        if body not in run.bodies or not others:
             continue
-        course = _Course(mine)
-        each = [course.distance(courses[other.episode]) for other in others]
+        each = [body_distance(run.bodies[body], other.bodies[body]) for other in others]
         found.append(
             BodyComparison(
                 recorded=run.episode,
                 simulated=tuple(other.episode for other in others),
-                distance=BodyDistance(
-                    **{
-                        part.name: float(np.mean([getattr(item, part.name) for item in each]))
-                        for part in fields(BodyDistance)
-                    }
-                ),
+                distance={
+                    name: float(np.mean([item[name] for item in each])) for name in BODY_DISTANCES
+                },
                 fitted=any(run.episode in other.fitted_to for other in others),
             )
         )
@@ -164,99 +138,77 @@ def compare_bodies(real: Side, simulated: Side, body: str) -> list[BodyCompariso
 
 def body_measurements(
     task: str, engine: str, body: str, compared: Sequence[BodyComparison]
-) -> list[Measurement]:
+) -> dict[str, Measurement]:
     """Measure the medians over recorded runs; runs that something was fitted to do not count."""
     counted = [item for item in compared if not item.fitted]
     words = f"{body}, {len(counted)} recorded runs against {engine}"
     episodes = [name for item in counted for name in (item.recorded, *item.simulated)]
-    return [
-        _median_of(
+    found = {}
+    for name, quantity in BODY_DISTANCES.items():
+        values = [item.distance[name] for item in counted]
+        found[name] = measured(
             quantity.of(task=task, engine=engine, body=body, what=words),
-            [getattr(item.distance, name) for item in counted],
-            list(dict.fromkeys(episodes)),
+            partial(median_of, values, "median", "no recorded run is left to compare with"),
+            n=len(values),
+            counted="run",
+            reason_without_interval=interval_or_reason(median_interval, values)[1],
+            episodes=list(dict.fromkeys(episodes)),
         )
-        for name, quantity in BODY_DISTANCES.items()
-    ]
+    return found
 
 
-def _median_of(defined: Defined, values_m: list[float], episodes: list[str]) -> Measurement:
-    interval, why_none = interval_or_reason(median_interval, values_m)
-
-    def compute() -> tuple[float, Interval | None]:
-        if not values_m:
-            raise UndefinedStatisticError(
-                statistic="median", reason="no recorded run is left to compare with"
-            )
-        return float(median(values_m)), interval
-
-    return measured(
-        defined,
-        compute,
-        n=len(values_m),
-        counted="run",
-        reason_without_interval=why_none,
-        episodes=episodes,
-    )
-
-
-def compare_end_points(task: str, real: Side, sides: Sequence[Side], table_id: str) -> Part:
+def compare_end_points(
+    task: str, real: Sequence[Run], engines: Mapping[str, Sequence[Run]], table_id: str
+) -> Part:
     """Compare every moved body of a task with every engine."""
     measurements: list[Measurement] = []
     rows: list[dict[str, Cell]] = []
     left_out: list[Exclusion] = []
     for body in moved_bodies(real):
-        for side in sides:
-            compared = compare_bodies(real, side, body)
+        for engine, simulated in engines.items():
+            compared = compare_bodies(real, simulated, body)
             if not compared:
                 continue
-            found = body_measurements(task, side.name, body, compared)
-            measurements += found
-            rows.append(_row(body, side, compared, found))
-            left_out += _fitted(side, compared) if body != TOOL_BODY else []
-    tables = (
-        Table.of(
-            rows,
-            id=table_id,
-            title=f"End points: {task}",
-            note="Medians over recorded runs. A replay is compared with the run that it was made "
-            "from, other simulated runs with every recorded one (mean over them). Displacement: "
-            "end minus start, so where a body began plays no part. Intervals of the end point: "
-            "order statistics, 95 %. Runs that something was fitted to do not count.",
-        ),
+            by_name = body_measurements(task, engine, body, compared)
+            measurements += by_name.values()
+            low, high = (millimetres(end) for end in ends(by_name["end_point_m"].interval))
+            rows.append(
+                {
+                    "body": body,
+                    "engine": engine,
+                    "recorded runs": by_name["end_point_m"].n,
+                    "fitted to": sum(item.fitted for item in compared),
+                    "end-point error (mm)": millimetres(by_name["end_point_m"].value),
+                    "low (mm)": low,
+                    "high (mm)": high,
+                    "displacement error (mm)": millimetres(by_name["displacement_m"].value),
+                    "path (mm)": millimetres(by_name["path_mean_m"].value),
+                    "lag (ms)": milliseconds(by_name["lag_s"].value),
+                }
+            )
+            reason = f"the replays of {engine} were fitted to this run; only held-out runs count"
+            left_out += [
+                Exclusion(episode=item.recorded, scope="end points", reason=reason)
+                for item in compared
+                if item.fitted and body != TOOL_BODY
+            ]
+    table = Table(
+        id=table_id,
+        title=f"End points: {task}",
+        columns=tuple(rows[0]) if rows else (),
+        rows=tuple(tuple(row.values()) for row in rows),
+        note="Medians over recorded runs. A replay is compared with the run that it was made "
+        "from, other simulated runs with every recorded one (mean over them). Displacement: "
+        "end minus start, so where a body began plays no part. Path: mean distance after both "
+        "clocks are begun where the body leaves its start and the remaining lag is taken out. "
+        "Intervals of the end point: order statistics, 95 %. Runs that something was fitted to do "
+        "not count.",
     )
     return Part(
         measurements=tuple(measurements),
-        tables=tables if rows else (),
+        tables=(table,) if rows else (),
         exclusions=tuple(dict.fromkeys(left_out)),
     )
-
-
-def _row(
-    body: str, side: Side, compared: Sequence[BodyComparison], found: Sequence[Measurement]
-) -> dict[str, Cell]:
-    by_name = dict(zip(BODY_DISTANCES, found, strict=True))
-    low, high = ends(by_name["end_point_m"].interval, 1e3)
-    return {
-        "body": body,
-        "engine": side.name,
-        "recorded runs": by_name["end_point_m"].n,
-        "fitted to": sum(item.fitted for item in compared),
-        "end-point error (mm)": millimetres(by_name["end_point_m"].value),
-        "low (mm)": None if low is None else round(low, 2),
-        "high (mm)": None if high is None else round(high, 2),
-        "displacement error (mm)": millimetres(by_name["displacement_m"].value),
-        "error over normalised time (mm)": millimetres(by_name["over_time_m"].value),
-        "the same, moving part (mm)": millimetres(by_name["moving_over_time_m"].value),
-    }
-
-
-def _fitted(side: Side, compared: Sequence[BodyComparison]) -> list[Exclusion]:
-    reason = f"the replays of {side.name} were fitted to this run; only held-out runs count"
-    return [
-        Exclusion(episode=item.recorded, scope="end points", reason=reason)
-        for item in compared
-        if item.fitted
-    ]
 
 
 FITTED_TO = "fitted_to"
@@ -272,9 +224,12 @@ def compare_imported(recorded: Sequence[Episode], files: Sequence[DerivedFile]) 
     tables: list[Table] = []
     missing: list[str] = []
     for task in sorted({run.task for run in runs}):
-        real, simulated = _sides(task, runs)
-        if not real.runs or not simulated:
-            lacking = "simulated" if real.runs else "recorded"
+        of_task = [run for run in runs if run.task == task]
+        real = [run for run in of_task if run.engine is None]
+        names = sorted({run.engine for run in of_task if run.engine is not None})
+        simulated = {name: [run for run in of_task if run.engine == name] for name in names}
+        if not real or not simulated:
+            lacking = "simulated" if real else "recorded"
             missing.append(f"motions of {task or 'the imported runs'}: no {lacking} run")
             continue
         name = f"end_points_{sum(table.id.startswith('end_points') for table in tables)}"
@@ -307,7 +262,7 @@ def _runs(
     ]
     found += [(file.episode, _side_name(file.derived), file.derived) for file in _newest(files)]
     for episode, engine, derived in found:
-        track = tcp_track(episode)
+        track = _tcp_track(episode)
         if track is None or len(track) < 2:
             reason = "no end-effector poses (a topic ending with /tcp/pose)"
             left_out.append(Exclusion(episode=episode.info.id, scope="motions", reason=reason))
@@ -321,21 +276,30 @@ def _runs(
                 episode=episode.path.stem if derived and derived.source_episode else info.id,
                 task=info.task,
                 engine=engine,
-                track=track,
-                objects={name: each for name, each in objects.items() if len(each) > 1},
+                bodies={TOOL_BODY: track}
+                | {name: each for name, each in objects.items() if len(each) > 1},
                 replayed_from=None if derived is None else derived.source_episode or None,
-                fitted_to=frozenset() if derived is None else _fitted_to(derived),
+                fitted_to=_fitted_to(derived),
             )
         )
     return runs, left_out
 
 
-def _fitted_to(derived: Derived) -> frozenset[str]:
+def _tcp_track(episode: Episode) -> PoseTrajectory | None:
+    """Return the tool centre point's poses, or None where they were not recorded."""
+    topics = [
+        topic for topic in episode.topics_of_type(schema.POSE_STAMPED) if topic.endswith(TCP_POSE)
+    ]
+    try:
+        return pose_track(episode, topics[0]) if topics else None
+    except BridgeError:
+        return None
+
+
+def _fitted_to(derived: Derived | None) -> frozenset[str]:
     """Recorded runs from which something was identified that a replay uses."""
-    named = derived.settings.get(FITTED_TO, ())
-    return (
-        frozenset(str(name) for name in named) if isinstance(named, list | tuple) else frozenset()
-    )
+    named = () if derived is None else derived.settings.get(FITTED_TO, ())
+    return frozenset(map(str, named)) if isinstance(named, list | tuple) else frozenset()
 
 
 def _newest(files: Sequence[DerivedFile]) -> list[DerivedFile]:
@@ -356,14 +320,3 @@ def _side_name(derived: Derived) -> str:
         return engine
     words = [engine, derived.trajectory or "", "calibrated" if derived.calibration_id else ""]
     return " ".join(word for word in words if word)
-
-
-def _sides(task: str, runs: Sequence[Run]) -> tuple[Side, list[Side]]:
-    """The recorded runs of a task, and the simulated ones by engine."""
-    of_task = [run for run in runs if run.task == task]
-    engines = sorted({run.engine for run in of_task if run.engine is not None})
-    real = Side(name="recorded", runs=tuple(run for run in of_task if run.engine is None))
-    return real, [
-        Side(name=engine, runs=tuple(run for run in of_task if run.engine == engine))
-        for engine in engines
-    ]

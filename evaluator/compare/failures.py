@@ -39,8 +39,8 @@ def failure_kind(row: TrialRow) -> FailureKind | None:
         cause = row.failing_cause or row.first_failing or UNNAMED
     elif row.recorded is False:
         cause = TWIN_SUCCEEDS if row.twin else NO_ANSWER
-        if row.twin and row.divergence is not None:
-            cause = f"{TWIN_SUCCEEDS}: {row.divergence.attribution}"
+        if row.twin and row.divergence:
+            cause = f"{TWIN_SUCCEEDS}: {row.divergence}"
     else:
         return None
     foretold = row.twin is False

@@ -12,12 +12,12 @@ from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.reader import Episode
 from bridge.episode.topics import TCP_POSE
 from bridge.geometry import se3
-from bridge.task.predicate import PredicateResult, Rollout, all_hold, evaluate_success, objects_done
+from bridge.task.predicate import PredicateResult, Rollout, all_hold, evaluate_success
 from bridge.task.task_file import Task
 from evaluator.compare.known_task import recorded_task
 from evaluator.compare.measure import Part, proportion
 from evaluator.compare.rows import TrialRow
-from evaluator.measurements import LABEL_AGREED, LABEL_AGREED_OF_TASK, LABEL_OBJECTS
+from evaluator.measurements import LABEL_AGREED, LABEL_AGREED_OF_TASK
 from evaluator.result import Cell, Exclusion, Measurement, Table
 
 AFTER = "end"
@@ -25,6 +25,8 @@ DECIDED_BY_A_LOOK = ("inside", "on", "moved", "shape")
 """Clauses that one localisation decides. Whether something still moves, it cannot say."""
 AWAY_M = 0.12
 """Fingers farther than this from an object's origin do not touch it."""
+TAIL_NS = 2 * NS_PER_S
+"""Read of a recording before all of it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +39,6 @@ class PerceivedOutcome:
     plan_id: str
     says: bool | None
     """None when a clause about where or in which shape an object is stays open."""
-    objects_done: int | None
-    """Objects of which everything that one look decides holds; None when some stay open."""
-    num_objects: int
     detail: str
     """What is wrong or open, or that nothing is."""
     not_asked: tuple[str, ...]
@@ -60,17 +59,12 @@ def perceive_outcome(
         return None
     findings = evaluate_success(task, _rollout(recorded, localised, plan_id, task))
     asked = [f for f in findings if f.kind in DECIDED_BY_A_LOOK or f.value is not None]
-    done = objects_done(asked, task.manipulated)
-    says = all_hold(asked)
-    counted = None if None in done.values() else sum(value is True for value in done.values())
     return PerceivedOutcome(
         episode=info.id,
         task=info.task,
         condition=info.condition,
         plan_id=plan_id,
-        says=says,
-        objects_done=counted,
-        num_objects=len(task.manipulated),
+        says=all_hold(asked),
         detail=_told(asked),
         not_asked=tuple(sorted({f.kind for f in findings} - {f.kind for f in asked})),
     )
@@ -130,16 +124,15 @@ def _away(
 
 
 def _tool_m(recorded: Episode, seen_ns: int) -> Float[np.ndarray, "3"] | None:
-    """Where the tool was when the objects were seen; it is asked for near that time first."""
+    """Where the tool was when the objects were seen: at the end of the recording, most often."""
     topics = [t for t in recorded.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE)][:1]
-    for around_ns in (NS_PER_S, None):
-        bounds = (None, None) if around_ns is None else (seen_ns - around_ns, seen_ns + around_ns)
-        found = recorded.messages(topics, start_ns=bounds[0], end_ns=bounds[1])
+    for start_ns in (recorded.end_ns - TAIL_NS, None):
+        found = recorded.messages(topics, start_ns=start_ns)
         try:
             track = streams.pose_track_of([message.data for message in found])
         except MalformedMessageError:
             return None
-        if track is not None:
+        if track is not None and (start_ns is None or track.stamps_ns[0] <= seen_ns):
             return np.asarray(track.at(np.array([seen_ns])).p_m[0])
     return None
 
@@ -163,9 +156,6 @@ def label_results(
     measurements += [
         _rate(task, [pair for pair in pairs if pair[0].task == task], method) for task in tasks
     ]
-    counted = [pair for pair in pairs if pair[0].unit == "object"]
-    if counted:
-        measurements.append(_counts(counted, method))
     return Part(
         measurements=tuple(measurements),
         tables=_disagreements(pairs),
@@ -191,19 +181,6 @@ def _rate(task: str, pairs: Sequence[Pair], method: str) -> Measurement:
         len(known),
         counted="trial",
         reason_if_undefined="no trial has both a label and a decided predicate",
-        episodes=[row.episode for row, _ in known],
-        method=method,
-    )
-
-
-def _counts(pairs: Sequence[Pair], method: str) -> Measurement:
-    known = [(r, w) for r, w in pairs if r.k is not None and w.objects_done is not None]
-    return proportion(
-        LABEL_OBJECTS.of(),
-        sum(row.k == outcome.objects_done for row, outcome in known),
-        len(known),
-        counted="trial",
-        reason_if_undefined="no trial labelled by object has a decided predicate of each object",
         episodes=[row.episode for row, _ in known],
         method=method,
     )

@@ -3,12 +3,13 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 from typing import TypeVar
 
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.measurements import Defined, quantity_of, slug
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
-from evaluator.statistics.intervals import RATE_INTERVALS
+from evaluator.statistics.intervals import RATE_INTERVALS, median_interval
 
 Item = TypeVar("Item")
 DEGREES = math.degrees(1.0)
@@ -30,11 +31,7 @@ def milliseconds(value_s: float | None) -> float | None:
 
 
 def ends(interval: Interval | None, factor: float = 1.0) -> tuple[float | None, float | None]:
-    """Return both ends of an interval, in another unit by ``factor``; unknown without one.
-
-    Args:
-        factor: Multiplies both ends, for example 1000 from m to mm.
-    """
+    """Return both ends of an interval, multiplied into another unit; unknown without one."""
     return (None, None) if interval is None else (factor * interval.low, factor * interval.high)
 
 
@@ -53,6 +50,22 @@ def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> floa
     """Return the mean of what is known; None when nothing is."""
     values = [value for item in items if (value := read(item)) is not None]
     return sum(values) / len(values) if values else None
+
+
+def mean_of(values: Sequence[float], statistic: str, reason: str) -> float:
+    """Return the mean; undefined for the reason given where there is no value."""
+    if not values:
+        raise UndefinedStatisticError(statistic=statistic, reason=reason)
+    return sum(values) / len(values)
+
+
+def median_of(
+    values: Sequence[float], statistic: str, reason: str
+) -> tuple[float, Interval | None]:
+    """Return the median with its interval; undefined for the reason given without a value."""
+    if not values:
+        raise UndefinedStatisticError(statistic=statistic, reason=reason)
+    return float(median(values)), interval_or_reason(median_interval, values)[0]
 
 
 def _rounded(value: float | None, factor: float) -> float | None:
@@ -105,11 +118,8 @@ def measured(
 ) -> Measurement:
     """Compute one statistic; ``compute`` gives a value, or a value with its interval.
 
-    What is not finite is undefined and says so: one broken pose must not end an evaluation.
-
-    Args:
-        compute: Gives the value, or the value with its interval; refuses by
-            ``UndefinedStatisticError``.
+    It refuses by ``UndefinedStatisticError``. What is not finite is undefined and says so: one
+    broken pose must not end an evaluation.
     """
     value: float | None = None
     interval: Interval | None = None

@@ -33,7 +33,7 @@ def as_designed(rows: Sequence[TrialRow], protocol: Protocol | None) -> list[Tri
     policies = {each.policy for each in protocol.policies}
     found = []
     for row in rows:
-        is_blank = row.path is None and row.recorded is None and row.sim_planned is None
+        is_blank = not row.file and row.recorded is None and row.sim_planned is None
         if is_blank and row.plan_id is None:
             continue
         if row.policy in arms:

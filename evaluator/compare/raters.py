@@ -38,19 +38,14 @@ def with_reviews(comparison: Comparison, reviews: Sequence[Review]) -> Compariso
     agreement = [line for line in agreement if line["trials"]]
     if not agreement:
         return replace(comparison, missing=(*missing, "raters: no trial has two known labels"))
-    return replace(
-        comparison, tables=(*comparison.tables, _rater_table(agreement)), missing=missing
-    )
-
-
-def _rater_table(lines: Sequence[dict[str, Cell]]) -> Table:
-    return Table.of(
-        lines,
+    table = Table.of(
+        agreement,
         id="raters",
         title="Agreement of raters",
         note="Kappa: Cohen's (1960), agreement beyond chance; 1 is full agreement. Brackets: 95 % "
         f"percentiles of trials drawn anew, from {FEWEST} trials on.",
     )
+    return replace(comparison, tables=(*comparison.tables, table), missing=missing)
 
 
 def _agreement(first: str, second: str, raters: Mapping[str, Labels]) -> dict[str, Cell]:

@@ -1,21 +1,13 @@
 """What a comparison is made of: one row per recorded trial, with what the twin said of it."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from bridge.episode.executions import NO_PLAN
 from evaluator.compare.motion import MotionSummary
-from evaluator.result import Exclusion, Measurement, Results, Table
-from evaluator.run_reader.episodes import FirstDivergence
-
-RECORDED_WORDS = {True: "stand-in", False: "real", None: "recorded"}
-"""What the recorded side is called."""
+from evaluator.result import Measurement, Results
+from evaluator.trial_row import RECORDED_WORDS
+from evaluator.trial_row import TrialRow as TrialRow
 
 
 def stand_in_of(marks: Iterable[bool | None]) -> bool | None:
@@ -24,98 +16,6 @@ def stand_in_of(marks: Iterable[bool | None]) -> bool | None:
     if True in found:
         return True
     return False if found == {False} else None
-
-
-@dataclass(frozen=True, kw_only=True)
-class TcpErrorSeries:
-    """Distance between the recorded and a replayed tool centre point over time."""
-
-    against: str
-    """``planned`` or ``executed``: which replay."""
-    t_s: Float[np.ndarray, " num_samples"]
-    """Time from the start of the execution [s]."""
-    position_m: Float[np.ndarray, " num_samples"]
-    rotation_rad: Float[np.ndarray, " num_samples"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrialRow:
-    """One recorded trial beside its replays. None means unknown, undecided or not there."""
-
-    episode: str
-    """Id of the recorded episode, or the trial id of a trials CSV."""
-    task: str
-    condition: str
-    policy: str
-    start_id: str | None
-    cell: str
-    stand_in: bool | None
-    """Whether a simulated laboratory recorded it; None where a table does not say."""
-    recorded: bool | None
-    """Task-level outcome as the operator labelled it."""
-    unit: str = "trial"
-    k: int | None = None
-    """Recorded successes in ``unit`` (1 of 1 for a trial; ducks in the basket for an object)."""
-    n: int | None = None
-    plan_id: str | None = None
-    """The plan actually sent: the last one whose execution started; ``NO_PLAN``: there was none."""
-    num_plans: int = 0
-    num_plans_sent: int = 0
-    nothing_executed: bool = False
-    """No plan was sent, though plans were published or the label says so."""
-    sim_planned: bool | None = None
-    """Headline sim: the sent plan, planned trajectory, dynamic, in the twin."""
-    sim_executed: bool | None = None
-    """Diagnosis only: the executed joints replayed dynamically. Never enters r."""
-    verdict: bool | None = None
-    """The gate's verdict on the sent plan, made before its execution started."""
-    p_success: float | None = None
-    """Chance of success as stated: of the planned replay, else of the gate."""
-    sim_varied: float | None = None
-    """Share of varied replays that succeed, of the planned replay, whose draws the gate did not
-    use; without what a posterior adds of how far answers are trusted."""
-    first_failing: str | None = None
-    """ik, clearance or terminal of the planned replay, or of the verdict where there is none."""
-    failing_detail: str | None = None
-    planned_replay: str | None = None
-    """File name of the derived episode ``sim_planned`` comes from."""
-    executed_replay: str | None = None
-    failing_cause: str | None = None
-    """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
-    divergence: FirstDivergence | None = None
-    """Where planned, executed and recorded part first, of the executed replay."""
-    failing_bodies: tuple[str, ...] = ()
-    """What touched, came too close or was lost then."""
-    failing_stage: str = ""
-    """The stage of the plan in which it failed, where the verdict gives an instant."""
-    study_arm: str = ""
-    """without, with or control; empty outside a study."""
-    why_unknown: str = ""
-    """What was said of an outcome that is not known."""
-    stages: tuple[tuple[str, bool | None], ...] = ()
-    """How each stage ended as labelled, in order; empty where nobody said."""
-    baselines: tuple[tuple[str, bool], ...] = ()
-    """What forecasts without a twin say of the plan sent, by name; unknown ones are left out."""
-    progress: float | None = None
-    """How far the recorded trial came, 0 to 1, where somebody scored it."""
-    sim_progress: float | None = None
-    tags: tuple[tuple[str, str], ...] = ()
-    """What was varied, by axis: lighting, pose, distractor, start region."""
-    began_ns: int = 0
-    """When its recording began; 0 where nobody knows, as in a table, whose rows are in order."""
-    path: Path | None = None
-    start_positions_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    """Where the objects were localised at the start, to judge pairs of starts."""
-
-    @property
-    def twin(self) -> bool | None:
-        """What the twin says of the trial: as planned; without a plan, as executed."""
-        return self.sim_executed if self.plan_id == NO_PLAN else self.sim_planned
-
-    @property
-    def recorded_word(self) -> str:
-        """``stand-in``, ``real`` or ``recorded``: what the recorded side of this row is."""
-        return RECORDED_WORDS[self.stand_in]
 
 
 def in_order(rows: Sequence[TrialRow]) -> list[TrialRow]:
@@ -168,23 +68,13 @@ class RateGroup:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Comparison(Results):
     """Everything ``compare_run`` found; the reports and the dashboard only show it."""
 
-    run: str
-    source: str
-    """run, trials, rates or images."""
-    stand_in: bool | None
     rows: tuple[TrialRow, ...] = ()
     groups: tuple[RateGroup, ...] = ()
-    measurements: tuple[Measurement, ...] = ()
-    tables: tuple[Table, ...] = ()
-    exclusions: tuple[Exclusion, ...] = ()
-    missing: tuple[str, ...] = ()
     motions: tuple[MotionSummary, ...] = ()
     """How far each motion lies from its replays, with its course."""
-    provenance: dict[str, Any] = field(default_factory=dict)
-    """Software, settings, and the content hash of every input file."""
 
     @property
     def recorded_word(self) -> str:
@@ -193,13 +83,4 @@ class Comparison:
 
     def results(self) -> Results:
         """Return what goes into ``results.json``."""
-        return Results(
-            run=self.run,
-            source=self.source,
-            stand_in=self.stand_in,
-            measurements=self.measurements,
-            tables=self.tables,
-            exclusions=self.exclusions,
-            missing=self.missing,
-            provenance=self.provenance,
-        )
+        return Results(**{part.name: getattr(self, part.name) for part in fields(Results)})

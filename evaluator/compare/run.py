@@ -14,9 +14,9 @@ from evaluator.cache import SummaryCache
 from evaluator.compare.baselines import with_rule
 from evaluator.compare.end_points import compare_imported
 from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.images.renders import compare_renders
-from evaluator.compare.images.scores import open_nets
-from evaluator.compare.images.views import ViewReport, compare_views
+from evaluator.compare.images.methods import compare_renders
+from evaluator.compare.images.scores import open_net
+from evaluator.compare.images.views import compare_views
 from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
 from evaluator.compare.motion import motion_results
@@ -29,13 +29,12 @@ from evaluator.compare.states import state_results
 from evaluator.compare.study import retry_table
 from evaluator.compare.summaries import Summaries, evaluation_pool, sum_up
 from evaluator.compare.trial import Trial, lay_out
-from evaluator.metrics.image_protocol import ImageOptions
+from evaluator.metrics.image_options import ImageOptions
 from evaluator.result import Exclusion
 from evaluator.run_reader.contents import ODD, RunContents, broken, read_contents
 from evaluator.run_reader.episodes import DerivedIndex
 
 Item = TypeVar("Item")
-AnyPart = Part | ViewReport
 
 QUIET = Output(quiet=True)
 
@@ -55,9 +54,9 @@ def compare_run(
     cache = SummaryCache(None) if cache is None else cache
     read = read_run(RunFolder.open(run.path), cache, output)
     contents = read.contents
-    nets = open_nets(images.backbones)
-    views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
-    methods = compare_renders(images, contents.derived, contents.sources, nets=nets)
+    net = open_net(images.lpips_vgg)
+    views = compare_views(contents.derived, contents.sources, net=net, cache=cache)
+    methods = compare_renders(images, contents.derived, contents.sources, net=net)
     motions = _imported_motions(contents)
     base = compare_read([read], name=read.name, method=method)
     # Words of what is missing come first, then those of images and imported motions.
@@ -210,7 +209,7 @@ def _of_protocol(read: ReadRun, method: str) -> Part:
     )
 
 
-def _with_parts(base: Comparison, parts: Sequence[AnyPart]) -> Comparison:
+def _with_parts(base: Comparison, parts: Sequence[Part]) -> Comparison:
     return replace(
         base,
         measurements=_joined(base.measurements, (part.measurements for part in parts)),
@@ -269,9 +268,7 @@ def _marks(read: ReadRun) -> Iterator[bool | None]:
     yield from (each.facts.info.stand_in for each in read.contents.recorded)
     yield from (file.info.stand_in for file in read.contents.derived)
     recorded = {each.facts.info.id for each in read.contents.recorded}
-    yield from (
-        row.stand_in for row in read.rows if row.path is None and row.episode not in recorded
-    )
+    yield from (row.stand_in for row in read.rows if not row.file and row.episode not in recorded)
 
 
 def _provenance(reads: Sequence[ReadRun]) -> dict[str, Any]:

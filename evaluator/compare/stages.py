@@ -6,11 +6,7 @@ from evaluator.compare.measure import proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.measurements import STAGE
 from evaluator.result import Exclusion, Measurement, Table
-from evaluator.statistics.funnel import (
-    StageCount,
-    failure_taxonomy,
-    funnel,
-)
+from evaluator.statistics.funnel import failure_taxonomy, funnel
 
 NOT_LABELLED, NO_STAGE = "stage not labelled", "no stage, but the task"
 """Stand for the stage of a failure of which nobody named one."""
@@ -58,40 +54,30 @@ def stage_results(
         ended = [[answer for _, answer in stages] for _, stages in alike]
         found = funnel(ended, names)
         episodes = [row.episode for row, _ in alike]
-        measurements += [_measure(task, condition, stage, episodes) for stage in found]
+        measurements += [
+            proportion(
+                STAGE.of(task=task, condition=condition, stage=stage.name),
+                stage.passed,
+                stage.reached - stage.unknown,
+                counted="trial",
+                reason_if_undefined="no trial reached it, or none is labelled",
+                episodes=episodes,
+            )
+            for stage in found
+        ]
         words = condition.replace("_", " ")
         funnel_rows += [
             (task, words, s.name, s.reached, s.passed, s.unknown or None) for s in found
         ]
-    return measurements, _tables(funnel_rows), left_out
-
-
-def _measure(task: str, condition: str, stage: StageCount, episodes: list[str]) -> Measurement:
-    return proportion(
-        STAGE.of(task=task, condition=condition, stage=stage.name),
-        stage.passed,
-        stage.reached - stage.unknown,
-        counted="trial",
-        reason_if_undefined="no trial reached it, or none is labelled",
-        episodes=episodes,
+    table = Table(
+        id="funnel",
+        title="Stage funnel",
+        columns=("task", "condition", "stage", "reached", "passed", "unknown"),
+        rows=tuple(funnel_rows),
+        note="Reached: every earlier stage succeeded. A stage after a failed one is not "
+        "reached, even where it is labelled a success.",
     )
-
-
-def _tables(
-    funnel_rows: Sequence[tuple[str | int | None, ...]],
-) -> tuple[Table, ...]:
-    if not funnel_rows:
-        return ()
-    return (
-        Table(
-            id="funnel",
-            title="Stage funnel",
-            columns=("task", "condition", "stage", "reached", "passed", "unknown"),
-            rows=tuple(funnel_rows),
-            note="Reached: every earlier stage succeeded. A stage after a failed one is not "
-            "reached, even where it is labelled a success.",
-        ),
-    )
+    return measurements, (table,) if funnel_rows else (), left_out
 
 
 def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:

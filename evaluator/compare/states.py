@@ -1,74 +1,65 @@
-"""The predicted final state: where each stage was to leave its object, and where it lay."""
+"""The predicted final state: where the last stage of each object was to leave it, and where it lay.
 
+The poses that the planner wrote into the plan, those at the end of each replay, and those that were
+localised after the execution.
+"""
+
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from statistics import median
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from bridge.episode.reader import Episode
-from bridge.task.task_file import ObjectModel, Task
+from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import PoseSample
+from bridge.episode.reader import Episode, RawMessage
+from bridge.errors import BridgeError
+from bridge.geometry import se3
+from bridge.task.plan import Plan
+from bridge.task.task_file import Task
 from evaluator.compare.known_task import recorded_task
+from evaluator.compare.labels import AFTER, TAIL_NS
 from evaluator.compare.measure import (
     Part,
     degrees,
     ends,
     interval_or_reason,
     measured,
+    median_of,
     millimetres,
 )
-from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import Defined
-from evaluator.metrics.state import extents_difference_m, turn_between_rad, turns_alike
+from evaluator.metrics.state import turn_between_rad, turns_alike
 from evaluator.motion_measurements import STATES
-from evaluator.result import Exclusion, Interval, Measurement, Table
-from evaluator.run_reader.object_states import (
-    ObjectState,
-    predicted_states,
-    read_sent,
-    recorded_states,
-    replayed_states,
-)
+from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.statistics.intervals import cluster_means, median_interval
 
-PLAN, PLANNED, EXECUTED, RECORDED = "plan", "planned", "executed", "recorded"
-PAIRS = (
-    (PLAN, RECORDED),
-    (PLAN, PLANNED),
-    (PLAN, EXECUTED),
-    (PLANNED, RECORDED),
-    (PLANNED, EXECUTED),
-    (EXECUTED, RECORDED),
-)
-"""Who predicts, and what it is held against. ``plan``: the poses the planner wrote into it."""
+PLAN, RECORDED = "plan", "recorded"
+PREDICTED_BY = (PLAN, "planned", "executed")
+"""Who predicts: the planner, or a dynamic replay of the planned or the executed motion."""
 NOT_LOCALISED = "it was not localised after the execution"
+
+Pose = Float[np.ndarray, "4 4"] | str
+"""Pose of an object in the robot's base, or why it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StateSummary:
-    """One predicted pose of one object against where it lay."""
+    """One predicted final pose of one object against where it was localised afterwards."""
 
     episode: str
     task: str
     condition: str
-    plan_id: str
-    stage: str
     object_id: str
     predicted_by: str
     """plan, planned or executed."""
-    against: str
-    """planned, executed or recorded."""
-    is_last: bool
-    """Whether no later stage moves the object: its final state, after settling."""
-    soft: bool
-    position_m: float | None
-    """Distance of the origins; of a soft object, of the middles."""
-    rotation_rad: float | None
+    position_m: float | None = None
+    """Distance of the origins."""
+    rotation_rad: float | None = None
     """Angle modulo the object's symmetry; None where the task file is not known."""
-    extents_m: float | None
-    """Largest difference of an extent, of soft objects whose shape both sides know."""
-    reason: str | None
+    reason: str | None = None
     """Why there is no position."""
 
 
@@ -80,142 +71,134 @@ def summarise_states(
     plan_id: str,
     task: Task | None = None,
 ) -> tuple[StateSummary, ...]:
-    """Compare what a plan, and its replays, predict of each stage's objects with what came out.
+    """Compare what a plan, and its replays, predict of each object with where it lay afterwards.
 
-    Objects are localised only after an execution, so only their final states are held against the
-    recording. Nothing is found when the plan predicts no object.
+    Nothing is found when the plan predicts no object.
     """
-    sent = read_sent(recorded, plan_id)
-    if sent is None:
+    plan = _sent_plan(recorded, plan_id)
+    if plan is None:
         return ()
     info = recorded.info
     task = recorded_task(recorded) if task is None else task
-    last = sent.last_stages()
-    seen = recorded_states(sent, localised)
-    missing = ObjectState(reason=NOT_LOCALISED)
-    sides = {side: replayed_states(replays[side], sent, task) for side in replays}
-    sides[PLAN] = predicted_states(sent.plan)
-    sides[RECORDED] = {
-        (stage, name): seen.get(name, missing)
-        for stage, name in sent.steps()
-        if last[name] == stage
+    last = {name: pose for stage in plan.stages for name, pose in stage.predicted_objects.items()}
+    seen = _seen(recorded, localised, plan_id)
+    sides: dict[str, Mapping[str, Pose]] = {
+        PLAN: {name: se3.pose_from_record(pose) for name, pose in last.items()},
+        **{side: _settled(replay, last) for side, replay in replays.items()},
     }
-    found = []
-    for stage, name in sent.steps():
-        model = None if task is None else task.objects.get(name)
-        for predicted_by, against in PAIRS:
-            first, second = (
-                sides.get(side, {}).get((stage, name)) for side in (predicted_by, against)
-            )
-            if first is None or second is None:
-                continue
-            position, rotation, extents, reason = _differences(first, second, model)
-            found.append(
-                StateSummary(
-                    episode=info.id,
-                    task=info.task,
-                    condition=info.condition,
-                    plan_id=plan_id,
-                    stage=stage,
-                    object_id=name,
-                    predicted_by=predicted_by,
-                    against=against,
-                    is_last=last[name] == stage,
-                    soft=model is not None and model.soft is not None,
-                    position_m=position,
-                    rotation_rad=rotation,
-                    extents_m=extents,
-                    reason=reason,
-                )
-            )
-    return tuple(found)
-
-
-def _differences(
-    first: ObjectState, second: ObjectState, model: ObjectModel | None
-) -> tuple[float | None, float | None, float | None, str | None]:
-    """Return position, rotation and extents, as far as both sides know them, or why not."""
-    T_first, T_second = first.T_base_object, second.T_base_object
-    middle_first, middle_second = first.middle_m, second.middle_m
-    if T_first is None or T_second is None or middle_first is None or middle_second is None:
-        return None, None, None, first.reason or second.reason
-    rotation = extents = None
-    if model is not None:
-        rotation = turn_between_rad(T_first[:3, :3], T_second[:3, :3], turns_alike(model))
-    if first.extents_m is not None and second.extents_m is not None:
-        extents = extents_difference_m(first.extents_m, second.extents_m)
-    return float(np.linalg.norm(middle_first - middle_second)), rotation, extents, None
-
-
-Group = tuple[str, str, str, str]
-"""Who predicts, what it is held against, task, condition."""
-
-
-def _defined(key: Group, name: str, **words: object) -> Defined:
-    predicted_by, against, task, condition = key
-    return STATES[name].of(
-        by=predicted_by,
-        against=against,
-        task=task,
-        condition=condition,
-        **{"quantity": "", "who": "", "other": "", "where": "", "count": 0} | words,
-    )
-
-
-def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
-    """Medians of each group."""
-    rows = []
-    for key in keys:
-        position = by_id[_defined(key, "position").id]
-        rotation = by_id.get(_defined(key, "rotation").id)
-        extents = by_id.get(_defined(key, "extents").id)
-        low, high = (millimetres(end) for end in ends(position.interval))
-        rows.append(
-            {
-                "task": key[2],
-                "condition": key[3].replace("_", " "),
-                "predicted by": key[0],
-                "against": key[1],
-                "objects": position.n,
-                "median distance (mm)": millimetres(position.value),
-                "low (mm)": low,
-                "high (mm)": high,
-                "median rotation (deg)": None if rotation is None else degrees(rotation.value),
-                "median extents (mm)": None if extents is None else millimetres(extents.value),
-            }
+    return tuple(
+        StateSummary(
+            episode=info.id,
+            task=info.task,
+            condition=info.condition,
+            object_id=name,
+            predicted_by=side,
+            **_difference(sides[side][name], seen.get(name, NOT_LOCALISED), task, name),
         )
-    return Table.of(
-        rows,
-        id="final_states",
-        title="Predicted against final object states",
-        note="After each object's last stage, when all has settled. plan: the poses the planner "
-        "wrote into it; planned, executed: the dynamic replays; recorded: localised after the "
-        "execution. Medians over episodes with 95 % intervals from order statistics; rotation is "
-        "modulo symmetry; distance of soft objects is that of their middles.",
+        for name in last
+        for side in PREDICTED_BY
+        if side in sides
     )
+
+
+def _sent_plan(recorded: Episode, plan_id: str) -> Plan | None:
+    """Find a plan in the recording, without its trajectory."""
+    named = json.dumps(plan_id, ensure_ascii=False).encode()  # a plan takes long to parse
+    for message in recorded.messages(recorded.topics_of_type(schema.PLAN)):
+        if named in message.data:
+            plan = Plan.outline_from_json(message.data)
+            if plan.id == plan_id:
+                return plan
+    return None
+
+
+def _seen(recorded: Episode, localised: Episode | None, plan_id: str) -> dict[str, Pose]:
+    """Return where objects were localised after the execution, or that they were not found.
+
+    By the twin, or else by the cell itself.
+    """
+    ended_ns: int | None = None
+    if localised is None:
+        ended_ns = streams.execution_ns(list(streams.events(recorded)), plan_id)[1]
+    states: dict[str, Pose] = {}
+    for record in streams.localisations(recorded if localised is None else localised):
+        if "phase" in record:
+            is_after = (record["phase"], record.get("plan_id")) == (AFTER, plan_id)
+        else:
+            is_after = ended_ns is not None and record["stamp_ns"] >= ended_ns
+        pose = record.get("T_base_object")
+        if is_after and record["found"] and pose is not None:
+            states[record["object"]] = se3.pose_from_record(pose)
+        elif is_after:
+            why = record.get("reason") or "no reason given"
+            states[record["object"]] = f"not found after the execution: {why}"
+    return states
+
+
+def _settled(replay: Episode, wanted: Mapping[str, Any]) -> dict[str, Pose]:
+    """Return where a replay leaves each object, when all has settled."""
+    topics = streams.object_pose_topics(replay)
+    named = [topics[name] for name in wanted if name in topics]
+    last: dict[str, RawMessage] = {}
+    for start_ns in (replay.end_ns - TAIL_NS, None):
+        for message in replay.messages(named, start_ns=start_ns):
+            held = last.get(message.topic)
+            if held is None or message.publish_time_ns >= held.publish_time_ns:
+                last[message.topic] = message
+        if len(last) == len(named):
+            break
+    found: dict[str, Pose] = {}
+    for name in wanted:
+        chosen = last.get(topics.get(name, ""))
+        if chosen is None:
+            found[name] = "the replay holds no poses of it"
+            continue
+        try:
+            T = PoseSample.from_cdr(chosen.data).T_frame_body
+            found[name] = T if np.isfinite(T).all() else "its replayed pose is not a number"
+        except BridgeError as error:
+            found[name] = str(error)
+    return found
+
+
+def _difference(first: Pose, second: Pose, task: Task | None, name: str) -> dict[str, Any]:
+    """Return position and rotation, as far as both sides know them, or why not."""
+    if isinstance(first, str) or isinstance(second, str):
+        return {"reason": first if isinstance(first, str) else second}
+    model = None if task is None else task.objects.get(name)
+    turn = None
+    if model is not None:
+        turn = turn_between_rad(first[:3, :3], second[:3, :3], turns_alike(model))
+    return {
+        "position_m": float(np.linalg.norm(first[:3, 3] - second[:3, 3])),
+        "rotation_rad": turn,
+    }
 
 
 WHO = {
     PLAN: "the plan's predicted pose",
-    PLANNED: "the planned replay's",
-    EXECUTED: "the executed replay's",
-    RECORDED: "the localised recording's",
+    "planned": "the planned replay's",
+    "executed": "the executed replay's",
 }
-QUANTITIES: tuple[tuple[str, str, Callable[[StateSummary], float | None]], ...] = (
-    ("position", "distance of the object", lambda s: s.position_m),
-    ("rotation", "angle modulo the object's symmetry", lambda s: s.rotation_rad),
-    ("extents", "largest difference of a soft object's extents", lambda s: s.extents_m),
+QUANTITIES: tuple[tuple[str, str, str, Callable[[StateSummary], float | None]], ...] = (
+    (
+        "position",
+        "distance of the object",
+        "no position is known",
+        lambda state: state.position_m,
+    ),
+    (
+        "rotation",
+        "angle modulo the object's symmetry",
+        "the task file is not known, so neither is the symmetry",
+        lambda state: state.rotation_rad,
+    ),
 )
-UNKNOWN = {
-    "position": "no position is known",
-    "rotation": "the task file is not known, so neither is the symmetry",
-    "extents": "not both sides know the shape",
-}
-"""Why a quantity has no value although its position has."""
+"""Name, words, why there is no value although there is a position, and the value."""
 
 
 def state_results(states: Sequence[StateSummary]) -> Part:
-    """Measure final states per task and condition; each stage's goes into a table.
+    """Measure final states per task and condition.
 
     Objects of one episode share its calibration and its start, so an episode counts once: the mean
     over its objects.
@@ -223,72 +206,76 @@ def state_results(states: Sequence[StateSummary]) -> Part:
     if not states:
         reason = "no plan that was sent predicts where a stage leaves its objects"
         return Part(missing=(f"final states: no data ({reason})",))
-    groups: dict[Group, list[StateSummary]] = {}
+    groups: dict[tuple[str, str, int], list[StateSummary]] = {}
     for state in states:
-        if state.is_last:
-            key = (state.predicted_by, state.against, state.task, state.condition)
-            groups.setdefault(key, []).append(state)
-    ordered = sorted(groups, key=lambda key: (key[2], key[3], PAIRS.index((key[0], key[1]))))
-    measurements = [m for key in ordered for m in _measure(key, groups[key])]
-    by_id = {measurement.id: measurement for measurement in measurements}
+        key = (state.task, state.condition, PREDICTED_BY.index(state.predicted_by))
+        groups.setdefault(key, []).append(state)
+    measurements: list[Measurement] = []
+    rows: list[dict[str, Cell]] = []
+    for key in sorted(groups):
+        position, rotation = _measure(groups[key])
+        low, high = (millimetres(end) for end in ends(position.interval))
+        measurements += [position, rotation]
+        rows.append(
+            {
+                "task": key[0],
+                "condition": key[1].replace("_", " "),
+                "predicted by": PREDICTED_BY[key[2]],
+                "objects": position.n,
+                "median distance (mm)": millimetres(position.value),
+                "low (mm)": low,
+                "high (mm)": high,
+                "median rotation (deg)": degrees(rotation.value),
+            }
+        )
+    table = Table.of(
+        rows,
+        id="final_states",
+        title="Predicted against final object states",
+        note="Where each object was localised after the execution, against the pose that the "
+        "planner wrote into the plan, and that of the planned and the executed dynamic replay when "
+        "all had settled. Medians over episodes with 95 % intervals from order statistics; "
+        "rotation is modulo symmetry.",
+    )
+    left_out = {
+        (state.episode, f"{state.object_id}: {state.reason}"): None
+        for state in states
+        if state.reason is not None
+    }
     return Part(
         measurements=tuple(measurements),
-        tables=(final_table(ordered, by_id),),
-        exclusions=_left_out(states),
+        tables=(table,),
+        exclusions=tuple(
+            Exclusion(episode=episode, scope="final states", reason=why)
+            for episode, why in left_out
+        ),
     )
 
 
-def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
-    predicted_by, against, task, condition = key
+def _measure(states: Sequence[StateSummary]) -> list[Measurement]:
     found = []
-    for name, quantity, read in QUANTITIES:
+    task, condition = states[0].task, states[0].condition
+    for name, quantity, unknown, read in QUANTITIES:
         pairs = [(value, s.episode) for s in states if (value := read(s)) is not None]
-        if name == "extents" and (predicted_by == PLAN or not any(s.soft for s in states)):
-            continue  # a plan predicts a pose and no shape
-        values, episodes = [value for value, _ in pairs], [episode for _, episode in pairs]
-        of_episode = cluster_means(values, episodes)
-        words = {
-            "quantity": quantity,
-            "who": WHO[predicted_by],
-            "other": WHO[against],
-            "where": f"{task}, {condition.replace('_', ' ')}",
-            "count": len(of_episode),
-        }
+        of_episode = cluster_means([value for value, _ in pairs], [name for _, name in pairs])
+        why = "; ".join(sorted({state.reason for state in states if state.reason})) or unknown
         found.append(
             measured(
-                _defined(key, name, **words),
-                partial(_median, of_episode, states, name),
-                n=len(values),
+                STATES[name].of(
+                    by=states[0].predicted_by,
+                    against=RECORDED,
+                    task=task,
+                    condition=condition,
+                    quantity=quantity,
+                    who=WHO[states[0].predicted_by],
+                    where=f"{task}, {condition.replace('_', ' ')}",
+                    count=len(of_episode),
+                ),
+                partial(median_of, of_episode, "final state", why),
+                n=len(pairs),
                 counted="object",
-                episodes=list(dict.fromkeys(episodes)),
+                episodes=list(dict.fromkeys(episode for _, episode in pairs)),
                 reason_without_interval=interval_or_reason(median_interval, of_episode)[1],
             )
         )
     return found
-
-
-def _median(
-    values: Sequence[float], states: Sequence[StateSummary], quantity: str
-) -> float | tuple[float, Interval | None]:
-    _some(values, states, quantity)
-    return float(median(values)), interval_or_reason(median_interval, values)[0]
-
-
-def _some(values: Sequence[float], states: Sequence[StateSummary], quantity: str) -> None:
-    if values:
-        return
-    reasons = {state.reason for state in states if state.reason}
-    raise UndefinedStatisticError(
-        statistic="final state", reason="; ".join(sorted(reasons)) or UNKNOWN[quantity]
-    )
-
-
-def _left_out(states: Sequence[StateSummary]) -> tuple[Exclusion, ...]:
-    found = {
-        (state.episode, f"{state.object_id}: {state.reason}"): None
-        for state in states
-        if state.reason is not None and state.is_last
-    }
-    return tuple(
-        Exclusion(episode=episode, scope="final states", reason=reason) for episode, reason in found
-    )

@@ -2,34 +2,22 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
-from bridge.clock import NS_PER_S
-from bridge.episode import schema
 from bridge.episode.catalogue_query import UNLABELLED
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import NOTHING_EXECUTED, Outcome, treatment_of
-from bridge.episode.reader import Episode
-from bridge.episode.streams import pose_track
-from bridge.episode.topics import TCP_POSE
-from bridge.errors import BridgeError
 from bridge.exchange.trials_csv import MOST_IN_TRIAL
-from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.verdict import SAME_ENGINE, is_same_engine
-from evaluator.compare.motion import SAME_CLOCK_NS
-from evaluator.compare.rows import TcpErrorSeries, TrialRow
-from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.trajectory import pose_errors
+from evaluator.compare.rows import TrialRow
 from evaluator.result import Exclusion
 from evaluator.run_reader.episodes import (
     DerivedFile,
     DerivedIndex,
     RecordedFacts,
     Replay,
+    RunFile,
     positions_at_start,
 )
-from evaluator.run_reader.inventory import RunFile
-from evaluator.run_reader.tracks import Tracks, read_tracks
 
 TRAJECTORIES = ("planned", "executed")
 CELLS_ENGINE = "cell's own engine"
@@ -151,6 +139,7 @@ def _row(
     places = () if localised is None else localised.facts.places
     return TrialRow(
         episode=info.id,
+        file=file.file_name,
         task=info.task,
         condition=treatment_of(info.condition, info.study_arm),
         study_arm=info.study_arm,
@@ -178,11 +167,10 @@ def _row(
         failing_bodies=() if failing is None else failing.failing_bodies,
         failing_stage=_stage_at(facts, None if failing is None else failing.failing_t_ns),
         stages=_stages(outcome),
-        planned_replay=replays["planned"].file.file_name if "planned" in replays else None,
-        divergence=replays["executed"].facts.divergence if "executed" in replays else None,
-        executed_replay=replays["executed"].file.file_name if "executed" in replays else None,
+        planned_replay=replays["planned"].file_name if "planned" in replays else None,
+        divergence=replays["executed"].facts.divergence if "executed" in replays else "",
+        executed_replay=replays["executed"].file_name if "executed" in replays else None,
         began_ns=facts.began_ns,
-        path=file.path,
         start_positions_m=facts.start_positions_m | positions_at_start(places, facts.started_ns),
     )
 
@@ -203,55 +191,3 @@ def _stages(outcome: Outcome | None) -> tuple[tuple[str, bool | None], ...]:
         (str(stage.get("id", "")), _ANSWERS.get(str(stage.get("result"))))
         for stage in (outcome.stages if outcome is not None else ())
     )
-
-
-def tcp_track(episode: Episode) -> PoseTrajectory | None:
-    """Return the tool centre point's poses, or None where they were not recorded."""
-    topics = [
-        topic for topic in episode.topics_of_type(schema.POSE_STAMPED) if topic.endswith(TCP_POSE)
-    ]
-    try:
-        return pose_track(episode, topics[0]) if topics else None
-    except BridgeError:
-        return None
-
-
-def read_tcp_errors(
-    recorded_path: Path, plan_id: str | None, replays: Mapping[str, Path]
-) -> tuple[TcpErrorSeries, ...]:
-    """Compare the recorded tool centre point with each replay's, over time, if files allow."""
-    if plan_id is None or not replays:
-        return ()
-    recorded = _tracks_of(recorded_path, plan_id)
-    mine = None if recorded is None else recorded.cut().tool
-    if recorded is None or recorded.started_ns is None or mine is None:
-        return ()
-    series = []
-    for against, path in replays.items():
-        other = _tracks_of(path, plan_id)
-        if other is None or other.tool is None:
-            continue
-        gap_ns = recorded.started_ns - int(other.tool.stamps_ns[0])
-        placed = other if abs(gap_ns) <= SAME_CLOCK_NS else other.shifted(gap_ns)
-        if placed.tool is None:
-            continue
-        try:
-            errors = pose_errors(mine, placed.tool)
-        except UndefinedStatisticError:  # they share no instant
-            continue
-        series.append(
-            TcpErrorSeries(
-                against=against,
-                t_s=(errors.stamps_ns - recorded.started_ns) / NS_PER_S,
-                position_m=errors.position_m,
-                rotation_rad=errors.rotation_rad,
-            )
-        )
-    return tuple(series)
-
-
-def _tracks_of(path: Path, plan_id: str) -> Tracks | None:
-    try:
-        return read_tracks(Episode.open(path), plan_id)
-    except BridgeError:  # it has gone or changed since it was listed
-        return None

@@ -1,7 +1,6 @@
-"""How far apart two places of one object are: position, rotation modulo its symmetry, extents."""
+"""How far apart two poses of one object are in rotation, modulo its symmetry."""
 
 from functools import cache
-from itertools import permutations, product
 
 import numpy as np
 from jaxtyping import Float
@@ -35,16 +34,11 @@ def turns_alike(model: ObjectModel) -> Float[np.ndarray, "num_turns 3 3"]:
 
 @cache
 def _box_turns() -> Float[np.ndarray, "24 3 3"]:
-    """Every rotation that lays the axes onto each other: the rotation group of the cube."""
-    turns = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            R = np.zeros((3, 3))
-            R[range(3), order] = signs
-            if np.linalg.det(R) > 0:
-                turns.append(R)
-    turns.sort(key=lambda R: -float(np.trace(R)))
-    return np.stack(turns)
+    """Every rotation that lays the axes onto each other, none first: the group of the cube."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  # takes half a second to load
+
+    turns = Rotation.create_group("O").as_matrix().round()
+    return np.asarray(turns[np.argsort(-turns.trace(axis1=1, axis2=2), kind="stable")])
 
 
 def turn_between_rad(
@@ -55,42 +49,5 @@ def turn_between_rad(
     """Return the smallest angle between two rotations of an object that looks alike after turns.
 
     Range: 0 rad to pi, 0 is perfect.
-
-    Args:
-        turns: What cannot be seen, in the object's frame.
     """
     return float(se3.rotation_angle_rad(R_base_first.T @ (R_base_second @ turns)).min())
-
-
-def soft_box(
-    nodes_m: Float[np.ndarray, "num_nodes 3"],
-    T_base_object: Float[np.ndarray, "4 4"],
-    rest_nodes_m: Float[np.ndarray, "num_nodes 3"],
-    T_base_rest: Float[np.ndarray, "4 4"],
-    size_m: tuple[float, float, float],
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return middle and extents of the box around a soft object, along the axes of its pose [m].
-
-    Nodes may reach beyond the surface or stay within it, so they only tell the change: each extent
-    is that at rest times what the nodes' extent has become, and the middle moves as theirs does.
-
-    Args:
-        nodes_m: Its nodes now, in the base frame.
-        T_base_object: Its pose now; the origin is the middle at rest.
-    """
-    now = se3.apply(se3.invert(T_base_object), nodes_m)
-    rest = se3.apply(se3.invert(T_base_rest), rest_nodes_m)
-    shift = (now.max(axis=0) + now.min(axis=0) - rest.max(axis=0) - rest.min(axis=0)) / 2
-    extents = np.ptp(now, axis=0) / np.ptp(rest, axis=0) * np.array(size_m)
-    return se3.apply(T_base_object, shift), extents
-
-
-def extents_difference_m(
-    first_m: Float[np.ndarray, "3"], second_m: Float[np.ndarray, "3"]
-) -> float:
-    """Return the largest difference of an extent [m]. Range: 0 m and up, 0 is perfect.
-
-    Args:
-        second_m: Its extents in the other, along the same axes [m].
-    """
-    return float(np.abs(first_m - second_m).max())

@@ -30,10 +30,6 @@ def find_lag_s(
     calibration's, and would else be bought off by a delay. Of delays that fit equally well the
     smallest is taken, so a motion that hardly moves has none.
     Range: -0.2 s to 0.6 s, known to 10 ms. Undefined when: positions are not finite.
-
-    Args:
-        stamps_ns: Instants on the common clock.
-        replayed: The same motion; held at its ends where it is shorter.
     """
     choice = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), MAX_INSTANTS)).round()
     ids = np.unique(choice.astype(np.int64))
@@ -80,11 +76,6 @@ def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
 
     Angles that differ by a whole turn put the arm into the same place and count as equal.
     Range: 0 rad to pi, 0 is perfect. Undefined when: no joint or no instant is shared.
-
-    Args:
-        recorded: Recorded joint positions [rad] over time.
-        replayed: Those of the replay, on the same clock; joints that only one side names are left
-            out.
     """
     names = tuple(name for name in recorded.names if name in replayed.names)
     if not names:
@@ -106,10 +97,6 @@ def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
     return JointErrors(names=names, stamps_ns=stamps, error_rad=wrapped)
 
 
-NORMALISED_SAMPLES = 101
-"""Samples from start to end for runs without a common clock."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class PoseErrors:
     """Distance between two poses at the same instants."""
@@ -124,9 +111,6 @@ def pose_errors(recorded: PoseTrajectory, replayed: PoseTrajectory) -> PoseError
 
     Absolute pose error without alignment, its length and its angle: Sturm et al. (2012).
     Range: 0 m and up, 0 is perfect. Undefined when: the two share no instant.
-
-    Args:
-        replayed: Those of the replay, in the same frame and on the same clock.
     """
     common = _common(recorded.stamps_ns, replayed)
     stamps = recorded.stamps_ns[common]
@@ -143,11 +127,7 @@ def position_errors(
     p_recorded_m: Float[np.ndarray, "num_samples 3"],
     replayed: PoseTrajectory,
 ) -> Float[np.ndarray, " num_common"]:
-    """Return the distances [m] of ``pose_errors``, to the bit, where no angle is asked for.
-
-    Args:
-        replayed: Poses of the replay, in the same frame and on the same clock.
-    """
+    """Return the distances [m] of ``pose_errors``, to the bit, where no angle is asked for."""
     common = _common(stamps_ns, replayed)
     other_m = replayed.positions_at(stamps_ns[common])
     return np.asarray(np.linalg.norm(p_recorded_m[common] - other_m, axis=1))
@@ -178,28 +158,3 @@ def angles_rad(
     near = np.linalg.norm(q_first_wxyz - q_second_wxyz, axis=1)
     far = np.linalg.norm(q_first_wxyz + q_second_wxyz, axis=1)
     return np.asarray(4.0 * np.arctan2(np.minimum(near, far), np.maximum(near, far)))
-
-
-MOVING_THRESHOLD_M = 0.01
-"""A run waits while it is closer than this to where it started, or will stay."""
-
-
-def moving_part(run: PoseTrajectory, *, threshold_m: float = MOVING_THRESHOLD_M) -> PoseTrajectory:
-    """Cut the waiting at both ends: from leaving the start to staying at the end.
-
-    A run that never leaves its start is returned whole.
-
-    Args:
-        threshold_m: Distance from the start, or the end, up to which the body counts as waiting
-            [m].
-    """
-    away_from_start = np.linalg.norm(run.p_m - run.p_m[0], axis=1) > threshold_m
-    away_from_end = np.linalg.norm(run.p_m - run.p_m[-1], axis=1) > threshold_m
-    if not away_from_start.any() or not away_from_end.any():
-        return run
-    first = max(0, int(np.argmax(away_from_start)) - 1)
-    last = min(len(run) - 1, int(np.flatnonzero(away_from_end)[-1]) + 1)
-    if last <= first:
-        return run
-    keep = slice(first, last + 1)
-    return PoseTrajectory(run.stamps_ns[keep], run.p_m[keep], run.q_wxyz[keep])

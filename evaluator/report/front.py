@@ -8,7 +8,8 @@ from evaluator.compare.agreement import says_nothing
 from evaluator.compare.conclusions import direction
 from evaluator.compare.policies import ALL_TASKS
 from evaluator.quantity import noun
-from evaluator.report.wording import HEADLINES, agreeing_side
+from evaluator.report.sections import HEADLINES
+from evaluator.report.wording import agreeing_side
 from evaluator.result import Cell, Measurement, Results, Table
 
 SHOWN_TASKS = 8
@@ -22,6 +23,8 @@ CLOSE_PP = 10.0
 """A bias smaller than this does not change what one does with a rate [percentage points]."""
 SIMPSON = "Simpson's paradox"
 """What the report begins with, where a note says it."""
+SAYS_NOTHING = "says nothing"
+"""Said of r by a note, which the first page does not say twice."""
 FIGURES = ("scatter", "success")
 """The picture beside the sentences: the first that was drawn."""
 Row = Mapping[str, Cell]
@@ -31,8 +34,10 @@ Row = Mapping[str, Cell]
 class Front:
     """What a reader sees first."""
 
-    summary: str
+    sentences: Sequence[str]
     """Over all tasks."""
+    next_step: str
+    """What to run next; empty where nothing would settle more."""
     tasks: Sequence[tuple[str, str]]
     """Task and sentence."""
     more_tasks: int
@@ -51,11 +56,15 @@ def front(results: Results) -> Front:
     about = [] if notes is None else [(str(a), str(b)) for a, b in notes.rows]
     missing = [text for text in results.missing if not text.startswith("figures without data")]
     opposed = [text for _, text in about if SIMPSON in text]
-    about = [(name, text) for name, text in about if text not in opposed]
+    told = _summary(results, len(rows))
+    about = [
+        (name, text)
+        for name, text in about
+        if text not in opposed and not (SAYS_NOTHING in text and SAYS_NOTHING in " ".join(told))
+    ]
     return Front(
-        summary=" ".join(
-            [*_compared(results), *(f"{t}." for t in opposed), _summary(results, len(rows))]
-        ),
+        sentences=[*_compared(results), *(f"{t}." for t in opposed), *told],
+        next_step=next_trials(rows),
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
@@ -130,12 +139,16 @@ def _bias_words(row: Row) -> str:
     bias, low, high = (_number(row[name]) for name in ("bias (pp)", "low", "high"))
     if bias is None:
         return "the bias is not known"
-    size = f"bias {round(bias):+d} {noun('point', abs(round(bias)))}"
+    size = f"bias {_signed(bias)} {noun('point', abs(round(bias)))}"
     if low is None or high is None:
         return f"{size}, without an interval"
-    ends = f"[{round(low):+d}, {round(high):+d}]"
+    ends = f"[{_signed(low)}, {_signed(high)}]"
     found = direction(low, high)
     return f"{size} {ends}: the twin is {found}" if found else f"{size}; interval {ends} includes 0"
+
+
+def _signed(value: float) -> str:
+    return f"{round(value):+d}" if round(value) else "0"
 
 
 def _points(value: float) -> str:
@@ -159,7 +172,7 @@ def _ranking_words(row: Row) -> str:
     return f"enough to rank: no, {trials}"
 
 
-def _summary(results: Results, num_tasks: int) -> str:
+def _summary(results: Results, num_tasks: int) -> list[str]:
     by_id = {m.id: m for m in results.measurements}
     parts = _all_alike(results)
     side = agreeing_side(by_id)
@@ -177,14 +190,14 @@ def _summary(results: Results, num_tasks: int) -> str:
     r = by_id.get("agreement.pearson_r")
     if r is not None and r.value is not None:
         parts.append(
-            f"r = {r.value:.2f}{_ends(r, '.2f')} says nothing: its interval is too wide."
+            f"r = {r.value:.2f}{_ends(r, '.2f')} {SAYS_NOTHING}: its interval is too wide."
             if says_nothing(r)
             else f"Its rates follow them with r = {r.value:.2f}{_ends(r, '.2f')}."
             if not r.is_beyond
             else f"Measured r = {r.value:.2f}; without the noise of counting r lies"
             f" in{_ends(r, '.2f')}."
         )
-    return " ".join(parts)
+    return parts
 
 
 def _all_alike(results: Results) -> list[str]:
@@ -237,7 +250,7 @@ def _number(cell: Cell) -> float | None:
 
 def _about(name: str) -> str:
     """Write what a note is about in words."""
-    return dict(HEADLINES).get(name, name.replace("_", " "))
+    return HEADLINES.get(name, name.replace("_", " "))
 
 
 def _short(text: str, longest: int = LONGEST) -> str:

@@ -18,9 +18,17 @@ from bridge.whole_file import write_whole
 from evaluator.report import wording
 from evaluator.report.figures import DARK, LIGHT, Drawing
 from evaluator.report.front import FIGURES, front, front_tables
-from evaluator.report.ranked import FIGURES as DECIDED
-from evaluator.report.ranked import decides, shown_tables
-from evaluator.report.sections import OTHER, SECTIONS, TRIALS, Section, numbers_of, section_of
+from evaluator.report.sections import FIGURES as DECIDED
+from evaluator.report.sections import (
+    OTHER,
+    SECTIONS,
+    TRIALS,
+    Section,
+    decides,
+    numbers_of,
+    section_of,
+    shown_tables,
+)
 from evaluator.report.views import Figures, Shown, is_number, used_columns, view
 from evaluator.result import Measurement, Results, Table
 
@@ -222,8 +230,8 @@ def breakable(text: str) -> Markup:
 
 
 def minus(text: str) -> str:
-    """Write a minus as long as a plus is wide; hyphens inside words stay."""
-    return re.sub(r"(?<![\w.])-(?=[\d.])", "−", text)
+    """Write a minus as long as a plus is wide, and keep a percent sign with its number."""
+    return re.sub(r"(?<![\w.])-(?=[\d.])", "−", text).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def thousands(count: int) -> str:

@@ -3,9 +3,11 @@
 Importing this module loads pyarrow; the evaluator does so only when it writes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, fields
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, get_args
 
 import msgspec
 import pyarrow as pa
@@ -14,39 +16,49 @@ from pyarrow.json import ParseOptions, ReadOptions, read_json
 
 from bridge.exchange.trials_csv import TrialRecord, tags_text
 from bridge.whole_file import part_of
-from evaluator.columns import INTERVAL, OF_MEASUREMENTS, OF_TRIALS
 from evaluator.result import Cell, Measurement, Table
 
 ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 """Column types in which unknown is null, never "", 0, NaN or False."""
 
 
+def _kind_of(field: "Field[Any]") -> type:
+    kind = next(k for k in get_args(field.type) or (field.type,) if k is not NoneType)
+    return kind if kind in ARROW else str
+
+
+OF_TRIALS = {field.name: _kind_of(field) for field in fields(TrialRecord)}
+"""As in ``trials.csv``; tags are one text."""
+INTERVAL = ("low", "high", "level", "method")
+"""Columns of their own; the episodes of a measurement are joined by blanks."""
+OF_MEASUREMENTS = {
+    f.name: _kind_of(f) for f in fields(Measurement) if f.name not in ("interval", "episodes")
+}
+OF_MEASUREMENTS |= dict(zip(INTERVAL, (float, float, float, str), strict=True)) | {"episodes": str}
+
+
 def write_trials(path: Path, trials: Sequence[TrialRecord]) -> Path:
     """Write one row per trial, the columns of ``trials.csv``; outcomes are true, false or null."""
-    columns = {name: [getattr(trial, name) for trial in trials] for name in OF_TRIALS}
-    columns["tags"] = [tags_text(tags) or None for tags in columns["tags"]]
-    return _write(path, columns, OF_TRIALS)
+    rows = [vars(trial) | {"tags": tags_text(trial.tags) or None} for trial in trials]
+    return _write(path, rows, OF_TRIALS)
 
 
 def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
     """Write one row per measured number, its interval in columns."""
-    columns: dict[str, list[Any]] = {
-        name: [getattr(item, name, None) for item in measurements] for name in OF_MEASUREMENTS
-    }
-    for name in INTERVAL:
-        columns[name] = [getattr(item.interval, name, None) for item in measurements]
     joined: dict[tuple[str, ...], str] = {}
+    rows = []
     for item in measurements:
-        joined.setdefault(item.episodes, " ".join(item.episodes))
-    columns["episodes"] = [joined[item.episodes] for item in measurements]
-    return _write(path, columns, OF_MEASUREMENTS)
+        episodes = joined.setdefault(item.episodes, " ".join(item.episodes))
+        ends = {name: getattr(item.interval, name, None) for name in INTERVAL}
+        rows.append(vars(item) | ends | {"episodes": episodes})
+    return _write(path, rows, OF_MEASUREMENTS)
 
 
 def write_table(path: Path, table: Table) -> Path:
     """Write one row per row of a table, each column with the type of what it holds."""
-    columns = {name: [row[i] for row in table.rows] for i, name in enumerate(table.columns)}
-    types = {name: _type_of(values) for name, values in columns.items()}
-    return _write(path, columns, types)
+    rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    types = {name: _type_of([row[name] for row in rows]) for name in table.columns}
+    return _write(path, rows, types)
 
 
 def _type_of(values: Sequence[Cell]) -> type:
@@ -55,10 +67,9 @@ def _type_of(values: Sequence[Cell]) -> type:
     return float if kinds == {int, float} else found
 
 
-def _write(path: Path, columns: dict[str, list[Any]], types: dict[str, type]) -> Path:
+def _write(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, type]) -> Path:
     schema = pa.schema([(name, ARROW[kind]) for name, kind in types.items()])
-    rows = zip(*(columns[name] for name in types), strict=True)
-    text = b"\n".join(msgspec.json.encode(dict(zip(types, row, strict=True))) for row in rows)
+    text = b"\n".join(msgspec.json.encode({name: row[name] for name in types}) for row in rows)
     if text:  # pyarrow reads JSON without loading pandas, which pa.array does: 0.4 s
         table = read_json(
             pa.BufferReader(text),

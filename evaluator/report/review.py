@@ -1,32 +1,36 @@
 """Write the index that the review pages read: trials, files, numbers, and what they mean."""
 
+import csv
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
-from functools import cache
+from collections.abc import Container, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError
+from bridge.exchange.trials_csv import trials_text
 from bridge.whole_file import write_whole
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare.failures import failure_kind, start_regions
-from evaluator.compare.rows import Comparison, TrialRow
-from evaluator.compare.run import compare_run
+from evaluator.compare.measure import refuse_alike
+from evaluator.compare.motion import MotionSummary
+from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
+from evaluator.compare.run import read_run
+from evaluator.compare.spreadsheet import record_from_row
 from evaluator.compare.stages import first_failed_stage
+from evaluator.memory import without_collecting
 from evaluator.quantity import slug
 from evaluator.report.front import CLOSE_PP, answer, conclusions, front, next_trials, sentence
 from evaluator.report.page import grid
 from evaluator.report.wording import cell_text
-from evaluator.result import Measurement, Results, Table, load_results
+from evaluator.result import Results, Table, load_results
 from evaluator.review_index import (
     FACETS,
     NO_RESULTS,
     IndexedFile,
-    IndexedTrial,
     index_path,
     plain_record,
     severity,
@@ -34,10 +38,6 @@ from evaluator.review_index import (
     written_index,
 )
 
-FROM_TRIALS = ("agreement.", "gain.", "rate.")
-"""Numbers that follow from trials, labels and replays, whatever else was asked of an evaluation."""
-DIGITS = 9
-"""Two versions of the program may sum up in another order."""
 SHOWN_EXCLUSIONS = 200
 """Of those left out; ``results.json`` has all."""
 SHOWN_ROWS = 24
@@ -45,26 +45,40 @@ SHOWN_ROWS = 24
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Stored:
-    """``results.json``, or why there is none."""
+class _Read:
+    """What the trials of a run say now, without the statistics of it, or why nothing."""
 
-    results: Results | None
+    began_ns: int
+    """When it began to be read."""
+    rows: Sequence[TrialRow] = ()
+    motions: Sequence[MotionSummary] = ()
+    derived: Container[str] = ()
+    """Names of the derived files that were read."""
     reason: str | None = None
 
 
 def refresh(run: RunFolder) -> bytes:
-    """Compare the run as it is now with its stored results; write and return its index.
+    """Read the run as it is now, beside its stored results; write and return its index.
 
     Where the run cannot be written, the index is only returned.
     """
-    began_ns = time.time_ns()
-    comparison, reason = None, None
+    read = _Read(began_ns=time.time_ns())
     try:
-        with SummaryCache(run.results_dir / FOLDER) as kept:
-            comparison = compare_run(run, cache=kept)
+        with without_collecting(), SummaryCache(run.results_dir / FOLDER) as kept:
+            found = read_run(RunFolder.open(run.path), kept)
+        for kind in FACETS:
+            refuse_alike(kind, ((getattr(row, kind), row.episode) for row in found.rows))
+        derived = {file.name for file in found.contents.derived}
+        motions = found.summaries.motions
+        read = replace(read, rows=found.rows, motions=motions, derived=derived)
     except GstError as error:
-        reason = str(error)
-    return _write(run, comparison, _load(run), reason, began_ns)
+        read = replace(read, reason=str(error))
+    try:
+        return _write(run, read, load_results(run.path), None)
+    except PathNotFoundError:
+        return _write(run, read, None, NO_RESULTS)
+    except GstError as error:
+        return _write(run, read, None, str(error))
 
 
 def index_run(run: RunFolder, comparison: Comparison, results: Results, began_ns: int) -> None:
@@ -73,55 +87,41 @@ def index_run(run: RunFolder, comparison: Comparison, results: Results, began_ns
     Args:
         began_ns: When it began to read; what changed since is looked at again [ns since 1970].
     """
-    _write(run, comparison, _Stored(results=results), None, began_ns)
+    derived = comparison.provenance.get("derived", {})
+    read = _Read(
+        began_ns=began_ns, rows=comparison.rows, motions=comparison.motions, derived=derived
+    )
+    _write(run, read, results, None)
 
 
-def _load(run: RunFolder) -> _Stored:
-    try:
-        return _Stored(results=load_results(run.path))
-    except PathNotFoundError:
-        return _Stored(results=None, reason=NO_RESULTS)
-    except GstError as error:
-        return _Stored(results=None, reason=str(error))
-
-
-def _write(
-    run: RunFolder,
-    comparison: Comparison | None,
-    stored: _Stored,
-    reason: str | None,
-    began_ns: int,
-) -> bytes:
+def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str | None) -> bytes:
     state = state_of(run)
-    rows = [] if comparison is None else list(comparison.rows)
-    motions = () if comparison is None else comparison.motions
     off = {
         motion.episode: (motion.path_max_m, motion.lag_s)
-        for motion in motions
-        if (motion.side, motion.against) == ("recorded", "planned")
+        for motion in read.motions
+        if motion.against == "planned"
     }
-    regions = start_regions(rows)
+    regions = start_regions(read.rows)
     trials = sorted(
         (
-            _trial(row, off.get(row.episode, (None, None)), regions.get(row.episode, ""))
-            for row in rows
+            _reviewed(row, off.get(row.episode, (None, None)), regions.get(row.episode, ""))
+            for row in read.rows
         ),
         key=severity,
     )
     about = {
         "state": state.digest,
-        "as_of_ns": began_ns,
-        "changed_meanwhile": state.newest_ns >= began_ns,
-        "comparison_reason": reason,
-        "outdated": _outdated(stored.results, comparison),
-        **_about(comparison, stored, has_trials=bool(rows)),
+        "as_of_ns": read.began_ns,
+        "changed_meanwhile": state.newest_ns >= read.began_ns,
+        "comparison_reason": read.reason,
+        "outdated": None if results is None or read.reason else _outdated(run, read.rows),
+        "results_reason": why_none,
+        "stand_in": stand_in_of(row.stand_in for row in read.rows)
+        if results is None or results.stand_in is None
+        else results.stand_in,
+        **_about(results, has_trials=bool(read.rows)),
     }
-    slug_of = cache(slug)
-    content = written_index(
-        ((each, {name: slug_of(getattr(each, name)) for name in FACETS}) for each in trials),
-        _files(run, comparison, {trial.file for trial in trials}),
-        about,
-    )
+    content = written_index(trials, _files(run, read, {trial.file for trial in trials}), about)
     path = index_path(run)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -131,12 +131,10 @@ def _write(
     return content
 
 
-def _trial(row: TrialRow, off: tuple[float | None, float | None], region: str) -> IndexedTrial:
+def _reviewed(row: TrialRow, off: tuple[float | None, float | None], region: str) -> TrialRow:
     kind = failure_kind(row)
-    shared = {each.name for each in fields(IndexedTrial)} & vars(row).keys()
-    return IndexedTrial(
-        **{name: getattr(row, name) for name in shared},
-        file="" if row.path is None else row.path.name,
+    return replace(
+        row,
         failed_stage=first_failed_stage(row) if row.recorded is False else "",
         distance_m=off[0],
         lag_s=off[1],
@@ -147,24 +145,18 @@ def _trial(row: TrialRow, off: tuple[float | None, float | None], region: str) -
     )
 
 
-def _about(comparison: Comparison | None, stored: _Stored, *, has_trials: bool) -> dict[str, Any]:
-    results = stored.results
-    stand_in = next(
-        (s.stand_in for s in (results, comparison) if s is not None and s.stand_in is not None),
-        None,
-    )
-    about: dict[str, Any] = {"results_reason": stored.reason, "stand_in": stand_in}
+def _about(results: Results | None, *, has_trials: bool) -> dict[str, Any]:
     if results is None:
-        return about | {"measurements": [], "exclusions": [], "num_exclusions": 0, "missing": []}
+        return {"measurements": [], "exclusions": [], "num_exclusions": 0, "missing": []}
     lines = conclusions(results)
     first = front(results)
     failures = next((t for t in results.tables if t.id == "failures"), None)
-    return about | {
+    return {
         "measurements": [plain_record(each) for each in results.measurements],
         "exclusions": [dict(vars(each)) for each in results.exclusions[:SHOWN_EXCLUSIONS]],
         "num_exclusions": len(results.exclusions),
         "missing": list(results.missing),
-        "summary": first.summary,
+        "summary": " ".join(first.sentences),
         "unseen": first.unseen,
         "notes": [list(note) for note in first.notes],
         "close_pp": CLOSE_PP,
@@ -194,45 +186,32 @@ def _shown(table: Table) -> dict[str, Any]:
     }
 
 
-def _outdated(results: Results | None, comparison: Comparison | None) -> list[Any] | None:
-    """Return the first number that differs between ``results.json`` and the files of the run.
-
-    Returns:
-        The stored value and the present one; None on a side that does not have it. None when all
-        numbers are up to date, or when there is nothing to compare them with.
-    """
-    if results is None or comparison is None:
-        return None
-    stored, now = (
-        {m.id: m for m in side.measurements if m.id.startswith(FROM_TRIALS)}
-        for side in (results, comparison)
+def _outdated(run: RunFolder, rows: Sequence[TrialRow]) -> str | None:
+    """Say what of a trial is not as it was when the stored results were computed; None of none."""
+    try:
+        stored = (run.results_dir / "trials.csv").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return None  # nothing to compare with
+    was, now = (
+        {line["trial_id"]: line for line in csv.DictReader(text.splitlines())}
+        for text in (stored, trials_text(map(record_from_row, rows)))
     )
-    for name in dict.fromkeys((*stored, *now)):
-        if _counts(stored.get(name)) != _counts(now.get(name)):
-            pair = (stored.get(name), now.get(name))
-            return [None if side is None else plain_record(side) for side in pair]
+    for name in dict.fromkeys((*was, *now)):
+        if name not in was or name not in now:
+            return f"trial {name} {'is new' if name in now else 'has gone'}"
+        for part, value in now[name].items():
+            if (before := was[name].get(part)) != value:
+                return f"{part} of {name} was {before or 'unknown'} and is now {value or 'unknown'}"
     return None
 
 
-def _counts(measurement: Measurement | None) -> tuple[float | None, int | None, int | None]:
-    """What makes a number another one; its interval is a matter of how it was asked for."""
-    if measurement is None:
-        return None, None, None
-    value = measurement.value
-    return None if value is None else round(value, DIGITS), measurement.k, measurement.n
-
-
-def _files(
-    run: RunFolder, comparison: Comparison | None, trials: set[str]
-) -> Iterator[IndexedFile]:
-    """Name what is no trial; what the comparison has read well is not opened again."""
-    derived = {} if comparison is None else comparison.provenance.get("derived", {})
-    read = {name.rpartition("/")[2] for name in derived}
+def _files(run: RunFolder, read: _Read, trials: set[str]) -> Iterator[IndexedFile]:
+    """Name what is no trial; derived files that were read well are not opened again."""
     for path in run.episodes():
         if path.name not in trials:
             yield _file(run, path)
     for path in run.derived():
-        if path.name not in read:
+        if f"{run.derived_dir.name}/{path.name}" not in read.derived:
             found = _file(run, path)
             if found.error:
                 yield found

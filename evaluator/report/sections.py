@@ -1,10 +1,67 @@
-"""The parts of the report, in the order a reader needs them, and what belongs to each."""
+"""What a report shows, in the order a reader needs it: parts, their tables, their numbers."""
 
-import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from evaluator.result import Measurement
+from evaluator.result import Measurement, Results, Table
+
+HEADLINES: dict[str, str] = {
+    "agreement.sim_planned.rate": "Sim and outcome agree",
+    "agreement.sim_planned.phi": "phi of sim and outcome",
+    "agreement.sim_planned.ppv": "Success when sim says success (PPV)",
+    "agreement.sim_planned.npv": "Failure when sim says failure (NPV)",
+    "baseline.sim_planned.base_rate": "Success whatever sim says (base rate)",
+    "baseline.sim_planned.geometric_rule.rate": "Geometric rule and outcome agree",
+    "baseline.sim_planned.geometric_rule.twin_gain_pp": "Sim more often right than that rule",
+    "agreement.verdict.ppv": "Success when the gate accepted (PPV)",
+    "agreement.pearson_r": "Pearson r over groups",
+    "agreement.pearson_r.without_replanning": "Pearson r without replanning",
+    "agreement.pearson_r.with_replanning": "Pearson r with replanning",
+    "agreement.bias_pp": "Bias of sim",
+    "agreement.mmrv_recorded_gap": "MMRV (gap of recorded rates)",
+    "gain.pp.recorded.average": "Replanning gain, mean of tasks",
+    "gain.relative.recorded.average": "The same, relative",
+    "decision.regret_pp": "Loss of taking what sim ranks first",
+    "motion.planned.path_mean_m": "Tool path: recorded to planned replay, lag taken out",
+    "motion.planned.lag_s": "Tool lag: recorded behind planned replay",
+    "motion.executed.path_mean_m": "Tool path: recorded to executed replay, lag taken out",
+    "views.all.psnr_db": "PSNR of held-out views, raw",
+    "views.all.psnr_gain_db": "The same after a gain per image and channel",
+    "views.all.ssim": "SSIM of held-out views",
+    "views.all.ssim_zero": "The same, zeros beyond the border",
+    "views.all.depth_median_abs_m": "Depth of held-out views, median error of an image",
+    "views.all.depth_mean_abs_m": "The same, mean error: edges count most",
+    "views.all.lpips": "LPIPS of held-out views",
+    "views.all.lpips_vgg_01": "LPIPS (VGG, images in 0..1) of held-out views",
+}
+"""What to read first, and what to call it."""
+NAMES: dict[str, str] = HEADLINES | {
+    "protocol.departures": "Departures from the protocol",
+    "agreement.spearman_rho": "Spearman's rank correlation",
+    "agreement.mae_pp": "Mean absolute error of sim",
+    "agreement.order_accuracy": "Pairs of groups in the right order",
+    "agreement.blind_share": "Share of groups in which sim says nothing",
+    "decision.wrong_pairs": "Pairs of candidates in the wrong order",
+    "decision.wrong_pairs_pp": "Recorded difference of those pairs, mean",
+    "gain.pp.sim.average": "The same in the twin",
+    "gain.relative.sim.average": "The same in the twin, relative",
+    "baseline.sim_planned.geometric_rule.ppv": "PPV of the geometric rule",
+    "baseline.sim_planned.geometric_rule.npv": "NPV of the geometric rule",
+    "agreement.verdict.rate": "Verdict and outcome agree",
+    "agreement.verdict.npv": "Failure when the gate refused (NPV)",
+    "agreement.verdict_unheeded.ppv": "PPV where the gate was not obeyed",
+    "agreement.verdict_unheeded.npv": "NPV where the gate was not obeyed",
+    "baseline.verdict_unheeded.base_rate": "Base rate where the gate was not obeyed",
+    "baseline.verdict_unheeded.geometric_rule.twin_gain_pp": "Gate more often right than the rule",
+    "reliability.brier": "Brier score of the stated probability",
+    "reliability.brier_of_base_rate": "Brier score of the base rate",
+    "motion.planned.path_max_m": "Tool path: largest distance to planned replay",
+    "motion.planned.joint_rms_rad": "Joints: recorded to planned replay, root mean square",
+    "motion.executed.joint_rms_rad": "Joints: recorded to executed replay, root mean square",
+    "label.localised.rate": "Label and localised goal agree",
+}
+"""All numbers that a report calls by name; the others stand in ``results.json``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,8 +72,8 @@ class Section:
     title: str
     lead: str
     """What question it answers, and what to beware of."""
-    numbers: tuple[tuple[str, str], ...] = ()
-    """Pattern of ids, and what to call the number; an empty name is made from the id."""
+    numbers: tuple[str, ...] = ()
+    """Patterns of ids; those in ``NAMES`` are shown."""
     tables: tuple[str, ...] = ()
     figures: tuple[str, ...] = ()
 
@@ -39,7 +96,7 @@ SECTIONS: tuple[Section, ...] = (
         id="protocol",
         title="The study against its protocol",
         lead="What was fixed before the first trial, what it found, and every departure from it.",
-        numbers=(("protocol.departures", "Departures from the protocol"),),
+        numbers=("protocol.*",),
         tables=("protocol_departures",),
     ),
     Section(
@@ -47,7 +104,6 @@ SECTIONS: tuple[Section, ...] = (
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
         "plan actually sent, replayed with physics.",
-        numbers=(),
         tables=("success", "layout", "notes"),
         figures=("success",),
     ),
@@ -56,18 +112,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Agreement over groups",
         lead="Whether the twin's rates move with the labelled ones, and how far off they are. A "
         "high r does not show that the right decision follows, nor that there is no bias.",
-        numbers=(
-            ("agreement.pearson_r", "Pearson r"),
-            ("agreement.pearson_r.without_replanning", "Pearson r, without replanning"),
-            ("agreement.pearson_r.with_replanning", "Pearson r, with replanning"),
-            ("agreement.spearman_rho", "Spearman's rank correlation"),
-            ("agreement.bias_pp", "Bias: sim minus labelled"),
-            ("agreement.mae_pp", "Mean absolute error"),
-            ("agreement.order_accuracy", "Pairs of groups in the right order"),
-            ("agreement.mmrv_recorded_gap", "MMRV, gap of recorded rates"),
-            ("agreement.blind*", ""),
-            ("decision.*", ""),
-        ),
+        numbers=("agreement.[!sv]*", "agreement.spearman_rho", "decision.*"),
         tables=("axes",),
         figures=("scatter",),
     ),
@@ -76,14 +121,7 @@ SECTIONS: tuple[Section, ...] = (
         title="The gain with replanning",
         lead="Percentage points and relative gain are two numbers for one change; each is "
         "labelled. The tests say whether so many trials can show it at all.",
-        numbers=(
-            ("gain.pp.recorded.average", "Gain, mean of tasks, as labelled"),
-            ("gain.relative.recorded.average", "The same, relative"),
-            ("gain.pp.sim.average", "Gain, mean of tasks, in the twin"),
-            ("gain.relative.sim.average", "The same, relative, in the twin"),
-            ("comparison.*", ""),
-            ("study.*", ""),
-        ),
+        numbers=("gain.*",),
         tables=("comparisons", "standing", "comparison_numbers", "study_arms", "gains", "retries"),
     ),
     Section(
@@ -91,29 +129,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Trial by trial: the gate's scorecard",
         lead="What the twin said of each plan against how it ended, and what obeying it costs "
         "and avoids.",
-        numbers=(
-            ("agreement.sim_planned.rate", "Sim and outcome agree"),
-            ("agreement.sim_planned.ppv", "Success when sim says success (PPV)"),
-            ("agreement.sim_planned.npv", "Failure when sim says failure (NPV)"),
-            ("agreement.sim_planned.phi", "phi of sim and outcome"),
-            ("baseline.sim_planned.base_rate", "Success whatever sim says (base rate)"),
-            ("baseline.sim_planned.geometric_rule.rate", "Geometric rule and outcome agree"),
-            ("baseline.sim_planned.geometric_rule.ppv", "PPV of the geometric rule"),
-            ("baseline.sim_planned.geometric_rule.npv", "NPV of the geometric rule"),
-            ("baseline.sim_planned.geometric_rule.twin_gain_pp", "Sim more often right than it"),
-            ("agreement.verdict.rate", "Verdict and outcome agree"),
-            ("agreement.verdict.ppv", "Success when the gate accepted (PPV)"),
-            ("agreement.verdict.npv", "Failure when the gate refused (NPV)"),
-            ("agreement.verdict_unheeded.ppv", "PPV where the gate was not obeyed"),
-            ("agreement.verdict_unheeded.npv", "NPV where the gate was not obeyed"),
-            ("baseline.verdict_unheeded.base_rate", "Base rate where the gate was not obeyed"),
-            (
-                "baseline.verdict_unheeded.geometric_rule.twin_gain_pp",
-                "Gate more right than it",
-            ),
-            ("reliability.brier", "Brier score of the stated probability"),
-            ("reliability.brier_of_base_rate", "Brier score of the base rate"),
-        ),
+        numbers=("agreement.sim_planned.*", "agreement.verdict*", "baseline.*", "reliability.*"),
         tables=("confusion", "gate_*"),
     ),
     Section(
@@ -126,7 +142,6 @@ SECTIONS: tuple[Section, ...] = (
         id="stages",
         title="Where trials are lost",
         lead="Which stage ends a trial, and what failed first on each side.",
-        numbers=(),
         tables=("funnel", "failures"),
     ),
     Section(
@@ -134,42 +149,23 @@ SECTIONS: tuple[Section, ...] = (
         title="Motions",
         lead="How far the recorded robot lies from the replayed one: planned tells about the "
         "controller, executed about kinematics and calibration.",
-        numbers=tuple(
-            (f"motion.{against}.{quantity}", f"{words}, {against} replay")
-            for against in ("planned", "executed")
-            for quantity, words in (
-                ("lag_s", "Tool, lag behind the replay"),
-                ("path_mean_m", "Tool, mean distance of the paths, lag taken out"),
-                ("path_max_m", "Tool, largest distance of the paths"),
-                ("end_point_m", "Tool, distance at the end"),
-                ("joint_rms_rad", "Joints, root mean square"),
-            )
-        ),
+        numbers=("motion.*",),
         tables=("motion*", "end_points_*"),
     ),
     Section(
         id="states",
         title="Predicted states and labels",
-        lead="Where the twin expected objects to end up, where they were localised, and where the "
-        "replay left them; and whether labels and localised goals agree.",
-        numbers=(("label.*", ""),),
+        lead="How far from where they were predicted objects were localised, and whether labels "
+        "and localised goals agree.",
+        numbers=("label.*",),
         tables=("final_states", "label*"),
     ),
     Section(
         id="views",
         title="Images",
         lead="Rendered against held-out recorded images. No value stands without its protocol: it "
-        "is in the definition of each number below.",
-        numbers=(
-            ("views.all.psnr_db", "PSNR, raw"),
-            ("views.all.psnr_gain_db", "PSNR, after a gain per image"),
-            ("views.all.ssim", "SSIM, raw"),
-            ("views.all.ssim_gain", "SSIM, after a gain per image"),
-            ("views.all.lpips*", ""),
-            ("views.all.depth_median_abs_m", "Depth, median absolute error"),
-            ("views.all.depth_mean_abs_m", "Depth, mean absolute error"),
-            ("image.*", ""),
-        ),
+        "is in the definition of each number in results.json.",
+        numbers=("views.*",),
         tables=("views*", "image*"),
     ),
 )
@@ -177,34 +173,72 @@ SECTIONS: tuple[Section, ...] = (
 OTHER = Section(id="other", title="More tables", lead="", tables=("*",))
 TRIALS = "trials"
 """The table that is as long as the run; it comes last."""
+MOST_TABLES = 12
+"""In a report; ``--all`` shows the rest too."""
+TABLES: dict[str, str] = {
+    "published": "whether a printed number may be quoted",
+    "comparisons": "which candidate to use, and whether to run more trials",
+    "standing": "which candidates to keep",
+    "protocol_departures": "whether the study may be quoted as it was planned",
+    "conclusions": "for which task the twin may stand in for the robot",
+    "layout": "whether to run with replanning",
+    "success": "which candidate to use",
+    "notes": "what these numbers must not be taken for",
+    "trials": "which trial to look at",
+    "against": "which of two twins to use",
+    "image_methods": "which reconstruction to use",
+    "confusion": "whether the twin's yes may start the robot, and its no may stop it",
+    "gate_baselines": "whether the twin is worth more than a rule without one",
+    "gains": "whether replanning is worth its time",
+    "funnel": "on which stage to work",
+    "failures": "which cause to remove first",
+    "end_points_*": "whether the engine's friction and timing are right",
+    "motion": "whether to work on the controller or on the calibration",
+    "final_states": "whether the localisation is good enough for the task",
+    "views_0": "whether the scene is good enough to look at",
+    "axes": "which circumstances to record more of",
+    "raters": "whether the labels can be trusted",
+}
+"""What each table decides, the most urgent first."""
+FIGURES: dict[str, str] = {
+    "success": "which candidate to use",
+    "scatter": "whether the twin's rates may stand in for recorded ones",
+}
 
 
 def section_of(table_id: str) -> Section:
     """Return the part a table belongs to."""
-    for section in SECTIONS:
-        if any(fnmatchcase(table_id, pattern) for pattern in section.tables):
-            return section
-    return OTHER
+    matches = (s for s in SECTIONS if any(fnmatchcase(table_id, name) for name in s.tables))
+    return next(matches, OTHER)
 
 
 def numbers_of(
-    section: Section, measurements: tuple[Measurement, ...]
+    section: Section, measurements: Sequence[Measurement]
 ) -> list[tuple[str, Measurement]]:
-    """Return (name, measurement) of a part, in the order of its patterns."""
-    found: dict[str, tuple[str, Measurement]] = {}
-    for pattern, name in section.numbers:
-        for measurement in measurements:
-            if fnmatchcase(measurement.id, pattern):
-                found.setdefault(measurement.id, (name or name_of(measurement.id), measurement))
-    return list(found.values())
+    """Return (name, measurement) of a part, in the order of the names."""
+    by_id = {measurement.id: measurement for measurement in measurements}
+    return [
+        (name, by_id[id_])
+        for id_, name in NAMES.items()
+        if id_ in by_id and any(fnmatchcase(id_, pattern) for pattern in section.numbers)
+    ]
 
 
-def name_of(measurement_id: str) -> str:
-    """Write an id as words, for numbers that have no other name."""
-    plain = _UNIT.sub("", measurement_id.removesuffix(".-"))
-    words = plain.removeprefix("views.all.").replace("_", " ").split(".")
-    return ", ".join(word for word in words if word not in ("", "-"))
+def shown_tables(results: Results, *, everything: bool = False) -> list[Table]:
+    """Return the tables that a report shows, in their own order."""
+    if everything:
+        return list(results.tables)
+    places = {table.id: _place(table.id) for table in results.tables if table.rows}
+    ranked = sorted((place, name) for name, place in places.items() if place is not None)
+    chosen = {name for _, name in ranked[:MOST_TABLES]}
+    return [table for table in results.tables if table.id in chosen]
 
 
-_UNIT = re.compile(r"_(m|rad|s|db|pp)$")
-"""Ends of ids that the value says again."""
+def _place(table_id: str) -> int | None:
+    return next((i for i, name in enumerate(TABLES) if fnmatchcase(table_id, name)), None)
+
+
+def decides(table_id: str) -> str:
+    """Say what a table decides; empty where it only informs."""
+    place = _place(table_id)
+    return "" if place is None else list(TABLES.values())[place]

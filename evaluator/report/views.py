@@ -5,7 +5,7 @@ drawn on the page and set in LaTeX is a view of them, made here row by row.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from evaluator.result import Cell, Table
@@ -47,11 +47,10 @@ class View:
 
 def view(table: Table) -> View:
     """Return what is printed of a table."""
-    build = _VIEWS.get(table.id)
-    if build is None or not table.rows:
+    if not table.rows:
         return View(**vars(table))
-    records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
-    shown = build(records)
+    build = _VIEWS.get(table.id, _folded)
+    shown = build([dict(zip(table.columns, row, strict=True)) for row in table.rows])
     rows = tuple(tuple(row.values()) for row in shown)
     return View(**(vars(table) | {"columns": tuple(shown[0]), "rows": rows}))
 
@@ -75,33 +74,75 @@ def is_number(table: View, index: int) -> bool:
     )
 
 
+def _last_word(name: str) -> str:
+    return name.partition(" (")[0].rpartition(" ")[2]
+
+
+def _folded(rows: Rows) -> Rows:
+    """Put each number, the count before it and the interval behind it into one cell.
+
+    A count is the two columns ``k`` and ``n``, an interval the two columns ``low`` and ``high``,
+    perhaps with a word before and a unit behind; ``why undefined`` stands where there is none.
+    """
+    names = list(rows[0])
+    ends: dict[str, Sequence[str]] = {}
+    counts: dict[str, Sequence[str]] = {}
+    for place, name in enumerate(names):
+        after, before = names[place + 1 : place + 3], names[max(0, place - 2) : place]
+        if [_last_word(each) for each in after] == ["low", "high"]:
+            ends[name] = after
+        if [_last_word(each) for each in before] == ["k", "n"]:
+            counts[name] = before
+    gone = {each for pair in (*ends.values(), *counts.values()) for each in pair}
+    gone |= {"interval", "why undefined"} if ends else set()
+
+    return [
+        {
+            name: _number(
+                name,
+                row[name],
+                [row[each] for each in ends.get(name, ())],
+                [row[each] for each in counts.get(name, ())],
+                row.get("why undefined"),
+            )
+            for name in names
+            if name not in gone
+        }
+        for row in rows
+    ]
+
+
+def _number(
+    name: str, value: Any, ends: Sequence[Any], count: Sequence[Any], why: str | None
+) -> Shown:
+    """Write a cell in the unit that its column names; what is no such number stays as it is."""
+    is_points = name.endswith("(pp)")
+    is_share = _last_word(name) == "rate"
+    is_change = name.startswith("relative")
+    if not (ends or is_points or is_share or is_change) or isinstance(value, str):
+        return value  # type: ignore[no-any-return]
+    if not _known(value):
+        return f"undefined: {why}" if why and (is_points or is_share or is_change) else None
+    factor, unit, form = 1.0, "", ".4g"
+    if is_points:
+        unit, form = " pp", "+.1f"
+    elif is_share or is_change:
+        factor, unit, form = 100.0, " %", "+.1f" if is_change else ".1f"
+    known = [_signed(f"{factor * end:{form}}") for end in ends if _known(end)]
+    told = Figures(
+        _signed(f"{factor * value:{form}}") + unit,
+        ", ".join(known),
+        f"{count[0]}/{count[1]}" if count and _known(count[0]) else "",
+    )
+    return f"{told} (no n)" if count and not told.count else told
+
+
+def _signed(text: str) -> str:
+    return text if float(text) else text.lstrip("+-")
+
+
 def _known(value: Any) -> bool:
     return value is not None and value == value  # NaN is not
-
-
-def percent(value: float | None, low: Any = None, high: Any = None, digits: int = 1) -> Shown:
-    """Write a share and its interval in percent; nothing where it is unknown.
-
-    Args:
-        value: The share, 0 to 1; None where it is unknown.
-        low: Lower end of its interval, 0 to 1; None leaves the interval out.
-    """
-    if not _known(value):
-        return None
-    ends = ""
-    if _known(low):
-        ends = f"{100 * low:.{digits}f}, {100 * high:.{digits}f}"
-    return Figures(f"{100 * (value or 0.0):.{digits}f} %", ends)
-
-
-def _rate(row: Record) -> Shown:
-    """Write a rate with its count and interval: ``4/5 = 80.0 % [37.6, 96.4]``."""
-    if not _known(row["rate"]):
-        return f"undefined: {row['why undefined']}"
-    shown = percent(row["rate"], row["low"], row["high"])
-    if not _known(row["k"]):
-        return f"{shown} (no n)"
-    return replace(shown, count=f"{row['k']}/{row['n']}") if isinstance(shown, Figures) else shown
 
 
 def _picked(row: Record, *names: str) -> Record:
@@ -109,87 +150,50 @@ def _picked(row: Record, *names: str) -> Record:
     return {name: row[name] for name in names}
 
 
-def _words(text: str) -> str:
-    return text.replace("_", " ")
-
-
 def _success(rows: Rows) -> Rows:
     """Put the sides of a group beside each other."""
+    folded = _folded(rows)
     sides = list(dict.fromkeys(row["side"] for row in rows))
-    of_side = [[row for row in rows if row["side"] == side] for side in sides]
+    of_side = [[row for row in folded if row["side"] == side] for side in sides]
     (gap,) = (name for name in rows[0] if name.startswith("sim - "))
     plain = {row["unit"] for row in of_side[0]} == {"trial"}  # as everybody counts
-    found = []
-    for group in zip(*of_side, strict=True):
-        first = group[0]
-        shown = _picked(first, "task", "condition", "policy", "unit")
-        shown |= {"condition": _words(first["condition"])} | ({"unit": None} if plain else {})
-        shown |= {row["side"]: _rate(row) for row in group}
-        found.append(shown | {gap: first[gap]})
-    return found
-
-
-def _points(value: float, row: Record) -> Figures:
-    """Write percentage points with the interval that stands in the row."""
-    ends = f"{row['low']:+.1f}, {row['high']:+.1f}" if _known(row["low"]) else ""
-    return Figures(f"{value:+.1f} pp", ends)
-
-
-def _points_of(row: Record, name: str) -> Shown:
-    return _points(row[name], row) if _known(row[name]) else None
-
-
-def _gains(rows: Rows) -> Rows:
-    def shown(row: Record) -> Record:
-        undefined = f"undefined: {row['why undefined']}"
-        relative = row["relative gain"]
-        return {
-            "task": ", ".join(part for part in (row["task"], row["policy"]) if part),
-            "side": row["side"],
-            "percentage points": _points_of(row, "gain (pp)") or undefined,
-            "relative gain": (
-                Figures(f"{100 * relative:+.1f} %") if _known(relative) else undefined
-            ),
-        }
-
-    return [shown(row) for row in rows]
+    return [
+        _picked(group[0], "task", "condition", "policy", "unit")
+        | {"condition": group[0]["condition"].replace("_", " ")}
+        | ({"unit": None} if plain else {})
+        | {row["side"]: row["rate"] for row in group}
+        | {gap: group[0][gap]}
+        for group in zip(*of_side, strict=True)
+    ]
 
 
 def _layout(rows: Rows) -> Rows:
+    def share(value: Any) -> Shown:
+        return Figures(f"{100 * value:.1f} %") if _known(value) else None
+
     rates = list(rows[0])[2:]
-    return [row | {name: percent(row[name]) or "undefined" for name in rates} for row in rows]
-
-
-def _share(row: Record, name: str, k: str, n: str) -> Shown:
-    """Write a share with its interval, and with its count: ``4/5 = 80 % [38, 96]``."""
-    shown = percent(row[name], row[f"{name} low"], row[f"{name} high"], digits=0)
-    return replace(shown, count=f"{row[k]}/{row[n]}") if isinstance(shown, Figures) else shown
+    return [row | {name: share(row[name]) for name in rates} for row in rows]
 
 
 def _conclusions(rows: Rows) -> Rows:
-    """Put the bias and its interval into one cell, and a yes beside those that were right."""
+    """Put a yes beside those that were right, and what succeeded at all."""
 
-    def points(value: float | None) -> Shown:
-        return None if value is None or not _known(value) else Figures(f"{value:.0f}")
-
-    def shown(row: Record) -> Record:
+    def shown(row: Record, folded: Record) -> Record:
         right = succeeded = None
         if row["yes"]:
             right = Figures(f"{row['yes and right']} of {row['yes']}")
             succeeded = Figures(f"{row['succeeded']} of {row['trials']}")
+        sizes = [name for name in row if name.startswith("smallest ")]
         return {
-            **_picked(row, "task", "groups"),
-            "bias": _points_of(row, "bias (pp)"),
-            "interval": row["interval"],
+            **_picked(folded, "task", "groups", "bias (pp)"),
             "yes and right": right,
             "succeeded at all": succeeded,
             **_picked(row, "candidates", "best recorded", "ranked", "more trials"),
             "trials each": row["recorded trials per candidate"],
-            "smallest difference (pp)": points(row["smallest difference (pp)"]),
-            "smallest bias (pp)": points(row["smallest bias (pp)"]),
+            **{n: Figures(f"{row[n]:.0f}") if _known(row[n]) else None for n in sizes},
         }
 
-    return [shown(row) for row in rows]
+    return [shown(row, folded) for row, folded in zip(rows, _folded(rows), strict=True)]
 
 
 def _baselines(rows: Rows) -> Rows:
@@ -204,28 +208,9 @@ def _baselines(rows: Rows) -> Rows:
             "right": share(row, "right", "trials"),
             "PPV": share(row, "yes and succeeded", "said yes"),
             "NPV": share(row, "no and failed", "said no"),
-            "twin more right": _points_of(row, "twin more right (pp)"),
+            "twin more right (pp)": folded["twin more right (pp)"],
         }
-        for row in rows
-    ]
-
-
-def _states(rows: Rows) -> Rows:
-    """Put both ends of the interval into one cell, where the lower one stood."""
-
-    def interval(row: Record) -> Shown:
-        known = _known(row["low (mm)"])
-        return f"[{row['low (mm)']:.1f}, {row['high (mm)']:.1f}]" if known else None
-
-    return [
-        {
-            ("interval (mm)" if name == "low (mm)" else name): (
-                interval(row) if name == "low (mm)" else cell
-            )
-            for name, cell in row.items()
-            if name != "high (mm)"
-        }
-        for row in rows
+        for row, folded in zip(rows, _folded(rows), strict=True)
     ]
 
 
@@ -243,33 +228,11 @@ def _published(rows: Rows) -> Rows:
     ]
 
 
-def _axes(rows: Rows) -> Rows:
-    """Put the agreement and the gap of each value of an axis into one cell each."""
-    word = next(name for name in rows[0] if name.endswith(" rate") and name[:3] != "sim")
-    gap = next(name for name in rows[0] if name.startswith("sim - "))
-
-    def points(row: Record) -> Shown:
-        if not _known(row[gap]):
-            return None
-        return _points(row[gap], {"low": row["gap low"], "high": row["gap high"]})
-
-    return [
-        _picked(row, "axis", "value", "trials")
-        | {"agree": _share(row | {"agree": row["agree rate"]}, "agree", "agree k", "agree n")}
-        | {name: percent(row[name], digits=0) for name in (word, "sim rate")}
-        | {gap: points(row)}
-        for row in rows
-    ]
-
-
 _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "conclusions": _conclusions,
     "success": _success,
-    "axes": _axes,
-    "gains": _gains,
     "layout": _layout,
     "gate_baselines": _baselines,
-    "final_states": _states,
     "published": _published,
 }
-"""By table; the others are printed as they are."""
+"""By table; of the others numbers are put together with their counts and intervals."""

@@ -5,42 +5,12 @@ from collections.abc import Mapping
 
 from evaluator.compare.tables import METHOD_NAMES
 from evaluator.quantity import noun
+from evaluator.report.sections import HEADLINES
 from evaluator.report.views import Shown
 from evaluator.result import Measurement, Results
 
 SIM_SIDE = "sim_planned"
 """The twin's side where there were plans: planned trajectory, dynamic, of the plan sent."""
-HEADLINES: tuple[tuple[str, str], ...] = (
-    ("agreement.sim_planned.rate", "Sim and outcome agree"),
-    ("agreement.sim_planned.phi", "phi"),
-    ("agreement.sim_planned.ppv", "Success when sim says success (PPV)"),
-    ("agreement.sim_planned.npv", "Failure when sim says failure (NPV)"),
-    ("baseline.sim_planned.base_rate", "Success whatever sim says (base rate)"),
-    ("baseline.sim_planned.geometric_rule.rate", "Geometric rule and outcome agree"),
-    ("baseline.sim_planned.geometric_rule.twin_gain_pp", "Sim more often right than that rule"),
-    ("agreement.verdict.ppv", "Success when the gate accepted (PPV)"),
-    ("agreement.pearson_r", "Pearson r over groups"),
-    ("agreement.pearson_r.without_replanning", "Pearson r without replanning"),
-    ("agreement.pearson_r.with_replanning", "Pearson r with replanning"),
-    ("agreement.bias_pp", "Bias of sim"),
-    ("agreement.mmrv_recorded_gap", "MMRV (gap of recorded rates)"),
-    ("gain.pp.recorded.average", "Replanning gain, mean of tasks"),
-    ("gain.relative.recorded.average", "The same, relative"),
-    ("decision.regret_pp", "Loss of taking what sim ranks first"),
-    ("motion.planned.path_mean_m", "Tool path: recorded to planned replay, lag taken out"),
-    ("motion.planned.lag_s", "Tool lag: recorded behind planned replay"),
-    ("motion.executed.path_mean_m", "Tool path: recorded to executed replay, lag taken out"),
-    ("views.all.psnr_db", "PSNR of held-out views, raw"),
-    ("views.all.psnr_gain_db", "The same after a gain per image and channel"),
-    ("views.all.ssim", "SSIM of held-out views"),
-    ("views.all.ssim_zero", "The same, zeros beyond the border"),
-    ("views.all.depth_median_abs_m", "Depth of held-out views, median error of an image"),
-    ("views.all.depth_mean_abs_m", "The same, mean error: edges count most"),
-    ("views.all.lpips", "LPIPS of held-out views"),
-    ("views.all.lpips_vgg_01", "LPIPS (VGG, images in 0..1) of held-out views"),
-    ("views.all.lpips_alex_pm1", "LPIPS (AlexNet, images in -1..1) of held-out views"),
-)
-
 SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
     "m": (1000.0, " mm", ".2f"),
     "rad": (180.0 / math.pi, "°", ".2f"),
@@ -69,8 +39,9 @@ def _figure(value: float, unit: str) -> str:
     if abs(value) >= HUGE and unit != "count":
         return f"{factor * value:.4g}"
     text = f"{factor * value:{digits}}"
-    small = value != 0 and float(text) == 0
-    return f"{factor * value:.1g}" if small else text  # small is not nothing
+    if float(text):
+        return text
+    return f"{factor * value:.1g}" if value else text.lstrip("+")  # small is not nothing
 
 
 def is_share(measurement: Measurement) -> bool:
@@ -148,15 +119,14 @@ def headlines(results: Results) -> list[tuple[str, str, Measurement]]:
     by_id = {measurement.id: measurement for measurement in results.measurements}
     listed = HEADLINES
     if agreeing_side(by_id) == "sim_executed":
-        listed = tuple(
-            (
-                name.replace("sim_planned", "sim_executed"),
-                label.replace("Sim", "Executed in twin").replace("sim says", "that says"),
-            )
-            for name, label in HEADLINES
+        listed = {
+            name.replace("sim_planned", "sim_executed"): label.replace(
+                "Sim", "Executed in twin"
+            ).replace("sim says", "that says")
+            for name, label in HEADLINES.items()
             if not name.startswith("motion.planned.")
-        )
-    found = [(label, by_id[name]) for name, label in listed if name in by_id]
+        }
+    found = [(label, by_id[name]) for name, label in listed.items() if name in by_id]
     if results.source not in ("run", "images"):  # who gave a table knows what is not in it
         found = [(label, m) for label, m in found if m.value is not None]
     return [(label, measurement_text(m), m) for label, m in found]

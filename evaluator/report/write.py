@@ -11,7 +11,7 @@ from evaluator.compare.spreadsheet import record_from_row
 from evaluator.errors import EvaluatorError
 from evaluator.report.figures import drawings_of
 from evaluator.report.page import name_shared, page
-from evaluator.report.ranked import FIGURES, shown_tables
+from evaluator.report.sections import FIGURES, shown_tables
 from evaluator.report.tables import as_csv, as_latex, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
@@ -36,12 +36,6 @@ GROUPS = "success"
 
 HEADLINE_TABLES = ("conclusions", "success", "layout", "comparisons", "gains", "confusion")
 """Those that ``--latex`` writes for a paper."""
-OLD_FIGURES = (
-    *("confusion", "order", "bands", "tasks", "costs", "reliability", "funnel"),
-    *("gains", "motions", "states", "views"),
-)
-"""Drawn by editions before."""
-
 PARQUET_PACKAGES = ("pyarrow",)
 LATEX_PACKAGES = ("pandas", "jinja2")
 INSTALL = "pip install 'robot-gst[report]'"
@@ -122,13 +116,11 @@ def _old_files(folder: Path) -> list[Path]:
     """
     try:
         tables = json.loads((folder / "results.json").read_bytes())["tables"]
-        named = [*(str(table["id"]) for table in tables), "methods", "references"]
+        named = [str(table["id"]) for table in tables]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []  # nothing of ours
-    endings = ("csv", "md", "tex", "bib", "svg", "pdf")
-    files = [folder / "tables" / f"{name}.{end}" for name in named for end in endings]
-    drawn = (*FIGURES, *OLD_FIGURES)
-    files += [folder / "figures" / f"{name}.{end}" for name in drawn for end in endings]
+    files = [folder / "tables" / f"{name}.{end}" for name in named for end in ("csv", "tex")]
+    files += [folder / "figures" / f"{name}.svg" for name in FIGURES]
     ours = ("trials.csv", "trials.parquet", "groups.parquet", "measurements.parquet")
     return [*files, *(folder / name for name in ours)]
 

@@ -1,14 +1,22 @@
-"""What all episodes of a run say of themselves, each read once and then kept."""
+"""What all episodes of a run say of themselves, each read once and then kept.
 
-from collections.abc import Callable, Sequence
+A file is its bytes, and the SHA-256 of them is what everything else goes by. A file whose size,
+both times and inode are those of the last evaluation is taken to hold the bytes it held then; one
+that changed within the last two seconds is hashed again next time.
+"""
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from bridge.episode.assigned import TRIAL_SUFFIX
-from bridge.episode.catalogue_query import LABEL_SUFFIX
-from bridge.episode.provenance import hash_file
+from bridge.episode.catalogue_query import LABEL_SUFFIX, stamp_of
+from bridge.episode.provenance import hash_file, hash_files
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -20,14 +28,17 @@ from evaluator.run_reader.episodes import (
     DerivedFacts,
     DerivedFile,
     RecordedFacts,
+    RunFile,
     read_derived,
     read_recorded,
 )
-from evaluator.run_reader.inventory import RunFile, take_inventory
 
 ODD = (GstError, OSError, TypeError, ValueError, KeyError, RecursionError)
 """What one file of another program, or a failing disk, may raise; it costs that file only."""
 
+MOST_THREADS = 4
+"""Hashing waits for the disk or runs outside Python's lock."""
+MEGABYTE = 1_000_000
 READ_S = 0.0015
 """About what reading one file takes [s]."""
 
@@ -61,42 +72,126 @@ def read_contents(
     run: RunFolder, cache: SummaryCache, output: Output, pool: ProcessPool | Serial = SERIAL
 ) -> RunContents:
     """Read what is new or has changed in a run; a broken file is left out and named."""
-    inventory = take_inventory(run, cache, output)
+    recorded, derived, left_out = _take_inventory(run, cache, output)
     labels = _labels(run)
-    recorded, left_out = _read(
-        inventory.recorded,
+    means = _Means(cache=cache, output=output, pool=pool, left_out=left_out)
+    facts = _read(
+        recorded,
         RecordedFacts,
         lambda file: f"{file.name} {file.sha256} {labels.get(file.stem, '')}",
-        partial(_recorded, run),
-        cache,
-        output,
-        pool,
+        partial(_tried, partial(read_recorded, run)),
+        means,
     )
-    derived, broken = _read(
-        inventory.derived,
+    made = _read(
+        derived,
         DerivedFacts,
         lambda file: f"{file.name} {file.sha256}",
-        _derived,
-        cache,
-        output,
-        pool,
+        partial(_tried, read_derived),
+        means,
     )
     found, doubled = _each_once(
-        [
-            RecordedFile(file=file, facts=recorded[file.name])
-            for file in inventory.recorded
-            if file.name in recorded
-        ]
+        [RecordedFile(file=file, facts=facts[file.name]) for file in recorded if file.name in facts]
     )
     return RunContents(
         recorded=tuple(found),
         derived=tuple(
-            DerivedFile(file=file, facts=derived[file.name])
-            for file in inventory.derived
-            if file.name in derived
+            DerivedFile(**vars(file), facts=made[file.name])
+            for file in derived
+            if file.name in made
         ),
-        left_out=(*inventory.left_out, *left_out, *doubled, *broken),
+        left_out=(*left_out, *doubled),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileHash:
+    """What a file's bytes were when it had a certain size, times and inode."""
+
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Unknown:
+    """A file whose hash is not known."""
+
+    name: str
+    parts: tuple[Path, ...]
+    key: str
+    """What its hash is kept under; empty where its stamp cannot be relied on."""
+
+
+def _take_inventory(
+    run: RunFolder, cache: SummaryCache, output: Output
+) -> tuple[list[RunFile], list[RunFile], list[Exclusion]]:
+    """Look at every file of a run, and hash those that are new or have changed.
+
+    Returns:
+        Recorded files, derived ones, and what cannot be read at all.
+    """
+    now_ns = time.time_ns()
+    groups = [(run.episodes_dir, parts) for parts in run.episode_parts().values()]
+    groups += [(run.derived_dir, [path.name]) for path in run.derived()]
+    hashes: dict[str, str | Exception] = {}
+    unknown = []
+    for folder, parts in groups:
+        name = f"{folder.name}/{parts[0]}"
+        stamp = stamp_of([os.path.join(folder, part) for part in parts], now_ns)  # noqa: PTH118
+        key = f"{name} {stamp}" if stamp else ""
+        known = cache.find(FileHash, key) if key else None
+        hashes[name] = known[0].sha256 if known else ""
+        if not known:
+            unknown.append(_Unknown(name=name, parts=tuple(folder / p for p in parts), key=key))
+    for each, found in _hashed(unknown, output):
+        hashes[each.name] = found
+        if each.key and isinstance(found, str):
+            cache.keep(FileHash, each.key, (FileHash(sha256=found),))
+    left_out = [
+        Exclusion(episode=Path(name).name, scope="everything", reason=str(error))
+        for name, error in hashes.items()
+        if isinstance(error, Exception)
+    ]
+    files = [
+        RunFile(folder=run.path, name=name, sha256=sha256)
+        for name, sha256 in hashes.items()
+        if isinstance(sha256, str)
+    ]
+    recorded = [file for file in files if file.name.startswith(f"{run.episodes_dir.name}/")]
+    return recorded, files[len(recorded) :], left_out
+
+
+def _hashed(unknown: list[_Unknown], output: Output) -> Iterator[tuple[_Unknown, str | Exception]]:
+    if not unknown:
+        return
+    sizes = [sum(map(_size, each.parts)) for each in unknown]
+    workers = min(MOST_THREADS, os.cpu_count() or 1)
+    done = 0
+    with (
+        output.progress("hash files (MB)", -(-sum(sizes) // MEGABYTE)) as advance,
+        ThreadPoolExecutor(workers) as pool,
+    ):
+        try:
+            for each, size, found in zip(unknown, sizes, pool.map(_sha256, unknown), strict=True):
+                done += size
+                advance(done // MEGABYTE, each.parts[0].name)
+                yield each, found
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # gigabytes may be waiting
+            raise
+
+
+def _sha256(unknown: _Unknown) -> str | Exception:
+    try:
+        parts = unknown.parts
+        return hash_files(parts if len(parts) == 1 else Episode.open(parts[0]).parts)
+    except (GstError, OSError) as error:
+        return error
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
 
 
 def _each_once(files: Sequence[RecordedFile]) -> tuple[list[RecordedFile], list[Exclusion]]:
@@ -140,18 +235,21 @@ def _labels(run: RunFolder) -> dict[str, str]:
     return found
 
 
-def _recorded(run: RunFolder, file: RunFile) -> RecordedFacts | Exclusion:
+def _tried(read: Callable[[Path], Facts], file: RunFile) -> Facts | Exclusion:
     try:
-        return read_recorded(run, Episode.open(file.path))
+        return read(file.path)
     except ODD as error:
         return broken(file.path.name, error)
 
 
-def _derived(file: RunFile) -> DerivedFacts | Exclusion:
-    try:
-        return read_derived(file.path)
-    except ODD as error:
-        return broken(file.path.name, error)
+@dataclass(frozen=True, kw_only=True)
+class _Means:
+    """What reading files takes, and the list of those that cannot be read."""
+
+    cache: SummaryCache
+    output: Output
+    pool: ProcessPool | Serial
+    left_out: list[Exclusion]
 
 
 def _read(
@@ -159,33 +257,29 @@ def _read(
     kind: type[Facts],
     key: Callable[[RunFile], str],
     read: Callable[[RunFile], Facts | Exclusion],
-    cache: SummaryCache,
-    output: Output,
-    pool: ProcessPool | Serial,
-) -> tuple[dict[str, Facts], list[Exclusion]]:
-    """Return what the files say of themselves, by name, and the files left out."""
+    means: _Means,
+) -> dict[str, Facts]:
+    """Return what the files say of themselves, by name; a file that is left out is named."""
     facts: dict[str, Facts] = {}
     unknown: list[RunFile] = []
-    left_out: list[Exclusion] = []
     for file in files:
-        kept = cache.find(kind, key(file))
-        if kept:
+        if kept := means.cache.find(kind, key(file)):
             facts[file.name] = kept[0]
         else:
             unknown.append(file)
     if not unknown:
-        return facts, left_out
-    with output.progress("read episodes", len(unknown)) as advance:
-        all_made = zip(unknown, pool.map(read, unknown, each_s=READ_S), strict=True)
+        return facts
+    with means.output.progress("read episodes", len(unknown)) as advance:
+        all_made = zip(unknown, means.pool.map(read, unknown, each_s=READ_S), strict=True)
         for done, (file, made) in enumerate(all_made, start=1):
             if isinstance(made, Exclusion):
-                left_out.append(made)
+                means.left_out.append(made)
             else:
                 facts[file.name] = made
                 if not made.broken:  # a message names the folder, which may move
-                    cache.keep(kind, key(file), (made,))
+                    means.cache.keep(kind, key(file), (made,))
             advance(done, file.path.name)
-    return facts, left_out
+    return facts
 
 
 def broken(name: str, error: Exception, *, scope: str = "everything") -> Exclusion:

@@ -4,11 +4,12 @@ Only its metadata and its few messages about plans, events, verdicts and places 
 arm moved is left to ``motion``.
 """
 
-import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
@@ -24,13 +25,39 @@ from bridge.episode.metadata import (
 )
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.streams import events, verdicts
+from bridge.episode.streams import verdicts
 from bridge.errors import GstError
 from bridge.task.plan import SCHEMA_VERSION, Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import STAND_IN_ENGINE, Verdict
 from evaluator.errors import EvaluatorError
-from evaluator.run_reader.inventory import RunFile
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFile:
+    """One episode of a run, recorded or derived, as it lies on the disk."""
+
+    folder: Path
+    """That ``name`` is relative to: the run's."""
+    name: str
+    """Of its first part, with forward slashes."""
+    sha256: str
+    """Of the bytes of all parts, one after the other."""
+
+    @property
+    def path(self) -> Path:
+        """Its first part; made when asked for, most files of a large run are not opened again."""
+        return self.folder / self.name
+
+    @property
+    def file_name(self) -> str:
+        """The name of the file without folder."""
+        return self.name.rpartition("/")[2]
+
+    @property
+    def stem(self) -> str:
+        """The name of the file without folder and ending."""
+        return self.file_name.rpartition(".")[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,12 +189,9 @@ class _Log:
     localised: list[bytes] = field(default_factory=list)
 
 
-def read_recorded(run: RunFolder, episode: Episode) -> RecordedFacts:
-    """Sum up a recorded episode; of one that is no trial, only who and what.
-
-    Raises:
-        EpisodeError: When its metadata was written by another program and cannot be read.
-    """
+def read_recorded(run: RunFolder, path: Path) -> RecordedFacts:
+    """Sum up a recorded episode; of one that is no trial, only who and what."""
+    episode = Episode.open(path)
     info, outcome = episode.info, episode.outcome
     if info.kind == RETRY:
         return RecordedFacts(info=info, outcome=outcome_of(run, episode))
@@ -223,12 +247,9 @@ def localised_positions(localisations: Iterable[bytes]) -> list[LocalisedPositio
 def positions_at_start(
     places: Iterable[LocalisedPosition], started_ns: int | None
 ) -> dict[str, Position]:
-    """Return the last place of each object that is not younger than the start.
+    """Return the last place of each object that is not younger than the start, where it is known.
 
-    Args:
-        places: Localised objects in the order of time; a later one of an object replaces an earlier
-            one.
-        started_ns: When the execution started; None takes the last place of each.
+    A later one of an object replaces an earlier one.
     """
     return {
         place.object_id: place.p_m
@@ -257,30 +278,23 @@ def _read_log(episode: Episode) -> _Log:
     return log
 
 
+class _Outline(msgspec.Struct):
+    """A plan without its hundreds of waypoints, which take longer to check than all the rest."""
+
+    schema_version: int
+    id: str
+    stages: tuple[StageTime, ...] = ()
+
+
 def _plan_of(data: bytes) -> tuple[str, tuple[StageTime, ...]]:
-    """Read a plan's id and stages; checking hundreds of waypoints takes longer than the rest."""
+    """Read a plan's id and stages."""
     try:
-        record = json.loads(data)
-    except (ValueError, RecursionError):
-        record = None
-    if isinstance(record, dict) and record.get("schema_version") == SCHEMA_VERSION:
-        plan_id = record.get("id")
-        if isinstance(plan_id, str) and plan_id:
-            return plan_id, tuple(_stages(record.get("stages")))
-    plan = Plan.from_json(data)  # which says what is wrong
-    return plan.id, ()
-
-
-def _stages(records: object) -> Iterator[StageTime]:
-    for stage in records if isinstance(records, list) else ():
-        try:
-            yield StageTime(
-                id=str(stage["id"]),
-                t_start_ns=int(stage["t_start_ns"]),
-                t_end_ns=int(stage["t_end_ns"]),
-            )
-        except (KeyError, TypeError, ValueError):  # the replay says what is wrong with it
-            return
+        outline = msgspec.json.decode(data, type=_Outline)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        outline = None
+    if outline is not None and outline.schema_version == SCHEMA_VERSION and outline.id:
+        return outline.id, outline.stages
+    return Plan.from_json(data).id, ()  # which says what is wrong
 
 
 def _note_verdict(log: _Log, message: RawMessage) -> None:
@@ -309,40 +323,11 @@ def _note_event(log: _Log, event: Mapping[str, Any]) -> None:
             log.label = build(Outcome, {**known, "stages": stages})
 
 
-@dataclass(frozen=True, kw_only=True)
-class FirstDivergence:
-    """Where planned, executed and recorded part first, as a replay found it."""
-
-    attribution: str
-    """tracking, perception, contact or predicate."""
-    quantity: str
-    between: str
-    body: str = ""
-    stage: str = ""
-    """The control step of that instant; empty before the first and after the last."""
-
-
-def first_divergence(episode: Episode) -> FirstDivergence | None:
-    """Read what a replay says of it; None where nothing parts, or nothing was compared."""
+def first_divergence(episode: Episode) -> str:
+    """Read what parts planned, executed and recorded first; empty where nothing does."""
     messages = list(episode.messages(episode.topics_of_type(schema.DIVERGENCE)))
     first = parse_record(messages[-1].data, name="divergence")["first"] if messages else None
-    if first is None:
-        return None
-    stage, started_ns = "", None
-    for event in events(episode):
-        if event["type"] == "execution_started":
-            started_ns = int(event["stamp_ns"])
-        if started_ns is None or event["stamp_ns"] > started_ns + first["first_t_ns"]:
-            continue
-        if event["type"] in ("stage_started", "stage_ended"):
-            stage = str(event["stage_id"]) if event["type"] == "stage_started" else ""
-    return FirstDivergence(
-        attribution=first["attribution"],
-        quantity=first["quantity"],
-        between=" and ".join(first["between"]),
-        body=first.get("body", ""),
-        stage=stage,
-    )
+    return "" if first is None else str(first["attribution"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -353,8 +338,8 @@ class DerivedFacts:
     derived: Derived
     verdict: VerdictSummary | None = None
     """Of a dynamic replay: the last verdict on the plan it replays."""
-    divergence: FirstDivergence | None = None
-    """Of a dynamic replay of what was executed."""
+    divergence: str = ""
+    """Of a dynamic replay of what was executed: what parts it first."""
     places: tuple[LocalisedPosition, ...] = ()
     """Of a localisation: where objects were found."""
     broken: str = ""
@@ -362,26 +347,10 @@ class DerivedFacts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DerivedFile:
+class DerivedFile(RunFile):
     """One derived episode and what it was made from."""
 
-    file: RunFile
     facts: DerivedFacts
-
-    @property
-    def path(self) -> Path:
-        """Of its first part."""
-        return self.file.path
-
-    @property
-    def name(self) -> str:
-        """Relative to the run folder."""
-        return self.file.name
-
-    @property
-    def sha256(self) -> str:
-        """Of its bytes."""
-        return self.file.sha256
 
     @property
     def info(self) -> EpisodeInfo:
@@ -424,11 +393,7 @@ class Replay:
 
 
 def read_derived(path: Path) -> DerivedFacts:
-    """Sum up a derived episode from its metadata and its few messages about verdicts or places.
-
-    Raises:
-        GstError: When it cannot be opened, or does not say what it was made from.
-    """
+    """Sum up a derived episode from its metadata and its few messages about verdicts or places."""
     episode = Episode.open(path)
     derived = episode.derived
     if derived is None:
@@ -440,7 +405,7 @@ def read_derived(path: Path) -> DerivedFacts:
                 decided for _, decided in verdicts(episode) if decided.plan_id == derived.plan_id
             ]
             last = summarise_verdict(mine[-1]) if mine else None
-            first = first_divergence(episode) if derived.trajectory == "executed" else None
+            first = first_divergence(episode) if derived.trajectory == "executed" else ""
             return DerivedFacts(info=info, derived=derived, verdict=last, divergence=first)
         if derived.kind == "localised":
             topics = episode.topics_of_type(schema.LOCALISATION)

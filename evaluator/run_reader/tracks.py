@@ -1,9 +1,11 @@
 """Read what a motion comparison needs of one episode, in one pass: tool, joints, start and end."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from bridge.episode import schema
 from bridge.episode.executions import NO_PLAN, with_execution
@@ -13,6 +15,8 @@ from bridge.episode.topics import JOINT_STATES, TCP_POSE
 from bridge.errors import BridgeError
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.record import parse_record
+
+Track = TypeVar("Track", PoseTrajectory, JointTrack)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,38 +32,22 @@ class Tracks:
 
     def cut(self) -> "Tracks":
         """Return what lies within the execution; everything where its start is not known."""
-        return replace(self, tool=self._cut_tool(), joints=self._cut_joints())
-
-    def _cut_tool(self) -> PoseTrajectory | None:
-        if self.tool is None:
-            return None
-        keep = self._within(self.tool.stamps_ns)
-        if not keep.any():
-            return None
-        return PoseTrajectory(
-            self.tool.stamps_ns[keep], self.tool.p_m[keep], self.tool.q_wxyz[keep]
+        first = self.started_ns
+        last = None if first is None else self.ended_ns
+        tool, joints = self.tool, self.joints
+        if tool is not None:
+            keep = _within(tool.stamps_ns, first, last)
+            tool = PoseTrajectory(tool.stamps_ns[keep], tool.p_m[keep], tool.q_wxyz[keep])
+        if joints is not None:
+            keep = _within(joints.stamps_ns, first, last)
+            joints = replace(
+                joints, stamps_ns=joints.stamps_ns[keep], position=joints.position[keep]
+            )
+        return replace(
+            self,
+            tool=None if tool is None or not len(tool) else tool,
+            joints=None if joints is None or not len(joints.stamps_ns) else joints,
         )
-
-    def _cut_joints(self) -> JointTrack | None:
-        if self.joints is None:
-            return None
-        keep = self._within(self.joints.stamps_ns)
-        if not keep.any():
-            return None
-        joints = self.joints
-        return JointTrack(
-            names=joints.names,
-            stamps_ns=joints.stamps_ns[keep],
-            position=joints.position[keep],
-        )
-
-    def _within(self, stamps_ns: Int[np.ndarray, " num_samples"]) -> np.ndarray:
-        keep = np.ones(len(stamps_ns), dtype=bool)
-        if self.started_ns is not None:
-            keep &= stamps_ns >= self.started_ns
-        if self.started_ns is not None and self.ended_ns is not None:
-            keep &= stamps_ns <= self.ended_ns
-        return keep
 
     def shifted(self, shift_ns: int) -> "Tracks":
         """Return the same motion on a clock that is so much ahead."""
@@ -72,6 +60,17 @@ class Tracks:
             started_ns=None if self.started_ns is None else self.started_ns + shift_ns,
             ended_ns=None if self.ended_ns is None else self.ended_ns + shift_ns,
         )
+
+
+def _within(
+    stamps_ns: Int[np.ndarray, " num_samples"], first_ns: int | None, last_ns: int | None
+) -> Bool[np.ndarray, " num_samples"]:
+    keep = np.ones(len(stamps_ns), dtype=bool)
+    if first_ns is not None:
+        keep &= stamps_ns >= first_ns
+    if last_ns is not None:
+        keep &= stamps_ns <= last_ns
+    return keep
 
 
 def read_tracks(episode: Episode, plan_id: str) -> Tracks:
@@ -92,22 +91,15 @@ def read_tracks(episode: Episode, plan_id: str) -> Tracks:
         records = with_execution(episode, records)
     started_ns, ended_ns = execution_ns(records, plan_id)
     return Tracks(
-        tool=_tool(of_tool),
-        joints=_joints(of_joints),
+        tool=_known(pose_track_of, of_tool),
+        joints=_known(joint_track_of, of_joints),
         started_ns=started_ns,
         ended_ns=ended_ns,
     )
 
 
-def _tool(payloads: list[bytes]) -> PoseTrajectory | None:
+def _known(read: Callable[[list[bytes]], Track | None], payloads: list[bytes]) -> Track | None:
     try:
-        return pose_track_of(payloads)
-    except BridgeError:
-        return None
-
-
-def _joints(payloads: list[bytes]) -> JointTrack | None:
-    try:
-        return joint_track_of(payloads)
+        return read(payloads)
     except BridgeError:
         return None

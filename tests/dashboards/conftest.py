@@ -20,6 +20,7 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
+from bridge.exchange.trials_csv import write_trials
 from bridge.media.color import encode_jpeg
 from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Stage, Waypoint
@@ -28,6 +29,7 @@ from dashboards.app import create_app
 from dashboards.guard import Admission
 from dashboards.library import Library
 from evaluator.compare import compare_run
+from evaluator.compare.spreadsheet import record_from_row
 from evaluator.result import write_results
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -392,7 +394,9 @@ def make_run(folder: Path) -> RunFolder:
         writer.describe(EpisodeInfo(id="scan", kind="scan", cell="standin", stand_in=True))
         _Log(writer).image("/standin/cam/side/color/image", picture(0.0, 0), START_NS)
     write_views(run)
-    write_results(compare_run(run).results(), run.results_dir / "results.json")
+    comparison = compare_run(run)
+    write_results(comparison.results(), run.results_dir / "results.json")
+    write_trials(run.results_dir / "trials.csv", map(record_from_row, comparison.rows))
     return run
 
 

@@ -25,7 +25,7 @@ from evaluator.compare.failures import (
     start_regions,
 )
 from evaluator.compare.rows import TrialRow
-from evaluator.review_index import FAILURE_PARTS, NOT_KNOWN, FailureSelection, IndexedTrial
+from evaluator.review_index import FAILURE_PARTS, NOT_KNOWN, FailureSelection
 
 ROW = TrialRow(
     episode="e", task="pour", condition="", policy="", start_id=None, cell="", stand_in=None,
@@ -95,7 +95,7 @@ def test_start_regions_are_halves_wherever_the_robot_stands() -> None:
     assert start_regions([stated, *_starts(p_m)[1:]])["pour 0"] == "behind the bowl"
 
 
-def failures() -> list[IndexedTrial]:
+def failures() -> list[TrialRow]:
     causes, bodies = ("dropped", HOSTILE, "unreachable"), ("cube and table", "", HOSTILE)
     return [
         replace(

@@ -3,13 +3,13 @@
 import os
 import random
 import shutil
-import sqlite3
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import msgspec
 import pytest
 from visible import words
 
@@ -23,9 +23,7 @@ from evaluator.compare import compare_run
 from evaluator.quantity import slug
 from evaluator.report.review import index_run, refresh
 from evaluator.review_index import (
-    FACETS,
     SORT,
-    IndexedTrial,
     ReviewIndex,
     Selection,
     UnusableIndexError,
@@ -34,24 +32,21 @@ from evaluator.review_index import (
     state_of,
     written_index,
 )
+from evaluator.trial_row import TrialRow
 
 HOSTILE = '<script>alert("x")</script>' + "long_name" * 45 + "\n'\";--%_ü"
-PLAIN = IndexedTrial(
-    episode="", file="", task="pour", condition="with_replanning", policy="act", start_id=None,
-    recorded=None, unit="trial", k=None, n=None, plan_id=None, num_plans=0, num_plans_sent=0,
-    sim_planned=None, sim_executed=None, verdict=None, p_success=None, first_failing=None,
-    failing_detail=None, failing_cause=None, failed_stage="", planned_replay=None,
-    executed_replay=None, began_ns=0, distance_m=None,
+PLAIN = TrialRow(
+    episode="", task="pour", condition="with_replanning", policy="act", start_id=None, cell="lab",
+    stand_in=None, recorded=None,
 )  # fmt: skip
 ANSWERS = (True, False, None)
 
 
-def made(trials: list[IndexedTrial], **about: Any) -> ReviewIndex:
-    slugs = [{name: slug(getattr(trial, name)) for name in FACETS} for trial in trials]
-    return ReviewIndex.open(written_index(zip(trials, slugs, strict=True), (), about))
+def made(trials: list[TrialRow], **about: Any) -> ReviewIndex:
+    return ReviewIndex(written_index(trials, (), about))
 
 
-def many() -> list[IndexedTrial]:
+def many() -> list[TrialRow]:
     """Every combination of outcomes in several tasks, and a name that nobody should choose."""
     tasks = ("pour", "Über den Tisch", HOSTILE)
     return [
@@ -112,11 +107,11 @@ def test_the_farthest_come_first_and_what_was_not_measured_last() -> None:
 
 
 @pytest.mark.parametrize("text", ["TRIAL_0007", "tisch über", "grasp pour", "%", "' OR 1=1 --"])
-def test_words_are_found_in_whatever_case_and_order_and_mean_nothing_to_sql(text: str) -> None:
+def test_words_are_found_in_whatever_case_and_order_and_are_plain_text(text: str) -> None:
     trials = many()
     found = made(trials).trials(Selection(q=text))
 
-    def has(trial: IndexedTrial) -> bool:
+    def has(trial: TrialRow) -> bool:
         held = f"{trial.episode} {trial.task} {trial.failing_cause} {trial.failed_stage}"
         return all(word in held.casefold() for word in text.casefold().split())
 
@@ -154,7 +149,7 @@ def test_causes_and_stages_select_the_failures_they_name() -> None:
 
 def test_the_index_holds_what_the_comparison_holds(shared_run: RunFolder) -> None:
     expected = {row.episode: row for row in compare_run(shared_run).rows}
-    found = ReviewIndex.open(refresh(shared_run)).trials(Selection())
+    found = ReviewIndex(refresh(shared_run)).trials(Selection())
     assert {t.episode for t in found} == set(expected)
     assert [t.episode for t in found] == [t.episode for t in judge(shared_run).rows]
     assert any(t.distance_m for t in found)
@@ -200,16 +195,15 @@ def test_a_damaged_or_foreign_index_is_made_anew(copy: RunFolder, damage: bytes 
     judge(copy)
     path = index_path(copy)
     if damage is None:
-        with sqlite3.connect(path) as db:
-            db.execute("PRAGMA user_version = 999")
-        db.close()
+        other = msgspec.msgpack.decode(path.read_bytes()) | {"version": 999}
+        path.write_bytes(msgspec.msgpack.encode(other))
     else:
         path.write_bytes(damage)
     with pytest.raises(UnusableIndexError):
-        ReviewIndex.open(path)
+        ReviewIndex(path)
     comparison._KNOWN.clear()
     assert len(judge(copy).rows) == 4
-    assert ReviewIndex.open(path).count(Selection()) == 4
+    assert ReviewIndex(path).count(Selection()) == 4
 
 
 def test_what_changes_while_an_evaluation_reads_is_read_again(copy: RunFolder) -> None:
@@ -269,8 +263,7 @@ def test_a_page_of_hostile_names_holds_no_markup_of_theirs(
         "failures": [["sim planned", HOSTILE, HOSTILE, 3]],
     }  # fmt: skip
     trials = [replace(trial, start_id=HOSTILE, policy=HOSTILE) for trial in many()]
-    slugs = [{name: slug(getattr(trial, name)) for name in FACETS} for trial in trials]
-    index_path(copy).write_bytes(written_index(zip(trials, slugs, strict=True), (), about))
+    index_path(copy).write_bytes(written_index(trials, (), about))
     page = synthetic.browser_of(copy).get("/?q=%3Cscript%3E&sort=%22%3E&page=%27").text
     assert "<script>alert" not in page
     page = synthetic.browser_of(copy).get("/?page=999999999999").text

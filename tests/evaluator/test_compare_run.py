@@ -17,7 +17,7 @@ from bridge.errors import PathNotFoundError
 from bridge.media.color import encode_jpeg
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, TrialRow, compare_run
-from evaluator.compare.trial import read_tcp_errors
+from evaluator.compare.motion import distance_over_time
 from evaluator.errors import EvaluatorError
 
 
@@ -158,13 +158,14 @@ def test_tool_error_is_measured_at_matching_instants(maker: Any, start_ns: int) 
     maker.replay("t1", offset_m=0.01, start_ns=start_ns)
     row = row_of(compare_run(maker.run), "t1")
     planned = maker.run.derived_dir / str(row.planned_replay)
-    assert row.path is not None
-    series = read_tcp_errors(row.path, row.plan_id, {"planned": planned})
-    assert [item.against for item in series] == ["planned"]
-    np.testing.assert_allclose(series[0].position_m, 0.01, atol=1e-9)
-    np.testing.assert_allclose(series[0].rotation_rad, 0.0, atol=1e-9)
-    assert series[0].t_s[0] == 0.0
-    assert series[0].t_s[-1] == pytest.approx(1.0)
+    recorded = maker.run.episodes_dir / row.file
+    found = distance_over_time(recorded, planned, str(row.plan_id))
+    assert found is not None
+    np.testing.assert_allclose(found[1], 0.01, atol=1e-9)
+    assert found[0][0] == 0.0
+    assert found[0][-1] == pytest.approx(1.0)
+    planned.unlink()
+    assert distance_over_time(recorded, planned, str(row.plan_id)) is None
 
 
 def test_an_episode_with_metadata_of_another_program_is_left_out_and_named(

@@ -17,7 +17,7 @@ from evaluator.cache import FOLDER, SummaryCache
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, compare_run
 from evaluator.result import write_results
-from evaluator.run_reader import inventory
+from evaluator.run_reader import contents
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # a first evaluation is checked elsewhere
 
@@ -57,14 +57,14 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def hashed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the files whose bytes were read whole."""
     names: list[str] = []
-    really_hash = inventory.hash_files
+    really_hash = contents.hash_files
 
     def hash_and_note(paths: Any) -> str:
         paths = list(paths)
         names.extend(path.name for path in paths)
         return really_hash(paths)
 
-    monkeypatch.setattr(inventory, "hash_files", hash_and_note)
+    monkeypatch.setattr(contents, "hash_files", hash_and_note)
     return names
 
 

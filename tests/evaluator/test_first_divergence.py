@@ -1,4 +1,4 @@
-"""Where planned, executed and recorded part first, counted by task, control step and cause."""
+"""What planned, executed and recorded part by first, read once and then kept."""
 
 from pathlib import Path
 from typing import Any
@@ -57,51 +57,27 @@ def replayed(path: Path, plan_id: str, first: dict[str, Any] | None) -> Path:
     return path
 
 
-INSTANTS = {
-    0: "grasp",
-    999_999_999: "grasp",
-    1_000_000_000: "",
-    1_500_000_000: "place",
-    2_999_999_999: "place",
-    3_500_000_000: "",
-}
+@pytest.mark.parametrize("attribution", ["tracking", "contact"])
+def test_what_parts_first_is_read(tmp_path: Path, attribution: str) -> None:
+    path = replayed(tmp_path / "replay.mcap", "p", quantity(0, attribution))
+    assert episodes.first_divergence(episodes.Episode.open(path)) == attribution
 
 
-@pytest.mark.parametrize(("t_ns", "stage"), INSTANTS.items())
-def test_an_instant_belongs_to_the_step_that_has_begun_and_not_ended(
-    tmp_path: Path, t_ns: int, stage: str
-) -> None:
-    path = replayed(tmp_path / "replay.mcap", "p", quantity(t_ns))
-    found = episodes.first_divergence(episodes.Episode.open(path))
-    assert found is not None
-    assert (found.stage, found.attribution, found.body) == (stage, "contact", "cube")
-
-
-def test_what_does_not_part_is_none(tmp_path: Path) -> None:
+def test_what_does_not_part_is_empty(tmp_path: Path) -> None:
     path = replayed(tmp_path / "replay.mcap", "p", None)
-    assert episodes.first_divergence(episodes.Episode.open(path)) is None
+    assert episodes.first_divergence(episodes.Episode.open(path)) == ""
 
 
 def test_trials_are_counted_by_step_and_cause_also_from_the_cache(
     maker: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    apart = {
-        "t1": episodes.FirstDivergence(
-            attribution="contact",
-            quantity="object_position",
-            between="planned and recorded",
-            body="cube",
-            stage="place",
-        ),
-        "t2": None,
-    }
-    apart["t3"] = apart["t1"]
+    apart = {"t1": "contact", "t2": "", "t3": "contact"}
     for name in apart:
         maker.trial(name, start_id=name)
         maker.replay(name)
         maker.replay(name, trajectory="executed")
 
-    def found(episode: Any) -> episodes.FirstDivergence | None:
+    def found(episode: Any) -> str:
         return apart[episode.derived.source_episode]
 
     monkeypatch.setattr(episodes, "first_divergence", found)
@@ -111,6 +87,6 @@ def test_trials_are_counted_by_step_and_cause_also_from_the_cache(
     assert divergences_of(maker) == once
 
 
-def divergences_of(maker: Any) -> dict[str, episodes.FirstDivergence | None]:
+def divergences_of(maker: Any) -> dict[str, str]:
     with SummaryCache(maker.run.results_dir / FOLDER) as cache:
         return {row.episode: row.divergence for row in compare_run(maker.run, cache=cache).rows}

@@ -5,13 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from metric_lists import with_tables
 
 from evaluator.compare import compare_csv, compare_run
 from evaluator.compare.measure import measured
 from evaluator.measurements import BIAS, REGISTRY, quantity_of
-from evaluator.quantity import with_tables
-from evaluator.report.sections import SECTIONS
-from evaluator.report.wording import HEADLINES
+from evaluator.report.sections import NAMES, SECTIONS, numbers_of
 from evaluator.result import Interval, Measurement
 from evaluator.thresholds import SHORT
 
@@ -48,7 +47,7 @@ def test_a_number_that_cannot_be_is_not_printed() -> None:
 
 def test_the_page_of_metrics_is_written_from_the_registry() -> None:
     page = (DOCS / "metrics.md").read_text()
-    hint = "run: python -m evaluator.measurements docs/metrics.md"
+    hint = "run: python tests/metric_lists.py"
     assert page == with_tables(page), hint
     missing = [q.id for q in REGISTRY if f"`{plain(q.id)}`" not in page]
     assert all(name.startswith("image.") for name in missing), hint  # as those of views
@@ -64,10 +63,19 @@ def test_a_table_has_only_registered_measurements(name: str) -> None:
 
 
 def test_what_the_report_shows_is_registered() -> None:
-    named = [*SHORT.values(), *(name for name, _ in HEADLINES)]
-    named += [pattern for section in SECTIONS for pattern, _ in section.numbers]
+    named = [*SHORT.values(), *NAMES]
     unknown = [name for name in named if "*" not in name and quantity_of(name) is None]
     assert unknown == []
+
+
+def test_every_named_number_stands_in_one_part() -> None:
+    numbers = tuple(
+        Measurement(id=name, value=0.0, unit=quantity.unit, definition="d")
+        for name in NAMES
+        if (quantity := quantity_of(name)) is not None
+    )
+    placed = [m.id for section in SECTIONS for _, m in numbers_of(section, numbers)]
+    assert sorted(placed) == sorted(NAMES)
 
 
 def test_a_quantity_finds_its_own_ids() -> None:

@@ -6,7 +6,7 @@ import pytest
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.media.image_quality import ImageShapeError, psnr_db
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.trajectory import moving_part, pose_errors
+from evaluator.metrics.trajectory import pose_errors
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (24, 32)) -> np.ndarray:
@@ -59,14 +59,3 @@ def test_a_delay_shows_as_speed_times_delay() -> None:
 def test_motions_that_share_no_instant_are_refused() -> None:
     with pytest.raises(UndefinedStatisticError, match="do not overlap"):
         pose_errors(track(line()), track(line(), start_ns=10**12))
-
-
-def test_waiting_at_the_ends_is_cut() -> None:
-    waiting = np.concatenate([np.repeat(line()[:1], 30, 0), line(), np.repeat(line()[-1:], 50, 0)])
-    cut, plain = (moving_part(track(p)).normalised_time(101) for p in (waiting, line()))
-    np.testing.assert_allclose(cut.p_m, plain.p_m, atol=1e-6)
-
-
-def test_a_run_that_stands_still_is_kept_whole() -> None:
-    still = track(np.zeros((5, 3)))
-    assert len(moving_part(still)) == 5

@@ -65,8 +65,6 @@ def tracks(
 def test_a_motion_is_nowhere_from_itself() -> None:
     found = compare_tracks(tracks(), tracks())
     assert found.aligned_by == "stamps"
-    assert found.num_samples == NUM
-    assert found.duration_s == pytest.approx(3.0)
     assert (found.path_max_m, found.rotation_mean_rad, found.joint_rms_rad) == (0, 0, 0)
     assert found.lag_s == 0.0
 
@@ -130,20 +128,6 @@ def test_clocks_of_their_own_are_laid_over_each_other_at_the_start() -> None:
     assert found.joint_rms_rad == pytest.approx(0.0, abs=1e-9)
 
 
-def test_without_a_start_time_is_normalised_and_nothing_is_said_of_delays() -> None:
-    slow = tracks(start_ns=None)
-    assert slow.tool is not None
-    stretched = PoseTrajectory(
-        7 * (slow.tool.stamps_ns - START_NS), slow.tool.p_m, slow.tool.q_wxyz
-    )
-    other = Tracks(tool=stretched, joints=None, started_ns=None, ended_ns=None)
-    found = compare_tracks(slow, other)
-    assert found.aligned_by == "normalised"
-    assert found.num_samples == 101
-    assert found.path_max_m == pytest.approx(0.0, abs=1e-4)  # resampled between its samples
-    assert found.lag_s is None
-
-
 def test_motions_without_poses_or_instants_in_common_are_refused() -> None:
     empty = Tracks(tool=None, joints=None, started_ns=START_NS, ended_ns=None)
     with pytest.raises(UndefinedStatisticError, match="no tool poses"):
@@ -188,7 +172,7 @@ def write(path: Path, source: Tracks, *, kind: str = "trial", plan_id: str = "p1
     return Episode.open(path)
 
 
-def test_files_give_what_their_tracks_give_and_the_replays_are_compared_too(tmp_path: Path) -> None:
+def test_files_give_what_their_tracks_give(tmp_path: Path) -> None:
     recorded = tracks(late_s=0.1, joint_rad=0.01)
     planned, executed = tracks(), tracks(late_s=0.1)
     episodes = {
@@ -197,20 +181,15 @@ def test_files_give_what_their_tracks_give_and_the_replays_are_compared_too(tmp_
     }
     replays = {name: episodes[name] for name in ("planned", "executed")}
     found = summarise_motions(episodes["recorded"], replays, plan_id="p1")
-    assert [(m.side, m.against) for m in found] == [
-        ("recorded", "planned"),
-        ("recorded", "executed"),
-        ("executed", "planned"),
-    ]
-    assert {(m.episode, m.task, m.condition, m.plan_id) for m in found} == {
-        ("recorded", "cube_into_box", "with_replanning", "p1")
+    assert [m.against for m in found] == ["planned", "executed"]
+    assert {(m.episode, m.task, m.condition) for m in found} == {
+        ("recorded", "cube_into_box", "with_replanning")
     }
     direct = compare_tracks(recorded, planned)
     assert found[0].position_mean_m == pytest.approx(direct.position_mean_m, abs=1e-9)
     assert found[0].lag_s == direct.lag_s == 0.1
     assert found[1].joint_rms_rad == pytest.approx(0.01 / np.sqrt(3))
     assert found[1].path_max_m == pytest.approx(0.0, abs=1e-9)
-    assert found[2].position_mean_m == pytest.approx(found[0].position_mean_m, abs=1e-9)
     alone = {"planned": episodes["planned"]}
     assert summarise_motions(episodes["recorded"], alone, plan_id="p1") == found[:1]
 
@@ -224,12 +203,18 @@ def test_samples_outside_the_execution_do_not_count(tmp_path: Path) -> None:
         started_ns=START_NS + 50 * STEP_NS,
         ended_ns=START_NS + 100 * STEP_NS,
     )
+    late = tracks()
+    assert late.tool is not None
+    p_m = late.tool.p_m.copy()
+    p_m[101:] += 1.0  # far off, after the end
+    p_m[:50] += 1.0
+    off = replace(late, tool=PoseTrajectory(late.tool.stamps_ns, p_m, late.tool.q_wxyz))
     (found,) = summarise_motions(
         write(tmp_path / "a.mcap", waiting),
-        {"planned": write(tmp_path / "b.mcap", tracks())},
+        {"planned": write(tmp_path / "b.mcap", off)},
         plan_id="p1",
     )
-    assert found.num_samples == 51
+    assert found.position_mean_m == pytest.approx(0.0, abs=1e-9)
 
 
 def summaries(*mean_m: float) -> list[MotionSummary]:
@@ -237,8 +222,10 @@ def summaries(*mean_m: float) -> list[MotionSummary]:
     return [
         MotionSummary(
             **{
-                **{name: getattr(found, name) for name in MotionSummary.__dataclass_fields__},
+                **vars(found),
                 "episode": f"e{index}",
+                "task": "t",
+                "condition": "",
                 "against": "planned",
                 "position_mean_m": value,
             }
@@ -254,7 +241,6 @@ def test_numbers_are_means_over_trials() -> None:
     assert (mean.value, mean.n, mean.counted) == (pytest.approx(0.03), 3, "trial")
     assert "share one calibration" in str(mean.reason_without_interval)
     assert by_id["motion.executed.position_mean_m"].value is None
-    assert by_id["motion.twin.position_mean_m"].value is None
 
 
 def test_a_pose_that_is_no_number_leaves_the_mean_undefined() -> None:

@@ -11,6 +11,7 @@ from bridge.episode.run_folder import RunFolder
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare import Comparison, compare_run
 from evaluator.compare.images import views
+from evaluator.compare.images.scores import ViewScore
 from evaluator.result import write_results
 
 
@@ -29,7 +30,7 @@ def scored(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     def noted(images: object, **asked: object) -> object:
         found = really(images, **asked)  # type: ignore[arg-type]
-        counts.append(len(found[0]))
+        counts.append(len(found))
         return found
 
     monkeypatch.setattr(views, "score_views", noted)
@@ -57,11 +58,12 @@ def test_views_are_scored_once_and_again_when_they_change(
     assert other.results().get("views.all.psnr_db") != results[0].results().get("views.all.psnr_db")
 
 
-def test_what_cannot_be_scored_keeps_its_reason(tmp_path: Path, scored: list[int]) -> None:
-    with SummaryCache(tmp_path) as cache:
-        summary = views.ViewSummary(reason="camera front at 1 ns: no picture", scores={})
-        cache.keep(views.ViewSummary, "k", (summary,))
-    with SummaryCache(tmp_path) as cache:
-        found = views.scored_views(views.Images(), "k", cache)
-    assert found == ([], ["camera front at 1 ns: no picture"])
-    assert scored == []
+def test_what_cannot_be_scored_keeps_its_reason(run: RunFolder, scored: list[int]) -> None:
+    with SummaryCache(run.results_dir / FOLDER) as cache:
+        first = compare_run(run, cache=cache)
+        for key in cache._of(ViewScore).rows:
+            cache.keep(ViewScore, key, (ViewScore(reason="camera front at 1 ns: no picture"),))
+    found = again(run)
+    assert len(first.exclusions) + 1 == len(found.exclusions)
+    assert any(e.reason == "camera front at 1 ns: no picture" for e in found.exclusions)
+    assert scored == [6]

@@ -73,10 +73,9 @@ def test_trials_with_plans_keep_their_headline(maker: Any) -> None:
 
 @pytest.mark.parametrize("field", ["started_ns", "ended_ns"])
 def test_when_it_was_executed_follows_from_the_joints(maker: Any, field: str) -> None:
-    from bridge.episode.reader import Episode
     from evaluator.run_reader.episodes import read_recorded
 
     moved(maker, "t1", "success")
-    facts = read_recorded(maker.run, Episode.open(maker.run.episodes_dir / "t1.mcap"))
+    facts = read_recorded(maker.run, maker.run.episodes_dir / "t1.mcap")
     expected = 10**18 + {"started_ns": 200, "ended_ns": 400}[field] * STEP_NS
     assert abs(getattr(facts, field) - expected) <= 50_000_000

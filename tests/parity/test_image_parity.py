@@ -58,9 +58,6 @@ def test_scores_agree_with_torchmetrics(seed: int, size: tuple[int, int]) -> Non
     from torchmetrics.functional.image import (
         peak_signal_noise_ratio as their_psnr,
     )
-    from torchmetrics.functional.image import (
-        structural_similarity_index_measure as their_ssim,
-    )
 
     images = pair(seed, size)
     recorded, replayed = tensors(images)
@@ -68,8 +65,6 @@ def test_scores_agree_with_torchmetrics(seed: int, size: tuple[int, int]) -> Non
     rounded = float(10 / torch.log(torch.tensor(10.0)))
     psnr = float(their_psnr(replayed, recorded, data_range=1.0)) * (10 / math.log(10)) / rounded
     assert psnr_db(*images) == pytest.approx(psnr, abs=EXACT)
-    similar = float(their_ssim(replayed, recorded, data_range=1.0))
-    assert ssim_maps(*images).mean("reflect") == pytest.approx(similar, abs=EXACT)
 
 
 def splatting_ssim(recorded: torch.Tensor, replayed: torch.Tensor) -> float:
@@ -97,7 +92,6 @@ def test_zero_padding_is_the_splatting_convention(size: tuple[int, int]) -> None
     assert ssim_maps(*images).mean("zero") == pytest.approx(theirs, abs=EXACT)
 
 
-def test_the_three_customs_are_three_numbers() -> None:
+def test_the_two_customs_are_two_numbers() -> None:
     maps = ssim_maps(*pair(0, (32, 48)))
-    found = [maps.mean(padding) for padding in ("valid", "zero", "reflect")]
-    assert min(abs(a - b) for a in found for b in found if a != b) > 1e-4
+    assert abs(maps.mean("valid") - maps.mean("zero")) > 1e-4

@@ -1,4 +1,4 @@
-"""Pair the images of a ``views`` episode, and score each pair in every way its topics allow.
+"""Pair the images of a ``views`` episode, score each pair, and measure means with their protocol.
 
 Topics end in ``/cam/<id>/`` and ``rendered/image``, ``recorded/image`` (or, in the source episode,
 ``color/image``), ``mask/<name>/image`` or ``mask/<name>`` (white inside),
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
@@ -29,91 +28,38 @@ from bridge.episode.topics import (
 )
 from bridge.errors import GstError, MissingDependencyError
 from bridge.media.color import JPEG_MAGIC, decode_color
-from bridge.media.image_quality import ALIGNMENTS, Alignment, as_float
+from evaluator.compare.measure import mean_of, measured
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import DepthScore, refuse_swapped, score_depth
-from evaluator.metrics.image_protocol import MASK_MODES, MaskMode, NetName
-from evaluator.metrics.image_scores import ImageScore, score_image
-from evaluator.metrics.lpips import PerceptualNet
+from evaluator.measurements import Quantity
+from evaluator.metrics.image import (
+    LPIPS,
+    METRICS,
+    RAW,
+    DepthScore,
+    ImageMetric,
+    ImageScore,
+    PerceptualNet,
+    score_depth,
+    score_pair,
+    variant_words,
+)
+from evaluator.result import Measurement
 
 
-@dataclass(frozen=True, kw_only=True)
-class Variant:
-    """One way to score a pair."""
-
-    name: str
-    """Part of the ids in ``results.json``."""
-    alignment: Alignment = "raw"
-    mode: MaskMode = "full"
-    mask: str = ""
-    """Name of the mask, where there is one."""
-    learned: bool = False
-    """Whether LPIPS is computed for it too; a network takes seconds for each image."""
-
-    @property
-    def mask_words(self) -> str:
-        """What the mask does, for a stamp."""
-        words = MASK_MODES[self.mode]
-        return f"{words} {self.mask!r}" if self.mask else words
-
-    @property
-    def alignment_words(self) -> str:
-        """What was fitted to the recorded image, for a stamp."""
-        return ALIGNMENTS[self.alignment]
-
-    @property
-    def clamp_words(self) -> str:
-        """What became of values outside 0..1."""
-        return "no value outside 0..1" if self.alignment == "raw" else "to 0..1 after alignment"
-
-
-RAW = Variant(name="raw", learned=True)
-GAIN = Variant(name="gain", alignment="gain", learned=True)
-_TAKEN = {variant.name for variant in (RAW, GAIN)}
-
-
-def masked(name: str) -> Variant:
-    """Return the way to score the pixels of a mask alone."""
-    own = f"mask_{name}" if name in _TAKEN else name
-    return Variant(name=own, mode="mask-pixels", mask=name)
-
-
-def score_variants(
-    recorded: UInt8[np.ndarray, "height width 3"] | Float[np.ndarray, "height width 3"],
-    rendered: (
-        UInt8[np.ndarray, "rendered_height rendered_width 3"]
-        | Float[np.ndarray, "rendered_height rendered_width 3"]
-    ),
-    masks: Mapping[str, Bool[np.ndarray, "height width"]],
-    *,
-    nets: Sequence[PerceptualNet] = (),
-) -> dict[Variant, ImageScore]:
-    """Score one pair in every way."""
-    ways: list[tuple[Variant, np.ndarray | None]] = [(RAW, None), (GAIN, None)]
-    ways += [(masked(name), mask) for name, mask in masks.items()]
-    return {
-        variant: score_image(
-            recorded,
-            rendered,
-            mask=mask,
-            alignment=variant.alignment,
-            nets=nets if variant.learned else (),
-        )
-        for variant, mask in ways
-    }
-
-
-def open_nets(backbones: Mapping[NetName, Path]) -> tuple[PerceptualNet, ...]:
-    """Load the networks of LPIPS that were asked for; without one, torch stays out."""
-    if not backbones:
-        return ()
+def open_net(backbone: Path | None) -> PerceptualNet | None:
+    """Load the network of LPIPS where it was asked for; without it, torch stays out."""
+    if backbone is None:
+        return None
     try:
         from evaluator.metrics.lpips_torch import LpipsNet  # noqa: PLC0415  # loads torch
+
+        return LpipsNet(backbone)
     except ModuleNotFoundError as error:
-        if error.name != "torch":
+        if error.name not in ("torch", "safetensors"):
             raise
-        raise MissingDependencyError(package="torch", extra="lpips", purpose="LPIPS") from error
-    return tuple(LpipsNet.open(net, path) for net, path in backbones.items())
+        raise MissingDependencyError(
+            package=str(error.name), extra="lpips", purpose="LPIPS"
+        ) from error
 
 
 Item = TypeVar("Item")
@@ -126,12 +72,7 @@ MAX_THREADS = 8
 def spread(
     work: Callable[[Item], Result], items: Iterable[Item], *, threads: int | None = None
 ) -> list[Result]:
-    """Call ``work`` on each item and return the results in the order of the items.
-
-    Args:
-        work: Must not share anything that changes.
-        threads: How many at once; as many as there are cores without it.
-    """
+    """Call ``work``, which shares nothing that changes, on each item; results keep their order."""
     count = min(MAX_THREADS, os.cpu_count() or 1) if threads is None else threads
     if count <= 1:
         return [work(item) for item in items]
@@ -140,14 +81,8 @@ def spread(
 
 
 RENDERED, RECORDED = "rendered", "recorded"
-_COLOR_TOPICS = (
-    (RENDERED, RENDERED_TOPIC),
-    (RECORDED, RECORDED_TOPIC),
-)
-_DEPTH_TOPICS = (
-    (RENDERED, RENDERED_DEPTH_TOPIC),
-    (RECORDED, RECORDED_DEPTH_TOPIC),
-)
+_COLOR_TOPICS = ((RENDERED, RENDERED_TOPIC), (RECORDED, RECORDED_TOPIC))
+_DEPTH_TOPICS = ((RENDERED, RENDERED_DEPTH_TOPIC), (RECORDED, RECORDED_DEPTH_TOPIC))
 
 Key = tuple[str, int]
 """Camera id and stamp [ns]."""
@@ -155,22 +90,22 @@ Key = tuple[str, int]
 
 @dataclass(frozen=True, kw_only=True)
 class ViewScore:
-    """One held-out image."""
+    """One held-out image: its scores, or the reason why there are none."""
 
-    camera_id: str
-    stamp_ns: int
-    size: tuple[int, int]
+    reason: str = ""
+    camera_id: str = ""
+    stamp_ns: int = 0
+    size: tuple[int, int] = (0, 0)
     """Height and width [px]."""
-    scores: Mapping[Variant, ImageScore]
-    """At least raw and gain; one of each mask where there are any."""
-    depth: DepthScore | None
-    jpeg: bool
+    scores: Mapping[str, ImageScore] = field(default_factory=dict)
+    """By variant; at least raw and gain, and one of each mask where there are any."""
+    depth: DepthScore | None = None
+    jpeg: bool = False
     """The rendered image was stored lossily."""
 
-    def psnr_db(self, variant: Variant = RAW) -> float | None:
-        """None where the variant is not there or both images are identical."""
-        score = self.scores.get(variant)
-        return None if score is None else score.psnr_db
+    def value(self, metric: str, variant: str = RAW) -> float | None:
+        """None where the variant is not there, or the metric is undefined."""
+        return None if variant not in self.scores else self.scores[variant].values.get(metric)
 
 
 @dataclass(kw_only=True)
@@ -191,22 +126,17 @@ class Images:
         return {name: mask for name, mask in found.items() if mask.any()}
 
 
-def score_views(
-    images: Images, *, nets: Sequence[PerceptualNet] = ()
-) -> tuple[list[ViewScore], list[str]]:
-    """Score every rendered image of a views episode; what cannot be scored is a reason."""
+def score_views(images: Images, *, net: PerceptualNet | None = None) -> tuple[ViewScore, ...]:
+    """Score every rendered image of a views episode; what cannot be scored has its reason."""
     rendered = sorted(images.color[RENDERED])
-    # A network uses all cores and much memory by itself.
-    done = spread(partial(_score, images, nets), rendered, threads=1 if nets else None)
-    scores = [found for found in done if isinstance(found, ViewScore)]
-    reasons = [found for found in done if isinstance(found, str)]
     if not rendered:
-        reasons.append("no topic .../cam/<id>/rendered/image in it")
-    return scores, reasons
+        return (ViewScore(reason="no topic .../cam/<id>/rendered/image in it"),)
+    # A network uses all cores and much memory by itself.
+    return tuple(spread(partial(_score, images, net), rendered, threads=1 if net else None))
 
 
 def images_of(views: Episode, source: Episode | None) -> Images:
-    """Collect the images of a views episode."""
+    """Collect the images of a views episode; recorded ones of its source where it has none."""
     images = read_images(views)
     if source is not None and not images.color[RECORDED]:
         wanted = {stamp for _, stamp in images.color[RENDERED]}
@@ -249,18 +179,19 @@ def _put_depth(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:
     into[camera_id, DepthImage.from_cdr(data).stamp_ns] = data
 
 
-def _score(images: Images, nets: Sequence[PerceptualNet], key: Key) -> ViewScore | str:
+def _score(images: Images, net: PerceptualNet | None, key: Key) -> ViewScore:
     where = f"camera {key[0]} at {key[1]} ns"
     rendered, recorded = images.color[RENDERED][key], images.color[RECORDED].get(key)
     if recorded is None:
-        return f"{where}: no recorded image with this stamp"
+        return ViewScore(reason=f"{where}: no recorded image with this stamp")
     try:
-        recorded_u8, rendered_u8 = decode_color(recorded), decode_color(rendered)
-        refuse_swapped(as_float(recorded_u8), as_float(rendered_u8))
-        scores = score_variants(recorded_u8, rendered_u8, images.masks_of(key), nets=nets)
+        recorded_u8 = decode_color(recorded)
+        scores = score_pair(
+            recorded_u8, decode_color(rendered), masks=images.masks_of(key), net=net
+        )
         depth = _score_depth(images, key)
     except GstError as error:
-        return f"{where}: {error}"
+        return ViewScore(reason=f"{where}: {error}")
     return ViewScore(
         camera_id=key[0],
         stamp_ns=key[1],
@@ -281,3 +212,72 @@ def _score_depth(images: Images, key: Key) -> DepthScore | None:
         )
     except UndefinedStatisticError:
         return None
+
+
+NOT_A_SAMPLE = (
+    "views of one scene are no random sample of views; the per-image list is in the table"
+)
+
+
+def size_words(sizes: Iterable[tuple[int, int]]) -> str:
+    """Write the sizes of images, given as (height, width) [px]."""
+    found = sorted(set(sizes))
+    if not found:
+        return "no image"
+    words = ", ".join(f"{width} x {height}" for height, width in found[:3])
+    return words if len(found) <= 3 else f"{words} and {len(found) - 3} other sizes"
+
+
+def measure_images(
+    quantities: Mapping[tuple[str, bool], Quantity],
+    scores: Sequence[Mapping[str, ImageScore]],
+    protocol: str,
+    *,
+    net: PerceptualNet | None = None,
+    episodes: Sequence[str] = (),
+    **part: str,
+) -> list[Measurement]:
+    """Measure the mean of every metric that each variant can have; no number without its protocol.
+
+    Args:
+        quantities: By the metric, and whether the images were compared as they are stored.
+        protocol: What all numbers about these images have in common.
+    """
+    variants = {variant: None for score in scores for variant in score} or {RAW: None}
+    found = []
+    for variant in variants:
+        of_variant = [score[variant] for score in scores if variant in score]
+        for metric in METRICS.values():
+            if (metric.id == LPIPS and net is None) or (metric.raw_only and variant != RAW):
+                continue
+            weights = f"weights {net.weights}" if net is not None and metric.id == LPIPS else ""
+            parts = (variant_words(variant), protocol, _lacking(metric, of_variant), weights)
+            words = "".join(f"; {part}" for part in parts if part)
+            values = [s.values[metric.id] for s in of_variant if metric.id in s.values]
+            found.append(
+                measured(
+                    quantities[metric.id, variant == RAW].of(
+                        variant=variant, protocol=words, **part
+                    ),
+                    partial(mean_of, values, metric.column, _first_reason(metric, of_variant)),
+                    n=len(values),
+                    counted="image",
+                    reason_without_interval=NOT_A_SAMPLE,
+                    episodes=episodes,
+                )
+            )
+    return found
+
+
+def _first_reason(metric: ImageMetric, scores: Sequence[ImageScore]) -> str:
+    found = (score.reasons[metric.id] for score in scores if metric.id in score.reasons)
+    return next(found, "no pair of images has it")
+
+
+def _lacking(metric: ImageMetric, scores: Sequence[ImageScore]) -> str:
+    """Count the images that the mean leaves out, with the first reason."""
+    without = sum(metric.id in score.reasons for score in scores)
+    if not 0 < without < len(scores):
+        return ""
+    reason = _first_reason(metric, scores)
+    return f"not in the mean: {without} of {len(scores)} images ({reason})"

@@ -5,98 +5,26 @@ episode are found, and their scores become measurements, each with its protocol.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
 from evaluator.cache import SummaryCache
 from evaluator.compare.images.scores import (
-    GAIN,
-    RAW,
-    Images,
-    Variant,
     ViewScore,
     images_of,
-    masked,
+    measure_images,
     score_views,
+    size_words,
 )
-from evaluator.compare.images.tables import (
-    Protocol,
-    per_image_table,
-    resolution_words,
-    stamped_measurements,
-)
-from evaluator.compare.measure import measured
-from evaluator.measurements import DEPTHS, LPIPS_MISSING, VIEWS, slug
-from evaluator.metrics.image import DepthScore
-from evaluator.metrics.image_protocol import UNSTATED
-from evaluator.metrics.image_scores import ImageScore
-from evaluator.metrics.lpips import LPIPS_NOT_COMPUTED, PerceptualNet
-from evaluator.result import Exclusion, Measurement, Table
+from evaluator.compare.measure import Part, mean_of, measured, millimetres
+from evaluator.measurements import DEPTHS, LPIPS_MISSING, VIEWS
+from evaluator.metrics.image import GAIN, LPIPS_NOT_COMPUTED, METRICS, PerceptualNet
+from evaluator.metrics.image_options import UNSTATED
+from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewSummary:
-    """One view that was scored, or the reason why it could not be."""
-
-    reason: str = ""
-    camera_id: str = ""
-    stamp_ns: int = 0
-    size: tuple[int, ...] = ()
-    masks: tuple[str, ...] = ()
-    scores: Mapping[str, ImageScore]
-    """By the name of the variant."""
-    depth: DepthScore | None = None
-    jpeg: bool = False
-
-
-def scored_views(
-    images: Images, key: str, cache: SummaryCache, *, nets: Sequence[PerceptualNet] = ()
-) -> tuple[list[ViewScore], list[str]]:
-    """Score the views of one episode as ``score_views`` does, or take what is kept of them."""
-    key = " ".join([key, *(net.weights for net in nets)])
-
-    def make() -> tuple[ViewSummary, ...]:
-        scores, reasons = score_views(images, nets=nets)
-        gone = (ViewSummary(reason=reason, scores={}) for reason in reasons)
-        return (*map(_summary_of, scores), *gone)
-
-    kept = cache.kept_or_made(ViewSummary, key, make)
-    scores = [_score_of(view) for view in kept if not view.reason]
-    return scores, [view.reason for view in kept if view.reason]
-
-
-def _summary_of(score: ViewScore) -> ViewSummary:
-    return ViewSummary(
-        camera_id=score.camera_id,
-        stamp_ns=score.stamp_ns,
-        size=score.size,
-        masks=tuple(dict.fromkeys(variant.mask for variant in score.scores if variant.mask)),
-        scores={variant.name: found for variant, found in score.scores.items()},
-        depth=score.depth,
-        jpeg=score.jpeg,
-    )
-
-
-def _score_of(view: ViewSummary) -> ViewScore:
-    variants = [RAW, GAIN, *map(masked, view.masks)]
-    named = {variant.name: variant for variant in variants}
-    height, width = view.size
-    return ViewScore(
-        camera_id=view.camera_id,
-        stamp_ns=view.stamp_ns,
-        size=(height, width),
-        scores={named[name]: found for name, found in view.scores.items()},
-        depth=view.depth,
-        jpeg=view.jpeg,
-    )
-
 
 TWIN = "twin"
 """What the run's own renders are called beside other methods."""
@@ -104,66 +32,76 @@ Source = tuple[Path, str]
 """A recorded episode: its file, and the content hash of it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewReport:
-    """What all ``views`` episodes of a run say."""
-
-    measurements: tuple[Measurement, ...] = ()
-    tables: tuple[Table, ...] = ()
-    exclusions: tuple[Exclusion, ...] = ()
-    missing: tuple[str, ...] = ()
-
-
 def compare_views(
     files: Sequence[DerivedFile],
     sources: Mapping[str, Source],
     *,
-    nets: Sequence[PerceptualNet] = (),
+    net: PerceptualNet | None = None,
     cache: SummaryCache | None = None,
-) -> ViewReport:
+) -> Part:
     """Compute every image metric of every rendered view, per image and mean."""
     cache = SummaryCache(None) if cache is None else cache
     views, left_out = newest_views(files, sources)
     if not views:
-        return ViewReport(
+        return Part(
             missing=("views: no rendered views (robot-gst rebuild makes them)",),
             exclusions=tuple(left_out),
         )
     tables: list[Table] = []
-    found: dict[str, list[ViewScore]] = {}
-    of: dict[str, DerivedFile] = {}
+    found: dict[str, tuple[ViewScore, ...]] = {}
     for file in views:
-        name = file.path.stem
-        source = file.derived.source_episode
+        name, source = file.path.stem, file.derived.source_episode
+        recorded = sources.get(source)
+        sha256 = "-" if recorded is None else recorded[1]
+        key = " ".join([file.sha256, sha256, *([net.weights] if net else ())])
         try:
-            recorded = sources.get(source)
-            images = images_of(file.episode, opened(recorded))
-            key = f"{file.sha256} {'-' if recorded is None else recorded[1]}"
-            scores, reasons = scored_views(images, key, cache, nets=nets)
+            scores = cache.kept_or_made(ViewScore, key, partial(_scored, file, recorded, net))
         except GstError as error:
             left_out.append(Exclusion(episode=file.path.name, scope="views", reason=str(error)))
             continue
-        left_out += [Exclusion(episode=name, scope="views", reason=reason) for reason in reasons]
-        found[source], of[source] = scores, file
-        tables.append(per_image_table(f"views_{len(tables)}", f"Held-out views: {name}", scores))
-    everything = [score for scores in found.values() for score in scores]
-    measurements = _measure("all", list(found), everything, of.values(), nets)
-    for source, scores in found.items() if len(found) > 1 else ():
-        measurements += _measure(slug(source), [source], scores, [of[source]], nets)
-    return ViewReport(
-        measurements=tuple(measurements),
+        left_out += [
+            Exclusion(episode=name, scope="views", reason=each.reason)
+            for each in scores
+            if each.reason
+        ]
+        found[source] = tuple(each for each in scores if not each.reason)
+        tables.append(_table(f"views_{len(tables)}", f"Held-out views: {name}", found[source]))
+    kept = [file for file in views if file.derived.source_episode in found]
+    return Part(
+        measurements=tuple(_measure(found, [file.derived.settings for file in kept], net)),
         tables=tuple(tables),
         exclusions=tuple(left_out),
     )
+
+
+def _scored(
+    file: DerivedFile, source: Source | None, net: PerceptualNet | None
+) -> tuple[ViewScore, ...]:
+    return score_views(images_of(file.episode, opened(source)), net=net)
 
 
 def newest_views(
     files: Sequence[DerivedFile], sources: Mapping[str, Source]
 ) -> tuple[list[DerivedFile], list[Exclusion]]:
     """Find the newest views of each recorded episode; stale and older ones are left out by name."""
-    views, stale = _current([file for file in files if file.derived.kind == "views"], sources)
-    views, older = _newest(views)
-    return views, [*older, *stale]
+    newest: dict[str, DerivedFile] = {}
+    why: dict[str, str] = {}
+    views = [file for file in files if file.derived.kind == "views"]
+    for file in sorted(views, key=lambda file: file.age):
+        source = sources.get(file.derived.source_episode)
+        if source is not None and file.derived.source_sha256 not in ("", source[1]):
+            why[file.name] = "made from another version of the episode (its hash differs); rebuild"
+            continue
+        older = newest.get(file.derived.source_episode)
+        if older is not None:
+            why[older.name] = "views of an older scene; there are newer ones of the same episode"
+        newest[file.derived.source_episode] = file
+    left_out = [
+        Exclusion(episode=file.path.name, scope="views", reason=why[file.name])
+        for file in views
+        if file.name in why
+    ]
+    return [file for file in views if file.name not in why], left_out
 
 
 def opened(source: Source | None) -> Episode | None:
@@ -171,127 +109,76 @@ def opened(source: Source | None) -> Episode | None:
     return None if source is None else Episode.open(source[0])
 
 
-def _current(
-    views: Sequence[DerivedFile], sources: Mapping[str, Source]
-) -> tuple[list[DerivedFile], list[Exclusion]]:
-    """Leave out views that were made from another version of their recorded episode."""
-    stale = []
-    for file in views:
-        source = sources.get(file.derived.source_episode)
-        if source is not None and file.derived.source_sha256 not in ("", source[1]):
-            stale.append(file)
-    reason = "made from another version of the episode (its hash differs); rebuild again"
-    left_out = [Exclusion(episode=f.path.name, scope="views", reason=reason) for f in stale]
-    return [file for file in views if file not in stale], left_out
-
-
-def _newest(views: Sequence[DerivedFile]) -> tuple[list[DerivedFile], list[Exclusion]]:
-    """Keep the newest views of each recorded episode; older scenes are named and left out."""
-    newest: dict[str, DerivedFile] = {}
-    for file in sorted(views, key=lambda item: (item.path.stat().st_mtime_ns, item.path.name)):
-        newest[file.derived.source_episode] = file
-    kept = [file for file in views if file is newest[file.derived.source_episode]]
-    reason = "views of an older scene; there are newer ones of the same episode"
-    left_out = [
-        Exclusion(episode=file.path.name, scope="views", reason=reason)
-        for file in views
-        if file not in kept
+def _table(table_id: str, title: str, scores: Sequence[ViewScore]) -> Table:
+    """List every view with its raw scores, and PSNR after a gain."""
+    shown = [metric for metric in METRICS if any(s.value(metric) is not None for s in scores)]
+    others = [metric for metric in shown if metric not in ("psnr_db", "ssim")]
+    rows: list[tuple[Cell, ...]] = [
+        (
+            *(s.camera_id, s.stamp_ns, _rounded(s.value("psnr_db"), 3), _rounded(s.value("ssim"))),
+            _rounded(s.value("psnr_db", GAIN), 3),
+            millimetres(None if s.depth is None else s.depth.mean_abs_m),
+            *(_rounded(s.value(metric)) for metric in others),
+        )
+        for s in scores
     ]
-    return kept, left_out
+    return Table(
+        id=table_id,
+        title=title,
+        columns=(
+            *("camera", "stamp_ns", "PSNR (dB)", "SSIM", "PSNR gain (dB)", "depth (mm)"),
+            *(METRICS[metric].column for metric in others),
+        ),
+        rows=tuple(rows),
+        note=f"{'. '.join(METRICS[m].definition for m in ('psnr_db', 'ssim', *others))}.",
+    )
+
+
+def _rounded(value: float | None, digits: int = 4) -> Cell:
+    return None if value is None else round(value, digits)
 
 
 def _measure(
-    part: str,
-    episodes: Sequence[str],
-    scores: Sequence[ViewScore],
-    files: Iterable[DerivedFile],
-    nets: Sequence[PerceptualNet],
+    found: Mapping[str, Sequence[ViewScore]],
+    settings: Sequence[Mapping[str, Any]],
+    net: PerceptualNet | None,
 ) -> list[Measurement]:
-    """All numbers about some views; the raw ones first."""
-    settings: list[Mapping[str, Any]] = [file.derived.settings for file in files]
-    described = _described(settings)
-    stored = "rendered images stored as JPEG" if any(s.jpeg for s in scores) else "stored lossless"
-    protocol = Protocol(
-        resolution=resolution_words([score.size for score in scores]),
-        split=agreed_setting(settings, "holdout") or UNSTATED,
-        stored=stored,
-        nets=nets,
-        note=described,
+    """All numbers about the views, of all episodes together; the raw ones first."""
+    views = [view for of_episode in found.values() for view in of_episode]
+    stored = "rendered images stored as JPEG" if any(v.jpeg for v in views) else "stored lossless"
+    split = agreed_setting(settings, "holdout") or UNSTATED
+    measurements = measure_images(
+        VIEWS,
+        [view.scores for view in views],
+        f"{size_words(v.size for v in views)}; split {split}; {stored}",
+        net=net,
+        episodes=list(found),
+        part="all",
     )
-    variants: dict[Variant, None] = {}
-    for score in scores:
-        variants |= dict.fromkeys(score.scores)
-    stamped = [
-        number
-        for variant in variants or {RAW: None}
-        for number in stamped_measurements(
-            VIEWS,
-            variant,
-            [s.scores[variant] for s in scores if variant in s.scores],
-            protocol,
-            episodes=episodes,
-            part=part,
-        )
-    ]
-    measurements = [number.measurement for number in stamped]
-    after = "; ".join(part for part in (stored, "mean of per-image values", described) if part)
-    measurements += _measure_depth(part, episodes, scores, after)
-    if not nets:
+    depths = [view.depth for view in views if view.depth is not None]
+    for name, quantity in DEPTHS.items() if depths else ():
+        values = [getattr(depth, name) for depth in depths]
         measurements.append(
-            Measurement(
-                **vars(LPIPS_MISSING.of(part=part)),
-                value=None,
-                reason_if_undefined=LPIPS_NOT_COMPUTED,
-                episodes=tuple(episodes),
+            measured(
+                quantity.of(part="all", after=stored),
+                partial(mean_of, values, "depth error", "no view has depth"),
+                n=len(depths),
+                counted="image",
+                reason_without_interval="the per-image list is in the table",
+                episodes=list(found),
             )
+        )
+    if net is None:
+        lacking = LPIPS_MISSING.of(part="all")
+        measurements.append(
+            Measurement(**vars(lacking), value=None, reason_if_undefined=LPIPS_NOT_COMPUTED)
         )
     return measurements
 
 
-def _measure_depth(
-    part: str, episodes: Sequence[str], scores: Sequence[ViewScore], after: str
-) -> list[Measurement]:
-    depths = [score.depth for score in scores if score.depth is not None]
-    if not depths:
-        return []
-    return [
-        measured(
-            quantity.of(part=part, after=after),
-            partial(_mean_depth_m, depths, name),
-            n=len(depths),
-            counted="image",
-            reason_without_interval="the per-image list is in the table",
-            episodes=episodes,
-        )
-        for name, quantity in DEPTHS.items()
-    ]
-
-
-def agreed_setting(settings: Sequence[Mapping[str, Any]], name: str) -> str:
+def agreed_setting(settings: Iterable[Mapping[str, Any]], name: str) -> str:
     """Return what all views say of one setting, or nothing."""
     values = [each.get(name) for each in settings]
     if not values or values[0] is None or any(value != values[0] for value in values):
         return ""
-    value = values[0]
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def _described(settings: Sequence[Mapping[str, Any]]) -> str:
-    """What the views say about how their scenes were made, where they agree."""
-    parts = []
-    for name, text in (
-        ("holdout", "held out: {}"),
-        ("training", "learnt from: {}"),
-        ("train_frames", "{} training frames"),
-        ("cameras_from", "cameras from {}"),
-        ("num_splats", "{} Gaussians"),
-        ("fit_cpu_seconds", "fitted in {} CPU seconds"),
-        ("peak_memory_mb", "at most {} MB"),
-    ):
-        if agreed := agreed_setting(settings, name):
-            parts.append(text.format(agreed))
-    return "; ".join(parts)
-
-
-def _mean_depth_m(depths: Sequence[DepthScore], name: str) -> float:
-    return float(np.mean([getattr(depth, name) for depth in depths]))
+    return ", ".join(map(str, values[0])) if isinstance(values[0], list) else str(values[0])

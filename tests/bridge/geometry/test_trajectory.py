@@ -33,12 +33,6 @@ def test_halfway_between_two_poses_is_the_mean_position() -> None:
     np.testing.assert_allclose(track.at(middle).p_m[0], track.p_m[:2].mean(axis=0), atol=1e-6)
 
 
-def test_normalised_time_keeps_both_ends() -> None:
-    resampled = spiral().normalised_time(7)
-    assert len(resampled) == 7
-    np.testing.assert_allclose(resampled.p_m[[0, -1]], spiral().p_m[[0, -1]], atol=1e-9)
-
-
 def test_one_pose_answers_every_stamp() -> None:
     track = spiral()
     single = PoseTrajectory(track.stamps_ns[:1], track.p_m[:1], track.q_wxyz[:1])

@@ -11,10 +11,10 @@ from skimage.metrics import peak_signal_noise_ratio
 
 from bridge.errors import PathNotFoundError, UsageError
 from evaluator.cli import evaluate
-from evaluator.compare.images.renders import compare_folders
+from evaluator.compare.images.methods import compare_folders
 from evaluator.compare.rows import Comparison
 from evaluator.errors import EvaluatorError
-from evaluator.metrics.image_protocol import ImageOptions
+from evaluator.metrics.image_options import ImageOptions
 
 SIZE = (48, 64)
 
@@ -166,13 +166,11 @@ def test_images_the_reference_does_not_have_are_named(folders: Path) -> None:
     assert "the reference has no such image" in reasons(compared(folders))["poor: train/0007"]
 
 
-def test_a_method_with_all_channels_swapped_is_left_out_whole(folders: Path) -> None:
+def test_a_method_with_all_channels_swapped_is_refused_with_the_reason(folders: Path) -> None:
     for path in sorted((folders / "poor").iterdir()):
         save(np.asarray(Image.open(path))[..., ::-1], path)
-    comparison = compared(folders)
-    assert "the whole method" in reasons(comparison)["poor"]
-    assert comparison.results().get("image.good.psnr_db").n == 3
-    assert not any(m.id.startswith("image.poor") for m in comparison.measurements)
+    with pytest.raises(EvaluatorError, match=r"poor: 0002: red and blue look swapped.*leave out"):
+        compared(folders)
 
 
 def test_nothing_in_common_is_an_error_that_shows_both_namings(folders: Path) -> None:
@@ -216,7 +214,7 @@ def test_the_command_writes_a_report_of_images_alone(folders: Path) -> None:
 
 
 def test_views_of_a_run_may_be_called_as_export_tum_calls_them() -> None:
-    from evaluator.compare.images.renders import other_names
+    from evaluator.compare.images.methods import other_names
 
     names = other_names(["wrist/1500000000", "side/1500000000", "side/2000000001"])
     assert names["wrist_1500000000"] == "wrist/1500000000"

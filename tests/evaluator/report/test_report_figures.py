@@ -8,8 +8,7 @@ import pytest
 
 from evaluator.compare import Comparison, compare_csv
 from evaluator.report.figures import DARK, LIGHT, WIDTH, Drawing, drawings_of, scatter
-from evaluator.report.ranked import FIGURES
-from evaluator.report.sections import SECTIONS
+from evaluator.report.sections import FIGURES, SECTIONS
 from evaluator.report.write import write_report
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "examples" / "paper_table_rates.csv"

@@ -11,9 +11,10 @@ from own_process import printed
 
 from bridge.episode.run_folder import RunFolder
 from bridge.exchange.trials_csv import TrialRecord, read_trials
-from evaluator.columns import OF_MEASUREMENTS, OF_TRIALS
 from evaluator.compare import compare_run
 from evaluator.report.parquet import (
+    OF_MEASUREMENTS,
+    OF_TRIALS,
     write_measurements,
     write_trials,
 )

@@ -70,7 +70,7 @@ def test_the_first_page_says_what_it_means_in_few_words() -> None:
     for path in (PAPER, published):
         results = compare_csv(path).results()
         first = front(results)
-        assert first.summary
+        assert first.sentences
         assert first.tasks
         assert first.unseen
         text = re.sub(r"<nav.*?</nav>|<style.*?</style>", " ", page(results), flags=re.S)
@@ -143,7 +143,7 @@ def shown(tmp_path: Path, text: str) -> tuple[str, str]:
     comparison = compare_csv(path)
     written = write_report(comparison, tmp_path / "out")
     first = front(written.content)
-    return first.summary + " ".join(first.missing), summary_text(written.content, written)
+    return " ".join([*first.sentences, *first.missing]), summary_text(written.content, written)
 
 
 def test_rates_without_n_ask_for_it_and_claim_no_interval(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import PointCloudSample, PoseSample
+from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
@@ -129,9 +129,6 @@ def replay_episode(
     path: Path,
     plan: Plan,
     moved: dict[str, list[np.ndarray]],
-    *,
-    nodes_m: dict[str, list[np.ndarray]] | None = None,
-    until: int = 1_000,
 ) -> Episode:
     """A replay: each object at the given poses, one for the end of each second from 0 on."""
     with EpisodeWriter(path) as writer:
@@ -139,19 +136,8 @@ def replay_episode(
         for name, poses in moved.items():
             for second, T in enumerate(poses):
                 _pose(writer, f"object/{name}", T, START_NS + second * 10 * STEP_NS)
-        for name, clouds in (nodes_m or {}).items():
-            for second, points in enumerate(clouds):
-                stamp = START_NS + second * 10 * STEP_NS
-                cloud = PointCloudSample(stamp_ns=stamp, frame_id="base_link", points_m=points)
-                writer.write(
-                    f"/cell/object/{name}/nodes",
-                    cloud.to_cdr(),
-                    type_name=schema.POINT_CLOUD,
-                    log_time_ns=stamp,
-                )
-        for index, stage in enumerate(plan.stages):
-            if index < until:
-                _event(writer, "stage_ended", START_NS + stage.t_end_ns, stage_id=stage.id)
+        for stage in plan.stages:
+            _event(writer, "stage_ended", START_NS + stage.t_end_ns, stage_id=stage.id)
     return Episode.open(path)
 
 

@@ -21,9 +21,9 @@ from state_samples import (
 )
 
 from bridge.episode.reader import Episode
-from bridge.task.task_file import ObjectModel, load_task
+from bridge.task.task_file import ObjectModel
 from evaluator.compare.states import StateSummary, state_results, summarise_states
-from evaluator.metrics.state import soft_box, turn_between_rad, turns_alike
+from evaluator.metrics.state import turn_between_rad, turns_alike
 
 LIFTED_M = (0.45, -0.1, 0.25)
 Made = Callable[..., tuple[StateSummary, ...]]
@@ -71,25 +71,6 @@ def test_turns_that_cannot_be_seen_change_nothing(seed: int, i: int, j: int) -> 
     assert plain <= np.deg2rad(62.8)
 
 
-def test_a_squeezed_body_is_shorter_and_its_middle_moves() -> None:
-    rng = np.random.default_rng(0)
-    size = (0.16, 0.1, 0.06)
-    rest = rng.uniform(-0.5, 0.5, size=(200, 3)) * np.array(size)
-    T_rest, T_now = posed((0.4, 0.0, 0.03), 0.3), posed((0.5, 0.2, 0.04), -0.5)
-    squeezed = rest.copy()
-    squeezed[:, 0] = np.where(squeezed[:, 0] > 0, squeezed[:, 0] / 2, squeezed[:, 0])
-    middle, extents = soft_box(
-        squeezed @ T_now[:3, :3].T + T_now[:3, 3],
-        T_now,
-        rest @ T_rest[:3, :3].T + T_rest[:3, 3],
-        T_rest,
-        size,
-    )
-    np.testing.assert_allclose(extents, [0.12, 0.1, 0.06], atol=1e-3)
-    local = T_now[:3, :3].T @ (middle - T_now[:3, 3])
-    np.testing.assert_allclose(local, [-0.02, 0.0, 0.0], atol=1e-3)
-
-
 @pytest.fixture
 def cube(tmp_path: Path) -> Made:
     """Two stages of a cube: the plan, two replays and the localisation all differ a little."""
@@ -98,7 +79,6 @@ def cube(tmp_path: Path) -> Made:
         *,
         seen: Seen | None = None,
         task: str = "cube_into_box",
-        until: int = 1_000,
         live: bool = False,
     ) -> tuple[StateSummary, ...]:
         plan = plan_of({"grasp": {"cube": posed(LIFTED_M)}, "place": {"cube": posed(IN_BOX_M)}})
@@ -118,7 +98,7 @@ def cube(tmp_path: Path) -> Made:
             tmp_path / "t.mcap", plan, task=task, seen=seen if live else None
         )
         replays: dict[str, Episode] = {
-            name: replay_episode(tmp_path / f"{name}.mcap", plan, {"cube": poses}, until=until)
+            name: replay_episode(tmp_path / f"{name}.mcap", plan, {"cube": poses})
             for name, poses in moved.items()
         }
         localised = None if live else localised_episode(tmp_path / "l.mcap", seen)
@@ -127,90 +107,56 @@ def cube(tmp_path: Path) -> Made:
     return make
 
 
-def pick(found: tuple[StateSummary, ...], stage: str, by: str, against: str) -> StateSummary:
-    (state,) = (s for s in found if (s.stage, s.predicted_by, s.against) == (stage, by, against))
+def pick(found: tuple[StateSummary, ...], by: str) -> StateSummary:
+    (state,) = (s for s in found if s.predicted_by == by)
     return state
-
-
-def test_each_stage_is_compared_with_whoever_knows_it(cube: Made) -> None:
-    found = cube()
-    assert [(s.predicted_by, s.against) for s in found if s.stage == "grasp"] == [
-        ("plan", "planned"),
-        ("plan", "executed"),
-        ("planned", "executed"),
-    ]
-    assert len([s for s in found if s.stage == "place"]) == 6
-    lifted = pick(found, "grasp", "plan", "executed")
-    assert lifted.position_m == pytest.approx(0.0, abs=1e-12)
-    assert lifted.rotation_rad == pytest.approx(0.1)
-    assert not lifted.is_last
 
 
 def test_final_states_are_those_after_settling(cube: Made) -> None:
     found = cube()
+    assert [s.predicted_by for s in found] == ["plan", "planned", "executed"]
     # The planned replay ends a second after the last stage, exactly where the plan says.
-    assert pick(found, "place", "plan", "planned").position_m == pytest.approx(0.0, abs=1e-12)
-    recorded = pick(found, "place", "planned", "recorded")
-    assert recorded.position_m == pytest.approx(0.005)
-    assert recorded.rotation_rad == pytest.approx(0.2)
-    assert recorded.is_last
+    planned = pick(found, "planned")
+    assert planned.position_m == pytest.approx(0.005)
+    assert planned.rotation_rad == pytest.approx(0.2)
     # A quarter turn of a cube cannot be seen.
-    assert pick(found, "place", "plan", "executed").rotation_rad == pytest.approx(0.0, abs=1e-9)
+    executed = pick(found, "executed")
+    assert executed.rotation_rad == pytest.approx(0.2)
+    assert executed.position_m == pytest.approx(np.hypot(0.003, 0.004 - 0.02))
 
 
 def test_the_cells_own_localisation_counts_without_the_twins(cube: Made) -> None:
     found = cube(live=True)
-    assert pick(found, "place", "plan", "recorded").position_m == pytest.approx(0.005)
+    assert pick(found, "plan").position_m == pytest.approx(0.005)
 
 
 def test_what_is_not_known_says_why(cube: Made) -> None:
-    lost = pick(cube(seen=Seen().add("cube", None)), "place", "plan", "recorded")
+    lost = pick(cube(seen=Seen().add("cube", None)), "plan")
     assert lost.position_m is None
     assert "hidden behind the box" in str(lost.reason)
 
 
 def test_an_object_that_was_not_looked_for_says_so(cube: Made) -> None:
-    state = pick(cube(seen=Seen()), "place", "plan", "recorded")
+    state = pick(cube(seen=Seen()), "plan")
     assert state.reason == "it was not localised after the execution"
 
 
-def test_a_replay_that_ends_early_knows_no_later_stage(cube: Made) -> None:
-    state = pick(cube(until=0), "grasp", "plan", "planned")
-    assert state.reason == "the replay ended before the stage did"
+def test_what_a_replay_does_not_show_says_so(tmp_path: Path) -> None:
+    plan = plan_of({"place": {"cube": posed(IN_BOX_M)}})
+    found = summarise_states(
+        recorded_episode(tmp_path / "t.mcap", plan),
+        {"planned": replay_episode(tmp_path / "r.mcap", plan, {"duck": [posed(LIFTED_M)]})},
+        localised_episode(tmp_path / "l.mcap", Seen().add("cube", in_box())),
+        plan_id=PLAN_ID,
+    )
+    assert pick(found, "planned").reason == "the replay holds no poses of it"
+    assert pick(found, "plan").position_m == pytest.approx(0.0, abs=1e-9)
 
 
 def test_an_unknown_task_has_positions_but_no_rotation(cube: Made) -> None:
-    state = pick(cube(task="../etc/passwd"), "place", "plan", "recorded")
+    state = pick(cube(task="../etc/passwd"), "plan")
     assert state.position_m == pytest.approx(0.005)
     assert state.rotation_rad is None
-
-
-def test_soft_objects_are_compared_by_middle_and_extents(tmp_path: Path) -> None:
-    size = np.array(load_task("sloth_into_basket").objects["sloth"].size_m)
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2 * size
-    T_start, T_end = posed((0.45, -0.1, 0.03)), posed((0.5, 0.2, 0.04), 0.5)
-    flat = corners * np.array([1.0, 1.0, 0.5])
-    plan = plan_of({"release": {"sloth": T_end}})
-    replay = replay_episode(
-        tmp_path / "r.mcap",
-        plan,
-        {"sloth": [T_start, T_end]},
-        nodes_m={
-            "sloth": [corners + T_start[:3, 3], flat @ T_end[:3, :3].T + T_end[:3, 3]],
-        },
-    )
-    seen = Seen().add("sloth", posed((0.5, 0.21, 0.04), 0.5), extents_m=(0.16, 0.1, 0.045))
-    found = summarise_states(
-        recorded_episode(tmp_path / "t.mcap", plan, task="sloth_into_basket"),
-        {"planned": replay},
-        localised_episode(tmp_path / "l.mcap", seen),
-        plan_id=PLAN_ID,
-    )
-    state = pick(found, "release", "planned", "recorded")
-    assert state.soft
-    assert state.position_m == pytest.approx(0.01, abs=1e-6)
-    assert state.extents_m == pytest.approx(0.015, abs=1e-6)
-    assert pick(found, "release", "plan", "recorded").extents_m is None
 
 
 def test_a_plan_that_is_not_there_or_predicts_nothing_gives_nothing(tmp_path: Path) -> None:
@@ -226,17 +172,10 @@ def states(count: int, *, condition: str = "with_replanning") -> list[StateSumma
             episode=f"{condition}_{index // 2}",
             task="cube_into_box",
             condition=condition,
-            plan_id="p",
-            stage="place",
             object_id=f"cube_{index % 2}",
             predicted_by="plan",
-            against="recorded",
-            is_last=True,
-            soft=False,
             position_m=float(value),
             rotation_rad=0.1,
-            extents_m=None,
-            reason=None,
         )
         for index, value in enumerate(rng.uniform(0.002, 0.02, size=count))
     ]
@@ -265,9 +204,9 @@ def test_an_episode_counts_once_and_conditions_stay_apart() -> None:
     assert "4 values" in str(few.reason_without_interval)
 
 
-def test_what_is_missing_is_named_and_stages_have_a_table() -> None:
+def test_what_is_missing_is_named() -> None:
     lost = replace(states(1)[0], position_m=None, rotation_rad=None, reason="not found: behind it")
-    part = state_results([lost, replace(lost, stage="grasp", is_last=False, reason="x")])
+    part = state_results([lost])
     (exclusion,) = part.exclusions
     assert "behind it" in exclusion.reason
     median = part.measurements[0]
@@ -275,16 +214,11 @@ def test_what_is_missing_is_named_and_stages_have_a_table() -> None:
     assert "behind it" in str(median.reason_if_undefined)
 
 
-def test_a_plan_has_no_extents_and_an_unknown_shape_says_so() -> None:
-    soft = [replace(state, soft=True, rotation_rad=None) for state in states(4)]
-    ids = {m.id: m for m in state_results(soft).measurements}
-    assert not any("extents" in name for name in ids)
+def test_an_unknown_symmetry_says_so() -> None:
+    found = [replace(state, rotation_rad=None) for state in states(4)]
+    ids = {m.id: m for m in state_results(found).measurements}
     turned = ids["state.plan_to_recorded.cube_into_box.with_replanning.rotation_median_rad"]
     assert "symmetry" in str(turned.reason_if_undefined)
-    replayed = [replace(state, predicted_by="planned") for state in soft]
-    ids = {m.id: m for m in state_results(replayed).measurements}
-    shape = ids["state.planned_to_recorded.cube_into_box.with_replanning.extents_median_m"]
-    assert shape.reason_if_undefined == "not both sides know the shape"
 
 
 def test_no_state_is_no_data() -> None:
