@@ -13,7 +13,7 @@ def _kind_of(field: "Field[Any]") -> type:
 
 
 OF_TRIALS = {field.name: _kind_of(field) for field in fields(TrialRecord)}
-"""As in ``trials.csv``; tags are one text."""
+"""As in ``trials.csv``."""
 INTERVAL = ("low", "high", "level", "method")
 OF_MEASUREMENTS: dict[str, type] = {
     "id": str,

@@ -14,7 +14,6 @@ SHORT = {
     "npv": "agreement.sim_planned.npv",
     "r": "agreement.pearson_r",
     "rho": "agreement.spearman_rho",
-    "order": "agreement.order_accuracy",
     "psnr": "views.all.psnr_db",
     "ssim": "views.all.ssim",
 }

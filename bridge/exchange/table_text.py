@@ -9,10 +9,10 @@ import difflib
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import date, datetime, time
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, UsageError
 from bridge.terminal import RARE
@@ -48,11 +48,6 @@ class TableOptions:
 
     map: Annotated[str, RARE] = ""
     """Which column is which, where the names differ: "outcome=Result,task=Scenario"."""
-    axes: str = ""
-    """Further columns to compare sim and outcome along, with commas: "Lighting,Start region"."""
-    names: Literal["ask", "merge", "apart"] = "ask"
-    """Tasks, conditions or policies whose names differ only by case or blanks: ask refuses and
-    lists them, merge counts them as one, apart as several."""
     yes: bool = False
     """Take a table as it was understood, where another reading is possible, too."""
 
@@ -72,11 +67,6 @@ class TableOptions:
                 raise UsageError(message)
             found[name] = theirs
         return found
-
-    @property
-    def axis_columns(self) -> tuple[str, ...]:
-        """Columns that hold the values of an axis."""
-        return tuple(filter(None, map(str.strip, self.axes.split(","))))
 
 
 AS_SAVED = TableOptions()
@@ -101,8 +91,6 @@ class SourceRow:
     path: Path
     row: int
     values: Mapping[str, str]
-    axes: Mapping[str, int | str] = field(default_factory=dict)
-    """By axis: the column that holds its value."""
 
     def text(self, name: str) -> str:
         """Return a field without the blanks around it; empty when the column is not there."""
@@ -187,8 +175,6 @@ class TableText:
     renamed: tuple[tuple[str, str], ...] = ()
     """Theirs and ours, where ``map`` said so."""
     left: tuple[str, ...] = ()
-    axes: Mapping[str, str] = field(default_factory=dict)
-    """By axis: the column that holds its value."""
     grid: Sequence[tuple[int, list[str]]] = ()
     """All lines that are not blank, with their numbers."""
 
@@ -215,7 +201,7 @@ class TableText:
     def row(self, number: int, cells: Sequence[str]) -> SourceRow:
         """Name the fields of one row."""
         values = dict(zip(self.header, cells, strict=True))
-        return SourceRow(path=self.path, row=number, values=values, axes=self.axes)
+        return SourceRow(path=self.path, row=number, values=values)
 
     def understood(self, kind: str, num_rows: int) -> str:
         """Say in one line what the table was read as."""
@@ -224,8 +210,6 @@ class TableText:
             name = DELIMITERS.get(self.delimiter, repr(self.delimiter))
             parts.append(f"separated by {name}")
         parts += [f"{theirs!r} read as {ours}" for theirs, ours in self.renamed]
-        if self.axes:
-            parts.append(f"axes: {', '.join(self.axes)}")
         if self.left:
             parts.append(f"not read: {', '.join(map(repr, self.left))}")
         return f"{self.path.name}: {'; '.join(parts)}"
@@ -257,9 +241,6 @@ def open_table(
             found=f"no column {absent[0]!r}",
             hint=f"Columns: {', '.join(names)}",
         )
-    axes = {
-        name: name for name in names if plain_name(name) in map(plain_name, options.axis_columns)
-    }
     header: list[str] = []
     renamed, left = [], []
     for name in names:
@@ -271,7 +252,7 @@ def open_table(
             header.append(plain)
         else:
             header.append(name)
-            left += [] if name in axes or not name else [name]
+            left += [name] if name else []
     table = TableText(
         path=path,
         delimiter=delimiter,
@@ -279,7 +260,6 @@ def open_table(
         header_row=row,
         renamed=tuple(renamed),
         left=tuple(left),
-        axes={plain_name(name): name for name in axes},
         grid=grid,
     )
     if near:

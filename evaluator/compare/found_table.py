@@ -6,6 +6,7 @@ a cell that fits no reading is refused by its row.
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from bridge.errors import UsageError
@@ -222,7 +223,11 @@ def _settle_sides(sheet: Sheet) -> None:
         elif column.label == "side" and folded(column.name) != "side" and not all_sides:
             label = "task" if folded(column.name) == "environment" else ""
             sheet.columns[place] = Column(place=place, name=column.name, label=label)
-    if any(column.side or column.label == "side" for column in sheet.columns):
+    if any(column.label == "side" for column in sheet.columns):
+        own = [replace(c, side="") if folded(c.name) == "recorded" else c for c in sheet.columns]
+        sheet.columns[:] = own  # the outcome of a side, whatever it is
+        return
+    if any(column.side for column in sheet.columns):
         return
     for column in [c for c in sheet.columns if c.label in NAMED]:
         split = [side_within(cell) for cell in sheet.cells(column)]
@@ -243,7 +248,9 @@ def _settle_sides(sheet: Sheet) -> None:
 
 
 def _values(sheet: Sheet) -> list[Value]:
-    labels = {label: sheet.labelled(label) for label in (*NAMED, "trial", "start_id", "side")}
+    labels = {
+        label: sheet.labelled(label) for label in (*NAMED, "trial", "start_id", "unit", "side")
+    }
     sheet.labels |= {label for label, column in labels.items() if column}
     blank = next((c for c in sheet.columns if not c.name and not c.label), None)
     if not labels["task"] and not labels["policy"] and blank and _is_text(sheet, blank):

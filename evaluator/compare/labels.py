@@ -149,9 +149,7 @@ OPEN = "the localised poses leave it open"
 Pair = tuple[TrialRow, PerceivedOutcome]
 
 
-def label_results(
-    perceived: Sequence[PerceivedOutcome], rows: Sequence[TrialRow], *, method: str = "wilson"
-) -> Part:
+def label_results(perceived: Sequence[PerceivedOutcome], rows: Sequence[TrialRow]) -> Part:
     """Count the trials in which label and predicate say the same, and list the others."""
     if not perceived:
         reason = "no trial of a known task was localised after its execution"
@@ -159,13 +157,13 @@ def label_results(
     of_episode: Mapping[str, PerceivedOutcome] = {outcome.episode: outcome for outcome in perceived}
     pairs = [(row, of_episode[row.episode]) for row in rows if row.episode in of_episode]
     tasks = sorted({row.task for row, _ in pairs})
-    measurements = [_rate("", pairs, method)]
+    measurements = [_rate("", pairs)]
     measurements += [
-        _rate(task, [pair for pair in pairs if pair[0].task == task], method) for task in tasks
+        _rate(task, [pair for pair in pairs if pair[0].task == task]) for task in tasks
     ]
     counted = [pair for pair in pairs if pair[0].unit == "object"]
     if counted:
-        measurements.append(_counts(counted, method))
+        measurements.append(_counts(counted))
     return Part(
         measurements=tuple(measurements),
         tables=_disagreements(pairs),
@@ -177,7 +175,7 @@ def _known(pairs: Sequence[Pair]) -> list[Pair]:
     return [(r, w) for r, w in pairs if r.recorded is not None and w.says is not None]
 
 
-def _rate(task: str, pairs: Sequence[Pair], method: str) -> Measurement:
+def _rate(task: str, pairs: Sequence[Pair]) -> Measurement:
     """Measure the trials of one task, or of all when it is empty."""
     known = _known(pairs)
     agreed = sum(row.recorded is outcome.says for row, outcome in known)
@@ -192,11 +190,10 @@ def _rate(task: str, pairs: Sequence[Pair], method: str) -> Measurement:
         counted="trial",
         reason_if_undefined="no trial has both a label and a decided predicate",
         episodes=[row.episode for row, _ in known],
-        method=method,
     )
 
 
-def _counts(pairs: Sequence[Pair], method: str) -> Measurement:
+def _counts(pairs: Sequence[Pair]) -> Measurement:
     known = [(r, w) for r, w in pairs if r.k is not None and w.objects_done is not None]
     return proportion(
         LABEL_OBJECTS.of(),
@@ -205,7 +202,6 @@ def _counts(pairs: Sequence[Pair], method: str) -> Measurement:
         counted="trial",
         reason_if_undefined="no trial labelled by object has a decided predicate of each object",
         episodes=[row.episode for row, _ in known],
-        method=method,
     )
 
 

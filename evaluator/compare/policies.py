@@ -23,7 +23,7 @@ from evaluator.compare.rows import RateGroup, TrialRow, in_order
 from evaluator.compare.success import CONDITION_OF_ARM, WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
 from evaluator.quantity import noun
-from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.sequential import Evidence, Look, Plan, Stratum, pairs_equivalent
 from evaluator.study_measurements import COMPARED, COMPARED_IN_TASK
 
@@ -120,16 +120,13 @@ def tries_of(rows: Sequence[TrialRow], question: Question, void_causes: Sequence
         (c.policy, c.condition): is_second
         for is_second, c in ((False, question.first), (True, question.second))
     }
-    void = {(row.task, row.start_id) for row in rows if _is_void(row, void_causes)}
+    void = {each.episode for each in void_starts(rows, void_causes)}
     found = []
     for row in in_order(rows):
         side = sides.get((row.policy, row.condition))
-        is_void = _is_void(row, void_causes) or (
-            row.start_id is not None and bool(row.study_arm) and (row.task, row.start_id) in void
-        )
         was_made = row.recorded is not None or row.nothing_executed
         was_made |= row.why_unknown not in ("", UNLABELLED)
-        if side is None or is_void or not was_made:
+        if side is None or row.episode in void or not was_made:
             continue
         found.append(
             Try(
@@ -144,8 +141,21 @@ def tries_of(rows: Sequence[TrialRow], question: Question, void_causes: Sequence
     return found
 
 
-def _is_void(row: TrialRow, void_causes: Sequence[str]) -> bool:
-    return row.recorded is None and row.why_unknown.startswith(tuple(void_causes))
+def void_starts(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[Exclusion]:
+    """Name the trials that enter no comparison, and why: void ones, in a study with their start."""
+    causes = tuple(void_causes)
+    void = [r for r in rows if r.recorded is None and r.why_unknown.startswith(causes)]
+    reasons = {row.episode: f"void: {row.why_unknown}" for row in void}
+    starts = {(row.task, row.start_id): row for row in void}
+    for row in rows:
+        in_study = bool(row.study_arm) and row.start_id is not None
+        first = starts.get((row.task, row.start_id)) if in_study else None
+        if first is not None:
+            words = f"start {row.start_id} is void in all arms: {first.episode}: "
+            reasons.setdefault(row.episode, f"{words}{first.why_unknown}")
+    return [
+        Exclusion(episode=name, scope="comparisons", reason=why) for name, why in reasons.items()
+    ]
 
 
 def evidence_of(tries: Sequence[Try], *, task: str = "") -> Evidence:

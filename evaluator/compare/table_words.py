@@ -15,6 +15,7 @@ LABELS = {
     "condition": "condition study_arm bedingung",
     "trial": "trial trial_id trial_number episode episode_id rollout attempt id nr versuch essai",
     "start_id": "start_id start initial_condition init_state",
+    "unit": "unit",
     "side": "side domain environment sim_or_real real_or_sim where seite",
 }
 """Our name of a column that says what a row is about, and other people's."""
@@ -68,7 +69,7 @@ class Column:
     place: int
     name: str
     label: str = ""
-    """task, policy, condition, trial, start_id or side."""
+    """task, policy, condition, trial, start_id, unit or side."""
     side: str = ""
     figure: str = ""
     """k, n, rate, percent or outcome."""

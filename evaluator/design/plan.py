@@ -27,7 +27,6 @@ from bridge.whole_file import write_whole
 from evaluator.compare.success import CONDITION_OF_ARM
 from evaluator.design.config import StudyOptions, Wanted
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.intervals import RATE_INTERVALS
 from evaluator.statistics.sequential import (
     Chances,
     chances,
@@ -105,9 +104,6 @@ def design(study: StudyOptions, wanted: Wanted) -> Design:
 
 def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
     """Lay out all but the number of starts."""
-    if study.interval not in RATE_INTERVALS:
-        names = ", ".join(RATE_INTERVALS)
-        raise UsageError(f"--interval {study.interval!r} is unknown. There are: {names}.")
     for arm in study.arms:
         if arm not in STUDY_ARMS:
             raise UsageError(f"--arms {arm!r} is unknown. There are: {', '.join(STUDY_ARMS)}.")
@@ -125,7 +121,6 @@ def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
         stopping="sequential",
         primary=primary,
         secondary=tuple(secondary),
-        interval=study.interval,
         alpha=wanted.alpha,
         codes=blinding_codes(policies, study.study_seed) if study.blind else {},
     )

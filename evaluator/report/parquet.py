@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pyarrow.json import ParseOptions, ReadOptions, read_json
 
-from bridge.exchange.trials_csv import TrialRecord, tags_text
+from bridge.exchange.trials_csv import TrialRecord
 from bridge.whole_file import part_of
 from evaluator.columns import INTERVAL, OF_MEASUREMENTS, OF_TRIALS
 from evaluator.result import Cell, Measurement, Table
@@ -24,7 +24,6 @@ ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_(
 def write_trials(path: Path, trials: Sequence[TrialRecord]) -> Path:
     """Write one row per trial, the columns of ``trials.csv``; outcomes are true, false or null."""
     columns = {name: [getattr(trial, name) for trial in trials] for name in OF_TRIALS}
-    columns["tags"] = [tags_text(tags) or None for tags in columns["tags"]]
     return _write(path, columns, OF_TRIALS)
 
 

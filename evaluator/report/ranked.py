@@ -18,15 +18,12 @@ TABLES: dict[str, str] = {
     "against": "which of two twins to use",
     "image_methods": "which reconstruction to use",
     "confusion": "whether the twin's yes may start the robot, and its no may stop it",
-    "gate_baselines": "whether the twin is worth more than a rule without one",
-    "gains": "whether replanning is worth its time",
     "funnel": "on which stage to work",
     "failures": "which cause to remove first",
     "end_points_*": "whether the engine's friction and timing are right",
     "motion": "whether to work on the controller or on the calibration",
     "final_states": "whether the localisation is good enough for the task",
     "views_0": "whether the scene is good enough to look at",
-    "axes": "which circumstances to record more of",
     "raters": "whether the labels can be trusted",
 }
 """What each table decides, the most urgent first."""

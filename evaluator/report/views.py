@@ -139,31 +139,9 @@ def _points_of(row: Record, name: str) -> Shown:
     return _points(row[name], row) if _known(row[name]) else None
 
 
-def _gains(rows: Rows) -> Rows:
-    def shown(row: Record) -> Record:
-        undefined = f"undefined: {row['why undefined']}"
-        relative = row["relative gain"]
-        return {
-            "task": ", ".join(part for part in (row["task"], row["policy"]) if part),
-            "side": row["side"],
-            "percentage points": _points_of(row, "gain (pp)") or undefined,
-            "relative gain": (
-                Figures(f"{100 * relative:+.1f} %") if _known(relative) else undefined
-            ),
-        }
-
-    return [shown(row) for row in rows]
-
-
 def _layout(rows: Rows) -> Rows:
     rates = list(rows[0])[2:]
     return [row | {name: percent(row[name]) or "undefined" for name in rates} for row in rows]
-
-
-def _share(row: Record, name: str, k: str, n: str) -> Shown:
-    """Write a share with its interval, and with its count: ``4/5 = 80 % [38, 96]``."""
-    shown = percent(row[name], row[f"{name} low"], row[f"{name} high"], digits=0)
-    return replace(shown, count=f"{row[k]}/{row[n]}") if isinstance(shown, Figures) else shown
 
 
 def _conclusions(rows: Rows) -> Rows:
@@ -190,24 +168,6 @@ def _conclusions(rows: Rows) -> Rows:
         }
 
     return [shown(row) for row in rows]
-
-
-def _baselines(rows: Rows) -> Rows:
-    def share(row: Record, k: str, n: str) -> Shown:
-        if not row[n]:
-            return None
-        return Figures(f"{100 * row[k] / row[n]:.0f} %", count=f"{row[k]}/{row[n]}")
-
-    return [
-        _picked(row, "asked of", "task", "forecast by")
-        | {
-            "right": share(row, "right", "trials"),
-            "PPV": share(row, "yes and succeeded", "said yes"),
-            "NPV": share(row, "no and failed", "said no"),
-            "twin more right": _points_of(row, "twin more right (pp)"),
-        }
-        for row in rows
-    ]
 
 
 def _states(rows: Rows) -> Rows:
@@ -243,32 +203,10 @@ def _published(rows: Rows) -> Rows:
     ]
 
 
-def _axes(rows: Rows) -> Rows:
-    """Put the agreement and the gap of each value of an axis into one cell each."""
-    word = next(name for name in rows[0] if name.endswith(" rate") and name[:3] != "sim")
-    gap = next(name for name in rows[0] if name.startswith("sim - "))
-
-    def points(row: Record) -> Shown:
-        if not _known(row[gap]):
-            return None
-        return _points(row[gap], {"low": row["gap low"], "high": row["gap high"]})
-
-    return [
-        _picked(row, "axis", "value", "trials")
-        | {"agree": _share(row | {"agree": row["agree rate"]}, "agree", "agree k", "agree n")}
-        | {name: percent(row[name], digits=0) for name in (word, "sim rate")}
-        | {gap: points(row)}
-        for row in rows
-    ]
-
-
 _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "conclusions": _conclusions,
     "success": _success,
-    "axes": _axes,
-    "gains": _gains,
     "layout": _layout,
-    "gate_baselines": _baselines,
     "final_states": _states,
     "published": _published,
 }

@@ -24,8 +24,6 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("agreement.pearson_r.with_replanning", "Pearson r with replanning"),
     ("agreement.bias_pp", "Bias of sim"),
     ("agreement.mmrv_recorded_gap", "MMRV (gap of recorded rates)"),
-    ("gain.pp.recorded.average", "Replanning gain, mean of tasks"),
-    ("gain.relative.recorded.average", "The same, relative"),
     ("decision.regret_pp", "Loss of taking what sim ranks first"),
     ("motion.planned.path_mean_m", "Tool path: recorded to planned replay, lag taken out"),
     ("motion.planned.lag_s", "Tool lag: recorded behind planned replay"),
@@ -51,7 +49,7 @@ SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
 }
 """Factor, unit and digits in which a reader thinks."""
 PLAIN = (1.0, "", ".3f")
-SHARES = ("average.", "rate.")
+SHARES = ("rate.",)
 UNSIGNED = ("agreement.mae_pp", "decision.regret_pp", "decision.wrong_pairs_pp")
 """Sizes in percentage points that are never below 0: a plus would look like a direction."""
 HUGE = 1e7
@@ -85,8 +83,6 @@ def value_text(measurement: Measurement) -> str:
         return "undefined"
     if is_share(measurement):
         return f"{100 * measurement.value:.1f} %"
-    if measurement.id.startswith("gain.relative."):
-        return f"{100 * measurement.value:+.1f} %"
     text = number(measurement.value, measurement.unit)
     return text.lstrip("+") if measurement.id in UNSIGNED else text
 
@@ -131,8 +127,6 @@ def measurement_text(measurement: Measurement) -> str:
     if measurement.value is None:
         return f"undefined: {measurement.reason_if_undefined}"
     text = value_text(measurement)
-    if measurement.id.startswith("gain.relative."):
-        text += " relative"
     if measurement.k is not None and measurement.n is not None:
         text = f"{measurement.k}/{measurement.n} = {text}"
     elif measurement.n is not None and measurement.counted:

@@ -7,7 +7,6 @@ changes its sign and MMRV its meaning when they are swapped.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -127,49 +126,6 @@ def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recor
         ]
         worst.append(max(violations, default=Fraction(0)))
     return float(sum(worst) / len(worst))
-
-
-@dataclass(frozen=True, kw_only=True)
-class OrderAccuracy:
-    """Of the pairs of groups that differ on the recorded side, how many the twin orders so."""
-
-    right: Fraction
-    """Pairs ordered as recorded; a tie in the twin counts one half."""
-    pairs: int
-
-    @property
-    def value(self) -> float:
-        """From 0 (all reversed) to 1; 1/2 is chance."""
-        return float(self.right / self.pairs)
-
-
-def order_accuracy(*, recorded: Sequence[Number], sim: Sequence[Number]) -> OrderAccuracy:
-    """Count the pairs of groups that the twin orders as the recorded rates do.
-
-    Args:
-        recorded: Recorded rate of each group; pairs that tie here are not counted.
-        sim: The twin's, of the same groups in the same order; a tie only here is half right.
-
-    Raises:
-        UndefinedStatisticError: Below 2 groups, or when no two recorded rates differ.
-    """
-    x, y = exact("pairwise order accuracy", recorded, sim, at_least=2)
-    right, pairs = Fraction(0), 0
-    for j in range(len(x)):
-        for i in range(j):
-            if x[i] == x[j]:
-                continue
-            pairs += 1
-            if y[i] == y[j]:
-                right += Fraction(1, 2)
-            elif (x[i] > x[j]) == (y[i] > y[j]):
-                right += 1
-    if pairs == 0:
-        raise UndefinedStatisticError(
-            statistic="pairwise order accuracy",
-            reason=f"the recorded side is constant ({float(x[0]):g} in all {len(x)} groups)",
-        )
-    return OrderAccuracy(right=right, pairs=pairs)
 
 
 def _gaps(statistic: str, recorded: Sequence[Number], sim: Sequence[Number]) -> list[Fraction]:

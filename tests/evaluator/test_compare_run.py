@@ -69,14 +69,6 @@ def test_starts_are_paired_across_conditions(six_trials: Any) -> None:
     assert (line["shared starts"], line["decided"]) == (3, "no")
 
 
-def test_gain_is_given_in_points_and_relative(six_trials: Any) -> None:
-    results = compare_run(six_trials.run).results()
-    points = results.get("gain.pp.recorded.cube_into_box.scripted")
-    assert points.value == pytest.approx(100 / 3)
-    assert points.unit == "pp"
-    assert results.get("gain.relative.recorded.cube_into_box.scripted").value == pytest.approx(1.0)
-
-
 def test_executed_in_twin_never_enters_the_headline(maker: Any) -> None:
     maker.trial("t1", recorded="failure")
     maker.replay("t1", accepted=True, trajectory="executed")
