@@ -308,7 +308,6 @@ class Overview:
     selection: Selection
     stand_in: bool | None
     summary: str
-    unseen: str
     notes: tuple[tuple[str, str], ...]
     tasks: tuple[Mapping[str, str], ...]
     """Task, its slug, answer and sentence."""
@@ -380,7 +379,6 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         selection=selection,
         stand_in=judgement.stand_in,
         summary=about.get("summary", ""),
-        unseen=about.get("unseen", ""),
         notes=tuple((name, text) for name, text in about.get("notes", [])),
         tasks=tuple(tasks[:MOST_TASKS]),
         more_tasks=max(0, len(tasks) - MOST_TASKS),

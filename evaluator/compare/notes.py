@@ -13,9 +13,6 @@ from evaluator.result import Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 from evaluator.statistics.agreement import within_and_between
 
-LARGE_BIAS_PP = 5.0
-HIGH_R = 0.8
-
 Note = tuple[str, str]
 """About what, and the sentence."""
 
@@ -27,7 +24,6 @@ def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> l
         *_opposed(groups, by_id),
         *_units(groups),
         *_blind(by_id),
-        *_hidden_bias(by_id),
     ]
 
 
@@ -75,17 +71,6 @@ def _blind(by_id: dict[str, Measurement]) -> list[Note]:
         for name, m in by_id.items()
         if name.startswith("agreement.blind.") and m.value is not None
     ]
-
-
-def _hidden_bias(by_id: dict[str, Measurement]) -> list[Note]:
-    r, bias = by_id.get("agreement.pearson_r"), by_id.get("agreement.bias_pp")
-    if r is None or bias is None or r.value is None or bias.value is None:
-        return []
-    if r.value < HIGH_R or abs(bias.value) < LARGE_BIAS_PP:
-        return []
-    direction = "optimistic" if bias.value > 0 else "pessimistic"
-    text = f"r = {r.value:.3f} does not show that the twin is {direction} by {bias.value:+.1f} pp"
-    return [("agreement.pearson_r", text)]
 
 
 def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list[Note]:

@@ -5,7 +5,7 @@ The table is a rates CSV with two more columns: a row with a ``statistic`` holds
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
@@ -55,7 +55,6 @@ WITHIN = "within the rounding of its rates"
 IMPOSSIBLE, UNDEFINED, NOT_PRINTED = "impossible", "undefined", "not in the table"
 AMBIGUOUS = "ambiguous"
 SWAPPED = "fits with arguments swapped"
-OTHERWISE = "fits otherwise"
 FEWEST = 3
 """Groups from which r is defined."""
 FAILED = (ROUNDED, DIFFERS, IMPOSSIBLE, UNDEFINED)
@@ -231,38 +230,15 @@ def _judge(
 def _fits_otherwise(
     claim: _Claim, groups: Sequence[RateGroup], shown: str
 ) -> tuple[str, str] | None:
-    """Try the other readings of a figure: MMRV's arguments swapped, r per task averaged."""
-    chosen = [group for group in groups if claim.condition in ("", group.condition)]
-    recorded, sim = sides(chosen)
+    """Try MMRV with its arguments swapped."""
+    if claim.statistic != "mmrv":
+        return None
     try:
-        if claim.statistic == "mmrv" and _fits(mmrv(recorded=recorded, sim=sim, gap="sim"), claim):
-            note = f"the gap of sim rates is weighted; by the gap of recorded rates it is {shown}"
-            return SWAPPED, note
-        if claim.statistic == "pearson_r" and not claim.task:
-            for words, value in _pooled_otherwise(chosen):
-                if _fits(value, claim):
-                    return OTHERWISE, f"it is {words}; over all groups r = {shown}"
+        swapped = _value("mmrv_sim_gap", claim.side, claim.condition, groups)
     except UndefinedStatisticError:
-        pass
-    return None
-
-
-def _pooled_otherwise(groups: Sequence[RateGroup]) -> Iterator[tuple[str, float]]:
-    """The other figures that are printed as the r of a table of tasks and policies."""
-    for kind in ("task", "policy", "condition"):
-        members: dict[str, list[RateGroup]] = {}
-        for group in groups:
-            members.setdefault(getattr(group, kind), []).append(group)
-        if not 1 < len(members) < len(groups):
-            continue
-        both = [sides(each) for each in members.values()]
-        if len(both) > 2:
-            yield (
-                f"r of the means per {kind}",
-                pearson([mean_rate(a) for a, _ in both], [mean_rate(b) for _, b in both]),
-            )
-        if all(len(a) > 2 for a, _ in both):
-            yield f"the mean of r per {kind}", mean_rate([pearson(a, b) for a, b in both])
+        return None
+    note = f"the gap of sim rates is weighted; by the gap of recorded rates it is {shown}"
+    return (SWAPPED, note) if _fits(swapped, claim) else None
 
 
 def _fits(value: float, claim: _Claim) -> bool:
@@ -383,13 +359,13 @@ def _not_printed(groups: Sequence[RateGroup], claims: Sequence[_Claim]) -> list[
         printed = {claim.statistic for claim in claims}
         parts += [(each, "all groups", groups) for each in others if each not in printed]
     findings = []
-    for statistic, words, members in parts:
+    for statistic, words, those in parts:
         value, instead = None, ""
         try:
-            value = _value(statistic, "", "", members)
+            value = _value(statistic, "", "", those)
         except UndefinedStatisticError as error:
             instead = f"undefined: {error.reason}"
-        what = f"{statistic} {words} (n = {len(members)})"
+        what = f"{statistic} {words} (n = {len(those)})"
         findings.append(Finding(None, what, "", value, NOT_PRINTED, instead=instead))
     return findings
 
@@ -409,6 +385,6 @@ def _table(findings: Sequence[Finding]) -> Table:
         note="A figure fits when it rounds to what is printed. Within the rounding: it does for "
         "rates that round to the printed ones. Fits with arguments swapped: MMRV weighted by the "
         "gap of sim rates, where its definition (Li et al. 2024) weights by the gap of recorded "
-        "rates. Fits otherwise: the note says as what. Ambiguous: several counts round to the "
+        "rates. Ambiguous: several counts round to the "
         "rate, so it has no interval here. Row numbers as in the CSV.",
     )

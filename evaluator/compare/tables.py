@@ -105,8 +105,8 @@ def layout_table(groups: Sequence[RateGroup], word: str) -> tuple[Table, ...]:
             line += values[-len(sides) :]
         rows.append(tuple(line))
     if len(rows) > 1:
-        values = list(zip(*rows, strict=True))[2:]
-        rows.append((MEAN_OF_TASKS, "", *map(_mean, values)))
+        rates = [[row[place] for row in rows] for place in range(2, len(rows[0]))]
+        rows.append((MEAN_OF_TASKS, "", *map(_mean, rates)))
     columns = [
         f"{side}, {condition.replace('_', ' ')}" for condition in conditions for side in sides
     ]

@@ -1,6 +1,5 @@
 """The first two pages: what an evaluation means, in one line per task, before any table."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -38,8 +37,6 @@ class Front:
     more_tasks: int
     notes: Sequence[tuple[str, str]]
     """What must be known before a number is used."""
-    unseen: str
-    """What so few trials could not have shown."""
     missing: Sequence[str]
     more_missing: int
 
@@ -59,7 +56,6 @@ def front(results: Results) -> Front:
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
-        unseen=_unseen(rows),
         missing=[_short(text) for text in missing[:SHOWN_MISSING]],
         more_missing=max(0, len(missing) - SHOWN_MISSING),
     )
@@ -202,32 +198,6 @@ def _ends(measurement: Measurement, digits: str = "+.0f") -> str:
     if interval is None:
         return ", without an interval"
     return f" [{interval.low:{digits}}, {interval.high:{digits}}]"
-
-
-def _unseen(rows: Sequence[Row]) -> str:
-    """Say the smallest differences that could have been called real, over all tasks."""
-    words = []
-    for name, what in (
-        ("smallest difference (pp)", "between two candidates"),
-        ("smallest bias (pp)", "between the twin and the recorded rate"),
-    ):
-        sizes = [size for row in rows if (size := _number(row[name])) is not None]
-        if sizes and (name.endswith("bias (pp)") or any(row["ranked"] for row in rows)):
-            low, high = math.ceil(min(sizes)), math.ceil(max(sizes))
-            span = f"{low}" if low == high else f"{low} to {high}"
-            words.append(f"{what} of less than {span} points")
-    none = sum(_number(row["smallest bias (pp)"]) is None for row in rows)
-    counts = [n for row in rows if (n := _number(row["recorded trials per candidate"])) is not None]
-    if not words and counts:
-        most = round(max(counts))
-        return (
-            f"With {most} {noun('trial', most)} of a candidate, hardly any difference, however "
-            "large, would have been seen: no test reaches 80 % power."
-        )
-    if not words:
-        return "Without counts of trials nobody can say what would have been seen." if rows else ""
-    rest = f" In {none} of {len(rows)} tasks nothing could have been seen." if none else ""
-    return f"A difference {', or '.join(words)} would most likely have gone unseen.{rest}"
 
 
 def _number(cell: Cell) -> float | None:

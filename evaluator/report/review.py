@@ -165,7 +165,6 @@ def _about(comparison: Comparison | None, stored: _Stored, *, has_trials: bool) 
         "num_exclusions": len(results.exclusions),
         "missing": list(results.missing),
         "summary": first.summary,
-        "unseen": first.unseen,
         "notes": [list(note) for note in first.notes],
         "close_pp": CLOSE_PP,
         "tasks": [

@@ -147,9 +147,6 @@ def _layout(rows: Rows) -> Rows:
 def _conclusions(rows: Rows) -> Rows:
     """Put the bias and its interval into one cell, and a yes beside those that were right."""
 
-    def points(value: float | None) -> Shown:
-        return None if value is None or not _known(value) else Figures(f"{value:.0f}")
-
     def shown(row: Record) -> Record:
         right = succeeded = None
         if row["yes"]:
@@ -162,9 +159,6 @@ def _conclusions(rows: Rows) -> Rows:
             "yes and right": right,
             "succeeded at all": succeeded,
             **_picked(row, "candidates", "best recorded", "ranked", "more trials"),
-            "trials each": row["recorded trials per candidate"],
-            "smallest difference (pp)": points(row["smallest difference (pp)"]),
-            "smallest bias (pp)": points(row["smallest bias (pp)"]),
         }
 
     return [shown(row) for row in rows]
