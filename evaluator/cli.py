@@ -61,8 +61,6 @@ def evaluate(
         tables: How tables are read.
         images: Renders to compare, and backbones of LPIPS.
     """
-    from bridge.episode.run_folder import RunFolder
-    from evaluator.report.review import index_run
     from evaluator.report.write import summary_text, write_report
     from evaluator.thresholds import missed, parse_thresholds
 
@@ -83,6 +81,9 @@ def evaluate(
         written = write_report(comparison, out or folder, everything=everything, latex=latex)
         results = written.content
         if len(sources) == 1 and written.results == sources[0] / RESULTS:
+            from bridge.episode.run_folder import RunFolder
+            from evaluator.report.review import index_run
+
             index_run(RunFolder(sources[0]), comparison, results, began_ns)
         record = results.to_record() if output.json else {}  # of a large run it takes a second
         output.result(record, summary_text(results, written))

@@ -7,12 +7,10 @@ its cause void: a policy that trips the arm must not gain by it.
 """
 
 import math
-from bisect import bisect_left
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -114,31 +112,36 @@ class Try:
     row: TrialRow
 
 
-def tries_of(rows: Sequence[TrialRow], question: Question, void_causes: Sequence[str]) -> list[Try]:
-    """Return the trials of both candidates in the order in which they were made."""
+def made_trials(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[TrialRow]:
+    """Return the trials that count, in the order in which they were made."""
+    void = {each.episode for each in void_starts(rows, void_causes)}
+    return [
+        row
+        for row in in_order(rows)
+        if (row.recorded is not None or row.nothing_executed)
+        or row.why_unknown not in ("", UNLABELLED)
+        if row.episode not in void
+    ]
+
+
+def tries_of(made: Sequence[TrialRow], question: Question) -> list[Try]:
+    """Return the trials of both candidates among those that count."""
     sides = {
         (c.policy, c.condition): is_second
         for is_second, c in ((False, question.first), (True, question.second))
     }
-    void = {each.episode for each in void_starts(rows, void_causes)}
-    found = []
-    for row in in_order(rows):
-        side = sides.get((row.policy, row.condition))
-        was_made = row.recorded is not None or row.nothing_executed
-        was_made |= row.why_unknown not in ("", UNLABELLED)
-        if side is None or row.episode in void or not was_made:
-            continue
-        found.append(
-            Try(
-                task=row.task,
-                start=row.start_id or "",
-                is_second=side,
-                succeeded=row.recorded is True,
-                has_outcome=row.recorded is not None,
-                row=row,
-            )
+    return [
+        Try(
+            task=row.task,
+            start=row.start_id or "",
+            is_second=side,
+            succeeded=row.recorded is True,
+            has_outcome=row.recorded is not None,
+            row=row,
         )
-    return found
+        for row in made
+        if (side := sides.get((row.policy, row.condition))) is not None
+    ]
 
 
 def void_starts(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[Exclusion]:
@@ -158,39 +161,89 @@ def void_starts(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[Ex
     ]
 
 
-def evidence_of(tries: Sequence[Try], *, task: str = "") -> Evidence:
-    """Count some trials: pairs of one start, and the others of each task."""
-    by_task: dict[str, list[Try]] = {}
-    for each in tries:
-        if not task or each.task == task:
-            by_task.setdefault(each.task, []).append(each)
-    return Evidence(strata=tuple(_stratum(members) for members in by_task.values()))
+@dataclass(kw_only=True)
+class _Count:
+    """Trials of one task, counted as they come in: pairs of one start, and the others."""
+
+    starts: dict[str, list[Try | None]] = field(default_factory=dict)
+    improved: int = 0
+    worsened: int = 0
+    pairs: int = 0
+    k: list[int] = field(default_factory=lambda: [0, 0])
+    n: list[int] = field(default_factory=lambda: [0, 0])
+
+    def add(self, each: Try) -> None:
+        """Count one more; the first of each side on a start are a pair."""
+        self.k[each.is_second] += each.succeeded
+        self.n[each.is_second] += 1
+        if not each.start:
+            return
+        firsts = self.starts.setdefault(each.start, [None, None])
+        if firsts[each.is_second] is not None:
+            return
+        firsts[each.is_second] = each
+        first, second = firsts
+        if first is None or second is None or not _is_same_start(first.row, second.row):
+            return
+        self.pairs += 1
+        self.improved += second.succeeded and not first.succeeded
+        self.worsened += first.succeeded and not second.succeeded
+        for side, member in enumerate((first, second)):
+            self.k[side] -= member.succeeded
+            self.n[side] -= 1
+
+    @property
+    def worth(self) -> float:
+        """Pairs that all of them are worth."""
+        return self.pairs + pairs_equivalent(*self.n)
+
+    def stratum(self) -> Stratum:
+        """Return what was counted so far."""
+        return Stratum(
+            improved=self.improved,
+            worsened=self.worsened,
+            pairs=self.pairs,
+            first=(self.k[0], self.n[0]),
+            second=(self.k[1], self.n[1]),
+        )
 
 
-def _stratum(tries: Sequence[Try]) -> Stratum:
-    starts: dict[str, tuple[list[Try], list[Try]]] = {}
-    for place, each in enumerate(tries):
-        name = each.start or f"unnamed {place}"
-        starts.setdefault(name, ([], []))[each.is_second].append(each)
-    counts = {(a, b): 0 for a in (False, True) for b in (False, True)}
-    left: tuple[list[Try], list[Try]] = ([], [])
-    for first, second in starts.values():
-        together = first and second and _is_same_start(first[0].row, second[0].row)
-        if together:
-            counts[first[0].succeeded, second[0].succeeded] += 1
-        for side, members in enumerate((first, second)):
-            left[side].extend(members[1:] if together else members)
-    alone = [(sum(each.succeeded for each in side), len(side)) for side in left]
-    return Stratum(
-        improved=counts[False, True],
-        worsened=counts[True, False],
-        pairs=sum(counts.values()),
-        first=alone[0],
-        second=alone[1],
-    )
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """What was counted when each look was due, and in all."""
+
+    all_: Evidence
+    at: Mapping[float, Evidence]
+
+    @staticmethod
+    def of(tries: Sequence[Try], plan: Plan) -> "Course":
+        """Count trials in their order."""
+        counts: dict[str, _Count] = {}
+        at: dict[float, Evidence] = {}
+        places, worth = plan.places(), 0.0
+        place = next(places)
+        for each in tries:
+            count = counts.setdefault(each.task, _Count())
+            worth -= count.worth
+            count.add(each)
+            worth += count.worth
+            while worth >= place - 1e-9:
+                at[place] = _evidence(counts)
+                place = next(places)
+        return Course(all_=_evidence(counts), at=at)
+
+    def read(self, plan: Plan) -> "Reading":
+        """Look at the trials as planned."""
+        return read(plan, self.all_, lambda pairs: self.at.get(pairs, self.all_))
+
+
+def _evidence(counts: Mapping[str, _Count]) -> Evidence:
+    return Evidence(strata=tuple(count.stratum() for count in counts.values()))
 
 
 def _is_same_start(first: TrialRow, second: TrialRow) -> bool:
+    if not (first.start_positions_m and second.start_positions_m):
+        return True
     shared = first.start_positions_m.keys() & second.start_positions_m.keys()
     gaps = (
         np.subtract(first.start_positions_m[name], second.start_positions_m[name])
@@ -236,41 +289,6 @@ def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence]) -> Read
         interval=all_.interval(limit) if all_.pairs else None,
         more=None if likely is None else max(1, math.ceil(likely - all_.pairs)),
     )
-
-
-def read_tries(plan: Plan, tries: Sequence[Try]) -> Reading:
-    """Read trials in their order."""
-    pairs = _pairs_after(tries)
-
-    def until(wanted: float) -> Evidence:
-        return evidence_of(tries[: bisect_left(pairs, wanted - 1e-9) + 1])
-
-    return read(plan, evidence_of(tries), until)
-
-
-def _pairs_after(tries: Sequence[Try]) -> list[float]:
-    """Pairs that the first so many trials are worth, for each number of trials."""
-    seen: dict[tuple[str, str], list[Try | None]] = {}
-    shared: Counter[str] = Counter()
-    left: dict[str, list[int]] = {}
-    counted: dict[str, float] = {}
-    total, found = 0.0, []
-    for place, each in enumerate(tries):
-        start = seen.setdefault((each.task, each.start or f"unnamed {place}"), [None, None])
-        others = left.setdefault(each.task, [0, 0])
-        other = start[not each.is_second]
-        others[each.is_second] += 1
-        if start[each.is_second] is None:
-            start[each.is_second] = each
-            if other is not None and _is_same_start(each.row, other.row):
-                shared[each.task] += 1
-                others[0] -= 1
-                others[1] -= 1
-        now = shared[each.task] + pairs_equivalent(*others)
-        total += now - counted.get(each.task, 0.0)
-        counted[each.task] = now
-        found.append(total)
-    return found
 
 
 def with_holm(
@@ -343,29 +361,35 @@ def compare_policies(
 ) -> list[Answer]:
     """Answer every question over all tasks, then in each task where there are several."""
     found = (Candidate(policy=row.policy, condition=row.condition) for row in rows)
-    asked = questions(found, protocol)
-    made = {q: tries_of(rows, q, void_causes) for q in asked}
-    asked = [q for q in asked if {each.is_second for each in made[q]} == {False, True}]
-    plan = plan_of(protocol)
-    primary = [q for q in asked if q.is_primary]
-    answers = [_answer(q, made[q], read_tries(plan, made[q]), "") for q in primary]
-    others = [q for q in asked if not q.is_primary]
-    readings = with_holm(others, plan, lambda part, q: read_tries(part, made[q]))
-    answers += [_answer(q, made[q], r, "") for q, r in zip(others, readings, strict=True)]
-    parts = [
-        (q, task)
-        for q in asked
-        for task in dict.fromkeys(each.task for each in made[q])
-        if len({each.task for each in made[q]}) > 1
-    ]
-    each_task = plan_of(protocol, of_task=True)
+    made = made_trials(rows, void_causes)
+    plan, of_task = plan_of(protocol), plan_of(protocol, of_task=True)
+    asked: list[_Case] = []
+    parts: list[_Case] = []
+    for question in questions(found, protocol):
+        tries = tries_of(made, question)
+        if len({each.is_second for each in tries}) < 2:
+            continue
+        asked.append(_Case(question, "", tries, Course.of(tries, plan)))
+        tasks: dict[str, list[Try]] = {}
+        for each in tries:
+            tasks.setdefault(each.task, []).append(each)
+        if len(tasks) > 1:
+            parts += [_Case(question, t, own, Course.of(own, of_task)) for t, own in tasks.items()]
+    primary = [case for case in asked if case.question.is_primary]
+    others = [case for case in asked if not case.question.is_primary]
+    readings = [case.course.read(plan) for case in primary]
+    readings += with_holm(others, plan, lambda share, case: case.course.read(share))
+    readings += with_holm(parts, of_task, lambda share, case: case.course.read(share))
+    return [_answer(c, r) for c, r in zip((*primary, *others, *parts), readings, strict=True)]
 
-    def of_task(part: Plan, item: tuple[Question, str]) -> Reading:
-        return read_tries(part, [each for each in made[item[0]] if each.task == item[1]])
 
-    for (q, task), reading in zip(parts, with_holm(parts, each_task, of_task), strict=True):
-        answers.append(_answer(q, made[q], reading, task))
-    return answers
+class _Case(NamedTuple):
+    """One question over all tasks or in one."""
+
+    question: Question
+    task: str
+    tries: Sequence[Try]
+    course: Course
 
 
 def plan_of(protocol: Protocol | None, *, of_task: bool = False) -> Plan:
@@ -377,20 +401,21 @@ def plan_of(protocol: Protocol | None, *, of_task: bool = False) -> Plan:
     return Plan(pairs=max(4, pairs), locked=not protocol.edited, alpha=protocol.alpha)
 
 
-def _answer(question: Question, tries: Sequence[Try], reading: Reading, task: str) -> Answer:
-    mine = [each for each in tries if not task or each.task == task]
-    sides = [[t for t in mine if t.is_second == is_second] for is_second in (False, True)]
+def _answer(case: _Case, reading: Reading) -> Answer:
+    sides = [[t for t in case.tries if t.is_second == second] for second in (False, True)]
     counts = [(sum(t.succeeded for t in side), len(side)) for side in sides]
     unknown = [sum(not t.has_outcome for t in side) for side in sides]
-    known = evidence_of([each for each in mine if each.has_outcome])
+    known = (
+        Course.of([t for t in case.tries if t.has_outcome], Plan()).all_ if any(unknown) else None
+    )
     return Answer(
-        question=question,
-        task=task,
+        question=case.question,
+        task=case.task,
         counts=(counts[0], counts[1]),
         reading=reading,
         no_outcome=(unknown[0], unknown[1]),
-        without_these=known.difference if any(unknown) and known.pairs else None,
-        episodes=tuple(each.row.episode for each in mine),
+        without_these=known.difference if known is not None and known.pairs else None,
+        episodes=tuple(each.row.episode for each in case.tries),
     )
 
 

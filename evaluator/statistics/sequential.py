@@ -186,18 +186,24 @@ class Plan:
     locked: bool = False
     alpha: float = ALPHA
 
+    def places(self) -> Iterator[float]:
+        """Yield the pairs after which it is looked at, without end."""
+        yield from map(float, look_pairs(self.pairs))
+        for turn in count():
+            yield 1.5 * self.pairs * 2**turn
+            yield 2.0 * self.pairs * 2**turn
+
     def looks(self, kind: Kind) -> Iterator[Look]:
         """Yield the looks in their order, without end."""
-        share, size = SHARES[self.locked], float(self.pairs)
+        share = SHARES[self.locked]
         limit = planned_limit(self.pairs, self.alpha * share, kind)
-        for part in look_pairs(self.pairs):
-            yield Look(pairs=float(part), limit=limit * math.sqrt(size / part))
-        left = 1 - share
-        for turn in count(1):
-            left /= 2
-            z = normal_quantile(1 - self.alpha * left / 4)
-            for more in (1.5, 2.0):
-                yield Look(pairs=more * size * 2 ** (turn - 1), limit=z)
+        num_planned, left = len(look_pairs(self.pairs)), 1 - share
+        for number, place in enumerate(self.places()):
+            if number < num_planned:
+                yield Look(pairs=place, limit=limit * math.sqrt(self.pairs / place))
+                continue
+            left /= 1 if (number - num_planned) % 2 else 2  # both looks of an extension share it
+            yield Look(pairs=place, limit=normal_quantile(1 - self.alpha * left / 4))
 
     def likely_at(self, evidence: Evidence) -> float | None:
         """Return the pairs at whose look a decision is more likely than not, as rates look now."""

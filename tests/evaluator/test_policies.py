@@ -1,16 +1,18 @@
 """Which candidate is better: what is a pair, who may be best, and that advice may be followed."""
 
 from collections.abc import Mapping, Sequence
+from itertools import islice
 
 import numpy as np
 import pytest
 
 from evaluator.compare.policies import (
     Answer,
+    Course,
     compare_counts,
     compare_policies,
     comparison_part,
-    read_tries,
+    made_trials,
     tries_of,
 )
 from evaluator.compare.regret import regret_results
@@ -133,8 +135,13 @@ def test_pairs_grow_as_they_are_counted() -> None:
         for n in range(60)
     ]
     answers = compare_policies(rows)
-    tries = tries_of(rows, answers[0].question, ())
-    assert read_tries(Plan(pairs=4), tries).evidence.pairs == answers[0].reading.evidence.pairs
+    tries = tries_of(made_trials(rows, ()), answers[0].question)
+    course = Course.of(tries, Plan(pairs=4))
+    assert course.all_.pairs == answers[0].reading.evidence.pairs
+    places = [place for place in islice(Plan(pairs=4).places(), 12) if place <= course.all_.pairs]
+    assert list(course.at) == places
+    for place, evidence in course.at.items():  # each look has the first trials that are worth it
+        assert place <= evidence.pairs < place + 2
 
 
 def measurements(rates: dict[str, tuple[int, int]]) -> dict[str, Measurement]:
