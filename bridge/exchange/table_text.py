@@ -33,8 +33,8 @@ ALIASES = {"outcome": "recorded", "sim": "sim_planned"}
 OUTCOME_LIKE = ("outcome", "result", "results", "success", "succeeded", "label", "real")
 """Columns that are read as the outcome where there is one of them and no ``recorded``."""
 WORKBOOKS = (".xlsx", ".xlsm")
-FIRST_LINES = 5
-"""Lines in which names of columns are looked for."""
+FIRST_LINES, MOST_TOP = 5, 200
+"""Lines in which names of columns are looked for, among so many with blanks and comments."""
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
 NEAR = 0.8
 """How like a column of ours a name must be to be taken for a slip."""
@@ -281,15 +281,14 @@ def load_grid(path: Path, known: Sequence[str]) -> tuple[str, list[tuple[int, li
         return "", _workbook_cells(path)
     text = _decoded(path)
     said = _SEP.match(text.split("\n", 1)[0])
-    best: tuple[str, list[tuple[int, list[str]]]] = (",", [])
-    most = -1
+    top = "\n".join(text.split("\n", MOST_TOP)[:MOST_TOP])
+    best, most = ",", -1
     for delimiter in (said[1],) if said else DELIMITERS:
-        lines = _lines(path, text, delimiter)
-        tops = [cells for _, cells in lines[:FIRST_LINES]]
+        tops = [cells for _, cells in _lines(path, top, delimiter)[:FIRST_LINES]]
         score = max((_score(cells, known) for cells in tops), default=-1)
         if score > most:
-            most, best = score, (delimiter, lines)
-    return best
+            most, best = score, delimiter
+    return best, _lines(path, text, best)
 
 
 def _workbook_cells(path: Path) -> list[tuple[int, list[str]]]:

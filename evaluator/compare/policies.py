@@ -9,6 +9,7 @@ its cause void: a policy that trips the arm must not gain by it.
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple, TypeVar
 
@@ -100,8 +101,7 @@ def questions(found: Iterable[Candidate], protocol: Protocol | None = None) -> l
     ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Try:
+class Try(NamedTuple):
     """One trial of one of two candidates."""
 
     task: str
@@ -171,11 +171,17 @@ class _Count:
     pairs: int = 0
     k: list[int] = field(default_factory=lambda: [0, 0])
     n: list[int] = field(default_factory=lambda: [0, 0])
+    worth: float = 0.0
+    """Pairs that all of them are worth."""
 
     def add(self, each: Try) -> None:
         """Count one more; the first of each side on a start are a pair."""
         self.k[each.is_second] += each.succeeded
         self.n[each.is_second] += 1
+        self._pair(each)
+        self.worth = self.pairs + pairs_equivalent(*self.n)
+
+    def _pair(self, each: Try) -> None:
         if not each.start:
             return
         firsts = self.starts.setdefault(each.start, [None, None])
@@ -191,11 +197,6 @@ class _Count:
         for side, member in enumerate((first, second)):
             self.k[side] -= member.succeeded
             self.n[side] -= 1
-
-    @property
-    def worth(self) -> float:
-        """Pairs that all of them are worth."""
-        return self.pairs + pairs_equivalent(*self.n)
 
     def stratum(self) -> Stratum:
         """Return what was counted so far."""
@@ -256,39 +257,40 @@ def _is_same_start(first: TrialRow, second: TrialRow) -> bool:
 class Reading:
     """What the trials say to one question, by one plan."""
 
+    plan: Plan
     evidence: Evidence
+    limit: float
+    """Standard errors from which on the last look that was due decides, else the first."""
     decided: Look | None
     """The look at which it was decided."""
     better: int
     """1 where the second is better, -1 where it is worse, 0 undecided."""
-    interval: Interval | None
-    more: int | None
-    """Further trials of each candidate after which a decision is likely; None where none is."""
+
+    @cached_property
+    def interval(self) -> Interval | None:
+        """Differences that the look leaves possible."""
+        return self.evidence.interval(self.limit) if self.evidence.pairs else None
+
+    @cached_property
+    def more(self) -> int | None:
+        """Further trials of each candidate after which a decision is likely; None without any."""
+        likely = self.plan.likely_at(self.evidence) if self.decided is None else None
+        return None if likely is None else max(1, math.ceil(likely - self.evidence.pairs))
 
 
 def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence]) -> Reading:
     """Look at the trials as planned: ``until`` gives what was counted after so many pairs."""
     limit = math.inf
     decided, better = None, 0
-    if all_.pairs:
-        for look in plan.looks(all_.kind):
-            passed = look.pairs <= all_.pairs + 1e-9
-            if not passed and math.isfinite(limit):
-                break
-            limit = look.limit
-            if not passed:
-                break
-            z = until(look.pairs).z()
-            if decided is None and abs(z) >= look.limit - 1e-9:
-                decided, better = look, 1 if z > 0 else -1
-    likely = plan.likely_at(all_) if decided is None else None
-    return Reading(
-        evidence=all_,
-        decided=decided,
-        better=better,
-        interval=all_.interval(limit) if all_.pairs else None,
-        more=None if likely is None else max(1, math.ceil(likely - all_.pairs)),
-    )
+    for look in plan.looks(all_.kind) if all_.pairs else ():
+        if look.pairs > all_.pairs + 1e-9:
+            limit = look.limit if math.isinf(limit) else limit
+            break
+        limit = look.limit
+        z = until(look.pairs).of_no_difference if decided is None else 0.0
+        if decided is None and abs(z) >= limit - 1e-9:
+            decided, better = look, 1 if z > 0 else -1
+    return Reading(plan=plan, evidence=all_, limit=limit, decided=decided, better=better)
 
 
 def with_holm(
