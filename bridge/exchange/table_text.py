@@ -26,6 +26,11 @@ NO = (
     *("not ok", "nein", "non", "fehlschlag", "échec", "✗", "✘", "❌"),
 )
 UNKNOWN = ("", "unknown", "undecided", "none", "na", "n/a", "nan", "null", "-", "?")
+ENDED = (
+    *("aborted", "abort", "interrupted", "void", "crashed", "protective stop", "protective_stop"),
+    *("estop", "e-stop", "emergency stop"),
+)
+"""How a trial ended that has no outcome: which of these are void, a protocol says."""
 MOST = 10**12
 """Counted in one field; beyond it a count is a slip, and soon no number that a float holds."""
 ALIASES = {"outcome": "recorded", "sim": "sim_planned"}
@@ -140,7 +145,7 @@ class SourceRow:
     def answer(self, name: str) -> bool | None:
         """Read yes, no or unknown."""
         text = self.text(name)
-        if text.lower() in UNKNOWN:
+        if text.lower() in (*UNKNOWN, *ENDED):
             return None
         found = answer_of(text)
         if found is not None:

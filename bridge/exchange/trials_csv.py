@@ -1,8 +1,8 @@
 """Trials CSV in and out: one row per trial, as people keep them in a spreadsheet.
 
 Columns: trial_id, task, condition, policy, start_id, unit, k, n, recorded, sim_planned,
-sim_executed, verdict, p_success, cell, stand_in, progress, sim_progress. Only task must be there
-(rows without trial_id are numbered); an empty field means unknown and stays unknown.
+sim_executed, verdict, p_success, cell, stand_in, progress, sim_progress, why_unknown. Only task
+must be there (rows without trial_id are numbered); an empty field means unknown and stays unknown.
 """
 
 import csv
@@ -15,6 +15,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.exchange.table_text import (
     AS_SAVED,
+    ENDED,
     SourceRow,
     TableOptions,
     TableText,
@@ -51,6 +52,8 @@ class TrialRecord:
     progress: float | None = None
     """How far the recorded trial came, 0 to 1, where a rubric or its stages say so."""
     sim_progress: float | None = None
+    why_unknown: str = ""
+    """What was said of an outcome that is not known: aborted, protective stop ..."""
 
 
 COLUMNS = tuple(field.name for field in fields(TrialRecord))
@@ -169,7 +172,13 @@ def read_trial(row: SourceRow) -> TrialRecord:
         stand_in=row.answer("stand_in"),
         progress=row.fraction("progress"),
         sim_progress=row.fraction("sim_progress"),
+        why_unknown=row.text("why_unknown") or _how_it_ended(row),
     )
+
+
+def _how_it_ended(row: SourceRow) -> str:
+    text = row.text("recorded").lower()
+    return text.replace("_", " ") if text in ENDED else ""
 
 
 def write_trials(path: Path, trials: Iterable[TrialRecord]) -> Path:

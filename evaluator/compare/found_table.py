@@ -91,6 +91,11 @@ def _sheet(path: Path, grid: Sequence[Line], options: TableOptions) -> Sheet:
     for place, names in enumerate(zip(*levels, strict=True) if levels else ()):
         mapped = next((theirs[plain_name(n)] for n in names if plain_name(n) in theirs), "")
         columns.append(read_name(place, [mapped] if mapped else names))
+    if any(folded(column.name) == "policy" for column in columns):  # a checkpoint is another thing
+        columns = [
+            c if c.label != "policy" or folded(c.name) == "policy" else Column(c.place, c.name)
+            for c in columns
+        ]
     sheet = Sheet(path=path, columns=columns, lines=[], found=found)
     _refuse_unnamed(sheet, lines[last + 1 :])
     sheet.lines = _body(sheet, lines[last + 1 :], levels)
@@ -375,7 +380,7 @@ def _all_answers(texts: Iterable[str]) -> bool:
 def _are_trials(sheet: Sheet, values: Sequence[Value]) -> bool:
     """Whether each cell is how one trial ended: yes or no, of one trial and no rate of several."""
     told = [v for v in values if v.column.figure != "n"]
-    known = [v.figure for v in told if v.figure is not None]
+    known = [v.figure for v in told if v.figure is not None and not v.figure.ended]
     words = any(f.answer is not None and not f.number for f in known)
     if any(v.column.figure in ("k", "n", "rate", "percent") for v in values) and not words:
         return False
@@ -412,5 +417,7 @@ def _trial_rows(sheet: Sheet, values: Sequence[Value]) -> list[SourceRow]:
         side = "sim_planned" if value.side == "sim" else "recorded"
         answer = None if value.figure is None else value.figure.answer
         texts[side] = "" if answer is None else "yes" if answer else "no"
+        if value.figure is not None and value.figure.ended:
+            texts[side] = value.figure.text
     sheet.found.notes.insert(0, f"{len(rows):,} trials")
     return [SourceRow(path=sheet.path, row=row, values=texts) for (row, _), texts in rows.items()]

@@ -11,7 +11,12 @@ from evaluator.compare.conclusions import conclusions_table
 from evaluator.compare.gate import agreement, reliability
 from evaluator.compare.measure import refuse_alike
 from evaluator.compare.notes import notes, notes_table
-from evaluator.compare.policies import compare_policies, comparison_part, void_starts
+from evaluator.compare.policies import (
+    compare_policies,
+    comparison_part,
+    remarks,
+    void_starts,
+)
 from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.compare.stages import failures_table, stage_results
@@ -64,7 +69,7 @@ def compare_rows(
             *conclusions_table(groups, answers, rows),
             success_table(groups, word, "Outcomes as the table gives them." if given else ""),
             *layout_table(groups, word),
-            *notes_table(notes(groups, measurements)),
+            *notes_table([*remarks(rows, void_causes), *notes(groups, measurements)]),
             confusion_table(rows, word),
             *stage_tables,
             *failures_table(rows, word),

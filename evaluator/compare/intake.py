@@ -12,8 +12,10 @@ from pathlib import Path
 from bridge.errors import UsageError
 from bridge.exchange.table_text import (
     AS_SAVED,
+    ENDED,
     OUTCOME_LIKE,
     UNKNOWN,
+    TableError,
     TableOptions,
     TableText,
     answer_of,
@@ -55,6 +57,7 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     _refuse_unknown(options, known)
     table = open_table(path, known, options, near=False, words=KNOWN)
     header = set(table.header)
+    _refuse_changed(table)
     if "statistic" in header:
         return Taken(path=path, kind=PUBLISHED, summary=f"{path.name}: rates with printed figures")
     others = {"side", "real", "sim"} & {*header, *map(plain_name, table.left)}
@@ -69,6 +72,25 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     return Taken(path=path, kind=kind, summary=summary, trials=found.trials, rates=found.rates)
 
 
+def _refuse_changed(table: TableText) -> None:
+    """Refuse a policy that was another checkpoint before: one name would stand for both."""
+    plain = list(map(plain_name, table.header))
+    if not {"policy", "checkpoint"} <= set(plain):
+        return
+    seen: dict[str, tuple[str, int]] = {}
+    for number, cells in table.grid[1:]:
+        whole = [*cells, *[""] * len(plain)]
+        policy, checkpoint = (whole[plain.index(name)].strip() for name in ("policy", "checkpoint"))
+        first, row = seen.setdefault(policy, (checkpoint, number)) if checkpoint else ("", 0)
+        if first != checkpoint:
+            raise TableError(
+                path=table.path,
+                row=number,
+                found=f"policy {policy!r} is checkpoint {checkpoint!r}, in row {row} {first!r}",
+                hint="Give each checkpoint a policy name of its own, or leave the column out",
+            )
+
+
 def _with_outcome(table: TableText, options: TableOptions) -> TableOptions:
     """Map the one column that is called an outcome, and holds nothing but yes and no."""
     named = [name for name in table.left if plain_name(name) in OUTCOME_LIKE]
@@ -76,7 +98,7 @@ def _with_outcome(table: TableText, options: TableOptions) -> TableOptions:
         return options
     place = table.header.index(named[0])
     texts = [cells[place] for _, cells in table.grid[1:] if place < len(cells)]
-    if not all(t.strip().lower() in UNKNOWN or answer_of(t) is not None for t in texts):
+    if not all(t.strip().lower() in (*UNKNOWN, *ENDED) or answer_of(t) is not None for t in texts):
         return options
     mapped = ",".join(filter(None, (options.map, f"outcome={named[0]}")))
     return replace(options, map=mapped)

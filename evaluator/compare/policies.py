@@ -7,6 +7,7 @@ its cause void: a policy that trips the arm must not gain by it.
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -326,6 +327,11 @@ class Answer:
     episodes: tuple[str, ...] = field(default=(), repr=False)
 
     @property
+    def _without_these(self) -> str:
+        sign = -1 if self.reading.better < 0 else 1
+        return f"{round(100 * sign * (self.without_these or 0.0)):+d} without them"
+
+    @property
     def sentence(self) -> str:
         """The answer in words."""
         first, second = self.question.names
@@ -340,6 +346,9 @@ class Answer:
             first, second, difference, low, high = second, first, -difference, -high, -low
             counts.reverse()
         points = f"{round(difference):+d} points [{round(low):+d}, {round(high):+d}]"
+        if lost := sum(self.no_outcome):
+            points += f" ({lost} without an outcome as {noun('failure', lost)}"
+            points += f"; {self._without_these})" if self.without_these is not None else ")"
         if self.reading.better:
             return (
                 f"{second} is better than {first}: {' against '.join(counts)}, {points}; stop here"
@@ -354,6 +363,31 @@ class Answer:
             else "no number of trials worth running is likely to decide it"
         )
         return f"undecided: {found}; {rest}"
+
+
+def remarks(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[tuple[str, str]]:
+    """Say which trials have no outcome, and which starts a candidate tried again."""
+    groups: dict[tuple[str, Candidate], list[TrialRow]] = {}
+    for row in made_trials(rows, void_causes):
+        who = Candidate(policy=row.policy, condition=row.condition)
+        groups.setdefault((row.task, who), []).append(row)
+    found = []
+    for (task, who), made in groups.items():
+        about = f"{who.words}, {task}" if len({t for t, _ in groups}) > 1 else who.words
+        lost = [row for row in made if row.recorded is None]
+        if lost:
+            k, n = sum(row.recorded is True for row in made), len(made)
+            why = ", ".join(dict.fromkeys(row.why_unknown or "nothing executed" for row in lost))
+            words = f"{len(lost)} of {n} trials have no outcome ({why}): {k} of {n} succeeded where"
+            words += f" they count as failures, as in comparisons, {k} of {n - len(lost)} without"
+            found.append((about, f"{words} them, as in its rate"))
+        starts = Counter(row.start_id for row in made if row.start_id)
+        again = [f"{name} {times} times" for name, times in starts.items() if times > 1]
+        if again:
+            more = f" and {len(again) - 3} more" if len(again) > 3 else ""
+            words = f"starts tried more than once: {', '.join(again[:3])}{more}; the first trial "
+            found.append((about, f"{words}of a start is paired, the others count without a pair"))
+    return found
 
 
 def compare_policies(

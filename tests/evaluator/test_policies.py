@@ -1,11 +1,15 @@
 """Which candidate is better: what is a pair, who may be best, and that advice may be followed."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bridge.exchange.table_text import TableError
+from evaluator.compare import compare_csv
 from evaluator.compare.policies import (
     Answer,
     Course,
@@ -13,6 +17,7 @@ from evaluator.compare.policies import (
     compare_policies,
     comparison_part,
     made_trials,
+    remarks,
     tries_of,
 )
 from evaluator.compare.regret import regret_results
@@ -174,3 +179,48 @@ def test_rates_with_n_are_compared_without_their_trials() -> None:
     answer = only(compare_counts(rate_groups(rows, side_rates(rows))))
     assert answer.counts == ((10, 40), (30, 40))
     assert answer.reading.better == 1
+
+
+def test_a_policy_that_trips_the_arm_does_not_gain_by_it(tmp_path: Path) -> None:
+    """Of 20 trials of B 6 ended by a protective stop: as failures, and without them."""
+    lines = ["trial_id,task,policy,start_id,outcome"]
+    for n in range(20):
+        lines.append(f"a{n},cup,A,s{n},{'success' if n < 12 else 'failure'}")
+        lines.append(f"b{n},cup,B,s{n},{'success' if n < 12 else 'protective stop'}")
+    lines[-1] = "b19,cup,B,s19,failure"
+    path = tmp_path / "trials.csv"
+    path.write_text("\n".join(lines) + "\n")
+    found = compare_csv(path)
+    (answer,) = compare_policies(found.rows)
+    assert answer.counts == ((12, 20), (12, 20))
+    assert answer.no_outcome == (0, 7)
+    assert "+0 points" in answer.sentence
+    assert "(7 without an outcome as failures; +0 without them)" in answer.sentence
+    notes = {
+        str(about): str(text) for t in found.tables if t.id == "notes" for about, text in t.rows
+    }
+    assert notes["B"].startswith("7 of 20 trials have no outcome (protective stop): 12 of 20")
+    assert "12 of 13 without them, as in its rate" in notes["B"]
+    declared = compare_policies(found.rows, void_causes=("protective stop",))
+    assert declared[0].counts == ((12, 20), (12, 13))
+
+
+def test_a_start_that_was_tried_again_is_named() -> None:
+    rows = interleaved(CLEAR)
+    again = [*rows, replace(rows[1], episode="again"), replace(rows[0], episode="once more")]
+    assert [about for about, _ in remarks(again, ())] == ["A", "B"]
+    assert all("s0 2 times" in text for _, text in remarks(again, ()))
+    assert remarks(rows, ()) == []
+    (answer,) = compare_policies(again)
+    assert answer.reading.evidence.strata[0].pairs == 40
+
+
+def test_a_checkpoint_that_changed_under_one_name_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "trials.csv"
+    lines = ["trial_id,task,policy,checkpoint,outcome", "1,cup,ACT,a1,yes", "2,cup,ACT,a1,no"]
+    path.write_text("\n".join(lines) + "\n")
+    assert [row.policy for row in compare_csv(path).rows] == ["ACT", "ACT"]
+    path.write_text("\n".join([*lines, "3,cup,ACT,b2,yes"]) + "\n")
+    message = r"row 4: policy 'ACT' is checkpoint 'b2', in row 2 'a1'. Give each checkpoint"
+    with pytest.raises(TableError, match=message):
+        compare_csv(path)
