@@ -101,6 +101,8 @@ def _ranking(
         return None, "tie", None
     if first.recorded.n is None or second.recorded.n is None:
         return name, "no n", None
+    if first.unit != "trial":
+        return name, f"counted in {first.unit}s", None
     pair = {Candidate(policy=g.policy, condition=g.condition) for g in (first, second)}
     found = [e for e in answers if {e.question.first, e.question.second} == pair]
     if not found:

@@ -279,16 +279,21 @@ class Reading:
         return None if likely is None else max(1, math.ceil(likely - self.evidence.pairs))
 
 
-def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence]) -> Reading:
-    """Look at the trials as planned: ``until`` gives what was counted after so many pairs."""
+def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence] | None = None) -> Reading:
+    """Look at the trials as planned.
+
+    Args:
+        until: Gives what was counted after so many pairs; without it all is one look.
+    """
     limit = math.inf
     decided, better = None, 0
     for look in plan.looks(all_.kind) if all_.pairs else ():
         if look.pairs > all_.pairs + 1e-9:
             limit = look.limit if math.isinf(limit) else limit
             break
-        limit = look.limit
-        z = until(look.pairs).of_no_difference if decided is None else 0.0
+        limit = look.limit if until is not None else min(limit, look.limit)
+        seen = all_ if until is None else until(look.pairs)
+        z = seen.of_no_difference if decided is None else 0.0
         if decided is None and abs(z) >= limit - 1e-9:
             decided, better = look, 1 if z > 0 else -1
     return Reading(plan=plan, evidence=all_, limit=limit, decided=decided, better=better)
@@ -350,9 +355,10 @@ class Answer:
             points += f" ({lost} without an outcome as {noun('failure', lost)}"
             points += f"; {self._without_these})" if self.without_these is not None else ")"
         if self.reading.better:
-            return (
-                f"{second} is better than {first}: {' against '.join(counts)}, {points}; stop here"
-            )
+            words = f"{second} is better than {first}: {' against '.join(counts)}, {points}"
+            look = self.reading.decided
+            then = f", decided after {look.pairs:g} pairs" if look and low <= 0 else ""
+            return f"{words}{then}; stop here"
         found = f"{second} {counts[0]}, {first} {counts[1]}, {points}"
         if max(-low, high) <= 100 * CLOSE:
             return f"no difference of more than 10 points: {found}; stop here"
@@ -458,28 +464,35 @@ def _answer(case: _Case, reading: Reading) -> Answer:
 def compare_counts(groups: Sequence[RateGroup]) -> list[Answer]:
     """Answer the same of a table of rates; nothing of what has no n, or counts parts of trials."""
     counted = [g for g in groups if g.unit == "trial" and g.recorded.k is not None and g.recorded.n]
-    cells = {(g.task, Candidate(policy=g.policy, condition=g.condition)): g for g in counted}
-    asked = []
+    cells = {
+        (g.task, Candidate(policy=g.policy, condition=g.condition)): (
+            g.recorded.k or 0,
+            g.recorded.n or 0,
+        )
+        for g in counted
+    }
+    asked: list[tuple[Question, str, list[Stratum]]] = []
+    parts: list[tuple[Question, str, list[Stratum]]] = []
     for question in questions(c for _, c in cells):
         tasks = [t for t, c in cells if c == question.first and (t, question.second) in cells]
-        sides = [
-            [(m.k or 0, m.n or 0) for t in tasks for m in (cells[t, c].recorded,)]
-            for c in (question.first, question.second)
+        strata = [
+            Stratum(first=cells[task, question.first], second=cells[task, question.second])
+            for task in tasks
         ]
         if tasks:
-            asked.append((question, sides))
-
-    def evidence(sides: list[list[tuple[int, int]]]) -> Evidence:
-        pairs = zip(*sides, strict=True)
-        return Evidence(strata=tuple(Stratum(first=a, second=b) for a, b in pairs))
-
-    readings = with_holm(
-        asked, Plan(), lambda plan, item: read(plan, all_ := evidence(item[1]), lambda _: all_)
-    )
-    return [
-        Answer(question=question, task="", counts=tuple(map(_sum, sides)), reading=reading)  # type: ignore[arg-type]
-        for (question, sides), reading in zip(asked, readings, strict=True)
-    ]
+            asked.append((question, "", strata))
+        if len(tasks) > 1:
+            parts += [(question, task, [own]) for task, own in zip(tasks, strata, strict=True)]
+    found = []
+    for cases in (asked, parts):
+        readings = with_holm(
+            cases, Plan(), lambda plan, case: read(plan, Evidence(strata=tuple(case[2])))
+        )
+        for (question, task, strata), reading in zip(cases, readings, strict=True):
+            first, second = ([s.first for s in strata], [s.second for s in strata])
+            counts = (_sum(first), _sum(second))
+            found.append(Answer(question=question, task=task, counts=counts, reading=reading))
+    return found
 
 
 def _sum(side: Sequence[tuple[int, int]]) -> tuple[int, int]:

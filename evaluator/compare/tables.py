@@ -43,6 +43,7 @@ def _brackets(shown: Sequence[Measurement]) -> str:
 
 def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "") -> Table:
     """Success without and with replanning, in the twin and recorded."""
+    twin = not source_note or any(group.shown_sim.value is not None for group in groups)
     paired = any(group.trial_table is not None for group in groups)
     one_sided = any(group.sim.n for group in groups) and not paired
     without_plans = all(group.executed is not None for group in groups)
@@ -66,6 +67,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
             ("sim" if group.executed is None else EXECUTED, group.shown_sim),
             (word, group.recorded),
         )
+        if twin or rate is group.recorded
     )
     return Table(
         id="success",

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from bridge.exchange.table_text import TableError
-from evaluator.compare import compare_csv
+from evaluator.compare import Comparison, compare_csv
+from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.policies import (
     Answer,
     Course,
@@ -23,6 +24,7 @@ from evaluator.compare.policies import (
 from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import rate_groups, side_rates
+from evaluator.report.front import front
 from evaluator.result import Measurement
 from evaluator.statistics.sequential import Plan
 
@@ -224,3 +226,42 @@ def test_a_checkpoint_that_changed_under_one_name_is_refused(tmp_path: Path) -> 
     message = r"row 4: policy 'ACT' is checkpoint 'b2', in row 2 'a1'. Give each checkpoint"
     with pytest.raises(TableError, match=message):
         compare_csv(path)
+
+
+@pytest.fixture
+def four_policies(tmp_path: Path) -> Comparison:
+    """Rates of four policies in three tasks; p3 is best in each."""
+    lines = ["task,policy,side,k,n"]
+    for task in ("cup", "hook", "drawer"):
+        for policy, real in (("p0", 4), ("p1", 10), ("p2", 11), ("p3", 19)):
+            lines += [f"{task},{policy},real,{real},20", f"{task},{policy},sim,{real + 1},20"]
+    path = tmp_path / "rates.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return compare_csv(path)
+
+
+def test_rates_are_compared_in_each_task_and_intervals_say_what_was_decided(
+    four_policies: Comparison,
+) -> None:
+    answers = compare_counts(four_policies.groups)
+    assert len(answers) == 6 * (1 + 3)
+    for answer in answers:
+        interval = answer.reading.interval
+        assert interval is not None
+        assert (interval.low > 0 or interval.high < 0) == bool(answer.reading.better)
+    assert "no, 20 more trials would do" in front(four_policies.results()).tasks[0][1]
+
+
+def test_the_first_page_begins_with_who_may_be_best(four_policies: Comparison) -> None:
+    summary = front(four_policies.results()).summary
+    assert summary.startswith("p3 is best of 4 candidates, with 57 of 60: every other one")
+    assert "undecided" not in summary.lower()  # between p1 and p2, which nobody would take
+
+
+@pytest.mark.parametrize(("k", "words"), [(0, "Nothing succeeded: 0 of 20"), (10, "Everything")])
+def test_a_study_where_all_trials_end_alike_says_so_first(k: int, words: str) -> None:
+    rows = [row(n, "AB"[n % 2], n // 2 < k, start_id=f"s{n // 2}") for n in range(20)]
+    found = compare_rows(rows, run="r", source="trials", stand_in=None)
+    summary = front(found.results()).summary
+    assert summary.startswith(words)
+    assert "costs" not in summary
