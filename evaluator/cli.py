@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from evaluator.compare import Comparison
     from evaluator.compare.published import Finding, PublishedCheck
     from evaluator.result import Results
-    from evaluator.thresholds import Missed
 
 STUDY, WANTED = StudyOptions(), Wanted()
 IMAGES = ImageOptions()
@@ -87,7 +86,7 @@ def evaluate(
             index_run(RunFolder(sources[0]), comparison, results, began_ns)
         record = results.to_record() if output.json else {}  # of a large run it takes a second
         output.result(record, summary_text(results, written))
-        failed = [_missed_text(item) for item in missed(thresholds, results)]
+        failed = missed(thresholds, results)
         failed += [_finding_text(item) for item in (published.failed if published else ())]
         for text in failed:
             output.say(text)
@@ -197,13 +196,6 @@ def _refuse_only_broken(results: "Results") -> None:
     )
 
 
-def _missed_text(item: "Missed") -> str:
-    threshold = item.threshold
-    name = "Agreement of sim and outcome" if threshold.name == "agreement" else threshold.name
-    shown = item.reason if item.value is None else f"{item.value:.4g}"
-    return f"{name} is {shown}; the threshold is {threshold.limit:g}."
-
-
 def _finding_text(item: "Finding") -> str:
     where = "" if item.row is None else f"row {item.row}: "
     return f"{where}{item.what}: {item.verdict}. {item.note}".strip()
@@ -231,4 +223,4 @@ def design(
 
     made = make(study, wanted)
     written = lock(run, made)
-    output.result(design_record(made, written), design_text(made, written, run, study))
+    output.result(design_record(made, written), design_text(made, written, run))

@@ -503,8 +503,16 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
     """Lay answers out; the first column that a reader needs is the sentence."""
     if not answers:
         return Part()
-    sentences: list[dict[str, Cell]] = [
-        {"answer": each.sentence, "task": each.task or ALL_TASKS} for each in answers
+    rows: list[dict[str, Cell]] = [
+        {
+            "answer": each.sentence,
+            "task": each.task or ALL_TASKS,
+            "shared starts": sum(s.pairs for s in each.reading.evidence.strata),
+            "decided": {1: "better", -1: "worse", 0: "no"}[each.reading.better],
+            "decided after (pairs)": each.reading.decided and each.reading.decided.pairs,
+            "more trials of each": each.reading.more,
+        }
+        for each in answers
     ]
     plan = plan_of(protocol)
     words = (
@@ -513,7 +521,7 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         else f"no plan was locked: as if {plan.pairs} pairs had been planned"
     )
     table = Table.of(
-        sentences,
+        rows,
         id="comparisons",
         title="Which is better, as recorded",
         note=f"Group-sequential score test, {words}, extended by doubling; alpha {plan.alpha:g} "
@@ -521,44 +529,10 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         "and the same in each task share another. Intervals hold at every look. Trials without an "
         "outcome are failures.",
     )
-    numbers = Table.of(
-        [_row(each) for each in answers],
-        id="comparison_numbers",
-        title="The counts behind these answers",
-        note="Pairs: starts that both tried, else one trial of each.",
-    )
     return Part(
         measurements=tuple(_measured(each) for each in answers),
-        tables=(table, *_standing(answers), numbers),
+        tables=(table, *_standing(answers)),
     )
-
-
-def _row(answer: Answer) -> dict[str, Cell]:
-    reading = answer.reading
-    (k, n), (j, m) = answer.counts
-    first, second = answer.question.names
-    known = reading.evidence.pairs > 0
-    low, high = ends(reading.interval, 100.0)
-    return {
-        "task": answer.task or ALL_TASKS,
-        "better?": second,
-        "than": first,
-        "k": j,
-        "n": m,
-        "k of the other": k,
-        "n of the other": n,
-        "shared starts": sum(each.pairs for each in reading.evidence.strata),
-        "difference (pp)": 100 * reading.evidence.difference if known else None,
-        "low": low,
-        "high": high,
-        "decided": {1: "better", -1: "worse", 0: "no"}[reading.better],
-        "decided after (pairs)": None if reading.decided is None else reading.decided.pairs,
-        "more trials of each": reading.more,
-        "without an outcome": sum(answer.no_outcome) or None,
-        "difference without these (pp)": None
-        if answer.without_these is None
-        else 100 * answer.without_these,
-    }
 
 
 def _measured(answer: Answer) -> Measurement:

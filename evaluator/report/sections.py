@@ -74,7 +74,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Which is better",
         lead="Policies, and each without and with replanning, as recorded.",
         numbers=(("comparison.*", ""),),
-        tables=("comparisons", "standing", "comparison_numbers"),
+        tables=("comparisons", "standing"),
     ),
     Section(
         id="gate",

@@ -197,8 +197,14 @@ def _published(rows: Rows) -> Rows:
     ]
 
 
+def _comparisons(rows: Rows) -> Rows:
+    """Leave what the sentences say in words to programs."""
+    return [_picked(row, "answer", "task") for row in rows]
+
+
 _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "conclusions": _conclusions,
+    "comparisons": _comparisons,
     "success": _success,
     "layout": _layout,
     "final_states": _states,

@@ -64,7 +64,7 @@ def test_starts_are_paired_across_conditions(six_trials: Any) -> None:
     found = results.get(f"comparison.pp.{name}")
     assert (found.n, found.value) == (6, pytest.approx(100 / 3))
     assert "with replanning 2 of 3, without replanning 1 of 3" in found.definition
-    counts = next(table for table in results.tables if table.id == "comparison_numbers")
+    counts = next(table for table in results.tables if table.id == "comparisons")
     line = dict(zip(counts.columns, counts.rows[0], strict=True))
     assert (line["shared starts"], line["decided"]) == (3, "no")
 

@@ -15,7 +15,7 @@ from bridge.exchange.trials_csv import trials_path
 from bridge.task.protocol import FILE_NAME, Protocol, read_protocol
 from evaluator.compare.run import compare_run
 from evaluator.design.config import StudyOptions, Wanted
-from evaluator.design.plan import ORDER_FILE, Design, design, design_text, lock, trials_command
+from evaluator.design.plan import ORDER_FILE, Design, design, design_text, lock
 from evaluator.result import Results
 from evaluator.statistics.sequential import look_pairs
 
@@ -64,14 +64,13 @@ def test_a_study_carried_out_as_designed_has_no_departure(tmp_path: Path, made: 
     assert written.sha256
     results = filled(tmp_path)
     assert results.get("protocol.departures").value == 0
-    questions = rows_of(results, "comparison_numbers")
+    questions = rows_of(results, "comparisons")
     assert [row["task"] for row in questions] == ["all tasks", "pour", "stack"]
     assert questions[0]["decided"] == "better"
     starts = 2 * made.protocol.tasks[0].starts
-    assert int(questions[0]["shared starts"]) == starts == int(questions[0]["n"])
+    assert int(questions[0]["shared starts"]) == starts
     assert float(questions[0]["decided after (pairs)"]) in look_pairs(starts)
-    said = rows_of(results, "comparisons")[0]["answer"]
-    assert said.endswith("stop here")
+    assert questions[0]["answer"].endswith("stop here")
 
 
 def leave_blank(lines: list[Line]) -> None:
@@ -172,7 +171,7 @@ def test_policies_are_compared_on_the_same_starts() -> None:
 
 def test_the_text_names_the_hash_and_the_command(tmp_path: Path, made: Design) -> None:
     written = lock(tmp_path, made)
-    text = design_text(made, written, tmp_path, STUDY)
+    text = design_text(made, written, tmp_path)
     assert written.sha256 in text
-    assert trials_command(tmp_path, made.protocol, STUDY) in text
+    assert f"fill in {ORDER_FILE}, robot-gst import trials" in text
     assert Protocol.from_json((tmp_path / FILE_NAME).read_bytes()) == made.protocol
