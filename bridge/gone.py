@@ -28,10 +28,7 @@ GONE: dict[str, str] = {
     "prune": "robot-gst ls RUN --json lists age, size and outcome for a script of yours.",
     "export lerobot --depth": "Depth stays in the episodes; robot-gst export tum writes it.",
     "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
-    "publish episode --remap": (
-        "Messages keep their names; namespace in a zenoh configuration (--config) comes before "
-        "all of them."
-    ),
+    "publish episode --remap": "Messages keep their names; namespace in --config comes before.",
     "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
     "record --failover": "A failing disk ends the recording; begin anew on another disk.",
@@ -65,7 +62,11 @@ GONE: dict[str, str] = {
         ("evaluate --live", "evaluate --recorder", "evaluate --connect", "evaluate --goal"),
         "evaluate says task by task how many more trials would settle the ranking.",
     ),
-    "design --past": "Say what is expected: --rate, --gain, --agreement.",
+    "evaluate --interval": "Intervals are Wilson's; results.json holds k and n for others.",
+    "design --interval": "Intervals are Wilson's; results.json holds k and n for others.",
+    "evaluate --axes": "Evaluate the rows of each setting as a table of their own.",
+    "evaluate --names": "Spell names alike that are one, and others further apart.",
+    "design --past": "Say what is expected: --rate, --gain.",
     "design --rate-width": "--width is that of the gain's interval.",
     "design --per-task": "A study asks for its gain over all tasks together.",
     "evaluate --force": "Delete RUN/results/cache; nothing else remembers a file.",
@@ -84,10 +85,7 @@ GONE: dict[str, str] = {
     "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",
     "plan --send-images": "A model is told the objects in words; leave the flag out.",
     "publish standin --probes": "Trials teach as much: robot-gst calibrate RUN --posterior.",
-    "calibrate --pairs": (
-        "Record target poses beside the joints (geometry_msgs/PoseStamped on "
-        "/CELL/cam/ID/target/pose), then robot-gst calibrate RUN --cameras."
-    ),
+    "calibrate --pairs": "Record /CELL/cam/ID/target/pose, then robot-gst calibrate RUN --cameras.",
     "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
     **dict.fromkeys(

@@ -55,7 +55,6 @@ SIDE_WORDS = {
     "recorded": "recorded",
     "sim_planned": "twin, planned",
     "sim_executed": "twin, executed",
-    "sim_varied": "twin, varied",
     "verdict": "gate accepted",
 }
 CARDS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
@@ -63,13 +62,13 @@ CARDS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("Success rates, correlation r", r"agreement\.pearson_r", (r"agreement\.bias_pp",)),
     (
         "Gain with replanning, recorded",
-        r"gain\.pp\.recorded\.average|gain\.pp\.recorded\..*",
-        (r"gain\.relative\.recorded\.average|gain\.relative\.recorded\..*",),
+        r"comparison\.pp\.[^.]*with_replanning\.against\.[^.]*without_replanning",
+        (),
     ),
     ("Held-out views, PSNR", r"views\..*\.psnr_db", (r"views\..*\.ssim",)),
 )
 """Title, pattern of the id (the first that matches), and patterns of what is printed below."""
-SMALL_NAMES = {"agreement.bias_pp": "bias", "gain.relative": "relative", "ssim": "SSIM"}
+SMALL_NAMES = {"agreement.bias_pp": "bias", "ssim": "SSIM"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,17 +93,6 @@ class RateRow:
     condition: str
     policy: str
     rates: tuple[Measurement | None, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class GainRow:
-    """The gain with replanning of one task on one side."""
-
-    task: str
-    policy: str
-    side: str
-    points: Measurement | None
-    relative: Measurement | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,31 +236,6 @@ def rate_groups(measurements: Sequence[Measurement]) -> list[RateGroup]:
     return found
 
 
-def gain_rows(measurements: Sequence[Measurement]) -> tuple[GainRow, ...]:
-    """Arrange every gain with replanning by group and side, points beside relative."""
-    found: dict[tuple[str, str], dict[str, Measurement]] = {}
-    for measurement in measurements:
-        parts = measurement.id.split(".", 3)
-        if len(parts) == 4 and parts[0] == "gain" and parts[1] in ("pp", "relative"):
-            found.setdefault((parts[3], parts[2]), {})[parts[1]] = measurement
-    rows = []
-    planned = agreeing_side({each.id: each for each in measurements}) == SIM_SIDE
-    for (name, side), kinds in found.items():
-        if side == "sim" and not planned:
-            continue
-        task, _, policy = name.partition(".")
-        rows.append(
-            GainRow(
-                task=task,
-                policy="" if policy == NO_NAME else policy,
-                side={"recorded": "recorded", "sim": "twin, planned"}.get(side, side),
-                points=kinds.get("pp"),
-                relative=kinds.get("relative"),
-            )
-        )
-    return tuple(rows)
-
-
 def methods(measurements: Sequence[Measurement], start: str) -> str:
     """Name the interval methods of the measurements whose id starts so."""
     named = [
@@ -345,7 +308,6 @@ class Overview:
     selection: Selection
     stand_in: bool | None
     summary: str
-    unseen: str
     notes: tuple[tuple[str, str], ...]
     tasks: tuple[Mapping[str, str], ...]
     """Task, its slug, answer and sentence."""
@@ -359,8 +321,6 @@ class Overview:
     more_groups: int
     """Groups that are not drawn."""
     rates: RateTable | None
-    gains: tuple[GainRow, ...]
-    gain_methods: str
     twin_failures: tuple[Failure, ...]
     recorded_failures: tuple[Failure, ...]
     list: TrialList
@@ -419,7 +379,6 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         selection=selection,
         stand_in=judgement.stand_in,
         summary=about.get("summary", ""),
-        unseen=about.get("unseen", ""),
         notes=tuple((name, text) for name, text in about.get("notes", [])),
         tasks=tuple(tasks[:MOST_TASKS]),
         more_tasks=max(0, len(tasks) - MOST_TASKS),
@@ -430,8 +389,6 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         scatter=scatter([g for g in groups if g in drawn]),
         more_groups=len(groups) - len(drawn),
         rates=rate_table(numbers, selection),
-        gains=gain_rows(numbers)[:MOST_GROUPS],
-        gain_methods=methods(numbers, "gain."),
         twin_failures=_failures(failures, twin=True),
         recorded_failures=_failures(failures, twin=False),
         list=trial_list(judgement, selection),

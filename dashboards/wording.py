@@ -52,7 +52,6 @@ NARROW = "\u00a0"
 """A space that never breaks a line: a number stays with its unit."""
 FORMS = {
     "fraction": ("{:.0f}", 100, "%"),
-    "relative": ("{:+.0f}", 100, "%"),
     "pp": ("{:+.0f}", 1, "pp"),
     "m": ("{:.1f}", 1000, "mm"),
     "rad": ("{:.4f}", 1, "rad"),
@@ -86,14 +85,12 @@ def length_text(length_m: float | None) -> str:
     return MISSING if length_m is None else number(length_m, "m")
 
 
-SHARES = ("average.", "rate.", "rate_common.")
+SHARES = ("rate.", "rate_common.")
 """Rates that are means of shares have no count of their own."""
 
 
 def shown_unit(measurement: Measurement) -> str:
-    """Return the unit to print in: a k/n of unit 1 is a fraction, a relative gain a change."""
-    if measurement.id.startswith("gain.relative."):
-        return "relative"
+    """Return the unit to print in: a k/n of unit 1 is a fraction."""
     if measurement.unit == "1" and (measurement.k is not None or measurement.id.startswith(SHARES)):
         return "fraction"
     return measurement.unit

@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from evaluator.compare import Comparison
     from evaluator.compare.published import Finding, PublishedCheck
     from evaluator.result import Results
-    from evaluator.thresholds import Missed, Threshold
 
 STUDY, WANTED = StudyOptions(), Wanted()
 IMAGES = ImageOptions()
@@ -34,7 +33,6 @@ def evaluate(
     check_published: Path | None = None,
     against: Path | None = None,
     reviews: tuple[Path, ...] = (),
-    interval: Literal["wilson", "clopper-pearson", "jeffreys"] = "wilson",
     everything: Annotated[bool, Parameter(name="--all")] = False,
     latex: bool = False,
     tables: Annotated[TableOptions, Parameter(name="*")] = AS_SAVED,
@@ -46,9 +44,8 @@ def evaluate(
     Example: robot-gst evaluate runs/monday --fail-under r=0.8
 
     Args:
-        sources: A run folder, a table of trials (one row per trial) or of rates (task, condition,
-            policy, side, unit, n, rate) in CSV or JSON, or a folder of any of these. Several are
-            one study. May be left out with --check-published.
+        sources: A run folder, or a table of trials (one row per trial) or of rates (policy, real,
+            sim). Several are one study. May be left out with --check-published.
         out: Folder for the results; RUN/results, or NAME_results beside a table, without it.
         fail_under: Exit with 3 when a number stays below: 0.8 for the trials in which sim and
             outcome agree, or r=0.8, ppv=0.9, any id of results.json; several with commas.
@@ -58,93 +55,130 @@ def evaluate(
             much better which one is, which trials flip, and which settings differ.
         reviews: A second rater's labels (columns trial_id, rater, time, result, cause; or a folder
             of such files), beside those in RUN/reviews: kappa of each two raters.
-        interval: Interval of success rates.
         everything: Show and write the tables that nobody decides by, and list every number.
         latex: Write the headline tables as LaTeX, too.
         tables: How tables are read.
         images: Renders to compare, and backbones of LPIPS.
     """
-    from evaluator.thresholds import parse_thresholds
+    from evaluator.report.write import summary_text, write_report
+    from evaluator.thresholds import missed, parse_thresholds
 
     thresholds = [] if fail_under is None else parse_thresholds(fail_under)
     asked = _Asked(
-        interval=interval,
+        sources=sources,
         tables=tables,
         images=images,
-        everything=everything,
-        latex=latex,
         check_published=check_published,
         against=against,
         reviews=reviews,
+        output=output,
     )
     with without_collecting():
-        return _evaluate(sources, asked, out, thresholds, output)
+        published = _recomputed(asked)
+        began_ns = time.time_ns()
+        comparison, folder = _found(asked, published)
+        written = write_report(comparison, out or folder, everything=everything, latex=latex)
+        results = written.content
+        if len(sources) == 1 and written.results == sources[0] / RESULTS:
+            from bridge.episode.run_folder import RunFolder
+            from evaluator.report.review import index_run
 
-
-def _evaluate(
-    sources: Sequence[Path],
-    asked: "_Asked",
-    out: Path | None,
-    thresholds: "Sequence[Threshold]",
-    output: Output,
-) -> int:
-    """Compare, write and say; return the exit code."""
-    from evaluator.report.write import summary_text, write_report
-    from evaluator.thresholds import missed
-
-    began_ns = time.time_ns()
-    published = _recomputed(asked)
-    comparison, folder = _found(sources, asked, published, output)
-    written = write_report(
-        comparison, out or folder, everything=asked.everything, latex=asked.latex
-    )
-    results = written.content
-    if len(sources) == 1 and written.results == sources[0] / RESULTS:
-        from bridge.episode.run_folder import RunFolder
-        from evaluator.report.review import index_run
-
-        index_run(RunFolder(sources[0]), comparison, results, began_ns)
-    record = results.to_record() if output.json else {}  # of a large run it takes a second
-    output.result(record, summary_text(results, written))
-    failed = [_missed_text(item) for item in missed(thresholds, results)]
-    failed += [_finding_text(item) for item in (published.failed if published else ())]
-    for text in failed:
-        output.say(text)
-    _refuse_only_broken(results)
+            index_run(RunFolder(sources[0]), comparison, results, began_ns)
+        record = results.to_record() if output.json else {}  # of a large run it takes a second
+        output.result(record, summary_text(results, written))
+        failed = missed(thresholds, results)
+        failed += [_finding_text(item) for item in (published.failed if published else ())]
+        for text in failed:
+            output.say(text)
+        _refuse_only_broken(results)
     return THRESHOLD_NOT_MET if failed else 0
 
 
-def _recomputed(asked: "_Asked") -> "PublishedCheck | None":
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """What was asked."""
+
+    sources: Sequence[Path]
+    tables: TableOptions
+    images: ImageOptions
+    check_published: Path | None
+    against: Path | None
+    reviews: Sequence[Path]
+    output: Output
+
+
+def _recomputed(asked: _Asked) -> "PublishedCheck | None":
     from evaluator.compare.published import check_published
 
     table = asked.check_published
-    return None if table is None else check_published(table, options=asked.tables)
+    return None if table is None else check_published(table, asked.tables)
 
 
-def _found(
-    sources: Sequence[Path], asked: "_Asked", published: "PublishedCheck | None", output: Output
-) -> "tuple[Comparison, Path]":
+def _found(asked: _Asked, published: "PublishedCheck | None") -> "tuple[Comparison, Path]":
     """Return what was found, and the folder for the results where no other is asked for.
 
     Raises:
         UsageError: When there is nothing to evaluate.
     """
-    if sources:
-        comparison, folder = _compare(sources, asked, output)
-        comparison = _with_others(comparison, sources, asked, output)
-        return (_beside(comparison, published.comparison) if published else comparison), folder
+    from bridge.errors import UsageError
+    from evaluator.compare.images.renders import compare_folders
+
+    if asked.sources:
+        comparison, folder = _compare(asked)
+        comparison = _with_others(comparison, asked)
+        if published is not None:
+            added = [table for table in published.comparison.tables if table.id == "published"]
+            comparison = replace(comparison, tables=(*comparison.tables, *added))
+        return comparison, folder
     if published is not None and asked.check_published is not None:
         name = f"{asked.check_published.stem}_results"
         return published.comparison, asked.check_published.with_name(name)
     if asked.images.renders:
-        return _compare_images(asked.images)
-    from bridge.errors import UsageError
-
-    message = (
+        comparison = compare_folders(asked.images)
+        return comparison, Path(f"{comparison.run}_results")
+    raise UsageError(
         "evaluate needs a run folder or a table, --check-published TABLE, or --reference "
         "FOLDER with --renders METHOD=FOLDER."
     )
-    raise UsageError(message)
+
+
+def _compare(asked: _Asked) -> "tuple[Comparison, Path]":
+    from bridge.episode.run_folder import RunFolder
+    from bridge.errors import UsageError
+    from bridge.exchange.trials_csv import trials_path
+    from evaluator.cache import FOLDER, SummaryCache
+    from evaluator.compare import compare_run
+    from evaluator.compare.several import compare_several, is_run
+
+    source, output = asked.sources[0], asked.output
+    has_others = source.is_dir() and not is_run(source) and any(source.iterdir())
+    if len(asked.sources) > 1 or source.is_file() or has_others:
+        if asked.images != IMAGES:
+            message = "images go with one run folder, or with --reference and no table."
+            raise UsageError(message)
+        beside = source.with_name(f"{source.stem}_results") if source.name else Path("results")
+        return compare_several(asked.sources, options=asked.tables, output=output), beside
+    run = RunFolder.open(source)
+    if not trials_path(run).is_file():
+        run.refuse_empty()
+    with SummaryCache(run.results_dir / FOLDER, say=output.say) as cache:
+        return compare_run(run, images=asked.images, cache=cache, output=output), run.results_dir
+
+
+def _with_others(comparison: "Comparison", asked: _Asked) -> "Comparison":
+    """Hold the results against another twin's, and against other raters' labels."""
+    from bridge.exchange.reviews import FOLDER, read_reviews
+    from evaluator.compare.raters import with_reviews
+    from evaluator.compare.several import with_against
+
+    if asked.against is not None:
+        comparison = with_against(
+            comparison, asked.sources[0], asked.against, options=asked.tables, output=asked.output
+        )
+    kept = [source / FOLDER for source in asked.sources if (source / FOLDER).is_dir()]
+    paths = (*kept, *asked.reviews)
+    found = [review for path in paths for review in read_reviews(path, asked.tables)]
+    return with_reviews(comparison, found) if found else comparison
 
 
 def _refuse_only_broken(results: "Results") -> None:
@@ -162,18 +196,9 @@ def _refuse_only_broken(results: "Results") -> None:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Asked:
-    """What was asked of the sources."""
-
-    interval: str
-    tables: TableOptions
-    images: ImageOptions
-    everything: bool
-    latex: bool
-    check_published: Path | None
-    against: Path | None
-    reviews: Sequence[Path]
+def _finding_text(item: "Finding") -> str:
+    where = "" if item.row is None else f"row {item.row}: "
+    return f"{where}{item.what}: {item.verdict}. {item.note}".strip()
 
 
 def design(
@@ -198,99 +223,4 @@ def design(
 
     made = make(study, wanted)
     written = lock(run, made)
-    output.result(design_record(made, written), design_text(made, written, run, study))
-
-
-def _compare(sources: Sequence[Path], asked: _Asked, output: Output) -> "tuple[Comparison, Path]":
-    from bridge.episode.run_folder import RunFolder
-    from bridge.errors import UsageError
-    from bridge.exchange.trials_csv import trials_path
-    from evaluator.cache import FOLDER, SummaryCache
-    from evaluator.compare import compare_run
-
-    source = sources[0]
-    beside = source.with_name(f"{source.stem}_results") if source.name else Path("results")
-    is_run = any((source / name).is_dir() for name in ("episodes", "derived", "scene", "notes"))
-    is_results = source.is_file() or (source.is_dir() and not is_run and any(source.iterdir()))
-    if len(sources) > 1 or is_results:
-        if asked.images != IMAGES:
-            message = "images go with one run folder, or with --reference and no table."
-            raise UsageError(message)
-        if source.is_file() and len(sources) == 1:
-            return _compare_table(source, asked), beside
-        return _compare_several(sources, asked, output), beside
-    run = RunFolder.open(source)
-    if not trials_path(run).is_file():
-        run.refuse_empty()
-    with SummaryCache(run.results_dir / FOLDER, say=output.say) as cache:
-        comparison = compare_run(
-            run,
-            method=asked.interval,
-            images=asked.images,
-            cache=cache,
-            output=output,
-        )
-    return comparison, run.results_dir
-
-
-def _with_others(
-    comparison: "Comparison", sources: Sequence[Path], asked: _Asked, output: Output
-) -> "Comparison":
-    """Hold the results against another twin's, and against other raters' labels."""
-    from bridge.exchange.reviews import FOLDER, read_reviews
-    from evaluator.compare.raters import with_reviews
-    from evaluator.compare.several import with_against
-
-    tables = asked.tables
-    if asked.against is not None:
-        comparison = with_against(
-            comparison, sources[0], asked.against, options=tables, output=output
-        )
-    kept = [source / FOLDER for source in sources if (source / FOLDER).is_dir()]
-    found = [review for path in (*kept, *asked.reviews) for review in read_reviews(path, tables)]
-    return with_reviews(comparison, found) if found else comparison
-
-
-def _compare_table(source: Path, asked: _Asked) -> "Comparison":
-    from evaluator.compare import compare_csv
-
-    return compare_csv(source, method=asked.interval, options=asked.tables)
-
-
-def _compare_several(sources: Sequence[Path], asked: _Asked, output: Output) -> "Comparison":
-    from evaluator.compare.several import compare_several
-
-    return compare_several(
-        sources,
-        method=asked.interval,
-        options=asked.tables,
-        output=output,
-    )
-
-
-def _compare_images(images: ImageOptions) -> "tuple[Comparison, Path]":
-    """Compare renders with a folder of recorded images, without any run."""
-    from evaluator.compare.images.methods import compare_folders
-
-    comparison = compare_folders(images)
-    return comparison, Path(f"{comparison.run}_results")
-
-
-def _beside(comparison: "Comparison", published: "Comparison") -> "Comparison":
-    """Add the check of a published table to a report about something else."""
-    from dataclasses import replace
-
-    added = [table for table in published.tables if table.id == "published"]
-    return replace(comparison, tables=(*comparison.tables, *added))
-
-
-def _missed_text(item: "Missed") -> str:
-    threshold = item.threshold
-    name = "Agreement of sim and outcome" if threshold.name == "agreement" else threshold.name
-    shown = item.reason if item.value is None else f"{item.value:.4g}"
-    return f"{name} is {shown}; the threshold is {threshold.limit:g}."
-
-
-def _finding_text(item: "Finding") -> str:
-    where = "" if item.row is None else f"row {item.row}: "
-    return f"{where}{item.what}: {item.verdict}. {item.note}".strip()
+    output.result(design_record(made, written), design_text(made, written, run))

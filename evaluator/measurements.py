@@ -1,10 +1,8 @@
 """Every measurement: its id, unit, definition, and which way is better.
 
-An id is a pattern: ``gain.pp.{side}.{task}.{policy}``. ``Quantity.of`` fills in the parts and gives
+An id is a pattern: ``rate.{side}.{task}.{condition}.{policy}``. ``Quantity.of`` fills in the parts and gives
 what a ``Measurement`` is made with, so no other module spells an id.
 """
-
-import math
 
 from evaluator import motion_measurements as motion_measurements
 from evaluator import study_measurements as study_measurements
@@ -54,30 +52,6 @@ RATE_AS_GIVEN = _new(
     "higher",
     "successes / {unit}s, as given{where}",
 )
-RATE_VARIED = _new(
-    "rate.sim_varied.{task}.{condition}.{policy}",
-    "1",
-    "higher",
-    "mean over trials of the share of varied planned replays of the plan actually sent that succeed: start, friction, forces, masses, stiffness and timing drawn anew, no draw that the gate used",
-)
-SELECTION_BIAS = _new(
-    "bias.selection.{task}.{condition}.{policy}",
-    "pp",
-    "none",
-    "sim - sim estimated again, over the trials that have varied replays",
-)
-AVERAGE_MACRO = _new(
-    "average.macro.{side}.{condition}",
-    "1",
-    "higher",
-    "mean of the unrounded {side} rates of {over} {condition}: every group counts the same",
-)
-AVERAGE_POOLED = _new(
-    "average.pooled.{side}.{condition}",
-    "1",
-    "higher",
-    "successes / {unit}s over {over} {condition} ({side}): every trial counts the same",
-)
 STAGE = _new(
     "stage.{task}.{condition}.{stage}",
     "1",
@@ -85,34 +59,6 @@ STAGE = _new(
     "trials that passed stage {stage} of {task} / trials that reached it and whose ending is known",
 )
 
-# Gains with replanning.
-
-GAIN_POINTS = _new(
-    "gain.pp.{side}.{task}.{policy}",
-    "pp",
-    "higher",
-    "gain with replanning in percentage points ({side}): {words}",
-)
-GAIN_RELATIVE = _new(
-    "gain.relative.{side}.{task}.{policy}",
-    "1",
-    "higher",
-    "relative gain with replanning ({side}), (with - without) / without: {words}; not percentage points",
-    (-1.0, math.inf),
-)
-GAIN_POINTS_AVERAGE = _new(
-    "gain.pp.{side}.average",
-    "pp",
-    "higher",
-    "gain with replanning in percentage points of the unrounded mean rates of {count} tasks ({side})",
-)
-GAIN_RELATIVE_AVERAGE = _new(
-    "gain.relative.{side}.average",
-    "1",
-    "higher",
-    "relative gain with replanning of the unrounded mean rates of {count} tasks ({side}); not percentage points",
-    (-1.0, math.inf),
-)
 # Agreement over groups. ``{what}`` says over which.
 
 PEARSON_R = _new(
@@ -181,12 +127,6 @@ MAE = _new(
     "mean size of sim rate - recorded rate {what}",
     (0.0, 100.0),
 )
-ORDER_ACCURACY = _new(
-    "agreement.order_accuracy",
-    "1",
-    "higher",
-    "pairs of groups that the twin orders as the recorded rates do / pairs whose recorded rates differ; a tie in the twin counts 1/2; {what}",
-)
 MMRV_RECORDED = _new(
     "agreement.mmrv_recorded_gap",
     "1",
@@ -206,13 +146,6 @@ PHI = _new(
     "1",
     "higher",
     "phi coefficient of {words} and the labelled outcome over trials",
-    SIGNED,
-)
-KAPPA = _new(
-    "agreement.{by}.kappa",
-    "1",
-    "higher",
-    "Cohen's kappa of {words} and the labelled outcome over trials",
     SIGNED,
 )
 PPV = _new(
@@ -240,29 +173,11 @@ BASELINE_ACCURACY = _new(
     "none",
     f"trials where the forecast without a twin ({{baseline}}) and the labelled outcome are the same / trials, {_BESIDE}",
 )
-BASELINE_PPV = _new(
-    "baseline.{by}.{baseline}.ppv",
-    "1",
-    "none",
-    f"trials that succeeded / trials where the forecast without a twin ({{baseline}}) said success, {_BESIDE}",
-)
-BASELINE_NPV = _new(
-    "baseline.{by}.{baseline}.npv",
-    "1",
-    "none",
-    f"trials that failed / trials where the forecast without a twin ({{baseline}}) said failure, {_BESIDE}",
-)
 BASELINE_GAIN = _new(
     "baseline.{by}.{baseline}.twin_gain_pp",
     "pp",
     "higher",
     f"share of right answers of the twin minus that of the forecast ({{baseline}}), paired, {_BESIDE}",
-)
-BASELINE_GAIN_OF_TASK = _new(
-    "baseline.{by}.{baseline}.twin_gain_pp.{task}",
-    "pp",
-    "higher",
-    BASELINE_GAIN.definition,
 )
 _WHOSE = "the probability is the planned replay's, where it has none the verdict's before motion; with replanning the twin selected these plans"
 BRIER = _new(

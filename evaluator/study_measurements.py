@@ -16,12 +16,6 @@ COMPARED_IN_TASK = new_quantity(
     "higher",
     "the same in {task}: {words}",
 )
-STUDY_NOT_EXECUTED = new_quantity(
-    "study.not_executed.{arm}.{task}.{policy}",
-    "1",
-    "lower",
-    "share of starts on which the arm {arm} executed nothing: {words}",
-)
 PROTOCOL_DEPARTURES = new_quantity(
     "protocol.departures",
     "count",

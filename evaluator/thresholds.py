@@ -14,7 +14,6 @@ SHORT = {
     "npv": "agreement.sim_planned.npv",
     "r": "agreement.pearson_r",
     "rho": "agreement.spearman_rho",
-    "order": "agreement.order_accuracy",
     "psnr": "views.all.psnr_db",
     "ssim": "views.all.ssim",
 }
@@ -29,16 +28,6 @@ class Threshold:
     """As the user wrote it."""
     id: str
     limit: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Missed:
-    """A threshold that was not reached, and what was found instead."""
-
-    threshold: Threshold
-    value: float | None
-    reason: str
-    """Why there is no value, empty where there is one."""
 
 
 def parse_thresholds(text: str | float) -> list[Threshold]:
@@ -69,18 +58,20 @@ def _parse(part: str) -> Threshold:
     return Threshold(name=name, id=SHORT.get(name, name), limit=limit)
 
 
-def missed(thresholds: Sequence[Threshold], results: Results) -> list[Missed]:
-    """Return what was not reached; an undefined number reaches nothing."""
+def missed(thresholds: Sequence[Threshold], results: Results) -> list[str]:
+    """Say what was not reached; an undefined number reaches nothing."""
     by_id = {measurement.id: measurement for measurement in results.measurements}
     found = []
     for threshold in thresholds:
         measurement = by_id.get(threshold.id)
         if measurement is None:
-            reason = f"undefined: there is no {threshold.id} in these results"
-            found.append(Missed(threshold=threshold, value=None, reason=reason))
+            shown = f"undefined: there is no {threshold.id} in these results"
         elif measurement.value is None:
-            reason = f"undefined: {measurement.reason_if_undefined}"
-            found.append(Missed(threshold=threshold, value=None, reason=reason))
-        elif measurement.value < threshold.limit:
-            found.append(Missed(threshold=threshold, value=measurement.value, reason=""))
+            shown = f"undefined: {measurement.reason_if_undefined}"
+        elif measurement.value >= threshold.limit:
+            continue
+        else:
+            shown = f"{measurement.value:.4g}"
+        name = "Agreement of sim and outcome" if threshold.name == "agreement" else threshold.name
+        found.append(f"{name} is {shown}; the threshold is {threshold.limit:g}.")
     return found

@@ -43,9 +43,6 @@ class TrialRow:
     """The gate's verdict on the sent plan, made before its execution started."""
     p_success: float | None = None
     """Chance of success as stated: of the planned replay, else of the gate."""
-    sim_varied: float | None = None
-    """Share of varied replays that succeed, of the planned replay, whose draws the gate did not
-    use; without what a posterior adds of how far answers are trusted."""
     first_failing: str | None = None
     """ik, clearance or terminal of the planned replay, or of the verdict where there is none."""
     failing_detail: str | None = None
@@ -72,8 +69,6 @@ class TrialRow:
     progress: float | None = None
     """How far the recorded trial came, 0 to 1, where somebody scored it."""
     sim_progress: float | None = None
-    tags: tuple[tuple[str, str], ...] = ()
-    """What was varied, by axis: lighting, pose, distractor, start region."""
     began_ns: int = 0
     """When its recording began; 0 where nobody knows, as in a table, whose rows are in order."""
     start_positions_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)

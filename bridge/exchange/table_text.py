@@ -9,10 +9,10 @@ import difflib
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import date, datetime, time
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, UsageError
 from bridge.terminal import RARE
@@ -26,6 +26,11 @@ NO = (
     *("not ok", "nein", "non", "fehlschlag", "échec", "✗", "✘", "❌"),
 )
 UNKNOWN = ("", "unknown", "undecided", "none", "na", "n/a", "nan", "null", "-", "?")
+ENDED = (
+    *("aborted", "abort", "interrupted", "void", "crashed", "protective stop", "protective_stop"),
+    *("estop", "e-stop", "emergency stop"),
+)
+"""How a trial ended that has no outcome: which of these are void, a protocol says."""
 MOST = 10**12
 """Counted in one field; beyond it a count is a slip, and soon no number that a float holds."""
 ALIASES = {"outcome": "recorded", "sim": "sim_planned"}
@@ -33,8 +38,8 @@ ALIASES = {"outcome": "recorded", "sim": "sim_planned"}
 OUTCOME_LIKE = ("outcome", "result", "results", "success", "succeeded", "label", "real")
 """Columns that are read as the outcome where there is one of them and no ``recorded``."""
 WORKBOOKS = (".xlsx", ".xlsm")
-FIRST_LINES = 5
-"""Lines in which names of columns are looked for."""
+FIRST_LINES, MOST_TOP = 5, 200
+"""Lines in which names of columns are looked for, among so many with blanks and comments."""
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
 NEAR = 0.8
 """How like a column of ours a name must be to be taken for a slip."""
@@ -48,11 +53,6 @@ class TableOptions:
 
     map: Annotated[str, RARE] = ""
     """Which column is which, where the names differ: "outcome=Result,task=Scenario"."""
-    axes: str = ""
-    """Further columns to compare sim and outcome along, with commas: "Lighting,Start region"."""
-    names: Literal["ask", "merge", "apart"] = "ask"
-    """Tasks, conditions or policies whose names differ only by case or blanks: ask refuses and
-    lists them, merge counts them as one, apart as several."""
     yes: bool = False
     """Take a table as it was understood, where another reading is possible, too."""
 
@@ -72,11 +72,6 @@ class TableOptions:
                 raise UsageError(message)
             found[name] = theirs
         return found
-
-    @property
-    def axis_columns(self) -> tuple[str, ...]:
-        """Columns that hold the values of an axis."""
-        return tuple(filter(None, map(str.strip, self.axes.split(","))))
 
 
 AS_SAVED = TableOptions()
@@ -101,8 +96,6 @@ class SourceRow:
     path: Path
     row: int
     values: Mapping[str, str]
-    axes: Mapping[str, int | str] = field(default_factory=dict)
-    """By axis: the column that holds its value."""
 
     def text(self, name: str) -> str:
         """Return a field without the blanks around it; empty when the column is not there."""
@@ -152,7 +145,7 @@ class SourceRow:
     def answer(self, name: str) -> bool | None:
         """Read yes, no or unknown."""
         text = self.text(name)
-        if text.lower() in UNKNOWN:
+        if text.lower() in (*UNKNOWN, *ENDED):
             return None
         found = answer_of(text)
         if found is not None:
@@ -187,8 +180,6 @@ class TableText:
     renamed: tuple[tuple[str, str], ...] = ()
     """Theirs and ours, where ``map`` said so."""
     left: tuple[str, ...] = ()
-    axes: Mapping[str, str] = field(default_factory=dict)
-    """By axis: the column that holds its value."""
     grid: Sequence[tuple[int, list[str]]] = ()
     """All lines that are not blank, with their numbers."""
 
@@ -215,7 +206,7 @@ class TableText:
     def row(self, number: int, cells: Sequence[str]) -> SourceRow:
         """Name the fields of one row."""
         values = dict(zip(self.header, cells, strict=True))
-        return SourceRow(path=self.path, row=number, values=values, axes=self.axes)
+        return SourceRow(path=self.path, row=number, values=values)
 
     def understood(self, kind: str, num_rows: int) -> str:
         """Say in one line what the table was read as."""
@@ -224,8 +215,6 @@ class TableText:
             name = DELIMITERS.get(self.delimiter, repr(self.delimiter))
             parts.append(f"separated by {name}")
         parts += [f"{theirs!r} read as {ours}" for theirs, ours in self.renamed]
-        if self.axes:
-            parts.append(f"axes: {', '.join(self.axes)}")
         if self.left:
             parts.append(f"not read: {', '.join(map(repr, self.left))}")
         return f"{self.path.name}: {'; '.join(parts)}"
@@ -257,9 +246,6 @@ def open_table(
             found=f"no column {absent[0]!r}",
             hint=f"Columns: {', '.join(names)}",
         )
-    axes = {
-        name: name for name in names if plain_name(name) in map(plain_name, options.axis_columns)
-    }
     header: list[str] = []
     renamed, left = [], []
     for name in names:
@@ -271,7 +257,7 @@ def open_table(
             header.append(plain)
         else:
             header.append(name)
-            left += [] if name in axes or not name else [name]
+            left += [name] if name else []
     table = TableText(
         path=path,
         delimiter=delimiter,
@@ -279,7 +265,6 @@ def open_table(
         header_row=row,
         renamed=tuple(renamed),
         left=tuple(left),
-        axes={plain_name(name): name for name in axes},
         grid=grid,
     )
     if near:
@@ -301,15 +286,14 @@ def load_grid(path: Path, known: Sequence[str]) -> tuple[str, list[tuple[int, li
         return "", _workbook_cells(path)
     text = _decoded(path)
     said = _SEP.match(text.split("\n", 1)[0])
-    best: tuple[str, list[tuple[int, list[str]]]] = (",", [])
-    most = -1
+    top = "\n".join(text.split("\n", MOST_TOP)[:MOST_TOP])
+    best, most = ",", -1
     for delimiter in (said[1],) if said else DELIMITERS:
-        lines = _lines(path, text, delimiter)
-        tops = [cells for _, cells in lines[:FIRST_LINES]]
+        tops = [cells for _, cells in _lines(path, top, delimiter)[:FIRST_LINES]]
         score = max((_score(cells, known) for cells in tops), default=-1)
         if score > most:
-            most, best = score, (delimiter, lines)
-    return best
+            most, best = score, delimiter
+    return best, _lines(path, text, best)
 
 
 def _workbook_cells(path: Path) -> list[tuple[int, list[str]]]:

@@ -1,13 +1,12 @@
 """Trials CSV in and out: one row per trial, as people keep them in a spreadsheet.
 
 Columns: trial_id, task, condition, policy, start_id, unit, k, n, recorded, sim_planned,
-sim_executed, verdict, p_success, cell, stand_in, progress, sim_progress, tags. Only task must be
-there (rows without trial_id are numbered); an empty field means unknown and stays unknown.
+sim_executed, verdict, p_success, cell, stand_in, progress, sim_progress, why_unknown. Only task
+must be there (rows without trial_id are numbered); an empty field means unknown and stays unknown.
 """
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -16,8 +15,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.exchange.table_text import (
     AS_SAVED,
+    ENDED,
     SourceRow,
-    TableError,
     TableOptions,
     TableText,
     open_table,
@@ -53,8 +52,8 @@ class TrialRecord:
     progress: float | None = None
     """How far the recorded trial came, 0 to 1, where a rubric or its stages say so."""
     sim_progress: float | None = None
-    tags: tuple[tuple[str, str], ...] = ()
-    """What was varied, by axis: lighting, pose, distractor, start region."""
+    why_unknown: str = ""
+    """What was said of an outcome that is not known: aborted, protective stop ..."""
 
 
 COLUMNS = tuple(field.name for field in fields(TrialRecord))
@@ -77,69 +76,6 @@ def open_trials(path: Path, options: TableOptions = AS_SAVED) -> TableText:
 def read_trials(path: Path, options: TableOptions = AS_SAVED) -> list[TrialRecord]:
     """Read and check a trials CSV."""
     return trials_of(rows_of(open_trials(path, options)))
-
-
-def read_trials_by_side(path: Path, options: TableOptions = AS_SAVED) -> list[TrialRecord]:
-    """Read a table with one rollout per row, here on the robot, there in the twin, without pairs.
-
-    Its column ``side`` says sim, real or stand-in; how the rollout ended is the outcome.
-
-    Args:
-        options: Columns whose names differ from ours; ``outcome`` is one of them, as a rule.
-    """
-    table = require(open_table(path, (*COLUMNS, "side"), options), ("task", "side"), COLUMNS)
-    if OUTCOME not in table.header:
-        raise TableError(
-            path=path,
-            row=table.header_row,
-            found="a column side, but neither rates (k and n, or rate) nor outcomes of trials",
-            hint='Say which column is the outcome of a trial, --map "outcome=...": '
-            f"{', '.join(table.left) or 'there is no other column'}",
-        )
-    rows = rows_of(table)
-    sides = {row.text("side").lower() for row in rows}
-    marked = str("stand-in" in sides).lower() if sides & {"real", "stand-in"} else ""
-    return trials_of([_on_its_side(row, marked) for row in rows])
-
-
-def _on_its_side(row: SourceRow, stand_in: str) -> SourceRow:
-    """Put the outcome of a rollout where a paired table has it."""
-    side = row.text("side").lower()
-    if side not in SIDES:
-        raise row.refuse(f"side is {side!r}", f"Sides: {', '.join(SIDES)}")
-    values = {name: text for name, text in row.values.items() if name != "side"}
-    if side == "sim":
-        values["sim_planned"] = values.pop(OUTCOME)
-    if not row.text("stand_in"):
-        values["stand_in"] = stand_in
-    return replace(row, values=values)
-
-
-def read_trials_json(path: Path, items: Sequence[dict[str, object]]) -> list[TrialRecord]:
-    """Read trials that a JSON file lists as objects with our columns as keys."""
-    return trials_of(json_rows(path, items, COLUMNS))
-
-
-def json_rows(
-    path: Path, items: Sequence[dict[str, object]], known: Sequence[str]
-) -> list[SourceRow]:
-    """Return the objects of a JSON list as rows of a table; other keys than ours are not read."""
-    return [
-        SourceRow(
-            path=path,
-            row=number,
-            values={name: _json_text(item[name]) for name in known if name in item},
-        )
-        for number, item in enumerate(items, start=1)
-    ]
-
-
-def _json_text(value: object) -> str:
-    if isinstance(value, dict):
-        return tags_text(value.items())
-    if value is None or isinstance(value, str):
-        return value or ""
-    return json.dumps(value)
 
 
 def trials_of(rows: Sequence[SourceRow]) -> list[TrialRecord]:
@@ -236,20 +172,13 @@ def read_trial(row: SourceRow) -> TrialRecord:
         stand_in=row.answer("stand_in"),
         progress=row.fraction("progress"),
         sim_progress=row.fraction("sim_progress"),
-        tags=_tags(row),
+        why_unknown=row.text("why_unknown") or _how_it_ended(row),
     )
 
 
-def _tags(row: SourceRow) -> tuple[tuple[str, str], ...]:
-    """Read what was varied: ``lighting=dim; pose=far``, and the columns that hold an axis each."""
-    tags = {axis: row.text(str(column)) for axis, column in row.axes.items()}
-    for part in filter(None, map(str.strip, row.text("tags").split(";"))):
-        axis, equals, value = (text.strip() for text in part.partition("="))
-        if not (equals and axis and value) or axis in tags:
-            hint = "Write axis=value, each axis once: lighting=dim; pose=far"
-            raise row.refuse(f"tags are {row.text('tags')!r}", hint)
-        tags[axis] = value
-    return tuple((axis, value) for axis, value in tags.items() if value)
+def _how_it_ended(row: SourceRow) -> str:
+    text = row.text("recorded").lower()
+    return text.replace("_", " ") if text in ENDED else ""
 
 
 def write_trials(path: Path, trials: Iterable[TrialRecord]) -> Path:
@@ -268,17 +197,10 @@ def trials_text(trials: Iterable[TrialRecord]) -> str:
     return stream.getvalue()
 
 
-def tags_text(tags: Iterable[tuple[str, str]]) -> str:
-    """Write what was varied as the column ``tags`` holds it: ``lighting=dim; pose=far``."""
-    return "; ".join(f"{axis}={value}" for axis, value in tags)
-
-
 def _field(name: str, value: object) -> str:
     if isinstance(value, bool):
         words = ("true", "false") if name == "stand_in" else ("success", "failure")
         return words[0] if value else words[1]
-    if isinstance(value, tuple):
-        return tags_text(value)
     return "" if value is None else str(value)
 
 

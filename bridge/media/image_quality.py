@@ -116,7 +116,7 @@ def _map(
     Windowed are u = a + b, v = a - b and their squares, for SSIM needs no more: 2 mu_a mu_b is half
     of mu_u^2 - mu_v^2, mu_a^2 + mu_b^2 half of mu_u^2 + mu_v^2, and so on for the variances.
     """
-    from scipy.ndimage import correlate1d  # noqa: PLC0415  # takes half a second to load
+    from scipy.ndimage import correlate1d  # noqa: PLC0415  # half a second that tables do without
 
     def windowed(plane: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
         down = correlate1d(plane, _WEIGHTS, axis=0, mode="constant")

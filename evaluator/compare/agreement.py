@@ -14,7 +14,6 @@ from evaluator.measurements import (
     BLIND_SHARE,
     MAE,
     MMRV_RECORDED,
-    ORDER_ACCURACY,
     PEARSON_R,
     PEARSON_R_OF_CONDITION,
     SPEARMAN,
@@ -117,7 +116,6 @@ def group_agreement(groups: Sequence[RateGroup]) -> list[Measurement]:
         make(SPEARMAN.of(what=what), lambda: agreement.spearman(recorded, sim)),
         _over_others(BIAS.of(what=what), usable, "bias"),
         make(MAE.of(what=what), lambda: 100 * agreement.mean_absolute_error(**both)),
-        make(ORDER_ACCURACY.of(what=what), lambda: agreement.order_accuracy(**both).value),
         make(MMRV_RECORDED.of(what=what), lambda: agreement.mmrv(**both, gap="recorded")),
         *_blind(usable),
     ]

@@ -1,10 +1,10 @@
 """What a verdict is worth beside forecasts that need no twin, over the same trials.
 
 Every one of them is asked of the plan that was sent: the base rate (always yes), the geometric
-rule, and whatever else a row carries, such as the cell's own engine with nominal parameters.
+rule, and whatever else a row carries.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,28 +16,18 @@ from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
-from evaluator.compare.gate import confusion_of, unheeded_verdict
+from evaluator.compare.gate import unheeded_verdict
 from evaluator.compare.known_task import recorded_task
 from evaluator.compare.labels import AFTER
-from evaluator.compare.measure import ends, measured, proportion
+from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import Answer, names_of
-from evaluator.measurements import (
-    BASE_RATE,
-    BASELINE_ACCURACY,
-    BASELINE_GAIN,
-    BASELINE_GAIN_OF_TASK,
-    BASELINE_NPV,
-    BASELINE_PPV,
-)
+from evaluator.measurements import BASE_RATE, BASELINE_ACCURACY, BASELINE_GAIN
 from evaluator.metrics.geometric_rule import judge_by_geometry
-from evaluator.result import Cell, Measurement, Table
+from evaluator.result import Measurement
 from evaluator.statistics.differences import paired_points
-from evaluator.statistics.gate import Confusion
 
-TWIN = "twin"
-ALWAYS_YES, GEOMETRIC_RULE = "always yes", "geometric rule"
-ALL_TASKS = "all tasks"
+GEOMETRIC_RULE = "geometric rule"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,134 +93,60 @@ SIDES: tuple[tuple[str, str, Answer], ...] = (
 """Whose answers are held against forecasts without a twin."""
 
 
-def baseline_results(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Table, ...]]:
+def baseline_results(rows: Sequence[TrialRow]) -> list[Measurement]:
     """Hold the twin's answers against every forecast without a twin, over the same trials.
 
     Nothing is found where no trial has both the twin's answer and an outcome.
     """
     names = list(dict.fromkeys(name for row in rows for name, _ in row.baselines))
-    measurements: list[Measurement] = []
-    lines: list[tuple[Cell, ...]] = []
+    found: list[Measurement] = []
     for by, words, answer_of in SIDES:
         known = [r for r in rows if answer_of(r) is not None and r.recorded is not None]
         if not known:
             continue
-        counts = confusion_of(known, answer_of)
-        lines += [
-            (words, task, TWIN, *_shares(confusion_of(members, answer_of)), None, None, None)
-            for task, members in _by_task(known).items()
-        ]
-        measurements.append(
+        found.append(
             proportion(
                 BASE_RATE.of(by=by, words=words),
-                counts.succeeded,
-                counts.n,
+                sum(row.recorded is True for row in known),
+                len(known),
                 counted="trial",
                 reason_if_undefined="no trial",
                 episodes=names_of(known),
             )
         )
-        for name in (ALWAYS_YES, *names):
-            forecast = _forecast(name)
-            both = [row for row in known if forecast(row) is not None]
-            measurements += _measure(by, words, name, both, answer_of)
-            for task, members in _by_task(both).items():
-                gain = _gain(by, words, name, task, members, answer_of)
-                measurements.append(gain)
-                shares = _shares(confusion_of(members, forecast))
-                lines.append((words, task, name, *shares, gain.value, *ends(gain.interval)))
-    return measurements, _table(lines)
+        for name in names:
+            forecasts = [(row, dict(row.baselines).get(name)) for row in known]
+            both = [(row, answer) for row, answer in forecasts if answer is not None]
+            found += _beside(by, words, name, both, answer_of)
+    return found
 
 
-def _forecast(name: str) -> Answer:
-    if name == ALWAYS_YES:
-        return lambda row: True
-    return lambda row: dict(row.baselines).get(name)
-
-
-def _by_task(rows: Sequence[TrialRow]) -> Mapping[str, Sequence[TrialRow]]:
-    """Rows of all tasks, then of each where there are several."""
-    tasks = sorted({row.task for row in rows})
-    parts = {task: [row for row in rows if row.task == task] for task in tasks}
-    return {ALL_TASKS: rows} | (parts if len(tasks) > 1 else {})
-
-
-def _measure(
-    by: str, words: str, name: str, rows: Sequence[TrialRow], answer_of: Answer
+def _beside(
+    by: str, words: str, name: str, both: Sequence[tuple[TrialRow, bool]], answer_of: Answer
 ) -> list[Measurement]:
-    counts = confusion_of(rows, _forecast(name))
-    nothing = f"no trial has an outcome, {words} and the forecast of: {name}"
-    return [
-        proportion(
-            quantity.of(by=by, baseline=name, words=words),
-            k,
-            n,
-            counted="trial",
-            reason_if_undefined=nothing if not counts.n else f"{name} never said {answer}",
-            episodes=names_of(rows),
-        )
-        for quantity, k, n, answer in (
-            (BASELINE_ACCURACY, counts.agreed, counts.n, ""),
-            (BASELINE_PPV, counts.true_positive, counts.predicted_success, "yes"),
-            (BASELINE_NPV, counts.true_negative, counts.predicted_failure, "no"),
-        )
-    ]
-
-
-def _gain(
-    by: str, words: str, name: str, task: str, rows: Sequence[TrialRow], answer_of: Answer
-) -> Measurement:
-    better, worse, n = _discordant(rows, answer_of, _forecast(name))
-    quantity = BASELINE_GAIN if task == ALL_TASKS else BASELINE_GAIN_OF_TASK
-    return measured(
-        quantity.of(by=by, baseline=name, task=task, words=words),
-        partial(paired_points, better, worse, n),
-        n=n,
-        counted="trial",
-        episodes=names_of(rows),
-    )
-
-
-def _discordant(
-    rows: Sequence[TrialRow], answer_of: Answer, forecast: Answer
-) -> tuple[int, int, int]:
-    """Trials that only the twin got right, that only the forecast got right, and all."""
-    better = worse = 0
-    for row in rows:
-        twin, other = answer_of(row) == row.recorded, forecast(row) == row.recorded
+    """Measure how often one forecast is right, and how much more often the twin is."""
+    better = worse = right = 0
+    for row, forecast in both:
+        twin, other = answer_of(row) == row.recorded, forecast == row.recorded
+        right += other
         better += twin and not other
         worse += other and not twin
-    return better, worse, len(rows)
-
-
-def _shares(counts: Confusion) -> tuple[Cell, ...]:
-    """Counts behind accuracy, PPV and NPV, and the outcomes."""
-    return (
-        *(counts.n, counts.succeeded, counts.agreed),
-        *(counts.predicted_success, counts.true_positive),
-        *(counts.predicted_failure, counts.true_negative),
-    )
-
-
-def _table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
-    if not lines:
-        return ()
-    return (
-        Table(
-            id="gate_baselines",
-            title="The twin beside forecasts that need no twin",
-            columns=(
-                *("asked of", "task", "forecast by", "trials", "succeeded", "right"),
-                *("said yes", "yes and succeeded", "said no", "no and failed"),
-                *("twin more right (pp)", "low", "high"),
-            ),
-            rows=tuple(lines),
-            note="Trials in which the outcome, the twin's answer and the forecast are known. "
-            "Always yes is right as often as trials succeed: the base rate. Geometric rule: each "
-            "grasp encloses its object, which then moves with the hand, drops straight down where "
-            "it is released and is where the task wants it; no physics, and no number that was "
-            "fitted to outcomes. Cell's own engine: the planned replay in the engine that moves "
-            "the stand-in cell (replay --engine both), from the same start. Differences are "
-            "paired, with 95 % Tango intervals.",
+    parts = {"by": by, "baseline": name, "words": words}
+    episodes = names_of(row for row, _ in both)
+    return [
+        proportion(
+            BASELINE_ACCURACY.of(**parts),
+            right,
+            len(both),
+            counted="trial",
+            reason_if_undefined=f"no trial has an outcome, {words} and the forecast of: {name}",
+            episodes=episodes,
         ),
-    )
+        measured(
+            BASELINE_GAIN.of(**parts),
+            partial(paired_points, better, worse, len(both)),
+            n=len(both),
+            counted="trial",
+            episodes=episodes,
+        ),
+    ]

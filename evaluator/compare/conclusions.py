@@ -1,9 +1,5 @@
-"""What an evaluation means, task by task: bias, worth of a yes, whether the ranking is settled.
+"""What an evaluation means, task by task: bias, worth of a yes, whether the ranking is settled."""
 
-And what it could not have seen: the smallest difference that so many trials would show.
-"""
-
-import math
 from collections.abc import Sequence
 
 from evaluator.compare.agreement import usable_groups
@@ -13,8 +9,7 @@ from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.compare.success import trials_in
 from evaluator.result import Cell, Interval, Table
 from evaluator.statistics.differences import points_of
-from evaluator.statistics.intervals import normal_quantile
-from evaluator.statistics.sequential import ALPHA, POWER, Stratum
+from evaluator.statistics.sequential import Stratum
 
 MOST_TASKS = 200
 """Tasks that get a line of their own; more are a sample, and the model speaks of it."""
@@ -37,9 +32,7 @@ def conclusions_table(
         "Bias: sim minus recorded, mean of the task's groups. A yes: trials in which sim said "
         "success, and those that then succeeded; beside it what succeeded whatever sim said. "
         "Ranked: whether the recorded trials settle which candidate is best; more trials, of the "
-        "best and the next together, after which the comparison is likely to be decided. "
-        "Smallest: the difference of two candidates, and of sim and recorded, that so many trials "
-        "would show with 80 % power (unpaired)."
+        "best and the next together, after which the comparison is likely to be decided."
     )
     return (Table.of(lines, id="conclusions", title="What it means, task by task", note=note),)
 
@@ -57,8 +50,6 @@ def _line(
     single = len({group.task for group in usable}) == 1
     mine = [each for each in answers if each.task == task or (single and not each.task)]
     best, ranked, more = _ranking(members, mine)
-    n = [group.recorded.n for group in members if group.recorded.n]
-    sim_n = [group.sim.n for group in members if group.sim.n]
     return {
         "task": task,
         "groups": len(members),
@@ -73,9 +64,6 @@ def _line(
         "best recorded": best,
         "ranked": ranked,
         "more trials": more,
-        "recorded trials per candidate": min(n) if n else None,
-        "smallest difference (pp)": _smallest(members, min(n) if n else 0),
-        "smallest bias (pp)": _smallest(members, min(n + sim_n) if n and sim_n else 0),
     }
 
 
@@ -113,6 +101,8 @@ def _ranking(
         return None, "tie", None
     if first.recorded.n is None or second.recorded.n is None:
         return name, "no n", None
+    if first.unit != "trial":
+        return name, f"counted in {first.unit}s", None
     pair = {Candidate(policy=g.policy, condition=g.condition) for g in (first, second)}
     found = [e for e in answers if {e.question.first, e.question.second} == pair]
     if not found:
@@ -123,23 +113,8 @@ def _ranking(
     return name, "no", None if reading.more is None else 2 * reading.more
 
 
-def _smallest(members: Sequence[RateGroup], n: int) -> float | None:
-    """The smallest difference [pp] to a rate like these that n trials on each side would show."""
-    rates = [float(group.recorded_rate or 0) for group in members]
-    middle = sum(rates) / len(rates)
-    low = min(middle, 1 - middle)  # towards the middle there is more room
-    reach = normal_quantile(1 - ALPHA / 2) + normal_quantile(POWER)
-    found = 1.0
-    for _ in range(40):
-        mean = min(1.0, low + found / 2)
-        found = min(1.0, reach * math.sqrt(2 * mean * (1 - mean) / n)) if n else 1.0
-    return None if found > 1 - low - 1e-9 else 100 * found
-
-
 def direction(low: float | None, high: float | None) -> str:
     """Say what an interval of the bias settles: optimistic, pessimistic, or neither."""
-    if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
+    if low is None or high is None:
         return ""
-    if low > 0:
-        return "optimistic"
-    return "pessimistic" if high < 0 else ""
+    return "optimistic" if low > 0 else "pessimistic" if high < 0 else ""

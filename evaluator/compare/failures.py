@@ -16,8 +16,6 @@ LEAST_SPREAD_M = 0.02
 """Starts that lie closer together than this along an axis are not told apart by it."""
 FEWEST = 4
 """Located starts of a task below which halves say nothing."""
-REGION_TAG = "start region"
-"""What a table calls it; what is stated there comes before what was localised."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +60,7 @@ def start_regions(rows: Sequence[TrialRow]) -> dict[str, str]:
     tasks: dict[str, list[TrialRow]] = {}
     for row in rows:
         tasks.setdefault(row.task, []).append(row)
-    found = {name: text for group in tasks.values() for name, text in _regions(group)}
-    stated = {row.episode: dict(row.tags).get(REGION_TAG, "") for row in rows if row.tags}
-    return found | {name: text for name, text in stated.items() if text}
+    return {name: text for group in tasks.values() for name, text in _regions(group)}
 
 
 def _regions(rows: Sequence[TrialRow]) -> Iterator[tuple[str, str]]:

@@ -49,6 +49,8 @@ class _Group:
     column: Column | None
     k: str
     n: str
+    counted: str
+    """trial, object or subtask, where a column says so."""
     unit: str = ""
     """k, rate or rate_percent, once it is settled."""
 
@@ -67,6 +69,7 @@ class _Group:
             column=main.column if main else None,
             k=k.figure.number if k and k.figure else "",
             n=(own_n.figure.number if own_n and own_n.figure else "") or inside or n,
+            counted=members[0].labels["unit"],
         )
 
     @property
@@ -98,6 +101,7 @@ class _Group:
             "policy": policy,
             "condition": condition,
             "side": side or "real",
+            "unit": self.counted,
             "n": self.n,
             "k": self.k,
         }

@@ -6,6 +6,7 @@ a cell that fits no reading is refused by its row.
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from bridge.errors import UsageError
@@ -90,6 +91,11 @@ def _sheet(path: Path, grid: Sequence[Line], options: TableOptions) -> Sheet:
     for place, names in enumerate(zip(*levels, strict=True) if levels else ()):
         mapped = next((theirs[plain_name(n)] for n in names if plain_name(n) in theirs), "")
         columns.append(read_name(place, [mapped] if mapped else names))
+    if any(folded(column.name) == "policy" for column in columns):  # a checkpoint is another thing
+        columns = [
+            c if c.label != "policy" or folded(c.name) == "policy" else Column(c.place, c.name)
+            for c in columns
+        ]
     sheet = Sheet(path=path, columns=columns, lines=[], found=found)
     _refuse_unnamed(sheet, lines[last + 1 :])
     sheet.lines = _body(sheet, lines[last + 1 :], levels)
@@ -222,7 +228,11 @@ def _settle_sides(sheet: Sheet) -> None:
         elif column.label == "side" and folded(column.name) != "side" and not all_sides:
             label = "task" if folded(column.name) == "environment" else ""
             sheet.columns[place] = Column(place=place, name=column.name, label=label)
-    if any(column.side or column.label == "side" for column in sheet.columns):
+    if any(column.label == "side" for column in sheet.columns):
+        own = [replace(c, side="") if folded(c.name) == "recorded" else c for c in sheet.columns]
+        sheet.columns[:] = own  # the outcome of a side, whatever it is
+        return
+    if any(column.side for column in sheet.columns):
         return
     for column in [c for c in sheet.columns if c.label in NAMED]:
         split = [side_within(cell) for cell in sheet.cells(column)]
@@ -243,7 +253,9 @@ def _settle_sides(sheet: Sheet) -> None:
 
 
 def _values(sheet: Sheet) -> list[Value]:
-    labels = {label: sheet.labelled(label) for label in (*NAMED, "trial", "start_id", "side")}
+    labels = {
+        label: sheet.labelled(label) for label in (*NAMED, "trial", "start_id", "unit", "side")
+    }
     sheet.labels |= {label for label, column in labels.items() if column}
     blank = next((c for c in sheet.columns if not c.name and not c.label), None)
     if not labels["task"] and not labels["policy"] and blank and _is_text(sheet, blank):
@@ -368,7 +380,7 @@ def _all_answers(texts: Iterable[str]) -> bool:
 def _are_trials(sheet: Sheet, values: Sequence[Value]) -> bool:
     """Whether each cell is how one trial ended: yes or no, of one trial and no rate of several."""
     told = [v for v in values if v.column.figure != "n"]
-    known = [v.figure for v in told if v.figure is not None]
+    known = [v.figure for v in told if v.figure is not None and not v.figure.ended]
     words = any(f.answer is not None and not f.number for f in known)
     if any(v.column.figure in ("k", "n", "rate", "percent") for v in values) and not words:
         return False
@@ -405,5 +417,7 @@ def _trial_rows(sheet: Sheet, values: Sequence[Value]) -> list[SourceRow]:
         side = "sim_planned" if value.side == "sim" else "recorded"
         answer = None if value.figure is None else value.figure.answer
         texts[side] = "" if answer is None else "yes" if answer else "no"
+        if value.figure is not None and value.figure.ended:
+            texts[side] = value.figure.text
     sheet.found.notes.insert(0, f"{len(rows):,} trials")
     return [SourceRow(path=sheet.path, row=row, values=texts) for (row, _), texts in rows.items()]

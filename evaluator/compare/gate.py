@@ -11,29 +11,26 @@ from evaluator.measurements import (
     AGREED,
     BRIER,
     BRIER_OF_BASE_RATE,
-    KAPPA,
     NPV,
     PHI,
     PPV,
 )
 from evaluator.result import Measurement
-from evaluator.statistics.gate import Confusion, brier, brier_of_base_rate, kappa, phi
+from evaluator.statistics.gate import Confusion, brier, brier_of_base_rate, phi
 
 
-def agreement(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
-    """Measure k/n agreement, phi, kappa and predictive values, of the replay and of the verdict."""
+def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:
+    """Measure k/n agreement, phi and predictive values, of the replay and of the verdict."""
     measurements = []
     for name, answer_of, words in (
         ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
         ("verdict", lambda row: row.verdict, "the verdict before motion"),
         ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
     ):
-        measurements.extend(_agreement_of(rows, name, answer_of, words, method))
+        measurements.extend(_agreement_of(rows, name, answer_of, words))
     if any(unheeded_verdict(row) is not None for row in rows):
         words = "the verdict before motion, recorded and not obeyed (without replanning)"
-        measurements.extend(
-            _agreement_of(rows, "verdict_unheeded", unheeded_verdict, words, method)
-        )
+        measurements.extend(_agreement_of(rows, "verdict_unheeded", unheeded_verdict, words))
     return measurements
 
 
@@ -60,12 +57,12 @@ def confusion_of(rows: Sequence[TrialRow], answer_of: Answer) -> Confusion:
 
 
 def _agreement_of(
-    rows: Sequence[TrialRow], name: str, answer_of: Answer, words: str, method: str
+    rows: Sequence[TrialRow], name: str, answer_of: Answer, words: str
 ) -> list[Measurement]:
     seen = [row for row in rows if answer_of(row) is not None and row.recorded is not None]
     counts = confusion_of(seen, answer_of)
     nothing = f"no trial has both {words} and a known outcome"
-    make = partial(proportion, counted="trial", method=method)
+    make = partial(proportion, counted="trial")
     coefficient = partial(
         measured,
         n=counts.n,
@@ -82,7 +79,6 @@ def _agreement_of(
             episodes=names_of(seen),
         ),
         coefficient(PHI.of(by=name, words=words), lambda: phi(counts)),
-        coefficient(KAPPA.of(by=name, words=words), lambda: kappa(counts)),
         make(
             PPV.of(by=name, words=words),
             counts.true_positive,

@@ -142,9 +142,7 @@ OPEN = "the localised poses leave it open"
 Pair = tuple[TrialRow, PerceivedOutcome]
 
 
-def label_results(
-    perceived: Sequence[PerceivedOutcome], rows: Sequence[TrialRow], *, method: str = "wilson"
-) -> Part:
+def label_results(perceived: Sequence[PerceivedOutcome], rows: Sequence[TrialRow]) -> Part:
     """Count the trials in which label and predicate say the same, and list the others."""
     if not perceived:
         reason = "no trial of a known task was localised after its execution"
@@ -152,9 +150,9 @@ def label_results(
     of_episode: Mapping[str, PerceivedOutcome] = {outcome.episode: outcome for outcome in perceived}
     pairs = [(row, of_episode[row.episode]) for row in rows if row.episode in of_episode]
     tasks = sorted({row.task for row, _ in pairs})
-    measurements = [_rate("", pairs, method)]
+    measurements = [_rate("", pairs)]
     measurements += [
-        _rate(task, [pair for pair in pairs if pair[0].task == task], method) for task in tasks
+        _rate(task, [pair for pair in pairs if pair[0].task == task]) for task in tasks
     ]
     return Part(
         measurements=tuple(measurements),
@@ -167,7 +165,7 @@ def _known(pairs: Sequence[Pair]) -> list[Pair]:
     return [(r, w) for r, w in pairs if r.recorded is not None and w.says is not None]
 
 
-def _rate(task: str, pairs: Sequence[Pair], method: str) -> Measurement:
+def _rate(task: str, pairs: Sequence[Pair]) -> Measurement:
     """Measure the trials of one task, or of all when it is empty."""
     known = _known(pairs)
     agreed = sum(row.recorded is outcome.says for row, outcome in known)
@@ -182,7 +180,6 @@ def _rate(task: str, pairs: Sequence[Pair], method: str) -> Measurement:
         counted="trial",
         reason_if_undefined="no trial has both a label and a decided predicate",
         episodes=[row.episode for row, _ in known],
-        method=method,
     )
 
 

@@ -9,7 +9,7 @@ from typing import TypeVar
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.measurements import Defined, quantity_of, slug
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
-from evaluator.statistics.intervals import RATE_INTERVALS, median_interval
+from evaluator.statistics.intervals import median_interval, wilson
 
 Item = TypeVar("Item")
 DEGREES = math.degrees(1.0)
@@ -85,14 +85,16 @@ class Part:
 Statistic = Callable[[], float | tuple[float, Interval | None]]
 
 
-def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
+def refuse_alike(
+    kind: str, named: Iterable[tuple[str, str]], by: Callable[[str], str] = slug
+) -> None:
     """Refuse two names that would share an id: the number of one would stand for both."""
     places: dict[str, str] = {}
     for name, where in named:
         places.setdefault(name, where)
     first_with: dict[str, str] = {}
     for name, where in places.items():
-        owner = first_with.setdefault(slug(name), name)
+        owner = first_with.setdefault(by(name), name)
         if owner != name:
             raise AlikeNamesError(kind=kind, names=(owner, name), places=(places[owner], where))
 
@@ -159,13 +161,12 @@ def proportion(
     counted: str,
     reason_if_undefined: str,
     episodes: Iterable[str] = (),
-    method: str = "wilson",
 ) -> Measurement:
-    """Measure k/n with its interval, Wilson's unless another was asked for; undefined for n = 0."""
+    """Measure k/n with Wilson's interval; undefined for n = 0."""
     return Measurement(
         **vars(defined),
         value=k / n if n else None,
-        interval=RATE_INTERVALS[method](k, n) if n else None,
+        interval=wilson(k, n) if n else None,
         k=k,
         n=n,
         counted=counted,

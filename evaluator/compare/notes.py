@@ -3,20 +3,15 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
-from itertools import chain, groupby
+from itertools import chain
 from typing import Any
 
-from evaluator.compare.agreement import says_nothing
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.trial import Trial
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 from evaluator.statistics.agreement import within_and_between
-
-LARGE_BIAS_PP = 5.0
-HIGH_R = 0.8
-FEW_GROUPS = 4
 
 Note = tuple[str, str]
 """About what, and the sentence."""
@@ -28,11 +23,7 @@ def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> l
     return [
         *_opposed(groups, by_id),
         *_units(groups),
-        *_few_groups(by_id),
-        *_says_nothing(by_id),
         *_blind(by_id),
-        *_hidden_bias(by_id),
-        *_two_gains(by_id),
     ]
 
 
@@ -74,24 +65,6 @@ def _units(groups: Sequence[RateGroup]) -> list[Note]:
     return notes
 
 
-def _few_groups(by_id: dict[str, Measurement]) -> list[Note]:
-    return [
-        (name, f"r over {m.n} groups has no interval: few points that rise together give a high r")
-        for name, m in by_id.items()
-        if name.startswith("agreement.pearson_r")
-        and m.value is not None
-        and (m.n or 0) < FEW_GROUPS
-    ]
-
-
-def _says_nothing(by_id: dict[str, Measurement]) -> list[Note]:
-    return [
-        (name, f"the interval of r is {i.high - i.low:.2f} wide, of 2 possible: it says nothing")
-        for name, m in by_id.items()
-        if name.startswith("agreement.pearson_r") and says_nothing(m) and (i := m.interval)
-    ]
-
-
 def _blind(by_id: dict[str, Measurement]) -> list[Note]:
     return [
         (name, f"the twin is probably blind here ({m.value:.2f}): {m.definition}")
@@ -100,25 +73,13 @@ def _blind(by_id: dict[str, Measurement]) -> list[Note]:
     ]
 
 
-def _hidden_bias(by_id: dict[str, Measurement]) -> list[Note]:
-    r, bias = by_id.get("agreement.pearson_r"), by_id.get("agreement.bias_pp")
-    if r is None or bias is None or r.value is None or bias.value is None:
-        return []
-    if r.value < HIGH_R or abs(bias.value) < LARGE_BIAS_PP:
-        return []
-    direction = "optimistic" if bias.value > 0 else "pessimistic"
-    text = f"r = {r.value:.3f} does not show that the twin is {direction} by {bias.value:+.1f} pp"
-    return [("agreement.pearson_r", text)]
-
-
 def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list[Note]:
     """Say that r within tasks tells another story than r over all groups (Simpson 1951)."""
-    usable = [g for g in groups if g.recorded_rate is not None and g.sim_rate is not None]
     tasks: dict[str, list[tuple[Fraction, Fraction]]] = {}
-    for group in usable:
+    for group in groups:
         if group.recorded_rate is not None and group.sim_rate is not None:
             tasks.setdefault(group.task, []).append((group.recorded_rate, group.sim_rate))
-    if not 1 < len(tasks) < len(usable):
+    if not 1 < len(tasks) < sum(map(len, tasks.values())):
         return []
     try:
         within, between = within_and_between(list(tasks.values()))
@@ -136,18 +97,6 @@ def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list
     if within < 0:
         text += ". Inside a task, what the twin ranks higher did worse: do not choose by it"
     return [("agreement.pearson_r", text)]
-
-
-def _two_gains(by_id: dict[str, Measurement]) -> list[Note]:
-    points = by_id.get("gain.pp.recorded.average")
-    relative = by_id.get("gain.relative.recorded.average")
-    if points is None or relative is None or points.value is None or relative.value is None:
-        return []
-    text = (
-        f"{points.value:+.2f} percentage points and {100 * relative.value:+.2f} % relative are the "
-        "same recorded gain"
-    )
-    return [("gain", text)]
 
 
 ABOUT = "replays"
@@ -204,20 +153,13 @@ def _counted(values: Counter[str]) -> str:
 
 def _settings(used: Sequence[DerivedFile]) -> Iterable[str]:
     """Name the first setting in which replays that count differ."""
-    # Nearly always all are equal: many files share one record, and equal ones are laid flat once.
+    # Nearly always all are equal, and many files share one record: it is laid flat once.
     records: dict[int, dict[str, Any]] = {}
     for file in used:
-        if id(file.derived.settings) not in records:
-            records[id(file.derived.settings)] = _made_with(file)
-    runs = [
-        (dict(_leaves(made)), sum(1 for _ in same))
-        for made, same in groupby(records[id(file.derived.settings)] for file in used)
-        if made
-    ]
-    for name in dict.fromkeys(chain.from_iterable(settings for settings, _ in runs)):
-        values: Counter[str] = Counter()
-        for settings, count in runs:
-            values[str(settings.get(name))] += count
+        records.setdefault(id(file.derived.settings), dict(_leaves(_made_with(file))))
+    made = [found for file in used if (found := records[id(file.derived.settings)])]
+    for name in dict.fromkeys(chain.from_iterable(records.values())):
+        values = Counter(str(settings.get(name)) for settings in made)
         if len(values) > 1:
             shown = ", ".join(f"{value} in {count}" for value, count in values.most_common())
             yield (
@@ -225,14 +167,6 @@ def _settings(used: Sequence[DerivedFile]) -> Iterable[str]:
                 "are judged by different twins"
             )
             return
-
-
-def made_with(file: DerivedFile) -> dict[str, Any]:
-    """Return the settings that may change a verdict, by dotted name.
-
-    There are none of a replay that another program made.
-    """
-    return dict(_leaves(_made_with(file)))
 
 
 def _made_with(file: DerivedFile) -> dict[str, Any]:

@@ -7,12 +7,12 @@ its cause void: a policy that trips the arm must not gain by it.
 """
 
 import math
-from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from evaluator.compare.rows import RateGroup, TrialRow, in_order
 from evaluator.compare.success import CONDITION_OF_ARM, WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
 from evaluator.quantity import noun
-from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.sequential import Evidence, Look, Plan, Stratum, pairs_equivalent
 from evaluator.study_measurements import COMPARED, COMPARED_IN_TASK
 
@@ -102,8 +102,7 @@ def questions(found: Iterable[Candidate], protocol: Protocol | None = None) -> l
     ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Try:
+class Try(NamedTuple):
     """One trial of one of two candidates."""
 
     task: str
@@ -114,73 +113,139 @@ class Try:
     row: TrialRow
 
 
-def tries_of(rows: Sequence[TrialRow], question: Question, void_causes: Sequence[str]) -> list[Try]:
-    """Return the trials of both candidates in the order in which they were made."""
+def made_trials(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[TrialRow]:
+    """Return the trials that count, in the order in which they were made."""
+    void = {each.episode for each in void_starts(rows, void_causes)}
+    return [
+        row
+        for row in in_order(rows)
+        if (row.recorded is not None or row.nothing_executed)
+        or row.why_unknown not in ("", UNLABELLED)
+        if row.episode not in void
+    ]
+
+
+def tries_of(made: Sequence[TrialRow], question: Question) -> list[Try]:
+    """Return the trials of both candidates among those that count."""
     sides = {
         (c.policy, c.condition): is_second
         for is_second, c in ((False, question.first), (True, question.second))
     }
-    void = {(row.task, row.start_id) for row in rows if _is_void(row, void_causes)}
-    found = []
-    for row in in_order(rows):
-        side = sides.get((row.policy, row.condition))
-        is_void = _is_void(row, void_causes) or (
-            row.start_id is not None and bool(row.study_arm) and (row.task, row.start_id) in void
+    return [
+        Try(
+            task=row.task,
+            start=row.start_id or "",
+            is_second=side,
+            succeeded=row.recorded is True,
+            has_outcome=row.recorded is not None,
+            row=row,
         )
-        was_made = row.recorded is not None or row.nothing_executed
-        was_made |= row.why_unknown not in ("", UNLABELLED)
-        if side is None or is_void or not was_made:
-            continue
-        found.append(
-            Try(
-                task=row.task,
-                start=row.start_id or "",
-                is_second=side,
-                succeeded=row.recorded is True,
-                has_outcome=row.recorded is not None,
-                row=row,
-            )
+        for row in made
+        if (side := sides.get((row.policy, row.condition))) is not None
+    ]
+
+
+def void_starts(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[Exclusion]:
+    """Name the trials that enter no comparison, and why: void ones, in a study with their start."""
+    causes = tuple(void_causes)
+    void = [r for r in rows if r.recorded is None and r.why_unknown.startswith(causes)]
+    reasons = {row.episode: f"void: {row.why_unknown}" for row in void}
+    starts = {(row.task, row.start_id): row for row in void}
+    for row in rows:
+        in_study = bool(row.study_arm) and row.start_id is not None
+        first = starts.get((row.task, row.start_id)) if in_study else None
+        if first is not None:
+            words = f"start {row.start_id} is void in all arms: {first.episode}: "
+            reasons.setdefault(row.episode, f"{words}{first.why_unknown}")
+    return [
+        Exclusion(episode=name, scope="comparisons", reason=why) for name, why in reasons.items()
+    ]
+
+
+@dataclass(kw_only=True)
+class _Count:
+    """Trials of one task, counted as they come in: pairs of one start, and the others."""
+
+    starts: dict[str, list[Try | None]] = field(default_factory=dict)
+    improved: int = 0
+    worsened: int = 0
+    pairs: int = 0
+    k: list[int] = field(default_factory=lambda: [0, 0])
+    n: list[int] = field(default_factory=lambda: [0, 0])
+    worth: float = 0.0
+    """Pairs that all of them are worth."""
+
+    def add(self, each: Try) -> None:
+        """Count one more; the first of each side on a start are a pair."""
+        self.k[each.is_second] += each.succeeded
+        self.n[each.is_second] += 1
+        self._pair(each)
+        self.worth = self.pairs + pairs_equivalent(*self.n)
+
+    def _pair(self, each: Try) -> None:
+        if not each.start:
+            return
+        firsts = self.starts.setdefault(each.start, [None, None])
+        if firsts[each.is_second] is not None:
+            return
+        firsts[each.is_second] = each
+        first, second = firsts
+        if first is None or second is None or not _is_same_start(first.row, second.row):
+            return
+        self.pairs += 1
+        self.improved += second.succeeded and not first.succeeded
+        self.worsened += first.succeeded and not second.succeeded
+        for side, member in enumerate((first, second)):
+            self.k[side] -= member.succeeded
+            self.n[side] -= 1
+
+    def stratum(self) -> Stratum:
+        """Return what was counted so far."""
+        return Stratum(
+            improved=self.improved,
+            worsened=self.worsened,
+            pairs=self.pairs,
+            first=(self.k[0], self.n[0]),
+            second=(self.k[1], self.n[1]),
         )
-    return found
 
 
-def _is_void(row: TrialRow, void_causes: Sequence[str]) -> bool:
-    return row.recorded is None and row.why_unknown.startswith(tuple(void_causes))
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """What was counted when each look was due, and in all."""
+
+    all_: Evidence
+    at: Mapping[float, Evidence]
+
+    @staticmethod
+    def of(tries: Sequence[Try], plan: Plan) -> "Course":
+        """Count trials in their order."""
+        counts: dict[str, _Count] = {}
+        at: dict[float, Evidence] = {}
+        places, worth = plan.places(), 0.0
+        place = next(places)
+        for each in tries:
+            count = counts.setdefault(each.task, _Count())
+            worth -= count.worth
+            count.add(each)
+            worth += count.worth
+            while worth >= place - 1e-9:
+                at[place] = _evidence(counts)
+                place = next(places)
+        return Course(all_=_evidence(counts), at=at)
+
+    def read(self, plan: Plan) -> "Reading":
+        """Look at the trials as planned."""
+        return read(plan, self.all_, lambda pairs: self.at.get(pairs, self.all_))
 
 
-def evidence_of(tries: Sequence[Try], *, task: str = "") -> Evidence:
-    """Count some trials: pairs of one start, and the others of each task."""
-    by_task: dict[str, list[Try]] = {}
-    for each in tries:
-        if not task or each.task == task:
-            by_task.setdefault(each.task, []).append(each)
-    return Evidence(strata=tuple(_stratum(members) for members in by_task.values()))
-
-
-def _stratum(tries: Sequence[Try]) -> Stratum:
-    starts: dict[str, tuple[list[Try], list[Try]]] = {}
-    for place, each in enumerate(tries):
-        name = each.start or f"unnamed {place}"
-        starts.setdefault(name, ([], []))[each.is_second].append(each)
-    counts = {(a, b): 0 for a in (False, True) for b in (False, True)}
-    left: tuple[list[Try], list[Try]] = ([], [])
-    for first, second in starts.values():
-        together = first and second and _is_same_start(first[0].row, second[0].row)
-        if together:
-            counts[first[0].succeeded, second[0].succeeded] += 1
-        for side, members in enumerate((first, second)):
-            left[side].extend(members[1:] if together else members)
-    alone = [(sum(each.succeeded for each in side), len(side)) for side in left]
-    return Stratum(
-        improved=counts[False, True],
-        worsened=counts[True, False],
-        pairs=sum(counts.values()),
-        first=alone[0],
-        second=alone[1],
-    )
+def _evidence(counts: Mapping[str, _Count]) -> Evidence:
+    return Evidence(strata=tuple(count.stratum() for count in counts.values()))
 
 
 def _is_same_start(first: TrialRow, second: TrialRow) -> bool:
+    if not (first.start_positions_m and second.start_positions_m):
+        return True
     shared = first.start_positions_m.keys() & second.start_positions_m.keys()
     gaps = (
         np.subtract(first.start_positions_m[name], second.start_positions_m[name])
@@ -193,74 +258,45 @@ def _is_same_start(first: TrialRow, second: TrialRow) -> bool:
 class Reading:
     """What the trials say to one question, by one plan."""
 
+    plan: Plan
     evidence: Evidence
+    limit: float
+    """Standard errors from which on the last look that was due decides, else the first."""
     decided: Look | None
     """The look at which it was decided."""
     better: int
     """1 where the second is better, -1 where it is worse, 0 undecided."""
-    interval: Interval | None
-    more: int | None
-    """Further trials of each candidate after which a decision is likely; None where none is."""
+
+    @cached_property
+    def interval(self) -> Interval | None:
+        """Differences that the look leaves possible."""
+        return self.evidence.interval(self.limit) if self.evidence.pairs else None
+
+    @cached_property
+    def more(self) -> int | None:
+        """Further trials of each candidate after which a decision is likely; None without any."""
+        likely = self.plan.likely_at(self.evidence) if self.decided is None else None
+        return None if likely is None else max(1, math.ceil(likely - self.evidence.pairs))
 
 
-def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence]) -> Reading:
-    """Look at the trials as planned: ``until`` gives what was counted after so many pairs."""
+def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence] | None = None) -> Reading:
+    """Look at the trials as planned.
+
+    Args:
+        until: Gives what was counted after so many pairs; without it all is one look.
+    """
     limit = math.inf
     decided, better = None, 0
-    if all_.pairs:
-        for look in plan.looks(all_.kind):
-            passed = look.pairs <= all_.pairs + 1e-9
-            if not passed and math.isfinite(limit):
-                break
-            limit = look.limit
-            if not passed:
-                break
-            z = until(look.pairs).z()
-            if decided is None and abs(z) >= look.limit - 1e-9:
-                decided, better = look, 1 if z > 0 else -1
-    likely = plan.likely_at(all_) if decided is None else None
-    return Reading(
-        evidence=all_,
-        decided=decided,
-        better=better,
-        interval=all_.interval(limit) if all_.pairs else None,
-        more=None if likely is None else max(1, math.ceil(likely - all_.pairs)),
-    )
-
-
-def read_tries(plan: Plan, tries: Sequence[Try]) -> Reading:
-    """Read trials in their order."""
-    pairs = _pairs_after(tries)
-
-    def until(wanted: float) -> Evidence:
-        return evidence_of(tries[: bisect_left(pairs, wanted - 1e-9) + 1])
-
-    return read(plan, evidence_of(tries), until)
-
-
-def _pairs_after(tries: Sequence[Try]) -> list[float]:
-    """Pairs that the first so many trials are worth, for each number of trials."""
-    seen: dict[tuple[str, str], list[Try | None]] = {}
-    shared: Counter[str] = Counter()
-    left: dict[str, list[int]] = {}
-    counted: dict[str, float] = {}
-    total, found = 0.0, []
-    for place, each in enumerate(tries):
-        start = seen.setdefault((each.task, each.start or f"unnamed {place}"), [None, None])
-        others = left.setdefault(each.task, [0, 0])
-        other = start[not each.is_second]
-        others[each.is_second] += 1
-        if start[each.is_second] is None:
-            start[each.is_second] = each
-            if other is not None and _is_same_start(each.row, other.row):
-                shared[each.task] += 1
-                others[0] -= 1
-                others[1] -= 1
-        now = shared[each.task] + pairs_equivalent(*others)
-        total += now - counted.get(each.task, 0.0)
-        counted[each.task] = now
-        found.append(total)
-    return found
+    for look in plan.looks(all_.kind) if all_.pairs else ():
+        if look.pairs > all_.pairs + 1e-9:
+            limit = look.limit if math.isinf(limit) else limit
+            break
+        limit = look.limit if until is not None else min(limit, look.limit)
+        seen = all_ if until is None else until(look.pairs)
+        z = seen.of_no_difference if decided is None else 0.0
+        if decided is None and abs(z) >= limit - 1e-9:
+            decided, better = look, 1 if z > 0 else -1
+    return Reading(plan=plan, evidence=all_, limit=limit, decided=decided, better=better)
 
 
 def with_holm(
@@ -296,6 +332,11 @@ class Answer:
     episodes: tuple[str, ...] = field(default=(), repr=False)
 
     @property
+    def _without_these(self) -> str:
+        sign = -1 if self.reading.better < 0 else 1
+        return f"{round(100 * sign * (self.without_these or 0.0)):+d} without them"
+
+    @property
     def sentence(self) -> str:
         """The answer in words."""
         first, second = self.question.names
@@ -310,10 +351,14 @@ class Answer:
             first, second, difference, low, high = second, first, -difference, -high, -low
             counts.reverse()
         points = f"{round(difference):+d} points [{round(low):+d}, {round(high):+d}]"
+        if lost := sum(self.no_outcome):
+            points += f" ({lost} without an outcome as {noun('failure', lost)}"
+            points += f"; {self._without_these})" if self.without_these is not None else ")"
         if self.reading.better:
-            return (
-                f"{second} is better than {first}: {' against '.join(counts)}, {points}; stop here"
-            )
+            words = f"{second} is better than {first}: {' against '.join(counts)}, {points}"
+            look = self.reading.decided
+            then = f", decided after {look.pairs:g} pairs" if look and low <= 0 else ""
+            return f"{words}{then}; stop here"
         found = f"{second} {counts[0]}, {first} {counts[1]}, {points}"
         if max(-low, high) <= 100 * CLOSE:
             return f"no difference of more than 10 points: {found}; stop here"
@@ -326,6 +371,31 @@ class Answer:
         return f"undecided: {found}; {rest}"
 
 
+def remarks(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[tuple[str, str]]:
+    """Say which trials have no outcome, and which starts a candidate tried again."""
+    groups: dict[tuple[str, Candidate], list[TrialRow]] = {}
+    for row in made_trials(rows, void_causes):
+        who = Candidate(policy=row.policy, condition=row.condition)
+        groups.setdefault((row.task, who), []).append(row)
+    found = []
+    for (task, who), made in groups.items():
+        about = f"{who.words}, {task}" if len({t for t, _ in groups}) > 1 else who.words
+        lost = [row for row in made if row.recorded is None]
+        if lost:
+            k, n = sum(row.recorded is True for row in made), len(made)
+            why = ", ".join(dict.fromkeys(row.why_unknown or "nothing executed" for row in lost))
+            words = f"{len(lost)} of {n} trials have no outcome ({why}): {k} of {n} succeeded where"
+            words += f" they count as failures, as in comparisons, {k} of {n - len(lost)} without"
+            found.append((about, f"{words} them, as in its rate"))
+        starts = Counter(row.start_id for row in made if row.start_id)
+        again = [f"{name} {times} times" for name, times in starts.items() if times > 1]
+        if again:
+            more = f" and {len(again) - 3} more" if len(again) > 3 else ""
+            words = f"starts tried more than once: {', '.join(again[:3])}{more}; the first trial "
+            found.append((about, f"{words}of a start is paired, the others count without a pair"))
+    return found
+
+
 def compare_policies(
     rows: Sequence[TrialRow],
     protocol: Protocol | None = None,
@@ -333,29 +403,35 @@ def compare_policies(
 ) -> list[Answer]:
     """Answer every question over all tasks, then in each task where there are several."""
     found = (Candidate(policy=row.policy, condition=row.condition) for row in rows)
-    asked = questions(found, protocol)
-    made = {q: tries_of(rows, q, void_causes) for q in asked}
-    asked = [q for q in asked if {each.is_second for each in made[q]} == {False, True}]
-    plan = plan_of(protocol)
-    primary = [q for q in asked if q.is_primary]
-    answers = [_answer(q, made[q], read_tries(plan, made[q]), "") for q in primary]
-    others = [q for q in asked if not q.is_primary]
-    readings = with_holm(others, plan, lambda part, q: read_tries(part, made[q]))
-    answers += [_answer(q, made[q], r, "") for q, r in zip(others, readings, strict=True)]
-    parts = [
-        (q, task)
-        for q in asked
-        for task in dict.fromkeys(each.task for each in made[q])
-        if len({each.task for each in made[q]}) > 1
-    ]
-    each_task = plan_of(protocol, of_task=True)
+    made = made_trials(rows, void_causes)
+    plan, of_task = plan_of(protocol), plan_of(protocol, of_task=True)
+    asked: list[_Case] = []
+    parts: list[_Case] = []
+    for question in questions(found, protocol):
+        tries = tries_of(made, question)
+        if len({each.is_second for each in tries}) < 2:
+            continue
+        asked.append(_Case(question, "", tries, Course.of(tries, plan)))
+        tasks: dict[str, list[Try]] = {}
+        for each in tries:
+            tasks.setdefault(each.task, []).append(each)
+        if len(tasks) > 1:
+            parts += [_Case(question, t, own, Course.of(own, of_task)) for t, own in tasks.items()]
+    primary = [case for case in asked if case.question.is_primary]
+    others = [case for case in asked if not case.question.is_primary]
+    readings = [case.course.read(plan) for case in primary]
+    readings += with_holm(others, plan, lambda share, case: case.course.read(share))
+    readings += with_holm(parts, of_task, lambda share, case: case.course.read(share))
+    return [_answer(c, r) for c, r in zip((*primary, *others, *parts), readings, strict=True)]
 
-    def of_task(part: Plan, item: tuple[Question, str]) -> Reading:
-        return read_tries(part, [each for each in made[item[0]] if each.task == item[1]])
 
-    for (q, task), reading in zip(parts, with_holm(parts, each_task, of_task), strict=True):
-        answers.append(_answer(q, made[q], reading, task))
-    return answers
+class _Case(NamedTuple):
+    """One question over all tasks or in one."""
+
+    question: Question
+    task: str
+    tries: Sequence[Try]
+    course: Course
 
 
 def plan_of(protocol: Protocol | None, *, of_task: bool = False) -> Plan:
@@ -367,48 +443,56 @@ def plan_of(protocol: Protocol | None, *, of_task: bool = False) -> Plan:
     return Plan(pairs=max(4, pairs), locked=not protocol.edited, alpha=protocol.alpha)
 
 
-def _answer(question: Question, tries: Sequence[Try], reading: Reading, task: str) -> Answer:
-    mine = [each for each in tries if not task or each.task == task]
-    sides = [[t for t in mine if t.is_second == is_second] for is_second in (False, True)]
+def _answer(case: _Case, reading: Reading) -> Answer:
+    sides = [[t for t in case.tries if t.is_second == second] for second in (False, True)]
     counts = [(sum(t.succeeded for t in side), len(side)) for side in sides]
     unknown = [sum(not t.has_outcome for t in side) for side in sides]
-    known = evidence_of([each for each in mine if each.has_outcome])
+    known = (
+        Course.of([t for t in case.tries if t.has_outcome], Plan()).all_ if any(unknown) else None
+    )
     return Answer(
-        question=question,
-        task=task,
+        question=case.question,
+        task=case.task,
         counts=(counts[0], counts[1]),
         reading=reading,
         no_outcome=(unknown[0], unknown[1]),
-        without_these=known.difference if any(unknown) and known.pairs else None,
-        episodes=tuple(each.row.episode for each in mine),
+        without_these=known.difference if known is not None and known.pairs else None,
+        episodes=tuple(each.row.episode for each in case.tries),
     )
 
 
 def compare_counts(groups: Sequence[RateGroup]) -> list[Answer]:
     """Answer the same of a table of rates; nothing of what has no n, or counts parts of trials."""
     counted = [g for g in groups if g.unit == "trial" and g.recorded.k is not None and g.recorded.n]
-    cells = {(g.task, Candidate(policy=g.policy, condition=g.condition)): g for g in counted}
-    asked = []
+    cells = {
+        (g.task, Candidate(policy=g.policy, condition=g.condition)): (
+            g.recorded.k or 0,
+            g.recorded.n or 0,
+        )
+        for g in counted
+    }
+    asked: list[tuple[Question, str, list[Stratum]]] = []
+    parts: list[tuple[Question, str, list[Stratum]]] = []
     for question in questions(c for _, c in cells):
         tasks = [t for t, c in cells if c == question.first and (t, question.second) in cells]
-        sides = [
-            [(m.k or 0, m.n or 0) for t in tasks for m in (cells[t, c].recorded,)]
-            for c in (question.first, question.second)
+        strata = [
+            Stratum(first=cells[task, question.first], second=cells[task, question.second])
+            for task in tasks
         ]
         if tasks:
-            asked.append((question, sides))
-
-    def evidence(sides: list[list[tuple[int, int]]]) -> Evidence:
-        pairs = zip(*sides, strict=True)
-        return Evidence(strata=tuple(Stratum(first=a, second=b) for a, b in pairs))
-
-    readings = with_holm(
-        asked, Plan(), lambda plan, item: read(plan, all_ := evidence(item[1]), lambda _: all_)
-    )
-    return [
-        Answer(question=question, task="", counts=tuple(map(_sum, sides)), reading=reading)  # type: ignore[arg-type]
-        for (question, sides), reading in zip(asked, readings, strict=True)
-    ]
+            asked.append((question, "", strata))
+        if len(tasks) > 1:
+            parts += [(question, task, [own]) for task, own in zip(tasks, strata, strict=True)]
+    found = []
+    for cases in (asked, parts):
+        readings = with_holm(
+            cases, Plan(), lambda plan, case: read(plan, Evidence(strata=tuple(case[2])))
+        )
+        for (question, task, strata), reading in zip(cases, readings, strict=True):
+            first, second = ([s.first for s in strata], [s.second for s in strata])
+            counts = (_sum(first), _sum(second))
+            found.append(Answer(question=question, task=task, counts=counts, reading=reading))
+    return found
 
 
 def _sum(side: Sequence[tuple[int, int]]) -> tuple[int, int]:
@@ -419,8 +503,16 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
     """Lay answers out; the first column that a reader needs is the sentence."""
     if not answers:
         return Part()
-    sentences: list[dict[str, Cell]] = [
-        {"answer": each.sentence, "task": each.task or ALL_TASKS} for each in answers
+    rows: list[dict[str, Cell]] = [
+        {
+            "answer": each.sentence,
+            "task": each.task or ALL_TASKS,
+            "shared starts": sum(s.pairs for s in each.reading.evidence.strata),
+            "decided": {1: "better", -1: "worse", 0: "no"}[each.reading.better],
+            "decided after (pairs)": each.reading.decided and each.reading.decided.pairs,
+            "more trials of each": each.reading.more,
+        }
+        for each in answers
     ]
     plan = plan_of(protocol)
     words = (
@@ -429,7 +521,7 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         else f"no plan was locked: as if {plan.pairs} pairs had been planned"
     )
     table = Table.of(
-        sentences,
+        rows,
         id="comparisons",
         title="Which is better, as recorded",
         note=f"Group-sequential score test, {words}, extended by doubling; alpha {plan.alpha:g} "
@@ -437,44 +529,10 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         "and the same in each task share another. Intervals hold at every look. Trials without an "
         "outcome are failures.",
     )
-    numbers = Table.of(
-        [_row(each) for each in answers],
-        id="comparison_numbers",
-        title="The counts behind these answers",
-        note="Pairs: starts that both tried, else one trial of each.",
-    )
     return Part(
         measurements=tuple(_measured(each) for each in answers),
-        tables=(table, *_standing(answers), numbers),
+        tables=(table, *_standing(answers)),
     )
-
-
-def _row(answer: Answer) -> dict[str, Cell]:
-    reading = answer.reading
-    (k, n), (j, m) = answer.counts
-    first, second = answer.question.names
-    known = reading.evidence.pairs > 0
-    low, high = ends(reading.interval, 100.0)
-    return {
-        "task": answer.task or ALL_TASKS,
-        "better?": second,
-        "than": first,
-        "k": j,
-        "n": m,
-        "k of the other": k,
-        "n of the other": n,
-        "shared starts": sum(each.pairs for each in reading.evidence.strata),
-        "difference (pp)": 100 * reading.evidence.difference if known else None,
-        "low": low,
-        "high": high,
-        "decided": {1: "better", -1: "worse", 0: "no"}[reading.better],
-        "decided after (pairs)": None if reading.decided is None else reading.decided.pairs,
-        "more trials of each": reading.more,
-        "without an outcome": sum(answer.no_outcome) or None,
-        "difference without these (pp)": None
-        if answer.without_these is None
-        else 100 * answer.without_these,
-    }
 
 
 def _measured(answer: Answer) -> Measurement:

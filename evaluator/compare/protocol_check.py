@@ -10,7 +10,6 @@ from bridge.task.protocol import FILE_NAME, Endpoint, Protocol
 from evaluator.compare.measure import Part, measured
 from evaluator.compare.policies import Answer
 from evaluator.compare.rows import TrialRow, in_order
-from evaluator.compare.study import study_starts
 from evaluator.compare.success import CONDITION_OF_ARM
 from evaluator.result import Cell, Exclusion, Table
 from evaluator.study_measurements import PROTOCOL_DEPARTURES
@@ -52,7 +51,6 @@ def protocol_results(
     protocol: Protocol | None,
     *,
     answers: Sequence[Answer] = (),
-    method: str = "wilson",
     left_out: Sequence[Exclusion] = (),
     task_hashes: Mapping[str, frozenset[str]] | None = None,
 ) -> Part:
@@ -65,7 +63,7 @@ def protocol_results(
         return Part()
     mine = [row for row in rows if row.study_arm]
     found = [
-        *_of_file(protocol, method, task_hashes or {}),
+        *_of_file(protocol, task_hashes or {}),
         *_of_numbers(mine, protocol),
         *_of_starts(mine, protocol),
         *_of_arms(rows, protocol),
@@ -94,16 +92,14 @@ class _Departure:
     done: Cell
 
 
-def _of_file(
-    protocol: Protocol, method: str, task_hashes: Mapping[str, frozenset[str]]
-) -> Iterable[_Departure]:
+def _of_file(protocol: Protocol, task_hashes: Mapping[str, frozenset[str]]) -> Iterable[_Departure]:
     if protocol.edited:
         found = "the content does not fit the hash: edited after it was written"
         yield _Departure("protocol", FILE_NAME, protocol.sha256, found)
     elif not protocol.sha256:
         yield _Departure("protocol", FILE_NAME, "a hash", "none: an edit would not be seen")
-    if method != protocol.interval:
-        yield _Departure("analysis", "interval of rates", protocol.interval, method)
+    if protocol.interval != "wilson":
+        yield _Departure("analysis", "interval of rates", protocol.interval, "wilson")
     for task in protocol.tasks:
         other = task_hashes.get(task.task, frozenset()) - {task.task_sha256}
         if other and task.task_sha256 != NO_HASH:
@@ -175,11 +171,12 @@ def _longest_rising(numbers: Sequence[int]) -> int:
 def _of_exclusions(
     rows: Sequence[TrialRow], protocol: Protocol, left_out: Sequence[Exclusion]
 ) -> Iterable[_Departure]:
-    _, dropped = study_starts(rows, protocol.void_causes)
     declared = ", ".join(protocol.void_causes)
-    reasons = Counter(item.reason for item in dropped if "is void in all arms" not in item.reason)
-    for reason, count in sorted(reasons.items()):
-        yield _Departure("exclusion not declared", f"{count} trials", declared, reason)
+    tried = Counter((row.task, row.policy, row.study_arm, row.start_id) for row in rows)
+    for (task, policy, arm, start), count in tried.items():
+        if count > 1:
+            where = f"{task}, {policy}, {arm}"
+            yield _Departure("start tried again", where, 1, f"{start or 'unnamed'}: {count} times")
     for item in left_out:
         yield _Departure("exclusion not declared", item.episode, declared, item.reason)
 

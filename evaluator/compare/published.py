@@ -5,13 +5,14 @@ The table is a rates CSV with two more columns: a row with a ``statistic`` holds
 """
 
 import math
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from itertools import product
 from pathlib import Path
 
+from bridge.episode.provenance import hash_file, software
 from bridge.exchange.table_text import AS_SAVED, SourceRow, TableError, TableOptions, read_rows
 from bridge.exchange.trials_csv import SIDES
 from bridge.exchange.trials_rates import (
@@ -54,13 +55,12 @@ WITHIN = "within the rounding of its rates"
 IMPOSSIBLE, UNDEFINED, NOT_PRINTED = "impossible", "undefined", "not in the table"
 AMBIGUOUS = "ambiguous"
 SWAPPED = "fits with arguments swapped"
-OTHERWISE = "fits otherwise"
 FEWEST = 3
 """Groups from which r is defined."""
 FAILED = (ROUNDED, DIFFERS, IMPOSSIBLE, UNDEFINED)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """One printed figure against what its rows give."""
 
@@ -103,9 +103,7 @@ class PublishedCheck:
         return tuple(finding for finding in self.findings if finding.verdict in FAILED)
 
 
-def check_published(
-    path: Path, *, method: str = "wilson", options: TableOptions = AS_SAVED
-) -> PublishedCheck:
+def check_published(path: Path, options: TableOptions = AS_SAVED) -> PublishedCheck:
     """Recompute every printed figure of a table.
 
     Raises:
@@ -122,14 +120,16 @@ def check_published(
         check_beside(row, record, records)
         records.append(record)
         findings += [] if finding is None else [finding]
-    comparison = compare_records(records, path, method=method)
+    comparison = compare_records(records, path.stem)
     groups = usable_groups(comparison.groups)
     halves = {_key_of(record): record.half for record in records}
     findings += [_judge(claim, groups, claims, halves) for claim in claims]
     findings += _not_printed(groups, claims)
     about = [(f.what, f.note) for f in findings if f.note]
     tables = (_table(findings), *with_notes(comparison.tables, about))
-    return PublishedCheck(comparison=replace(comparison, tables=tables), findings=tuple(findings))
+    provenance = {"software": software(), "files": {str(path): hash_file(path)}}
+    comparison = replace(comparison, tables=tables, provenance=provenance)
+    return PublishedCheck(comparison=comparison, findings=tuple(findings))
 
 
 def _claim(row: SourceRow) -> _Claim:
@@ -171,31 +171,12 @@ def _read(row: SourceRow) -> tuple[RateRecord, Finding | None]:
     if printed is None:
         raise refusal
     names = (row.text("task"), row.text("condition"), row.text("side"))
-    finding = Finding(
-        row=row.row,
-        what=" ".join(name for name in names if name),
-        printed=row.text("rate_percent") or row.text("rate"),
-        recomputed=None,
-        verdict=verdict,
-        note=str(refusal).partition(f" row {row.row}: ")[2],
-        instead=instead,
-    )
-    return _as_printed(row, *printed), finding
-
-
-def _as_printed(row: SourceRow, rate: Fraction, half: Fraction) -> RateRecord:
-    """Keep a rate without its n, so that the rest can be recomputed."""
-    return RateRecord(
-        task=row.text("task"),
-        condition=row.text("condition"),
-        side=row.text("side"),
-        unit=row.text("unit") or "trial",
-        k=None,
-        n=None,
-        rate=rate,
-        row=row.row,
-        policy=row.text("policy"),
-        half=half,
+    what = " ".join(name for name in names if name)
+    text = row.text("rate_percent") or row.text("rate")
+    note = str(refusal).partition(f" row {row.row}: ")[2]
+    kept = {name: text for name, text in row.values.items() if name not in ("k", "n")}
+    return read_rate(replace(row, values=kept)), Finding(
+        row.row, what, text, None, verdict, note, instead
     )
 
 
@@ -223,15 +204,9 @@ def _judge(
     try:
         value = _value(claim.statistic, claim.side, claim.condition, groups)
     except UndefinedStatisticError as error:
-        return Finding(
-            row=claim.row.row,
-            what=what,
-            printed=printed,
-            recomputed=None,
-            verdict=UNDEFINED,
-            instead=f"undefined: {error.reason}",
-            note=f"printed {printed}, but the rows do not give it: {error.reason}",
-        )
+        note = f"printed {printed}, but the rows do not give it: {error.reason}"
+        instead = f"undefined: {error.reason}"
+        return Finding(claim.row.row, what, printed, None, UNDEFINED, note, instead)
     shown = f"{value:.4g}" if abs(value) < 1 else f"{value:.2f}"
     if _fits(value, claim):
         verdict, note = AS_PRINTED, ""
@@ -249,51 +224,21 @@ def _judge(
         if from_rounded is not None and _fits(from_rounded, claim):
             verdict = ROUNDED
             note = f"{printed} comes from the rounded averages; unrounded it is {shown}"
-    return Finding(
-        row=claim.row.row,
-        what=what,
-        printed=printed,
-        recomputed=value,
-        verdict=verdict,
-        note=note,
-    )
+    return Finding(claim.row.row, what, printed, value, verdict, note)
 
 
 def _fits_otherwise(
     claim: _Claim, groups: Sequence[RateGroup], shown: str
 ) -> tuple[str, str] | None:
-    """Try the other readings of a figure: MMRV's arguments swapped, r per task averaged."""
-    chosen = [group for group in groups if claim.condition in ("", group.condition)]
-    recorded, sim = sides(chosen)
+    """Try MMRV with its arguments swapped."""
+    if claim.statistic != "mmrv":
+        return None
     try:
-        if claim.statistic == "mmrv" and _fits(mmrv(recorded=recorded, sim=sim, gap="sim"), claim):
-            note = f"the gap of sim rates is weighted; by the gap of recorded rates it is {shown}"
-            return SWAPPED, note
-        if claim.statistic == "pearson_r" and not claim.task:
-            for words, value in _pooled_otherwise(chosen):
-                if _fits(value, claim):
-                    return OTHERWISE, f"it is {words}; over all groups r = {shown}"
+        swapped = _value("mmrv_sim_gap", claim.side, claim.condition, groups)
     except UndefinedStatisticError:
-        pass
-    return None
-
-
-def _pooled_otherwise(groups: Sequence[RateGroup]) -> Iterator[tuple[str, float]]:
-    """The other figures that are printed as the r of a table of tasks and policies."""
-    for kind in ("task", "policy", "condition"):
-        members: dict[str, list[RateGroup]] = {}
-        for group in groups:
-            members.setdefault(getattr(group, kind), []).append(group)
-        if not 1 < len(members) < len(groups):
-            continue
-        both = [sides(each) for each in members.values()]
-        if len(both) > 2:
-            yield (
-                f"r of the means per {kind}",
-                pearson([mean_rate(a) for a, _ in both], [mean_rate(b) for _, b in both]),
-            )
-        if all(len(a) > 2 for a, _ in both):
-            yield f"the mean of r per {kind}", mean_rate([pearson(a, b) for a, b in both])
+        return None
+    note = f"the gap of sim rates is weighted; by the gap of recorded rates it is {shown}"
+    return (SWAPPED, note) if _fits(swapped, claim) else None
 
 
 def _fits(value: float, claim: _Claim) -> bool:
@@ -390,81 +335,38 @@ def _from_rounded(claim: _Claim, claims: Sequence[_Claim]) -> float | None:
 
 
 def _not_printed(groups: Sequence[RateGroup], claims: Sequence[_Claim]) -> list[Finding]:
-    """The correlation that a success table of both sides invites, where it is not printed."""
+    """What a success table of both sides invites, where it is not printed.
+
+    r inside each task, in each condition and over all; over all groups rank agreement and errors,
+    MMRV in both orders of its arguments.
+    """
     asked = [claim for claim in claims if claim.statistic == "pearson_r" and not claim.policy]
-    printed = {claim.condition for claim in asked if not claim.task}
-    conditions = [*dict.fromkeys(group.condition for group in groups), ""]
-    findings = _per_task(groups, {claim.task for claim in asked})
-    for condition in dict.fromkeys(conditions):
-        num = sum(condition in ("", group.condition) for group in groups)
-        if condition in printed or (condition and num < FEWEST):
-            continue
-        value, instead = None, ""
-        try:
-            value = _value("pearson_r", "", condition, groups)
-        except UndefinedStatisticError as error:
-            instead = f"undefined: {error.reason}"
-        findings.append(
-            Finding(
-                row=None,
-                what=f"pearson_r {condition or 'all groups'} (n = {num})",
-                printed="",
-                recomputed=value,
-                verdict=NOT_PRINTED,
-                instead=instead,
-            )
-        )
-    return [*findings, *_others(groups, {claim.statistic for claim in claims})]
-
-
-def _others(groups: Sequence[RateGroup], printed: Container[str]) -> list[Finding]:
-    """Rank agreement and errors over all groups, MMRV in both orders of its arguments."""
-    found = []
-    for statistic in ("spearman_rho", "mmrv", "mmrv_sim_gap", "mae_pp", "rmse_pp"):
-        if statistic in printed or len(groups) < FEWEST:
-            continue
-        value, instead = None, ""
-        try:
-            value = _value(statistic, "", "", groups)
-        except UndefinedStatisticError as error:
-            instead = f"undefined: {error.reason}"
-        what = f"{statistic} all groups (n = {len(groups)})"
-        found.append(
-            Finding(
-                row=None,
-                what=what,
-                printed="",
-                recomputed=value,
-                verdict=NOT_PRINTED,
-                instead=instead,
-            )
-        )
-    return found
-
-
-def _per_task(groups: Sequence[RateGroup], printed: Container[str]) -> list[Finding]:
-    """The r inside each task, beside the pooled one that is usually printed."""
-    findings = []
+    whole = [claim.condition for claim in asked if not claim.task]
+    parts: list[tuple[str, str, Sequence[RateGroup]]] = []
     for task in dict.fromkeys(group.task for group in groups):
         members = [group for group in groups if group.task == task]
-        if task in printed or not FEWEST <= len(members) < len(groups):
-            continue
+        if task not in {claim.task for claim in asked} and len(members) < len(groups):
+            parts.append(("pearson_r", task, members))
+    for condition in dict.fromkeys(group.condition for group in groups):
+        if condition and condition not in whole:
+            members = [group for group in groups if group.condition == condition]
+            parts.append(("pearson_r", condition, members))
+    parts = [part for part in parts if len(part[2]) >= FEWEST]
+    if "" not in whole:
+        parts.append(("pearson_r", "all groups", groups))
+    if len(groups) >= FEWEST:
+        others = ("spearman_rho", "mmrv", "mmrv_sim_gap", "mae_pp", "rmse_pp")
+        printed = {claim.statistic for claim in claims}
+        parts += [(each, "all groups", groups) for each in others if each not in printed]
+    findings = []
+    for statistic, words, those in parts:
         value, instead = None, ""
         try:
-            value = _value("pearson_r", "", "", members)
+            value = _value(statistic, "", "", those)
         except UndefinedStatisticError as error:
             instead = f"undefined: {error.reason}"
-        what = f"pearson_r {task} (n = {len(members)})"
-        findings.append(
-            Finding(
-                row=None,
-                what=what,
-                printed="",
-                recomputed=value,
-                verdict=NOT_PRINTED,
-                instead=instead,
-            )
-        )
+        what = f"{statistic} {words} (n = {len(those)})"
+        findings.append(Finding(None, what, "", value, NOT_PRINTED, instead=instead))
     return findings
 
 
@@ -483,6 +385,6 @@ def _table(findings: Sequence[Finding]) -> Table:
         note="A figure fits when it rounds to what is printed. Within the rounding: it does for "
         "rates that round to the printed ones. Fits with arguments swapped: MMRV weighted by the "
         "gap of sim rates, where its definition (Li et al. 2024) weights by the gap of recorded "
-        "rates. Fits otherwise: the note says as what. Ambiguous: several counts round to the "
+        "rates. Ambiguous: several counts round to the "
         "rate, so it has no interval here. Row numbers as in the CSV.",
     )

@@ -26,7 +26,6 @@ from evaluator.compare.protocol_check import as_designed, protocol_results
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.spreadsheet import imported_rows
 from evaluator.compare.states import state_results
-from evaluator.compare.study import retry_table
 from evaluator.compare.summaries import Summaries, evaluation_pool, sum_up
 from evaluator.compare.trial import Trial, lay_out
 from evaluator.metrics.image_options import ImageOptions
@@ -42,7 +41,6 @@ QUIET = Output(quiet=True)
 def compare_run(
     run: RunFolder,
     *,
-    method: str = "wilson",
     images: ImageOptions = ImageOptions(),  # noqa: B008  # frozen
     cache: SummaryCache | None = None,
     output: Output = QUIET,
@@ -58,7 +56,7 @@ def compare_run(
     views = compare_views(contents.derived, contents.sources, net=net, cache=cache)
     methods = compare_renders(images, contents.derived, contents.sources, net=net)
     motions = _imported_motions(contents)
-    base = compare_read([read], name=read.name, method=method)
+    base = compare_read([read], name=read.name)
     # Words of what is missing come first, then those of images and imported motions.
     return replace(
         _with_parts(base, (views, methods, motions)),
@@ -154,7 +152,6 @@ def compare_read(
     *,
     name: str,
     more_rows: Sequence[TrialRow] = (),
-    method: str = "wilson",
 ) -> Comparison:
     """Measure everything that the trials of some runs say together."""
     rows = [row for read in reads for row in read.rows]
@@ -172,18 +169,16 @@ def compare_read(
         stand_in=stand_in_of(
             [*(row.stand_in for row in more_rows), *(mark for r in reads for mark in _marks(r))]
         ),
-        method=method,
         void_causes=tuple(dict.fromkeys(cause for r in reads for cause in r.void_causes)),
         protocol=reads[0].protocol if len(reads) == 1 else None,
     )
     trials = [trial for read in reads for trial in read.trials]
     derived = [file for read in reads for file in read.contents.derived]
-    recorded = [(e.facts.info, e.facts.outcome) for r in reads for e in r.contents.recorded]
     missing = [] if rows else ["trials: the run holds no recorded trial"]
     left_out = [item for read in reads for item in read.exclusions]
     base = replace(
         base,
-        tables=(*with_notes(base.tables, check_settings(trials, derived)), *retry_table(recorded)),
+        tables=with_notes(base.tables, check_settings(trials, derived)),
         exclusions=(*left_out, *base.exclusions, *summaries.left_out),
         missing=(*missing, *base.missing),
         motions=summaries.motions,
@@ -192,18 +187,17 @@ def compare_read(
     parts = (
         motion_results(summaries.motions),
         state_results(summaries.states),
-        label_results(summaries.perceived, rows, method=method),
-        *(_of_protocol(read, method) for read in reads if len(reads) == 1),
+        label_results(summaries.perceived, rows),
+        *(_of_protocol(read) for read in reads if len(reads) == 1),
     )
     return _with_parts(base, parts)
 
 
-def _of_protocol(read: ReadRun, method: str) -> Part:
+def _of_protocol(read: ReadRun) -> Part:
     return protocol_results(
         read.rows,
         read.protocol,
         answers=compare_policies(read.rows, read.protocol, read.void_causes),
-        method=method,
         left_out=read.unread,
         task_hashes=_task_hashes(read.contents),
     )

@@ -1,7 +1,7 @@
-"""Several runs, tables and folders of results in one evaluation: groups over all of them."""
+"""Runs and tables in one evaluation, one or several: groups over all of them."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,18 +10,19 @@ from bridge.episode.provenance import hash_file, software
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.exchange.table_text import AS_SAVED, TableOptions
+from bridge.exchange.trials_rates import RateRecord
 from bridge.terminal import Output
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare.against import against_tables
 from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.intake import PUBLISHED, Left, Taken, look_through, take
-from evaluator.compare.names import settle_names
+from evaluator.compare.intake import PUBLISHED, Taken, take
+from evaluator.compare.measure import refuse_alike
+from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_records
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.run import QUIET, ReadRun, compare_read, read_run
 from evaluator.compare.spreadsheet import row_from_record, unknown_sides
-from evaluator.compare.trial import Trial
-from evaluator.result import Cell, Exclusion, Table
+from evaluator.quantity import slug
 
 ALONE = "of several runs together; evaluate each run alone for it"
 
@@ -30,9 +31,9 @@ ALONE = "of several runs together; evaluate each run alone for it"
 class _Gathered:
     """What the sources hold, before it is measured."""
 
+    name: str
     reads: list[ReadRun] = field(default_factory=list)
     taken: list[Taken] = field(default_factory=list)
-    left: list[Left] = field(default_factory=list)
 
     def rows(self) -> list[TrialRow]:
         """Trials of tables; an id that another table has too is told apart by the file's name."""
@@ -48,32 +49,42 @@ class _Gathered:
         ]
 
 
+def compare_csv(path: Path, options: TableOptions = AS_SAVED) -> Comparison:
+    """Compare one table: trials, rates, or rates with printed figures; its content tells which.
+
+    Raises:
+        TableError: Naming the row that contradicts itself.
+    """
+    return compare_several([path], options=options)
+
+
 def compare_several(
     sources: Sequence[Path],
     *,
-    method: str = "wilson",
     options: TableOptions = AS_SAVED,
     output: Output = QUIET,
 ) -> Comparison:
-    """Compare several runs, tables or folders of results as one study.
+    """Compare runs and tables as one study.
 
     Groups are task x condition x policy over all of them. An episode or trial id that two sources
-    have is told apart by the source's name; a file that is there twice counts once. Starts of one
-    id are one start, wherever they were tried.
+    have is told apart by the source's name; an episode that is there twice counts once. Starts of
+    one id are one start, wherever they were tried.
     """
     refuse_twice(sources)
     with ExitStack() as caches:
         gathered = _gather(sources, options, output, caches)
-    trials = gathered.rows()
-    if not (trials or gathered.reads) and any(each.rates for each in gathered.taken):
-        base = _rates_alone(gathered, sources, method, options)
-    else:
-        base = _trials(gathered, trials, sources, method, options)
-    if not base.measurements:
-        lines = "\n".join(f"  {one.path}: {one.reason}" for one in gathered.left[:12])
-        message = f"Nothing in {_named(sources)} could be read as results.\n{lines}"
-        raise UsageError(message.rstrip())
-    return replace(base, tables=(*base.tables, *_intake_table(gathered, base)))
+    if any(each.kind == PUBLISHED for each in gathered.taken):
+        if len(sources) > 1:
+            raise UsageError("a table of printed figures is checked alone: --check-published.")
+        return check_published(sources[0], options).comparison
+    with_rates = [each for each in gathered.taken if each.rates]
+    if with_rates and (len(with_rates) < len(gathered.taken) or gathered.reads):
+        message = (
+            f"{with_rates[0].path} holds rates, and other sources hold trials: rates that rest on "
+            "them would count twice. Evaluate it alone."
+        )
+        raise UsageError(message)
+    return _rates(gathered) if with_rates else _trials(gathered)
 
 
 def with_against(
@@ -86,88 +97,60 @@ def with_against(
 ) -> Comparison:
     """Add the paired comparison with another twin's answers to the same recorded trials."""
     refuse_twice([source, other])
-    mine, theirs = (answers_of(path, options, output) for path in (source, other))
     tables = against_tables(
-        comparison.rows or mine[0],
-        theirs[0],
+        comparison.rows,
+        answers_of(other, options, output),
         names=(source.resolve().stem, other.resolve().stem),
-        trials=(mine[1], theirs[1]),
     )
     return replace(comparison, tables=(*comparison.tables, *tables))
 
 
 def answers_of(
     path: Path, options: TableOptions = AS_SAVED, output: Output = QUIET
-) -> tuple[Sequence[TrialRow], Sequence[Trial]]:
-    """Read trials with the twin's answers, and of a run the replays behind them."""
-    if not (path / "episodes").is_dir():
-        return list(map(row_from_record, take(path, options).trials)), ()
+) -> Sequence[TrialRow]:
+    """Read trials with the twin's answers."""
+    if not is_run(path):
+        return list(map(row_from_record, take(path, options).trials))
     run = RunFolder.open(path)
     with SummaryCache(run.results_dir / FOLDER, say=output.say) as cache:
-        read = read_run(run, cache, output)
-    return read.rows, read.trials
+        return read_run(run, cache, output).rows
+
+
+def is_run(path: Path) -> bool:
+    """Say whether a folder is one of a run."""
+    return any((path / name).is_dir() for name in ("episodes", "derived", "scene", "notes"))
 
 
 def refuse_twice(sources: Sequence[Path]) -> None:
     """Refuse a source that is given twice: its trials would count double."""
-    seen: set[Path] = set()
+    seen: dict[str, Path] = {}
     for source in sources:
-        if source.resolve() in seen:
-            message = f"{source} is given twice; its trials would count double."
-            raise UsageError(message)
-        seen.add(source.resolve())
-
-
-def _named(sources: Sequence[Path]) -> str:
-    return " + ".join(source.resolve().name for source in sources)
+        same = hash_file(source) if source.is_file() else str(source.resolve())
+        if same in seen:
+            like = "" if seen[same] == source else f", once as {seen[same]}"
+            raise UsageError(f"{source} is given twice{like}; its trials would count double.")
+        seen[same] = source
 
 
 def _gather(
-    sources: Sequence[Path],
-    options: TableOptions,
-    output: Output,
-    caches: ExitStack,
+    sources: Sequence[Path], options: TableOptions, output: Output, caches: ExitStack
 ) -> _Gathered:
-    gathered = _Gathered()
+    name = " + ".join(source.resolve().name for source in sources)
+    if len(sources) == 1 and sources[0].is_file():
+        name = sources[0].stem
+    gathered = _Gathered(name=name)
     for source in sources:
-        if (source / "episodes").is_dir():
+        if is_run(source):
             run = RunFolder.open(source)
             cache = SummaryCache(run.results_dir / FOLDER, say=output.say)
             read = read_run(run, caches.enter_context(cache), output)
             gathered.reads.append(_with_own_ids(read, gathered.reads))
         elif source.is_dir():
-            taken, left = look_through(source, options)
-            gathered.taken += taken
-            gathered.left += left
+            message = f"{source} holds no episodes. Give a run folder, or tables: {source}/*.csv."
+            raise UsageError(message)
         else:
             gathered.taken.append(take(source, options))
-    kept = _without_copies(gathered)
-    for each in kept.taken:
-        output.say(f"Read {each.summary}.")
-    for one in kept.left:
-        output.say(f"Left {one.path}: {one.reason}")
-    return kept
-
-
-def _without_copies(gathered: _Gathered) -> _Gathered:
-    """Leave out tables of figures, copies, and rates where there are trials."""
-    hashes: dict[str, Path] = {}
-    has_trials = bool(gathered.reads) or any(each.trials for each in gathered.taken)
-    kept, left = [], list(gathered.left)
-    for each in gathered.taken:
-        reason = ""
-        if each.path.is_file():
-            first = hashes.setdefault(hash_file(each.path), each.path)
-            reason = "" if first == each.path else f"the same bytes as {first}"
-        if each.kind == PUBLISHED:
-            reason = "printed figures: --check-published reads it"
-        elif each.rates and has_trials:
-            reason = "rates, and there are trials: rates that rest on them would count twice"
-        if reason:
-            left.append(Left(path=each.path, reason=reason))
-        else:
-            kept.append(each)
-    return _Gathered(reads=gathered.reads, taken=kept, left=left)
+    return gathered
 
 
 def _with_own_ids(read: ReadRun, earlier: Iterable[ReadRun]) -> ReadRun:
@@ -185,39 +168,25 @@ def _with_own_ids(read: ReadRun, earlier: Iterable[ReadRun]) -> ReadRun:
     return read
 
 
-def _trials(
-    gathered: _Gathered,
-    trials: Sequence[TrialRow],
-    sources: Sequence[Path],
-    method: str,
-    options: TableOptions,
-) -> Comparison:
+def _trials(gathered: _Gathered) -> Comparison:
     """Measure trials of runs and tables together."""
-    inside = [row for read in gathered.reads for row in read.rows]
-    settled, merged = settle_names([*inside, *trials], options.names)
-    new = {row.episode: row for row in settled}
-    reads = [replace(read, rows=[new[row.episode] for row in read.rows]) for read in gathered.reads]
-    rows = settled[len(inside) :]
-    if reads:
-        base = compare_read(reads, name=_named(sources), more_rows=rows, method=method)
-        base = replace(
-            base, missing=(*base.missing, f"images: {ALONE}", f"imported motions: {ALONE}")
-        )
+    rows = gathered.rows()
+    if rows:
+        together = [*(row for read in gathered.reads for row in read.rows), *rows]
+        refuse_slips((row, row.episode) for row in together)
+    if gathered.reads:
+        base = compare_read(gathered.reads, name=gathered.name, more_rows=rows)
+        alone = (f"images: {ALONE}", f"imported motions: {ALONE}")
+        base = replace(base, missing=(*base.missing, *alone))
     else:
-        base = compare_rows(
-            rows,
-            run=_named(sources),
-            source="trials",
-            stand_in=stand_in_of(row.stand_in for row in rows),
-            method=method,
-        )
-    return _from(base, gathered, unknown_sides(rows), merged)
+        stand_in = stand_in_of(row.stand_in for row in rows)
+        base = compare_rows(rows, run=gathered.name, source="trials", stand_in=stand_in)
+    base = replace(base, exclusions=(*unknown_sides(rows), *base.exclusions))
+    return _from(base, gathered)
 
 
-def _rates_alone(
-    gathered: _Gathered, sources: Sequence[Path], method: str, options: TableOptions
-) -> Comparison:
-    """Measure rates of several tables together; a cell that two tables give is refused."""
+def _rates(gathered: _Gathered) -> Comparison:
+    """Measure rates of tables together; a cell that two tables give is refused."""
     seen: dict[tuple[str, ...], Path] = {}
     for each in gathered.taken:
         for record in each.rates:
@@ -227,43 +196,29 @@ def _rates_alone(
                 message = f"{cell} stands in {seen[key]} and in {each.path}. Give each cell once."
                 raise UsageError(message)
     records = [record for each in gathered.taken for record in each.rates]
-    settled, merged = settle_names(records, options.names)
-    base = compare_records(settled, gathered.taken[0].path, method=method)
-    return _from(replace(base, run=_named(sources)), gathered, (), merged)
+    refuse_slips((record, f"row {record.row}") for record in records)
+    return _from(compare_records(records, gathered.name), gathered)
 
 
-def _from(
-    base: Comparison,
-    gathered: _Gathered,
-    left_out: Iterable[Exclusion],
-    merged: Sequence[str],
-) -> Comparison:
-    """Add where everything came from, and what was left."""
-    files: Mapping[str, str] = {
-        str(each.path): hash_file(each.path) for each in gathered.taken if each.path.is_file()
-    }
-    provenance = {
-        **(base.provenance or {"software": software()}),
-        "files": files,
-        "read_as": [*(each.summary for each in gathered.taken), *merged],
-    }
-    return replace(base, provenance=provenance, exclusions=(*left_out, *base.exclusions))
+def refuse_slips(named: Iterable[tuple[TrialRow | RateRecord, str]]) -> None:
+    """Refuse names of a table that differ only by case, blanks or signs.
+
+    Raises:
+        AlikeNamesError: Naming both and where they stand.
+    """
+    found = list(named)
+    for kind in ("task", "condition", "policy"):
+        names = ((getattr(each, kind), where) for each, where in found)
+        refuse_alike(kind, names, lambda name: slug(name.casefold()))
 
 
-def _intake_table(gathered: _Gathered, base: Comparison) -> tuple[Table, ...]:
-    """Say of every source what it was taken for, or why it was left."""
-    rows: list[dict[str, Cell]] = []
-    for read in gathered.reads:
-        holds = f"{len(read.rows):,} trials"
-        rows.append({"source": str(read.run.path), "taken for": "run", "holds": holds})
-    for each in gathered.taken:
-        num = len(each.trials) + len(each.rates)
-        holds = f"{num:,} {'rates' if each.rates else 'trials'}"
-        rows.append({"source": str(each.path), "taken for": each.kind, "holds": holds})
-    rows += [
-        {"source": str(one.path), "taken for": "left", "holds": one.reason} for one in gathered.left
-    ]
-    if not rows:
-        return ()
-    title = f"What was read, and what was left ({len(base.groups)} groups)"
-    return (Table.of(rows, id="intake", title=title),)
+def _from(base: Comparison, gathered: _Gathered) -> Comparison:
+    """Add where everything came from."""
+    return replace(
+        base,
+        provenance={
+            **(base.provenance or {"software": software()}),
+            "files": {str(each.path): hash_file(each.path) for each in gathered.taken},
+            "read_as": [each.summary for each in gathered.taken],
+        },
+    )

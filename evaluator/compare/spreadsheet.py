@@ -1,19 +1,11 @@
-"""A trials CSV into a ``Comparison``; a run's trials out again."""
+"""Lines of a trials CSV as trial rows, and back."""
 
 from collections.abc import Container, Sequence
-from dataclasses import fields, replace
-from pathlib import Path
+from dataclasses import fields
 
-from bridge.episode.provenance import hash_file, software
 from bridge.episode.run_folder import RunFolder
-from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.exchange.trials_csv import TrialRecord, read_trials, trials_path
-from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.intake import PUBLISHED, Taken, take
-from evaluator.compare.names import settle_names
-from evaluator.compare.published import check_published
-from evaluator.compare.rates import compare_records
-from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
+from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import unpaired_keys
 from evaluator.result import Exclusion
 
@@ -52,45 +44,6 @@ def imported_rows(
     return [row for row in rows if row.episode not in recorded_ids], doubled
 
 
-def compare_csv(
-    path: Path,
-    *,
-    method: str = "wilson",
-    options: TableOptions = AS_SAVED,
-) -> Comparison:
-    """Compare a table; its content tells which.
-
-    Read are a trials CSV, a rates CSV, a published table (rates with printed figures) and a JSON
-    list of trials or rates.
-
-    Raises:
-        TableError: Naming the row that contradicts itself.
-    """
-    return compare_taken(take(path, options), method=method, options=options)
-
-
-def compare_taken(
-    taken: Taken,
-    *,
-    method: str = "wilson",
-    options: TableOptions = AS_SAVED,
-) -> Comparison:
-    """Compare what one file or folder holds."""
-    path, read_as = taken.path, [taken.summary]
-    if taken.kind == PUBLISHED:
-        return check_published(path, method=method, options=options).comparison
-    if taken.rates:
-        settled, merged = settle_names(taken.rates, options.names)
-        base = compare_records(settled, path, method=method)
-        return replace(base, provenance={**base.provenance, "read_as": [*read_as, *merged]})
-    settled_rows, merged = settle_names(map(row_from_record, taken.trials), options.names)
-    stand_in = stand_in_of(record.stand_in for record in taken.trials)
-    base = compare_rows(
-        settled_rows, run=path.stem, source="trials", stand_in=stand_in, method=method
-    )
-    return _with_source(base, path, unknown_sides(settled_rows), [*read_as, *merged])
-
-
 def unknown_sides(rows: Sequence[TrialRow]) -> list[Exclusion]:
     """Trials that lack a side; of an unpaired group all do, and each side counts on its own."""
     unpaired = unpaired_keys(rows)
@@ -115,18 +68,3 @@ def record_from_row(row: TrialRow) -> TrialRecord:
     if row.unit == "trial" and row.recorded is not None:
         shared |= {"k": int(row.recorded), "n": 1}
     return TrialRecord(trial_id=row.episode, **shared)
-
-
-def _with_source(
-    base: Comparison, path: Path, left_out: Sequence[Exclusion], read_as: Sequence[str]
-) -> Comparison:
-    return replace(
-        base,
-        exclusions=(*left_out, *base.exclusions),
-        provenance={
-            "software": software(),
-            "file": path.name,
-            "sha256": hash_file(path) if path.is_file() else None,
-            "read_as": list(read_as),
-        },
-    )

@@ -1,12 +1,13 @@
 """Where trials are lost: the stage funnel, kinds of failure."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from evaluator.compare.measure import proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.measurements import STAGE
 from evaluator.result import Exclusion, Measurement, Table
-from evaluator.statistics.funnel import failure_taxonomy, funnel
+from evaluator.statistics.funnel import funnel
 
 NOT_LABELLED, NO_STAGE = "stage not labelled", "no stage, but the task"
 """Stand for the stage of a failure of which nobody named one."""
@@ -82,16 +83,17 @@ def stage_results(
 
 def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
     """Count what failed first: in the twin by clause and cause, recorded by stage."""
-    twin = failure_taxonomy(
-        (row.first_failing or "unknown", row.failing_cause or "")
+    twin = Counter(
+        ("sim planned", row.first_failing or "unknown", row.failing_cause or "")
         for row in rows
         if row.sim_planned is False
     )
-    recorded = failure_taxonomy(
-        (first_failed_stage(row), "") for row in rows if row.recorded is False
-    )
-    lines = [("sim planned", kind.clause, kind.cause, kind.count) for kind in twin]
-    lines += [(word, kind.clause, kind.cause, kind.count) for kind in recorded]
+    recorded = Counter((word, first_failed_stage(row), "") for row in rows if row.recorded is False)
+    lines = [
+        (*kind, count)
+        for counts in (twin, recorded)
+        for kind, count in sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    ]
     if not lines:
         return ()
     return (

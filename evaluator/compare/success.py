@@ -8,22 +8,16 @@ from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import CONTROL
 from bridge.episode.metadata import WITH as WITH
 from bridge.episode.metadata import WITHOUT as WITHOUT
-from evaluator.compare.measure import measured, proportion
+from evaluator.compare.measure import proportion
 from evaluator.compare.rows import RateGroup, TrialRow
-from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
-    AVERAGE_MACRO,
-    AVERAGE_POOLED,
     RATE_BY_UNIT,
-    RATE_VARIED,
     RATES,
     RATES_IN_COMMON,
-    SELECTION_BIAS,
     Defined,
     Quantity,
 )
 from evaluator.result import Measurement
-from evaluator.statistics.agreement import counted_groups, mean_rate
 
 CONDITION_OF_ARM = {"without": WITHOUT, "with": WITH, "control": CONTROL}
 """What the trials of a study arm are grouped by."""
@@ -75,7 +69,6 @@ def answered(
     answer: Answer,
     *,
     reason_if_undefined: str,
-    method: str = "wilson",
 ) -> Measurement:
     """Measure the share of yes among the trials whose answer is known."""
     known = [row for row in rows if answer(row) is not None]
@@ -86,11 +79,10 @@ def answered(
         counted="trial",
         reason_if_undefined=reason_if_undefined,
         episodes=names_of(known),
-        method=method,
     )
 
 
-def side_rates(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
+def side_rates(rows: Sequence[TrialRow]) -> list[Measurement]:
     """Measure every side of every group, counted in trials; object counts beside them."""
     measurements = []
     for key, members in group_rows(rows).items():
@@ -103,10 +95,9 @@ def side_rates(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Meas
                     reason_if_undefined="no plan"
                     if side == "sim_planned" and _without_plans(members)
                     else f"none of {trials_in(members)} trials has it",
-                    method=method,
                 )
             )
-        measurements.extend(_counted_rate(key, members, method))
+        measurements.extend(_counted_rate(key, members))
     return measurements
 
 
@@ -114,7 +105,7 @@ def _without_plans(rows: Sequence[TrialRow]) -> bool:
     return all(row.plan_id == NO_PLAN for row in rows)
 
 
-def _counted_rate(key: Key, members: Sequence[TrialRow], method: str) -> list[Measurement]:
+def _counted_rate(key: Key, members: Sequence[TrialRow]) -> list[Measurement]:
     """Measure objects or sub-tasks where trials are counted in them; never two units together."""
     counted = [row for row in members if row.unit != "trial" and row.k is not None and row.n]
     if not counted:
@@ -131,14 +122,11 @@ def _counted_rate(key: Key, members: Sequence[TrialRow], method: str) -> list[Me
             counted=unit,
             reason_if_undefined=f"trials are counted in different units: {firsts}",
             episodes=names_of(counted),
-            method=method,
         )
     ]
 
 
-def rate_groups(
-    rows: Sequence[TrialRow], rates: Sequence[Measurement], *, method: str = "wilson"
-) -> tuple[RateGroup, ...]:
+def rate_groups(rows: Sequence[TrialRow], rates: Sequence[Measurement]) -> tuple[RateGroup, ...]:
     """Lay the recorded and the headline sim rate of each group side by side.
 
     Over the trials where both sides are known; where there is none, each side over its own trials.
@@ -156,7 +144,6 @@ def rate_groups(
                 both,
                 SIDES[side],
                 reason_if_undefined="no trial has both sides",
-                method=method,
             )
             for side, common in RATES_IN_COMMON.items()
         )
@@ -210,124 +197,6 @@ def trial_table(
     return table[0], table[1], table[2], table[3]
 
 
-def averages(groups: Sequence[RateGroup], *, method: str = "wilson") -> list[Measurement]:
-    """Average over groups of a condition: macro (groups alike) and pooled (trials alike)."""
-    measurements = []
-    for condition in dict.fromkeys(group.condition for group in groups):
-        members = [group for group in groups if group.condition == condition]
-        if len(members) < 2:
-            continue
-        for side in ("recorded", "sim_planned"):
-            rates = [group.recorded if side == "recorded" else group.sim for group in members]
-            measurements += _averages(side, condition, members, rates, method)
-    return measurements
-
-
-def _averages(
-    side: str,
-    condition: str,
-    members: Sequence[RateGroup],
-    rates: Sequence[Measurement],
-    method: str,
-) -> list[Measurement]:
-    units = sorted({group.unit for group in members})
-    over = counted_groups(len(members))
-    countable = len(units) == 1 and all(rate.k is not None and rate.n for rate in rates)
-    why = f"groups are counted in different units ({', '.join(units)})"
-    why = why if len(units) > 1 else "the number of trials of a group is not known"
-    words = {"side": side, "condition": condition, "over": over}
-    episodes = [episode for rate in rates for episode in rate.episodes]
-    return [
-        measured(
-            AVERAGE_MACRO.of(**words),
-            lambda: _macro(rates),
-            n=len(members),
-            counted="group",
-            reason_without_interval="the groups are these, not a sample of others",
-            episodes=episodes,
-        ),
-        proportion(
-            AVERAGE_POOLED.of(**words, unit=units[0]),
-            sum(rate.k or 0 for rate in rates) if countable else 0,
-            sum(rate.n or 0 for rate in rates) if countable else 0,
-            counted=units[0],
-            reason_if_undefined=why,
-            episodes=episodes,
-            method=method,
-        ),
-    ]
-
-
-def _macro(rates: Sequence[Measurement]) -> float:
-    undefined = [rate for rate in rates if rate.value is None]
-    if undefined:
-        raise UndefinedStatisticError(statistic="average", reason=f"{undefined[0].id} is undefined")
-    return mean_rate([rate.value for rate in rates if rate.value is not None])
-
-
 def of_group(quantity: Quantity, key: Key, **words: object) -> Defined:
     """Name a measurement of one task, condition and policy."""
     return quantity.of(task=key[0], condition=key[1], policy=key[2], **words)
-
-
-# Sim estimated again with fresh seeds. With replanning the accepted plan was selected by the twin,
-# so its one nominal replay is optimistic by that selection (the winner's curse).
-# ``robot-gst replay RUN --samples K`` replays each plan K more times with everything varied that is
-# not known exactly. The gate used none of those draws: those of a replay are named after its
-# recording, those of a gate after the start it was asked about.
-
-NO_INTERVAL = "means of shares are no counts, and no interval of them was checked for its coverage"
-
-
-def varied_sim(rows: Sequence[TrialRow]) -> list[Measurement]:
-    """Estimate the twin's rates again from varied replays, beside the nominal ones.
-
-    Returns:
-        Per task, condition and policy with varied replays: ``rate.sim_varied.*``, and
-        ``bias.selection.*``, how far the nominal replays of the same trials lie above them [pp].
-        Nothing where no trial has varied replays.
-    """
-    found: list[Measurement] = []
-    for key, members in group_rows(rows).items():
-        there = [row for row in members if row.sim_varied is not None]
-        if there:
-            found += [_again(key, there), _gap(key, there)]
-    return found
-
-
-def _again(key: Key, rows: Sequence[TrialRow]) -> Measurement:
-    return measured(
-        of_group(RATE_VARIED, key),
-        lambda: _mean(rows),
-        n=len(rows),
-        counted="trial",
-        reason_without_interval=NO_INTERVAL,
-        episodes=names_of(rows),
-    )
-
-
-def _gap(key: Key, rows: Sequence[TrialRow]) -> Measurement:
-    both = [row for row in rows if row.sim_planned is not None]
-
-    def gap_pp() -> float:
-        if not both:
-            reason = "no nominal planned replay of these trials was decided"
-            raise UndefinedStatisticError(statistic="selection", reason=reason)
-        return 100 * (_nominal(both) / len(both) - _mean(both))
-
-    return measured(
-        of_group(SELECTION_BIAS, key),
-        gap_pp,
-        n=len(both),
-        counted="trial",
-        reason_without_interval=NO_INTERVAL,
-        episodes=names_of(both),
-    )
-
-
-def _mean(rows: Sequence[TrialRow]) -> float:
-    return sum(row.sim_varied for row in rows if row.sim_varied is not None) / len(rows)
-
-
-def _nominal(rows: Sequence[TrialRow]) -> int:
-    return sum(row.sim_planned is True for row in rows)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bridge.errors import UsageError
-from bridge.exchange.table_text import UNKNOWN, answer_of
+from bridge.exchange.table_text import ENDED, UNKNOWN, answer_of
 
 LABELS = {
     "task": "task tasks task_name scenario scenarios aufgabe tache experiment benchmark env",
@@ -15,6 +15,7 @@ LABELS = {
     "condition": "condition study_arm bedingung",
     "trial": "trial trial_id trial_number episode episode_id rollout attempt id nr versuch essai",
     "start_id": "start_id start initial_condition init_state",
+    "unit": "unit",
     "side": "side domain environment sim_or_real real_or_sim where seite",
 }
 """Our name of a column that says what a row is about, and other people's."""
@@ -61,14 +62,14 @@ KNOWN = (*_LABEL, *_SIDE, *_FIGURE)
 _N_INSIDE = re.compile(r"\(?\b[nN]\s*=\s*(\d+)\)?")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Column:
     """What a column holds, by its name alone."""
 
     place: int
     name: str
     label: str = ""
-    """task, policy, condition, trial, start_id or side."""
+    """task, policy, condition, trial, start_id, unit or side."""
     side: str = ""
     figure: str = ""
     """k, n, rate, percent or outcome."""
@@ -166,6 +167,8 @@ class Figure:
     """As printed, with a point."""
     percent: bool = False
     answer: bool | None = None
+    ended: bool = False
+    """Whether it says how a trial ended that has no outcome."""
 
     @property
     def is_certain(self) -> bool:
@@ -210,6 +213,8 @@ def read_cell(row: int, text: str) -> Figure | None:
         if not 0 <= k <= n or not n:
             raise CellError(f"{k} of {n} is not a possible count")
         return Figure(row=row, text=text, k=k, n=n)
+    if cut.lower() in ENDED:
+        return Figure(row=row, text=cut, ended=True)
     answer = answer_of(cut)
     if share := _SHARE.fullmatch(cut):
         number = _pointed(share[1], percent=bool(share[2]))

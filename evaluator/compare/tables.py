@@ -3,24 +3,12 @@
 from collections.abc import Sequence
 
 from evaluator.compare.gate import confusion_of, heeded_verdict, unheeded_verdict
-from evaluator.compare.measure import RATE_COLUMNS, ends, rate_row
+from evaluator.compare.measure import RATE_COLUMNS, rate_row
 from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.compare.success import WITH, WITHOUT
-from evaluator.measurements import (
-    AVERAGE_MACRO,
-    AVERAGE_POOLED,
-    GAIN_POINTS,
-    GAIN_POINTS_AVERAGE,
-    GAIN_RELATIVE,
-    GAIN_RELATIVE_AVERAGE,
-)
 from evaluator.result import Cell, Measurement, Table
 
 MEAN_OF_TASKS = "mean of tasks"
-AVERAGES = {kind: f"average, {kind}" for kind in ("macro", "pooled")}
-"""What lines of averages say in the column of tasks."""
-
-
 EXECUTED = "executed in twin"
 """The twin's side of a group in which nobody published a plan."""
 EXECUTED_NOTE = "executed in twin: the recorded joints, replayed dynamically; there was no plan."
@@ -28,7 +16,7 @@ SIM_NOTE = (
     "sim: planned-in-twin, dynamic, of the plan actually sent, replayed from the start localised "
     "again in the recording. With replanning the twin selected the accepted plans, so their sim is "
     "optimistic by that selection: the replay has the gate's engine and nominal physics and draws "
-    "nothing new. Replays with --samples estimate it again with fresh seeds, in its own table. "
+    "nothing new. "
     "A trial in which no plan was sent has an outcome and no sim."
 )
 
@@ -38,8 +26,6 @@ UNPAIRED_NOTE = "Each side counts its own trials; none was made on both."
 
 METHOD_NAMES = {
     "wilson": "Wilson",
-    "clopper-pearson": "Clopper-Pearson",
-    "jeffreys": "Jeffreys",
     "score": "score",
     "tango": "Tango",
     "repeated-score": "repeated score",
@@ -57,6 +43,7 @@ def _brackets(shown: Sequence[Measurement]) -> str:
 
 def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "") -> Table:
     """Success without and with replanning, in the twin and recorded."""
+    twin = not source_note or any(group.shown_sim.value is not None for group in groups)
     paired = any(group.trial_table is not None for group in groups)
     one_sided = any(group.sim.n for group in groups) and not paired
     without_plans = all(group.executed is not None for group in groups)
@@ -80,6 +67,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
             ("sim" if group.executed is None else EXECUTED, group.shown_sim),
             (word, group.recorded),
         )
+        if twin or rate is group.recorded
     )
     return Table(
         id="success",
@@ -103,51 +91,7 @@ def _gap(group: RateGroup) -> float | None:
     return round(float(100 * (group.sim_rate - group.recorded_rate)), 1)
 
 
-def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
-    """The replanning gain: percentage points and relative gain are two columns; none without."""
-    if not gains:
-        return ()
-    by_id = {gain.id: gain for gain in gains}
-    found = []
-    for gain in gains:
-        for points, relative in (
-            (GAIN_POINTS, GAIN_RELATIVE),
-            (GAIN_POINTS_AVERAGE, GAIN_RELATIVE_AVERAGE),
-        ):
-            if parts := points.pattern.fullmatch(gain.id):
-                named = parts.groupdict()
-                found.append((named, gain, by_id[relative.id.format(**named)]))
-                break
-    rows = [
-        (
-            named.get("task", MEAN_OF_TASKS),
-            named.get("policy", "").removesuffix("-"),
-            word if named["side"] == "recorded" else "sim",
-            gain.value,
-            *ends(gain.interval),
-            None if gain.interval is None else gain.interval.method,
-            relative.value,
-            gain.reason_if_undefined or relative.reason_if_undefined,
-        )
-        for named, gain, relative in found
-    ]
-    table = Table(
-        id="gains",
-        title="Gain with replanning",
-        columns=(
-            *("task", "policy", "side", "gain (pp)", "low", "high", "interval"),
-            *("relative gain", "why undefined"),
-        ),
-        rows=tuple(rows),
-        note=f"Two different numbers. {_brackets([gain for _, gain, _ in found])} Groups count as "
-        "unpaired; an interval that reaches below 0 does not show a gain.",
-    )
-    return (table,)
-
-
-def layout_table(
-    groups: Sequence[RateGroup], measurements: Sequence[Measurement], word: str
-) -> tuple[Table, ...]:
+def layout_table(groups: Sequence[RateGroup], word: str) -> tuple[Table, ...]:
     """Lay rates out as papers print them: a row per task, sim and recorded without and with."""
     conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in groups)]
     if len(conditions) < 2:
@@ -162,15 +106,9 @@ def layout_table(
             values = [group.sim.value, group.recorded.value] if group else [None, None]
             line += values[-len(sides) :]
         rows.append(tuple(line))
-    by_id = {measurement.id: measurement for measurement in measurements}
-    for kind, average in (("macro", AVERAGE_MACRO), ("pooled", AVERAGE_POOLED)):
-        ids = [
-            average.of(side=side, condition=condition, over="", unit="").id
-            for condition in conditions
-            for side in ("sim_planned", "recorded")[-len(sides) :]
-        ]
-        if all(name in by_id for name in ids):
-            rows.append((AVERAGES[kind], "", *(by_id[name].value for name in ids)))
+    if len(rows) > 1:
+        rates = [[row[place] for row in rows] for place in range(2, len(rows[0]))]
+        rows.append((MEAN_OF_TASKS, "", *map(_mean, rates)))
     columns = [
         f"{side}, {condition.replace('_', ' ')}" for condition in conditions for side in sides
     ]
@@ -180,10 +118,14 @@ def layout_table(
             title="Success without and with replanning",
             columns=("task", "policy", *columns),
             rows=tuple(rows),
-            note="Macro: every task counts the same. Pooled: every trial counts the same; "
-            "undefined where tasks are counted in different units.",
+            note="In the mean every line counts the same.",
         ),
     )
+
+
+def _mean(values: Sequence[Cell]) -> float | None:
+    known = [value for value in values if isinstance(value, float)]
+    return sum(known) / len(known) if len(known) == len(values) else None
 
 
 def trials_table(rows: Sequence[TrialRow], word: str) -> Table:

@@ -160,7 +160,6 @@ def _row(
         sim_executed=found["executed"].accepted,
         verdict=None if verdict is None else verdict.accepted,
         p_success=next((p for p in probabilities if p is not None), None),
-        sim_varied=None if planned.verdict is None else planned.verdict.varied_share,
         first_failing=None if failing is None else failing.first_failing,
         failing_detail=None if failing is None else failing.failing_detail,
         failing_cause=None if failing is None else failing.failing_cause,

@@ -32,8 +32,6 @@ class StudyOptions:
     """Draws the order of the starts, of the policies and arms on each, and the codes."""
     blind: bool = False
     """Name arms by codes in the operator's list."""
-    interval: str = "wilson"
-    """Interval of rates: wilson, clopper-pearson or jeffreys."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that no study can have."""

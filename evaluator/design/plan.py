@@ -27,7 +27,6 @@ from bridge.whole_file import write_whole
 from evaluator.compare.success import CONDITION_OF_ARM
 from evaluator.design.config import StudyOptions, Wanted
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.intervals import RATE_INTERVALS
 from evaluator.statistics.sequential import (
     Chances,
     chances,
@@ -105,9 +104,6 @@ def design(study: StudyOptions, wanted: Wanted) -> Design:
 
 def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
     """Lay out all but the number of starts."""
-    if study.interval not in RATE_INTERVALS:
-        names = ", ".join(RATE_INTERVALS)
-        raise UsageError(f"--interval {study.interval!r} is unknown. There are: {names}.")
     for arm in study.arms:
         if arm not in STUDY_ARMS:
             raise UsageError(f"--arms {arm!r} is unknown. There are: {', '.join(STUDY_ARMS)}.")
@@ -125,7 +121,6 @@ def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
         stopping="sequential",
         primary=primary,
         secondary=tuple(secondary),
-        interval=study.interval,
         alpha=wanted.alpha,
         codes=blinding_codes(policies, study.study_seed) if study.blind else {},
     )
@@ -239,7 +234,7 @@ def order_list(protocol: Protocol) -> bytes:
     return text.getvalue().encode()
 
 
-def design_text(made: Design, written: Protocol, run_path: Path, study: StudyOptions) -> str:
+def design_text(made: Design, written: Protocol, run_path: Path) -> str:
     """Return the design in words."""
     protocol = made.protocol
     arms = sum(len(policy.arms) for policy in protocol.policies)
@@ -257,27 +252,10 @@ def design_text(made: Design, written: Protocol, run_path: Path, study: StudyOpt
         f"Locked: {run_path / FILE_NAME}, sha256 {written.sha256}",
         f"Order: {run_path / ORDER_FILE}, interleaved by --study-seed {protocol.study_seed}"
         + (", arms by code" if protocol.codes else ""),
-        f"On the stand-in cell: {trials_command(run_path, protocol, study)}",
-        f"Elsewhere: fill in {ORDER_FILE}, robot-gst import trials {run_path / ORDER_FILE} "
+        f"Then: fill in {ORDER_FILE}, robot-gst import trials {run_path / ORDER_FILE} "
         f"{run_path}, robot-gst evaluate {run_path}",
     ]
     return "\n".join(lines)
-
-
-def trials_command(run_path: Path, protocol: Protocol, study: StudyOptions) -> str:
-    """Return the command that carries a design out on the stand-in cell."""
-    words = ["robot-gst", "trials", str(run_path)]
-    for name, values in (
-        ("--task", study.task),
-        ("--policies", study.policies),
-        ("--arms", study.arms),
-    ):
-        words += [word for value in values for word in (name, value)]
-    words += ["--trials", str(protocol.tasks[0].starts), "--rounds", str(protocol.rounds)]
-    words += ["--seed", str(study.seed), "--study-seed", str(protocol.study_seed)]
-    if study.coin is not None and "control" in study.arms:
-        words += ["--coin", f"{study.coin:g}"]
-    return " ".join(words)
 
 
 def design_record(made: Design, written: Protocol) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """The first two pages: what an evaluation means, in one line per task, before any table."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ from evaluator.quantity import noun
 from evaluator.report.sections import HEADLINES
 from evaluator.report.wording import agreeing_side
 from evaluator.result import Cell, Measurement, Results, Table
+from evaluator.statistics.intervals import wilson
 
 SHOWN_TASKS = 8
 """Tasks with a line; the table holds the others."""
@@ -43,8 +43,6 @@ class Front:
     more_tasks: int
     notes: Sequence[tuple[str, str]]
     """What must be known before a number is used."""
-    unseen: str
-    """What so few trials could not have shown."""
     missing: Sequence[str]
     more_missing: int
 
@@ -68,7 +66,6 @@ def front(results: Results) -> Front:
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
-        unseen=_unseen(rows),
         missing=[_short(text) for text in missing[:SHOWN_MISSING]],
         more_missing=max(0, len(missing) - SHOWN_MISSING),
     )
@@ -79,12 +76,47 @@ def _compared(results: Results) -> list[str]:
     table = next((t for t in results.tables if t.id == "comparisons"), None)
     rows = [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
     sentences = [str(row["answer"]) for row in rows if row["task"] == ALL_TASKS]
-    found = [f"{text[0].upper()}{text[1:]}." for text in sentences[:SHOWN_ANSWERS]]
+    heads = ("undecided", "no difference")  # others begin with a name, which keeps its letters
+    standing, beaten = _standing(results)
+    if standing:  # it says who is worse; what is open between those who may be best is left
+        sentences = [
+            text
+            for text in sentences
+            if text.startswith("undecided")
+            and not any(f": {name} " in text or f", {name} " in text for name in beaten)
+        ]
+    found = standing + [
+        f"{text[0].upper()}{text[1:]}." if text.startswith(heads) else f"{text}."
+        for text in sentences[: SHOWN_ANSWERS - len(standing)]
+    ]
+    if alike := _all_alike(results):
+        return [*alike, *found]
     regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
     if regret is not None and regret.value is not None:
         ends = _ends(regret, ".0f")
         found.append(f"Taking what sim ranks first costs {_points(regret.value)}{ends}.")
     return found
+
+
+def _standing(results: Results) -> tuple[list[str], list[str]]:
+    """Say which of three candidates and more may be best, and return the others.
+
+    Nothing where it may be any of them.
+    """
+    table = next((t for t in results.tables if t.id == "standing"), None)
+    rows = [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
+    best = [row for row in rows if row["may be best"] == "yes"]
+    beaten = [str(row["candidate"]) for row in rows if row["may be best"] == "no"]
+    if not beaten:
+        return [], []
+    if len(best) > 1:
+        listed = ", ".join(str(row["candidate"]) for row in best[:SHOWN_TASKS])
+        more = " ..." if len(best) > SHOWN_TASKS else ""
+        return [f"{len(best)} of {len(rows)} candidates may be best: {listed}{more}."], beaten
+    counts = " ".join(f"with {row['k']} of {row['n']}" for row in best)
+    name = best[0]["candidate"]
+    words = f"{name} is best of {len(rows)} candidates, {counts}: every other one is shown to be "
+    return [f"{words}worse than another; stop here."], beaten
 
 
 def conclusions(results: Results) -> list[Row]:
@@ -166,6 +198,8 @@ def _ranking_words(row: Row) -> str:
         return "enough to rank: no, the best two are level"
     if ranked == "no n":
         return f"{best} looks best; without counts nothing says how surely"
+    if str(ranked).startswith("counted in"):
+        return f"{best} looks best; {ranked}, which are not independent, so no test says how surely"
     trials = "far more trials would be needed"
     if isinstance(more, int):
         trials = f"{more} more {noun('trial', more)} would do"
@@ -174,7 +208,7 @@ def _ranking_words(row: Row) -> str:
 
 def _summary(results: Results, num_tasks: int) -> list[str]:
     by_id = {m.id: m for m in results.measurements}
-    parts = _all_alike(results)
+    parts: list[str] = []
     side = agreeing_side(by_id)
     rate = by_id.get(f"agreement.{side}.rate")
     if rate is not None and rate.k is not None and rate.n:
@@ -188,6 +222,7 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
         size = f"{_points(bias.value)} {word}" if round(bias.value) else "level with"
         parts.append(f"Over {bias.n} groups the twin lies {size} the recorded rates{ends}.")
     r = by_id.get("agreement.pearson_r")
+    blind = by_id.get("agreement.blind_share")
     if r is not None and r.value is not None:
         parts.append(
             f"r = {r.value:.2f}{_ends(r, '.2f')} {SAYS_NOTHING}: its interval is too wide."
@@ -197,6 +232,11 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
             else f"Measured r = {r.value:.2f}; without the noise of counting r lies"
             f" in{_ends(r, '.2f')}."
         )
+    named = sum(name.startswith("agreement.blind.") for name in by_id)
+    if blind is not None and blind.interval is not None and (named or blind.interval.low > 0.01):
+        low, high = (round(100 * end) for end in (blind.interval.low, blind.interval.high))
+        which = f", probably in {named} of these, which the notes name" if named else ""
+        parts.append(f"It is blind in {low} to {high} % of such groups{which}.")
     return parts
 
 
@@ -207,7 +247,13 @@ def _all_alike(results: Results) -> list[str]:
     if not n or any(m.k is None for m in rates) or 0 < k < n:
         return []
     word = "Nothing" if k == 0 else "Everything"
-    return [f"{word} succeeded: {k} of {n} recorded trials. That ranks no candidate."]
+    ends = wilson(k, n)
+    reach = f"{100 * ends.low:.0f} to {100 * ends.high:.0f} %"
+    task = "an easier task" if k == 0 else "a harder task"
+    return [
+        f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies in {reach}. "
+        f"That ranks no candidate; {task}, or more trials, would."
+    ]
 
 
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:
@@ -215,32 +261,6 @@ def _ends(measurement: Measurement, digits: str = "+.0f") -> str:
     if interval is None:
         return ", without an interval"
     return f" [{interval.low:{digits}}, {interval.high:{digits}}]"
-
-
-def _unseen(rows: Sequence[Row]) -> str:
-    """Say the smallest differences that could have been called real, over all tasks."""
-    words = []
-    for name, what in (
-        ("smallest difference (pp)", "between two candidates"),
-        ("smallest bias (pp)", "between the twin and the recorded rate"),
-    ):
-        sizes = [size for row in rows if (size := _number(row[name])) is not None]
-        if sizes and (name.endswith("bias (pp)") or any(row["ranked"] for row in rows)):
-            low, high = math.ceil(min(sizes)), math.ceil(max(sizes))
-            span = f"{low}" if low == high else f"{low} to {high}"
-            words.append(f"{what} of less than {span} points")
-    none = sum(_number(row["smallest bias (pp)"]) is None for row in rows)
-    counts = [n for row in rows if (n := _number(row["recorded trials per candidate"])) is not None]
-    if not words and counts:
-        most = round(max(counts))
-        return (
-            f"With {most} {noun('trial', most)} of a candidate, hardly any difference, however "
-            "large, would have been seen: no test reaches 80 % power."
-        )
-    if not words:
-        return "Without counts of trials nobody can say what would have been seen." if rows else ""
-    rest = f" In {none} of {len(rows)} tasks nothing could have been seen." if none else ""
-    return f"A difference {', or '.join(words)} would most likely have gone unseen.{rest}"
 
 
 def _number(cell: Cell) -> float | None:

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pyarrow.json import ParseOptions, ReadOptions, read_json
 
-from bridge.exchange.trials_csv import TrialRecord, tags_text
+from bridge.exchange.trials_csv import TrialRecord
 from bridge.whole_file import part_of
 from evaluator.result import Cell, Measurement, Table
 
@@ -39,8 +39,7 @@ OF_MEASUREMENTS |= dict(zip(INTERVAL, (float, float, float, str), strict=True)) 
 
 def write_trials(path: Path, trials: Sequence[TrialRecord]) -> Path:
     """Write one row per trial, the columns of ``trials.csv``; outcomes are true, false or null."""
-    rows = [vars(trial) | {"tags": tags_text(trial.tags) or None} for trial in trials]
-    return _write(path, rows, OF_TRIALS)
+    return _write(path, [vars(trial) for trial in trials], OF_TRIALS)
 
 
 def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:

@@ -157,7 +157,6 @@ def _about(results: Results | None, *, has_trials: bool) -> dict[str, Any]:
         "num_exclusions": len(results.exclusions),
         "missing": list(results.missing),
         "summary": " ".join(first.sentences),
-        "unseen": first.unseen,
         "notes": [list(note) for note in first.notes],
         "close_pp": CLOSE_PP,
         "tasks": [

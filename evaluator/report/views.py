@@ -183,35 +183,14 @@ def _conclusions(rows: Rows) -> Rows:
         if row["yes"]:
             right = Figures(f"{row['yes and right']} of {row['yes']}")
             succeeded = Figures(f"{row['succeeded']} of {row['trials']}")
-        sizes = [name for name in row if name.startswith("smallest ")]
         return {
             **_picked(folded, "task", "groups", "bias (pp)"),
             "yes and right": right,
             "succeeded at all": succeeded,
             **_picked(row, "candidates", "best recorded", "ranked", "more trials"),
-            "trials each": row["recorded trials per candidate"],
-            **{n: Figures(f"{row[n]:.0f}") if _known(row[n]) else None for n in sizes},
         }
 
     return [shown(row, folded) for row, folded in zip(rows, _folded(rows), strict=True)]
-
-
-def _baselines(rows: Rows) -> Rows:
-    def share(row: Record, k: str, n: str) -> Shown:
-        if not row[n]:
-            return None
-        return Figures(f"{100 * row[k] / row[n]:.0f} %", count=f"{row[k]}/{row[n]}")
-
-    return [
-        _picked(row, "asked of", "task", "forecast by")
-        | {
-            "right": share(row, "right", "trials"),
-            "PPV": share(row, "yes and succeeded", "said yes"),
-            "NPV": share(row, "no and failed", "said no"),
-            "twin more right (pp)": folded["twin more right (pp)"],
-        }
-        for row, folded in zip(rows, _folded(rows), strict=True)
-    ]
 
 
 def _published(rows: Rows) -> Rows:
@@ -228,11 +207,16 @@ def _published(rows: Rows) -> Rows:
     ]
 
 
+def _comparisons(rows: Rows) -> Rows:
+    """Leave what the sentences say in words to programs."""
+    return [_picked(row, "answer", "task") for row in rows]
+
+
 _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "conclusions": _conclusions,
+    "comparisons": _comparisons,
     "success": _success,
     "layout": _layout,
-    "gate_baselines": _baselines,
     "published": _published,
 }
 """By table; of the others numbers are put together with their counts and intervals."""

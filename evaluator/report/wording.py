@@ -21,7 +21,7 @@ SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
 }
 """Factor, unit and digits in which a reader thinks."""
 PLAIN = (1.0, "", ".3f")
-SHARES = ("average.", "rate.")
+SHARES = ("rate.",)
 UNSIGNED = ("agreement.mae_pp", "decision.regret_pp", "decision.wrong_pairs_pp")
 """Sizes in percentage points that are never below 0: a plus would look like a direction."""
 HUGE = 1e7
@@ -56,8 +56,6 @@ def value_text(measurement: Measurement) -> str:
         return "undefined"
     if is_share(measurement):
         return f"{100 * measurement.value:.1f} %"
-    if measurement.id.startswith("gain.relative."):
-        return f"{100 * measurement.value:+.1f} %"
     text = number(measurement.value, measurement.unit)
     return text.lstrip("+") if measurement.id in UNSIGNED else text
 
@@ -102,8 +100,6 @@ def measurement_text(measurement: Measurement) -> str:
     if measurement.value is None:
         return f"undefined: {measurement.reason_if_undefined}"
     text = value_text(measurement)
-    if measurement.id.startswith("gain.relative."):
-        text += " relative"
     if measurement.k is not None and measurement.n is not None:
         text = f"{measurement.k}/{measurement.n} = {text}"
     elif measurement.n is not None and measurement.counted:

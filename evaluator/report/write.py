@@ -17,15 +17,11 @@ from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
 SHOWN = (
-    "intake",
     "published",
     "success",
     "layout",
     "comparisons",
     "standing",
-    "study_arms",
-    "gains",
-    "retries",
     "image_methods",
     "notes",
 )
@@ -34,7 +30,7 @@ SHOWN = (
 GROUPS = "success"
 """The table of success rates; ``groups.parquet`` holds it too."""
 
-HEADLINE_TABLES = ("conclusions", "success", "layout", "comparisons", "gains", "confusion")
+HEADLINE_TABLES = ("conclusions", "success", "layout", "comparisons", "confusion")
 """Those that ``--latex`` writes for a paper."""
 PARQUET_PACKAGES = ("pyarrow",)
 LATEX_PACKAGES = ("pandas", "jinja2")

@@ -80,8 +80,6 @@ class VerdictSummary:
     """What touched, came too close or was lost, in the verdict's order."""
     failing_t_ns: int | None = None
     """First instant at which it is false, since the start of the plan."""
-    varied_share: float | None = None
-    """Of the varied replays themselves that succeed."""
 
 
 def summarise_verdict(verdict: Verdict) -> VerdictSummary:
@@ -99,16 +97,7 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
         engine=verdict.engine,
         failing_bodies=() if factor is None else factor.bodies,
         failing_t_ns=None if factor is None else factor.first_t_ns,
-        varied_share=_share(verdict.p_success),
     )
-
-
-def _share(p_success: Mapping[str, float] | None) -> float | None:
-    """Share of varied replays that succeed; as it was stated where nobody counted them."""
-    if p_success is None:
-        return None
-    n = p_success.get("n", 0)
-    return p_success["k"] / n if n and "k" in p_success else p_success.get("value")
 
 
 def _undecided(verdict: Verdict) -> str:

@@ -7,11 +7,8 @@ changes its sign and MMRV its meaning when they are swapped.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
-
-import numpy as np
-from jaxtyping import Float64
+from typing import Literal
 
 from evaluator.errors import UndefinedStatisticError
 
@@ -20,6 +17,8 @@ MIN_GROUPS = 3
 
 Number = Fraction | float | int
 """Rates as exact fractions where counts are known, so that ties are ties."""
+Gap = Literal["recorded", "sim"]
+"""Which side's gap MMRV weighs an order by that the other one gets wrong."""
 
 
 def counted_groups(count: int) -> str:
@@ -32,20 +31,16 @@ def exact(
 ) -> tuple[list[Fraction], list[Fraction]]:
     """Return both sides as exact fractions.
 
-    Args:
-        recorded: Recorded rate of each group; a fraction stays exact.
-
     Raises:
         UndefinedStatisticError: Below ``at_least`` groups.
     """
     if len(recorded) != len(sim):
         message = f"{len(recorded)} recorded rates but {len(sim)} of the twin"
         raise ValueError(message)
-    count = len(recorded)
-    if count == 0:
-        raise UndefinedStatisticError(statistic=statistic, reason="there are no groups")
-    if count < at_least:
-        reason = f"{counted_groups(count)}; it needs at least {at_least}"
+    if len(recorded) < at_least:
+        reason = f"{counted_groups(len(recorded))}; it needs at least {at_least}"
+        if not recorded and at_least < MIN_GROUPS:
+            reason = "there are no groups"
         raise UndefinedStatisticError(statistic=statistic, reason=reason)
     return [Fraction(v) for v in recorded], [Fraction(v) for v in sim]
 
@@ -54,37 +49,21 @@ def varying(
     statistic: str, recorded: Sequence[Number], sim: Sequence[Number]
 ) -> tuple[list[Fraction], list[Fraction]]:
     """Return both sides, at least 3 groups of which not all are the same on either side."""
-    # No groups are too few groups here; exact() would word it as an absence.
-    if len(recorded) == len(sim) == 0:
-        raise UndefinedStatisticError(
-            statistic=statistic, reason=f"0 groups; it needs at least {MIN_GROUPS}"
-        )
     x, y = exact(statistic, recorded, sim, at_least=MIN_GROUPS)
     for name, side in (("recorded", x), ("twin", y)):
         if len(set(side)) == 1:
-            raise UndefinedStatisticError(
-                statistic=statistic,
-                reason=f"the {name} side is constant "
-                f"({float(side[0]):g} in all {len(side)} groups)",
-            )
+            value = f"{float(side[0]):g} in all {len(side)} groups"
+            reason = f"the {name} side is constant ({value})"
+            raise UndefinedStatisticError(statistic=statistic, reason=reason)
     return x, y
-
-
-def floats(values: Sequence[Number]) -> Float64[np.ndarray, " groups"]:
-    """Return rates as an array."""
-    return np.array([float(v) for v in values], dtype=np.float64)
 
 
 def ranks(values: Sequence[Number]) -> list[Fraction]:
     """Return ranks from 1; equal values share their average rank."""
-    return [
-        Fraction(2 * sum(other < v for other in values) + sum(other == v for other in values) + 1)
-        / 2
-        for v in values
-    ]
-
-
-CONVENTIONS = ("recorded", "sim")
+    ordered = sorted(values)
+    first = {value: place for place, value in reversed([*enumerate(ordered, start=1)])}
+    last = {value: place for place, value in enumerate(ordered, start=1)}
+    return [Fraction(first[value] + last[value], 2) for value in values]
 
 
 def bias(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
@@ -99,7 +78,7 @@ def mean_absolute_error(*, recorded: Sequence[Number], sim: Sequence[Number]) ->
     return float(sum(map(abs, gaps)) / len(gaps))
 
 
-def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recorded") -> float:
+def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: Gap = "recorded") -> float:
     """Return the mean maximum rank violation (SIMPLER, Li et al. 2024, equation 1).
 
     For each group the largest gap to a group whose order the twin got wrong, averaged over groups.
@@ -113,63 +92,17 @@ def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recor
         UndefinedStatisticError: Below 2 groups.
     """
     x, y = exact("MMRV", recorded, sim, at_least=2)
-    if gap not in CONVENTIONS:
-        message = f"gap {gap!r} is no MMRV convention; there are: {', '.join(CONVENTIONS)}"
-        raise ValueError(message)
     judge, judged = (x, y) if gap == "recorded" else (y, x)
-    worst = []
-    groups = range(len(judge))
-    for i in groups:
-        violations = [
-            abs(judge[i] - judge[j])
-            for j in groups
-            if (judged[i] > judged[j]) != (judge[i] > judge[j])
-        ]
-        worst.append(max(violations, default=Fraction(0)))
-    return float(sum(worst) / len(worst))
-
-
-@dataclass(frozen=True, kw_only=True)
-class OrderAccuracy:
-    """Of the pairs of groups that differ on the recorded side, how many the twin orders so."""
-
-    right: Fraction
-    """Pairs ordered as recorded; a tie in the twin counts one half."""
-    pairs: int
-
-    @property
-    def value(self) -> float:
-        """From 0 (all reversed) to 1; 1/2 is chance."""
-        return float(self.right / self.pairs)
-
-
-def order_accuracy(*, recorded: Sequence[Number], sim: Sequence[Number]) -> OrderAccuracy:
-    """Count the pairs of groups that the twin orders as the recorded rates do.
-
-    Args:
-        recorded: Recorded rate of each group; pairs that tie here are not counted.
-        sim: The twin's, of the same groups in the same order; a tie only here is half right.
-
-    Raises:
-        UndefinedStatisticError: Below 2 groups, or when no two recorded rates differ.
-    """
-    x, y = exact("pairwise order accuracy", recorded, sim, at_least=2)
-    right, pairs = Fraction(0), 0
-    for j in range(len(x)):
-        for i in range(j):
-            if x[i] == x[j]:
-                continue
-            pairs += 1
-            if y[i] == y[j]:
-                right += Fraction(1, 2)
-            elif (x[i] > x[j]) == (y[i] > y[j]):
-                right += 1
-    if pairs == 0:
-        raise UndefinedStatisticError(
-            statistic="pairwise order accuracy",
-            reason=f"the recorded side is constant ({float(x[0]):g} in all {len(x)} groups)",
+    both = [*zip(judge, judged, strict=True)]
+    worst = [
+        max(
+            abs(a - other)
+            for other, of_other in both
+            if a == other or (b > of_other) != (a > other)
         )
-    return OrderAccuracy(right=right, pairs=pairs)
+        for a, b in both
+    ]
+    return float(sum(worst) / len(worst))
 
 
 def _gaps(statistic: str, recorded: Sequence[Number], sim: Sequence[Number]) -> list[Fraction]:
@@ -181,7 +114,7 @@ def mean_rate(rates: Sequence[Number]) -> float:
     """Return the macro average: every group counts the same, however many trials it has."""
     if not rates:
         raise UndefinedStatisticError(statistic="mean rate", reason="there are no groups")
-    return float(floats(rates).mean())
+    return float(sum(map(float, rates)) / len(rates))
 
 
 def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:

@@ -15,16 +15,6 @@ def paired_points(
     return points_of([Stratum(improved=improved, worsened=worsened, pairs=n)], level=level)
 
 
-def unpaired_points(
-    first: tuple[int, int], second: tuple[int, int], *, level: float = LEVEL
-) -> tuple[float, Interval]:
-    """Return second - first of two sides' own trials, successes and trials each.
-
-    With the score interval of Farrington and Manning (1990).
-    """
-    return points_of([Stratum(first=first, second=second)], level=level)
-
-
 def points_of(strata: Sequence[Stratum], *, level: float = LEVEL) -> tuple[float, Interval]:
     """Return the difference over tasks or groups, each weighted by its pairs.
 

@@ -1,7 +1,7 @@
 """Where in a task the trials are lost: stage by stage."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from evaluator.errors import UndefinedStatisticError
@@ -45,19 +45,3 @@ def funnel(trials: Sequence[Sequence[bool | None]], names: Sequence[str]) -> lis
         )
         going = [trial for trial in going if trial[place]]
     return stages
-
-
-@dataclass(frozen=True, kw_only=True)
-class FailureKind:
-    """Trials that failed for the same reason."""
-
-    clause: str
-    cause: str
-    count: int
-
-
-def failure_taxonomy(failures: Iterable[tuple[str, str]]) -> list[FailureKind]:
-    """Count failures (clause, cause), most frequent first."""
-    counts = Counter(failures)
-    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-    return [FailureKind(clause=clause, cause=cause, count=n) for (clause, cause), n in ordered]

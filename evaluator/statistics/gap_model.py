@@ -120,18 +120,22 @@ def _drawn(nodes: int = NODES, seed: int = 0) -> _Populations:
     )
 
 
-def _bent(z: np.ndarray, bend: np.ndarray | float) -> np.ndarray:
-    """A straight line, or by ``bend`` two levels with little between them."""
-    return np.asarray((1 - bend) * z + bend * 1.25 * np.tanh(3 * z))
+def _bent(z: np.ndarray, bend: np.ndarray) -> np.ndarray:
+    """A straight line, or by ``bend`` two levels with little between them: one row a population."""
+    found = np.array(np.broadcast_to(z, (len(bend), *z.shape[1:])))
+    rows = np.flatnonzero(bend)
+    by = bend[rows].reshape(-1, *[1] * (z.ndim - 1))
+    found[rows] = (1 - by) * found[rows] + by * 1.25 * np.tanh(3 * found[rows])
+    return found
 
 
 def _masses(at: np.ndarray, size: np.ndarray, bend: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Chance of each cell of log-odds, and the normal number in its middle."""
     z = np.linspace(-6, 6, 241)
-    ends = (EDGES[None, 1:-1] - at[:, None]) / size[:, None]
-    found = ends.copy()
-    for node in np.flatnonzero(bend):
-        found[node] = np.interp(ends[node], _bent(z, float(bend[node])), z)
+    found = (EDGES[None, 1:-1] - at[:, None]) / size[:, None]
+    rows = np.flatnonzero(bend)
+    for node, curve in zip(rows, _bent(z[None], bend[rows]), strict=True):
+        found[node] = np.interp(found[node], curve, z)
     below = np.concatenate([np.zeros((len(at), 1)), ndtr(found), np.ones((len(at), 1))], axis=1)
     middle = ndtri(np.clip((below[:, 1:] + below[:, :-1]) / 2, 1e-9, 1 - 1e-9))
     return np.diff(below, axis=1) + 1e-12, middle
@@ -152,11 +156,11 @@ def _moments(
     w = np.exp(-0.5 * QUADRATURE**2)
     w /= w.sum()
     z = QUADRATURE[None, :]
-    at, size, bend = (each[:, None] for each in recorded)
-    x = expit(at + size * _bent(z, bend))
-    at, size, bend = (each[:, None, None] for each in sim)
+    at, size, bend = recorded
+    x = expit(at[:, None] + size[:, None] * _bent(z, bend))
+    at, size, bend = sim
     other = rho[:, None, None] * z[:, :, None] + np.sqrt(1 - rho**2)[:, None, None] * z[:, None, :]
-    y = expit(at + size * _bent(other, bend))
+    y = expit(at[:, None, None] + size[:, None, None] * _bent(other, bend))
     given = y @ w
     of_blind = expit(blind_at[:, None] + blind_size[:, None] * z)
     mean_x, square_x = x @ w, x**2 @ w
@@ -196,8 +200,10 @@ class GapModel:
         odds = common_log_odds(self.groups)
         table = np.stack([_likelihood(group, odds) for group in self.groups])
         seeing = there.seeing @ table.reshape(len(table), -1).T.astype(np.float32)
-        of_blind = np.einsum("gxy,ny->ngx", table, there.blind, optimize=True)
-        blind = np.einsum("ngx,nx->ng", of_blind, there.recorded)
+        rows = np.flatnonzero(there.share)
+        apart = there.recorded[rows, :, None].astype(np.float64) * there.blind[rows, None, :]
+        blind = np.zeros(seeing.shape)
+        blind[rows] = apart.reshape(len(rows), -1) @ table.reshape(len(table), -1).T
         share = there.share[:, None]
         chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
         logs = np.log(chance).sum(axis=1) / self.design_effect

@@ -6,10 +6,10 @@ the median has one that holds for any distribution, from six values on.
 """
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
-from scipy.special import bdtr, betaincinv, ndtri
+from scipy.special import bdtr, ndtri
 
 from evaluator.errors import EvaluatorError, UndefinedStatisticError
 from evaluator.result import Interval
@@ -37,36 +37,6 @@ def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
     low = 0.0 if k == 0 else max(0.0, centre - half)
     high = 1.0 if k == n else min(1.0, centre + half)
     return Interval(low=low, high=high, level=level, method="wilson")
-
-
-def clopper_pearson(k: int, n: int, *, level: float = LEVEL) -> Interval:
-    """Return the interval that covers at least ``level`` for every true rate (1934)."""
-    check_count(k, n)
-    tail = (1 - level) / 2
-    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
-    high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1 - tail))
-    return Interval(low=low, high=high, level=level, method="clopper-pearson")
-
-
-def jeffreys(k: int, n: int, *, level: float = LEVEL) -> Interval:
-    """Return the equal-tailed interval of the posterior Beta(k + 1/2, n - k + 1/2).
-
-    With the ends 0 at k = 0 and 1 at k = n (Brown, Cai and DasGupta 2001, section 4.1): without
-    that change it never covers rates near 0 and 1.
-    """
-    check_count(k, n)
-    tail = (1 - level) / 2
-    low = 0.0 if k == 0 else float(betaincinv(k + 0.5, n - k + 0.5, tail))
-    high = 1.0 if k == n else float(betaincinv(k + 0.5, n - k + 0.5, 1 - tail))
-    return Interval(low=low, high=high, level=level, method="jeffreys")
-
-
-RATE_INTERVALS: dict[str, Callable[..., Interval]] = {
-    "wilson": wilson,
-    "clopper-pearson": clopper_pearson,
-    "jeffreys": jeffreys,
-}
-"""What ``evaluate --interval`` chooses from."""
 
 
 def relative_gain(before: float, after: float) -> float:

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import count, pairwise
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Complex, Float64
@@ -146,6 +146,11 @@ class Evidence:
             return math.copysign(math.inf, distance) if abs(distance) > 1e-12 else 0.0
         return distance / math.sqrt(variance)
 
+    @cached_property
+    def of_no_difference(self) -> float:
+        """Standard errors between what was found and no difference."""
+        return self.z()
+
     def interval(self, z: float | None = None, *, level: float = LEVEL) -> Interval:
         """Return all differences from which less than ``z`` standard errors lie.
 
@@ -186,18 +191,24 @@ class Plan:
     locked: bool = False
     alpha: float = ALPHA
 
+    def places(self) -> Iterator[float]:
+        """Yield the pairs after which it is looked at, without end."""
+        yield from map(float, look_pairs(self.pairs))
+        for turn in count():
+            yield 1.5 * self.pairs * 2**turn
+            yield 2.0 * self.pairs * 2**turn
+
     def looks(self, kind: Kind) -> Iterator[Look]:
         """Yield the looks in their order, without end."""
-        share, size = SHARES[self.locked], float(self.pairs)
+        share = SHARES[self.locked]
         limit = planned_limit(self.pairs, self.alpha * share, kind)
-        for part in look_pairs(self.pairs):
-            yield Look(pairs=float(part), limit=limit * math.sqrt(size / part))
-        left = 1 - share
-        for turn in count(1):
-            left /= 2
-            z = normal_quantile(1 - self.alpha * left / 4)
-            for more in (1.5, 2.0):
-                yield Look(pairs=more * size * 2 ** (turn - 1), limit=z)
+        num_planned, left = len(look_pairs(self.pairs)), 1 - share
+        for number, place in enumerate(self.places()):
+            if number < num_planned:
+                yield Look(pairs=place, limit=limit * math.sqrt(self.pairs / place))
+                continue
+            left /= 1 if (number - num_planned) % 2 else 2  # both looks of an extension share it
+            yield Look(pairs=place, limit=normal_quantile(1 - self.alpha * left / 4))
 
     def likely_at(self, evidence: Evidence) -> float | None:
         """Return the pairs at whose look a decision is more likely than not, as rates look now."""
@@ -229,21 +240,23 @@ def planned_limit(pairs: int, alpha: float, kind: Kind) -> float:
     if pairs > COUNTED:
         return _limit_of_normal(alpha) + LATTICE
     low, high = 1.0, 6.0
+    nuisance = equal(kind, np.array(NUISANCE))
     for _ in range(14):
         middle = (low + high) / 2
-        size = max(decided(pairs, middle, kind, equal(kind, rate))[-1] for rate in NUISANCE)
+        size = float(decided(pairs, middle, kind, nuisance)[-1].max())
         low, high = (low, middle) if size <= alpha else (middle, high)
     return high
 
 
+Number = TypeVar("Number", float, np.ndarray)
 Chances = tuple[float, float, float]
 """Of the score of one pair: second alone, first alone, both succeed."""
 
 
-def equal(kind: Kind, rate: float) -> Chances:
+def equal(kind: Kind, rate: Number) -> tuple[Number, Number, Number]:
     """Return the chances of equal candidates: independent ones of a rate, or of shared starts."""
     if kind == "shared":
-        return rate, rate, 0.0
+        return rate, rate, 0 * rate
     return rate * (1 - rate), rate * (1 - rate), rate * rate
 
 
@@ -256,31 +269,32 @@ def chances(first: float, second: float, correlation: float = 0.0) -> Chances:
 
 
 def decided(
-    pairs: int, limit: float, kind: Kind, of_pair: Chances
-) -> Float64[np.ndarray, " looks"]:
+    pairs: int, limit: float, kind: Kind, of_pair: Sequence[float | np.ndarray]
+) -> Float64[np.ndarray, "looks *rates"]:
     """Return the chance that a plan is decided by each of its looks.
 
     Counted out: counts of both candidates, or of pairs that improve and worsen, are carried from
     look to look by the characteristic function of one pair.
     """
-    better, worse, both = of_pair
+    better, worse, both = (np.asarray(chance)[..., None, None] for chance in of_pair)
     turn = np.exp(-2j * np.pi * np.arange(pairs + 1) / (pairs + 1))
     first, second = turn[:, None], turn[None, :]
     neither = 1 - better - worse - (both if kind == "other" else 0.0)
-    one: Complex[np.ndarray, "k k"] = neither + worse * first + better * second
+    one: Complex[np.ndarray, "*rates k k"] = neither + worse * first + better * second
     if kind == "other":
         one = one + both * first * second
     a, b = np.arange(pairs + 1)[:, None], np.arange(pairs + 1)[None, :]
-    mass, found, total = np.zeros((pairs + 1, pairs + 1)), [], 0.0
-    mass[0, 0] = 1.0
+    mass = np.zeros(one.shape)
+    mass[..., 0, 0] = 1.0
+    found, total = [], np.zeros(one.shape[:-2])
     for before, now in pairwise([0, *look_pairs(pairs)]):
         mass = np.fft.ifft2(np.fft.fft2(mass) * one ** (now - before)).real
         rate = np.clip((a + b) / (2 * now), 0, 1)
         variance = a + b if kind == "shared" else 2 * now * rate * (1 - rate)
         stops = (b - a) ** 2 >= limit**2 * variance * pairs / now - 1e-9
         stops &= a != b
-        total += float(mass[stops].sum())
-        mass[stops] = 0.0
+        total = total + mass[..., stops].sum(axis=-1)
+        mass[..., stops] = 0.0
         found.append(total)
     return np.array(found)
 

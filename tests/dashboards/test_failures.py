@@ -91,8 +91,6 @@ def test_start_regions_are_halves_wherever_the_robot_stands() -> None:
     assert start_regions(_starts(p_m[:3])) == {}
     both = start_regions([*_starts(p_m), *_starts(p_m + 5, "stack")])
     assert list(both.values()) == expected * 2
-    stated = replace(_starts(p_m)[0], tags=(("start region", "behind the bowl"),))
-    assert start_regions([stated, *_starts(p_m)[1:]])["pour 0"] == "behind the bowl"
 
 
 def failures() -> list[TrialRow]:

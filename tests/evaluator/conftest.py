@@ -168,13 +168,12 @@ class RunMaker:
         tag: str = "a",
         num_poses: int = NUM_POSES,
         astray: int | None = None,
-        varied: tuple[int, int] | None = None,
         scene_hash: str | None = None,
         settings: dict[str, Any] | None = None,
         engine: str = "test",
         stand_in: bool = True,
     ) -> Path:
-        """Write one derived replay of a trial; ``varied``: successes and number of its samples."""
+        """Write one derived replay of a trial."""
         source = self.run.episodes_dir / f"{name}.mcap"
         plan_id = plan_id or f"plan_{name}"
         derived = Derived(
@@ -196,9 +195,6 @@ class RunMaker:
             writer.describe(info, derived=derived)
             log = _Log(writer)
             said = verdict_of(accepted, plan_id=plan_id, trajectory=trajectory)
-            if varied is not None:
-                k, n = varied
-                said = replace(said, p_success={"value": k / n, "k": k, "n": n})
             log.raw("/standin/verdict", schema.VERDICT, said.to_json(), start_ns)
             log.poses("/standin/tcp/pose", start_ns, offset_m, num_poses, astray)
         return path

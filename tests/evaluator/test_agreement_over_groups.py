@@ -2,11 +2,9 @@
 
 from fractions import Fraction
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics import agreement
 
 rates = st.lists(st.fractions(0, 1, max_denominator=10), min_size=3, max_size=7)
@@ -22,18 +20,8 @@ def test_errors_keep_their_order(recorded: list[Fraction], data: st.DataObject) 
     assert min(gaps) - 1e-12 <= absolute <= max(gaps) + 1e-12
 
 
-def test_order_accuracy_counts_ties_of_the_twin_as_half() -> None:
-    found = agreement.order_accuracy(recorded=[0.1, 0.2, 0.2, 0.4], sim=[0.5, 0.5, 0.9, 0.7])
-    # Pairs that differ when recorded: 5; tied in sim: 1, right: 3 (1-3, 1-4, 2-4), wrong: 3-4.
-    assert (found.right, found.pairs) == (Fraction(7, 2), 5)
-    assert found.value == pytest.approx(0.7)
-    with pytest.raises(UndefinedStatisticError, match="recorded side is constant"):
-        agreement.order_accuracy(recorded=[1, 1], sim=[0, 1])
-
-
 def test_exact_counts_see_ties_that_floats_would_miss() -> None:
     # 3 x 0.1 is not 0.3 as a float; as counts 3/10 of ten and of thirty are the same rate.
     recorded = [Fraction(3, 10), Fraction(9, 30), Fraction(5, 10)]
     sim = [Fraction(1, 10), Fraction(2, 10), Fraction(9, 10)]
-    assert agreement.order_accuracy(recorded=recorded, sim=sim).pairs == 2
     assert agreement.mmrv(recorded=recorded, sim=sim) == 0

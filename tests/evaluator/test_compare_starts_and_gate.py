@@ -53,7 +53,6 @@ def test_a_plan_refused_but_executed_anyway_is_named_as_such(maker: Any) -> None
 def test_the_success_table_says_that_the_twin_selected_the_accepted_plans(six_trials: Any) -> None:
     table = next(t for t in compare_run(six_trials.run).tables if t.id == "success")
     assert "the twin selected the accepted plans" in table.note
-    assert "Replays with --samples estimate it again with fresh seeds" in table.note
 
 
 def test_the_largest_tool_error_is_not_lost_between_samples(maker: Any) -> None:

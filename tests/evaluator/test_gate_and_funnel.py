@@ -3,7 +3,7 @@
 import pytest
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.funnel import failure_taxonomy, funnel
+from evaluator.statistics.funnel import funnel
 from evaluator.statistics.gate import (
     Confusion,
     brier,
@@ -43,8 +43,3 @@ def test_a_stage_after_a_failed_one_is_not_reached() -> None:
         funnel([[True]], ["pick", "carry", "release"])
     with pytest.raises(UndefinedStatisticError, match="no trials with labelled stages"):
         funnel([], ["pick"])
-
-
-def test_failures_are_counted_most_frequent_first() -> None:
-    found = failure_taxonomy([("ik", ""), *[("clearance", "collision")] * 2, ("ik", "")])
-    assert [(kind.clause, kind.count) for kind in found] == [("clearance", 2), ("ik", 2)]

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.exchange.table_text import TableOptions
-from evaluator.compare.spreadsheet import compare_csv
+from evaluator.compare import compare_csv
 from evaluator.errors import UndefinedStatisticError
 from evaluator.report.front import front
 from evaluator.result import Interval
 from evaluator.statistics.differences import paired_points, points_of
-from evaluator.statistics.intervals import ImpossibleCountError, jeffreys, wilson
+from evaluator.statistics.intervals import ImpossibleCountError, wilson
 from evaluator.statistics.sequential import Evidence, Stratum
 
 
@@ -59,12 +59,6 @@ def test_pairs_that_cannot_be_are_refused() -> None:
         paired_points(0, 0, 0)
     with pytest.raises(ImpossibleCountError, match="6 successes of 5"):
         tango_difference(4, 2, 5)
-
-
-def test_jeffreys_reaches_the_ends_where_it_must() -> None:
-    assert jeffreys(0, 10).low == 0
-    assert jeffreys(10, 10).high == 1
-    assert jeffreys(3, 10).low < 0.3 < jeffreys(3, 10).high
 
 
 def test_trials_of_either_side_of_two_policies_have_a_bias_with_its_interval(

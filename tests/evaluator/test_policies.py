@@ -1,21 +1,30 @@
 """Which candidate is better: what is a pair, who may be best, and that advice may be followed."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bridge.exchange.table_text import TableError
+from evaluator.compare import Comparison, compare_csv
+from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.policies import (
     Answer,
+    Course,
     compare_counts,
     compare_policies,
     comparison_part,
-    read_tries,
+    made_trials,
+    remarks,
     tries_of,
 )
 from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import rate_groups, side_rates
+from evaluator.report.front import front
 from evaluator.result import Measurement
 from evaluator.statistics.sequential import Plan
 
@@ -133,8 +142,13 @@ def test_pairs_grow_as_they_are_counted() -> None:
         for n in range(60)
     ]
     answers = compare_policies(rows)
-    tries = tries_of(rows, answers[0].question, ())
-    assert read_tries(Plan(pairs=4), tries).evidence.pairs == answers[0].reading.evidence.pairs
+    tries = tries_of(made_trials(rows, ()), answers[0].question)
+    course = Course.of(tries, Plan(pairs=4))
+    assert course.all_.pairs == answers[0].reading.evidence.pairs
+    places = [place for place in islice(Plan(pairs=4).places(), 12) if place <= course.all_.pairs]
+    assert list(course.at) == places
+    for place, evidence in course.at.items():  # each look has the first trials that are worth it
+        assert place <= evidence.pairs < place + 2
 
 
 def measurements(rates: dict[str, tuple[int, int]]) -> dict[str, Measurement]:
@@ -167,3 +181,87 @@ def test_rates_with_n_are_compared_without_their_trials() -> None:
     answer = only(compare_counts(rate_groups(rows, side_rates(rows))))
     assert answer.counts == ((10, 40), (30, 40))
     assert answer.reading.better == 1
+
+
+def test_a_policy_that_trips_the_arm_does_not_gain_by_it(tmp_path: Path) -> None:
+    """Of 20 trials of B 6 ended by a protective stop: as failures, and without them."""
+    lines = ["trial_id,task,policy,start_id,outcome"]
+    for n in range(20):
+        lines.append(f"a{n},cup,A,s{n},{'success' if n < 12 else 'failure'}")
+        lines.append(f"b{n},cup,B,s{n},{'success' if n < 12 else 'protective stop'}")
+    lines[-1] = "b19,cup,B,s19,failure"
+    path = tmp_path / "trials.csv"
+    path.write_text("\n".join(lines) + "\n")
+    found = compare_csv(path)
+    (answer,) = compare_policies(found.rows)
+    assert answer.counts == ((12, 20), (12, 20))
+    assert answer.no_outcome == (0, 7)
+    assert "+0 points" in answer.sentence
+    assert "(7 without an outcome as failures; +0 without them)" in answer.sentence
+    notes = {
+        str(about): str(text) for t in found.tables if t.id == "notes" for about, text in t.rows
+    }
+    assert notes["B"].startswith("7 of 20 trials have no outcome (protective stop): 12 of 20")
+    assert "12 of 13 without them, as in its rate" in notes["B"]
+    declared = compare_policies(found.rows, void_causes=("protective stop",))
+    assert declared[0].counts == ((12, 20), (12, 13))
+
+
+def test_a_start_that_was_tried_again_is_named() -> None:
+    rows = interleaved(CLEAR)
+    again = [*rows, replace(rows[1], episode="again"), replace(rows[0], episode="once more")]
+    assert [about for about, _ in remarks(again, ())] == ["A", "B"]
+    assert all("s0 2 times" in text for _, text in remarks(again, ()))
+    assert remarks(rows, ()) == []
+    (answer,) = compare_policies(again)
+    assert answer.reading.evidence.strata[0].pairs == 40
+
+
+def test_a_checkpoint_that_changed_under_one_name_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "trials.csv"
+    lines = ["trial_id,task,policy,checkpoint,outcome", "1,cup,ACT,a1,yes", "2,cup,ACT,a1,no"]
+    path.write_text("\n".join(lines) + "\n")
+    assert [row.policy for row in compare_csv(path).rows] == ["ACT", "ACT"]
+    path.write_text("\n".join([*lines, "3,cup,ACT,b2,yes"]) + "\n")
+    message = r"row 4: policy 'ACT' is checkpoint 'b2', in row 2 'a1'. Give each checkpoint"
+    with pytest.raises(TableError, match=message):
+        compare_csv(path)
+
+
+@pytest.fixture
+def four_policies(tmp_path: Path) -> Comparison:
+    """Rates of four policies in three tasks; p3 is best in each."""
+    lines = ["task,policy,side,k,n"]
+    for task in ("cup", "hook", "drawer"):
+        for policy, real in (("p0", 4), ("p1", 10), ("p2", 11), ("p3", 19)):
+            lines += [f"{task},{policy},real,{real},20", f"{task},{policy},sim,{real + 1},20"]
+    path = tmp_path / "rates.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return compare_csv(path)
+
+
+def test_rates_are_compared_in_each_task_and_intervals_say_what_was_decided(
+    four_policies: Comparison,
+) -> None:
+    answers = compare_counts(four_policies.groups)
+    assert len(answers) == 6 * (1 + 3)
+    for answer in answers:
+        interval = answer.reading.interval
+        assert interval is not None
+        assert (interval.low > 0 or interval.high < 0) == bool(answer.reading.better)
+    assert "no, 20 more trials would do" in front(four_policies.results()).tasks[0][1]
+
+
+def test_the_first_page_begins_with_who_may_be_best(four_policies: Comparison) -> None:
+    summary = front(four_policies.results()).summary
+    assert summary.startswith("p3 is best of 4 candidates, with 57 of 60: every other one")
+    assert "undecided" not in summary.lower()  # between p1 and p2, which nobody would take
+
+
+@pytest.mark.parametrize(("k", "words"), [(0, "Nothing succeeded: 0 of 20"), (10, "Everything")])
+def test_a_study_where_all_trials_end_alike_says_so_first(k: int, words: str) -> None:
+    rows = [row(n, "AB"[n % 2], n // 2 < k, start_id=f"s{n // 2}") for n in range(20)]
+    found = compare_rows(rows, run="r", source="trials", stand_in=None)
+    summary = front(found.results()).summary
+    assert summary.startswith(words)
+    assert "costs" not in summary

@@ -1,6 +1,5 @@
-"""Tables as people save them, several sources in one study, and folders of results."""
+"""Tables as people save them, and several sources in one study."""
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,10 +12,8 @@ from hypothesis import strategies as st
 from bridge.errors import UsageError
 from bridge.exchange.table_text import TableOptions, read_rows
 from bridge.exchange.trials_csv import COLUMNS, read_trials
-from evaluator.cli import evaluate
 from evaluator.compare import compare_csv
-from evaluator.compare.axes import axis_tables
-from evaluator.compare.intake import look_through, take
+from evaluator.compare.intake import take
 from evaluator.compare.several import compare_several
 from evaluator.errors import AlikeNamesError
 
@@ -97,15 +94,12 @@ def test_no_delimiter_changes_a_name(
 ALIKE = "trial_id,task,recorded,sim_planned\na,Cup,yes,yes\nb,cup,no,yes\nc,Cube,no,no\n"
 
 
-def test_names_that_differ_by_case_are_asked_about(write_table: Callable[[str], Path]) -> None:
-    path = write_table(ALIKE)
-    with pytest.raises(AlikeNamesError, match=r"'Cup' \(a\) and 'cup' \(b\).*--names merge"):
+def test_names_that_differ_by_case_are_refused(write_table: Callable[[str], Path]) -> None:
+    with pytest.raises(AlikeNamesError, match=r"'Cup' \(a\) and 'cup' \(b\).*Spell them alike"):
+        compare_csv(write_table(ALIKE))
+    path = write_table("policy,real,sim\nACT,7/10,8/10\nact,5/10,6/10\n")
+    with pytest.raises(AlikeNamesError, match=r"'ACT' \(row 2\) and 'act' \(row 3\)"):
         compare_csv(path)
-    merged = compare_csv(path, options=TableOptions(names="merge"))
-    assert [(g.task, g.recorded.n) for g in merged.groups] == [("Cube", 1), ("Cup", 2)]
-    assert "task 'cup' counted as 'Cup'" in merged.provenance["read_as"]
-    apart = compare_csv(path, options=TableOptions(names="apart"))
-    assert [g.task for g in apart.groups] == ["Cube", "Cup", "cup"]
 
 
 def test_runs_and_tables_are_one_study_and_keep_their_own_ids(
@@ -139,50 +133,29 @@ def test_a_copied_run_counts_no_trial_twice(six_trials: Any, tmp_path: Path) -> 
     assert len(copies) == len(alone.rows)
 
 
-def test_a_folder_of_results_is_read_and_what_is_left_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "results"
-    for policy, successes in (("act", [1, 0]), ("dp", [1, 1])):
-        (folder / policy).mkdir(parents=True)
-        trials = [{"task": "g/0", "policy": policy, "sim_planned": each} for each in successes]
-        (folder / policy / "trials.json").write_text(json.dumps(trials))
-    (folder / "lengths.csv").write_text("episode,episode_length\n0,100\n")
-    (folder / "real.json").write_text(json.dumps([{"task": "g/0", "policy": "act", "recorded": 1}]))
-    (folder / "rates.csv").write_text("task,side,rate\nx,real,0.5\n")
-    (folder / "notes.md").write_text("monday")
-    assert evaluate(folder, out=tmp_path / "out") == 0
-    err = capsys.readouterr().err
-    assert "neither a table of trials" in err
-    taken, left = look_through(folder)
-    assert {each.kind for each in taken} == {"trials", "rates"}
-    assert {one.path.name for one in left} == {"lengths.csv", "notes.md"}
-    comparison = compare_several([folder])
-    sides = {(g.task, g.policy): (g.recorded.n, g.sim.n) for g in comparison.groups}
-    assert sides == {("g/0", "act"): (1, 2), ("g/0", "dp"): (0, 2)}
-    (intake,) = (table for table in comparison.tables if table.id == "intake")
-    assert len(intake.rows) == 6
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "empty" / "a.txt").write_text("hello\n")
-    with pytest.raises(UsageError, match="could be read as results"):
-        compare_several([tmp_path / "empty"])
+def test_what_is_neither_run_nor_table_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "rates.csv").write_text("policy,real,sim\nACT,7/10,8/10\n")
+    (tmp_path / "trials.csv").write_text(ALIKE.replace("cup", "Cup"))
+    (tmp_path / "trials.json").write_text('[{"task": "g/0", "recorded": 1}]')
+    with pytest.raises(UsageError, match=r"holds no episodes. Give a run folder, or tables"):
+        compare_several([tmp_path])
+    with pytest.raises(UsageError, match="Save it as a table"):
+        compare_csv(tmp_path / "trials.json")
+    with pytest.raises(UsageError, match=r"rates.csv holds rates, and other sources hold trials"):
+        compare_several([tmp_path / "trials.csv", tmp_path / "rates.csv"])
 
 
-def test_agreement_along_axes(write_table: Callable[[str], Path]) -> None:
-    lines = ["trial_id;task;recorded;sim_planned;progress;sim_progress;tags;Start region"]
-    for i in range(8):
-        light, real, sim = ("dim", i % 2, 1) if i < 4 else ("bright", 1, 1)
-        lines.append(f"{i};cup;{real};{sim};0,{i};0,{i + 1};lighting={light};R{i % 2}")
-    path = write_table("\n".join(lines) + "\n")
-    comparison = compare_csv(path, options=TableOptions(axes="Start region"))
-    (axes,) = axis_tables(comparison.rows, comparison.recorded_word)
-    assert axes in comparison.tables
-    assert {row[0] for row in axes.rows} == {"lighting", "start_region"}
-    by_value = {row[1]: dict(zip(axes.columns, row, strict=True)) for row in axes.rows}
-    assert (by_value["dim"]["agree k"], by_value["dim"]["agree n"]) == (2, 4)
-    assert by_value["dim"]["sim - recorded (pp)"] == pytest.approx(50)
-    assert by_value["bright"]["sim - recorded (pp)"] == 0
-    assert set(by_value) == {"dim", "bright", "R0", "R1"}
+def test_a_copy_of_a_table_is_refused_and_a_cell_counts_once(tmp_path: Path) -> None:
+    first, copy, other = (tmp_path / f"{name}.csv" for name in ("first", "copy", "other"))
+    first.write_text("policy,real,sim\nACT,7/10,8/10\n")
+    copy.write_text(first.read_text())
+    with pytest.raises(UsageError, match=r"copy.csv is given twice, once as .*first.csv"):
+        compare_several([first, copy])
+    other.write_text("task,policy,real,sim\nfirst,ACT,6/10,8/10\n")
+    with pytest.raises(UsageError, match=r"first, ACT, real stands in .*first.csv and in"):
+        compare_several([first, other])
+    other.write_text("task,policy,real,sim\nhook,ACT,6/10,8/10\n")
+    assert [group.task for group in compare_several([first, other]).groups] == ["first", "hook"]
 
 
 def test_a_table_of_single_rollouts_on_either_side_is_an_unpaired_study(

@@ -5,14 +5,12 @@ from dataclasses import replace
 import pytest
 
 from bridge.episode.executions import NO_PLAN
-from bridge.episode.metadata import EpisodeInfo, Outcome, treatment_of
+from bridge.episode.metadata import treatment_of
 from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.policies import compare_policies
+from evaluator.compare.policies import compare_policies, void_starts
 from evaluator.compare.rows import TrialRow
-from evaluator.compare.study import retry_table, study_results, study_starts
 from evaluator.compare.success import rate_groups, side_rates
 from evaluator.compare.tables import success_table
-from evaluator.result import Measurement
 
 ARMS = ("without", "with", "control")
 CONDITION = {
@@ -49,10 +47,6 @@ def study(outcomes: list[tuple[bool, bool, bool]], task: str = "stack") -> list[
     ]
 
 
-def by_id(rows: list[TrialRow]) -> dict[str, Measurement]:
-    return {each.id: each for each in study_results(rows)[0]}
-
-
 FIRST = study([(False, True, False)] * 6 + [(True, False, True)] * 1 + [(True, True, True)] * 3)
 SECOND = study([(False, True, True)] * 3 + [(False, False, False)] * 2, task="push")
 
@@ -73,43 +67,26 @@ def test_what_was_not_executed_is_a_failure_and_per_protocol_it_is_left_out(
         else each
         for each in FIRST
     ]
-    found, full = by_id(rows), by_id(FIRST)
     answers = compare_policies(rows)
     assert [(each.counts, each.reading.evidence.strata[0].improved) for each in answers] == [
         (((4, 10), (8, 10)), 5)
     ]
-    assert found["study.not_executed.with.stack.nominal"].value == pytest.approx(0.1)
-    assert full["study.not_executed.with.stack.nominal"].value == 0.0
 
 
 def test_a_void_trial_takes_its_start_out_of_all_arms() -> None:
     void = replace(FIRST[1], recorded=None, plan_id=None, why_unknown="interrupted")
-    starts, left_out = study_starts([FIRST[0], void, *FIRST[2:]])
-    assert len(starts) == 9
-    assert {each.episode for each in left_out} == {f"stack_0_{arm}" for arm in ARMS}
-    assert all("void in all arms" in each.reason for each in left_out)
-    starts, _ = study_starts([FIRST[0], void, *FIRST[2:]], void_causes=("power cut",))
-    assert len(starts) == 10  # not a cause that was named: a failure of its arm
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        (lambda rows: rows[1:], "was not tried in the arms without"),
-        (lambda rows: [*rows, rows[0]], "more than once in one arm"),
-        (lambda rows: [replace(rows[0], start_id=None), *rows[1:]], "no start_id"),
-        (
-            lambda rows: [
-                replace(rows[0], recorded=None, why_unknown="nobody labelled it"),
-                *rows[1:],
-            ],
-            "was executed, and nobody knows how it ended",
-        ),
-    ],
-)
-def test_a_start_that_is_not_whole_is_left_out_with_the_reason(change: object, why: str) -> None:
-    _, left_out = study_starts(change(list(FIRST)))  # type: ignore[operator]
-    assert why in " ".join(each.reason for each in left_out)
+    rows = [FIRST[0], void, *FIRST[2:]]
+    reasons = {each.episode: each.reason for each in void_starts(rows, ("interrupted",))}
+    assert reasons == {
+        "stack_0_with": "void: interrupted",
+        "stack_0_without": "start stack/0 is void in all arms: stack_0_with: interrupted",
+        "stack_0_control": "start stack/0 is void in all arms: stack_0_with: interrupted",
+    }
+    assert compare_policies(rows)[0].counts == ((4, 9), (8, 9))
+    assert compare_rows(rows, run="r", source="run", stand_in=True).exclusions[0].episode in reasons
+    # Not a cause that was named: a failure of its arm.
+    assert void_starts(rows, ("power cut",)) == []
+    assert compare_policies(rows, void_causes=("power cut",))[0].counts == ((4, 10), (8, 10))
 
 
 def test_the_control_is_a_group_of_its_own_and_pairs_only_in_the_study() -> None:
@@ -119,32 +96,7 @@ def test_the_control_is_a_group_of_its_own_and_pairs_only_in_the_study() -> None
     assert groups["without_replanning"].recorded.n == 10
     ids = [each.id for each in found.measurements]
     assert any(each.startswith("rate.recorded.stack.control") for each in ids)
-    assert {"study_arms", "comparisons"} <= {table.id for table in found.tables}
-
-
-def test_without_a_study_there_is_nothing_of_it() -> None:
-    rows = [replace(each, study_arm="") for each in FIRST if each.study_arm != "control"]
-    assert study_results(rows) == ([], (), [])
-
-
-def test_retries_are_counted_by_treatment_and_nothing_else_is() -> None:
-    def one(kind: str, condition: str, result: str | None) -> tuple[EpisodeInfo, Outcome | None]:
-        info = EpisodeInfo(id="x", kind=kind, task="stack", condition=condition, policy="nominal")
-        return info, None if result is None else Outcome(result=result)
-
-    recorded = [
-        one("trial", "with_replanning", "failure"),
-        one("retry", "with_replanning", "success"),
-        one("retry", "with_replanning", "failure"),
-        one("retry", "with_replanning", None),
-        one("retry", "without_replanning", "failure"),
-    ]
-    (table,) = retry_table(recorded)
-    assert table.rows == (
-        ("stack", "nominal", "with_replanning", 1, 3, 1),
-        ("stack", "nominal", "without_replanning", 0, 1, 0),
-    )
-    assert retry_table(recorded[:1]) == ()
+    assert "comparisons" in {table.id for table in found.tables}
 
 
 def test_without_plans_what_was_executed_is_shown_and_enters_no_statistic() -> None:

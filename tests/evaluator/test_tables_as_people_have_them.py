@@ -203,6 +203,15 @@ READ: dict[str, tuple[str, Rates | Trials]] = {
         ",DP,1/10,2/10\n",
         counts("cup", "7/10 5/10", "8/10 6/10") | counts("cube", "3/10 1/10", "5/10 2/10"),
     ),
+    "a side beside our own name of the outcome": (
+        "trial_id,task,policy,side,recorded\n1,cup,ACT,real,1\n2,cup,ACT,sim,0\n",
+        [("cup", "ACT", True, None), ("cup", "ACT", None, False)],
+    ),
+    "rates of objects with our own names": (
+        "task,condition,policy,side,unit,n,rate\nducks,a,p,sim,object,50,0.46\n"
+        "ducks,a,p,real,object,50,0.6\n",
+        counts("ducks", "30/50", "23/50", "p"),
+    ),
     "a name that says sim or real": (
         "experiment,policy,success,trials\ncup_real,ACT,7,10\ncup_sim,ACT,8,10\n",
         {("cup", "ACT", "real"): (7, 10), ("cup", "ACT", "sim"): (8, 10)},

@@ -29,18 +29,7 @@ def plain(frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def trials_in(frame: pd.DataFrame) -> list[TrialRecord]:
-    """Rows as trials; their tags are one text, null without any."""
-    return [
-        TrialRecord(**(row | {"tags": tuple(map(tag, row["tags"].split("; ")))}))
-        if row["tags"]
-        else TrialRecord(**(row | {"tags": ()}))
-        for row in plain(frame)
-    ]
-
-
-def tag(text: str) -> tuple[str, str]:
-    axis, _, value = text.partition("=")
-    return axis, value
+    return [TrialRecord(**row) for row in plain(frame)]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +51,7 @@ def test_an_unknown_answer_stays_unknown(tmp_path: Path) -> None:
     trials = [
         TrialRecord(trial_id="a", task="t", recorded=True, k=1, n=1, p_success=0.25),
         TrialRecord(trial_id="b", task="t,'\n", recorded=False),
-        TrialRecord(trial_id="c", task="t", stand_in=True, tags=(("light", "dim"), ("pose", "1"))),
+        TrialRecord(trial_id="c", task="t", stand_in=True),
     ]
     frame = pd.read_parquet(
         write_trials(tmp_path / "t.parquet", trials), dtype_backend="numpy_nullable"
