@@ -112,7 +112,7 @@ CORE: tuple[leaves.Command, ...] = (
         "evaluator.cli",
         """
         evaluate | Compute success rates and agreement; write a report. | runs/monday
-        design | Size a study, and lock its protocol. | runs/study --rate 0.5 --gain 0.3 --width 0.4
+        design | Size a study, and lock its protocol. | runs/study --rate 0.5 --gain 0.3
         """,
     ),
     *leaves.commands_of(

@@ -121,7 +121,7 @@ def _found(asked: _Asked, published: "PublishedCheck | None") -> "tuple[Comparis
         UsageError: When there is nothing to evaluate.
     """
     from bridge.errors import UsageError
-    from evaluator.compare.images.renders import compare_folders
+    from evaluator.compare.images.methods import compare_folders
 
     if asked.sources:
         comparison, folder = _compare(asked)
@@ -211,7 +211,7 @@ def design(
 ) -> None:
     """Size a study before its first trial, and lock its protocol: protocol.json, order.csv.
 
-    Example: robot-gst design runs/study --rate 0.5 --gain 0.3 --width 0.4
+    Example: robot-gst design runs/study --rate 0.5 --gain 0.3
 
     Args:
         run: Folder of the study; made where it is not there.
