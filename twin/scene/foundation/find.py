@@ -26,7 +26,7 @@ from twin.scene.store.folder import read_scene
 
 MAX_VIEWS = 12
 """Frames of the scan among which the picture is chosen."""
-SHOWN_PX = 40
+SHOWN_PX = 20
 """A frame shows a thing that has so many of its pixels."""
 CANONICAL = ("object", "thing", "stuff", "texture")
 """What a text has to beat (LERF, Kerr et al. 2023)."""

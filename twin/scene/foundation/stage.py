@@ -86,8 +86,10 @@ def masks_in(
     prompts = prompts_of(config, task)
     masks = []
     for done, frame in enumerate(frames, 1):
-        where = {"camera_id": frame.camera_id, "stamp_ns": frame.stamp_ns}
-        masks.append((viewpoint_of(frame), segmenter.segment(frame.image_u8, prompts, **where)))
+        found = segmenter.segment(
+            frame.image_u8, prompts, camera_id=frame.camera_id, stamp_ns=frame.stamp_ns
+        )
+        masks.append((viewpoint_of(frame), found))
         advance(done, segmenter.kind.name)
     return masks
 
