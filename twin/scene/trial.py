@@ -81,11 +81,11 @@ class TrialInScene:
         moved = self.moved.get(camera_id)
         if moved is None:
             return T_base_camera
-        if moved.T_said_true is None:
+        if moved.T_posed_true is None:
             found = moved.describe(camera_id)
             message = f"{self.recorded.info.id} is not rendered from there: {found}."
             raise MovedCameraError(message)
-        return np.asarray(T_base_camera @ moved.T_said_true)
+        return np.asarray(T_base_camera @ moved.T_posed_true)
 
     def meshes(self, run: RunFolder) -> dict[str, Mesh]:
         """Surfaces of the objects that are drawn, each in its own frame."""

@@ -22,7 +22,7 @@ from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 
 MOVED_M, MOVED_RAD = 0.005, np.radians(0.5)
 """From here on a camera was moved; less is the scatter of poses and of this comparison."""
-APART_M = (0.06, 0.02)
+BEYOND_M = (0.06, 0.02)
 """Depths that differ by more, in the first and in the second round, show another thing."""
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.03)
 
@@ -35,23 +35,23 @@ class MovedCameraError(TwinError):
 class MovedCamera:
     """Where a camera is, seen from where its poses say it is."""
 
-    T_said_true: Float[np.ndarray, "4 4"] | None
+    T_posed_true: Float[np.ndarray, "4 4"] | None
     """Of its colour frame; None: it was moved, and its images do not say where to."""
 
     def to_record(self) -> dict[str, Any]:
         """What a localisation says of it."""
-        T = self.T_said_true
-        return {"T_said_true": None if T is None else se3.pose_record(T)}
+        T = self.T_posed_true
+        return {"T_posed_true": None if T is None else se3.pose_record(T)}
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> "MovedCamera":
         """Read what ``to_record`` gave."""
-        T = record["T_said_true"]
-        return MovedCamera(T_said_true=None if T is None else se3.pose_from_record(T))
+        T = record["T_posed_true"]
+        return MovedCamera(T_posed_true=None if T is None else se3.pose_from_record(T))
 
     def describe(self, camera_id: str) -> str:
         """What happened to it."""
-        T = self.T_said_true
+        T = self.T_posed_true
         if T is None:
             return (
                 f"camera {camera_id} does not see the scene where it should, and what it sees does "
@@ -77,8 +77,8 @@ def moved_camera(
     vectors, is_lost = [], False
     for frame in frames:
         T, found = np.eye(4), False
-        for apart_m in APART_M:
-            pair = _looks(frame, T, background, rasteriser, aligner, apart_m)
+        for beyond_m in BEYOND_M:
+            pair = _looks(frame, T, background, rasteriser, aligner, beyond_m)
             if pair.overlap < MIN_OVERLAP:
                 break  # it looks where the scan did not
             step = aligner.lay(pair.recorded, pair.drawn, np.eye(4))
@@ -89,14 +89,14 @@ def moved_camera(
         if found:
             vectors.append(np.concatenate([T[:3, 3], se3.vector_from_rotation(T[:3, :3])]))
     if not vectors:
-        return MovedCamera(T_said_true=None) if is_lost else None
+        return MovedCamera(T_posed_true=None) if is_lost else None
     middle = np.median(vectors, axis=0)
     shift_m, turn_rad = (float(np.linalg.norm(part)) for part in (middle[:3], middle[3:]))
     if shift_m < MOVED_M and turn_rad < MOVED_RAD:
         return None
-    T_said_true = np.eye(4)
-    T_said_true[:3, :3], T_said_true[:3, 3] = se3.rotation_from_vector(middle[3:]), middle[:3]
-    return MovedCamera(T_said_true=T_said_true)
+    T_posed_true = np.eye(4)
+    T_posed_true[:3, :3], T_posed_true[:3, 3] = se3.rotation_from_vector(middle[3:]), middle[:3]
+    return MovedCamera(T_posed_true=T_posed_true)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,24 +112,24 @@ class _Pair:
 
 def _looks(
     frame: RgbdFrame,
-    T_said_true: Float[np.ndarray, "4 4"],
+    T_posed_true: Float[np.ndarray, "4 4"],
     background: GaussianCloud,
     rasteriser: Rasteriser,
     aligner: Aligner,
-    apart_m: float,
+    beyond_m: float,
 ) -> _Pair:
     """What was recorded, and the scene from where the camera is thought to be."""
-    camera, T = frame.color_camera, frame.T_base_color @ T_said_true
+    camera, T = frame.color_camera, frame.T_base_color @ T_posed_true
     view = rasteriser.view(background, camera, T)
     recorded_m = FrameSurface(frame, LIMITS).depth_in_color_camera()
     both = (recorded_m > 0) & (view.depth_m > 0)
-    apart = both & (np.abs(recorded_m - view.depth_m) > apart_m)
+    other = both & (np.abs(recorded_m - view.depth_m) > beyond_m)
     overlap = float(both.sum() / max((recorded_m > 0).sum(), 1))
-    recorded_m[apart] = 0.0
+    recorded_m[other] = 0.0
     posed = replace(frame, depth_camera=camera, T_base_color=T, T_base_depth=T)
     return _Pair(
         recorded=aligner.look(replace(posed, depth_m=recorded_m)),
         drawn=aligner.look(replace(posed, depth_m=view.depth_m, image_u8=view.image_u8())),
         overlap=overlap,
-        agreement=1.0 - float(apart.sum() / max(both.sum(), 1)),
+        agreement=1.0 - float(other.sum() / max(both.sum(), 1)),
     )

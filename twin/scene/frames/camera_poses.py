@@ -267,20 +267,20 @@ def poses_shifted(
     poses: CameraPoses,
     episode: Episode,
     camera_id: str,
-    T_said_true: Float[np.ndarray, "4 4"] | None,
+    T_posed_true: Float[np.ndarray, "4 4"] | None,
 ) -> CameraPoses:
     """Poses of a camera that is elsewhere than they say.
 
     Args:
-        T_said_true: Its colour frame, seen from where it was said to be; None: nobody knows.
+        T_posed_true: Its colour frame, seen from where it was said to be; None: nobody knows.
     """
     stamps = paired_stamps_ns(episode, camera_id)
-    if T_said_true is None:
+    if T_posed_true is None:
         return replace(poses, unposed_ns=frozenset(stamps.tolist()))
     (color, depth), tree, edges = _frame_ids(episode, camera_id), poses.tree, []
     for stamp in (t for t in stamps.tolist() if t not in poses.unposed_ns):
-        T_said = tree.T_root_frame(color, stamp)
-        T_new_old = T_said @ T_said_true @ se3.invert(T_said)
+        T_posed = tree.T_root_frame(color, stamp)
+        T_new_old = T_posed @ T_posed_true @ se3.invert(T_posed)
         for frame in {color, depth}:
             T = T_new_old @ tree.T_root_frame(frame, stamp)
             edges.append(_edge(tree.root_of(color), frame, T, stamp))

@@ -201,7 +201,7 @@ def trial_cameras(run: RunFolder, episode: Episode, moved: Mapping[str, MovedCam
     poses = dict(calibrated_cameras(episode, read_calibration(run)))
     for camera_id, item in moved.items():
         known = poses.get(camera_id) or CameraPoses(tree=base_tree(episode), source="tf")
-        poses[camera_id] = poses_shifted(known, episode, camera_id, item.T_said_true)
+        poses[camera_id] = poses_shifted(known, episode, camera_id, item.T_posed_true)
     return poses
 
 

@@ -182,36 +182,11 @@ static inline Floats view_direction(const Local& local, const Camera& camera, Fl
     return inverse;
 }
 
-// Factors of degree 2 (order 1, 0, 2) and 3 (order 0, 1, 2, that of xyz, order 3).
-constexpr float kSecond1 = 1.0925484305920792f, kSecond0 = 0.31539156525252005f;
-constexpr float kSecond2 = 0.5462742152960396f, kThird0 = 0.37317633259011546f;
-constexpr float kThird1 = 0.4570457994644658f, kThird2 = 1.445305721320277f;
-constexpr float kThirdXyz = 2.890611442640554f, kThird3 = 0.5900435899266435f;
-
-// Real spherical harmonics along a unit vector, in the order and with the signs of 3DGS files.
-template <int kCount>
+// Real spherical harmonics of degree 1 along a unit vector, with the signs of 3DGS files.
 static inline void harmonic_basis(const Floats* direction, Floats* basis) {
     basis[0] = -kHarmonicFactor * direction[1];
     basis[1] = kHarmonicFactor * direction[2];
     basis[2] = -kHarmonicFactor * direction[0];
-    if constexpr (kCount >= kSecondHarmonics) {
-        const Floats x = direction[0], y = direction[1], z = direction[2];
-        const Floats xx = x * x, yy = y * y, zz = z * z;
-        basis[3] = kSecond1 * x * y;
-        basis[4] = -kSecond1 * y * z;
-        basis[5] = kSecond0 * (2.0f * zz - xx - yy);
-        basis[6] = -kSecond1 * x * z;
-        basis[7] = kSecond2 * (xx - yy);
-        if constexpr (kCount >= kThirdHarmonics) {
-            basis[8] = -kThird3 * y * (3.0f * xx - yy);
-            basis[9] = kThirdXyz * x * y * z;
-            basis[10] = -kThird1 * y * (4.0f * zz - xx - yy);
-            basis[11] = kThird0 * z * (2.0f * zz - 3.0f * xx - 3.0f * yy);
-            basis[12] = -kThird1 * x * (4.0f * zz - xx - yy);
-            basis[13] = kThird2 * z * (xx - yy);
-            basis[14] = -kThird3 * x * (xx - 3.0f * yy);
-        }
-    }
 }
 
 }  // namespace splat::SPLAT_ISA

@@ -61,6 +61,8 @@ class PyFitSession {
     PyFitSession(int threads, const std::string& isa)
         : session_(choose(isa), thread_count(threads)) {}
 
+    void use_threads(int threads) { session_.use_threads(thread_count(threads)); }
+
     nb::tuple step(const nb::tuple& values, const nb::tuple& first, const nb::tuple& second,
                    const Pose& T_camera_world, const Intrinsics& intrinsics, float alpha_cut,
                    float transmittance_stop, const Bytes& planes_u8, const Depth& depth_m,
@@ -157,6 +159,7 @@ void add_session(nb::module_& module) {
              "T_camera_world"_a.noconvert(), "intrinsics"_a, "alpha_cut"_a,
              "transmittance_stop"_a, "planes_u8"_a.noconvert(), "depth_m"_a.noconvert(),
              "static_mask"_a.noconvert(), "exposure"_a.noconvert(), "loss"_a, "rates"_a, "step"_a)
+        .def("use_threads", &PyFitSession::use_threads, "threads"_a)
         .def("planes", &PyFitSession::planes)
         .def("gradients", &PyFitSession::gradients)
         .def("visible", &PyFitSession::visible);

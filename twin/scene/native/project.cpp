@@ -11,27 +11,17 @@ struct Cut {
     float alpha, log2_alpha;
 };
 
-template <int kCount>
-void add_harmonics(const Splats& in, const Floats* direction, int begin, int count, Floats* rgb) {
-    Floats basis[kCount], h[3 * kCount];
-    harmonic_basis<kCount>(direction, basis);
-    gather<3 * kCount>(in.harmonics, begin, count, h);
-    for (int k = 0; k < kCount; ++k)
-        for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * h[3 * k + c];
-}
-
 void seen_colors(const Splats& in, const Camera& camera, const Local& local, int begin, int count,
                  Floats* rgb) {
     gather<3>(in.colors, begin, count, rgb);
     if (in.harmonics == nullptr) return;
     Floats direction[3];
     view_direction(local, camera, direction);
-    if (in.num_harmonics == kFirstHarmonics)
-        add_harmonics<kFirstHarmonics>(in, direction, begin, count, rgb);
-    else if (in.num_harmonics == kSecondHarmonics)
-        add_harmonics<kSecondHarmonics>(in, direction, begin, count, rgb);
-    else
-        add_harmonics<kThirdHarmonics>(in, direction, begin, count, rgb);
+    Floats basis[kNumHarmonics], h[3 * kNumHarmonics];
+    harmonic_basis(direction, basis);
+    gather<3 * kNumHarmonics>(in.harmonics, begin, count, h);
+    for (int k = 0; k < kNumHarmonics; ++k)
+        for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * h[3 * k + c];
 }
 
 // The members of Projected in their order.

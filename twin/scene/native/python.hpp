@@ -69,8 +69,7 @@ inline Camera make_camera(const Pose& T_camera_world, const Intrinsics& intrinsi
 }
 
 inline int checked_harmonics(std::size_t count) {
-    if (count != kFirstHarmonics && count != kSecondHarmonics && count != kThirdHarmonics)
-        throw nb::value_error("a colour has 3, 8 or 15 harmonics, or None");
+    if (count != kNumHarmonics) throw nb::value_error("a colour has 3 harmonics, or None");
     return static_cast<int>(count);
 }
 

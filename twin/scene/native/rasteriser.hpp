@@ -17,6 +17,8 @@ class Rasteriser {
   public:
     Rasteriser(const Kernels& kernels, int threads) : kernels_(kernels), threads_(threads) {}
 
+    void use_threads(int threads) { threads_ = threads; }
+
     // Fills ``planes`` (5 x height x width): red, green, blue, sum w depth, sum w.
     void draw(const Splats&, int count, const Camera&, const Settings&, float* planes);
 

@@ -56,6 +56,13 @@ class FitSession {
     StepResult step(int count, const Camera&, const Settings&, const FitTarget&,
                     const LossWeights&, const Learning&);
 
+    // From the next step on; the result does not depend on it.
+    void use_threads(int threads) {
+        threads_ = threads;
+        rasteriser_.use_threads(threads);
+        similarity_.use_threads(threads);
+    }
+
     const Rasteriser& rasteriser() const { return rasteriser_; }
     // Of the last step: what was drawn (5 planes), and the gradient on one of the six tables.
     const std::vector<float>& planes() const { return planes_; }

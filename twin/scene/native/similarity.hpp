@@ -11,6 +11,8 @@ class Similarity {
   public:
     Similarity(const Kernels& kernels, int threads) : kernels_(kernels), threads_(threads) {}
 
+    void use_threads(int threads) { threads_ = threads; }
+
     // ``rendered``, ``target`` and ``gradient`` are 3 x height x width; returns the mean over all
     // pixels and channels, and fills the gradient of that mean with respect to ``rendered``.
     double mean(const float* rendered, const float* target, float* gradient, int width,

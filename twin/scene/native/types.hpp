@@ -12,9 +12,7 @@ constexpr int kBlockWidth = 4;     // a tile is stored in blocks of 4 x tall pix
 constexpr int kPlanes = 5;         // red, green, blue, depth, alpha
 constexpr int kPairGradients = 12; // see PairGradient
 constexpr int kPoseEntries = 12;   // a 3 x 4 matrix
-constexpr int kFirstHarmonics = 3;   // real spherical harmonics up to degree 1
-constexpr int kSecondHarmonics = 8;  // up to degree 2
-constexpr int kThirdHarmonics = 15;  // up to degree 3
+constexpr int kNumHarmonics = 3;  // real spherical harmonics of degree 1
 constexpr float kHarmonicFactor = 0.4886025119029199f;  // sqrt(3 / (4 pi))
 constexpr float kMaxAlpha = 0.999f;
 constexpr float kMipVariance = 0.1f;     // added to the image covariance [px^2]
@@ -49,7 +47,7 @@ struct Splats {
     const float* opacities;    // n, logits
     const float* colors;       // n x 3
     const float* harmonics;    // n x num_harmonics x 3; null where there are none
-    int num_harmonics;         // 0, 3, 8 or 15
+    int num_harmonics;         // 0 or 3
 };
 
 struct SplatGradients {

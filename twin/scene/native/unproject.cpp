@@ -92,46 +92,20 @@ void point_gradient(const Local& local, const Camera& camera, const Inverse& K,
                                inverse_z;
 }
 
-// Adds to dL/ddirection what comes by way of degree 2; ``on`` is dL/dbasis.
-void second_gradient(const Floats* direction, const Floats* on, Floats* out) {
-    const Floats x = direction[0], y = direction[1], z = direction[2];
-    out[0] += kSecond1 * (y * on[3] - z * on[6]) + 2.0f * x * (kSecond2 * on[7] - kSecond0 * on[5]);
-    out[1] += kSecond1 * (x * on[3] - z * on[4]) - 2.0f * y * (kSecond2 * on[7] + kSecond0 * on[5]);
-    out[2] += 4.0f * kSecond0 * z * on[5] - kSecond1 * (y * on[4] + x * on[6]);
-}
-
-// The same of degree 3.
-void third_gradient(const Floats* direction, const Floats* on, Floats* out) {
-    const Floats x = direction[0], y = direction[1], z = direction[2];
-    const Floats xx = x * x, yy = y * y, zz = z * z, three = 3.0f * kThird3 * (xx - yy);
-    out[0] += kThirdXyz * y * z * on[9] + 2.0f * kThird1 * x * y * on[10] -
-              6.0f * kThird3 * x * y * on[8] - 6.0f * kThird0 * x * z * on[11] -
-              kThird1 * (4.0f * zz - 3.0f * xx - yy) * on[12] + 2.0f * kThird2 * x * z * on[13] -
-              three * on[14];
-    out[1] += kThirdXyz * x * z * on[9] - kThird1 * (4.0f * zz - xx - 3.0f * yy) * on[10] -
-              three * on[8] - 6.0f * kThird0 * y * z * on[11] + 2.0f * kThird1 * x * y * on[12] -
-              2.0f * kThird2 * y * z * on[13] + 6.0f * kThird3 * x * y * on[14];
-    out[2] += kThirdXyz * x * y * on[9] - 8.0f * kThird1 * z * (y * on[10] + x * on[12]) +
-              3.0f * kThird0 * (2.0f * zz - xx - yy) * on[11] + kThird2 * (xx - yy) * on[13];
-}
-
 // Fills dL/dharmonics and the gradient on the ray from the camera centre to the mean.
-template <int kCount>
 void harmonic_gradient(const Splats& in, const Camera& camera, const Local& local,
                        const Floats* d_rgb, int begin, int count, Floats* d_harmonics,
                        Floats* d_ray) {
-    Floats direction[3], basis[kCount], along[kCount], h[3 * kCount];
+    Floats direction[3], basis[kNumHarmonics], along[kNumHarmonics], h[3 * kNumHarmonics];
     const Floats inverse = view_direction(local, camera, direction);
-    harmonic_basis<kCount>(direction, basis);
-    gather<3 * kCount>(in.harmonics, begin, count, h);
-    for (int k = 0; k < kCount; ++k) {
+    harmonic_basis(direction, basis);
+    gather<3 * kNumHarmonics>(in.harmonics, begin, count, h);
+    for (int k = 0; k < kNumHarmonics; ++k) {
         along[k] = h[3 * k] * d_rgb[0] + h[3 * k + 1] * d_rgb[1] + h[3 * k + 2] * d_rgb[2];
         for (int c = 0; c < 3; ++c) d_harmonics[3 * k + c] = basis[k] * d_rgb[c];
     }
     Floats d_direction[3] = {-kHarmonicFactor * along[2], -kHarmonicFactor * along[0],
                              kHarmonicFactor * along[1]};
-    if constexpr (kCount >= kSecondHarmonics) second_gradient(direction, along, d_direction);
-    if constexpr (kCount >= kThirdHarmonics) third_gradient(direction, along, d_direction);
     const Floats radial = d_direction[0] * direction[0] + d_direction[1] * direction[1] +
                           d_direction[2] * direction[2];
     for (int i = 0; i < 3; ++i) d_ray[i] = (d_direction[i] - radial * direction[i]) * inverse;
@@ -160,13 +134,12 @@ void write(Floats* values, Ints shown, float* table, int begin, int count) {
     scatter<kColumns>(values, table, begin, count);
 }
 
-template <int kCount>
 void write_harmonics(const Splats& in, const Camera& camera, const Local& local,
                      const Floats* d_rgb, Ints shown, float* table, int begin, int count,
                      Floats* d_ray) {
-    Floats d_harmonics[3 * kCount];
-    harmonic_gradient<kCount>(in, camera, local, d_rgb, begin, count, d_harmonics, d_ray);
-    write<3 * kCount>(d_harmonics, shown, table, begin, count);
+    Floats d_harmonics[3 * kNumHarmonics];
+    harmonic_gradient(in, camera, local, d_rgb, begin, count, d_harmonics, d_ray);
+    write<3 * kNumHarmonics>(d_harmonics, shown, table, begin, count);
 }
 
 // dA and dB to scales, rotation, T and the optical axis (last row of W).
@@ -211,13 +184,8 @@ void unproject_lanes(const Splats& in, const Camera& camera, const float* pair_s
     quaternion_gradient(local, dR, d_quats);
     Floats dp[3], d_ray[3] = {Floats{}, Floats{}, Floats{}}, d_mean[3];
     point_gradient(local, camera, K, slope, sums, dT, dp);
-    if (in.harmonics != nullptr) {
-        const auto write_them = in.num_harmonics == kFirstHarmonics ? write_harmonics<kFirstHarmonics>
-                                : in.num_harmonics == kSecondHarmonics
-                                    ? write_harmonics<kSecondHarmonics>
-                                    : write_harmonics<kThirdHarmonics>;
-        write_them(in, camera, local, sums + kRed, shown, out.harmonics, begin, count, d_ray);
-    }
+    if (in.harmonics != nullptr)
+        write_harmonics(in, camera, local, sums + kRed, shown, out.harmonics, begin, count, d_ray);
     for (int k = 0; k < 3; ++k)
         d_mean[k] = camera.R[k] * dp[0] + camera.R[3 + k] * dp[1] + camera.R[6 + k] * dp[2] +
                     d_ray[k];

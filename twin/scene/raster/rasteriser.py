@@ -114,6 +114,42 @@ class StepReport:
     """How much of it one thread spent alone: by Amdahl's law it bounds what more threads gain."""
 
 
+OFTEN, RARELY = 32, 256
+"""Steps from one with the slower number of threads to the next: rarely where it is far slower."""
+FAR_SLOWER = 1.3
+FORGETS = 0.2
+"""Weight of one step's time in the running mean."""
+
+
+class ThreadPace:
+    """How many threads a step takes: all, or one where that was faster of late.
+
+    On a busy machine a step of two threads waits at each of its barriers until the other one is
+    given time again, and takes three times as long as one thread alone.
+    """
+
+    def __init__(self, most: int) -> None:
+        """Nothing was timed yet."""
+        self._counts = (1, most)
+        self._seconds: dict[tuple[int, int], float] = {}
+        self._steps = 0
+
+    def choose(self, size: int) -> int:
+        """The number for the next step, for images of some size."""
+        self._steps += 1
+        for count in self._counts:
+            if (size, count) not in self._seconds:
+                return count
+        fast, slow = sorted(self._counts, key=lambda count: self._seconds[size, count])
+        far = self._seconds[size, slow] > FAR_SLOWER * self._seconds[size, fast]
+        return slow if self._steps % (RARELY if far else OFTEN) == 0 else fast
+
+    def took(self, size: int, count: int, seconds: float) -> None:
+        """Remember how long a step took."""
+        before = self._seconds.get((size, count), seconds)
+        self._seconds[size, count] = before + FORGETS * (seconds - before)
+
+
 class FitSession:
     """A cloud being fitted, with the moments of Adam (Kingma and Ba 2015).
 
@@ -136,6 +172,7 @@ class FitSession:
         self.steps = 0
         self._loss = (loss == "3dgs", l1_share, depth_weight)
         self._native = load_native().FitSession(self.config.threads, self.config.isa)
+        self._pace = ThreadPace(self.config.threads or os.cpu_count() or 1)
         self._cloud = _own_copy(cloud)
         self._first = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
         self._second = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
@@ -160,6 +197,9 @@ class FitSession:
             exposure: Times the drawn (red, green, blue, 1) is compared with the image.
         """
         self.steps += 1
+        size = target.depth_m.size
+        threads = self._pace.choose(size)
+        self._native.use_threads(threads)
         loss, squared, num_static, d_gain, d_pose, seconds, serial_s = self._native.step(
             self._tables(dict(arrays(self._cloud))),
             self._tables(self._first),
@@ -175,6 +215,7 @@ class FitSession:
             tuple(float(rates.get(name, 0.0)) for name in NAMES),
             self.steps,
         )
+        self._pace.took(size, threads, sum(seconds))
         return StepReport(
             loss=loss,
             mse=squared / (3 * num_static) if num_static else None,

@@ -68,7 +68,7 @@ def shapes_of(
         make = reconstruct if T[2, 2] >= UPRIGHT_COSINE else partial(_leaning, T_base_object=T)
         try:
             if is_known(models[key]):
-                found[key] = _as_stated(useful, models[key])
+                found[key] = _task_shape(useful, models[key])
             else:
                 found[key] = make(useful, support)
         except TwinError as error:
@@ -81,7 +81,7 @@ def is_known(model: ObjectModel) -> bool:
     return model.shape != SCANNED and model.soft is None
 
 
-def _as_stated(views: Sequence[MaskedView], model: ObjectModel) -> ObjectShape:
+def _task_shape(views: Sequence[MaskedView], model: ObjectModel) -> ObjectShape:
     """The task's shape; what no view measured of it is marked."""
     vertices, faces = shape_mesh(model)
     if not views:

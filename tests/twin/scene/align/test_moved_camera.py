@@ -70,8 +70,8 @@ def test_a_bumped_camera_is_registered_again(
     moved = compared(background, bump)
     assert moved is not None
     again = MovedCamera.from_record(moved.to_record())
-    assert again.T_said_true is not None
-    left = se3.invert(bump) @ again.T_said_true
+    assert again.T_posed_true is not None
+    left = se3.invert(bump) @ again.T_posed_true
     assert np.linalg.norm(left[:3, 3]) < MOVED_M
     assert se3.rotation_angle_rad(left[:3, :3]) < MOVED_RAD
     assert "was moved by" in moved.describe("side")
@@ -85,5 +85,5 @@ def test_a_camera_before_another_room_is_lost_and_said_to_be(background: Gaussia
     )
     moved = moved_camera([other], background, threads=1)
     assert moved is not None
-    assert moved.T_said_true is None
+    assert moved.T_posed_true is None
     assert "scan again" in moved.describe("side")

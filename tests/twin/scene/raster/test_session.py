@@ -14,6 +14,7 @@ from twin.scene.raster.rasteriser import (
     FitSession,
     RasterConfig,
     Rasteriser,
+    ThreadPace,
     load_native,
 )
 
@@ -171,3 +172,14 @@ def test_moments_go_along_with_their_gaussians() -> None:
     other = twin.step(some_target(), a_pose(), RATES)
     assert report.loss == other.loss
     assert not np.array_equal(session.cloud.means_m[0], twin.cloud.means_m[0])
+
+
+@pytest.mark.parametrize(("alone_s", "both_s"), [(0.028, 0.095), (0.028, 0.015), (0.028, 0.029)])
+def test_two_threads_are_never_much_slower_than_one(alone_s: float, both_s: float) -> None:
+    pace, total_s = ThreadPace(2), 0.0
+    for _ in range(2000):
+        count = pace.choose(9)
+        seconds = alone_s if count == 1 else both_s
+        pace.took(9, count, seconds)
+        total_s += seconds
+    assert total_s < 1.03 * 2000 * min(alone_s, both_s)

@@ -13,7 +13,6 @@ from bridge.errors import PathNotFoundError
 from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.mesh import (
     UnreadableMeshError,
-    face_normals,
     is_watertight,
     mesh_ply,
     read_mesh,
@@ -103,13 +102,3 @@ def test_a_damaged_mesh_is_refused(tmp_path: Path, old: bytes, new: bytes, says:
         read_mesh(path)
     with pytest.raises(PathNotFoundError):
         read_mesh(tmp_path / "none.ply")
-
-
-def test_a_sphere_is_closed_has_its_volume_and_faces_outwards() -> None:
-    vertices, faces = sphere(0.05, 0.002)
-    assert is_watertight(faces)
-    assert volume_m3(vertices, faces) == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=2e-3)
-    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, atol=1e-4)
-    normals, _ = face_normals(vertices, faces)
-    outwards = np.einsum("ni,ni->n", normals, vertices[faces].mean(axis=1))
-    assert np.all(outwards > 0)
