@@ -20,15 +20,14 @@ VGG = [
     *((12, 256, 256, 3), (14, 256, 256, 3), (17, 256, 512, 3), (19, 512, 512, 3)),
     *((21, 512, 512, 3), (24, 512, 512, 3), (26, 512, 512, 3), (28, 512, 512, 3)),
 ]
-ALEX = [(0, 3, 64, 11), (3, 64, 192, 5), (6, 192, 384, 3), (8, 384, 256, 3), (10, 256, 256, 3)]
 """Index in ``features``, channels in, channels out, size."""
 
 
-def backbone(net: str) -> dict[str, np.ndarray]:
-    """Draw the weights of a network from a seed, named as torchvision names them."""
-    rng = np.random.default_rng({"vgg": 16, "alex": 8}[net])
+def backbone() -> dict[str, np.ndarray]:
+    """Draw the weights of VGG16 from a seed, named as torchvision names them."""
+    rng = np.random.default_rng(16)
     state = {}
-    for index, channels_in, channels_out, size in {"vgg": VGG, "alex": ALEX}[net]:
+    for index, channels_in, channels_out, size in VGG:
         shape = (channels_out, channels_in, size, size)
         spread = np.float32(np.sqrt(2.0 / (channels_in * size * size)))
         state[f"features.{index}.weight"] = rng.standard_normal(shape, dtype=np.float32) * spread
@@ -56,26 +55,23 @@ def stub_torchvision() -> list[object]:
 
 
 def main() -> None:
-    """Ask the package about two pairs, with both networks and both ranges of input."""
+    """Ask the package about two pairs in 0..1."""
     import torch
 
     alive = stub_torchvision()
     import lpips
 
     cases = []
-    for net in ("vgg", "alex"):
-        model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)
-        state = {}
-        for name, value in backbone(net).items():
-            own = next(n for n in model.net.state_dict() if n.split(".", 1)[1] == name[9:])
-            state[own] = torch.from_numpy(value)
-        model.net.load_state_dict(state, strict=True)
-        for seed in range(2):
-            pair = [torch.from_numpy(i).permute(2, 0, 1)[None].float() for i in images(seed)]
-            for given, normalize in (("01", False), ("pm1", True)):
-                with torch.no_grad():
-                    value = float(model(*pair, normalize=normalize))
-                cases.append({"net": net, "seed": seed, "input": given, "value": value})
+    model = lpips.LPIPS(net="vgg", pnet_rand=True, verbose=False)
+    state = {}
+    for name, value in backbone().items():
+        own = next(n for n in model.net.state_dict() if n.split(".", 1)[1] == name[9:])
+        state[own] = torch.from_numpy(value)
+    model.net.load_state_dict(state, strict=True)
+    for seed in range(2):
+        pair = [torch.from_numpy(i).permute(2, 0, 1)[None].float() for i in images(seed)]
+        with torch.no_grad():
+            cases.append({"seed": seed, "value": float(model(*pair, normalize=False))})
     del alive
     version = sys.modules["importlib.metadata"].version("lpips")
     PATH.write_text(json.dumps({"lpips": version, "cases": cases}, indent=1) + "\n")

@@ -2,6 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -99,13 +100,10 @@ def test_nothing_is_drawn_beyond_the_edge(drawn: list[Drawing]) -> None:
 
 
 def test_a_figure_that_has_lost_its_data_is_removed(tmp_path: Path, paper: Comparison) -> None:
-    stale = tmp_path / "figures" / "motions.svg"
-    stale.parent.mkdir()
-    stale.write_text("<svg/>")
-    (tmp_path / "results.json").write_text('{"tables": []}')
-    mine = tmp_path / "figures" / "mine.svg"
-    mine.write_text("<svg/>")
     write_report(paper, tmp_path)
+    stale, mine = (tmp_path / "figures" / name for name in ("scatter.svg", "mine.svg"))
+    assert stale.is_file()
+    mine.write_text("<svg/>")
+    write_report(replace(paper, groups=()), tmp_path)
     assert not stale.exists()
     assert mine.exists()
-    assert (tmp_path / "figures" / "scatter.svg").is_file()
