@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 from evaluator import motion_measurements as motion_measurements
-from evaluator import study_measurements as study_measurements
 from evaluator.metrics import image
 from evaluator.metrics.image_protocol import ImageMetric
 from evaluator.metrics.image_scores import METRICS
@@ -61,6 +60,27 @@ STAGE = _new(
     "1",
     "higher",
     "trials that passed stage {stage} of {task} / trials that reached it and whose ending is known",
+)
+
+# Which is better, and the protocol.
+
+COMPARED = _new(
+    "comparison.pp.{second}.against.{first}",
+    "pp",
+    "higher",
+    "recorded success of {second} less that of {first}, over all tasks, each weighted by its pairs: {words}",
+)
+COMPARED_IN_TASK = _new(
+    "comparison.pp.{second}.against.{first}.{task}",
+    "pp",
+    "higher",
+    "the same in {task}: {words}",
+)
+PROTOCOL_DEPARTURES = _new(
+    "protocol.departures",
+    "count",
+    "lower",
+    "departures of what was done from the protocol that was locked before the first trial",
 )
 
 # Agreement over groups. ``{what}`` says over which.

@@ -22,10 +22,10 @@ from evaluator.compare.measure import Part, ends, measured
 from evaluator.compare.rows import RateGroup, TrialRow, in_order
 from evaluator.compare.success import CONDITION_OF_ARM, WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import COMPARED, COMPARED_IN_TASK
 from evaluator.quantity import noun
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.sequential import Evidence, Look, Plan, Stratum, pairs_equivalent
-from evaluator.study_measurements import COMPARED, COMPARED_IN_TASK
 
 Item = TypeVar("Item")
 
