@@ -509,7 +509,7 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
             "task": each.task or ALL_TASKS,
             "shared starts": sum(s.pairs for s in each.reading.evidence.strata),
             "decided": {1: "better", -1: "worse", 0: "no"}[each.reading.better],
-            "decided after (pairs)": each.reading.decided and each.reading.decided.pairs,
+            "decided after (pairs)": look.pairs if (look := each.reading.decided) else None,
             "more trials of each": each.reading.more,
         }
         for each in answers
