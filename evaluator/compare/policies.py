@@ -283,7 +283,8 @@ def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence] | None =
     """Look at the trials as planned.
 
     Args:
-        until: Gives what was counted after so many pairs; without it all is one look.
+        until: Gives what was counted after so many pairs; without it the last look that was due
+            sees all of it.
     """
     limit = math.inf
     decided, better = None, 0
@@ -291,11 +292,14 @@ def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence] | None =
         if look.pairs > all_.pairs + 1e-9:
             limit = look.limit if math.isinf(limit) else limit
             break
-        limit = look.limit if until is not None else min(limit, look.limit)
+        limit = look.limit
+        if until is None:
+            decided = None  # of what was counted at once only the last look is asked
         seen = all_ if until is None else until(look.pairs)
         z = seen.of_no_difference if decided is None else 0.0
         if decided is None and abs(z) >= limit - 1e-9:
             decided, better = look, 1 if z > 0 else -1
+    better = better if decided is not None else 0
     return Reading(plan=plan, evidence=all_, limit=limit, decided=decided, better=better)
 
 
