@@ -5,7 +5,6 @@ what a ``Measurement`` is made with, so no other module spells an id.
 """
 
 from evaluator import motion_measurements as motion_measurements
-from evaluator import study_measurements as study_measurements
 from evaluator.metrics import image
 from evaluator.metrics.image import METRICS, ImageMetric
 from evaluator.quantity import REGISTRY as REGISTRY
@@ -57,6 +56,27 @@ STAGE = _new(
     "1",
     "higher",
     "trials that passed stage {stage} of {task} / trials that reached it and whose ending is known",
+)
+
+# Which is better, and the protocol.
+
+COMPARED = _new(
+    "comparison.pp.{second}.against.{first}",
+    "pp",
+    "higher",
+    "recorded success of {second} less that of {first}, over all tasks, each weighted by its pairs: {words}",
+)
+COMPARED_IN_TASK = _new(
+    "comparison.pp.{second}.against.{first}.{task}",
+    "pp",
+    "higher",
+    "the same in {task}: {words}",
+)
+PROTOCOL_DEPARTURES = _new(
+    "protocol.departures",
+    "count",
+    "lower",
+    "departures of what was done from the protocol that was locked before the first trial",
 )
 
 # Agreement over groups. ``{what}`` says over which.

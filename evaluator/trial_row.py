@@ -66,9 +66,6 @@ class TrialRow:
     """How each stage ended as labelled, in order; empty where nobody said."""
     baselines: tuple[tuple[str, bool], ...] = ()
     """What forecasts without a twin say of the plan sent, by name; unknown ones are left out."""
-    progress: float | None = None
-    """How far the recorded trial came, 0 to 1, where somebody scored it."""
-    sim_progress: float | None = None
     began_ns: int = 0
     """When its recording began; 0 where nobody knows, as in a table, whose rows are in order."""
     start_positions_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)

@@ -1,8 +1,8 @@
 """Trials CSV in and out: one row per trial, as people keep them in a spreadsheet.
 
 Columns: trial_id, task, condition, policy, start_id, unit, k, n, recorded, sim_planned,
-sim_executed, verdict, p_success, cell, stand_in, progress, sim_progress, why_unknown. Only task
-must be there (rows without trial_id are numbered); an empty field means unknown and stays unknown.
+sim_executed, verdict, p_success, cell, stand_in, why_unknown. Only task must be there (rows
+without trial_id are numbered); an empty field means unknown and stays unknown.
 """
 
 import csv
@@ -49,9 +49,6 @@ class TrialRecord:
     p_success: float | None = None
     cell: str = ""
     stand_in: bool | None = None
-    progress: float | None = None
-    """How far the recorded trial came, 0 to 1, where a rubric or its stages say so."""
-    sim_progress: float | None = None
     why_unknown: str = ""
     """What was said of an outcome that is not known: aborted, protective stop ..."""
 
@@ -170,8 +167,6 @@ def read_trial(row: SourceRow) -> TrialRecord:
         p_success=row.fraction("p_success"),
         cell=row.text("cell"),
         stand_in=row.answer("stand_in"),
-        progress=row.fraction("progress"),
-        sim_progress=row.fraction("sim_progress"),
         why_unknown=row.text("why_unknown") or _how_it_ended(row),
     )
 

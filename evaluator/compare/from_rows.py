@@ -42,14 +42,17 @@ def compare_rows(
         refuse_alike(kind, ((getattr(row, kind), row.episode) for row in rows))
     rates = side_rates(rows)
     groups = rate_groups(rows, rates)
+    # A run may lack its replays, which is told; a table without a twin is none of a twin.
+    has_twin = source == "run" or any(
+        each is not None for r in rows for each in (r.sim_planned, r.sim_executed, r.verdict)
+    )
     answers = compare_policies(rows, protocol, void_causes)
     compared = comparison_part(answers, protocol)
     stages, stage_tables, other_stages = stage_results(rows)
     measurements = (
         *rates,
         *(rate for group in groups for rate in (group.sim_common, group.recorded_common) if rate),
-        *agreement(rows),
-        *group_agreement(groups),
+        *((*agreement(rows), *group_agreement(groups)) if has_twin else ()),
         *compared.measurements,
         *regret_results(usable_groups(groups)),
         *baseline_results(rows),
@@ -70,7 +73,7 @@ def compare_rows(
             success_table(groups, word, "Outcomes as the table gives them." if given else ""),
             *layout_table(groups, word),
             *notes_table([*remarks(rows, void_causes), *notes(groups, measurements)]),
-            confusion_table(rows, word),
+            *((confusion_table(rows, word),) if has_twin else ()),
             *stage_tables,
             *failures_table(rows, word),
             trials_table(rows, word),

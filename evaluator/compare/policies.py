@@ -22,10 +22,10 @@ from evaluator.compare.measure import Part, ends, measured
 from evaluator.compare.rows import RateGroup, TrialRow, in_order
 from evaluator.compare.success import CONDITION_OF_ARM, WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import COMPARED, COMPARED_IN_TASK
 from evaluator.quantity import noun
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.sequential import Evidence, Look, Plan, Stratum, pairs_equivalent
-from evaluator.study_measurements import COMPARED, COMPARED_IN_TASK
 
 Item = TypeVar("Item")
 
@@ -283,7 +283,8 @@ def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence] | None =
     """Look at the trials as planned.
 
     Args:
-        until: Gives what was counted after so many pairs; without it all is one look.
+        until: Gives what was counted after so many pairs; without it the last look that was due
+            sees all of it.
     """
     limit = math.inf
     decided, better = None, 0
@@ -291,11 +292,14 @@ def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence] | None =
         if look.pairs > all_.pairs + 1e-9:
             limit = look.limit if math.isinf(limit) else limit
             break
-        limit = look.limit if until is not None else min(limit, look.limit)
+        limit = look.limit
+        if until is None:
+            decided = None  # of what was counted at once only the last look is asked
         seen = all_ if until is None else until(look.pairs)
         z = seen.of_no_difference if decided is None else 0.0
         if decided is None and abs(z) >= limit - 1e-9:
             decided, better = look, 1 if z > 0 else -1
+    better = better if decided is not None else 0
     return Reading(plan=plan, evidence=all_, limit=limit, decided=decided, better=better)
 
 
@@ -509,7 +513,7 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
             "task": each.task or ALL_TASKS,
             "shared starts": sum(s.pairs for s in each.reading.evidence.strata),
             "decided": {1: "better", -1: "worse", 0: "no"}[each.reading.better],
-            "decided after (pairs)": each.reading.decided and each.reading.decided.pairs,
+            "decided after (pairs)": look.pairs if (look := each.reading.decided) else None,
             "more trials of each": each.reading.more,
         }
         for each in answers

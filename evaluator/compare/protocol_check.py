@@ -11,8 +11,8 @@ from evaluator.compare.measure import Part, measured
 from evaluator.compare.policies import Answer
 from evaluator.compare.rows import TrialRow, in_order
 from evaluator.compare.success import CONDITION_OF_ARM
+from evaluator.measurements import PROTOCOL_DEPARTURES
 from evaluator.result import Cell, Exclusion, Table
-from evaluator.study_measurements import PROTOCOL_DEPARTURES
 
 ARM_OF_CONDITION = {condition: arm for arm, condition in CONDITION_OF_ARM.items()}
 NO_HASH = "0" * 64

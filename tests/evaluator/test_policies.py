@@ -265,3 +265,12 @@ def test_a_study_where_all_trials_end_alike_says_so_first(k: int, words: str) ->
     summary = front(found.results()).summary
     assert summary.startswith(words)
     assert "costs" not in summary
+
+
+def test_a_study_without_a_twin_says_nothing_of_a_twin() -> None:
+    found = compare_rows(interleaved(CLEAR), run="r", source="trials", stand_in=None)
+    assert not [m.id for m in found.measurements if m.id.startswith("agreement.")]
+    assert not {"confusion", "conclusions"} & {table.id for table in found.tables}
+    (success,) = [table for table in found.tables if table.id == "success"]
+    assert {row[3] for row in success.rows} == {"recorded"}
+    assert front(found.results()).summary.startswith("B is better than A: 30 of 40")
