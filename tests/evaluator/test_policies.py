@@ -253,7 +253,7 @@ def test_rates_are_compared_in_each_task_and_intervals_say_what_was_decided(
 
 
 def test_the_first_page_begins_with_who_may_be_best(four_policies: Comparison) -> None:
-    summary = front(four_policies.results()).summary
+    summary = " ".join(front(four_policies.results()).sentences)
     assert summary.startswith("p3 is best of 4 candidates, with 57 of 60: every other one")
     assert "undecided" not in summary.lower()  # between p1 and p2, which nobody would take
 
@@ -262,7 +262,7 @@ def test_the_first_page_begins_with_who_may_be_best(four_policies: Comparison) -
 def test_a_study_where_all_trials_end_alike_says_so_first(k: int, words: str) -> None:
     rows = [row(n, "AB"[n % 2], n // 2 < k, start_id=f"s{n // 2}") for n in range(20)]
     found = compare_rows(rows, run="r", source="trials", stand_in=None)
-    summary = front(found.results()).summary
+    summary = " ".join(front(found.results()).sentences)
     assert summary.startswith(words)
     assert "costs" not in summary
 
@@ -273,4 +273,4 @@ def test_a_study_without_a_twin_says_nothing_of_a_twin() -> None:
     assert not {"confusion", "conclusions"} & {table.id for table in found.tables}
     (success,) = [table for table in found.tables if table.id == "success"]
     assert {row[3] for row in success.rows} == {"recorded"}
-    assert front(found.results()).summary.startswith("B is better than A: 30 of 40")
+    assert front(found.results()).sentences[0].startswith("B is better than A: 30 of 40")
