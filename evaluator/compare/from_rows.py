@@ -14,7 +14,7 @@ from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.policies import (
     compare_policies,
     comparison_part,
-    remarks,
+    notes_of_trials,
     void_starts,
 )
 from evaluator.compare.regret import regret_results
@@ -72,7 +72,7 @@ def compare_rows(
             *conclusions_table(groups, answers, rows),
             success_table(groups, word, "Outcomes as the table gives them." if given else ""),
             *layout_table(groups, word),
-            *notes_table([*remarks(rows, void_causes), *notes(groups, measurements)]),
+            *notes_table([*notes_of_trials(rows, void_causes), *notes(groups, measurements)]),
             *((confusion_table(rows, word),) if has_twin else ()),
             *stage_tables,
             *failures_table(rows, word),

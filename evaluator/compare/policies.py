@@ -172,7 +172,7 @@ class _Count:
     pairs: int = 0
     k: list[int] = field(default_factory=lambda: [0, 0])
     n: list[int] = field(default_factory=lambda: [0, 0])
-    worth: float = 0.0
+    num_pairs: float = 0.0
     """Pairs that all of them are worth."""
 
     def add(self, each: Try) -> None:
@@ -180,7 +180,7 @@ class _Count:
         self.k[each.is_second] += each.succeeded
         self.n[each.is_second] += 1
         self._pair(each)
-        self.worth = self.pairs + pairs_equivalent(*self.n)
+        self.num_pairs = self.pairs + pairs_equivalent(*self.n)
 
     def _pair(self, each: Try) -> None:
         if not each.start:
@@ -222,14 +222,14 @@ class Course:
         """Count trials in their order."""
         counts: dict[str, _Count] = {}
         at: dict[float, Evidence] = {}
-        places, worth = plan.places(), 0.0
+        places, total = plan.places(), 0.0
         place = next(places)
         for each in tries:
             count = counts.setdefault(each.task, _Count())
-            worth -= count.worth
+            total -= count.num_pairs
             count.add(each)
-            worth += count.worth
-            while worth >= place - 1e-9:
+            total += count.num_pairs
+            while total >= place - 1e-9:
                 at[place] = _evidence(counts)
                 place = next(places)
         return Course(all_=_evidence(counts), at=at)
@@ -375,7 +375,7 @@ class Answer:
         return f"undecided: {found}; {rest}"
 
 
-def remarks(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[tuple[str, str]]:
+def notes_of_trials(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[tuple[str, str]]:
     """Say which trials have no outcome, and which starts a candidate tried again."""
     groups: dict[tuple[str, Candidate], list[TrialRow]] = {}
     for row in made_trials(rows, void_causes):

@@ -201,9 +201,9 @@ class GapModel:
         table = np.stack([_likelihood(group, odds) for group in self.groups])
         seeing = there.seeing @ table.reshape(len(table), -1).T.astype(np.float32)
         rows = np.flatnonzero(there.share)
-        apart = there.recorded[rows, :, None].astype(np.float64) * there.blind[rows, None, :]
+        blind_pairs = there.recorded[rows, :, None].astype(np.float64) * there.blind[rows, None, :]
         blind = np.zeros(seeing.shape)
-        blind[rows] = apart.reshape(len(rows), -1) @ table.reshape(len(table), -1).T
+        blind[rows] = blind_pairs.reshape(len(rows), -1) @ table.reshape(len(table), -1).T
         share = there.share[:, None]
         chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
         logs = np.log(chance).sum(axis=1) / self.design_effect

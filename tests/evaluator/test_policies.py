@@ -18,7 +18,7 @@ from evaluator.compare.policies import (
     compare_policies,
     comparison_part,
     made_trials,
-    remarks,
+    notes_of_trials,
     tries_of,
 )
 from evaluator.compare.regret import regret_results
@@ -210,9 +210,9 @@ def test_a_policy_that_trips_the_arm_does_not_gain_by_it(tmp_path: Path) -> None
 def test_a_start_that_was_tried_again_is_named() -> None:
     rows = interleaved(CLEAR)
     again = [*rows, replace(rows[1], episode="again"), replace(rows[0], episode="once more")]
-    assert [about for about, _ in remarks(again, ())] == ["A", "B"]
-    assert all("s0 2 times" in text for _, text in remarks(again, ()))
-    assert remarks(rows, ()) == []
+    assert [about for about, _ in notes_of_trials(again, ())] == ["A", "B"]
+    assert all("s0 2 times" in text for _, text in notes_of_trials(again, ()))
+    assert notes_of_trials(rows, ()) == []
     (answer,) = compare_policies(again)
     assert answer.reading.evidence.strata[0].pairs == 40
 
