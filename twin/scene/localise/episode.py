@@ -16,7 +16,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import LOCALISATION, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import EpisodeError
+from bridge.errors import EpisodeError, GstError
 from bridge.task.task_file import Task
 from twin.scene.align.moved_camera import MovedCamera, moved_camera
 from twin.scene.frames.camera_poses import CameraPoses, base_tree, poses_shifted
@@ -182,13 +182,15 @@ def moved_cameras(run: RunFolder, episode: Episode) -> dict[str, MovedCamera]:
     None where there is no scene, or where it is in another frame than these cameras.
     """
     record = read_record(run)
-    if record is None or record["frame"] != streams.recorded_robot(episode).base_frame:
+    if record is None or record.get("frame") != streams.recorded_robot(episode).base_frame:
         return {}
     poses, before_ns = trial_cameras(run, episode, {}), first_execution_ns(episode)
     frames = stationary_frames(episode, STILL_FRAMES, before_ns=before_ns, poses=poses)
-    background = read_scene(run).background if frames else None
-    found = {}
-    for camera_id in {frame.camera_id for frame in frames} if background is not None else ():
+    try:
+        background, found = read_scene(run).background, {}
+    except GstError:  # nothing to compare with: who draws the scene says why
+        return {}
+    for camera_id in {frame.camera_id for frame in frames}:
         own = [frame for frame in frames if frame.camera_id == camera_id]
         moved = moved_camera(own, background)
         if moved is not None:
