@@ -75,7 +75,7 @@ class TwinEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         mapping = PolicyMap(rate_hz=rate_hz, actions=Actions(kind=control))
         self._speak = Interpreter(mapping, robot, start.task.instruction)
         known = tuple(cameras) or streams.camera_ids(Episode.open(start.episode_path))
-        sizes = None if size is None else dict.fromkeys(known, tuple(size))
+        sizes = None if size is None else dict.fromkeys(known, size)
         self._cameras = TwinCameras(self._run, start, known, sizes)
         low, high = action_limits(control, robot, self._period_s)
         width = robot.record.gripper.max_width_m
@@ -188,4 +188,4 @@ def action_limits(
     return -most, most
 
 
-gymnasium.register(id=ID, entry_point=TwinEnv)
+gymnasium.register(id=ID, entry_point="twin.policies.environment:TwinEnv")

@@ -90,7 +90,9 @@ def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[
         return
     clock = [item.stamp_ns for item in pictures[names[0]][:-1]]
     seen = [t for t in clock if trial.postures.covers(t)]
-    chosen = np.unique(np.linspace(0, len(seen) - 1, INSTANTS).round().astype(int)) if seen else []
+    if not seen:
+        return
+    chosen = np.unique(np.linspace(0, len(seen) - 1, INSTANTS).round().astype(int))
     artists = {name: _artist(trial, episode, name) for name in names}
     stamps = np.array([seen[k] for k in chosen], dtype=np.int64)
     trees = {name: poses_in_scene(run, read_scene(run), episode, name, stamps) for name in names}

@@ -142,7 +142,7 @@ class Interpreter:
         if value == "joints_rad":
             return joints_rad
         if value == "joints_deg":
-            return np.degrees(joints_rad)
+            return np.asarray(np.degrees(joints_rad))
         if value == "width_m":
             return np.array([width_m])
         if value in ("closed", "open"):
