@@ -34,6 +34,8 @@ class MaskedView:
     """Along the optical axis; 0, negative or not finite is "not measured"."""
     mask: Bool[np.ndarray, "mask_height mask_width"]
     """True where the object is seen."""
+    sensor: str = ""
+    """Which camera it is: views of one camera share the errors of its depth."""
 
     def __post_init__(self) -> None:
         """Refuse images that do not belong together."""

@@ -47,4 +47,5 @@ def describe_shape(shape: ObjectShape) -> dict[str, Any]:
         "voxel_m": shape.sdf.voxel_m,
         "truncation_m": shape.truncation_m,
         "num_views": shape.num_views,
+        "view_shift_m": shape.view_shift_m,
     }

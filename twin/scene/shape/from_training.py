@@ -41,6 +41,7 @@ STANDING_M = 0.008
 """An object whose underside is at most this far from the table stands on it."""
 UPRIGHT_COSINE, LEANING_COSINE = 0.999, 0.95
 """Above the first an object's own frame is level; a toy may rest leaning, down to the second."""
+ALIGN_ROUNDS = 8
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 
@@ -70,7 +71,7 @@ def shapes_of(
             if is_known(models[key]):
                 found[key] = _task_shape(useful, models[key])
             else:
-                found[key] = make(useful, support)
+                found[key] = make(useful, support, align_rounds=ALIGN_ROUNDS)
         except TwinError as error:
             found[key] = str(error)
     return found
@@ -92,7 +93,10 @@ def _task_shape(views: Sequence[MaskedView], model: ObjectModel) -> ObjectShape:
 
 
 def _leaning(
-    views: Sequence[MaskedView], support: float | None, T_base_object: Float[np.ndarray, "4 4"]
+    views: Sequence[MaskedView],
+    support: float | None,
+    T_base_object: Float[np.ndarray, "4 4"],
+    align_rounds: int,
 ) -> ObjectShape:
     """Reconstruct in a level frame, where the table is a plane of the grid; then lean it."""
     T_base_level = np.eye(4)
@@ -100,11 +104,11 @@ def _leaning(
     T_base_level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     T_base_level[:3, 3] = T_base_object[:3, 3]
     T_level_object = se3.invert(T_base_level) @ T_base_object
-    level = reconstruct(moved_views(views, T_level_object), support)
+    level = reconstruct(moved_views(views, T_level_object), support, align_rounds=align_rounds)
     vertices = se3.apply(se3.invert(T_level_object), level.vertices_m)
     points = np.concatenate([view.points_m() for view in views])
     leant = shape_of_mesh(vertices, level.faces, points)
-    return replace(leant, num_views=level.num_views)
+    return replace(leant, num_views=level.num_views, view_shift_m=level.view_shift_m)
 
 
 def support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:
@@ -152,6 +156,7 @@ def masked_view(
         T_base_camera=se3.invert(T) @ view.T_base_color,
         depth_m=depth,
         mask=mask,
+        sensor=view.camera_id,
     )
 
 

@@ -19,6 +19,7 @@ from twin.scene.shape.carve import (
 )
 from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.mesh import Faces, Vertices, face_normals, is_watertight, volume_m3
+from twin.scene.shape.registration import laid_together
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
 
 PAD_VOXELS = 4
@@ -61,22 +62,28 @@ class ObjectShape:
     volume_m3: float
     num_views: int
     truncation_m: float
+    view_shift_m: float = 0.0
+    """Root mean square of the shifts that laid the views together; 0 without rounds."""
 
 
-def reconstruct(views: Sequence[MaskedView], support_z_m: float | None) -> ObjectShape:
+def reconstruct(
+    views: Sequence[MaskedView], support_z_m: float | None, *, align_rounds: int = 0
+) -> ObjectShape:
     """Carve an object out of the views that see it, close it, and mesh it.
 
     Args:
         views: Depth with masks, in one frame whose z axis points up.
         support_z_m: Height of the plane the object stands on: its unseen underside is closed
             there. None when it does not stand on one.
+        align_rounds: Steps in which every view is moved onto what the others saw.
 
     Raises:
         ShapeError: When fewer than two views show the object, all from one side, or nothing
             is left after carving.
     """
     useful = _useful(views)
-    return _carved(useful, support_z_m)
+    useful, shift = laid_together(useful, support_z_m, align_rounds)
+    return replace(_carved(useful, support_z_m), view_shift_m=shift)
 
 
 def _useful(views: Sequence[MaskedView]) -> list[MaskedView]:
