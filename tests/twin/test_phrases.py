@@ -6,7 +6,7 @@ import pytest
 from bridge.geometry import se3
 from twin.naming.phrases import Asker
 from twin.naming.things import Instance, SemanticScene, SemanticsError
-from twin.naming.words import kind_of, words_of
+from twin.naming.words import kind_of, names_of, words_of
 
 THINGS = {
     "red cube": ((0.0, -0.2, 0.02), (0.04, 0.04, 0.04), (200, 20, 20)),
@@ -160,3 +160,18 @@ def test_words_are_lower_case_singular_and_without_articles() -> None:
 )
 def test_the_label_says_which_parts_to_look_for(label: str, kind: str) -> None:
     assert kind_of(label) == kind
+
+
+@pytest.mark.parametrize(
+    ("label", "word", "answers"),
+    [
+        ("blue open box", "mug", False),
+        ("blue open box", "bowl", False),
+        ("blue open box", "tray", True),
+        ("white bowl", "mug", False),
+        ("white bowl", "bowl", True),
+        ("grey open container", "mug", True),
+    ],
+)
+def test_what_somebody_named_is_nothing_else(label: str, word: str, answers: bool) -> None:
+    assert (word in names_of(label)) is answers

@@ -19,6 +19,8 @@ SHAPE_WORDS = {
     "thing": (),
 }  # fmt: skip
 """What a thing of a shape may be called."""
+ROUND = ("bowl", "bucket", "cup", "mug", "pot")
+"""Open containers that are called nothing else."""
 ANY_THING = ("thing", "object", "item", "stuff", "everything", "anything")
 ANIMALS = ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll")
 KIND_NAMES = {"container": ("container",), "animal": ("toy", "animal", "plush"), "other": ()}
@@ -102,10 +104,17 @@ def shape_in(label: str) -> str | None:
 
 
 def names_of(label: str) -> set[str]:
-    """Nouns that a label answers to: its own words, its kind, what its shape may be called."""
-    names = set(words_of(label)) | set(ANY_THING) | set(KIND_NAMES[kind_of(label)])
+    """Nouns that a label answers to: its own words, its kind, what its shape may be called.
+
+    What somebody called a box is no mug, though both are open containers.
+    """
+    words = words_of(label)
+    names = set(words) | set(ANY_THING) | set(KIND_NAMES[kind_of(label)])
     shape = shape_in(label)
-    return names | set(SHAPE_WORDS[shape] if shape is not None else ())
+    called = set(SHAPE_WORDS[shape] if shape is not None else ())
+    if shape == "open container" and words[-1] != "container":
+        called -= set(ROUND)
+    return names | called
 
 
 def known_words() -> set[str]:
