@@ -274,7 +274,7 @@ def test_a_camera_that_moves_asks_for_target_poses(
         ((), "say what to calibrate"),
         (("--physics", "--cameras"), "say what to calibrate"),
         (("--physics", "--workers", "0"), "--workers 0"),
-        (("--cameras", "--pairs", "x.json"), "Record target poses beside the joints"),
+        (("--cameras", "--pairs", "x.json"), "Record /CELL/cam/ID/target/pose"),
         (("--cameras", "--camera", "front"), "camera front has neither"),
         (("--physics", "--evaluations", "9"), "trials teach through --posterior"),
     ],

@@ -18,7 +18,7 @@ from twin.physics.engines import (
     open_world,
 )
 from twin.replay.config import ReplayConfig
-from twin.replay.dynamics import _mesh_hulls
+from twin.replay.dynamics import mesh_hulls
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot, with_absolute_meshes
 
@@ -192,7 +192,7 @@ def test_mujoco_moves_other_arms_also_without_fingers(name: str) -> None:
     hulls = hulls_of(load_robot(record.description()))
     count = len(record.joints)
     home = np.full(count, 0.3) if record.home_rad is None else np.array(record.home_rad)
-    with open_world("mujoco", hulls.robot.urdf, _mesh_hulls(hulls), PhysicsConfig()) as world:
+    with open_world("mujoco", hulls.robot.urdf, mesh_hulls(hulls), PhysicsConfig()) as world:
         world.reset_robot(home - 0.05, record.gripper.max_width_m)
         for step in range(240):
             share = min(1.0, step / 120)

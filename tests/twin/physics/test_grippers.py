@@ -11,7 +11,7 @@ from bridge.robots.robot import Finger, Gripper, Robot, read_robot
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.world import World
-from twin.replay.dynamics import _mesh_hulls
+from twin.replay.dynamics import mesh_hulls
 from twin.robot.collision import RobotHulls
 from twin.robot.model import RobotModel
 
@@ -20,7 +20,7 @@ PANDA = read_robot("panda")
 
 def opened(robot: Robot) -> tuple[World, RobotModel]:
     model = RobotModel(robot.description())
-    world = World(model.urdf, _mesh_hulls(RobotHulls(model)), PhysicsConfig())
+    world = World(model.urdf, mesh_hulls(RobotHulls(model)), PhysicsConfig())
     world.reset_robot(model.home_rad, robot.gripper.max_width_m)
     return world, model
 

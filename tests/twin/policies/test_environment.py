@@ -94,7 +94,7 @@ def test_several_side_by_side(run: RunFolder) -> None:
     """As LeRobot asks: a vector of environments, each picture its own."""
     both = gymnasium.vector.SyncVectorEnv([lambda: TwinEnv(run.path, cameras=["side"])] * 2)
     found, _ = both.reset(seed=[1, 2])
-    assert found["pixels"]["side"].shape == (2, 48, 64, 3)
+    assert found["pixels"]["side"].shape == (2, 120, 160, 3)
     assert not np.array_equal(*found["pixels"]["side"])
     _, _, over, _, info = both.step(found["agent_pos"])
     assert over.tolist() == [False, False]

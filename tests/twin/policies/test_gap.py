@@ -35,7 +35,7 @@ def test_brightness_is_what_it_goes_by(run: RunFolder) -> None:
         shades[camera] = []
         for index in range(10):
             config = RenderConfig(
-                camera=camera, episode="trial_1", at_s=index * 0.1,
+                camera=camera, episode="trial_1", at_s=index * 0.2,
                 out=run.path / f"{camera}_{index}.png",
             )  # fmt: skip
             render(run, config)
