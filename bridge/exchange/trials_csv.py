@@ -56,8 +56,6 @@ class TrialRecord:
 COLUMNS = tuple(field.name for field in fields(TrialRecord))
 SIDES = ("sim", "real", "stand-in")
 """Where a rollout, or the trials behind a rate, took place."""
-OUTCOME = "recorded"
-"""The column ``--map "outcome=..."`` is about."""
 SIDES_OF_TRIAL = ("recorded", "sim_planned", "sim_executed", "verdict", "k")
 """A table of tasks with one of these columns is one of trials, numbered where they have no id."""
 

@@ -112,7 +112,6 @@ SECTIONS: tuple[Section, ...] = (
         id="comparisons",
         title="Which is better",
         lead="Policies, and each without and with replanning, as recorded.",
-        numbers=("comparison.*",),
         tables=("comparisons", "standing"),
     ),
     Section(

@@ -14,7 +14,6 @@ from gymnasium import spaces
 from jaxtyping import Float, UInt8
 
 from bridge.episode import streams
-from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from twin.policies.cell import TwinCell
@@ -74,7 +73,7 @@ class TwinEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         robot = load_robot(start.scene.urdf)
         mapping = PolicyMap(rate_hz=rate_hz, actions=Actions(kind=control))
         self._speak = Interpreter(mapping, robot, start.task.instruction)
-        known = tuple(cameras) or streams.camera_ids(Episode.open(start.episode_path))
+        known = tuple(cameras) or streams.camera_ids(episodes[0])
         sizes = None if size is None else dict.fromkeys(known, size)
         self._cameras = TwinCameras(self._run, start, known, sizes)
         low, high = action_limits(control, robot, self._period_s)
@@ -100,8 +99,7 @@ class TwinEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
                 f"no start {start_id!r} in {self._run.path}; there are: {', '.join(self._episodes)}"
             )
         if start_id not in self._starts:
-            episode = Episode.open(self._episodes[start_id].path)
-            self._starts[start_id] = open_start(self._run, episode)
+            self._starts[start_id] = open_start(self._run, self._episodes[start_id])
         return self._starts[start_id]
 
     def reset(
@@ -151,8 +149,8 @@ class TwinEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """What the first camera sees."""
-        pictures = self._cameras.draw(self._opened())
-        return next(iter(pictures.values()), None)
+        self._opened()
+        return next(iter(self._pictures.values()), None)
 
     def close(self) -> None:
         """Free the engine."""
@@ -167,8 +165,8 @@ class TwinEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     def _observe(self) -> dict[str, Any]:
         cell = self._opened()
-        pictures = self._cameras.draw(cell)
-        found = self._speak.observation(pictures, *cell.posture())
+        self._pictures = self._cameras.draw(cell)
+        found = self._speak.observation(self._pictures, *cell.posture())
         return {name: found[name] for name in ("pixels", "agent_pos")}
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import streams
-from bridge.episode.cdr.messages import CompressedColor, RawColor, color_from_message
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from twin.policies.errors import PolicyError
@@ -23,7 +22,7 @@ from twin.policies.views import Pictures
 from twin.robot.posture import Posture
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.render import poses_in_scene
-from twin.scene.sequence import Artist, Frame
+from twin.scene.sequence import Artist, Frame, recorded_images
 from twin.scene.store.folder import read_scene
 from twin.scene.trial import TrialInScene, open_trial
 
@@ -84,8 +83,9 @@ def visual_gap(
 
 
 def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[_State]:
-    trial = open_trial(run, read_scene(run), episode)
-    pictures = {name: _recorded(episode, name) for name in names}
+    scene = read_scene(run)
+    trial = open_trial(run, scene, episode)
+    pictures = {name: list(recorded_images(episode, name)) for name in names}
     if trial.postures is None or not all(len(items) > 1 for items in pictures.values()):
         return
     clock = [item.stamp_ns for item in pictures[names[0]][:-1]]
@@ -95,7 +95,7 @@ def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[
     chosen = np.unique(np.linspace(0, len(seen) - 1, INSTANTS).round().astype(int))
     artists = {name: _artist(trial, episode, name) for name in names}
     stamps = np.array([seen[k] for k in chosen], dtype=np.int64)
-    trees = {name: poses_in_scene(run, read_scene(run), episode, name, stamps) for name in names}
+    trees = {name: poses_in_scene(run, scene, episode, name, stamps) for name in names}
     for stamp_ns in stamps.tolist():
         places, posture = trial.places(stamp_ns), trial.postures.at(stamp_ns)
         frames = {
@@ -117,12 +117,6 @@ def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[
             following={name: pictures[name][k + 1].image_u8() for name, k in near.items()},
             rendered={name: artists[name].draw(frame).image_u8 for name, frame in frames.items()},
         )
-
-
-def _recorded(episode: Episode, camera_id: str) -> list[CompressedColor | RawColor]:
-    topic = streams.find_camera_topic(episode, camera_id, "color/image")
-    messages = episode.messages([] if topic is None else [topic])
-    return [color_from_message(message.type_name, message.data) for message in messages]
 
 
 def _artist(trial: TrialInScene, episode: Episode, camera_id: str) -> Artist:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bridge.episode.cdr.messages import CompressedColor
-from bridge.episode.metadata import Derived
+from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.provenance import hash_settings
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -19,7 +19,7 @@ from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan
 from twin.policies.cell import TwinCell
 from twin.policies.errors import PolicyError, StoppedError
-from twin.policies.mapping import Interpreter, PolicyMap, read_mapping
+from twin.policies.mapping import Interpreter, PolicyMap
 from twin.policies.policy import Policy, open_policy
 from twin.policies.starts import Start, drawn_starts, open_start
 from twin.policies.views import Pictures, TwinCameras
@@ -51,14 +51,10 @@ class RolloutJob:
     """How it is opened."""
     name: str
     """What it is called in tables."""
-    map_path: Path | None
+    mapping: PolicyMap
     max_s: float
     latency_s: float
     timeout_s: float
-
-    def mapping(self) -> PolicyMap:
-        """What it is told, and how it is read."""
-        return read_mapping(self.map_path)
 
     def settings(self) -> dict[str, Any]:
         """What the name of the file covers."""
@@ -66,7 +62,7 @@ class RolloutJob:
             "rollout_version": ROLLOUT_VERSION,
             "policy": self.policy,
             "name": self.name,
-            "mapping_sha256": self.mapping().sha256(),
+            "mapping_sha256": self.mapping.sha256(),
             "drawn": self.drawn,
             "seed": self.seed,
             "number": self.number,
@@ -86,7 +82,7 @@ class RolloutJob:
 
     def needed_paths(self) -> tuple[Path, ...]:
         """What a process on another machine must see."""
-        return (self.run_path, self.episode_path, *([self.map_path] if self.map_path else []))
+        return (self.run_path, self.episode_path)
 
 
 @dataclass
@@ -118,22 +114,23 @@ def roll_out(job: RolloutJob) -> dict[str, Any]:
         finally:
             policy.close()
     except GstError as error:
-        return _row(job, "", job.episode_path.stem, Acted(problem=str(error)), None)
+        unknown = EpisodeInfo(id=job.episode_path.stem, kind="trial")
+        return _row(job, unknown, unknown.id, Acted(problem=str(error)), None)
 
 
 def _roll_out(
     job: RolloutJob, run: RunFolder, episode: Episode, start: Start, policy: Policy
 ) -> dict[str, Any]:
-    cell, mapping = TwinCell(start), job.mapping()
+    cell = TwinCell(start)
     try:
-        speak = Interpreter(mapping, cell.robot, start.task.instruction)
+        speak = Interpreter(job.mapping, cell.robot, start.task.instruction)
         cameras = TwinCameras(run, start, speak.cameras(), speak.sizes())
         policy.reset(job.seed + job.number)
         acted = act(cell, cameras, policy, speak, max_s=job.max_s, latency_s=job.latency_s)
         cell.rest(start.config.settle_after_s)
-        info = replace(episode.info, policy=job.name)
+        info = replace(episode.info, policy=job.name, task=start.task.name)
         result, plan = cell.judged(info)
-        row = _row(job, start.task.name, start.id, acted, result)
+        row = _row(job, info, start.id, acted, result)
         _write(job, episode, start, (result, plan), acted, row, policy.metadata)
         return row
     finally:
@@ -196,7 +193,7 @@ def act(
 
 
 def _row(
-    job: RolloutJob, task: str, start_id: str, acted: Acted, result: ReplayResult | None
+    job: RolloutJob, info: EpisodeInfo, start_id: str, acted: Acted, result: ReplayResult | None
 ) -> dict[str, Any]:
     """One line of the table. Success is None where the rollout says nothing of the policy."""
     success = None
@@ -206,7 +203,8 @@ def _row(
     detail = None if result is None else result.verdict.terminal.detail
     return {
         "policy": job.name,
-        "task": task,
+        "task": info.task,
+        "stand_in": info.stand_in,
         "start_id": start_id,
         "number": job.number,
         "success": success,
@@ -243,7 +241,7 @@ def _write(
         calibration_id=start.scene.calibration_id,
         settings={
             **job.settings(),
-            "prompt": job.mapping().prompt or start.task.instruction,
+            "prompt": job.mapping.prompt or start.task.instruction,
             "server_sha256": hash_settings(dict(metadata)),
             ROLLOUT: dict(row),
         },

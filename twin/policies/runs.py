@@ -6,18 +6,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bridge.episode.catalogue import outcome_of
+from bridge.episode.catalogue import find_episodes
+from bridge.episode.catalogue_query import CatalogueQuery
 from bridge.episode.metadata import WITH
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError, UsageError
+from bridge.errors import UsageError
 from bridge.process_pool import Failed, runner_of
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
 from twin.policies.config import RolloutConfig
+from twin.policies.mapping import read_mapping
 from twin.policies.rollout import ROLLOUT, RolloutJob, roll_out, row_of_file
 from twin.policies.starts import trial_episodes
 
+RESULTS = {"success": True, "failure": False}
+"""Outcomes that count."""
 TABLE = "rollouts.csv"
 COLUMNS = ("trial_id", "task", "policy", "start_id", "recorded", "sim_planned", "stand_in")
 """As ``robot-gst evaluate`` reads them; ``sim_planned`` is the rollout in the twin."""
@@ -25,7 +29,7 @@ COLUMNS = ("trial_id", "task", "policy", "start_id", "recorded", "sim_planned", 
 
 def jobs_of(run: RunFolder, config: RolloutConfig) -> Iterator[RolloutJob]:
     """List the rollouts that are asked for."""
-    episodes = trial_episodes(run, config.task)
+    episodes, mapping = trial_episodes(run, config.task), read_mapping(config.map)
     for episode, drawn in _starts(episodes, config.starts):
         for number in range(config.times):
             yield RolloutJob(
@@ -36,7 +40,7 @@ def jobs_of(run: RunFolder, config: RolloutConfig) -> Iterator[RolloutJob]:
                 number=number,
                 policy=config.policy,
                 name=config.name or config.policy,
-                map_path=config.map,
+                mapping=mapping,
                 max_s=config.max_s,
                 latency_s=config.latency_s,
                 timeout_s=config.timeout_s,
@@ -92,8 +96,8 @@ def write_table(run: RunFolder) -> Path:
         outcomes, number = recorded.get(key, []), row["number"]
         outcome = int(outcomes[number]) if number < len(outcomes) else ""  # each counts once
         name = f"{row['policy']} {row['start_id']} {number}"
-        stand_in = str(Episode.open(path).info.stand_in).lower()
         about = (row["task"], row["policy"], row["start_id"])
+        stand_in = str(row["stand_in"]).lower()
         rows.append((name, *about, outcome, int(row["success"]), stand_in))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -106,17 +110,10 @@ def write_table(run: RunFolder) -> Path:
 def _recorded(run: RunFolder) -> dict[tuple[str, str, str], list[bool]]:
     """By policy, task and start: the outcomes in the cell, without what replanning added."""
     found: dict[tuple[str, str, str], list[bool]] = {}
-    for path in run.episodes():
-        try:
-            episode = Episode.open(path)
-            info, outcome = episode.info, outcome_of(run, episode)
-        except GstError:  # which `check` names
-            continue
-        if info.kind != "trial" or info.condition == WITH or outcome is None:
-            continue
-        if outcome.result != "unknown":
-            key = (info.policy, info.task, info.start_id or info.id)
-            found.setdefault(key, []).append(outcome.result == "success")
+    for trial in find_episodes(run, CatalogueQuery(kind=("trial",), outcome=tuple(RESULTS))):
+        if trial.condition != WITH:
+            key = (trial.policy, trial.task, trial.start_id or trial.id)
+            found.setdefault(key, []).append(RESULTS[trial.outcome])
     return found
 
 

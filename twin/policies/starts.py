@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import streams
+from bridge.episode.catalogue import find_episodes
+from bridge.episode.catalogue_query import CatalogueQuery
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -50,14 +52,11 @@ class Start:
 def trial_episodes(run: RunFolder, task: str) -> list[Episode]:
     """The recorded trials of a task, one for each of its starts."""
     found: dict[str, Episode] = {}
-    for path in run.episodes():
-        try:
-            episode = Episode.open(path)
-            info = episode.info
-        except GstError:  # which `check` names
-            continue
-        if info.kind == "trial" and info.task and task in ("", info.task):
-            found.setdefault(f"{info.task} {info.start_id or info.id}", episode)
+    asked = CatalogueQuery(kind=("trial",), task=(task,) if task else (), error=False)
+    for trial in find_episodes(run, asked):
+        start = f"{trial.task} {trial.start_id or trial.id}"
+        if trial.task and start not in found:
+            found[start] = Episode.open(run.episodes_dir / trial.file)
     if not found:
         wanted = f"trial of task {task!r}" if task else "trial of a task"
         raise PolicyError(

@@ -9,21 +9,19 @@ from jaxtyping import Float, UInt8
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.policies.cell import TwinCell
 from twin.policies.errors import PolicyError
 from twin.policies.mapping import fitting
 from twin.policies.starts import Start
-from twin.replay.images import Drawable, set_up
+from twin.replay.images import Drawable, mounting, set_up
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
-from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
+from twin.scene.gaussians import GaussianCloud, concatenate
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.raster.rasteriser import View
-from twin.scene.render import carried_camera, sized_camera
-from twin.scene.robot.splats import posed
+from twin.scene.render import sized_camera
 from twin.scene.store.calibration import read_calibration
 
 Pictures = Mapping[str, UInt8[np.ndarray, "height width 3"]]
@@ -96,14 +94,10 @@ class TwinCameras:
         key += b"".join(rows.tobytes() for rows in nodes.values())
         if self._kept is None or self._kept[0] != key:
             self._kept = key, self._drawable.at(places, nodes, None)
-        parts = self._drawable.parts
+        rest, parts = self._kept[1], self._drawable.parts
         if not parts.links:
-            return self._kept[1]
-        urdf = self._drawable.urdf
-        robot = posed(
-            parts.links, posture.joints_rad, urdf, width_m=posture.width_m, lighting=parts.lighting
-        )
-        return concatenate([self._kept[1], moved_cloud(robot, parts.T_root_base)])
+            return rest
+        return concatenate([rest, parts.robot_at(posture, self._drawable.urdf)])
 
     def _picture(
         self, cloud: GaussianCloud, camera: Camera, T: Float[np.ndarray, "4 4"]
@@ -128,18 +122,18 @@ def _viewpoint(
     if place is not None:
         stamps_ns = np.array([start.stamp_ns], dtype=np.int64)
         tree = calibrated_tree_at(episode, camera_id, place, stamps_ns)
-    base = streams.recorded_robot(episode).base_frame
+    robot = load_robot(start.scene.urdf)
+    base = robot.record.base_frame
     if info.frame_id not in tree.frames() or tree.root_of(info.frame_id) != base:
         raise PolicyError(
             f"nobody recorded where camera {camera_id} was in {base}; calibrate it "
             "(robot-gst calibrate RUN --cameras) or leave it out"
         )
-    carried = carried_camera(episode, info.frame_id, start.joints_rad, tree)
-    if carried is None:
-        T = tree.T_root_frame(info.frame_id, start.stamp_ns)
-        return Viewpoint(camera=camera, T_base_camera=T)
-    hand = load_robot(start.scene.urdf).T_base_tcp(start.joints_rad)
-    return Viewpoint(camera=camera, T_base_camera=carried, T_tcp_camera=se3.invert(hand) @ carried)
+    return Viewpoint(
+        camera=camera,
+        T_base_camera=tree.T_root_frame(info.frame_id, start.stamp_ns),
+        T_tcp_camera=mounting(episode, tree, info.frame_id, start.joints_rad, robot),
+    )
 
 
 def _fitted_in(camera: Camera, size: tuple[int, int]) -> Camera:

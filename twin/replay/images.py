@@ -20,10 +20,10 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.media.color import encode_jpeg
-from bridge.robots.robot import robot_of
 from twin.replay.dynamics import soft_models
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
+from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
 from twin.scene.gaussians import GaussianCloud
@@ -82,7 +82,7 @@ def render_replay(
         executed: Whether the plan was executed then, so that there are instants to compare with.
     """
     stage = set_up(run, episode, scene)
-    rasteriser = open_rasteriser()
+    rasteriser, robot = open_rasteriser(), load_robot(scene.urdf)
     tree, calibration = base_tree(episode), read_calibration(run)
     places = {} if calibration is None else calibration.cameras
     for camera_id in streams.camera_ids(episode):
@@ -94,9 +94,7 @@ def render_replay(
             seen = calibrated_tree_at(episode, camera_id, place, stamps_ns)
             lost = without_joints(episode, place, stamps_ns)
         T_tcp_camera = (
-            _mounting(episode, seen, info.frame_id, result, robot_of(scene.urdf).base_frame)
-            if planned
-            else None
+            mounting(episode, seen, info.frame_id, result.joints_rad[0], robot) if planned else None
         )
         for stamp_ns in stamps:
             if T_tcp_camera is None and stamp_ns in lost:
@@ -159,11 +157,15 @@ def _stamps(
     return stamps[::step]
 
 
-def _mounting(
-    episode: Episode, tree: TransformTree, frame_id: str, result: ReplayResult, base_frame: str
+def mounting(
+    episode: Episode,
+    tree: TransformTree,
+    frame_id: str,
+    joints_rad: Float[np.ndarray, " num_joints"],
+    robot: RobotModel,
 ) -> Float[np.ndarray, "4 4"] | None:
-    """Where a camera sits in the hand; None for one that stands still."""
-    if tree.root_of(frame_id) != base_frame:
+    """Where a camera sits in the hand, seen in any posture; None for one that stands still."""
+    if tree.root_of(frame_id) != robot.record.base_frame:
         return None
-    T_base_camera = carried_camera(episode, frame_id, result.joints_rad[0], tree)
-    return None if T_base_camera is None else se3.invert(result.Ts_base_tcp[0]) @ T_base_camera
+    T = carried_camera(episode, frame_id, joints_rad, tree)
+    return None if T is None else se3.invert(robot.T_base_tcp(joints_rad)) @ T

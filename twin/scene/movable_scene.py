@@ -152,15 +152,15 @@ class MovableScene:
             own = bent[name] if name in bent else moved_cloud(item.cloud, placed[name])
             parts.append(own)
         if posture is not None and self.links:
-            robot = posed(
-                self.links,
-                posture.joints_rad,
-                urdf,
-                width_m=posture.width_m,
-                lighting=self.lighting,
-            )
-            parts.append(moved_cloud(robot, self.T_root_base))
+            parts.append(self.robot_at(posture, urdf))
         return concatenate(parts)
+
+    def robot_at(self, posture: Posture, urdf: str) -> GaussianCloud:
+        """The robot's part of that cloud; there must be links."""
+        robot = posed(
+            self.links, posture.joints_rad, urdf, width_m=posture.width_m, lighting=self.lighting
+        )
+        return moved_cloud(robot, self.T_root_base)
 
 
 def read_movable_scene(

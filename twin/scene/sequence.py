@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from bridge.episode import streams
-from bridge.episode.cdr.messages import color_from_message
+from bridge.episode.cdr.messages import CompressedColor, RawColor, color_from_message
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
@@ -95,7 +95,7 @@ def frames_of(
 
 
 def _stamps(episode: TrialInScene, camera_id: str) -> np.ndarray:
-    images = _recorded_images(episode.recorded, camera_id)
+    images = recorded_images(episode.recorded, camera_id)
     recorded = np.array([message.stamp_ns for message in images], dtype=np.int64)
     first_ns, last_ns = episode.recorded.start_ns, episode.recorded.end_ns
     if episode.postures is not None:
@@ -107,7 +107,8 @@ def _stamps(episode: TrialInScene, camera_id: str) -> np.ndarray:
     return np.asarray(stamps)
 
 
-def _recorded_images(episode: Episode, camera_id: str) -> Iterator[Any]:
+def recorded_images(episode: Episode, camera_id: str) -> Iterator[CompressedColor | RawColor]:
+    """Colour images of a camera, in log order."""
     topic = streams.find_camera_topic(episode, camera_id, "color/image")
     for message in episode.messages([] if topic is None else [topic]):
         yield color_from_message(message.type_name, message.data)
@@ -134,7 +135,7 @@ def render_sequence(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     )
     out = config.out or run.results_dir / f"{episode.recorded.path.stem}.{camera_id}.mp4"
     comparison = _Comparison.start(run, episode) if config.compare else None
-    recorded = _recorded_images(episode.recorded, camera_id) if config.compare else iter(())
+    recorded = recorded_images(episode.recorded, camera_id) if config.compare else iter(())
     begun_ns: int | None = None
     stamps: list[int] = []
     with _writer(out, _rate_hz(_stamps(episode, camera_id))) as write:

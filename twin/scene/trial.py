@@ -169,8 +169,10 @@ def trial_parts(
         return read_movable_scene(run, scene, scanned), library.notes(task)
     parts = read_movable_scene(run, scene, [name for name in scanned if name in Ts_base_object])
     others = {name: Ts_base_object[name] for name in missing if name in Ts_base_object}
-    poses, light = trial_cameras(run, episode, moved), parts.lighting
-    made = _from_task(episode, task, others, poses, light) if others else {}
+    made = {}
+    if others:
+        poses = trial_cameras(run, episode, moved)
+        made = _from_task(episode, task, others, poses, parts.lighting)
     notes = [
         note if name in made else f"{name} was {NOT_SCANNED} and is not drawn: nobody saw it"
         for name, note in zip(missing, library.notes(task), strict=True)
