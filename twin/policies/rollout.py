@@ -278,8 +278,9 @@ def _write(
 def row_of_file(path: Path) -> dict[str, Any] | None:
     """The row of a rollout that was made before; None where there is none."""
     try:
-        made = Episode.open(path).derived
+        episode = Episode.open(path)
+        made, info = episode.derived, episode.info
     except GstError:
         return None
     row = None if made is None else made.settings.get(ROLLOUT)
-    return dict(row) if isinstance(row, dict) else None
+    return {**row, "stand_in": info.stand_in} if isinstance(row, dict) else None
