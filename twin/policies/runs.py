@@ -85,10 +85,13 @@ def roll_out_run(run: RunFolder, config: RolloutConfig, output: Output) -> dict[
 
 
 def write_table(run: RunFolder) -> Path:
-    """Write every rollout of a run beside what was recorded of the same policy from its start."""
+    """Write every rollout of a run beside what was recorded of the same policy from its start.
+
+    Of several with other settings the newest counts.
+    """
     recorded = _recorded(run)
-    rows = []
-    for path in run.derived(f"*.{ROLLOUT}.*"):
+    rows = {}
+    for path in sorted(run.derived(f"*.{ROLLOUT}.*"), key=lambda path: path.stat().st_mtime_ns):
         row = row_of_file(path)
         if row is None or row["success"] is None:
             continue
@@ -98,10 +101,10 @@ def write_table(run: RunFolder) -> Path:
         name = f"{row['policy']} {row['start_id']} {number}"
         about = (row["task"], row["policy"], row["start_id"])
         stand_in = str(row["stand_in"]).lower()
-        rows.append((name, *about, outcome, int(row["success"]), stand_in))
+        rows[row["task"], name] = (name, *about, outcome, int(row["success"]), stand_in)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([COLUMNS, *sorted(rows)])
+    writer.writerows([COLUMNS, *sorted(rows.values())])
     path = run.path / TABLE
     write_whole(path, text.getvalue().encode())
     return path

@@ -66,6 +66,12 @@ def test_a_policy_that_does_the_task_is_judged_kept_and_compared(run: RunFolder)
     assert before == {path: path.stat().st_mtime_ns for path in run.derived("*.rollout.*")}
 
 
+def test_of_several_settings_the_newest_counts(run: RunFolder) -> None:
+    roll_out_run(run, config("Scripted", max_s=30.0), QUIET)
+    roll_out_run(run, config("Scripted", max_s=1.0), QUIET)  # too short to do it
+    assert [trial.sim_planned for trial in read_trials(run.path / TABLE)] == [False, False]
+
+
 @pytest.mark.parametrize(
     ("policy", "success", "words"),
     [
