@@ -9,6 +9,7 @@ scope of axis names where a hint has any, and a checking function is made at the
 import functools
 import inspect
 import types
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import is_dataclass
@@ -21,17 +22,22 @@ from jaxtyping._storage import pop_shape_memo, push_shape_memo
 CHECK_ALL_OF, THEN_ONE_OF = 100, 10
 """Of the calls of a function in a test the first are all checked, after them one in ten. What is
 called a thousand times is called alike; which calls are checked does not depend on other tests."""
+CHECK_MADE = 10
+"""Of a function inside a function, which every call of the outer one makes anew, so many are
+checked in a test: the check of one is compiled in a millisecond."""
 CHECKED = "_checked_by_the_tests"
 CONF = BeartypeConf(violation_type=jaxtyping.TypeCheckError)
 """A ``TypeError``, as the code itself would raise a moment later."""
 
 
 _tests = types.SimpleNamespace(begun=0)
+_made: Counter[types.CodeType] = Counter()
 
 
 def begin_test() -> None:
     """Count calls from zero again."""
     _tests.begun += 1
+    _made.clear()
 
 
 def install() -> None:
@@ -68,6 +74,10 @@ def checked(thing: Any) -> Any:
             return property(*(part and checked(part) for part in parts))
     if not thing.__annotations__:
         return thing
+    if "<locals>" in thing.__qualname__:
+        _made[thing.__code__] += 1
+        if _made[thing.__code__] > CHECK_MADE:
+            return thing
     checking: Callable[..., Any] | None = None
     number = of_test = 0
 

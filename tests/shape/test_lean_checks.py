@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from jaxtyping import Float, TypeCheckError
-from lean_checks import CHECK_ALL_OF, THEN_ONE_OF, begin_test, checked
+from lean_checks import CHECK_ALL_OF, CHECK_MADE, THEN_ONE_OF, begin_test, checked
 
 from bridge.clock import ns_from_s
 from bridge.geometry.se3 import invert, split
@@ -123,3 +123,20 @@ def passes(call: Any, *arguments: Any) -> bool:
     except TypeCheckError:
         return False
     return True
+
+
+def test_of_a_function_made_at_each_call_the_first_are_checked() -> None:
+    begin_test()
+
+    def made() -> Any:
+        @checked
+        def inner(number: int) -> int:
+            return number
+
+        return inner
+
+    makings = [made() for _ in range(CHECK_MADE + 1)]
+    for each in makings[:-1]:
+        with pytest.raises(TypeCheckError):
+            each("one")
+    assert makings[-1]("one") == "one"

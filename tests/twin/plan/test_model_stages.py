@@ -228,6 +228,7 @@ def test_garbage_leaves_it_to_the_grammar(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_what_no_plan_keeps_is_left_out_and_said(
     run: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
