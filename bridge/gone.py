@@ -71,6 +71,7 @@ GONE: dict[str, str] = {
     "design --per-task": "A study asks for its gain over all tasks together.",
     "evaluate --force": "Delete RUN/results/cache; nothing else remembers a file.",
     "evaluate --lpips-alex": "--lpips-vgg makes LPIPS as papers on splatting compute it.",
+    "evaluate --against": "Evaluate each run; trials.csv has the same trials in both.",
     "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
     "render --rate-hz": "One frame is drawn for each recorded image.",
     **dict.fromkeys(

@@ -31,7 +31,6 @@ def evaluate(
     out: Path | None = None,
     fail_under: str | float | None = None,
     check_published: Path | None = None,
-    against: Path | None = None,
     reviews: tuple[Path, ...] = (),
     everything: Annotated[bool, Parameter(name="--all")] = False,
     latex: bool = False,
@@ -51,8 +50,6 @@ def evaluate(
             outcome agree, or r=0.8, ppv=0.9, any id of results.json; several with commas.
         check_published: A published table (a rates CSV with printed figures): recompute it from
             its rows, and exit with 3 when a figure does not follow from them.
-        against: A run or table with another twin's answers to the same recorded trials: say how
-            much better which one is, which trials flip, and which settings differ.
         reviews: A second rater's labels (columns trial_id, rater, time, result, cause; or a folder
             of such files), beside those in RUN/reviews: kappa of each two raters.
         everything: Show and write the tables that nobody decides by, and list every number.
@@ -69,7 +66,6 @@ def evaluate(
         tables=tables,
         images=images,
         check_published=check_published,
-        against=against,
         reviews=reviews,
         output=output,
     )
@@ -102,7 +98,6 @@ class _Asked:
     tables: TableOptions
     images: ImageOptions
     check_published: Path | None
-    against: Path | None
     reviews: Sequence[Path]
     output: Output
 
@@ -166,15 +161,10 @@ def _compare(asked: _Asked) -> "tuple[Comparison, Path]":
 
 
 def _with_others(comparison: "Comparison", asked: _Asked) -> "Comparison":
-    """Hold the results against another twin's, and against other raters' labels."""
+    """Hold the labels against other raters'."""
     from bridge.exchange.reviews import FOLDER, read_reviews
     from evaluator.compare.raters import with_reviews
-    from evaluator.compare.several import with_against
 
-    if asked.against is not None:
-        comparison = with_against(
-            comparison, asked.sources[0], asked.against, options=asked.tables, output=asked.output
-        )
     kept = [source / FOLDER for source in asked.sources if (source / FOLDER).is_dir()]
     paths = (*kept, *asked.reviews)
     found = [review for path in paths for review in read_reviews(path, asked.tables)]

@@ -123,10 +123,10 @@ SECTIONS: tuple[Section, ...] = (
         tables=("confusion",),
     ),
     Section(
-        id="against",
-        title="Another twin, other raters",
-        lead="Which of two twins is right more often on the same trials, and how far raters agree.",
-        tables=("against", "flips", "raters"),
+        id="raters",
+        title="Other raters",
+        lead="How far raters of the same trials agree.",
+        tables=("raters",),
     ),
     Section(
         id="stages",
@@ -175,7 +175,6 @@ TABLES: dict[str, str] = {
     "success": "which candidate to use",
     "notes": "what these numbers must not be taken for",
     "trials": "which trial to look at",
-    "against": "which of two twins to use",
     "image_methods": "which reconstruction to use",
     "confusion": "whether the twin's yes may start the robot, and its no may stop it",
     "funnel": "on which stage to work",
