@@ -17,10 +17,9 @@ from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from evaluator.compare.gate import unheeded_verdict
-from evaluator.compare.known_task import recorded_task
-from evaluator.compare.labels import AFTER
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import TrialRow
+from evaluator.compare.states import AFTER
 from evaluator.compare.success import Answer, names_of
 from evaluator.measurements import BASE_RATE, BASELINE_ACCURACY, BASELINE_GAIN
 from evaluator.metrics.geometric_rule import judge_by_geometry
@@ -40,10 +39,9 @@ class RuleSummary:
 
 
 def apply_rule(
-    recorded: Episode, localised: Episode | None, *, plan_id: str, task: Task | None = None
+    recorded: Episode, localised: Episode | None, *, plan_id: str, task: Task | None
 ) -> RuleSummary | None:
     """Ask the geometric rule about the plan that was sent; None where there is nothing to ask."""
-    task = recorded_task(recorded) if task is None else task
     plan = _plan(recorded, plan_id)
     if task is None or plan is None:
         return None

@@ -8,7 +8,7 @@ from bridge.task.protocol import VOID_CAUSES, Protocol
 from evaluator.compare.agreement import group_agreement, usable_groups
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.conclusions import conclusions_table
-from evaluator.compare.gate import agreement, reliability
+from evaluator.compare.gate import agreement
 from evaluator.compare.measure import refuse_alike
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.policies import (
@@ -56,7 +56,6 @@ def compare_rows(
         *compared.measurements,
         *regret_results(usable_groups(groups)),
         *baseline_results(rows),
-        *reliability(rows),
         *stages,
     )
     word = empty.recorded_word
@@ -83,10 +82,7 @@ def compare_rows(
     )
 
 
-NO_DATA = (
-    ("reliability.", "reliability of the success probability", "no trial has p_success"),
-    ("stage.", "stage funnel", "no trial has labelled stages or counts sub-tasks"),
-)
+NO_DATA = (("stage.", "stage funnel", "no trial has labelled stages or counts sub-tasks"),)
 """Parts of the evaluation whose input a run may not have."""
 
 

@@ -9,14 +9,12 @@ from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
 from evaluator.measurements import (
     AGREED,
-    BRIER,
-    BRIER_OF_BASE_RATE,
     NPV,
     PHI,
     PPV,
 )
 from evaluator.result import Measurement
-from evaluator.statistics.gate import Confusion, brier, brier_of_base_rate, phi
+from evaluator.statistics.gate import Confusion, phi
 
 
 def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:
@@ -94,31 +92,3 @@ def _agreement_of(
             episodes=names_of(row for row in seen if not answer_of(row)),
         ),
     ]
-
-
-def reliability(rows: Sequence[TrialRow]) -> list[Measurement]:
-    """Judge the sampled success probability against the outcomes; nothing where none was said."""
-    seen = [
-        (row.episode, row.p_success, row.recorded)
-        for row in rows
-        if row.p_success is not None and row.recorded is not None
-    ]
-    if not seen:
-        return []
-    probabilities, happened = [p for _, p, _ in seen], [outcome for _, _, outcome in seen]
-    make = partial(
-        measured, n=len(seen), counted="trial", episodes=[episode for episode, _, _ in seen]
-    )
-    measurements = [
-        make(
-            BRIER.of(),
-            lambda: brier(probabilities, happened),
-            reason_without_interval="beside it stands what knowing nothing reaches",
-        ),
-        make(
-            BRIER_OF_BASE_RATE.of(),
-            lambda: brier_of_base_rate(happened),
-            reason_without_interval="the outcomes' own rate; what it would be on others is unknown",
-        ),
-    ]
-    return measurements

@@ -17,7 +17,6 @@ from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.images.methods import compare_renders
 from evaluator.compare.images.scores import open_net
 from evaluator.compare.images.views import compare_views
-from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
 from evaluator.compare.motion import motion_results
 from evaluator.compare.notes import check_settings, with_notes
@@ -187,7 +186,6 @@ def compare_read(
     parts = (
         motion_results(summaries.motions),
         state_results(summaries.states),
-        label_results(summaries.perceived, rows),
         *(_of_protocol(read) for read in reads if len(reads) == 1),
     )
     return _with_parts(base, parts)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bridge.clock import NS_PER_S
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.reader import Episode, RawMessage
@@ -20,8 +21,6 @@ from bridge.errors import BridgeError
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
-from evaluator.compare.known_task import recorded_task
-from evaluator.compare.labels import AFTER, TAIL_NS
 from evaluator.compare.measure import (
     Part,
     degrees,
@@ -39,6 +38,10 @@ from evaluator.statistics.intervals import cluster_means, median_interval
 PLAN, RECORDED = "plan", "recorded"
 PREDICTED_BY = (PLAN, "planned", "executed")
 """Who predicts: the planner, or a dynamic replay of the planned or the executed motion."""
+AFTER = "end"
+"""Phase of a localisation after the execution."""
+TAIL_NS = 2 * NS_PER_S
+"""Read of a replay before all of it is."""
 NOT_LOCALISED = "it was not localised after the execution"
 
 Pose = Float[np.ndarray, "4 4"] | str
@@ -69,17 +72,16 @@ def summarise_states(
     localised: Episode | None,
     *,
     plan_id: str,
-    task: Task | None = None,
+    task: Task | None,
 ) -> tuple[StateSummary, ...]:
     """Compare what a plan, and its replays, predict of each object with where it lay afterwards.
 
-    Nothing is found when the plan predicts no object.
+    Nothing is found when the plan predicts no object. Without its task no symmetry is known.
     """
     plan = _sent_plan(recorded, plan_id)
     if plan is None:
         return ()
     info = recorded.info
-    task = recorded_task(recorded) if task is None else task
     last = {name: pose for stage in plan.stages for name, pose in stage.predicted_objects.items()}
     seen = _seen(recorded, localised, plan_id)
     sides: dict[str, Mapping[str, Pose]] = {

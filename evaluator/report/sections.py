@@ -47,12 +47,9 @@ NAMES: dict[str, str] = HEADLINES | {
     "agreement.verdict_unheeded.npv": "NPV where the gate was not obeyed",
     "baseline.verdict_unheeded.base_rate": "Base rate where the gate was not obeyed",
     "baseline.verdict_unheeded.geometric_rule.twin_gain_pp": "Gate more often right than the rule",
-    "reliability.brier": "Brier score of the stated probability",
-    "reliability.brier_of_base_rate": "Brier score of the base rate",
     "motion.planned.path_max_m": "Tool path: largest distance to planned replay",
     "motion.planned.joint_rms_rad": "Joints: recorded to planned replay, root mean square",
     "motion.executed.joint_rms_rad": "Joints: recorded to executed replay, root mean square",
-    "label.localised.rate": "Label and localised goal agree",
 }
 """All numbers that a report calls by name; the others stand in ``results.json``."""
 
@@ -119,7 +116,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Trial by trial: the gate's scorecard",
         lead="What the twin said of each plan against how it ended, and what obeying it costs "
         "and avoids.",
-        numbers=("agreement.sim_planned.*", "agreement.verdict*", "baseline.*", "reliability.*"),
+        numbers=("agreement.sim_planned.*", "agreement.verdict*", "baseline.*"),
         tables=("confusion",),
     ),
     Section(
@@ -144,11 +141,9 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="states",
-        title="Predicted states and labels",
-        lead="How far from where they were predicted objects were localised, and whether labels "
-        "and localised goals agree.",
-        numbers=("label.*",),
-        tables=("final_states", "label*"),
+        title="Predicted states",
+        lead="How far from where they were predicted objects were localised.",
+        tables=("final_states",),
     ),
     Section(
         id="views",

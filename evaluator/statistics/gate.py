@@ -5,43 +5,11 @@ Equal rates can hide that the twin was wrong about every single trial.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 
-import numpy as np
-
 from evaluator.errors import UndefinedStatisticError
-
-
-def brier(predicted: Sequence[float], happened: Sequence[bool]) -> float:
-    """Return the mean of (p - outcome)^2 (Brier 1950).
-
-    Range: 0 to 1, 0 is perfect; always saying 1/2 gives 1/4.
-    """
-    p = _checked("Brier score", predicted, happened)
-    return float(np.mean((p - np.array(happened, dtype=np.float64)) ** 2))
-
-
-def brier_of_base_rate(happened: Sequence[bool]) -> float:
-    """Return the Brier score of always saying the observed rate: what knowing nothing reaches."""
-    if not happened:
-        raise UndefinedStatisticError(statistic="Brier score", reason="there are no trials")
-    rate = sum(happened) / len(happened)
-    return rate * (1 - rate)
-
-
-def _checked(statistic: str, predicted: Sequence[float], happened: Sequence[bool]) -> np.ndarray:
-    if len(predicted) != len(happened):
-        message = f"{len(predicted)} probabilities but {len(happened)} outcomes"
-        raise ValueError(message)
-    if not len(predicted):
-        raise UndefinedStatisticError(statistic=statistic, reason="there are no trials")
-    p = np.array(predicted, dtype=np.float64)
-    if not ((p >= 0) & (p <= 1)).all():
-        message = "a success probability lies in 0..1"
-        raise ValueError(message)
-    return p
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The gate's worth, reliability, and the stage funnel."""
+"""The gate's worth and the stage funnel."""
 
 import pytest
 
@@ -6,8 +6,6 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.funnel import funnel
 from evaluator.statistics.gate import (
     Confusion,
-    brier,
-    brier_of_base_rate,
     kappa,
 )
 
@@ -22,17 +20,6 @@ def test_kappa_by_hand_and_undefined() -> None:
     with pytest.raises(UndefinedStatisticError, match="both sides are the same"):
         kappa(table(4, 0, 0, 0))
     assert kappa(table(2, 2, 0, 0)) == 0
-
-
-def test_reliability_of_a_forecaster_who_is_right_and_of_one_who_is_not() -> None:
-    assert brier([1.0, 0.0], [True, False]) == 0
-    assert brier([0.5, 0.5], [True, False]) == 0.25 == brier_of_base_rate([True, False])
-    with pytest.raises(UndefinedStatisticError, match="there are no trials"):
-        brier([], [])
-    with pytest.raises(ValueError, match=r"lies in 0\.\.1"):
-        brier([1.2], [True])
-    with pytest.raises(ValueError, match="1 probabilities but 2"):
-        brier([1.0], [True, False])
 
 
 def test_a_stage_after_a_failed_one_is_not_reached() -> None:
