@@ -7,12 +7,7 @@ from bridge.episode.metadata import CONTROL
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
-from evaluator.measurements import (
-    AGREED,
-    NPV,
-    PHI,
-    PPV,
-)
+from evaluator.measurements import AGREED, NPV, PHI, PPV
 from evaluator.result import Measurement
 from evaluator.statistics.gate import Confusion, phi
 
@@ -87,7 +82,7 @@ def _agreement_of(
         make(
             NPV.of(by=name, words=words),
             counts.true_negative,
-            counts.predicted_failure,
+            counts.n - counts.predicted_success,
             reason_if_undefined=nothing if not counts.n else "it never predicted failure",
             episodes=names_of(row for row in seen if not answer_of(row)),
         ),

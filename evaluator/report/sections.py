@@ -48,8 +48,6 @@ NAMES: dict[str, str] = HEADLINES | {
     "baseline.verdict_unheeded.base_rate": "Base rate where the gate was not obeyed",
     "baseline.verdict_unheeded.geometric_rule.twin_gain_pp": "Gate more often right than the rule",
     "motion.planned.path_max_m": "Tool path: largest distance to planned replay",
-    "motion.planned.joint_rms_rad": "Joints: recorded to planned replay, root mean square",
-    "motion.executed.joint_rms_rad": "Joints: recorded to executed replay, root mean square",
 }
 """All numbers that a report calls by name; the others stand in ``results.json``."""
 

@@ -115,7 +115,10 @@ def _folded(rows: Rows) -> Rows:
 def _number(
     name: str, value: Any, ends: Sequence[Any], count: Sequence[Any], why: str | None
 ) -> Shown:
-    """Write a cell in the unit that its column names; what is no such number stays as it is."""
+    """Write a cell in the unit that its column names; what is no such number stays as it is.
+
+    Points stand without a unit: the column's name ends in it.
+    """
     is_points = name.endswith("(pp)")
     is_share = _last_word(name) == "rate"
     is_change = name.startswith("relative")
@@ -125,7 +128,7 @@ def _number(
         return f"undefined: {why}" if why and (is_points or is_share or is_change) else None
     factor, unit, form = 1.0, "", ".4g"
     if is_points:
-        unit, form = " pp", "+.1f"
+        form = "+.1f"
     elif is_share or is_change:
         factor, unit, form = 100.0, " %", "+.1f" if is_change else ".1f"
     known = [_signed(f"{factor * end:{form}}") for end in ends if _known(end)]

@@ -6,14 +6,13 @@ Equal rates can hide that the twin was wrong about every single trial.
 import math
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
 
 from evaluator.errors import UndefinedStatisticError
 
 
-@dataclass(frozen=True, kw_only=True)
-class Confusion:
+class Confusion(NamedTuple):
     """Said against happened, counted over trials."""
 
     true_positive: int
@@ -28,17 +27,13 @@ class Confusion:
     def count(pairs: Iterable[tuple[bool, bool]]) -> "Confusion":
         """Count pairs (said, happened)."""
         sums = Counter((bool(predicted), bool(happened)) for predicted, happened in pairs)
-        return Confusion(
-            true_positive=sums[True, True],
-            false_positive=sums[True, False],
-            false_negative=sums[False, True],
-            true_negative=sums[False, False],
-        )
+        both = (True, True), (True, False), (False, True), (False, False)
+        return Confusion(*(sums[pair] for pair in both))
 
     @property
     def n(self) -> int:
         """All pairs."""
-        return self.true_positive + self.false_positive + self.false_negative + self.true_negative
+        return sum(self)
 
     @property
     def agreed(self) -> int:
@@ -50,16 +45,6 @@ class Confusion:
         """Denominator of the positive predictive value."""
         return self.true_positive + self.false_positive
 
-    @property
-    def predicted_failure(self) -> int:
-        """Denominator of the negative predictive value."""
-        return self.true_negative + self.false_negative
-
-    @property
-    def succeeded(self) -> int:
-        """Pairs that happened to succeed."""
-        return self.true_positive + self.false_negative
-
 
 def phi(confusion: Confusion) -> float:
     """Return the correlation of two yes/no columns (Matthews' coefficient).
@@ -67,8 +52,7 @@ def phi(confusion: Confusion) -> float:
     Range: -1 to 1, 1 is full agreement, 0 is none beyond the margins.
     Undefined when: one column is constant, for then there is nothing to correlate.
     """
-    tp, fp = confusion.true_positive, confusion.false_positive
-    fn, tn = confusion.false_negative, confusion.true_negative
+    tp, fp, fn, tn = confusion
     if confusion.n == 0:
         raise UndefinedStatisticError(statistic="phi", reason="there are no pairs")
     constant = [
@@ -93,7 +77,8 @@ def kappa(confusion: Confusion) -> float:
     n = confusion.n
     if n == 0:
         raise UndefinedStatisticError(statistic="kappa", reason="there are no pairs")
-    predicted, happened = confusion.predicted_success, confusion.succeeded
+    predicted = confusion.predicted_success
+    happened = confusion.true_positive + confusion.false_negative
     by_chance = Fraction(predicted * happened + (n - predicted) * (n - happened), n * n)
     if by_chance == 1:
         raise UndefinedStatisticError(
