@@ -5,7 +5,7 @@ localised after the execution.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -167,14 +167,11 @@ def _difference(first: Pose, second: Pose, task: Task | None, name: str) -> dict
     """Return position and rotation, as far as both sides know them, or why not."""
     if isinstance(first, str) or isinstance(second, str):
         return {"reason": first if isinstance(first, str) else second}
-    model = None if task is None else task.objects.get(name)
-    turn = None
-    if model is not None:
-        turn = turn_between_rad(first[:3, :3], second[:3, :3], turns_alike(model))
-    return {
-        "position_m": float(np.linalg.norm(first[:3, 3] - second[:3, 3])),
-        "rotation_rad": turn,
-    }
+    found: dict[str, Any] = {"position_m": float(np.linalg.norm(first[:3, 3] - second[:3, 3]))}
+    if task is not None and name in task.objects:
+        turns = turns_alike(task.objects[name])
+        found["rotation_rad"] = turn_between_rad(first[:3, :3], second[:3, :3], turns)
+    return found
 
 
 WHO = {
@@ -182,21 +179,15 @@ WHO = {
     "planned": "the planned replay's",
     "executed": "the executed replay's",
 }
-QUANTITIES: tuple[tuple[str, str, str, Callable[[StateSummary], float | None]], ...] = (
+QUANTITIES = (
+    ("position_m", "distance of the object", "no position is known"),
     (
-        "position",
-        "distance of the object",
-        "no position is known",
-        lambda state: state.position_m,
-    ),
-    (
-        "rotation",
+        "rotation_rad",
         "angle modulo the object's symmetry",
         "the task file is not known, so neither is the symmetry",
-        lambda state: state.rotation_rad,
     ),
 )
-"""Name, words, why there is no value although there is a position, and the value."""
+"""Field, words, and why there is no value although there is a position."""
 
 
 def state_results(states: Sequence[StateSummary]) -> Part:
@@ -239,44 +230,42 @@ def state_results(states: Sequence[StateSummary]) -> Part:
         "all had settled. Medians over episodes with 95 % intervals from order statistics; "
         "rotation is modulo symmetry.",
     )
-    left_out = {
-        (state.episode, f"{state.object_id}: {state.reason}"): None
-        for state in states
-        if state.reason is not None
-    }
+    left_out = (
+        Exclusion(episode=s.episode, scope="final states", reason=f"{s.object_id}: {s.reason}")
+        for s in states
+        if s.reason is not None
+    )
     return Part(
         measurements=tuple(measurements),
         tables=(table,),
-        exclusions=tuple(
-            Exclusion(episode=episode, scope="final states", reason=why)
-            for episode, why in left_out
-        ),
+        exclusions=tuple(dict.fromkeys(left_out)),
     )
 
 
 def _measure(states: Sequence[StateSummary]) -> list[Measurement]:
     found = []
-    task, condition = states[0].task, states[0].condition
-    for name, quantity, unknown, read in QUANTITIES:
-        pairs = [(value, s.episode) for s in states if (value := read(s)) is not None]
-        of_episode = cluster_means([value for value, _ in pairs], [name for _, name in pairs])
+    first = states[0]
+    for field, quantity, unknown in QUANTITIES:
+        known = [state for state in states if getattr(state, field) is not None]
+        episodes = [state.episode for state in known]
+        of_episode = cluster_means([getattr(state, field) for state in known], episodes)
         why = "; ".join(sorted({state.reason for state in states if state.reason})) or unknown
         found.append(
             measured(
-                STATES[name].of(
-                    by=states[0].predicted_by,
+                STATES[field.partition("_")[0]].of(
+                    by=first.predicted_by,
                     against=RECORDED,
-                    task=task,
-                    condition=condition,
+                    task=first.task,
+                    condition=first.condition,
                     quantity=quantity,
-                    who=WHO[states[0].predicted_by],
-                    where=f"{task}, {condition.replace('_', ' ')}",
+                    who=WHO[first.predicted_by],
+                    where=f"{first.task}, {first.condition.replace('_', ' ')}",
                     count=len(of_episode),
                 ),
                 partial(median_of, of_episode, "final state", why),
-                n=len(pairs),
+                n=len(known),
                 counted="object",
-                episodes=list(dict.fromkeys(episode for _, episode in pairs)),
+                episodes=list(dict.fromkeys(episodes)),
                 reason_without_interval=interval_or_reason(median_interval, of_episode)[1],
             )
         )
