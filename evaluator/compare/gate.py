@@ -12,21 +12,6 @@ from evaluator.result import Measurement
 from evaluator.statistics.gate import Confusion, phi
 
 
-def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:
-    """Measure k/n agreement, phi and predictive values, of the replay and of the verdict."""
-    measurements = []
-    for name, answer_of, words in (
-        ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
-        ("verdict", lambda row: row.verdict, "the verdict before motion"),
-        ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
-    ):
-        measurements.extend(_agreement_of(rows, name, answer_of, words))
-    if any(unheeded_verdict(row) is not None for row in rows):
-        words = "the verdict before motion, recorded and not obeyed (without replanning)"
-        measurements.extend(_agreement_of(rows, "verdict_unheeded", unheeded_verdict, words))
-    return measurements
-
-
 def unheeded_verdict(row: TrialRow) -> bool | None:
     """The gate's verdict where it decided nothing: a refused plan was executed all the same.
 
@@ -40,19 +25,35 @@ def heeded_verdict(row: TrialRow) -> bool | None:
     return row.verdict if row.condition == WITH else None
 
 
+def known_to(rows: Sequence[TrialRow], answer_of: Answer) -> list[TrialRow]:
+    """Return the trials with an answer and an outcome."""
+    return [row for row in rows if answer_of(row) is not None and row.recorded is not None]
+
+
 def confusion_of(rows: Sequence[TrialRow], answer_of: Answer) -> Confusion:
     """Count what was said against what was labelled, over trials where both are known."""
     return Confusion.count(
-        (answer, row.recorded)
-        for row in rows
-        if (answer := answer_of(row)) is not None and row.recorded is not None
+        (bool(answer_of(row)), bool(row.recorded)) for row in known_to(rows, answer_of)
     )
+
+
+def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:
+    """Measure k/n agreement, phi and predictive values, of the replay and of the verdict."""
+    sides: list[tuple[str, Answer, str]] = [
+        ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
+        ("verdict", lambda row: row.verdict, "the verdict before motion"),
+        ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
+    ]
+    if any(unheeded_verdict(row) is not None for row in rows):
+        words = "the verdict before motion, recorded and not obeyed (without replanning)"
+        sides.append(("verdict_unheeded", unheeded_verdict, words))
+    return [measurement for side in sides for measurement in _agreement_of(rows, *side)]
 
 
 def _agreement_of(
     rows: Sequence[TrialRow], name: str, answer_of: Answer, words: str
 ) -> list[Measurement]:
-    seen = [row for row in rows if answer_of(row) is not None and row.recorded is not None]
+    seen = known_to(rows, answer_of)
     counts = confusion_of(seen, answer_of)
     nothing = f"no trial has both {words} and a known outcome"
     make = partial(proportion, counted="trial")

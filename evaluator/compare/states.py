@@ -5,7 +5,7 @@ localised after the execution.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -78,7 +78,7 @@ def summarise_states(
 
     Nothing is found when the plan predicts no object. Without its task no symmetry is known.
     """
-    plan = _sent_plan(recorded, plan_id)
+    plan = sent_plan(recorded, plan_id, Plan.outline_from_json)
     if plan is None:
         return ()
     info = recorded.info
@@ -103,15 +103,12 @@ def summarise_states(
     )
 
 
-def _sent_plan(recorded: Episode, plan_id: str) -> Plan | None:
-    """Find a plan in the recording, without its trajectory."""
-    named = json.dumps(plan_id, ensure_ascii=False).encode()  # a plan takes long to parse
-    for message in recorded.messages(recorded.topics_of_type(schema.PLAN)):
-        if named in message.data:
-            plan = Plan.outline_from_json(message.data)
-            if plan.id == plan_id:
-                return plan
-    return None
+def sent_plan(recorded: Episode, plan_id: str, read: Callable[[bytes], Plan]) -> Plan | None:
+    """Find a plan in the recording; only one that names the id is read, which takes long."""
+    named = json.dumps(plan_id, ensure_ascii=False).encode()
+    messages = recorded.messages(recorded.topics_of_type(schema.PLAN))
+    plans = (read(message.data) for message in messages if named in message.data)
+    return next((plan for plan in plans if plan.id == plan_id), None)
 
 
 def _seen(recorded: Episode, localised: Episode | None, plan_id: str) -> dict[str, Pose]:

@@ -6,7 +6,7 @@ from evaluator.compare.gate import confusion_of, heeded_verdict, unheeded_verdic
 from evaluator.compare.measure import RATE_COLUMNS, rate_row
 from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.compare.success import WITH, WITHOUT
-from evaluator.result import Cell, Measurement, Table
+from evaluator.result import Cell, Table
 
 MEAN_OF_TASKS = "mean of tasks"
 EXECUTED = "executed in twin"
@@ -33,9 +33,10 @@ METHOD_NAMES = {
 }
 
 
-def _brackets(shown: Sequence[Measurement]) -> str:
-    """Name the intervals that stand in brackets, and say that some are left out if they are."""
-    found = [m.interval.method for m in shown if m.interval is not None]
+def _brackets(groups: Sequence[RateGroup]) -> str:
+    """Name the intervals that stand in brackets, or say that there are none."""
+    shown = [side.interval for group in groups for side in (group.shown_sim, group.recorded)]
+    found = [interval.method for interval in shown if interval is not None]
     known = {name: METHOD_NAMES.get(name.removeprefix("mean-"), name) for name in found}
     names = " and ".join(dict.fromkeys(known.values()))
     return f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
@@ -48,7 +49,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
     one_sided = any(group.sim.n for group in groups) and not paired
     without_plans = all(group.executed is not None for group in groups)
     note = EXECUTED_NOTE if without_plans else SIM_NOTE
-    parts = [source_note or (UNPAIRED_NOTE if one_sided else note), _brackets(_sides(groups))]
+    parts = [source_note or (UNPAIRED_NOTE if one_sided else note), _brackets(groups)]
     if paired:
         parts.append("The difference is over trials where both sides are known.")
     rows = tuple(
@@ -59,7 +60,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
             side,
             group.unit,
             *rate_row(rate),
-            _gap(group),
+            None if (gap := group.gap) is None else round(float(100 * gap), 1),
             rate.reason_if_undefined,
         )
         for group in groups
@@ -79,16 +80,6 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
         rows=rows,
         note=" ".join(parts),
     )
-
-
-def _sides(groups: Sequence[RateGroup]) -> list[Measurement]:
-    return [side for group in groups for side in (group.shown_sim, group.recorded)]
-
-
-def _gap(group: RateGroup) -> float | None:
-    if group.sim_rate is None or group.recorded_rate is None:
-        return None
-    return round(float(100 * (group.sim_rate - group.recorded_rate)), 1)
 
 
 def layout_table(groups: Sequence[RateGroup], word: str) -> tuple[Table, ...]:
@@ -134,31 +125,14 @@ def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
         id="trials",
         title="Trials",
         columns=(
-            "episode",
-            "task",
-            "condition",
-            "policy",
-            "start",
-            word,
-            "sim planned",
-            "verdict before motion",
-            "sim executed",
-            "first failing",
-            "detail",
+            *("episode", "task", "condition", "policy", "start", word, "sim planned"),
+            *("verdict before motion", "sim executed", "first failing", "detail"),
         ),
         rows=tuple(
             (
-                row.episode,
-                row.task,
-                row.condition.replace("_", " "),
-                row.policy,
-                row.start_id,
-                _answer(row.recorded),
-                _answer(row.sim_planned),
-                _answer(row.verdict),
-                _answer(row.sim_executed),
-                row.first_failing,
-                row.failing_detail,
+                *(row.episode, row.task, row.condition.replace("_", " "), row.policy, row.start_id),
+                *map(_ANSWERS.get, (row.recorded, row.sim_planned, row.verdict, row.sim_executed)),
+                *(row.first_failing, row.failing_detail),
             )
             for row in rows
         ),
@@ -199,5 +173,4 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     )
 
 
-def _answer(value: bool | None) -> str | None:
-    return None if value is None else ("success" if value else "failure")
+_ANSWERS = {True: "success", False: "failure", None: None}

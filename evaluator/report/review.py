@@ -32,7 +32,6 @@ from evaluator.review_index import (
     NO_RESULTS,
     IndexedFile,
     index_path,
-    plain_record,
     severity,
     state_of,
     written_index,
@@ -121,7 +120,9 @@ def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str |
         else results.stand_in,
         **_about(results, has_trials=bool(read.rows)),
     }
-    content = written_index(trials, _files(run, read, {trial.file for trial in trials}), about)
+    numbers = () if results is None else results.measurements
+    files = _files(run, read, {trial.file for trial in trials})
+    content = written_index(trials, files, about, numbers)
     path = index_path(run)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -147,12 +148,11 @@ def _reviewed(row: TrialRow, off: tuple[float | None, float | None], region: str
 
 def _about(results: Results | None, *, has_trials: bool) -> dict[str, Any]:
     if results is None:
-        return {"measurements": [], "exclusions": [], "num_exclusions": 0, "missing": []}
+        return {"exclusions": [], "num_exclusions": 0, "missing": []}
     lines = conclusions(results)
     first = front(results)
     failures = next((t for t in results.tables if t.id == "failures"), None)
     return {
-        "measurements": [plain_record(each) for each in results.measurements],
         "exclusions": [dict(vars(each)) for each in results.exclusions[:SHOWN_EXCLUSIONS]],
         "num_exclusions": len(results.exclusions),
         "missing": list(results.missing),
