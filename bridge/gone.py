@@ -60,7 +60,7 @@ GONE: dict[str, str] = {
     ),
     **dict.fromkeys(
         ("evaluate --live", "evaluate --recorder", "evaluate --connect", "evaluate --goal"),
-        "evaluate says task by task how many more trials would settle the ranking.",
+        "evaluate says how many more trials would likely decide a comparison.",
     ),
     "evaluate --interval": "Intervals are Wilson's; results.json holds k and n for others.",
     "design --interval": "Intervals are Wilson's; results.json holds k and n for others.",

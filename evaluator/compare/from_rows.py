@@ -21,7 +21,7 @@ from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.success import WITH, WITHOUT, rate_groups, side_rates, unpaired_keys
-from evaluator.compare.tables import confusion_table, layout_table, success_table, trials_table
+from evaluator.compare.tables import confusion_table, success_table, trials_table
 from evaluator.result import Measurement
 
 
@@ -68,9 +68,8 @@ def compare_rows(
         measurements=measurements,
         tables=(
             *compared.tables,
-            *conclusions_table(groups, answers, rows),
+            *conclusions_table(groups, rows),
             success_table(groups, word, "Outcomes as the table gives them." if given else ""),
-            *layout_table(groups, word),
             *notes_table([*notes_of_trials(rows, void_causes), *notes(groups, measurements)]),
             *((confusion_table(rows, word),) if has_twin else ()),
             *stage_tables,

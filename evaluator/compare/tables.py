@@ -5,10 +5,8 @@ from collections.abc import Sequence
 from evaluator.compare.gate import confusion_of, heeded_verdict, unheeded_verdict
 from evaluator.compare.measure import RATE_COLUMNS, rate_row
 from evaluator.compare.rows import RateGroup, TrialRow
-from evaluator.compare.success import WITH, WITHOUT
 from evaluator.result import Cell, Table
 
-MEAN_OF_TASKS = "mean of tasks"
 EXECUTED = "executed in twin"
 """The twin's side of a group in which nobody published a plan."""
 EXECUTED_NOTE = "executed in twin: the recorded joints, replayed dynamically; there was no plan."
@@ -80,43 +78,6 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
         rows=rows,
         note=" ".join(parts),
     )
-
-
-def layout_table(groups: Sequence[RateGroup], word: str) -> tuple[Table, ...]:
-    """Lay rates out as papers print them: a row per task, sim and recorded without and with."""
-    conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in groups)]
-    if len(conditions) < 2:
-        return ()
-    found = {(c.task, c.policy, c.condition): c for c in groups}
-    sides = (word,) if all(group.executed is not None for group in groups) else ("sim", word)
-    rows = []
-    for task, policy in dict.fromkeys((c.task, c.policy) for c in groups):
-        line: list[Cell] = [task, policy]
-        for condition in conditions:
-            group = found.get((task, policy, condition))
-            values = [group.sim.value, group.recorded.value] if group else [None, None]
-            line += values[-len(sides) :]
-        rows.append(tuple(line))
-    if len(rows) > 1:
-        rates = [[row[place] for row in rows] for place in range(2, len(rows[0]))]
-        rows.append((MEAN_OF_TASKS, "", *map(_mean, rates)))
-    columns = [
-        f"{side}, {condition.replace('_', ' ')}" for condition in conditions for side in sides
-    ]
-    return (
-        Table(
-            id="layout",
-            title="Success without and with replanning",
-            columns=("task", "policy", *columns),
-            rows=tuple(rows),
-            note="In the mean every line counts the same.",
-        ),
-    )
-
-
-def _mean(values: Sequence[Cell]) -> float | None:
-    known = [value for value in values if isinstance(value, float)]
-    return sum(known) / len(known) if len(known) == len(values) else None
 
 
 def trials_table(rows: Sequence[TrialRow], word: str) -> Table:

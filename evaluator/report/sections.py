@@ -92,7 +92,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
         "plan actually sent, replayed with physics.",
-        tables=("success", "layout", "notes"),
+        tables=("success", "notes"),
         figures=("success",),
     ),
     Section(
@@ -164,7 +164,6 @@ TABLES: dict[str, str] = {
     "standing": "which candidates to keep",
     "protocol_departures": "whether the study may be quoted as it was planned",
     "conclusions": "for which task the twin may stand in for the robot",
-    "layout": "whether to run with replanning",
     "success": "which candidate to use",
     "notes": "what these numbers must not be taken for",
     "trials": "which trial to look at",

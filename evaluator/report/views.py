@@ -170,14 +170,6 @@ def _success(rows: Rows) -> Rows:
     ]
 
 
-def _layout(rows: Rows) -> Rows:
-    def share(value: Any) -> Shown:
-        return Figures(f"{100 * value:.1f} %") if _known(value) else None
-
-    rates = list(rows[0])[2:]
-    return [row | {name: share(row[name]) for name in rates} for row in rows]
-
-
 def _conclusions(rows: Rows) -> Rows:
     """Put a yes beside those that were right, and what succeeded at all."""
 
@@ -190,7 +182,6 @@ def _conclusions(rows: Rows) -> Rows:
             **_picked(folded, "task", "groups", "bias (pp)"),
             "yes and right": right,
             "succeeded at all": succeeded,
-            **_picked(row, "candidates", "best recorded", "ranked", "more trials"),
         }
 
     return [shown(row, folded) for row, folded in zip(rows, _folded(rows), strict=True)]
@@ -219,7 +210,6 @@ _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "conclusions": _conclusions,
     "comparisons": _comparisons,
     "success": _success,
-    "layout": _layout,
     "published": _published,
 }
 """By table; of the others numbers are put together with their counts and intervals."""
