@@ -60,7 +60,7 @@ GONE: dict[str, str] = {
     ),
     **dict.fromkeys(
         ("evaluate --live", "evaluate --recorder", "evaluate --connect", "evaluate --goal"),
-        "evaluate says task by task how many more trials would settle the ranking.",
+        "evaluate says how many more trials would likely decide a comparison.",
     ),
     "evaluate --interval": "Intervals are Wilson's; results.json holds k and n for others.",
     "design --interval": "Intervals are Wilson's; results.json holds k and n for others.",
@@ -71,6 +71,7 @@ GONE: dict[str, str] = {
     "design --per-task": "A study asks for its gain over all tasks together.",
     "evaluate --force": "Delete RUN/results/cache; nothing else remembers a file.",
     "evaluate --lpips-alex": "--lpips-vgg makes LPIPS as papers on splatting compute it.",
+    "evaluate --against": "Evaluate each run; trials.csv has the same trials in both.",
     "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
     "render --rate-hz": "One frame is drawn for each recorded image.",
     **dict.fromkeys(

@@ -199,27 +199,6 @@ BASELINE_GAIN = _new(
     "higher",
     f"share of right answers of the twin minus that of the forecast ({{baseline}}), paired, {_BESIDE}",
 )
-_WHOSE = "the probability is the planned replay's, where it has none the verdict's before motion; with replanning the twin selected these plans"
-BRIER = _new(
-    "reliability.brier",
-    "1",
-    "lower",
-    f"Brier score: mean of (sampled success probability - outcome)^2; {_WHOSE}",
-)
-BRIER_OF_BASE_RATE = _new(
-    "reliability.brier_of_base_rate",
-    "1",
-    "none",
-    "Brier score of always saying the observed success rate; above it the probability is worth nothing",
-)
-LABEL_AGREED = _new(
-    "label.localised.rate",
-    "1",
-    "higher",
-    "trials{where} where the operator's label and the success predicate on the poses localised after the execution say the same / trials where both are known{without}",
-)
-LABEL_AGREED_OF_TASK = _new("label.localised.{task}.rate", "1", "higher", LABEL_AGREED.definition)
-
 # Images. A mean over views, before and after an alignment or a mask (``{variant}``).
 
 

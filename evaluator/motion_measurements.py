@@ -4,23 +4,21 @@ from evaluator.quantity import new_quantity as _new
 
 # ruff: noqa: E501  # one line for each definition
 
-TOOL = "tool centre point"
 MOTIONS = {
     name: _new(
         f"motion.{{against}}.{name}",
         unit,
         "none" if name == "lag_s" else "lower",
-        f"{what}, {{meaning}}: {words}, mean over trials; aligned by {{how}}",
+        f"tool centre point, {{meaning}}: {words}, mean over trials; aligned by {{how}}",
         (-0.2, 0.6) if name == "lag_s" else None,
     )
-    for name, unit, what, words in (
-        ("lag_s", "s", TOOL, "delay of least distance, a rigid motion apart"),
-        ("path_mean_m", "m", TOOL, "mean distance over time after that delay is taken out"),
-        ("path_max_m", "m", TOOL, "largest distance over time after that delay is taken out"),
-        ("position_mean_m", "m", TOOL, "mean distance at equal times"),
-        ("end_point_m", "m", TOOL, "distance at the last common instant"),
-        ("rotation_mean_rad", "rad", TOOL, "mean angle over time"),
-        ("joint_rms_rad", "rad", "joints", "root mean square error"),
+    for name, unit, words in (
+        ("lag_s", "s", "delay of least distance, a rigid motion apart"),
+        ("path_mean_m", "m", "mean distance over time after that delay is taken out"),
+        ("path_max_m", "m", "largest distance over time after that delay is taken out"),
+        ("position_mean_m", "m", "mean distance at equal times"),
+        ("end_point_m", "m", "distance at the last common instant"),
+        ("rotation_mean_rad", "rad", "mean angle over time"),
     )
 }
 """By the field of ``MotionSummary`` they are the mean of."""

@@ -34,8 +34,6 @@ class Interval:
     level: float
     method: str
     """For example ``wilson``; a method is always named."""
-    worst_coverage: float | None = None
-    """The least it covers of the truths looked at, for this n; None where nobody looked."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from evaluator.result import Measurement
 from evaluator.trial_row import TrialRow
 
 FILE_NAME = "review_index.msgpack"
-VERSION = 7
+VERSION = 8
 """Raise it whenever what a field holds changes."""
 NO_RESULTS = "no results yet"
 """Why there are no numbers of a run that was never evaluated."""
@@ -54,19 +54,17 @@ class IndexedFile:
     """Why it cannot be read; empty for one that can."""
 
 
-SHOW = {
-    "": "all",
-    "disagree": "disagreements",
-    "wrong_yes": "wrong yes of the twin",
-    "failure": "recorded failures",
-    "undecided": "undecided",
+_SHOW: dict[str, tuple[str, Callable[[TrialRow], bool]]] = {
+    "": ("all", lambda _: True),
+    "disagree": ("disagreements", lambda trial: trial.agrees is False),
+    "wrong_yes": (
+        "wrong yes of the twin",
+        lambda trial: trial.twin is True and trial.recorded is False,
+    ),
+    "failure": ("recorded failures", lambda trial: trial.recorded is False),
+    "undecided": ("undecided", lambda trial: trial.agrees is None),
 }
-_SHOW: dict[str, Callable[[TrialRow], bool]] = {
-    "disagree": lambda trial: trial.agrees is False,
-    "wrong_yes": lambda trial: trial.twin is True and trial.recorded is False,
-    "failure": lambda trial: trial.recorded is False,
-    "undecided": lambda trial: trial.agrees is None,
-}
+SHOW = {name: words for name, (words, _) in _SHOW.items()}
 SORT: dict[str, tuple[Callable[[TrialRow], Any], ...]] = {
     "": (),
     "name": (lambda trial: trial.episode,),
@@ -149,7 +147,7 @@ class Selection(_Selected):
         """Say whether a trial is selected."""
         if not super().takes(trial):
             return False
-        if self.show and (self.show not in _SHOW or not _SHOW[self.show](trial)):
+        if self.show not in _SHOW or not _SHOW[self.show][1](trial):
             return False
         if (self.clause or self.cause) and trial.twin is not False:
             return False
@@ -185,14 +183,14 @@ FAILURE_PARTS = {
     "start": "start_region",
 }
 """What failures are sorted by, and the fields that hold it."""
-FAILED = {
-    "": "all",
-    "foretold": "both fail",
-    "wrong_yes": "only the trial fails",
-    "wrong_no": "only the twin fails",
+_FAILED = {
+    "": ("all", None),
+    "foretold": ("both fail", (True, True)),
+    "wrong_yes": ("only the trial fails", (True, False)),
+    "wrong_no": ("only the twin fails", (False, True)),
 }
-_FAILED = {"foretold": (True, True), "wrong_yes": (True, False), "wrong_no": (False, True)}
-"""Whether the trial fails, and whether the twin."""
+"""Words, and whether the trial fails, and whether the twin."""
+FAILED = {name: words for name, (words, _) in _FAILED.items()}
 NOT_KNOWN = "-"
 """Selects failures of which a part is not known: an empty value selects all."""
 
@@ -222,7 +220,7 @@ class FailureSelection(_Selected):
         if not trial.fail_cause or not super().takes(trial):
             return False
         who = trial.recorded is False, trial.twin is False
-        if self.failed and _FAILED.get(self.failed) != who:
+        if self.failed and _FAILED.get(self.failed, ("", None))[1] != who:
             return False
         asked = ((getattr(self, name), field) for name, field in FAILURE_PARTS.items())
         return all(
@@ -311,13 +309,17 @@ class _Content:
     about: dict[str, Any]
     trials: tuple[TrialRow, ...]
     files: tuple[IndexedFile, ...]
+    measurements: tuple[Measurement, ...]
 
 
 _decode = msgspec.msgpack.Decoder(_Content).decode
 
 
 def written_index(
-    trials: Iterable[TrialRow], files: Iterable[IndexedFile], about: Mapping[str, Any]
+    trials: Iterable[TrialRow],
+    files: Iterable[IndexedFile],
+    about: Mapping[str, Any],
+    measurements: Iterable[Measurement] = (),
 ) -> bytes:
     """Return the bytes of an index; what is not valid Unicode, as names of files, is spelt out."""
     content = _Content(
@@ -326,16 +328,13 @@ def written_index(
         about=dict(about),
         trials=tuple(trials),
         files=tuple(files),
+        measurements=tuple(replace(each, episodes=()) for each in measurements),
     )
     try:
         return packed(content)
     except UnicodeEncodeError:
-        spelt = replace(
-            content,
-            trials=tuple(map(_spelt, content.trials)),
-            files=tuple(map(_spelt, content.files)),
-        )
-        return packed(spelt)
+        trials, files = tuple(map(_spelt, content.trials)), tuple(map(_spelt, content.files))
+        return packed(replace(content, trials=trials, files=files))
 
 
 Item = TypeVar("Item", TrialRow, IndexedFile)
@@ -369,10 +368,10 @@ class ReviewIndex:
         """Whatever is not a list of trials or files."""
         return self._content.about
 
-    @cached_property
+    @property
     def measurements(self) -> tuple[Measurement, ...]:
         """The numbers of ``results.json``, without the episodes behind them."""
-        return tuple(measurement_of(record) for record in self.about["measurements"])
+        return self._content.measurements
 
     def trials(
         self, selection: _Selected, *, limit: int | None = None, offset: int = 0
@@ -450,17 +449,3 @@ class ReviewIndex:
         """Return the files that are no trials, and how many there are."""
         found = [each for each in self._content.files if bool(each.error) is broken]
         return tuple(found[:limit]), len(found)
-
-
-def plain_record(measurement: Measurement) -> dict[str, Any]:
-    """Return a measurement as JSON, without the episodes behind it."""
-    record = {name: value for name, value in vars(measurement).items() if value is not None}
-    record.pop("episodes")
-    if measurement.interval is not None:
-        record["interval"] = dict(vars(measurement.interval))
-    return record
-
-
-def measurement_of(record: Mapping[str, Any]) -> Measurement:
-    """Read what ``plain_record`` wrote."""
-    return msgspec.convert({"value": None, **record}, Measurement)

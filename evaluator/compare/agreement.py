@@ -1,12 +1,13 @@
 """Do the twin's success rates of groups follow the recorded ones, and how far off are they?"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache, partial
 
 from evaluator.compare.measure import measured
 from evaluator.compare.rows import RateGroup
+from evaluator.compare.success import of_group
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
     BIAS,
@@ -167,14 +168,12 @@ def _blind(groups: Sequence[RateGroup]) -> list[Measurement]:
         model = model_of(groups)
     except UndefinedStatisticError:
         return []
-    make: Callable[..., Measurement] = partial(measured, counted="group")
-    found = [make(BLIND_SHARE.of(), lambda: model.blind_share, n=len(groups))]
+    found = [measured(BLIND_SHARE.of(), lambda: model.blind_share, n=len(groups), counted="group")]
     for group, chance in zip(groups, model.blind_groups.tolist(), strict=True):
         if chance >= LIKELY_BLIND:
-            parts = {"task": group.task, "condition": group.condition, "policy": group.policy}
             found.append(
                 measured(
-                    BLIND_GROUP.of(**parts),
+                    of_group(BLIND_GROUP, (group.task, group.condition, group.policy)),
                     lambda chance=chance: chance,  # type: ignore[misc]
                     n=(group.recorded.n or 0) + (group.sim.n or 0),
                     counted="trial",

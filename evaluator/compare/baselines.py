@@ -11,16 +11,15 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from bridge.episode import schema, streams
+from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
-from evaluator.compare.gate import unheeded_verdict
-from evaluator.compare.known_task import recorded_task
-from evaluator.compare.labels import AFTER
+from evaluator.compare.gate import known_to, unheeded_verdict
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import TrialRow
+from evaluator.compare.states import AFTER, sent_plan
 from evaluator.compare.success import Answer, names_of
 from evaluator.measurements import BASE_RATE, BASELINE_ACCURACY, BASELINE_GAIN
 from evaluator.metrics.geometric_rule import judge_by_geometry
@@ -36,19 +35,17 @@ class RuleSummary:
 
     episode: str
     value: bool | None
-    detail: str
 
 
 def apply_rule(
-    recorded: Episode, localised: Episode | None, *, plan_id: str, task: Task | None = None
+    recorded: Episode, localised: Episode | None, *, plan_id: str, task: Task | None
 ) -> RuleSummary | None:
     """Ask the geometric rule about the plan that was sent; None where there is nothing to ask."""
-    task = recorded_task(recorded) if task is None else task
-    plan = _plan(recorded, plan_id)
+    plan = sent_plan(recorded, plan_id, Plan.from_json)
     if task is None or plan is None:
         return None
     answer = judge_by_geometry(plan, task, _poses_at_start(recorded, localised, plan_id))
-    return RuleSummary(episode=recorded.info.id, value=answer.value, detail=answer.detail)
+    return RuleSummary(episode=recorded.info.id, value=answer.value)
 
 
 def with_rule(rows: Iterable[TrialRow], summaries: Sequence[RuleSummary]) -> list[TrialRow]:
@@ -60,16 +57,6 @@ def with_rule(rows: Iterable[TrialRow], summaries: Sequence[RuleSummary]) -> lis
         else row
         for row in rows
     ]
-
-
-def _plan(recorded: Episode, plan_id: str) -> Plan | None:
-    found = (
-        plan
-        for message in recorded.messages(recorded.topics_of_type(schema.PLAN))
-        if plan_id.encode() in message.data
-        if (plan := Plan.from_json(message.data)).id == plan_id
-    )
-    return next(found, None)
 
 
 def _poses_at_start(
@@ -101,7 +88,7 @@ def baseline_results(rows: Sequence[TrialRow]) -> list[Measurement]:
     names = list(dict.fromkeys(name for row in rows for name, _ in row.baselines))
     found: list[Measurement] = []
     for by, words, answer_of in SIDES:
-        known = [r for r in rows if answer_of(r) is not None and r.recorded is not None]
+        known = known_to(rows, answer_of)
         if not known:
             continue
         found.append(

@@ -6,6 +6,7 @@ belongs to no single recorded run is compared with each of them. It says that it
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from statistics import median
@@ -24,6 +25,7 @@ from evaluator.compare.measure import (
     Part,
     ends,
     interval_or_reason,
+    joined,
     measured,
     median_of,
     millimetres,
@@ -55,18 +57,6 @@ class Run:
     """The recorded run that a replay was made from; None where it belongs to no single one."""
     fitted_to: frozenset[str] = frozenset()
     """Recorded runs from which something was identified that a replay uses."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BodyComparison:
-    """One recorded run against the simulated runs it is compared with."""
-
-    recorded: str
-    simulated: tuple[str, ...]
-    distance: Mapping[str, float]
-    """By the name in ``BODY_DISTANCES``; over several simulated runs the mean."""
-    fitted: bool
-    """Something was fitted to this very run, so it says nothing about other runs."""
 
 
 def body_distance(recorded: PoseTrajectory, simulated: PoseTrajectory) -> dict[str, float]:
@@ -109,75 +99,62 @@ def moved_bodies(real: Sequence[Run]) -> list[str]:
     return found
 
 
-def compare_bodies(
+def _compared(
     real: Sequence[Run], simulated: Sequence[Run], body: str
-) -> list[BodyComparison]:
-    """Compare one body run by run; recorded runs without a counterpart are left out."""
-    found = []
+) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Compare one body run by run; recorded runs without a counterpart are left out.
+
+    Returns:
+        Distances by recorded run and name in ``BODY_DISTANCES``, over several simulated runs the
+        mean; and runs to which something was fitted, which say nothing about others.
+    """
+    found: dict[str, dict[str, float]] = {}
+    fitted = []
     for run in real:
-        others = [
-            other
-            for other in simulated
-            if other.replayed_from in (None, run.episode) and body in other.bodies
-        ]
-        if body not in run.bodies or not others:
-            continue
-        each = [body_distance(run.bodies[body], other.bodies[body]) for other in others]
-        found.append(
-            BodyComparison(
-                recorded=run.episode,
-                simulated=tuple(other.episode for other in others),
-                distance={
-                    name: float(np.mean([item[name] for item in each])) for name in BODY_DISTANCES
-                },
-                fitted=any(run.episode in other.fitted_to for other in others),
-            )
-        )
-    return found
-
-
-def body_measurements(
-    task: str, engine: str, body: str, compared: Sequence[BodyComparison]
-) -> dict[str, Measurement]:
-    """Measure the medians over recorded runs; runs that something was fitted to do not count."""
-    counted = [item for item in compared if not item.fitted]
-    words = f"{body}, {len(counted)} recorded runs against {engine}"
-    episodes = [name for item in counted for name in (item.recorded, *item.simulated)]
-    found = {}
-    for name, quantity in BODY_DISTANCES.items():
-        values = [item.distance[name] for item in counted]
-        found[name] = measured(
-            quantity.of(task=task, engine=engine, body=body, what=words),
-            partial(median_of, values, "median", "no recorded run is left to compare with"),
-            n=len(values),
-            counted="run",
-            reason_without_interval=interval_or_reason(median_interval, values)[1],
-            episodes=list(dict.fromkeys(episodes)),
-        )
-    return found
+        others = [o for o in simulated if o.replayed_from in (None, run.episode)]
+        others = [other for other in others if body in other.bodies and body in run.bodies]
+        if others:
+            each = [body_distance(run.bodies[body], other.bodies[body]) for other in others]
+            found[run.episode] = {
+                name: float(np.mean([item[name] for item in each])) for name in BODY_DISTANCES
+            }
+            fitted += [run.episode] * any(run.episode in other.fitted_to for other in others)
+    return found, fitted
 
 
 def compare_end_points(
     task: str, real: Sequence[Run], engines: Mapping[str, Sequence[Run]], table_id: str
 ) -> Part:
-    """Compare every moved body of a task with every engine."""
+    """Compare every moved body of a task with every engine: medians over recorded runs."""
     measurements: list[Measurement] = []
     rows: list[dict[str, Cell]] = []
-    left_out: list[Exclusion] = []
+    left_out: dict[Exclusion, None] = {}
     for body in moved_bodies(real):
         for engine, simulated in engines.items():
-            compared = compare_bodies(real, simulated, body)
-            if not compared:
+            found, fitted = _compared(real, simulated, body)
+            if not found:
                 continue
-            by_name = body_measurements(task, engine, body, compared)
+            counted = [episode for episode in found if episode not in fitted]
+            by_name: dict[str, Measurement] = {}
+            for name, quantity in BODY_DISTANCES.items():
+                values = [found[episode][name] for episode in counted]
+                words = f"{body}, {len(counted)} recorded runs against {engine}"
+                by_name[name] = measured(
+                    quantity.of(task=task, engine=engine, body=body, what=words),
+                    partial(median_of, values, "median", "no recorded run is left to compare with"),
+                    n=len(values),
+                    counted="run",
+                    reason_without_interval=interval_or_reason(median_interval, values)[1],
+                    episodes=counted,
+                )
             measurements += by_name.values()
             low, high = (millimetres(end) for end in ends(by_name["end_point_m"].interval))
             rows.append(
                 {
                     "body": body,
                     "engine": engine,
-                    "recorded runs": by_name["end_point_m"].n,
-                    "fitted to": sum(item.fitted for item in compared),
+                    "recorded runs": len(counted),
+                    "fitted to": len(fitted),
                     "end-point error (mm)": millimetres(by_name["end_point_m"].value),
                     "low (mm)": low,
                     "high (mm)": high,
@@ -186,17 +163,15 @@ def compare_end_points(
                     "lag (ms)": milliseconds(by_name["lag_s"].value),
                 }
             )
-            reason = f"the replays of {engine} were fitted to this run; only held-out runs count"
-            left_out += [
-                Exclusion(episode=item.recorded, scope="end points", reason=reason)
-                for item in compared
-                if item.fitted and body != TOOL_BODY
-            ]
-    table = Table(
+            why = f"the replays of {engine} were fitted to this run; only held-out runs count"
+            for episode in fitted if body != TOOL_BODY else ():
+                left_out[Exclusion(episode=episode, scope="end points", reason=why)] = None
+    if not rows:
+        return Part()
+    table = Table.of(
+        rows,
         id=table_id,
         title=f"End points: {task}",
-        columns=tuple(rows[0]) if rows else (),
-        rows=tuple(tuple(row.values()) for row in rows),
         note="Medians over recorded runs. A replay is compared with the run that it was made "
         "from, other simulated runs with every recorded one (mean over them). Displacement: "
         "end minus start, so where a body began plays no part. Path: mean distance after both "
@@ -204,11 +179,7 @@ def compare_end_points(
         "Intervals of the end point: order statistics, 95 %. Runs that something was fitted to do "
         "not count.",
     )
-    return Part(
-        measurements=tuple(measurements),
-        tables=(table,) if rows else (),
-        exclusions=tuple(dict.fromkeys(left_out)),
-    )
+    return Part(measurements=tuple(measurements), tables=(table,), exclusions=tuple(left_out))
 
 
 FITTED_TO = "fitted_to"
@@ -220,29 +191,20 @@ def compare_imported(recorded: Sequence[Episode], files: Sequence[DerivedFile]) 
     runs, left_out = _runs(recorded, files)
     if not runs:  # nothing imported, or imported without a robot, as an RGB-D folder
         return Part()
-    measurements: list[Measurement] = []
-    tables: list[Table] = []
-    missing: list[str] = []
+    parts = [Part(exclusions=tuple(left_out))]
     for task in sorted({run.task for run in runs}):
         of_task = [run for run in runs if run.task == task]
         real = [run for run in of_task if run.engine is None]
         names = sorted({run.engine for run in of_task if run.engine is not None})
         simulated = {name: [run for run in of_task if run.engine == name] for name in names}
-        if not real or not simulated:
+        if real and simulated:
+            name = f"end_points_{sum(bool(part.tables) for part in parts)}"
+            parts.append(compare_end_points(task, real, simulated, name))
+        else:
             lacking = "simulated" if real else "recorded"
-            missing.append(f"motions of {task or 'the imported runs'}: no {lacking} run")
-            continue
-        name = f"end_points_{sum(table.id.startswith('end_points') for table in tables)}"
-        bodies = compare_end_points(task, real, simulated, name)
-        measurements += bodies.measurements
-        tables += bodies.tables
-        left_out += bodies.exclusions
-    return Part(
-        measurements=tuple(measurements),
-        tables=tuple(tables),
-        exclusions=tuple(left_out),
-        missing=tuple(missing),
-    )
+            missing = f"motions of {task or 'the imported runs'}: no {lacking} run"
+            parts.append(Part(missing=(missing,)))
+    return joined(parts)
 
 
 def engine_of(info: EpisodeInfo) -> str | None:
@@ -262,7 +224,10 @@ def _runs(
     ]
     found += [(file.episode, _side_name(file.derived), file.derived) for file in _newest(files)]
     for episode, engine, derived in found:
-        track = _tcp_track(episode)
+        track = None
+        topics = [t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE)]
+        with suppress(BridgeError):
+            track = pose_track(episode, topics[0]) if topics else None
         if track is None or len(track) < 2:
             reason = "no end-effector poses (a topic ending with /tcp/pose)"
             left_out.append(Exclusion(episode=episode.info.id, scope="motions", reason=reason))
@@ -283,17 +248,6 @@ def _runs(
             )
         )
     return runs, left_out
-
-
-def _tcp_track(episode: Episode) -> PoseTrajectory | None:
-    """Return the tool centre point's poses, or None where they were not recorded."""
-    topics = [
-        topic for topic in episode.topics_of_type(schema.POSE_STAMPED) if topic.endswith(TCP_POSE)
-    ]
-    try:
-        return pose_track(episode, topics[0]) if topics else None
-    except BridgeError:
-        return None
 
 
 def _fitted_to(derived: Derived | None) -> frozenset[str]:

@@ -8,7 +8,7 @@ from bridge.task.protocol import VOID_CAUSES, Protocol
 from evaluator.compare.agreement import group_agreement, usable_groups
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.conclusions import conclusions_table
-from evaluator.compare.gate import agreement, reliability
+from evaluator.compare.gate import agreement
 from evaluator.compare.measure import refuse_alike
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.policies import (
@@ -21,7 +21,7 @@ from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.success import WITH, WITHOUT, rate_groups, side_rates, unpaired_keys
-from evaluator.compare.tables import confusion_table, layout_table, success_table, trials_table
+from evaluator.compare.tables import confusion_table, success_table, trials_table
 from evaluator.result import Measurement
 
 
@@ -56,7 +56,6 @@ def compare_rows(
         *compared.measurements,
         *regret_results(usable_groups(groups)),
         *baseline_results(rows),
-        *reliability(rows),
         *stages,
     )
     word = empty.recorded_word
@@ -69,9 +68,8 @@ def compare_rows(
         measurements=measurements,
         tables=(
             *compared.tables,
-            *conclusions_table(groups, answers, rows),
+            *conclusions_table(groups, rows),
             success_table(groups, word, "Outcomes as the table gives them." if given else ""),
-            *layout_table(groups, word),
             *notes_table([*notes_of_trials(rows, void_causes), *notes(groups, measurements)]),
             *((confusion_table(rows, word),) if has_twin else ()),
             *stage_tables,
@@ -83,10 +81,7 @@ def compare_rows(
     )
 
 
-NO_DATA = (
-    ("reliability.", "reliability of the success probability", "no trial has p_success"),
-    ("stage.", "stage funnel", "no trial has labelled stages or counts sub-tasks"),
-)
+NO_DATA = (("stage.", "stage funnel", "no trial has labelled stages or counts sub-tasks"),)
 """Parts of the evaluation whose input a run may not have."""
 
 

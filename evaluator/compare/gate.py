@@ -7,31 +7,9 @@ from bridge.episode.metadata import CONTROL
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
-from evaluator.measurements import (
-    AGREED,
-    BRIER,
-    BRIER_OF_BASE_RATE,
-    NPV,
-    PHI,
-    PPV,
-)
+from evaluator.measurements import AGREED, NPV, PHI, PPV
 from evaluator.result import Measurement
-from evaluator.statistics.gate import Confusion, brier, brier_of_base_rate, phi
-
-
-def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:
-    """Measure k/n agreement, phi and predictive values, of the replay and of the verdict."""
-    measurements = []
-    for name, answer_of, words in (
-        ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
-        ("verdict", lambda row: row.verdict, "the verdict before motion"),
-        ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
-    ):
-        measurements.extend(_agreement_of(rows, name, answer_of, words))
-    if any(unheeded_verdict(row) is not None for row in rows):
-        words = "the verdict before motion, recorded and not obeyed (without replanning)"
-        measurements.extend(_agreement_of(rows, "verdict_unheeded", unheeded_verdict, words))
-    return measurements
+from evaluator.statistics.gate import Confusion, phi
 
 
 def unheeded_verdict(row: TrialRow) -> bool | None:
@@ -47,19 +25,35 @@ def heeded_verdict(row: TrialRow) -> bool | None:
     return row.verdict if row.condition == WITH else None
 
 
+def known_to(rows: Sequence[TrialRow], answer_of: Answer) -> list[TrialRow]:
+    """Return the trials with an answer and an outcome."""
+    return [row for row in rows if answer_of(row) is not None and row.recorded is not None]
+
+
 def confusion_of(rows: Sequence[TrialRow], answer_of: Answer) -> Confusion:
     """Count what was said against what was labelled, over trials where both are known."""
     return Confusion.count(
-        (answer, row.recorded)
-        for row in rows
-        if (answer := answer_of(row)) is not None and row.recorded is not None
+        (bool(answer_of(row)), bool(row.recorded)) for row in known_to(rows, answer_of)
     )
+
+
+def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:
+    """Measure k/n agreement, phi and predictive values, of the replay and of the verdict."""
+    sides: list[tuple[str, Answer, str]] = [
+        ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
+        ("verdict", lambda row: row.verdict, "the verdict before motion"),
+        ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
+    ]
+    if any(unheeded_verdict(row) is not None for row in rows):
+        words = "the verdict before motion, recorded and not obeyed (without replanning)"
+        sides.append(("verdict_unheeded", unheeded_verdict, words))
+    return [measurement for side in sides for measurement in _agreement_of(rows, *side)]
 
 
 def _agreement_of(
     rows: Sequence[TrialRow], name: str, answer_of: Answer, words: str
 ) -> list[Measurement]:
-    seen = [row for row in rows if answer_of(row) is not None and row.recorded is not None]
+    seen = known_to(rows, answer_of)
     counts = confusion_of(seen, answer_of)
     nothing = f"no trial has both {words} and a known outcome"
     make = partial(proportion, counted="trial")
@@ -89,36 +83,8 @@ def _agreement_of(
         make(
             NPV.of(by=name, words=words),
             counts.true_negative,
-            counts.predicted_failure,
+            counts.n - counts.predicted_success,
             reason_if_undefined=nothing if not counts.n else "it never predicted failure",
             episodes=names_of(row for row in seen if not answer_of(row)),
         ),
     ]
-
-
-def reliability(rows: Sequence[TrialRow]) -> list[Measurement]:
-    """Judge the sampled success probability against the outcomes; nothing where none was said."""
-    seen = [
-        (row.episode, row.p_success, row.recorded)
-        for row in rows
-        if row.p_success is not None and row.recorded is not None
-    ]
-    if not seen:
-        return []
-    probabilities, happened = [p for _, p, _ in seen], [outcome for _, _, outcome in seen]
-    make = partial(
-        measured, n=len(seen), counted="trial", episodes=[episode for episode, _, _ in seen]
-    )
-    measurements = [
-        make(
-            BRIER.of(),
-            lambda: brier(probabilities, happened),
-            reason_without_interval="beside it stands what knowing nothing reaches",
-        ),
-        make(
-            BRIER_OF_BASE_RATE.of(),
-            lambda: brier_of_base_rate(happened),
-            reason_without_interval="the outcomes' own rate; what it would be on others is unknown",
-        ),
-    ]
-    return measurements

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from statistics import median
 from typing import TypeVar
 
@@ -80,6 +80,17 @@ class Part:
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     missing: tuple[str, ...] = ()
+
+
+def joined(parts: Iterable[Part]) -> Part:
+    """Put parts one behind the other."""
+    together = list(parts)
+    return Part(
+        **{
+            each.name: tuple(item for part in together for item in getattr(part, each.name))
+            for each in fields(Part)
+        }
+    )
 
 
 Statistic = Callable[[], float | tuple[float, Interval | None]]

@@ -17,7 +17,6 @@ from jaxtyping import Float
 
 from bridge.clock import NS_PER_S
 from bridge.episode.reader import Episode
-from bridge.episode.streams import JointTrack
 from bridge.errors import GstError
 from evaluator.compare.measure import (
     Part,
@@ -29,7 +28,7 @@ from evaluator.compare.measure import (
     milliseconds,
 )
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.trajectory import find_lag_s, joint_errors, pose_errors, position_errors
+from evaluator.metrics.trajectory import find_lag_s, pose_errors, position_errors
 from evaluator.motion_measurements import MOTIONS
 from evaluator.result import Cell, Measurement, Table
 from evaluator.run_reader.tracks import Tracks, read_tracks
@@ -57,8 +56,6 @@ class MotionErrors:
     path_mean_m: float
     """Mean distance after that lag is taken out: another path, not a later one."""
     path_max_m: float
-    joint_rms_rad: float | None = None
-    """Over all joints and instants; None without joints of the same names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,18 +111,7 @@ def compare_tracks(mine: Tracks, other: Tracks) -> MotionErrors:
         lag_s=lag_s,
         path_mean_m=float(path_m.mean()),
         path_max_m=float(path_m.max()),
-        joint_rms_rad=_joint_rms_rad(mine.joints, other.joints),
     )
-
-
-def _joint_rms_rad(mine: JointTrack | None, other: JointTrack | None) -> float | None:
-    if mine is None or other is None:
-        return None
-    try:
-        over_time = joint_errors(mine, other).over_time_rad()
-    except UndefinedStatisticError:
-        return None
-    return float(np.sqrt((over_time**2).mean()))
 
 
 def _no_tool() -> UndefinedStatisticError:
@@ -188,7 +174,6 @@ def group_table(groups: Groups) -> Table:
                     ),
                     "end point (mm)": millimetres(average(members, attrgetter("end_point_m"))),
                     "mean angle (deg)": degrees(average(members, attrgetter("rotation_mean_rad"))),
-                    "joints, RMS (deg)": degrees(average(members, attrgetter("joint_rms_rad"))),
                 }
             )
     return Table.of(

@@ -20,11 +20,12 @@ Note = tuple[str, str]
 def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> list[Note]:
     """Collect what follows from the groups and the numbers alone."""
     by_id = {measurement.id: measurement for measurement in measurements}
-    return [
-        *_opposed(groups, by_id),
-        *_units(groups),
-        *_blind(by_id),
+    blind = [
+        (name, f"the twin is probably blind here ({m.value:.2f}): {m.definition}")
+        for name, m in by_id.items()
+        if name.startswith("agreement.blind.") and m.value is not None
     ]
+    return [*_opposed(groups, by_id), *_units(groups), *blind]
 
 
 def notes_table(found: Iterable[Note]) -> tuple[Table, ...]:
@@ -65,14 +66,6 @@ def _units(groups: Sequence[RateGroup]) -> list[Note]:
     return notes
 
 
-def _blind(by_id: dict[str, Measurement]) -> list[Note]:
-    return [
-        (name, f"the twin is probably blind here ({m.value:.2f}): {m.definition}")
-        for name, m in by_id.items()
-        if name.startswith("agreement.blind.") and m.value is not None
-    ]
-
-
 def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list[Note]:
     """Say that r within tasks tells another story than r over all groups (Simpson 1951)."""
     tasks: dict[str, list[tuple[Fraction, Fraction]]] = {}
@@ -110,48 +103,37 @@ HASH_DIGITS = 12
 def check_settings(trials: Sequence[Trial], derived: Sequence[DerivedFile]) -> list[Note]:
     """Say what a reader of one rate over all trials would not expect of the replays behind it."""
     used = [file for trial in trials for file in trial.replays.values()]
-    reasons = [file.why_not_counted for file in derived]
-    known = list(zip(derived, reasons, strict=True))
-    found = list(_passed_over(why for file, why in known if file.derived.kind == "replay"))
-    if used:
-        found += [*_scenes(used, derived), *_settings(used)]
+    passed_over = Counter(file.why_not_counted for file in derived if file.derived.kind == "replay")
+    found = [f"{count} that never count were {why}" for why, count in passed_over.items() if why]
+    found += [text for text in (_scenes(used, derived), _settings(used)) if text]
     return [(ABOUT, text) for text in found]
 
 
-def _passed_over(reasons: Iterable[str]) -> Iterable[str]:
-    """Say which replays are shown and never counted, and why."""
-    for why, count in Counter(reasons).items():
-        if why:
-            yield f"{count} that never count were {why}"
-
-
-def _scenes(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> Iterable[str]:
+def _scenes(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> str:
+    """Say that replays, or replays and views, are of different scenes."""
     scenes = Counter(_scene(file.derived.scene_hash) for file in used)
-    if len(scenes) > 1:
-        yield (
-            f"those that count were made in different scenes ({_counted(scenes)}), so trials are "
-            "judged by different twins; robot-gst replay RUN makes those of the scene there is now"
-        )
-        return
     views = [each.derived.scene_hash for each in derived if each.derived.kind == "views"]
     shown = {_scene(scene_hash) for scene_hash in views if scene_hash}
-    if shown and not shown & scenes.keys():
-        yield (
-            f"made in {next(iter(scenes))}, while the held-out views are of "
-            f"{' and '.join(sorted(shown))}: numbers of trials and of images are of different "
-            "twins; robot-gst replay RUN replays in the scene there is now"
+    if len(scenes) > 1:
+        counted = ", ".join(f"{count} in {name}" for name, count in scenes.most_common())
+        return (
+            f"those that count were made in different scenes ({counted}), so trials are "
+            "judged by different twins; robot-gst replay RUN makes those of the scene there is now"
         )
+    if not scenes or not shown or shown & scenes.keys():
+        return ""
+    return (
+        f"made in {next(iter(scenes))}, while the held-out views are of "
+        f"{' and '.join(sorted(shown))}: numbers of trials and of images are of different "
+        "twins; robot-gst replay RUN replays in the scene there is now"
+    )
 
 
 def _scene(scene_hash: str | None) -> str:
     return f"scene {scene_hash[:HASH_DIGITS]}" if scene_hash else NO_SCENE
 
 
-def _counted(values: Counter[str]) -> str:
-    return ", ".join(f"{count} in {value}" for value, count in values.most_common())
-
-
-def _settings(used: Sequence[DerivedFile]) -> Iterable[str]:
+def _settings(used: Sequence[DerivedFile]) -> str:
     """Name the first setting in which replays that count differ."""
     # Nearly always all are equal, and many files share one record: it is laid flat once.
     records: dict[int, dict[str, Any]] = {}
@@ -162,11 +144,11 @@ def _settings(used: Sequence[DerivedFile]) -> Iterable[str]:
         values = Counter(str(settings.get(name)) for settings in made)
         if len(values) > 1:
             shown = ", ".join(f"{value} in {count}" for value, count in values.most_common())
-            yield (
+            return (
                 f"those that count were made with different settings ({name} {shown}), so trials "
                 "are judged by different twins"
             )
-            return
+    return ""
 
 
 def _made_with(file: DerivedFile) -> dict[str, Any]:

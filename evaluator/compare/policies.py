@@ -511,6 +511,8 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         {
             "answer": each.sentence,
             "task": each.task or ALL_TASKS,
+            "first": each.question.first.words,
+            "second": each.question.second.words,
             "shared starts": sum(s.pairs for s in each.reading.evidence.strata),
             "decided": {1: "better", -1: "worse", 0: "no"}[each.reading.better],
             "decided after (pairs)": look.pairs if (look := each.reading.decided) else None,

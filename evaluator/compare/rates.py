@@ -12,7 +12,7 @@ from evaluator.compare.policies import compare_counts, comparison_part
 from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.compare.success import WITH
-from evaluator.compare.tables import layout_table, success_table
+from evaluator.compare.tables import success_table
 from evaluator.measurements import RATE_AS_GIVEN
 from evaluator.result import Exclusion, Measurement
 from evaluator.statistics.intervals import wilson
@@ -54,9 +54,8 @@ def compare_records(records: Sequence[RateRecord], name: str) -> Comparison:
         measurements=measurements,
         tables=(
             *compared.tables,
-            *conclusions_table(groups, answers),
+            *conclusions_table(groups),
             success_table(groups, empty.recorded_word, "Rates as given."),
-            *layout_table(groups, empty.recorded_word),
             *notes_table(notes(groups, measurements)),
         ),
         exclusions=tuple(left_out),

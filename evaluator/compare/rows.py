@@ -61,6 +61,12 @@ class RateGroup:
         return self.sim_common or self.sim, self.recorded_common or self.recorded
 
     @property
+    def gap(self) -> Fraction | None:
+        """Sim rate less recorded rate; None where one is not known."""
+        known = self.sim_rate is not None and self.recorded_rate is not None
+        return self.sim_rate - self.recorded_rate if known else None  # type: ignore[operator]
+
+    @property
     def label(self) -> str:
         """Task and condition in a reader's words."""
         parts = (self.task, self.condition, self.policy)

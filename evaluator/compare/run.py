@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
@@ -17,8 +17,7 @@ from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.images.methods import compare_renders
 from evaluator.compare.images.scores import open_net
 from evaluator.compare.images.views import compare_views
-from evaluator.compare.labels import label_results
-from evaluator.compare.measure import Part
+from evaluator.compare.measure import Part, joined
 from evaluator.compare.motion import motion_results
 from evaluator.compare.notes import check_settings, with_notes
 from evaluator.compare.policies import START_LIMIT_M, compare_policies
@@ -32,8 +31,6 @@ from evaluator.metrics.image_options import ImageOptions
 from evaluator.result import Exclusion
 from evaluator.run_reader.contents import ODD, RunContents, broken, read_contents
 from evaluator.run_reader.episodes import DerivedIndex
-
-Item = TypeVar("Item")
 
 QUIET = Output(quiet=True)
 
@@ -187,7 +184,6 @@ def compare_read(
     parts = (
         motion_results(summaries.motions),
         state_results(summaries.states),
-        label_results(summaries.perceived, rows),
         *(_of_protocol(read) for read in reads if len(reads) == 1),
     )
     return _with_parts(base, parts)
@@ -204,17 +200,8 @@ def _of_protocol(read: ReadRun) -> Part:
 
 
 def _with_parts(base: Comparison, parts: Sequence[Part]) -> Comparison:
-    return replace(
-        base,
-        measurements=_joined(base.measurements, (part.measurements for part in parts)),
-        tables=_joined(base.tables, (part.tables for part in parts)),
-        exclusions=_joined(base.exclusions, (part.exclusions for part in parts)),
-        missing=_joined(base.missing, (part.missing for part in parts)),
-    )
-
-
-def _joined(first: Iterable[Item], others: Iterable[Iterable[Item]]) -> tuple[Item, ...]:
-    return (*first, *(item for other in others for item in other))
+    added = vars(joined(parts))
+    return replace(base, **{name: (*getattr(base, name), *more) for name, more in added.items()})
 
 
 def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:

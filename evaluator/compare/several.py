@@ -13,7 +13,6 @@ from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.exchange.trials_rates import RateRecord
 from bridge.terminal import Output
 from evaluator.cache import FOLDER, SummaryCache
-from evaluator.compare.against import against_tables
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.intake import PUBLISHED, Taken, take
 from evaluator.compare.measure import refuse_alike
@@ -85,35 +84,6 @@ def compare_several(
         )
         raise UsageError(message)
     return _rates(gathered) if with_rates else _trials(gathered)
-
-
-def with_against(
-    comparison: Comparison,
-    source: Path,
-    other: Path,
-    *,
-    options: TableOptions = AS_SAVED,
-    output: Output = QUIET,
-) -> Comparison:
-    """Add the paired comparison with another twin's answers to the same recorded trials."""
-    refuse_twice([source, other])
-    tables = against_tables(
-        comparison.rows,
-        answers_of(other, options, output),
-        names=(source.resolve().stem, other.resolve().stem),
-    )
-    return replace(comparison, tables=(*comparison.tables, *tables))
-
-
-def answers_of(
-    path: Path, options: TableOptions = AS_SAVED, output: Output = QUIET
-) -> Sequence[TrialRow]:
-    """Read trials with the twin's answers."""
-    if not is_run(path):
-        return list(map(row_from_record, take(path, options).trials))
-    run = RunFolder.open(path)
-    with SummaryCache(run.results_dir / FOLDER, say=output.say) as cache:
-        return read_run(run, cache, output).rows
 
 
 def is_run(path: Path) -> bool:

@@ -2,12 +2,12 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from evaluator.compare.measure import proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.measurements import STAGE
 from evaluator.result import Exclusion, Measurement, Table
-from evaluator.statistics.funnel import funnel
 
 NOT_LABELLED, NO_STAGE = "stage not labelled", "no stage, but the task"
 """Stand for the stage of a failure of which nobody named one."""
@@ -28,6 +28,35 @@ def stages_of(row: TrialRow) -> tuple[tuple[str, bool | None], ...]:
     return tuple((f"subtask_{place}", answer) for place, answer in enumerate(ended, start=1))
 
 
+class StageCount(NamedTuple):
+    """One stage of a task over all trials."""
+
+    name: str
+    reached: int
+    """Trials in which every earlier stage succeeded."""
+    passed: int
+    """Of those, the trials in which this one succeeded too."""
+    unknown: int
+    """Of those, the trials in which nobody said how it ended; they go no further."""
+
+
+def funnel(trials: Sequence[Sequence[bool | None]], names: Sequence[str]) -> list[StageCount]:
+    """Count how far trials came, over stages in order.
+
+    A stage after a failed one is not reached, even when it is labelled a success: a later success
+    then rests on a person or on luck. Passed / (reached - unknown) is the stage's own rate.
+
+    Args:
+        trials: How each stage ended, one sequence per trial; None is unknown.
+    """
+    going, stages = list(trials), []
+    for place, name in enumerate(names):
+        answers = Counter(trial[place] for trial in going)
+        stages.append(StageCount(name, len(going), answers[True], answers[None]))
+        going = [trial for trial in going if trial[place]]
+    return stages
+
+
 def stage_results(
     rows: Sequence[TrialRow],
 ) -> tuple[list[Measurement], tuple[Table, ...], list[Exclusion]]:
@@ -39,46 +68,35 @@ def stage_results(
             groups.setdefault((row.task, row.condition), []).append((row, stages))
     measurements: list[Measurement] = []
     left_out: list[Exclusion] = []
-    funnel_rows: list[tuple[str | int | None, ...]] = []
+    lines: list[tuple[str | int | None, ...]] = []
     for (task, condition), trials in groups.items():
         names = [name for name, _ in trials[0][1]]
-        alike = [trial for trial in trials if [name for name, _ in trial[1]] == names]
-        left_out += [
-            Exclusion(
-                episode=row.episode,
-                scope="stage funnel",
-                reason=f"its stages differ from those of {trials[0][0].episode}",
-            )
-            for row, stages in trials
-            if [name for name, _ in stages] != names
-        ]
-        ended = [[answer for _, answer in stages] for _, stages in alike]
-        found = funnel(ended, names)
-        episodes = [row.episode for row, _ in alike]
-        measurements += [
-            proportion(
-                STAGE.of(task=task, condition=condition, stage=stage.name),
-                stage.passed,
-                stage.reached - stage.unknown,
-                counted="trial",
-                reason_if_undefined="no trial reached it, or none is labelled",
-                episodes=episodes,
-            )
-            for stage in found
-        ]
+        reason = f"its stages differ from those of {trials[0][0].episode}"
+        differ = [row.episode for row, stages in trials if [name for name, _ in stages] != names]
+        left_out += [Exclusion(episode=e, scope="stage funnel", reason=reason) for e in differ]
+        alike = [trial for trial in trials if trial[0].episode not in differ]
         words = condition.replace("_", " ")
-        funnel_rows += [
-            (task, words, s.name, s.reached, s.passed, s.unknown or None) for s in found
-        ]
+        for stage in funnel([[answer for _, answer in stages] for _, stages in alike], names):
+            lines.append((task, words, *stage[:3], stage.unknown or None))
+            measurements.append(
+                proportion(
+                    STAGE.of(task=task, condition=condition, stage=stage.name),
+                    stage.passed,
+                    stage.reached - stage.unknown,
+                    counted="trial",
+                    reason_if_undefined="no trial reached it, or none is labelled",
+                    episodes=[row.episode for row, _ in alike],
+                )
+            )
     table = Table(
         id="funnel",
         title="Stage funnel",
         columns=("task", "condition", "stage", "reached", "passed", "unknown"),
-        rows=tuple(funnel_rows),
+        rows=tuple(lines),
         note="Reached: every earlier stage succeeded. A stage after a failed one is not "
         "reached, even where it is labelled a success.",
     )
-    return measurements, (table,) if funnel_rows else (), left_out
+    return measurements, (table,) if lines else (), left_out
 
 
 def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:

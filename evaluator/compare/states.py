@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bridge.clock import NS_PER_S
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.reader import Episode, RawMessage
@@ -20,8 +21,6 @@ from bridge.errors import BridgeError
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
-from evaluator.compare.known_task import recorded_task
-from evaluator.compare.labels import AFTER, TAIL_NS
 from evaluator.compare.measure import (
     Part,
     degrees,
@@ -39,6 +38,10 @@ from evaluator.statistics.intervals import cluster_means, median_interval
 PLAN, RECORDED = "plan", "recorded"
 PREDICTED_BY = (PLAN, "planned", "executed")
 """Who predicts: the planner, or a dynamic replay of the planned or the executed motion."""
+AFTER = "end"
+"""Phase of a localisation after the execution."""
+TAIL_NS = 2 * NS_PER_S
+"""Read of a replay before all of it is."""
 NOT_LOCALISED = "it was not localised after the execution"
 
 Pose = Float[np.ndarray, "4 4"] | str
@@ -69,17 +72,16 @@ def summarise_states(
     localised: Episode | None,
     *,
     plan_id: str,
-    task: Task | None = None,
+    task: Task | None,
 ) -> tuple[StateSummary, ...]:
     """Compare what a plan, and its replays, predict of each object with where it lay afterwards.
 
-    Nothing is found when the plan predicts no object.
+    Nothing is found when the plan predicts no object. Without its task no symmetry is known.
     """
-    plan = _sent_plan(recorded, plan_id)
+    plan = sent_plan(recorded, plan_id, Plan.outline_from_json)
     if plan is None:
         return ()
     info = recorded.info
-    task = recorded_task(recorded) if task is None else task
     last = {name: pose for stage in plan.stages for name, pose in stage.predicted_objects.items()}
     seen = _seen(recorded, localised, plan_id)
     sides: dict[str, Mapping[str, Pose]] = {
@@ -101,15 +103,12 @@ def summarise_states(
     )
 
 
-def _sent_plan(recorded: Episode, plan_id: str) -> Plan | None:
-    """Find a plan in the recording, without its trajectory."""
-    named = json.dumps(plan_id, ensure_ascii=False).encode()  # a plan takes long to parse
-    for message in recorded.messages(recorded.topics_of_type(schema.PLAN)):
-        if named in message.data:
-            plan = Plan.outline_from_json(message.data)
-            if plan.id == plan_id:
-                return plan
-    return None
+def sent_plan(recorded: Episode, plan_id: str, read: Callable[[bytes], Plan]) -> Plan | None:
+    """Find a plan in the recording; only one that names the id is read, which takes long."""
+    named = json.dumps(plan_id, ensure_ascii=False).encode()
+    messages = recorded.messages(recorded.topics_of_type(schema.PLAN))
+    plans = (read(message.data) for message in messages if named in message.data)
+    return next((plan for plan in plans if plan.id == plan_id), None)
 
 
 def _seen(recorded: Episode, localised: Episode | None, plan_id: str) -> dict[str, Pose]:
@@ -165,14 +164,11 @@ def _difference(first: Pose, second: Pose, task: Task | None, name: str) -> dict
     """Return position and rotation, as far as both sides know them, or why not."""
     if isinstance(first, str) or isinstance(second, str):
         return {"reason": first if isinstance(first, str) else second}
-    model = None if task is None else task.objects.get(name)
-    turn = None
-    if model is not None:
-        turn = turn_between_rad(first[:3, :3], second[:3, :3], turns_alike(model))
-    return {
-        "position_m": float(np.linalg.norm(first[:3, 3] - second[:3, 3])),
-        "rotation_rad": turn,
-    }
+    found: dict[str, Any] = {"position_m": float(np.linalg.norm(first[:3, 3] - second[:3, 3]))}
+    if task is not None and name in task.objects:
+        turns = turns_alike(task.objects[name])
+        found["rotation_rad"] = turn_between_rad(first[:3, :3], second[:3, :3], turns)
+    return found
 
 
 WHO = {
@@ -180,21 +176,15 @@ WHO = {
     "planned": "the planned replay's",
     "executed": "the executed replay's",
 }
-QUANTITIES: tuple[tuple[str, str, str, Callable[[StateSummary], float | None]], ...] = (
+QUANTITIES = (
+    ("position_m", "distance of the object", "no position is known"),
     (
-        "position",
-        "distance of the object",
-        "no position is known",
-        lambda state: state.position_m,
-    ),
-    (
-        "rotation",
+        "rotation_rad",
         "angle modulo the object's symmetry",
         "the task file is not known, so neither is the symmetry",
-        lambda state: state.rotation_rad,
     ),
 )
-"""Name, words, why there is no value although there is a position, and the value."""
+"""Field, words, and why there is no value although there is a position."""
 
 
 def state_results(states: Sequence[StateSummary]) -> Part:
@@ -237,44 +227,42 @@ def state_results(states: Sequence[StateSummary]) -> Part:
         "all had settled. Medians over episodes with 95 % intervals from order statistics; "
         "rotation is modulo symmetry.",
     )
-    left_out = {
-        (state.episode, f"{state.object_id}: {state.reason}"): None
-        for state in states
-        if state.reason is not None
-    }
+    left_out = (
+        Exclusion(episode=s.episode, scope="final states", reason=f"{s.object_id}: {s.reason}")
+        for s in states
+        if s.reason is not None
+    )
     return Part(
         measurements=tuple(measurements),
         tables=(table,),
-        exclusions=tuple(
-            Exclusion(episode=episode, scope="final states", reason=why)
-            for episode, why in left_out
-        ),
+        exclusions=tuple(dict.fromkeys(left_out)),
     )
 
 
 def _measure(states: Sequence[StateSummary]) -> list[Measurement]:
     found = []
-    task, condition = states[0].task, states[0].condition
-    for name, quantity, unknown, read in QUANTITIES:
-        pairs = [(value, s.episode) for s in states if (value := read(s)) is not None]
-        of_episode = cluster_means([value for value, _ in pairs], [name for _, name in pairs])
+    first = states[0]
+    for field, quantity, unknown in QUANTITIES:
+        known = [state for state in states if getattr(state, field) is not None]
+        episodes = [state.episode for state in known]
+        of_episode = cluster_means([getattr(state, field) for state in known], episodes)
         why = "; ".join(sorted({state.reason for state in states if state.reason})) or unknown
         found.append(
             measured(
-                STATES[name].of(
-                    by=states[0].predicted_by,
+                STATES[field.partition("_")[0]].of(
+                    by=first.predicted_by,
                     against=RECORDED,
-                    task=task,
-                    condition=condition,
+                    task=first.task,
+                    condition=first.condition,
                     quantity=quantity,
-                    who=WHO[states[0].predicted_by],
-                    where=f"{task}, {condition.replace('_', ' ')}",
+                    who=WHO[first.predicted_by],
+                    where=f"{first.task}, {first.condition.replace('_', ' ')}",
                     count=len(of_episode),
                 ),
                 partial(median_of, of_episode, "final state", why),
-                n=len(pairs),
+                n=len(known),
                 counted="object",
-                episodes=list(dict.fromkeys(episode for _, episode in pairs)),
+                episodes=list(dict.fromkeys(episodes)),
                 reason_without_interval=interval_or_reason(median_interval, of_episode)[1],
             )
         )

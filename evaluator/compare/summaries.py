@@ -12,14 +12,15 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.process_pool import SERIAL, ProcessPool, Serial, cores
+from bridge.task.find import MissingTaskError, find_task_file
+from bridge.task.task_file import Task
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.baselines import RuleSummary, apply_rule
-from evaluator.compare.known_task import task_sha256
-from evaluator.compare.labels import PerceivedOutcome, perceive_outcome
 from evaluator.compare.motion import MotionSummary, summarise_motions
 from evaluator.compare.states import StateSummary, summarise_states
 from evaluator.compare.trial import TRAJECTORIES, Trial
@@ -38,7 +39,6 @@ class Summaries:
 
     motions: tuple[MotionSummary, ...] = ()
     states: tuple[StateSummary, ...] = ()
-    perceived: tuple[PerceivedOutcome, ...] = ()
     rules: tuple[RuleSummary, ...] = ()
     left_out: tuple[Exclusion, ...] = ()
     """Trials of which something could not be read."""
@@ -65,6 +65,18 @@ class _Files:
     @cached_property
     def localised(self) -> Episode | None:
         return None if self.localised_path is None else Episode.open(self.localised_path)
+
+    @cached_property
+    def task(self) -> Task | None:
+        return recorded_task(self.recorded)
+
+
+def recorded_task(episode: Episode) -> Task | None:
+    """Load the task an episode was recorded with; None where its file is nowhere."""
+    try:
+        return streams.task_file(episode).task()
+    except MissingTaskError:
+        return None
 
 
 def _files_of(trial: Trial, plan_id: str) -> _Files:
@@ -112,7 +124,7 @@ def sum_up(
     output: Output,
     pool: ProcessPool | Serial = SERIAL,
 ) -> Summaries:
-    """Summarise motions, final states and localised success of every trial with a plan sent."""
+    """Summarise motions and final states of every trial with a plan sent."""
     found: dict[type[Any], list[Any]] = {part.kind: [] for part in PARTS}
     unknown: list[tuple[Trial, _Job]] = []
     for trial in trials:
@@ -142,7 +154,6 @@ def sum_up(
     return Summaries(
         motions=_in_order(found[MotionSummary], trials),
         states=_in_order(found[StateSummary], trials),
-        perceived=_in_order(found[PerceivedOutcome], trials),
         rules=_in_order(found[RuleSummary], trials),
         left_out=tuple(left_out),
     )
@@ -173,18 +184,13 @@ def _motions(files: _Files) -> tuple[MotionSummary, ...]:
 
 
 def _states(files: _Files) -> tuple[StateSummary, ...]:
-    return summarise_states(files.recorded, files.replays, files.localised, plan_id=files.plan_id)
-
-
-def _perceived(files: _Files) -> tuple[PerceivedOutcome, ...]:
-    if files.localised is None:
-        return ()
-    found = perceive_outcome(files.recorded, files.localised, plan_id=files.plan_id)
-    return () if found is None else (found,)
+    return summarise_states(
+        files.recorded, files.replays, files.localised, plan_id=files.plan_id, task=files.task
+    )
 
 
 def _rules(files: _Files) -> tuple[RuleSummary, ...]:
-    found = apply_rule(files.recorded, files.localised, plan_id=files.plan_id)
+    found = apply_rule(files.recorded, files.localised, plan_id=files.plan_id, task=files.task)
     return () if found is None else (found,)
 
 
@@ -195,7 +201,7 @@ def _hashes(trial: Trial) -> dict[str, str]:
         trial.replays[name].sha256 if name in trial.replays else "-" for name in TRAJECTORIES
     ]
     localised = "-" if trial.localised is None else trial.localised.sha256
-    task = task_sha256(trial.row.task, _tasks_dir(trial.file.folder))
+    task = _task_sha256(trial.row.task, trial.file.folder)
     return {
         "replays": " ".join([recorded, *replays, str(plan_id)]),
         "localised": f"{recorded} {localised} {plan_id} {task}",
@@ -203,8 +209,12 @@ def _hashes(trial: Trial) -> dict[str, str]:
 
 
 @cache
-def _tasks_dir(folder: Path) -> Path:
-    return RunFolder(folder).tasks_dir
+def _task_sha256(name: str, folder: Path) -> str:
+    """Hash the file of that name in a run's ``tasks/`` or among the shipped; "-" without one."""
+    try:
+        return find_task_file(name, tasks_dir=RunFolder(folder).tasks_dir).sha256
+    except MissingTaskError:
+        return "-"
 
 
 PARTS = (
@@ -215,6 +225,5 @@ PARTS = (
         make=_states,
         made_from=("replays", "localised"),
     ),
-    _Part(kind=PerceivedOutcome, scope="label", make=_perceived, made_from=("localised",)),
     _Part(kind=RuleSummary, scope="baselines", make=_rules, made_from=("localised",)),
 )

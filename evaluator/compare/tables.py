@@ -5,10 +5,8 @@ from collections.abc import Sequence
 from evaluator.compare.gate import confusion_of, heeded_verdict, unheeded_verdict
 from evaluator.compare.measure import RATE_COLUMNS, rate_row
 from evaluator.compare.rows import RateGroup, TrialRow
-from evaluator.compare.success import WITH, WITHOUT
-from evaluator.result import Cell, Measurement, Table
+from evaluator.result import Cell, Table
 
-MEAN_OF_TASKS = "mean of tasks"
 EXECUTED = "executed in twin"
 """The twin's side of a group in which nobody published a plan."""
 EXECUTED_NOTE = "executed in twin: the recorded joints, replayed dynamically; there was no plan."
@@ -33,9 +31,10 @@ METHOD_NAMES = {
 }
 
 
-def _brackets(shown: Sequence[Measurement]) -> str:
-    """Name the intervals that stand in brackets, and say that some are left out if they are."""
-    found = [m.interval.method for m in shown if m.interval is not None]
+def _brackets(groups: Sequence[RateGroup]) -> str:
+    """Name the intervals that stand in brackets, or say that there are none."""
+    shown = [side.interval for group in groups for side in (group.shown_sim, group.recorded)]
+    found = [interval.method for interval in shown if interval is not None]
     known = {name: METHOD_NAMES.get(name.removeprefix("mean-"), name) for name in found}
     names = " and ".join(dict.fromkeys(known.values()))
     return f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
@@ -48,7 +47,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
     one_sided = any(group.sim.n for group in groups) and not paired
     without_plans = all(group.executed is not None for group in groups)
     note = EXECUTED_NOTE if without_plans else SIM_NOTE
-    parts = [source_note or (UNPAIRED_NOTE if one_sided else note), _brackets(_sides(groups))]
+    parts = [source_note or (UNPAIRED_NOTE if one_sided else note), _brackets(groups)]
     if paired:
         parts.append("The difference is over trials where both sides are known.")
     rows = tuple(
@@ -59,7 +58,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
             side,
             group.unit,
             *rate_row(rate),
-            _gap(group),
+            None if (gap := group.gap) is None else round(float(100 * gap), 1),
             rate.reason_if_undefined,
         )
         for group in groups
@@ -81,84 +80,20 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
     )
 
 
-def _sides(groups: Sequence[RateGroup]) -> list[Measurement]:
-    return [side for group in groups for side in (group.shown_sim, group.recorded)]
-
-
-def _gap(group: RateGroup) -> float | None:
-    if group.sim_rate is None or group.recorded_rate is None:
-        return None
-    return round(float(100 * (group.sim_rate - group.recorded_rate)), 1)
-
-
-def layout_table(groups: Sequence[RateGroup], word: str) -> tuple[Table, ...]:
-    """Lay rates out as papers print them: a row per task, sim and recorded without and with."""
-    conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in groups)]
-    if len(conditions) < 2:
-        return ()
-    found = {(c.task, c.policy, c.condition): c for c in groups}
-    sides = (word,) if all(group.executed is not None for group in groups) else ("sim", word)
-    rows = []
-    for task, policy in dict.fromkeys((c.task, c.policy) for c in groups):
-        line: list[Cell] = [task, policy]
-        for condition in conditions:
-            group = found.get((task, policy, condition))
-            values = [group.sim.value, group.recorded.value] if group else [None, None]
-            line += values[-len(sides) :]
-        rows.append(tuple(line))
-    if len(rows) > 1:
-        rates = [[row[place] for row in rows] for place in range(2, len(rows[0]))]
-        rows.append((MEAN_OF_TASKS, "", *map(_mean, rates)))
-    columns = [
-        f"{side}, {condition.replace('_', ' ')}" for condition in conditions for side in sides
-    ]
-    return (
-        Table(
-            id="layout",
-            title="Success without and with replanning",
-            columns=("task", "policy", *columns),
-            rows=tuple(rows),
-            note="In the mean every line counts the same.",
-        ),
-    )
-
-
-def _mean(values: Sequence[Cell]) -> float | None:
-    known = [value for value in values if isinstance(value, float)]
-    return sum(known) / len(known) if len(known) == len(values) else None
-
-
 def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
     """One line per trial."""
     return Table(
         id="trials",
         title="Trials",
         columns=(
-            "episode",
-            "task",
-            "condition",
-            "policy",
-            "start",
-            word,
-            "sim planned",
-            "verdict before motion",
-            "sim executed",
-            "first failing",
-            "detail",
+            *("episode", "task", "condition", "policy", "start", word, "sim planned"),
+            *("verdict before motion", "sim executed", "first failing", "detail"),
         ),
         rows=tuple(
             (
-                row.episode,
-                row.task,
-                row.condition.replace("_", " "),
-                row.policy,
-                row.start_id,
-                _answer(row.recorded),
-                _answer(row.sim_planned),
-                _answer(row.verdict),
-                _answer(row.sim_executed),
-                row.first_failing,
-                row.failing_detail,
+                *(row.episode, row.task, row.condition.replace("_", " "), row.policy, row.start_id),
+                *map(_ANSWERS.get, (row.recorded, row.sim_planned, row.verdict, row.sim_executed)),
+                *(row.first_failing, row.failing_detail),
             )
             for row in rows
         ),
@@ -199,5 +134,4 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     )
 
 
-def _answer(value: bool | None) -> str | None:
-    return None if value is None else ("success" if value else "failure")
+_ANSWERS = {True: "success", False: "failure", None: None}

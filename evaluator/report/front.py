@@ -49,9 +49,8 @@ class Front:
 
 def front(results: Results) -> Front:
     """Write the first page of some results."""
-    rows = conclusions(results)
-    notes = next((t for t in results.tables if t.id == "notes"), None)
-    about = [] if notes is None else [(str(a), str(b)) for a, b in notes.rows]
+    rows = rows_of(results, "conclusions")
+    about = [(str(row["about"]), str(row["note"])) for row in rows_of(results, "notes")]
     missing = [text for text in results.missing if not text.startswith("figures without data")]
     opposed = [text for _, text in about if SIMPSON in text]
     told = _summary(results, len(rows))
@@ -62,7 +61,7 @@ def front(results: Results) -> Front:
     ]
     return Front(
         sentences=[*_compared(results), *(f"{t}." for t in opposed), *told],
-        next_step=next_trials(rows),
+        next_step=next_trials(results),
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
@@ -73,8 +72,7 @@ def front(results: Results) -> Front:
 
 def _compared(results: Results) -> list[str]:
     """Say which candidate is better, of the questions over all tasks, and what the twin's cost."""
-    table = next((t for t in results.tables if t.id == "comparisons"), None)
-    rows = [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
+    rows = rows_of(results, "comparisons")
     sentences = [str(row["answer"]) for row in rows if row["task"] == ALL_TASKS]
     heads = ("undecided", "no difference")  # others begin with a name, which keeps its letters
     standing, beaten = _standing(results)
@@ -103,8 +101,7 @@ def _standing(results: Results) -> tuple[list[str], list[str]]:
 
     Nothing where it may be any of them.
     """
-    table = next((t for t in results.tables if t.id == "standing"), None)
-    rows = [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
+    rows = rows_of(results, "standing")
     best = [row for row in rows if row["may be best"] == "yes"]
     beaten = [str(row["candidate"]) for row in rows if row["may be best"] == "no"]
     if not beaten:
@@ -119,27 +116,22 @@ def _standing(results: Results) -> tuple[list[str], list[str]]:
     return [f"{words}worse than another; stop here."], beaten
 
 
-def conclusions(results: Results) -> list[Row]:
-    """Return the rows of the table of conclusions; none where there is no such table."""
-    table = next((t for t in results.tables if t.id == "conclusions"), None)
+def rows_of(results: Results, table_id: str) -> list[Row]:
+    """Return the rows of a table; none where there is no such table."""
+    table = next((t for t in results.tables if t.id == table_id), None)
     return [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
 
 
 def sentence(row: Row) -> str:
     """Write what one task's numbers mean."""
     parts = [_bias_words(row)]
-    yes, right = row["yes"], row["yes and right"]
-    if isinstance(yes, int) and isinstance(right, int):
-        parts.append(f"when the twin predicted success it was right {right} of {yes}")
-        parts += _overall(row)
-    return "; ".join(filter(None, [*parts, _ranking_words(row)])) + "."
-
-
-def _overall(row: Row) -> list[str]:
-    """Say what a yes has to be held against; nothing for results written before it was counted."""
-    succeeded, trials = row.get("succeeded"), row.get("trials")
-    known = isinstance(succeeded, int) and isinstance(trials, int)
-    return [f"overall {succeeded} of {trials} succeeded"] if known else []
+    if isinstance(row["yes"], int) and isinstance(row["yes and right"], int):
+        parts.append(
+            f"when the twin predicted success it was right {row['yes and right']} of {row['yes']}"
+        )
+        if isinstance(row.get("succeeded"), int):  # older results do not count it
+            parts.append(f"overall {row['succeeded']} of {row['trials']} succeeded")
+    return "; ".join(parts) + "."
 
 
 def answer(row: Row) -> str:
@@ -156,15 +148,23 @@ def answer(row: Row) -> str:
     return "not for this" if direction(low, high) else "not yet"
 
 
-def next_trials(rows: Sequence[Row]) -> str:
-    """Name the task that the fewest further trials would settle; empty where none would."""
-    open_ = [(row["more trials"], str(row["task"])) for row in rows if row["ranked"] == "no"]
-    wanted = [(more, task) for more, task in open_ if isinstance(more, int) and more > 0]
+def next_trials(results: Results) -> str:
+    """Name the comparison that the fewest trials are likely to decide; empty where none is open.
+
+    Candidates that are shown to be worse than another are left out.
+    """
+    _, beaten = _standing(results)
+    wanted = [
+        (more, f"{row.get('first', 'one')} against {row.get('second', 'another')}")
+        for row in rows_of(results, "comparisons")
+        if row["task"] == ALL_TASKS and row["decided"] == "no"
+        if not {row.get("first"), row.get("second")} & {*beaten}
+        if isinstance(more := row["more trials of each"], int) and more > 0
+    ]
     if not wanted:
         return ""
-    more, task = min(wanted)
-    trials = f"{more} more {noun('trial', more)}"
-    return f"{task.replace('_', ' ')}: {trials} would settle which candidate is best."
+    more, pair = min(wanted)
+    return f"{more} more {noun('trial', more)} of each would likely decide {pair}."
 
 
 def _bias_words(row: Row) -> str:
@@ -186,24 +186,6 @@ def _signed(value: float) -> str:
 def _points(value: float) -> str:
     size = round(abs(value))
     return f"{size} {noun('point', size)}"
-
-
-def _ranking_words(row: Row) -> str:
-    ranked, best, more = row["ranked"], row["best recorded"], row["more trials"]
-    if ranked is None:
-        return ""
-    if ranked == "yes":
-        return f"enough to rank: yes, {best} is best"
-    if ranked == "tie":
-        return "enough to rank: no, the best two are level"
-    if ranked == "no n":
-        return f"{best} looks best; without counts nothing says how surely"
-    if str(ranked).startswith("counted in"):
-        return f"{best} looks best; {ranked}, which are not independent, so no test says how surely"
-    trials = "far more trials would be needed"
-    if isinstance(more, int):
-        trials = f"{more} more {noun('trial', more)} would do"
-    return f"enough to rank: no, {trials}"
 
 
 def _summary(results: Results, num_tasks: int) -> list[str]:
@@ -280,7 +262,5 @@ def _short(text: str, longest: int = LONGEST) -> str:
 
 
 def front_tables(results: Results) -> list[Table]:
-    """Return the table of the first page: rates beside each other, none where it is long."""
-    found = [t for t in results.tables if t.id in ("layout", "success") and t.rows]
-    layout = [table for table in found if table.id == "layout"]
-    return (layout or found)[:1]
+    """Return the table of the first page: rates beside each other."""
+    return [table for table in results.tables if table.id == "success" and table.rows]

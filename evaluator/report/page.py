@@ -57,7 +57,7 @@ SHOWN_ENTRIES = 12
 """Of a long part of the provenance."""
 OPEN_ROWS = 14
 """A longer table is folded away: it is looked things up in, not read."""
-ALWAYS_OPEN = ("published", "success", "layout", TRIALS)
+ALWAYS_OPEN = ("published", "success", TRIALS)
 
 SHARED = "shared"
 """Folder beside the report: files with the clips of single trials."""

@@ -23,7 +23,7 @@ from evaluator.compare.spreadsheet import record_from_row
 from evaluator.compare.stages import first_failed_stage
 from evaluator.memory import without_collecting
 from evaluator.quantity import slug
-from evaluator.report.front import CLOSE_PP, answer, conclusions, front, next_trials, sentence
+from evaluator.report.front import CLOSE_PP, answer, front, rows_of, sentence
 from evaluator.report.page import grid
 from evaluator.report.wording import cell_text
 from evaluator.result import Results, Table, load_results
@@ -32,7 +32,6 @@ from evaluator.review_index import (
     NO_RESULTS,
     IndexedFile,
     index_path,
-    plain_record,
     severity,
     state_of,
     written_index,
@@ -121,7 +120,9 @@ def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str |
         else results.stand_in,
         **_about(results, has_trials=bool(read.rows)),
     }
-    content = written_index(trials, _files(run, read, {trial.file for trial in trials}), about)
+    numbers = () if results is None else results.measurements
+    files = _files(run, read, {trial.file for trial in trials})
+    content = written_index(trials, files, about, numbers)
     path = index_path(run)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -147,12 +148,9 @@ def _reviewed(row: TrialRow, off: tuple[float | None, float | None], region: str
 
 def _about(results: Results | None, *, has_trials: bool) -> dict[str, Any]:
     if results is None:
-        return {"measurements": [], "exclusions": [], "num_exclusions": 0, "missing": []}
-    lines = conclusions(results)
+        return {"exclusions": [], "num_exclusions": 0, "missing": []}
     first = front(results)
-    failures = next((t for t in results.tables if t.id == "failures"), None)
     return {
-        "measurements": [plain_record(each) for each in results.measurements],
         "exclusions": [dict(vars(each)) for each in results.exclusions[:SHOWN_EXCLUSIONS]],
         "num_exclusions": len(results.exclusions),
         "missing": list(results.missing),
@@ -166,10 +164,10 @@ def _about(results: Results | None, *, has_trials: bool) -> dict[str, Any]:
                 "answer": answer(line),
                 "sentence": sentence(line),
             }
-            for line in lines
+            for line in rows_of(results, "conclusions")
         ],
-        "next_trials": next_trials(lines),
-        "failures": [] if failures is None else [list(row) for row in failures.rows],
+        "next_trials": first.next_step,
+        "failures": [list(row.values()) for row in rows_of(results, "failures")],
         "tables": [] if has_trials else [_shown(t) for t in results.tables if t.rows],
     }
 

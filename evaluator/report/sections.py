@@ -47,12 +47,7 @@ NAMES: dict[str, str] = HEADLINES | {
     "agreement.verdict_unheeded.npv": "NPV where the gate was not obeyed",
     "baseline.verdict_unheeded.base_rate": "Base rate where the gate was not obeyed",
     "baseline.verdict_unheeded.geometric_rule.twin_gain_pp": "Gate more often right than the rule",
-    "reliability.brier": "Brier score of the stated probability",
-    "reliability.brier_of_base_rate": "Brier score of the base rate",
     "motion.planned.path_max_m": "Tool path: largest distance to planned replay",
-    "motion.planned.joint_rms_rad": "Joints: recorded to planned replay, root mean square",
-    "motion.executed.joint_rms_rad": "Joints: recorded to executed replay, root mean square",
-    "label.localised.rate": "Label and localised goal agree",
 }
 """All numbers that a report calls by name; the others stand in ``results.json``."""
 
@@ -97,7 +92,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
         "plan actually sent, replayed with physics.",
-        tables=("success", "layout", "notes"),
+        tables=("success", "notes"),
         figures=("success",),
     ),
     Section(
@@ -119,14 +114,14 @@ SECTIONS: tuple[Section, ...] = (
         title="Trial by trial: the gate's scorecard",
         lead="What the twin said of each plan against how it ended, and what obeying it costs "
         "and avoids.",
-        numbers=("agreement.sim_planned.*", "agreement.verdict*", "baseline.*", "reliability.*"),
+        numbers=("agreement.sim_planned.*", "agreement.verdict*", "baseline.*"),
         tables=("confusion",),
     ),
     Section(
-        id="against",
-        title="Another twin, other raters",
-        lead="Which of two twins is right more often on the same trials, and how far raters agree.",
-        tables=("against", "flips", "raters"),
+        id="raters",
+        title="Other raters",
+        lead="How far raters of the same trials agree.",
+        tables=("raters",),
     ),
     Section(
         id="stages",
@@ -144,11 +139,9 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="states",
-        title="Predicted states and labels",
-        lead="How far from where they were predicted objects were localised, and whether labels "
-        "and localised goals agree.",
-        numbers=("label.*",),
-        tables=("final_states", "label*"),
+        title="Predicted states",
+        lead="How far from where they were predicted objects were localised.",
+        tables=("final_states",),
     ),
     Section(
         id="views",
@@ -171,11 +164,9 @@ TABLES: dict[str, str] = {
     "standing": "which candidates to keep",
     "protocol_departures": "whether the study may be quoted as it was planned",
     "conclusions": "for which task the twin may stand in for the robot",
-    "layout": "whether to run with replanning",
     "success": "which candidate to use",
     "notes": "what these numbers must not be taken for",
     "trials": "which trial to look at",
-    "against": "which of two twins to use",
     "image_methods": "which reconstruction to use",
     "confusion": "whether the twin's yes may start the robot, and its no may stop it",
     "funnel": "on which stage to work",

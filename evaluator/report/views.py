@@ -115,7 +115,10 @@ def _folded(rows: Rows) -> Rows:
 def _number(
     name: str, value: Any, ends: Sequence[Any], count: Sequence[Any], why: str | None
 ) -> Shown:
-    """Write a cell in the unit that its column names; what is no such number stays as it is."""
+    """Write a cell in the unit that its column names; what is no such number stays as it is.
+
+    Points stand without a unit: the column's name ends in it.
+    """
     is_points = name.endswith("(pp)")
     is_share = _last_word(name) == "rate"
     is_change = name.startswith("relative")
@@ -125,7 +128,7 @@ def _number(
         return f"undefined: {why}" if why and (is_points or is_share or is_change) else None
     factor, unit, form = 1.0, "", ".4g"
     if is_points:
-        unit, form = " pp", "+.1f"
+        form = "+.1f"
     elif is_share or is_change:
         factor, unit, form = 100.0, " %", "+.1f" if is_change else ".1f"
     known = [_signed(f"{factor * end:{form}}") for end in ends if _known(end)]
@@ -167,14 +170,6 @@ def _success(rows: Rows) -> Rows:
     ]
 
 
-def _layout(rows: Rows) -> Rows:
-    def share(value: Any) -> Shown:
-        return Figures(f"{100 * value:.1f} %") if _known(value) else None
-
-    rates = list(rows[0])[2:]
-    return [row | {name: share(row[name]) for name in rates} for row in rows]
-
-
 def _conclusions(rows: Rows) -> Rows:
     """Put a yes beside those that were right, and what succeeded at all."""
 
@@ -187,7 +182,6 @@ def _conclusions(rows: Rows) -> Rows:
             **_picked(folded, "task", "groups", "bias (pp)"),
             "yes and right": right,
             "succeeded at all": succeeded,
-            **_picked(row, "candidates", "best recorded", "ranked", "more trials"),
         }
 
     return [shown(row, folded) for row, folded in zip(rows, _folded(rows), strict=True)]
@@ -216,7 +210,6 @@ _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "conclusions": _conclusions,
     "comparisons": _comparisons,
     "success": _success,
-    "layout": _layout,
     "published": _published,
 }
 """By table; of the others numbers are put together with their counts and intervals."""

@@ -25,7 +25,7 @@ SHARES = ("rate.",)
 UNSIGNED = ("agreement.mae_pp", "decision.regret_pp", "decision.wrong_pairs_pp")
 """Sizes in percentage points that are never below 0: a plus would look like a direction."""
 HUGE = 1e7
-"""Nobody reads more digits before the point; evidence may have hundreds."""
+"""Nobody reads more digits before the point."""
 
 
 def number(value: float, unit: str) -> str:
@@ -84,15 +84,11 @@ def ends_text(measurement: Measurement) -> str:
 
 
 def method_text(measurement: Measurement) -> str:
-    """Write level, method and least coverage of the interval at this n, or nothing."""
+    """Write level and method of the interval, or nothing."""
     interval = measurement.interval
     if interval is None:
         return ""
-    known = interval.worst_coverage
-    worst = "" if known is None else f"; guaranteed coverage at this n: {100 * known:.1f} %"
-    return (
-        f"{100 * interval.level:.0f} % {METHOD_NAMES.get(interval.method, interval.method)}{worst}"
-    )
+    return f"{100 * interval.level:.0f} % {METHOD_NAMES.get(interval.method, interval.method)}"
 
 
 def measurement_text(measurement: Measurement) -> str:

@@ -19,7 +19,6 @@ from evaluator.result import Results, write_results
 SHOWN = (
     "published",
     "success",
-    "layout",
     "comparisons",
     "standing",
     "image_methods",
@@ -30,7 +29,7 @@ SHOWN = (
 GROUPS = "success"
 """The table of success rates; ``groups.parquet`` holds it too."""
 
-HEADLINE_TABLES = ("conclusions", "success", "layout", "comparisons", "confusion")
+HEADLINE_TABLES = ("conclusions", "success", "comparisons", "confusion")
 """Those that ``--latex`` writes for a paper."""
 PARQUET_PACKAGES = ("pyarrow",)
 LATEX_PACKAGES = ("pandas", "jinja2")

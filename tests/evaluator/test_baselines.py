@@ -99,9 +99,9 @@ def test_without_answers_of_the_twin_nothing_is_compared() -> None:
 
 def test_the_rule_enters_the_row_of_its_trial_only() -> None:
     rows = [trial(0, True, True, None), trial(1, True, True, None)]
-    said = [RuleSummary(episode="trial_0001", value=False, detail="")]
+    said = [RuleSummary(episode="trial_0001", value=False)]
     plain, judged = with_rule(rows, said)
     assert plain == rows[0]
     assert judged.baselines == ((GEOMETRIC_RULE, False),)
-    unknown = [RuleSummary(episode="trial_0001", value=None, detail="")]
+    unknown = [RuleSummary(episode="trial_0001", value=None)]
     assert with_rule(rows, unknown) == rows

@@ -38,10 +38,8 @@ def line(
 def test_a_run_without_data_for_a_part_says_no_data(six_trials: Any) -> None:
     missing = " | ".join(compare_run(six_trials.run).missing)
     parts = (
-        "reliability of the success probability",
         "stage funnel",
         "final states",
-        "label against localised predicate",
     )
     for part in parts:
         assert f"{part}" in missing
@@ -57,15 +55,6 @@ def test_the_gate_is_judged_where_it_was_not_obeyed(
     comparison = trials(write_table, lines)
     results = comparison.results()
     assert results.get("agreement.verdict_unheeded.phi").value == pytest.approx(0.7071, abs=1e-4)
-
-
-def test_a_stated_probability_is_judged(write_table: Callable[[str], Path]) -> None:
-    lines = [line(i, i % 2 == 0, None, p="0.9" if i % 2 == 0 else "0.2") for i in range(8)]
-    comparison = trials(write_table, lines)
-    results = comparison.results()
-    assert results.get("reliability.brier").value == pytest.approx((0.01 + 0.04) / 2)
-    assert results.get("reliability.brier_of_base_rate").value == 0.25
-    assert not any("reliability" in text for text in comparison.missing)
 
 
 def test_subtasks_make_a_funnel(write_table: Callable[[str], Path]) -> None:

@@ -1,13 +1,11 @@
-"""The gate's worth, reliability, and the stage funnel."""
+"""The gate's worth and the stage funnel."""
 
 import pytest
 
+from evaluator.compare.stages import funnel
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.funnel import funnel
 from evaluator.statistics.gate import (
     Confusion,
-    brier,
-    brier_of_base_rate,
     kappa,
 )
 
@@ -24,22 +22,7 @@ def test_kappa_by_hand_and_undefined() -> None:
     assert kappa(table(2, 2, 0, 0)) == 0
 
 
-def test_reliability_of_a_forecaster_who_is_right_and_of_one_who_is_not() -> None:
-    assert brier([1.0, 0.0], [True, False]) == 0
-    assert brier([0.5, 0.5], [True, False]) == 0.25 == brier_of_base_rate([True, False])
-    with pytest.raises(UndefinedStatisticError, match="there are no trials"):
-        brier([], [])
-    with pytest.raises(ValueError, match=r"lies in 0\.\.1"):
-        brier([1.2], [True])
-    with pytest.raises(ValueError, match="1 probabilities but 2"):
-        brier([1.0], [True, False])
-
-
 def test_a_stage_after_a_failed_one_is_not_reached() -> None:
     trials = [[True, True, True], [True, False, True], [False, True, True], [True, None, True]]
     stages = funnel(trials, ["pick", "carry", "release"])
     assert [(s.reached, s.passed, s.unknown) for s in stages] == [(4, 3, 0), (3, 1, 1), (1, 1, 0)]
-    with pytest.raises(ValueError, match="a trial has 1 stages, the task 3"):
-        funnel([[True]], ["pick", "carry", "release"])
-    with pytest.raises(UndefinedStatisticError, match="no trials with labelled stages"):
-        funnel([], ["pick"])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from bridge.episode import schema
-from bridge.episode.cdr.batch import joint_messages, pose_messages
+from bridge.episode.cdr.batch import pose_messages
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
@@ -29,7 +29,6 @@ from evaluator.run_reader.tracks import Tracks
 START_NS = 10_000_000_000
 STEP_NS = 20_000_000
 NUM = 151
-NAMES = ("pan", "lift", "elbow")
 
 
 def path_m(t_s: np.ndarray) -> np.ndarray:
@@ -44,7 +43,6 @@ def tracks(
     late_s: float = 0.0,
     shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     turn_rad: float = 0.0,
-    joint_rad: float = 0.0,
     start_ns: int | None = START_NS,
     first_ns: int = START_NS,
 ) -> Tracks:
@@ -52,11 +50,8 @@ def tracks(
     t_s = (stamps - first_ns) * 1e-9
     p = path_m(t_s - late_s) + np.array(shift_m)
     q = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_quat(scalar_first=True)
-    joints = np.stack([np.sin(t_s), np.cos(t_s), 0.1 * t_s], axis=1)
-    joints[:, 1] += joint_rad
     return Tracks(
         tool=PoseTrajectory(stamps, p, np.tile(q, (NUM, 1))),
-        joints=JointTrack(names=NAMES, stamps_ns=stamps, position=joints),
         started_ns=start_ns,
         ended_ns=None if start_ns is None else start_ns + STEP_NS * NUM,
     )
@@ -65,7 +60,7 @@ def tracks(
 def test_a_motion_is_nowhere_from_itself() -> None:
     found = compare_tracks(tracks(), tracks())
     assert found.aligned_by == "stamps"
-    assert (found.path_max_m, found.rotation_mean_rad, found.joint_rms_rad) == (0, 0, 0)
+    assert (found.path_max_m, found.rotation_mean_rad) == (0, 0)
     assert found.lag_s == 0.0
 
 
@@ -99,8 +94,11 @@ def test_a_late_motion_on_another_path_has_both_told_apart(late_s: float, bump_m
 
 
 def test_a_joint_offset_is_found_with_its_joint_and_whole_turns_do_not_count() -> None:
-    found = compare_tracks(tracks(joint_rad=0.03 - 2 * np.pi), tracks())
-    assert found.joint_rms_rad == pytest.approx(0.03 / np.sqrt(3))
+    stamps, names = np.array([0, 10]), ("pan", "lift", "elbow")
+    mine = JointTrack(names=names, stamps_ns=stamps, position=np.full((2, 3), 0.5))
+    off = mine.position + np.array([0.0, 0.03 - 2 * np.pi, 0.0])
+    errors = joint_errors(replace(mine, position=off), mine)
+    np.testing.assert_allclose(errors.over_time_rad(), 0.03 / np.sqrt(3))
 
 
 def test_joints_are_compared_by_name() -> None:
@@ -125,16 +123,14 @@ def test_clocks_of_their_own_are_laid_over_each_other_at_the_start() -> None:
     found = compare_tracks(tracks(shift_m=(0.0, 0.02, 0.0)), tracks(first_ns=0, start_ns=0))
     assert found.aligned_by == "starts"
     assert found.position_mean_m == pytest.approx(0.02)
-    assert found.joint_rms_rad == pytest.approx(0.0, abs=1e-9)
 
 
 def test_motions_without_poses_or_instants_in_common_are_refused() -> None:
-    empty = Tracks(tool=None, joints=None, started_ns=START_NS, ended_ns=None)
+    empty = Tracks(tool=None, started_ns=START_NS, ended_ns=None)
     with pytest.raises(UndefinedStatisticError, match="no tool poses"):
         compare_tracks(tracks(), empty)
     later = Tracks(
         tool=tracks().tool,
-        joints=None,
         started_ns=START_NS + 10**12,
         ended_ns=START_NS + 2 * 10**12,
     )
@@ -144,7 +140,6 @@ def test_motions_without_poses_or_instants_in_common_are_refused() -> None:
 
 def write(path: Path, source: Tracks, *, kind: str = "trial", plan_id: str = "p1") -> Episode:
     assert source.tool is not None
-    assert source.joints is not None
     stamps = source.tool.stamps_ns
     with EpisodeWriter(path) as writer:
         writer.describe(
@@ -163,17 +158,13 @@ def write(path: Path, source: Tracks, *, kind: str = "trial", plan_id: str = "p1
                 }
                 writer.write_json("/cell/event", record, type_name=schema.EVENT, log_time_ns=stamp)
         poses = pose_messages(stamps, "base_link", source.tool.transforms())
-        arm = joint_messages(stamps, source.joints.names, source.joints.position)
-        for stamp, pose, joint in zip(stamps.tolist(), poses, arm, strict=True):
+        for stamp, pose in zip(stamps.tolist(), poses, strict=True):
             writer.write("/cell/tcp/pose", pose, type_name=schema.POSE_STAMPED, log_time_ns=stamp)
-            writer.write(
-                "/cell/joint_states", joint, type_name=schema.JOINT_STATE, log_time_ns=stamp
-            )
     return Episode.open(path)
 
 
 def test_files_give_what_their_tracks_give(tmp_path: Path) -> None:
-    recorded = tracks(late_s=0.1, joint_rad=0.01)
+    recorded = tracks(late_s=0.1)
     planned, executed = tracks(), tracks(late_s=0.1)
     episodes = {
         name: write(tmp_path / f"{name}.mcap", source)
@@ -188,7 +179,6 @@ def test_files_give_what_their_tracks_give(tmp_path: Path) -> None:
     direct = compare_tracks(recorded, planned)
     assert found[0].position_mean_m == pytest.approx(direct.position_mean_m, abs=1e-9)
     assert found[0].lag_s == direct.lag_s == 0.1
-    assert found[1].joint_rms_rad == pytest.approx(0.01 / np.sqrt(3))
     assert found[1].path_max_m == pytest.approx(0.0, abs=1e-9)
     alone = {"planned": episodes["planned"]}
     assert summarise_motions(episodes["recorded"], alone, plan_id="p1") == found[:1]
@@ -199,7 +189,6 @@ def test_samples_outside_the_execution_do_not_count(tmp_path: Path) -> None:
     assert recorded.tool is not None
     waiting = Tracks(
         tool=recorded.tool,
-        joints=recorded.joints,
         started_ns=START_NS + 50 * STEP_NS,
         ended_ns=START_NS + 100 * STEP_NS,
     )

@@ -44,7 +44,7 @@ def test_confusion_counts_said_against_happened() -> None:
     found = Confusion.count(pairs)
     assert (found.true_positive, found.false_positive) == (1, 2)
     assert (found.false_negative, found.true_negative) == (1, 1)
-    assert (found.n, found.agreed, found.predicted_success, found.predicted_failure) == (5, 2, 3, 2)
+    assert (found.n, found.agreed, found.predicted_success) == (5, 2, 3)
 
 
 @settings(max_examples=40, deadline=None)

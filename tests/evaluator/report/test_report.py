@@ -135,7 +135,7 @@ def test_evaluate_writes_everything_and_says_where(evaluated: Evaluated) -> None
     assert "undefined: 2 groups; it needs at least 3" in shown
     assert "Stand-in:" in shown
     assert load_results(run.path).get("agreement.sim_planned.rate").k == 5
-    for name in ("report.html", "trials.csv", "figures/success.svg", "tables/layout.csv"):
+    for name in ("report.html", "trials.csv", "figures/success.svg", "tables/success.csv"):
         assert (run.results_dir / name).is_file()
     assert not list(run.results_dir.rglob("*.part"))
     kept = [path for path in run.results_dir.rglob("*") if path.is_file()]

@@ -23,6 +23,7 @@ from state_samples import (
 from bridge.episode.reader import Episode
 from bridge.task.task_file import ObjectModel
 from evaluator.compare.states import StateSummary, state_results, summarise_states
+from evaluator.compare.summaries import recorded_task
 from evaluator.metrics.state import turn_between_rad, turns_alike
 
 LIFTED_M = (0.45, -0.1, 0.25)
@@ -102,7 +103,9 @@ def cube(tmp_path: Path) -> Made:
             for name, poses in moved.items()
         }
         localised = None if live else localised_episode(tmp_path / "l.mcap", seen)
-        return summarise_states(recorded, replays, localised, plan_id=PLAN_ID)
+        return summarise_states(
+            recorded, replays, localised, plan_id=PLAN_ID, task=recorded_task(recorded)
+        )
 
     return make
 
@@ -148,6 +151,7 @@ def test_what_a_replay_does_not_show_says_so(tmp_path: Path) -> None:
         {"planned": replay_episode(tmp_path / "r.mcap", plan, {"duck": [posed(LIFTED_M)]})},
         localised_episode(tmp_path / "l.mcap", Seen().add("cube", in_box())),
         plan_id=PLAN_ID,
+        task=None,
     )
     assert pick(found, "planned").reason == "the replay holds no poses of it"
     assert pick(found, "plan").position_m == pytest.approx(0.0, abs=1e-9)
@@ -161,8 +165,8 @@ def test_an_unknown_task_has_positions_but_no_rotation(cube: Made) -> None:
 
 def test_a_plan_that_is_not_there_or_predicts_nothing_gives_nothing(tmp_path: Path) -> None:
     recorded = recorded_episode(tmp_path / "t.mcap", plan_of({"grasp": {}}))
-    assert summarise_states(recorded, {}, None, plan_id=PLAN_ID) == ()
-    assert summarise_states(recorded, {}, None, plan_id="another") == ()
+    assert summarise_states(recorded, {}, None, plan_id=PLAN_ID, task=None) == ()
+    assert summarise_states(recorded, {}, None, plan_id="another", task=None) == ()
 
 
 def states(count: int, *, condition: str = "with_replanning") -> list[StateSummary]:

@@ -1,7 +1,5 @@
-"""Two twins on the same trials, and two raters of the same trials."""
+"""Two raters of the same trials."""
 
-import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,15 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.errors import InvalidRecordError, UsageError
+from bridge.errors import InvalidRecordError
 from bridge.exchange.reviews import Review, read_reviews
 from bridge.exchange.table_text import TableError
-from evaluator.cli import evaluate
 from evaluator.compare import compare_csv
-from evaluator.compare.against import against_tables
 from evaluator.compare.raters import with_reviews
-from evaluator.compare.several import with_against
-from evaluator.errors import EvaluatorError
 from evaluator.result import Table
 
 HEAD = "trial_id,task,start_id,recorded,sim_planned,p_success\n"
@@ -35,53 +29,6 @@ def twin(right: int, n: int = 20) -> str:
 
 def cells(table: Table, row: int = 0) -> dict[str, Any]:
     return dict(zip(table.columns, table.rows[row], strict=True))
-
-
-def test_a_better_twin_is_shown_to_be_better_by_the_pairs(tmp_path: Path) -> None:
-    good, bad = tmp_path / "good.csv", tmp_path / "bad.csv"
-    good.write_text(twin(19))
-    bad.write_text(twin(9))
-    comparison = with_against(compare_csv(good), good, bad)
-    tables = {table.id: table for table in comparison.tables}
-    accuracy = cells(tables["against"])
-    assert (accuracy["good"], accuracy["bad"], accuracy["trials"]) == (19, 9, 20)
-    assert accuracy["difference (pp)"] == pytest.approx(50)
-    assert accuracy["low"] > 0
-    assert len(tables["flips"].rows) == 10
-    assert {row[-3] for row in tables["flips"].rows} == {"good"}
-    back = against_tables(compare_csv(bad).rows, compare_csv(good).rows, names=("bad", "good"))
-    assert cells(back[0])["difference (pp)"] == pytest.approx(-50)
-
-
-def test_the_same_twin_twice_shows_no_difference(write_table: Callable[[str], Path]) -> None:
-    rows = compare_csv(write_table(twin(15))).rows
-    (table,) = against_tables(rows, rows, names=("a", "a"))
-    assert cells(table)["difference (pp)"] == 0
-    assert cells(table)["low"] < 0 < cells(table)["high"]
-
-
-def test_two_twins_must_speak_of_the_same_trials(tmp_path: Path) -> None:
-    one, other = tmp_path / "one.csv", tmp_path / "other.csv"
-    one.write_text(twin(15))
-    other.write_text(twin(15).replace("t0,task0,s0,0", "t0,task0,s0,1"))
-    with pytest.raises(EvaluatorError, match="t0 succeeded in one and failed in the other"):
-        with_against(compare_csv(one), one, other)
-    other.write_text(HEAD + "x,y,z,1,1,\n")
-    with pytest.raises(EvaluatorError, match="No trial has an outcome and an answer of both"):
-        with_against(compare_csv(one), one, other)
-    with pytest.raises(UsageError, match="given twice"):
-        with_against(compare_csv(one), one, one)
-
-
-def test_a_run_against_its_copy_has_no_flip(six_trials: Any, tmp_path: Path) -> None:
-    run, copy = six_trials.run.path, tmp_path / "copy"
-    shutil.copytree(run, copy)
-    assert evaluate(run, against=copy, out=tmp_path / "out") == 0
-    tables = {
-        t["id"] for t in json.loads((tmp_path / "out" / "results.json").read_text())["tables"]
-    }
-    assert "against" in tables
-    assert "flips" not in tables
 
 
 def test_reviews_are_kept_and_read_in_one_format(tmp_path: Path) -> None:
