@@ -15,7 +15,6 @@ from bridge.exchange.table_text import (
     ENDED,
     OUTCOME_LIKE,
     UNKNOWN,
-    TableError,
     TableOptions,
     TableText,
     answer_of,
@@ -33,6 +32,7 @@ from bridge.exchange.trials_csv import (
 from bridge.exchange.trials_rates import COLUMNS as RATE_COLUMNS
 from bridge.exchange.trials_rates import RateRecord
 from evaluator.compare.found_table import read_found
+from evaluator.compare.policies import refuse_changed
 from evaluator.compare.table_words import KNOWN
 
 PUBLISHED = "a published table"
@@ -75,20 +75,12 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
 def _refuse_changed(table: TableText) -> None:
     """Refuse a policy that was another checkpoint before: one name would stand for both."""
     plain = list(map(plain_name, table.header))
-    if not {"policy", "checkpoint"} <= set(plain):
-        return
-    seen: dict[str, tuple[str, int]] = {}
-    for number, cells in table.grid[1:]:
-        whole = [*cells, *[""] * len(plain)]
-        policy, checkpoint = (whole[plain.index(name)].strip() for name in ("policy", "checkpoint"))
-        first, row = seen.setdefault(policy, (checkpoint, number)) if checkpoint else ("", 0)
-        if first != checkpoint:
-            raise TableError(
-                path=table.path,
-                row=number,
-                found=f"policy {policy!r} is checkpoint {checkpoint!r}, in row {row} {first!r}",
-                hint="Give each checkpoint a policy name of its own, or leave the column out",
-            )
+    if {"policy", "checkpoint"} <= set(plain):
+        places = [plain.index(name) for name in ("policy", "checkpoint")]
+        rows = (
+            (f"{table.path} row {n}", [*cells, *[""] * len(plain)]) for n, cells in table.grid[1:]
+        )
+        refuse_changed((where, *(row[p].strip() for p in places)) for where, row in rows)
 
 
 def _with_outcome(table: TableText, options: TableOptions) -> TableOptions:

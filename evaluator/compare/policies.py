@@ -7,6 +7,7 @@ its cause void: a policy that trips the arm must not gain by it.
 """
 
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from bridge.episode.catalogue_query import UNLABELLED
+from bridge.errors import UsageError
 from bridge.task.protocol import VOID_CAUSES, Protocol
 from evaluator.compare.measure import Part, ends, measured
 from evaluator.compare.rows import RateGroup, TrialRow, in_order
@@ -111,6 +113,31 @@ class Try(NamedTuple):
     succeeded: bool
     has_outcome: bool
     row: TrialRow
+
+
+_HASHES = re.compile(r"\b(server|code|map)=(\S+)")
+"""What a rollout says of who acted, beside or instead of a checkpoint."""
+
+
+def refuse_changed(named: Iterable[tuple[str, str, str]]) -> None:
+    """Refuse a policy that was another checkpoint before: one name would stand for both.
+
+    Args:
+        named: Where it stands, the policy, and who acted.
+
+    Raises:
+        UsageError: Naming both, and where they stand.
+    """
+    seen: dict[tuple[str, str], tuple[str, str]] = {}
+    for where, policy, who in named:
+        parts = {**dict(_HASHES.findall(who)), "checkpoint": _HASHES.sub("", who).strip()}
+        for part, now in parts.items():
+            first, place = seen.setdefault((policy, part), (now, where)) if now else ("", "")
+            if policy and now and first != now:
+                raise UsageError(
+                    f"{where}: policy {policy!r} is {part} {now!r}, in {place} {first!r}. Give "
+                    "each checkpoint a policy name of its own, or leave one of them out."
+                )
 
 
 def made_trials(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[TrialRow]:

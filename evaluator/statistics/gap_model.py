@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 from scipy.special import betainc, expit, ndtr, ndtri
 
 from evaluator.errors import UndefinedStatisticError
@@ -33,6 +33,9 @@ MOST = 100
 """A larger side is taken as one of so many trials: its rate is as good as known then."""
 AT_END = 0.02
 """An interval that ends this close to 1 or -1 holds it: no population was drawn at the end."""
+BEYOND, TOWARD_0 = 0.01, 0.04
+"""Chances outside an interval of r: few groups say less of how strong a correlation is than of its
+sign, so what the populations leave out lies beyond it, away from 0."""
 QUADRATURE = np.linspace(-3.4, 3.4, 21)
 
 
@@ -64,9 +67,10 @@ class _Populations:
 
     seeing: Float32[np.ndarray, "nodes cells"]
     """Chance of each pair of cells, recorded by twin, where the twin is not blind."""
-    recorded: Float32[np.ndarray, "nodes rates"]
-    blind: Float32[np.ndarray, "nodes rates"]
-    """Of what a blind twin says."""
+    may_be_blind: Int64[np.ndarray, " some"]
+    """Populations with a share of blind groups."""
+    blind: Float32[np.ndarray, "some cells"]
+    """The same chances in these, where the twin is blind."""
     share: Float64[np.ndarray, " nodes"]
     """Of groups in which it is blind."""
     r: Float64[np.ndarray, " nodes"]
@@ -102,6 +106,8 @@ def _drawn(nodes: int = NODES, seed: int = 0) -> _Populations:
     seeing = np.exp(-(near**2 * (a * a + b * b) - 2 * near * a * b) / (2 * (1 - near**2)))
     seeing *= x[:, :, None] * y[:, None, :]
     seeing /= seeing.sum(axis=(1, 2), keepdims=True)
+    rows = np.flatnonzero(share)
+    pairs = seeing[rows].sum(axis=2)[:, :, None] * blind[rows, None, :]
     r, bias = _moments(
         (recorded_at, size, bends[0]),
         (sim_at, sim_size, bends[1]),
@@ -112,8 +118,8 @@ def _drawn(nodes: int = NODES, seed: int = 0) -> _Populations:
     )
     return _Populations(
         seeing=seeing.reshape(nodes, -1).astype(np.float32),
-        recorded=seeing.sum(axis=2).astype(np.float32),
-        blind=blind.astype(np.float32),
+        may_be_blind=rows,
+        blind=pairs.reshape(len(rows), -1).astype(np.float32),
         share=share,
         r=r,
         bias=bias,
@@ -199,11 +205,10 @@ class GapModel:
         there = self.populations
         odds = common_log_odds(self.groups)
         table = np.stack([_likelihood(group, odds) for group in self.groups])
-        seeing = there.seeing @ table.reshape(len(table), -1).T.astype(np.float32)
-        rows = np.flatnonzero(there.share)
-        blind_pairs = there.recorded[rows, :, None].astype(np.float64) * there.blind[rows, None, :]
+        chances = table.reshape(len(table), -1).T.astype(np.float32)
+        seeing = there.seeing @ chances
         blind = np.zeros(seeing.shape)
-        blind[rows] = blind_pairs.reshape(len(rows), -1) @ table.reshape(len(table), -1).T
+        blind[there.may_be_blind] = there.blind @ chances
         share = there.share[:, None]
         chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
         logs = np.log(chance).sum(axis=1) / self.design_effect
@@ -229,7 +234,8 @@ class GapModel:
     @property
     def r(self) -> Interval:
         """Correlation of true rates over all groups of this kind."""
-        low, high = self._ends(self.populations.r)
+        above = float(self.weights @ (self.populations.r > 0))
+        low, high = self._ends(self.populations.r, BEYOND + (TOWARD_0 - BEYOND) * above)
         return Interval(
             low=-1.0 if low < AT_END - 1 else low,
             high=1.0 if high > 1 - AT_END else high,
@@ -251,11 +257,12 @@ class GapModel:
         found = Interval(low=low, high=high, level=LEVEL, method=METHOD)
         return float(self.weights @ share), found
 
-    def _ends(self, values: Float64[np.ndarray, " nodes"]) -> tuple[float, float]:
+    def _ends(
+        self, values: Float64[np.ndarray, " nodes"], below: float = (1 - LEVEL) / 2
+    ) -> tuple[float, float]:
         order = np.argsort(values, kind="stable")
         middle = np.cumsum(self.weights[order]) - self.weights[order] / 2
-        tail = (1 - LEVEL) / 2
-        low, high = np.interp([tail, 1 - tail], middle, values[order])
+        low, high = np.interp([below, below + LEVEL], middle, values[order])
         return float(low), float(high)
 
 

@@ -76,13 +76,13 @@ def test_r_and_bias_of_a_population_are_those_of_its_own_draws() -> None:
     rates = 1 / (1 + np.exp(-CENTRES))
     rng = np.random.default_rng(3)
     checked = 0
-    for node in rng.integers(0, len(there.r), 60):
-        chances = there.seeing[node].astype(np.float64)
-        cells = rng.choice(len(chances), p=chances / chances.sum(), size=20_000)
-        x, y = rates[cells // len(rates)], rates[cells % len(rates)]
-        said = there.blind[node].astype(np.float64)
+    for place, node in enumerate(there.may_be_blind[:60]):
         blind = rng.random(20_000) < there.share[node]
-        y = np.where(blind, rng.choice(rates, p=said / said.sum(), size=20_000), y)
+        cells = np.zeros(20_000, dtype=int)
+        for rows, whose in ((~blind, there.seeing[node]), (blind, there.blind[place])):
+            chances = whose.astype(np.float64)
+            cells[rows] = rng.choice(len(chances), p=chances / chances.sum(), size=rows.sum())
+        x, y = rates[cells // len(rates)], rates[cells % len(rates)]
         assert (y - x).mean() == pytest.approx(there.bias[node], abs=0.05)
         if min(x.std(), y.std()) > 0.15:
             assert np.corrcoef(x, y)[0, 1] == pytest.approx(there.r[node], abs=0.08)

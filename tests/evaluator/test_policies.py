@@ -1,6 +1,7 @@
 """Which candidate is better: what is a pair, who may be best, and that advice may be followed."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.exchange.table_text import TableError
+from bridge.errors import UsageError
 from evaluator.compare import Comparison, compare_csv
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.policies import (
@@ -223,9 +224,30 @@ def test_a_checkpoint_that_changed_under_one_name_is_refused(tmp_path: Path) -> 
     path.write_text("\n".join(lines) + "\n")
     assert [row.policy for row in compare_csv(path).rows] == ["ACT", "ACT"]
     path.write_text("\n".join([*lines, "3,cup,ACT,b2,yes"]) + "\n")
-    message = r"row 4: policy 'ACT' is checkpoint 'b2', in row 2 'a1'. Give each checkpoint"
-    with pytest.raises(TableError, match=message):
+    message = r"row 4: policy 'ACT' is checkpoint 'b2', in .*trials.csv row 2 'a1'. Give each"
+    with pytest.raises(UsageError, match=message):
         compare_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "words"),
+    [
+        ("a1", "b2", "policy 'A' is checkpoint 'b2', in .* 'a1'"),
+        ("a1 map=07", "a1 map=08", "policy 'A' is map '08', in .* '07'"),
+        ("server=0a map=07", "server=0b map=07", "policy 'A' is server '0b', in .* '0a'"),
+        ("a1", "code=m:f map=07", ""),  # nothing that both say differs
+        ("a1", "", ""),
+    ],
+)
+def test_who_acted_may_not_change_under_one_name(first: str, second: str, words: str) -> None:
+    rows = interleaved(CLEAR)
+    mine = [row for row in rows if row.policy == "A"]
+    rows = [*rows, replace(mine[0], episode="before", checkpoint=first)]
+    rows.append(replace(mine[1], episode="after", checkpoint=second))
+    with nullcontext() if not words else pytest.raises(UsageError, match=f"after: {words}"):
+        compare_rows(rows, run="r", source="table", stand_in=None)
+    rows[-1] = replace(rows[-1], policy="B")
+    compare_rows(rows, run="r", source="table", stand_in=None)
 
 
 @pytest.fixture
