@@ -5,8 +5,9 @@ which the twin is blind: there it says something that has nothing to do with wha
 thousand populations are drawn once from the prior, each laid out as chances of pairs of rates; what
 was counted weighs them. So one product of two matrices gives the posterior, and equal counts give
 equal numbers. Where fewer than ``FEW`` populations would count, the weights are flattened until so
-many do: intervals are wider then, never narrower than the drawn populations can tell. Groups that
-share tasks or policies count as fewer, by how much their rates have in common.
+many do: intervals are wider then, never narrower than the drawn populations can tell; the weights
+as they are tell which group is blind. Groups that share tasks or policies count as fewer, by how
+much their rates have in common.
 """
 
 from collections.abc import Hashable, Sequence
@@ -204,17 +205,15 @@ class GapModel:
             raise UndefinedStatisticError(statistic="model of agreement", reason=reason)
         there = self.populations
         odds = common_log_odds(self.groups)
-        table = np.stack([_likelihood(group, odds) for group in self.groups])
-        chances = table.reshape(len(table), -1).T.astype(np.float32)
-        seeing = there.seeing @ chances
-        blind = np.zeros(seeing.shape)
-        blind[there.may_be_blind] = there.blind @ chances
+        seeing, blind = chances_in(there, [_likelihood(group, odds) for group in self.groups])
         share = there.share[:, None]
         chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
         logs = np.log(chance).sum(axis=1) / self.design_effect
         weights = _flattened(logs)
         object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "blind_groups", weights @ (share * blind / chance))
+        # Flat weights would see scatter in place of groups that lie apart from the others.
+        sharp = _flattened(logs, few=1.0)
+        object.__setattr__(self, "blind_groups", sharp @ (share * blind / chance))
 
     @property
     def populations(self) -> _Populations:
@@ -266,6 +265,16 @@ class GapModel:
         return float(low), float(high)
 
 
+def chances_in(
+    there: _Populations, tables: Sequence[np.ndarray]
+) -> tuple[Float32[np.ndarray, "nodes groups"], Float32[np.ndarray, "nodes groups"]]:
+    """Return the chance of each group's counts where the twin sees, and where it is blind."""
+    chances = np.stack([table.ravel() for table in tables], axis=1).astype(np.float32)
+    blind = np.zeros((len(there.share), len(tables)), dtype=np.float32)
+    blind[there.may_be_blind] = there.blind @ chances
+    return there.seeing @ chances, blind
+
+
 def _shared(names: Sequence[Hashable], rates: Float64[np.ndarray, " groups"]) -> float:
     """Groups of a name less one, times how much of the variance of rates names share."""
     places = [np.flatnonzero([other == name for other in names]) for name in dict.fromkeys(names)]
@@ -280,13 +289,15 @@ def _shared(names: Sequence[Hashable], rates: Float64[np.ndarray, " groups"]) ->
     return float((many - 1) * variance / max(variance + inside, 1e-12))
 
 
-def _flattened(logs: Float64[np.ndarray, " nodes"]) -> Float64[np.ndarray, " nodes"]:
+def _flattened(
+    logs: Float64[np.ndarray, " nodes"], few: float = FEW
+) -> Float64[np.ndarray, " nodes"]:
     """Return weights of sum 1, flattened by a power until enough populations count."""
     power, weights = 1.0, logs
     for _ in range(60):
         weights = np.exp(power * (logs - logs.max()))
         weights /= weights.sum()
-        if 1 / (weights**2).sum() >= FEW:
+        if 1 / (weights**2).sum() >= few:
             break
         power *= 0.9
     return np.asarray(weights)
