@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bridge.errors import UsageError
-from bridge.exchange.table_text import SourceRow, TableOptions, plain_name
+from bridge.exchange.table_text import MEASURED, UNKNOWN, SourceRow, TableOptions, plain_name
 from bridge.exchange.trials_csv import trials_of
 from bridge.exchange.trials_rates import rates_of
 from evaluator.compare.found_rates import rate_rows
@@ -20,6 +20,8 @@ from evaluator.compare.table_words import (
     Column,
     DoubtfulTableError,
     folded,
+    is_number,
+    is_share,
     is_summary,
     read_cell,
     read_name,
@@ -255,7 +257,7 @@ def _settle_sides(sheet: Sheet) -> None:
 def _values(sheet: Sheet) -> list[Value]:
     labels = {
         label: sheet.labelled(label) for label in (*NAMED, "trial", "start_id", "unit", "side")
-    }
+    } | {label: _measured(sheet, label) for label in MEASURED}
     sheet.labels |= {label for label, column in labels.items() if column}
     blank = next((c for c in sheet.columns if not c.name and not c.label), None)
     if not labels["task"] and not labels["policy"] and blank and _is_text(sheet, blank):
@@ -270,6 +272,14 @@ def _values(sheet: Sheet) -> list[Value]:
         for column in columns:
             values.append(_value(sheet, number, cells, column, about, rest_is))
     return values
+
+
+def _measured(sheet: Sheet, label: str) -> Column | None:
+    """Return the one column of progress or of time, where its cells are that."""
+    these = [column for column in sheet.columns if column.label == label]
+    is_ours = is_share if label == "progress" else is_number
+    fits = [c for c in these if all(is_ours(t) or t in UNKNOWN for t in sheet.cells(c))]
+    return fits[0] if len(these) == 1 and fits else None
 
 
 def _is_text(sheet: Sheet, column: Column) -> bool:
@@ -410,6 +420,9 @@ def _trial_rows(sheet: Sheet, values: Sequence[Value]) -> list[SourceRow]:
         name = value.column.name if len(columns) > 1 and not paired else ""
         texts = rows.setdefault((value.row, name), {"stand_in": stand_in})
         texts |= {label: value.labels[label] for label in (*NAMED, "start_id")}
+        if not name:  # of several trials in one row nobody knows whose it is
+            texts |= {label: value.labels[label] for label in MEASURED}
+            sheet.read |= {c.place for c in sheet.columns if value.labels.get(c.label)}
         texts["task"] = texts["task"] or sheet.path.stem
         trial = value.labels["trial"]
         if trial or name:

@@ -13,6 +13,7 @@ from bridge.errors import UsageError
 from bridge.exchange.table_text import (
     AS_SAVED,
     ENDED,
+    MEASURED,
     OUTCOME_LIKE,
     UNKNOWN,
     TableOptions,
@@ -33,7 +34,7 @@ from bridge.exchange.trials_rates import COLUMNS as RATE_COLUMNS
 from bridge.exchange.trials_rates import RateRecord
 from evaluator.compare.found_table import read_found
 from evaluator.compare.policies import refuse_changed
-from evaluator.compare.table_words import KNOWN
+from evaluator.compare.table_words import KNOWN, is_number, is_share
 
 PUBLISHED = "a published table"
 
@@ -84,16 +85,25 @@ def _refuse_changed(table: TableText) -> None:
 
 
 def _with_outcome(table: TableText, options: TableOptions) -> TableOptions:
-    """Map the one column that is called an outcome, and holds nothing but yes and no."""
-    named = [name for name in table.left if plain_name(name) in OUTCOME_LIKE]
-    if "recorded" in table.header or len(named) != 1:
-        return options
-    place = table.header.index(named[0])
-    texts = [cells[place] for _, cells in table.grid[1:] if place < len(cells)]
-    if not all(t.strip().lower() in (*UNKNOWN, *ENDED) or answer_of(t) is not None for t in texts):
-        return options
-    mapped = ",".join(filter(None, (options.map, f"outcome={named[0]}")))
-    return replace(options, map=mapped)
+    """Map the one column that is called an outcome, and one of progress and of time, by content."""
+    found = [options.map] if options.map else []
+    for ours, names, is_ours in (
+        ("recorded", OUTCOME_LIKE, _is_answer),
+        ("progress", MEASURED["progress"], is_share),
+        ("time_s", MEASURED["time_s"], is_number),
+    ):
+        named = [name for name in table.left if plain_name(name) in names]
+        if ours in table.header or len(named) != 1:
+            continue
+        place = table.header.index(named[0])
+        texts = [cells[place].strip().lower() for _, cells in table.grid[1:] if place < len(cells)]
+        if all(text in UNKNOWN or is_ours(text) for text in texts):
+            found.append(f"{ours}={named[0]}")
+    return replace(options, map=",".join(found))
+
+
+def _is_answer(text: str) -> bool:
+    return text in ENDED or answer_of(text) is not None
 
 
 def ranges(rates: Sequence[RateRecord]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bridge.errors import UsageError
-from bridge.exchange.table_text import ENDED, UNKNOWN, answer_of
+from bridge.exchange.table_text import ENDED, MEASURED, UNKNOWN, answer_of
 
 LABELS = {
     "task": "task tasks task_name scenario scenarios aufgabe tache experiment benchmark env",
@@ -16,6 +16,7 @@ LABELS = {
     "trial": "trial trial_id trial_number episode episode_id rollout attempt id nr versuch essai",
     "start_id": "start_id start initial_condition init_state",
     "unit": "unit",
+    **{ours: " ".join(names) for ours, names in MEASURED.items()},
     "side": "side domain environment sim_or_real real_or_sim where seite",
 }
 """Our name of a column that says what a row is about, and other people's."""
@@ -224,6 +225,17 @@ def read_cell(row: int, text: str) -> Figure | None:
     if _DATE.fullmatch(cut):
         raise CellError("is a date or a time; a spreadsheet makes one of 7/10: write '7 of 10'")
     raise CellError("is neither a rate, nor a count, nor an answer")
+
+
+def is_number(text: str) -> bool:
+    """Whether a cell is a plain number."""
+    return re.fullmatch(_NUMBER, text.strip()) is not None
+
+
+def is_share(text: str) -> bool:
+    """Whether a cell is a part of 1, or percent with their sign; 3 of some scale is neither."""
+    found = _SHARE.fullmatch(text.strip())
+    return found is not None and (bool(found[2]) or float(found[1].replace(",", ".")) <= 1)
 
 
 def _pointed(text: str, *, percent: bool = False) -> str:

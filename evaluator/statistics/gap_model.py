@@ -77,6 +77,11 @@ class _Populations:
     r: Float64[np.ndarray, " nodes"]
     bias: Float64[np.ndarray, " nodes"]
 
+    @cached_property
+    def orders(self) -> dict[str, np.ndarray]:
+        """How r, bias and share are sorted."""
+        return {n: np.argsort(getattr(self, n), kind="stable") for n in ("r", "bias", "share")}
+
 
 @lru_cache(maxsize=2)
 def _drawn(nodes: int = NODES, seed: int = 0) -> _Populations:
@@ -230,11 +235,11 @@ class GapModel:
             found += max(_shared(names, side) for side in rates.T)
         return found
 
-    @property
+    @cached_property
     def r(self) -> Interval:
         """Correlation of true rates over all groups of this kind."""
         above = float(self.weights @ (self.populations.r > 0))
-        low, high = self._ends(self.populations.r, BEYOND + (TOWARD_0 - BEYOND) * above)
+        low, high = self._ends("r", BEYOND + (TOWARD_0 - BEYOND) * above)
         return Interval(
             low=-1.0 if low < AT_END - 1 else low,
             high=1.0 if high > 1 - AT_END else high,
@@ -245,21 +250,20 @@ class GapModel:
     @property
     def bias(self) -> Interval:
         """Mean of the twin's rate - recorded rate over all groups of this kind."""
-        low, high = self._ends(self.populations.bias)
+        low, high = self._ends("bias")
         return Interval(low=low, high=high, level=LEVEL, method=METHOD)
 
     @property
     def blind_share(self) -> tuple[float, Interval]:
         """Share of groups of this kind in which the twin is blind: mean and interval."""
         share = self.populations.share
-        low, high = self._ends(share)
+        low, high = self._ends("share")
         found = Interval(low=low, high=high, level=LEVEL, method=METHOD)
         return float(self.weights @ share), found
 
-    def _ends(
-        self, values: Float64[np.ndarray, " nodes"], below: float = (1 - LEVEL) / 2
-    ) -> tuple[float, float]:
-        order = np.argsort(values, kind="stable")
+    def _ends(self, what: str, below: float = (1 - LEVEL) / 2) -> tuple[float, float]:
+        order = self.populations.orders[what]
+        values = getattr(self.populations, what)
         middle = np.cumsum(self.weights[order]) - self.weights[order] / 2
         low, high = np.interp([below, below + LEVEL], middle, values[order])
         return float(low), float(high)
