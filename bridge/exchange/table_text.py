@@ -25,7 +25,22 @@ NO = (
     *("failure", "false", "no", "n", "0", "fail", "failed", "refused", "rejected", "nok"),
     *("not ok", "nein", "non", "fehlschlag", "échec", "✗", "✘", "❌"),
 )
-UNKNOWN = ("", "unknown", "undecided", "none", "na", "n/a", "nan", "null", "-", "?")
+UNKNOWN = (
+    "",
+    "unknown",
+    "undecided",
+    "not evaluated",
+    "none",
+    "na",
+    "n/a",
+    "nan",
+    "null",
+    "-",
+    "–",
+    "—",
+    "?",
+    "未评",
+)
 ENDED = (
     *("aborted", "abort", "interrupted", "void", "crashed", "protective stop", "protective_stop"),
     *("estop", "e-stop", "emergency stop"),
