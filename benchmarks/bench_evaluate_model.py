@@ -96,7 +96,7 @@ class Known:
         counts = {tuple(map(int, each)) for each in np.stack(study, axis=-1).reshape(-1, 4)}
         groups = [GroupCounts(recorded=(k, n), sim=(j, m)) for k, n, j, m in sorted(counts)]
         tables = [gap_model._likelihood(group, 0.0) for group in groups]
-        self.chances_in(gap_model._drawn(gap_model.NODES, 0), tables)
+        self.chances_in(gap_model._drawn(), tables)
 
 
 def fisher(study: Study, at: int) -> Ends:

@@ -62,6 +62,10 @@ class GroupCounts:
         return recorded, (self.sim[0] + both + only_sim, self.sim[1] + n)
 
 
+Side = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Middle, size and bend of a curve of log-odds, one of each population."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Populations:
     """Populations drawn from the prior."""
@@ -83,45 +87,28 @@ class _Populations:
         return {n: np.argsort(getattr(self, n), kind="stable") for n in ("r", "bias", "share")}
 
 
-@lru_cache(maxsize=2)
-def _drawn(nodes: int = NODES, seed: int = 0) -> _Populations:
-    rng = np.random.default_rng(seed)
+@lru_cache(maxsize=1)
+def _drawn(nodes: int = NODES) -> _Populations:
+    rng = np.random.default_rng(0)
     z, u = rng.standard_normal((nodes, 8)), rng.random((nodes, 5))
     recorded_at = 1.6 * z[:, 0]
-    sim_at = recorded_at + 1.2 * z[:, 1]
     size = np.maximum(np.abs(2 * z[:, 2]), 0.02)
     sim_size = np.maximum(size * np.exp(0.5 * z[:, 3]), 0.02)
     rho = np.sin(np.pi * (u[:, 0] - 0.5))
     share = np.where(u[:, 1] < 0.5, 0.0, 0.5 * u[:, 2])
-    bends = (
-        np.where(u[:, 3] < 0.6, 0.0, u[:, 3] * 0.95),
-        np.where(u[:, 4] < 0.6, 0.0, u[:, 4] * 0.95),
-    )
-    blind_at, blind_size = 2 * z[:, 4], np.maximum(np.abs(z[:, 5]), 0.05)
-    sides = [
-        _masses(at, spread, bend)
-        for at, spread, bend in (
-            (recorded_at, size, bends[0]),
-            (sim_at, sim_size, bends[1]),
-            (blind_at, blind_size, np.zeros(nodes)),
-        )
-    ]
-    (x, middle_x), (y, middle_y), (blind, _) = sides
+    bends = np.where(u[:, 3:] < 0.6, 0.0, u[:, 3:] * 0.95).T
+    recorded: Side = (recorded_at, size, bends[0])
+    sim: Side = (recorded_at + 1.2 * z[:, 1], sim_size, bends[1])
+    blind: Side = (2 * z[:, 4], np.maximum(np.abs(z[:, 5]), 0.05), np.zeros(nodes))
+    (x, middle_x), (y, middle_y), (of_blind, _) = (_masses(*s) for s in (recorded, sim, blind))
     near = np.clip(rho, -0.97, 0.97)[:, None, None]
     a, b = middle_x[:, :, None], middle_y[:, None, :]
     seeing = np.exp(-(near**2 * (a * a + b * b) - 2 * near * a * b) / (2 * (1 - near**2)))
     seeing *= x[:, :, None] * y[:, None, :]
     seeing /= seeing.sum(axis=(1, 2), keepdims=True)
     rows = np.flatnonzero(share)
-    pairs = seeing[rows].sum(axis=2)[:, :, None] * blind[rows, None, :]
-    r, bias = _moments(
-        (recorded_at, size, bends[0]),
-        (sim_at, sim_size, bends[1]),
-        rho,
-        share,
-        blind_at,
-        blind_size,
-    )
+    pairs = seeing[rows].sum(axis=2)[:, :, None] * of_blind[rows, None, :]
+    r, bias = _moments(recorded, sim, blind, rho, share)
     return _Populations(
         seeing=seeing.reshape(nodes, -1).astype(np.float32),
         may_be_blind=rows,
@@ -153,16 +140,8 @@ def _masses(at: np.ndarray, size: np.ndarray, bend: np.ndarray) -> tuple[np.ndar
     return np.diff(below, axis=1) + 1e-12, middle
 
 
-Side = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
 def _moments(
-    recorded: Side,
-    sim: Side,
-    rho: np.ndarray,
-    share: np.ndarray,
-    blind_at: np.ndarray,
-    blind_size: np.ndarray,
+    recorded: Side, sim: Side, blind: Side, rho: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Correlation and mean difference of both rates in each population."""
     w = np.exp(-0.5 * QUADRATURE**2)
@@ -174,7 +153,7 @@ def _moments(
     other = rho[:, None, None] * z[:, :, None] + np.sqrt(1 - rho**2)[:, None, None] * z[:, None, :]
     y = expit(at[:, None, None] + size[:, None, None] * _bent(other, bend))
     given = y @ w
-    of_blind = expit(blind_at[:, None] + blind_size[:, None] * z)
+    of_blind = expit(blind[0][:, None] + blind[1][:, None] * z)
     mean_x, square_x = x @ w, x**2 @ w
     mean_y = (1 - share) * (given @ w) + share * (of_blind @ w)
     square_y = (1 - share) * ((y**2 @ w) @ w) + share * (of_blind**2 @ w)
@@ -189,8 +168,6 @@ class GapModel:
     """What some groups say of the population that they are from."""
 
     groups: tuple[GroupCounts, ...]
-    nodes: int = NODES
-    seed: int = 0
     weights: Float64[np.ndarray, " nodes"] = field(init=False, repr=False)
     blind_groups: Float64[np.ndarray, " groups"] = field(init=False, repr=False)
     """Probability of each group that the twin is blind in it."""
@@ -223,7 +200,7 @@ class GapModel:
     @property
     def populations(self) -> _Populations:
         """The populations that are weighed."""
-        return _drawn(self.nodes, self.seed)
+        return _drawn()
 
     @cached_property
     def design_effect(self) -> float:
