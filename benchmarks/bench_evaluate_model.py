@@ -18,9 +18,8 @@ truth, groups, trials and factor of the twin's trials. Success:
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import product
-from typing import Any
 
 import numpy as np
 from agreement_truths import (
@@ -55,48 +54,60 @@ Study = tuple[Counts, Counts, Counts, Counts]
 Ends = tuple[float, float]
 
 
-def model_of(study: Study, at: int, crossed: bool, groups: int) -> GapModel:
-    """The model under test."""
+def groups_of(study: Study, at: int, crossed: bool, groups: int) -> tuple[GroupCounts, ...]:
+    """What was counted in one study."""
     k, n, j, m = (side[at] for side in study)
     policies = NUM_GROUPS[groups][1]
-    return GapModel(
-        groups=tuple(
-            GroupCounts(
-                recorded=(int(k[g]), int(n[g])),
-                sim=(int(j[g]), int(m[g])),
-                shares=(f"task {g // policies}", f"policy {g % policies}") if crossed else (),
-            )
-            for g in range(groups)
+    return tuple(
+        GroupCounts(
+            recorded=(int(k[g]), int(n[g])),
+            sim=(int(j[g]), int(m[g])),
+            shares=(f"task {g // policies}", f"policy {g % policies}") if crossed else (),
         )
+        for g in range(groups)
     )
 
 
-class Known:
-    """Chances of counts, asked for all groups of many studies at once: a third of the time."""
+def model_of(study: Study, at: int, crossed: bool, groups: int) -> GapModel:
+    """The model under test."""
+    return GapModel(groups=groups_of(study, at, crossed, groups))
 
-    def __init__(self) -> None:
-        """Stand in for the function that the model calls."""
-        self.found: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-        self.asked = gap_model.chances_in
-        gap_model.chances_in = self.chances_in  # type: ignore[assignment]
 
-    def chances_in(self, there: Any, tables: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Look up, and ask for what is not known."""
-        keys = [table.tobytes() for table in tables]
-        new = {k: t for k, t in zip(keys, tables, strict=True) if k not in self.found}
-        if new:
-            columns = (side.T for side in self.asked(there, list(new.values())))
-            self.found |= dict(zip(new, zip(*columns, strict=True), strict=True))
-        seeing, blind = zip(*(self.found[key] for key in keys), strict=True)
-        return np.stack(seeing).T, np.stack(blind).T
+class Logs:
+    """Logs of the chances of a cell's groups in each population, each kind of group once."""
 
-    def prepare(self, study: Study) -> None:
-        """Ask for all groups of some studies."""
-        self.found.clear()
-        counts = {tuple(map(int, each)) for each in np.stack(study, axis=-1).reshape(-1, 4)}
-        groups = [GroupCounts(recorded=(k, n), sim=(j, m)) for k, n, j, m in sorted(counts)]
-        tables = [gap_model._likelihood(group, 0.0) for group in groups]
-        self.chances_in(gap_model._drawn(), tables)
+    def __init__(self, study: Study) -> None:
+        """Ask the model for them."""
+        counts = np.stack(study, axis=-1)
+        kinds, places = np.unique(counts.reshape(-1, 4), axis=0, return_inverse=True)
+        self.places = places.reshape(counts.shape[:2])
+        there = gap_model._drawn()
+        share = there.share[:, None].astype(np.float32)
+        self.found = np.empty((len(kinds), len(share)), dtype=np.float32)
+        for start in range(0, len(kinds), 200):
+            some = kinds[start : start + 200].tolist()
+            groups = [GroupCounts(recorded=(k, n), sim=(j, m)) for k, n, j, m in some]
+            tables = [gap_model._likelihood(group, 0.0) for group in groups]
+            seeing, blind = gap_model.chances_in(there, tables)
+            chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
+            self.found[start : start + len(some)] = np.log(chance).T
+
+    def model(self, study: Study, at: int, crossed: bool, groups: int) -> GapModel:
+        """The model under test, with the weights that follow; the first one is made twice."""
+        if not at:
+            self.check(whole := model_of(study, at, crossed, groups), self.places[0])
+            return whole
+        made = object.__new__(GapModel)
+        object.__setattr__(made, "groups", groups_of(study, at, crossed, groups))
+        logs = self.found[self.places[at]].sum(axis=0, dtype=np.float64)
+        object.__setattr__(made, "weights", gap_model._flattened(logs / made.design_effect))
+        return made
+
+    def check(self, whole: GapModel, places: np.ndarray) -> None:
+        """End where the weights are not the model's own."""
+        logs = self.found[places].sum(axis=0, dtype=np.float64)
+        weights = gap_model._flattened(logs / whole.design_effect)
+        np.testing.assert_allclose(weights, whole.weights, rtol=1e-2, atol=1e-6)
 
 
 def fisher(study: Study, at: int) -> Ends:
@@ -151,17 +162,17 @@ OTHERS: dict[str, Callable[[Study, int], Ends]] = {
 Cells = dict[tuple[str, int, int], dict[str, list[float]]]
 
 
-def covering(known: Known) -> Cells:
+def covering() -> Cells:
     """By cell: which intervals hold the truth, and how wide they are."""
     cells: Cells = {}
     for name in TRUTHS:
         r, bias = population(name)
         for groups, trials, factor in product(NUM_GROUPS, NUM_TRIALS, SIM_FACTORS):
             study = studies(name, groups, trials, factor, DRAWS)
-            known.prepare(study)
+            logs = Logs(study)
             found = cells.setdefault((name, groups, trials), {})
             for at in range(DRAWS):
-                model = model_of(study, at, name in CROSSED, groups)
+                model = logs.model(study, at, name in CROSSED, groups)
                 ends = {"model": (model.r.low, model.r.high)}
                 if at < OF_OTHERS:
                     ends |= {method: make(study, at) for method, make in OTHERS.items()}
@@ -178,7 +189,7 @@ def covering(known: Known) -> Cells:
     return cells
 
 
-def naming(known: Known) -> dict[str, dict[str, float | None]]:
+def naming() -> dict[str, dict[str, float | None]]:
     """By twin and number of groups: which groups are named, of blind and of other ones."""
     found: dict[str, dict[str, float | None]] = {}
     twins = [(words, said, BLIND) for words, said in SAID.items()] + [("", SAID["yes"], 0.0)]
@@ -189,7 +200,6 @@ def naming(known: Known) -> dict[str, dict[str, float | None]]:
             x, y, is_blind = with_blind(said, share, rng, (max(DRAWS // 5, 2), groups))
             n, m = np.full(x.shape, trials), np.full(x.shape, factor * trials)
             study = rng.binomial(n, x), n, rng.binomial(m, y), m
-            known.prepare(study)
             for at in range(len(x)):
                 model = model_of(study, at, False, groups)
                 named = model.blind_groups >= LIKELY_BLIND
@@ -214,9 +224,8 @@ def naming(known: Known) -> dict[str, dict[str, float | None]]:
 def main() -> None:
     """Measure, print and store."""
     began = time.process_time()
-    known = Known()
-    named = naming(known)
-    cells = covering(known)
+    named = naming()
+    cells = covering()
     table = [
         {"cell": list(cell), **{key: round(float(np.mean(each)), 3) for key, each in found.items()}}
         for cell, found in cells.items()

@@ -34,9 +34,10 @@ MOST = 100
 """A larger side is taken as one of so many trials: its rate is as good as known then."""
 AT_END = 0.02
 """An interval that ends this close to 1 or -1 holds it: no population was drawn at the end."""
-BEYOND, TOWARD_0 = 0.01, 0.04
-"""Chances outside an interval of r: few groups say less of how strong a correlation is than of its
-sign, so what the populations leave out lies beyond it, away from 0."""
+BEYOND, TOWARD_0 = 0.005, 0.04
+"""Chances outside an interval of r, away from 0 and towards it, where its sign is certain: few
+groups say less of how strong a correlation is than of its sign. Less where it is not."""
+TAIL = (1 - LEVEL) / 2
 QUADRATURE = np.linspace(-3.4, 3.4, 21)
 
 
@@ -216,7 +217,8 @@ class GapModel:
     def r(self) -> Interval:
         """Correlation of true rates over all groups of this kind."""
         above = float(self.weights @ (self.populations.r > 0))
-        low, high = self._ends("r", BEYOND + (TOWARD_0 - BEYOND) * above)
+        below, beyond = (BEYOND + (TOWARD_0 - BEYOND) * sure**3 for sure in (above, 1 - above))
+        low, high = self._ends("r", below, beyond)
         return Interval(
             low=-1.0 if low < AT_END - 1 else low,
             high=1.0 if high > 1 - AT_END else high,
@@ -238,11 +240,11 @@ class GapModel:
         found = Interval(low=low, high=high, level=LEVEL, method=METHOD)
         return float(self.weights @ share), found
 
-    def _ends(self, what: str, below: float = (1 - LEVEL) / 2) -> tuple[float, float]:
+    def _ends(self, what: str, below: float = TAIL, beyond: float = TAIL) -> tuple[float, float]:
         order = self.populations.orders[what]
         values = getattr(self.populations, what)
         middle = np.cumsum(self.weights[order]) - self.weights[order] / 2
-        low, high = np.interp([below, below + LEVEL], middle, values[order])
+        low, high = np.interp([below, 1 - beyond], middle, values[order])
         return float(low), float(high)
 
 
