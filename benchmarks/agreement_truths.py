@@ -2,16 +2,18 @@
 
 Every truth draws groups: a recorded rate and the twin's. Judged is whether an interval holds the
 correlation and the mean difference of the rates of the population that the groups come from: of new
-tasks and policies, too, where groups are tasks x policies. Sixteen truths, each with 8, 12 and 28
+tasks and policies, too, where groups are tasks x policies. Seventeen truths, each with 8, 12 and 28
 groups (4 x 2, 4 x 3, 7 x 4) of 10 and 20 recorded trials, half of the studies with as many trials
-of the twin and half with ten times as many; the seed of a cell is [truth, groups, trials, factor].
-Success: the least coverage over truths (all cells of one together) is at least 93 %.
+of the twin and half with ten times as many; the seed is [truth, groups, trials, factor, 1].
+Success: the least coverage over the 102 cells (truth, groups, trials) is at least 93 %. How the
+tails of r are divided was chosen on other seeds, [991, truth, groups, trials, factor], and once
+more after a first choice had held 91.5 % in the worst of the cells seen on [truth, ..., factor].
 """
 
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.special import expit, logit, ndtr
 from scipy.stats import beta
 
@@ -58,18 +60,19 @@ def _copula(recorded: Curve, sim: Curve, rho: float) -> Draw:
     return draw
 
 
+def with_blind(
+    said: Curve, share: float, rng: np.random.Generator, shape: tuple[int, int]
+) -> tuple[Rates, Rates, Bool[np.ndarray, "studies groups"]]:
+    """A twin that follows closely, but in some groups says something else; and in which."""
+    x = _beta(1.2, 1.2)(rng.random(shape))
+    noise = 0.3 + 0.4 * rng.standard_normal(shape)
+    y = expit(logit(np.clip(x, 0.002, 0.998)) + noise)
+    blind = rng.random(shape) < share
+    return x, np.where(blind, said(rng.random(shape)), y), blind
+
+
 def _blind(said: Curve) -> Draw:
-    """A twin that follows closely but in a fifth of the groups, where it says something else."""
-    recorded = _beta(1.2, 1.2)
-
-    def draw(rng: np.random.Generator, studies: int, groups: int) -> Sides:
-        shape = (studies, groups)
-        x = recorded(rng.random(shape))
-        noise = 0.3 + 0.4 * rng.standard_normal(shape)
-        y = expit(logit(np.clip(x, 0.002, 0.998)) + noise)
-        return x, np.where(rng.random(shape) < BLIND, said(rng.random(shape)), y)
-
-    return draw
+    return lambda rng, studies, groups: with_blind(said, BLIND, rng, (studies, groups))[:2]
 
 
 def _crossed(of_tasks: float, of_policies: float, of_cells: float) -> Draw:
@@ -91,6 +94,12 @@ def _same(rng: np.random.Generator, studies: int, groups: int) -> Sides:
     return x, x
 
 
+SAID: dict[str, Curve] = {
+    "yes": lambda u: 0.85 + 0.15 * u,
+    "no": lambda u: 0.1 * u,
+    "anything": lambda u: u,
+}
+"""What a blind twin says."""
 MIDDLING = (_beta(2, 2), _beta(2.5, 2))
 TRUTHS: dict[str, Draw] = {
     "middling, rho 0": _copula(*MIDDLING, 0.0),
@@ -100,15 +109,14 @@ TRUTHS: dict[str, Draw] = {
     "U-shaped, rho 0.95": _copula(_beta(0.4, 0.4), _beta(0.5, 0.4), 0.95),
     "full of zeros": _copula(_zeros(0.4), _zeros(0.3), 0.6),
     "two levels": _copula(_levels(0.8), _levels(0.9), 0.6),
-    "blind fifth says yes": _blind(lambda u: 0.85 + 0.15 * u),
-    "blind fifth says no": _blind(lambda u: 0.1 * u),
-    "blind fifth says anything": _blind(lambda u: u),
+    **{f"blind fifth says {words}": _blind(said) for words, said in SAID.items()},
     "tasks x policies": _crossed(0.7, 0.7, 0.3),
     "tasks x policies, opposed": _crossed(0.9, -0.3, 0.0),
     "ceiling": _copula(_beta(8, 1.5), _beta(9, 1.2), 0.6),
     "all alike": _copula(lambda u: 0.46 + 0.08 * u, lambda u: 0.5 + 0.1 * u, 0.6),
     "unequal n": _copula(*MIDDLING, 0.6),
     "the twin is right": _same,
+    "the twin turns it round": _copula(*MIDDLING, -0.8),
 }
 CROSSED = ("tasks x policies", "tasks x policies, opposed")
 UNEQUAL = "unequal n"
@@ -130,7 +138,7 @@ def studies(
     name: str, groups: int, trials: int, factor: int, many: int
 ) -> tuple[Counts, Counts, Counts, Counts]:
     """Draw studies: successes and trials as recorded, and the twin's."""
-    rng = np.random.default_rng([list(TRUTHS).index(name), groups, trials, factor])
+    rng = np.random.default_rng([list(TRUTHS).index(name), groups, trials, factor, 1])
     x, y = TRUTHS[name](rng, many, groups)
     n = np.full(x.shape, trials)
     if name == UNEQUAL:

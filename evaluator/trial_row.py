@@ -62,6 +62,12 @@ class TrialRow:
     """without, with or control; empty outside a study."""
     why_unknown: str = ""
     """What was said of an outcome that is not known."""
+    checkpoint: str = ""
+    """Who acted under the policy's name, where somebody says so."""
+    progress: float | None = None
+    """Part of the task that was done, 0 to 1."""
+    time_s: float | None = None
+    """How long a success took."""
     stages: tuple[tuple[str, bool | None], ...] = ()
     """How each stage ended as labelled, in order; empty where nobody said."""
     baselines: tuple[tuple[str, bool], ...] = ()

@@ -53,6 +53,11 @@ class EpisodeInfo:
         """The study arm of a trial; empty outside a study."""
         return study_arm_of(self.tags)
 
+    @property
+    def checkpoint(self) -> str:
+        """Which weights acted under the policy's name; empty where nobody said so."""
+        return tagged(self.tags, CHECKPOINT_TAG)
+
 
 def imported_info(episode_id: str, task: str, **more: Any) -> EpisodeInfo:
     """Describe an imported episode; with the name of a task it is a trial like any other."""
@@ -61,12 +66,17 @@ def imported_info(episode_id: str, task: str, **more: Any) -> EpisodeInfo:
 
 RETRY_OF_TAG = "retry_of:"
 STUDY_ARM_TAG = "study_arm:"
+CHECKPOINT_TAG = "checkpoint:"
+
+
+def tagged(tags: Iterable[str], prefix: str) -> str:
+    """Return what the first tag that begins so goes on with; empty where there is none."""
+    return next((tag for tag in tags if tag.startswith(prefix)), "").removeprefix(prefix)
 
 
 def study_arm_of(tags: Iterable[str]) -> str:
     """Read the study arm from an episode's tags; empty outside a study."""
-    found = (tag for tag in tags if tag.startswith(STUDY_ARM_TAG))
-    return next(found, "").removeprefix(STUDY_ARM_TAG)
+    return tagged(tags, STUDY_ARM_TAG)
 
 
 CONTROL = "control"
@@ -79,8 +89,7 @@ def treatment_of(condition: str, study_arm: str) -> str:
 
 def retried_trial(info: EpisodeInfo) -> str:
     """Id of the trial that a retry follows; empty where it does not say."""
-    found = (tag for tag in info.tags if tag.startswith(RETRY_OF_TAG))
-    return next(found, "").removeprefix(RETRY_OF_TAG)
+    return tagged(info.tags, RETRY_OF_TAG)
 
 
 @dataclass(frozen=True, kw_only=True)

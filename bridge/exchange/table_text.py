@@ -25,7 +25,22 @@ NO = (
     *("failure", "false", "no", "n", "0", "fail", "failed", "refused", "rejected", "nok"),
     *("not ok", "nein", "non", "fehlschlag", "échec", "✗", "✘", "❌"),
 )
-UNKNOWN = ("", "unknown", "undecided", "none", "na", "n/a", "nan", "null", "-", "?")
+UNKNOWN = (
+    "",
+    "unknown",
+    "undecided",
+    "not evaluated",
+    "none",
+    "na",
+    "n/a",
+    "nan",
+    "null",
+    "-",
+    "–",
+    "—",
+    "?",
+    "未评",
+)
 ENDED = (
     *("aborted", "abort", "interrupted", "void", "crashed", "protective stop", "protective_stop"),
     *("estop", "e-stop", "emergency stop"),
@@ -37,6 +52,11 @@ ALIASES = {"outcome": "recorded", "sim": "sim_planned"}
 """Words that ``map`` takes for our columns."""
 OUTCOME_LIKE = ("outcome", "result", "results", "success", "succeeded", "label", "real")
 """Columns that are read as the outcome where there is one of them and no ``recorded``."""
+MEASURED = {
+    "progress": ("progress", "partial", "partial_credit", "score", "completion"),
+    "time_s": ("time_s", "duration_s", "time_to_success_s", "time_to_success", "completion_time_s"),
+}
+"""Columns beside the outcome that are compared, too, and other people's names of them."""
 WORKBOOKS = (".xlsx", ".xlsm")
 FIRST_LINES, MOST_TOP = 5, 200
 """Lines in which names of columns are looked for, among so many with blanks and comments."""
@@ -116,11 +136,20 @@ class SourceRow:
         return int(number)
 
     def fraction(self, name: str) -> float | None:
-        """Read a number in 0..1."""
+        """Read a number in 0..1, or percent with their sign."""
         number = self._number(name)
+        if number is not None and self.text(name).endswith("%"):
+            number /= 100
         if number is not None and not 0 <= number <= 1:
-            hint = f"{name} is a fraction from 0 to 1"
+            hint = f"{name} is a fraction from 0 to 1, or percent with a sign"
             raise self.refuse(f"{name} is {self.text(name)!r}", hint)
+        return number
+
+    def seconds(self, name: str) -> float | None:
+        """Read a duration [s]."""
+        number = self._number(name)
+        if number is not None and not 0 < number <= MOST:
+            raise self.refuse(f"{name} is {self.text(name)!r}", f"{name} is a duration in seconds")
         return number
 
     def figure(self, name: str) -> str:
@@ -138,7 +167,7 @@ class SourceRow:
         """Return the number in a field, None when it is empty, -1 when it is not a number."""
         text = self.figure(name)
         try:
-            return float(text) if text else None
+            return float(text.removesuffix("%")) if text else None
         except ValueError:
             return -1.0
 
@@ -392,7 +421,7 @@ def _refuse_doubled(table: TableText) -> None:
 
 def _refuse_slips(table: TableText, known: Sequence[str]) -> None:
     """Refuse a column that is almost one of ours: it would be left out unseen."""
-    free = [name for name in known if name not in table.header]
+    free = [name for name in known if name not in (*table.header, "time_s")]  # "time": of the day
     for name in table.left:
         likely = difflib.get_close_matches(plain_name(name), free, n=1, cutoff=NEAR)
         if likely:

@@ -1,8 +1,9 @@
 """Trials CSV in and out: one row per trial, as people keep them in a spreadsheet.
 
 Columns: trial_id, task, condition, policy, start_id, unit, k, n, recorded, sim_planned,
-sim_executed, verdict, p_success, cell, stand_in, why_unknown. Only task must be there (rows
-without trial_id are numbered); an empty field means unknown and stays unknown.
+sim_executed, verdict, p_success, cell, stand_in, why_unknown, checkpoint,
+progress (0 to 1), time_s (of successes). Only task must be there (rows without trial_id are
+numbered); an empty field means unknown and stays unknown.
 """
 
 import csv
@@ -51,6 +52,12 @@ class TrialRecord:
     stand_in: bool | None = None
     why_unknown: str = ""
     """What was said of an outcome that is not known: aborted, protective stop ..."""
+    checkpoint: str = ""
+    """Which weights acted under the policy's name, where somebody says so."""
+    progress: float | None = None
+    """Part of the task that was done, 0 to 1."""
+    time_s: float | None = None
+    """How long a success took."""
 
 
 COLUMNS = tuple(field.name for field in fields(TrialRecord))
@@ -166,6 +173,9 @@ def read_trial(row: SourceRow) -> TrialRecord:
         cell=row.text("cell"),
         stand_in=row.answer("stand_in"),
         why_unknown=row.text("why_unknown") or _how_it_ended(row),
+        checkpoint=row.text("checkpoint"),
+        progress=row.fraction("progress"),
+        time_s=row.seconds("time_s"),
     )
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bridge.errors import UsageError
-from bridge.exchange.table_text import SourceRow, TableOptions, plain_name
+from bridge.exchange.table_text import MEASURED, UNKNOWN, SourceRow, TableOptions, plain_name
 from bridge.exchange.trials_csv import trials_of
 from bridge.exchange.trials_rates import rates_of
 from evaluator.compare.found_rates import rate_rows
@@ -19,7 +19,10 @@ from evaluator.compare.table_words import (
     CellError,
     Column,
     DoubtfulTableError,
+    Figure,
     folded,
+    is_number,
+    is_share,
     is_summary,
     read_cell,
     read_name,
@@ -44,6 +47,7 @@ def read_found(path: Path, grid: Sequence[Line], options: TableOptions) -> Found
     if options.mapped:
         found.notes += [f"{theirs!r} read as {ours}" for ours, theirs in options.mapped.items()]
     _settle_sides(sheet)
+    _settle_sections(sheet)
     values = _values(sheet)
     if not values:
         raise UsageError(_nothing(sheet))
@@ -83,6 +87,7 @@ def _sheet(path: Path, grid: Sequence[Line], options: TableOptions) -> Sheet:
     found = Found()
     top, last = _header(lines)
     found.notes += [f"row {n} is a title" for n, _ in lines[:top]]
+    title = lines[top - 1][1][0] if top else ""
     levels = [list(cells) for _, cells in lines[top : last + 1]]
     for level in levels[:-1]:
         _spread(level, levels[-1])
@@ -98,7 +103,7 @@ def _sheet(path: Path, grid: Sequence[Line], options: TableOptions) -> Sheet:
         ]
     sheet = Sheet(path=path, columns=columns, lines=[], found=found)
     _refuse_unnamed(sheet, lines[last + 1 :])
-    sheet.lines = _body(sheet, lines[last + 1 :], levels)
+    sheet.lines = _body(sheet, lines[last + 1 :], levels, title)
     return sheet
 
 
@@ -153,12 +158,15 @@ def _names_too(cells: Sequence[str]) -> bool:
     return not cells[0] or all(_is_word(cell) for cell in filled)
 
 
-def _is_figure(cell: str) -> bool:
+def _figure(cell: str) -> Figure | None:
     try:
-        read_cell(0, cell)
+        return read_cell(0, cell)
     except CellError:
-        return False
-    return True
+        return None
+
+
+def _is_figure(cell: str) -> bool:
+    return cell.strip().lower() in UNKNOWN or _figure(cell) is not None
 
 
 def _spread(level: list[str], lowest: Sequence[str]) -> None:
@@ -170,8 +178,10 @@ def _spread(level: list[str], lowest: Sequence[str]) -> None:
             level[place] = above
 
 
-def _body(sheet: Sheet, lines: Sequence[Line], levels: Sequence[list[str]]) -> list[Line]:
-    """Leave out summaries, notes and repeated names; let a section's side stand in its rows."""
+def _body(
+    sheet: Sheet, lines: Sequence[Line], levels: Sequence[list[str]], title: str
+) -> list[Line]:
+    """Leave out summaries, notes and repeated names; let side and title stand in their rows."""
     named = [column.place for column in sheet.columns if column.label in NAMED] or [0]
     body: list[Line] = []
     section = note = ""
@@ -181,7 +191,7 @@ def _body(sheet: Sheet, lines: Sequence[Line], levels: Sequence[list[str]]) -> l
         if len(filled) == 1 and side_of(filled[0]):
             section = side_of(filled[0])
         elif cells in levels:
-            continue
+            title, note, before = note or title, "", []  # a further table with a title of its own
         elif any(is_summary(cells[place]) for place in named):
             sheet.found.notes.append(f"row {number} sums up others")
         elif len(filled) == 1 and len(cells) > 1 and cells[0]:
@@ -194,7 +204,7 @@ def _body(sheet: Sheet, lines: Sequence[Line], levels: Sequence[list[str]]) -> l
             whole = _continued(cells, before, named)
             if whole != cells and "blank names continue those above" not in sheet.found.notes:
                 sheet.found.notes.append("blank names continue those above")
-            body.append((number, [*whole, section]))
+            body.append((number, [*whole, section, title]))
             before = whole
     return body
 
@@ -249,27 +259,78 @@ def _settle_sides(sheet: Sheet) -> None:
             )
 
 
+def _settle_sections(sheet: Sheet) -> None:
+    """Tables of one header below each other: their titles are tasks, or policies."""
+    place = len(sheet.lines[0][1]) - 1 if sheet.lines else 0
+    if len({cells[place] for _, cells in sheet.lines}) > 1:
+        taken = [column.label for column in sheet.columns]
+        label = next((name for name in ("task", "policy", "condition") if name not in taken), "")
+        sheet.columns.append(Column(place=place, name="", label=label))
+        sheet.found.notes.append(f"titles read as {label}")
+
+
 # Figures with whom they are about.
 
 
 def _values(sheet: Sheet) -> list[Value]:
     labels = {
         label: sheet.labelled(label) for label in (*NAMED, "trial", "start_id", "unit", "side")
-    }
+    } | {label: _measured(sheet, label) for label in MEASURED}
     sheet.labels |= {label for label, column in labels.items() if column}
-    blank = next((c for c in sheet.columns if not c.name and not c.label), None)
-    if not labels["task"] and not labels["policy"] and blank and _is_text(sheet, blank):
-        labels["policy"] = blank
-        sheet.read.add(blank.place)
-        sheet.found.notes.append("first column read as policy")
+    first = next((c for c in sheet.columns if not c.label and not c.side and not c.figure), None)
+    if first is not None and not labels["policy"] and not labels["task"]:
+        of_rates = first.place == 0 and _holds_rates(sheet)
+        if _is_text(sheet, first) and (of_rates or not first.name):
+            _label(sheet, labels, "policy", first)
     columns, rest_is = _value_columns(sheet, labels)
     sheet.read |= {column.place for column in columns}
+    is_said = labels["policy"] is not None and labels["policy"].label == "policy"
+    are_rows = _holds_rates(sheet) and not _are_apart(sheet, labels) and not is_said
+    if are_rows:
+        sheet.found.doubts.append("rows of one name are read as different policies")
     values = []
     for number, cells in sheet.lines:
         about = {label: cells[c.place] if c else "" for label, c in labels.items()}
+        about["policy"] += f" row {number}" if are_rows else ""
         for column in columns:
             values.append(_value(sheet, number, cells, column, about, rest_is))
     return values
+
+
+def _measured(sheet: Sheet, label: str) -> Column | None:
+    """Return the one column of progress or of time, where its cells are that."""
+    these = [column for column in sheet.columns if column.label == label]
+    is_ours = is_share if label == "progress" else is_number
+    fits = [c for c in these if all(is_ours(t) or t in UNKNOWN for t in sheet.cells(c))]
+    return fits[0] if len(these) == 1 and fits else None
+
+
+def _label(sheet: Sheet, labels: dict[str, Column | None], label: str, column: Column) -> None:
+    which = "first column" if column.place == 0 else repr(column.name)
+    labels[label] = column
+    sheet.read.add(column.place)
+    sheet.found.notes.append(f"{which} read as {label}")
+
+
+def _holds_rates(sheet: Sheet) -> bool:
+    """Whether each row has both sides, and rates of several trials."""
+    sided = [column for column in sheet.columns if column.side and not column.label]
+    figures = [_figure(text) for column in sided for text in sheet.cells(column)]
+    several = any(f and (f.n or f.percent or (f.number and f.answer is None)) for f in figures)
+    return several and len({column.side for column in sided}) > 1
+
+
+def _are_apart(sheet: Sheet, labels: dict[str, Column | None]) -> bool:
+    """Whether names tell all rows apart, if need be with those of a further column."""
+    named = [labels[name] for name in NAMED if labels[name]]
+    free = [c for c in sheet.columns if c.name and not c.label and c.place not in sheet.read]
+    for more in (None, *(c for c in free if _is_text(sheet, c) and not labels["condition"])):
+        keys = [tuple(cells[c.place] for c in (*named, more) if c) for _, cells in sheet.lines]
+        if len(set(keys)) == len(keys):
+            if more is not None:
+                _label(sheet, labels, "condition", more)
+            return True
+    return False
 
 
 def _is_text(sheet: Sheet, column: Column) -> bool:
@@ -410,6 +471,9 @@ def _trial_rows(sheet: Sheet, values: Sequence[Value]) -> list[SourceRow]:
         name = value.column.name if len(columns) > 1 and not paired else ""
         texts = rows.setdefault((value.row, name), {"stand_in": stand_in})
         texts |= {label: value.labels[label] for label in (*NAMED, "start_id")}
+        if not name:  # of several trials in one row nobody knows whose it is
+            texts |= {label: value.labels[label] for label in MEASURED}
+            sheet.read |= {c.place for c in sheet.columns if value.labels.get(c.label)}
         texts["task"] = texts["task"] or sheet.path.stem
         trial = value.labels["trial"]
         if trial or name:

@@ -15,6 +15,7 @@ from evaluator.compare.policies import (
     compare_policies,
     comparison_part,
     notes_of_trials,
+    refuse_changed,
     void_starts,
 )
 from evaluator.compare.regret import regret_results
@@ -40,6 +41,7 @@ def compare_rows(
         return empty
     for kind in ("task", "condition", "policy"):
         refuse_alike(kind, ((getattr(row, kind), row.episode) for row in rows))
+    refuse_changed((row.episode, row.policy, row.checkpoint) for row in rows)
     rates = side_rates(rows)
     groups = rate_groups(rows, rates)
     # A run may lack its replays, which is told; a table without a twin is none of a twin.

@@ -13,9 +13,9 @@ from bridge.errors import UsageError
 from bridge.exchange.table_text import (
     AS_SAVED,
     ENDED,
+    MEASURED,
     OUTCOME_LIKE,
     UNKNOWN,
-    TableError,
     TableOptions,
     TableText,
     answer_of,
@@ -33,7 +33,8 @@ from bridge.exchange.trials_csv import (
 from bridge.exchange.trials_rates import COLUMNS as RATE_COLUMNS
 from bridge.exchange.trials_rates import RateRecord
 from evaluator.compare.found_table import read_found
-from evaluator.compare.table_words import KNOWN
+from evaluator.compare.policies import refuse_changed
+from evaluator.compare.table_words import KNOWN, is_number, is_share
 
 PUBLISHED = "a published table"
 
@@ -75,33 +76,34 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
 def _refuse_changed(table: TableText) -> None:
     """Refuse a policy that was another checkpoint before: one name would stand for both."""
     plain = list(map(plain_name, table.header))
-    if not {"policy", "checkpoint"} <= set(plain):
-        return
-    seen: dict[str, tuple[str, int]] = {}
-    for number, cells in table.grid[1:]:
-        whole = [*cells, *[""] * len(plain)]
-        policy, checkpoint = (whole[plain.index(name)].strip() for name in ("policy", "checkpoint"))
-        first, row = seen.setdefault(policy, (checkpoint, number)) if checkpoint else ("", 0)
-        if first != checkpoint:
-            raise TableError(
-                path=table.path,
-                row=number,
-                found=f"policy {policy!r} is checkpoint {checkpoint!r}, in row {row} {first!r}",
-                hint="Give each checkpoint a policy name of its own, or leave the column out",
-            )
+    if {"policy", "checkpoint"} <= set(plain):
+        places = [plain.index(name) for name in ("policy", "checkpoint")]
+        rows = (
+            (f"{table.path} row {n}", [*cells, *[""] * len(plain)]) for n, cells in table.grid[1:]
+        )
+        refuse_changed((where, *(row[p].strip() for p in places)) for where, row in rows)
 
 
 def _with_outcome(table: TableText, options: TableOptions) -> TableOptions:
-    """Map the one column that is called an outcome, and holds nothing but yes and no."""
-    named = [name for name in table.left if plain_name(name) in OUTCOME_LIKE]
-    if "recorded" in table.header or len(named) != 1:
-        return options
-    place = table.header.index(named[0])
-    texts = [cells[place] for _, cells in table.grid[1:] if place < len(cells)]
-    if not all(t.strip().lower() in (*UNKNOWN, *ENDED) or answer_of(t) is not None for t in texts):
-        return options
-    mapped = ",".join(filter(None, (options.map, f"outcome={named[0]}")))
-    return replace(options, map=mapped)
+    """Map the one column that is called an outcome, and one of progress and of time, by content."""
+    found = [options.map] if options.map else []
+    for ours, names, is_ours in (
+        ("recorded", OUTCOME_LIKE, _is_answer),
+        ("progress", MEASURED["progress"], is_share),
+        ("time_s", MEASURED["time_s"], is_number),
+    ):
+        named = [name for name in table.left if plain_name(name) in names]
+        if ours in table.header or len(named) != 1:
+            continue
+        place = table.header.index(named[0])
+        texts = [cells[place].strip().lower() for _, cells in table.grid[1:] if place < len(cells)]
+        if all(text in UNKNOWN or is_ours(text) for text in texts):
+            found.append(f"{ours}={named[0]}")
+    return replace(options, map=",".join(found))
+
+
+def _is_answer(text: str) -> bool:
+    return text in ENDED or answer_of(text) is not None
 
 
 def ranges(rates: Sequence[RateRecord]) -> str:

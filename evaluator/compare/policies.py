@@ -7,6 +7,7 @@ its cause void: a policy that trips the arm must not gain by it.
 """
 
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +18,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from bridge.episode.catalogue_query import UNLABELLED
+from bridge.errors import UsageError
 from bridge.task.protocol import VOID_CAUSES, Protocol
+from evaluator.compare.beside import MEASURES, Measure
 from evaluator.compare.measure import Part, ends, measured
 from evaluator.compare.rows import RateGroup, TrialRow, in_order
 from evaluator.compare.success import CONDITION_OF_ARM, WITH, WITHOUT
@@ -111,6 +114,31 @@ class Try(NamedTuple):
     succeeded: bool
     has_outcome: bool
     row: TrialRow
+
+
+_HASHES = re.compile(r"\b(server|code|map)=(\S+)")
+"""What a rollout says of who acted, beside or instead of a checkpoint."""
+
+
+def refuse_changed(named: Iterable[tuple[str, str, str]]) -> None:
+    """Refuse a policy that was another checkpoint before: one name would stand for both.
+
+    Args:
+        named: Where it stands, the policy, and who acted.
+
+    Raises:
+        UsageError: Naming both, and where they stand.
+    """
+    seen: dict[tuple[str, str], tuple[str, str]] = {}
+    for where, policy, who in named:
+        parts = {**dict(_HASHES.findall(who)), "checkpoint": _HASHES.sub("", who).strip()}
+        for part, now in parts.items():
+            first, place = seen.setdefault((policy, part), (now, where)) if now else ("", "")
+            if policy and now and first != now:
+                raise UsageError(
+                    f"{where}: policy {policy!r} is {part} {now!r}, in {place} {first!r}. Give "
+                    "each checkpoint a policy name of its own, or leave one of them out."
+                )
 
 
 def made_trials(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[TrialRow]:
@@ -334,6 +362,8 @@ class Answer:
     without_these: float | None = None
     """The difference if they did not count."""
     episodes: tuple[str, ...] = field(default=(), repr=False)
+    beside: tuple[str, ...] = ()
+    """What progress and time to success say."""
 
     @property
     def _without_these(self) -> str:
@@ -342,7 +372,11 @@ class Answer:
 
     @property
     def sentence(self) -> str:
-        """The answer in words."""
+        """The answer in words, and what stands beside it."""
+        return "; ".join((self._of_success, *self.beside))
+
+    @property
+    def _of_success(self) -> str:
         first, second = self.question.names
         (k, n), (j, m) = self.counts
         pairs = self.reading.evidence.pairs
@@ -426,7 +460,37 @@ def compare_policies(
     readings = [case.course.read(plan) for case in primary]
     readings += with_holm(others, plan, lambda share, case: case.course.read(share))
     readings += with_holm(parts, of_task, lambda share, case: case.course.read(share))
-    return [_answer(c, r) for c, r in zip((*primary, *others, *parts), readings, strict=True)]
+    beside = _beside(asked, plan)
+    return [
+        _answer(case, reading, beside.get(id(case), ()))
+        for case, reading in zip((*primary, *others, *parts), readings, strict=True)
+    ]
+
+
+def _beside(cases: Sequence["_Case"], plan: Plan) -> dict[int, tuple[str, ...]]:
+    """Compare progress and time to success over all tasks; these share another alpha."""
+    asked: list[tuple[_Case, Measure, Course]] = []
+    for case in cases:
+        sides = [[t.row for t in case.tries if t.is_second == second] for second in (False, True)]
+        for measure in MEASURES:
+            if not all(map(measure.is_recorded, sides)):
+                continue
+            tries = []
+            for first, second, won in measure.pairs([(t.is_second, t.row) for t in case.tries]):
+                for row, is_second in ((first, False), (second, True)):
+                    start, better = str(len(tries) // 2), won > 0 if is_second else won < 0
+                    row = replace(row, start_positions_m={})  # noqa: PLW2901
+                    tries.append(Try(row.task, start, is_second, better, True, row))
+            asked.append((case, measure, Course.of(tries, plan)))
+    found: dict[int, tuple[str, ...]] = {}
+    readings = with_holm(asked, plan, lambda share, each: each[2].read(share))
+    for (case, measure, _), reading in zip(asked, readings, strict=True):
+        strata = reading.evidence.strata
+        counts = (sum(s.improved for s in strata), sum(s.worsened for s in strata))
+        sides = [[t.row for t in case.tries if t.is_second == second] for second in (True, False)]
+        words = measure.sentence(sides, counts, reading.evidence.pairs, decided=reading.better != 0)
+        found[id(case)] = (*found.get(id(case), ()), words)
+    return found
 
 
 class _Case(NamedTuple):
@@ -447,7 +511,7 @@ def plan_of(protocol: Protocol | None, *, of_task: bool = False) -> Plan:
     return Plan(pairs=max(4, pairs), locked=not protocol.edited, alpha=protocol.alpha)
 
 
-def _answer(case: _Case, reading: Reading) -> Answer:
+def _answer(case: _Case, reading: Reading, beside: tuple[str, ...] = ()) -> Answer:
     sides = [[t for t in case.tries if t.is_second == second] for second in (False, True)]
     counts = [(sum(t.succeeded for t in side), len(side)) for side in sides]
     unknown = [sum(not t.has_outcome for t in side) for side in sides]
@@ -462,6 +526,7 @@ def _answer(case: _Case, reading: Reading) -> Answer:
         no_outcome=(unknown[0], unknown[1]),
         without_these=known.difference if known is not None and known.pairs else None,
         episodes=tuple(each.row.episode for each in case.tries),
+        beside=beside,
     )
 
 
@@ -532,8 +597,8 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         title="Which is better, as recorded",
         note=f"Group-sequential score test, {words}, extended by doubling; alpha {plan.alpha:g} "
         "holds however often one looks. All questions share it (Holm), a primary one has it alone, "
-        "and the same in each task share another. Intervals hold at every look. Trials without an "
-        "outcome are failures.",
+        "the same in each task share another, progress and time to success a third. Intervals hold "
+        "at every look. Trials without an outcome are failures.",
     )
     return Part(
         measurements=tuple(_measured(each) for each in answers),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bridge.errors import UsageError
-from bridge.exchange.table_text import ENDED, UNKNOWN, answer_of
+from bridge.exchange.table_text import ENDED, MEASURED, UNKNOWN, answer_of
 
 LABELS = {
     "task": "task tasks task_name scenario scenarios aufgabe tache experiment benchmark env",
@@ -16,12 +16,13 @@ LABELS = {
     "trial": "trial trial_id trial_number episode episode_id rollout attempt id nr versuch essai",
     "start_id": "start_id start initial_condition init_state",
     "unit": "unit",
+    **{ours: " ".join(names) for ours, names in MEASURED.items()},
     "side": "side domain environment sim_or_real real_or_sim where seite",
 }
 """Our name of a column that says what a row is about, and other people's."""
 SIDE_WORDS = {
     "real": "real real_world realworld real_robot robot hardware recorded physical reell reel",
-    "sim": "sim simulation simulated simulator twin digital_twin simuliert simule",
+    "sim": "sim simulation simulated simulator twin digital_twin simuliert simule wm world_model",
     "stand-in": "stand_in standin",
 }
 FIGURE_WORDS = {
@@ -32,6 +33,18 @@ FIGURE_WORDS = {
     "percent": "rate_percent success_rate_percent sr_percent percent pct prozent",
     "outcome": "outcome result results success succeeded erfolg succes resultat ergebnis recorded",
 }
+TRANSLATED = {
+    "仿真": "sim",
+    "真实世界": "real",
+    "真机": "real",
+    "真实": "real",
+    "成功率": "success rate",
+    "方法": "method",
+    "任务": "task",
+}
+"""Words of a script without blanks between them, each as one of the above."""
+AXES = ("x", "y")
+"""Said of which axis of a figure a column is, and nothing more."""
 SUMMARIES = "average avg mean overall total mittel mittelwert durchschnitt gesamt moyenne"
 """Rows and columns that begin so sum up the others."""
 BESIDE = (
@@ -108,15 +121,22 @@ def read_name(place: int, levels: Sequence[str]) -> Column:
     """Say what a column holds; ``levels`` are its names from the top row of the header down."""
     parts = list(dict.fromkeys(part for part in levels if part))
     name = " ".join(parts)
-    whole = folded(parts[-1]) if parts else ""
-    if whole in _LABEL and all(folded(part) in _LABEL for part in parts):
+    whole = folded(_translated(parts[-1])) if parts else ""
+    if whole in _LABEL and all(folded(_translated(part)) in _LABEL for part in parts):
         return Column(place=place, name=name, label=_LABEL[whole])
     side = figure = ""
     n: int | None = None
     rest: list[str] = []
-    if len(set(filter(None, (_SIDE.get(folded(w)) for w in re.split(r"[\W_]+", name))))) > 1:
+    if (
+        len(
+            set(
+                filter(None, (_SIDE.get(folded(w)) for w in re.split(r"[\W_]+", _translated(name))))
+            )
+        )
+        > 1
+    ):
         return Column(place=place, name=name, rest="difference")
-    for part in parts:
+    for part in map(_translated, parts):
         inside = _N_INSIDE.search(part)
         if inside:
             n, part = int(inside[1]), _N_INSIDE.sub(" ", part)  # noqa: PLW2901
@@ -125,8 +145,14 @@ def read_name(place: int, levels: Sequence[str]) -> Column:
         for a_side, a_figure, left in found or [_sorted_out(words, " ")]:
             side = side or a_side
             figure = a_figure if a_figure == "percent" or not figure else figure
-            rest += [left] if left else []
+            rest += [left] if left and folded(left) not in AXES else []
     return Column(place=place, name=name, side=side, figure=figure, rest=" ".join(rest), n=n)
+
+
+def _translated(name: str) -> str:
+    for word, ours in TRANSLATED.items():
+        name = name.replace(word, f" {ours} ")
+    return name.strip()
 
 
 def _known(words: Sequence[str]) -> tuple[str, str, str]:
@@ -186,6 +212,7 @@ _SPREAD = re.compile(rf"\s*(?:±|\+/?-|\\pm)\s*(?:{_NUMBER})\s*%?$")
 _SHARE = re.compile(rf"({_NUMBER})\s*(%?)")
 _COUNT = re.compile(r"(\d+)\s*(?:/|of|out of|von|sur)\s*(\d+)", re.IGNORECASE)
 _BOTH = re.compile(rf"({_NUMBER})\s*%\s*\(({_COUNT.pattern})\)", re.IGNORECASE)
+_TURNED = re.compile(rf"({_COUNT.pattern})\s*\(({_NUMBER})\s*%\)", re.IGNORECASE)
 _DATE = re.compile(
     r"\d{1,2}[-. ]\s?[A-Za-zäé]{3,9}\.?|[A-Za-zäé]{3,9}[-. ]\d{1,4}|\d{4}-\d\d-\d\d.*"
     r"|\d{1,2}[./]\d{1,2}[./]\d{2,4}|\d{1,2}:\d\d(:\d\d)?"
@@ -202,7 +229,8 @@ def read_cell(row: int, text: str) -> Figure | None:
     Raises:
         CellError: For a text that is neither a share, nor a count, nor an answer.
     """
-    cut = _SPREAD.sub("", text.strip())
+    cut = _SPREAD.sub("", unicodedata.normalize("NFKC", text).strip())
+    cut = _TURNED.sub(r"\4% (\1)", cut)
     if cut.lower() in UNKNOWN:
         return None
     if both := _BOTH.fullmatch(cut):
@@ -224,6 +252,17 @@ def read_cell(row: int, text: str) -> Figure | None:
     if _DATE.fullmatch(cut):
         raise CellError("is a date or a time; a spreadsheet makes one of 7/10: write '7 of 10'")
     raise CellError("is neither a rate, nor a count, nor an answer")
+
+
+def is_number(text: str) -> bool:
+    """Whether a cell is a plain number."""
+    return re.fullmatch(_NUMBER, text.strip()) is not None
+
+
+def is_share(text: str) -> bool:
+    """Whether a cell is a part of 1, or percent with their sign; 3 of some scale is neither."""
+    found = _SHARE.fullmatch(text.strip())
+    return found is not None and (bool(found[2]) or float(found[1].replace(",", ".")) <= 1)
 
 
 def _pointed(text: str, *, percent: bool = False) -> str:

@@ -145,6 +145,7 @@ def _row(
         study_arm=info.study_arm,
         why_unknown=_why_unknown(outcome),
         policy=info.policy,
+        checkpoint=info.checkpoint,
         start_id=info.start_id,
         cell=info.cell,
         stand_in=info.stand_in,

@@ -5,8 +5,9 @@ which the twin is blind: there it says something that has nothing to do with wha
 thousand populations are drawn once from the prior, each laid out as chances of pairs of rates; what
 was counted weighs them. So one product of two matrices gives the posterior, and equal counts give
 equal numbers. Where fewer than ``FEW`` populations would count, the weights are flattened until so
-many do: intervals are wider then, never narrower than the drawn populations can tell. Groups that
-share tasks or policies count as fewer, by how much their rates have in common.
+many do: intervals are wider then, never narrower than the drawn populations can tell; the weights
+as they are tell which group is blind. Groups that share tasks or policies count as fewer, by how
+much their rates have in common.
 """
 
 from collections.abc import Hashable, Sequence
@@ -14,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 from scipy.special import betainc, expit, ndtr, ndtri
 
 from evaluator.errors import UndefinedStatisticError
@@ -33,6 +34,10 @@ MOST = 100
 """A larger side is taken as one of so many trials: its rate is as good as known then."""
 AT_END = 0.02
 """An interval that ends this close to 1 or -1 holds it: no population was drawn at the end."""
+BEYOND, TOWARD_0 = 0.005, 0.04
+"""Chances outside an interval of r, away from 0 and towards it, where its sign is certain: few
+groups say less of how strong a correlation is than of its sign. Less where it is not."""
+TAIL = (1 - LEVEL) / 2
 QUADRATURE = np.linspace(-3.4, 3.4, 21)
 
 
@@ -58,62 +63,57 @@ class GroupCounts:
         return recorded, (self.sim[0] + both + only_sim, self.sim[1] + n)
 
 
+Side = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Middle, size and bend of a curve of log-odds, one of each population."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Populations:
     """Populations drawn from the prior."""
 
     seeing: Float32[np.ndarray, "nodes cells"]
     """Chance of each pair of cells, recorded by twin, where the twin is not blind."""
-    recorded: Float32[np.ndarray, "nodes rates"]
-    blind: Float32[np.ndarray, "nodes rates"]
-    """Of what a blind twin says."""
+    may_be_blind: Int64[np.ndarray, " some"]
+    """Populations with a share of blind groups."""
+    blind: Float32[np.ndarray, "some cells"]
+    """The same chances in these, where the twin is blind."""
     share: Float64[np.ndarray, " nodes"]
     """Of groups in which it is blind."""
     r: Float64[np.ndarray, " nodes"]
     bias: Float64[np.ndarray, " nodes"]
 
+    @cached_property
+    def orders(self) -> dict[str, np.ndarray]:
+        """How r, bias and share are sorted."""
+        return {n: np.argsort(getattr(self, n), kind="stable") for n in ("r", "bias", "share")}
 
-@lru_cache(maxsize=2)
-def _drawn(nodes: int = NODES, seed: int = 0) -> _Populations:
-    rng = np.random.default_rng(seed)
+
+@lru_cache(maxsize=1)
+def _drawn(nodes: int = NODES) -> _Populations:
+    rng = np.random.default_rng(0)
     z, u = rng.standard_normal((nodes, 8)), rng.random((nodes, 5))
     recorded_at = 1.6 * z[:, 0]
-    sim_at = recorded_at + 1.2 * z[:, 1]
     size = np.maximum(np.abs(2 * z[:, 2]), 0.02)
     sim_size = np.maximum(size * np.exp(0.5 * z[:, 3]), 0.02)
     rho = np.sin(np.pi * (u[:, 0] - 0.5))
     share = np.where(u[:, 1] < 0.5, 0.0, 0.5 * u[:, 2])
-    bends = (
-        np.where(u[:, 3] < 0.6, 0.0, u[:, 3] * 0.95),
-        np.where(u[:, 4] < 0.6, 0.0, u[:, 4] * 0.95),
-    )
-    blind_at, blind_size = 2 * z[:, 4], np.maximum(np.abs(z[:, 5]), 0.05)
-    sides = [
-        _masses(at, spread, bend)
-        for at, spread, bend in (
-            (recorded_at, size, bends[0]),
-            (sim_at, sim_size, bends[1]),
-            (blind_at, blind_size, np.zeros(nodes)),
-        )
-    ]
-    (x, middle_x), (y, middle_y), (blind, _) = sides
+    bends = np.where(u[:, 3:] < 0.6, 0.0, u[:, 3:] * 0.95).T
+    recorded: Side = (recorded_at, size, bends[0])
+    sim: Side = (recorded_at + 1.2 * z[:, 1], sim_size, bends[1])
+    blind: Side = (2 * z[:, 4], np.maximum(np.abs(z[:, 5]), 0.05), np.zeros(nodes))
+    (x, middle_x), (y, middle_y), (of_blind, _) = (_masses(*s) for s in (recorded, sim, blind))
     near = np.clip(rho, -0.97, 0.97)[:, None, None]
     a, b = middle_x[:, :, None], middle_y[:, None, :]
     seeing = np.exp(-(near**2 * (a * a + b * b) - 2 * near * a * b) / (2 * (1 - near**2)))
     seeing *= x[:, :, None] * y[:, None, :]
     seeing /= seeing.sum(axis=(1, 2), keepdims=True)
-    r, bias = _moments(
-        (recorded_at, size, bends[0]),
-        (sim_at, sim_size, bends[1]),
-        rho,
-        share,
-        blind_at,
-        blind_size,
-    )
+    rows = np.flatnonzero(share)
+    pairs = seeing[rows].sum(axis=2)[:, :, None] * of_blind[rows, None, :]
+    r, bias = _moments(recorded, sim, blind, rho, share)
     return _Populations(
         seeing=seeing.reshape(nodes, -1).astype(np.float32),
-        recorded=seeing.sum(axis=2).astype(np.float32),
-        blind=blind.astype(np.float32),
+        may_be_blind=rows,
+        blind=pairs.reshape(len(rows), -1).astype(np.float32),
         share=share,
         r=r,
         bias=bias,
@@ -141,16 +141,8 @@ def _masses(at: np.ndarray, size: np.ndarray, bend: np.ndarray) -> tuple[np.ndar
     return np.diff(below, axis=1) + 1e-12, middle
 
 
-Side = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
 def _moments(
-    recorded: Side,
-    sim: Side,
-    rho: np.ndarray,
-    share: np.ndarray,
-    blind_at: np.ndarray,
-    blind_size: np.ndarray,
+    recorded: Side, sim: Side, blind: Side, rho: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Correlation and mean difference of both rates in each population."""
     w = np.exp(-0.5 * QUADRATURE**2)
@@ -162,7 +154,7 @@ def _moments(
     other = rho[:, None, None] * z[:, :, None] + np.sqrt(1 - rho**2)[:, None, None] * z[:, None, :]
     y = expit(at[:, None, None] + size[:, None, None] * _bent(other, bend))
     given = y @ w
-    of_blind = expit(blind_at[:, None] + blind_size[:, None] * z)
+    of_blind = expit(blind[0][:, None] + blind[1][:, None] * z)
     mean_x, square_x = x @ w, x**2 @ w
     mean_y = (1 - share) * (given @ w) + share * (of_blind @ w)
     square_y = (1 - share) * ((y**2 @ w) @ w) + share * (of_blind**2 @ w)
@@ -177,8 +169,6 @@ class GapModel:
     """What some groups say of the population that they are from."""
 
     groups: tuple[GroupCounts, ...]
-    nodes: int = NODES
-    seed: int = 0
     weights: Float64[np.ndarray, " nodes"] = field(init=False, repr=False)
     blind_groups: Float64[np.ndarray, " groups"] = field(init=False, repr=False)
     """Probability of each group that the twin is blind in it."""
@@ -198,23 +188,20 @@ class GapModel:
             raise UndefinedStatisticError(statistic="model of agreement", reason=reason)
         there = self.populations
         odds = common_log_odds(self.groups)
-        table = np.stack([_likelihood(group, odds) for group in self.groups])
-        seeing = there.seeing @ table.reshape(len(table), -1).T.astype(np.float32)
-        rows = np.flatnonzero(there.share)
-        blind_pairs = there.recorded[rows, :, None].astype(np.float64) * there.blind[rows, None, :]
-        blind = np.zeros(seeing.shape)
-        blind[rows] = blind_pairs.reshape(len(rows), -1) @ table.reshape(len(table), -1).T
+        seeing, blind = chances_in(there, [_likelihood(group, odds) for group in self.groups])
         share = there.share[:, None]
         chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
         logs = np.log(chance).sum(axis=1) / self.design_effect
         weights = _flattened(logs)
         object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "blind_groups", weights @ (share * blind / chance))
+        # Flat weights would see scatter in place of groups that lie apart from the others.
+        sharp = _flattened(logs, few=1.0)
+        object.__setattr__(self, "blind_groups", sharp @ (share * blind / chance))
 
     @property
     def populations(self) -> _Populations:
         """The populations that are weighed."""
-        return _drawn(self.nodes, self.seed)
+        return _drawn()
 
     @cached_property
     def design_effect(self) -> float:
@@ -226,10 +213,12 @@ class GapModel:
             found += max(_shared(names, side) for side in rates.T)
         return found
 
-    @property
+    @cached_property
     def r(self) -> Interval:
         """Correlation of true rates over all groups of this kind."""
-        low, high = self._ends(self.populations.r)
+        above = float(self.weights @ (self.populations.r > 0))
+        below, beyond = (BEYOND + (TOWARD_0 - BEYOND) * sure**3 for sure in (above, 1 - above))
+        low, high = self._ends("r", below, beyond)
         return Interval(
             low=-1.0 if low < AT_END - 1 else low,
             high=1.0 if high > 1 - AT_END else high,
@@ -240,23 +229,33 @@ class GapModel:
     @property
     def bias(self) -> Interval:
         """Mean of the twin's rate - recorded rate over all groups of this kind."""
-        low, high = self._ends(self.populations.bias)
+        low, high = self._ends("bias")
         return Interval(low=low, high=high, level=LEVEL, method=METHOD)
 
     @property
     def blind_share(self) -> tuple[float, Interval]:
         """Share of groups of this kind in which the twin is blind: mean and interval."""
         share = self.populations.share
-        low, high = self._ends(share)
+        low, high = self._ends("share")
         found = Interval(low=low, high=high, level=LEVEL, method=METHOD)
         return float(self.weights @ share), found
 
-    def _ends(self, values: Float64[np.ndarray, " nodes"]) -> tuple[float, float]:
-        order = np.argsort(values, kind="stable")
+    def _ends(self, what: str, below: float = TAIL, beyond: float = TAIL) -> tuple[float, float]:
+        order = self.populations.orders[what]
+        values = getattr(self.populations, what)
         middle = np.cumsum(self.weights[order]) - self.weights[order] / 2
-        tail = (1 - LEVEL) / 2
-        low, high = np.interp([tail, 1 - tail], middle, values[order])
+        low, high = np.interp([below, 1 - beyond], middle, values[order])
         return float(low), float(high)
+
+
+def chances_in(
+    there: _Populations, tables: Sequence[np.ndarray]
+) -> tuple[Float32[np.ndarray, "nodes groups"], Float32[np.ndarray, "nodes groups"]]:
+    """Return the chance of each group's counts where the twin sees, and where it is blind."""
+    chances = np.stack([table.ravel() for table in tables], axis=1).astype(np.float32)
+    blind = np.zeros((len(there.share), len(tables)), dtype=np.float32)
+    blind[there.may_be_blind] = there.blind @ chances
+    return there.seeing @ chances, blind
 
 
 def _shared(names: Sequence[Hashable], rates: Float64[np.ndarray, " groups"]) -> float:
@@ -273,13 +272,15 @@ def _shared(names: Sequence[Hashable], rates: Float64[np.ndarray, " groups"]) ->
     return float((many - 1) * variance / max(variance + inside, 1e-12))
 
 
-def _flattened(logs: Float64[np.ndarray, " nodes"]) -> Float64[np.ndarray, " nodes"]:
+def _flattened(
+    logs: Float64[np.ndarray, " nodes"], few: float = FEW
+) -> Float64[np.ndarray, " nodes"]:
     """Return weights of sum 1, flattened by a power until enough populations count."""
     power, weights = 1.0, logs
     for _ in range(60):
         weights = np.exp(power * (logs - logs.max()))
         weights /= weights.sum()
-        if 1 / (weights**2).sum() >= FEW:
+        if 1 / (weights**2).sum() >= few:
             break
         power *= 0.9
     return np.asarray(weights)

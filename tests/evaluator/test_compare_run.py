@@ -13,7 +13,7 @@ from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import PathNotFoundError
+from bridge.errors import PathNotFoundError, UsageError
 from bridge.media.color import encode_jpeg
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, TrialRow, compare_run
@@ -93,6 +93,16 @@ def test_only_the_plan_that_was_sent_counts(maker: Any) -> None:
     assert row.plan_id == "plan_t1"
     assert row.sim_planned is True
     assert (row.num_plans, row.num_plans_sent) == (2, 1)
+
+
+def test_two_checkpoints_recorded_under_one_name_end_it_with_both_named(maker: Any) -> None:
+    maker.trial("first", tags=("monday", "checkpoint:step 40000"))
+    maker.trial("unsaid")
+    assert row_of(compare_run(maker.run), "first").checkpoint == "step 40000"
+    maker.trial("second", tags=("checkpoint:step 50000",))
+    words = "second: policy 'scripted' is checkpoint 'step 50000', in first 'step 40000'"
+    with pytest.raises(UsageError, match=words):
+        compare_run(maker.run)
 
 
 def test_a_trial_whose_plans_were_not_sent_executed_nothing(maker: Any) -> None:

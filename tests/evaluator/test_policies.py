@@ -1,6 +1,7 @@
 """Which candidate is better: what is a pair, who may be best, and that advice may be followed."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.exchange.table_text import TableError
+from bridge.errors import UsageError
 from evaluator.compare import Comparison, compare_csv
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.policies import (
@@ -223,9 +224,30 @@ def test_a_checkpoint_that_changed_under_one_name_is_refused(tmp_path: Path) -> 
     path.write_text("\n".join(lines) + "\n")
     assert [row.policy for row in compare_csv(path).rows] == ["ACT", "ACT"]
     path.write_text("\n".join([*lines, "3,cup,ACT,b2,yes"]) + "\n")
-    message = r"row 4: policy 'ACT' is checkpoint 'b2', in row 2 'a1'. Give each checkpoint"
-    with pytest.raises(TableError, match=message):
+    message = r"row 4: policy 'ACT' is checkpoint 'b2', in .*trials.csv row 2 'a1'. Give each"
+    with pytest.raises(UsageError, match=message):
         compare_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "words"),
+    [
+        ("a1", "b2", "policy 'A' is checkpoint 'b2', in .* 'a1'"),
+        ("a1 map=07", "a1 map=08", "policy 'A' is map '08', in .* '07'"),
+        ("server=0a map=07", "server=0b map=07", "policy 'A' is server '0b', in .* '0a'"),
+        ("a1", "code=m:f map=07", ""),  # nothing that both say differs
+        ("a1", "", ""),
+    ],
+)
+def test_who_acted_may_not_change_under_one_name(first: str, second: str, words: str) -> None:
+    rows = interleaved(CLEAR)
+    mine = [row for row in rows if row.policy == "A"]
+    rows = [*rows, replace(mine[0], episode="before", checkpoint=first)]
+    rows.append(replace(mine[1], episode="after", checkpoint=second))
+    with nullcontext() if not words else pytest.raises(UsageError, match=f"after: {words}"):
+        compare_rows(rows, run="r", source="table", stand_in=None)
+    rows[-1] = replace(rows[-1], policy="B")
+    compare_rows(rows, run="r", source="table", stand_in=None)
 
 
 @pytest.fixture
@@ -274,3 +296,70 @@ def test_a_study_without_a_twin_says_nothing_of_a_twin() -> None:
     (success,) = [table for table in found.tables if table.id == "success"]
     assert {row[3] for row in success.rows} == {"recorded"}
     assert front(found.results()).sentences[0].startswith("B is better than A: 30 of 40")
+
+
+def with_measures(count: int = 40, seed: int = 1, gain: float = 0.3) -> list[TrialRow]:
+    """Two policies that succeed alike; B does more of the task, and is done 3 s sooner."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for each in interleaved({name: list(rng.random(count) < 0.5) for name in "AB"}):
+        by = gain if each.policy == "B" else 0.0
+        progress = 1.0 if each.recorded else round(float(rng.random() * 0.5 + by), 3)
+        time_s = float(15 + rng.normal() - 10 * by) if each.recorded else None
+        rows.append(replace(each, progress=progress, time_s=time_s))
+    return rows
+
+
+def test_progress_and_time_stand_beside_the_answer_of_success() -> None:
+    rows = with_measures()
+    answer = only(compare_policies(rows))
+    plain = only(compare_policies([replace(r, progress=None, time_s=None) for r in rows]))
+    assert answer.sentence.startswith(plain.sentence + "; progress ")
+    assert answer.reading == plain.reading
+    first, second = ([r for r in rows if r.policy == name] for name in "AB")
+    both = list(zip(first, second, strict=True))
+    more = sum((b.progress or 0) > (a.progress or 0) for a, b in both)
+    less = sum((b.progress or 0) < (a.progress or 0) for a, b in both)
+    means = [f"{100 * np.mean([r.progress for r in side]):.3g} %" for side in (second, first)]
+    assert f"progress {means[0]} against {means[1]}, more in {more} and less in {less} of 40" in (
+        answer.sentence
+    )
+    sooner = sum(b.time_s < (a.time_s or np.inf) for a, b in both if b.time_s)
+    later = sum(a.time_s < (b.time_s or np.inf) for a, b in both if a.time_s)
+    assert f"sooner in {sooner} and later in {later} of 40 pairs" in answer.sentence
+
+
+def test_progress_that_says_no_more_than_success_is_not_told() -> None:
+    rows = [replace(r, progress=float(bool(r.recorded))) for r in with_measures()]
+    rows = [replace(r, time_s=None) for r in rows]
+    assert only(compare_policies(rows)).beside == ()
+
+
+def test_equal_progress_followed_for_ten_looks_is_decided_in_few_studies() -> None:
+    """Sequential as success is: at most 5 % of equal candidates, however often one looks."""
+    decided = 0
+    for seed in range(150):
+        rows = with_measures(80, seed, gain=0.0)
+        looks = (only(compare_policies(rows[:size])) for size in range(16, 161, 16))
+        decided += any("(decided)" in look.sentence for look in looks)
+    assert decided <= 15  # 5 % of 150 and two standard errors
+
+
+@pytest.mark.parametrize("task", ["task,", ""])
+@pytest.mark.parametrize(
+    ("names", "cells", "found"),
+    [
+        ("score,duration_s", ("0.5", "12.5"), (0.5, 12.5)),
+        ("progress,time_s", ("50 %", "12,5"), (0.5, 12.5)),
+        ("score,time", ("3", "14:05"), (None, None)),
+        ("partial,completion_time_s", ("", ""), (None, None)),
+    ],
+)
+def test_columns_of_progress_and_time_are_read_by_what_they_hold(
+    tmp_path: Path, task: str, names: str, cells: tuple[str, str], found: tuple[float, float]
+) -> None:
+    lines = [f"trial_id;{task.replace(',', ';')}policy;outcome;{names.replace(',', ';')}"]
+    lines += [f"{n};{'cup;' if task else ''}A;yes;{';'.join(cells)}" for n in range(3)]
+    path = tmp_path / "trials.csv"
+    path.write_text("\n".join(lines) + "\n")
+    assert {(row.progress, row.time_s) for row in compare_csv(path).rows} == {found}

@@ -1,14 +1,19 @@
 """The published tables in ``datasets/published``: all are read, and agree with NumPy."""
 
-from collections.abc import Callable
+import re
+import tomllib
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bridge.exchange.table_text import TableError, TableOptions
+from evaluator.compare import compare_csv
 from evaluator.compare.published import SWAPPED, check_published
 from evaluator.compare.rows import RateGroup
+from evaluator.compare.table_words import DoubtfulTableError
 
 FOLDER = Path(__file__).resolve().parents[2] / "datasets" / "published"
 TABLES = sorted(FOLDER.glob("*.csv"))
@@ -93,3 +98,49 @@ def test_a_mean_of_r_per_task_is_told_from_r_over_all_groups(
         "pearson_r a": "as printed",
         "average_percent sim x": "as printed",
     }
+
+
+AS_PRINTED = tomllib.loads((FOLDER / "as_printed" / "sources.toml").read_text())
+
+
+def numbers(path: Path, columns: Sequence[int], scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Both rates of each row in which both stand, read without the reader: counts, else numbers."""
+    found = []
+    for line in path.read_text().splitlines():
+        cells = [c.strip(" *") for c in line.strip("|").split("|" if path.suffix == ".md" else ",")]
+        texts = [cells[place] for place in columns if place < len(cells)]
+        shares = [re.search(r"(\d+)/(\d+)", text) for text in texts]
+        plain = [re.match(r"[\d.]+", text) for text in texts]
+        if len(texts) == 2 and all(plain):
+            found.append(
+                [
+                    int(share[1]) / int(share[2]) if share else float(number[0]) / scale
+                    for share, number in zip(shares, plain, strict=True)
+                    if number
+                ]
+            )
+    return np.array(found)[:, 0], np.array(found)[:, 1]
+
+
+@pytest.mark.parametrize("name", AS_PRINTED)
+def test_a_table_as_it_is_printed_is_read_without_editing(name: str) -> None:
+    source = AS_PRINTED[name]
+    (path,) = (FOLDER / "as_printed").glob(f"{name}.[mc]*")
+    options = TableOptions(yes=source.get("yes", False))
+    if "refused" in source:
+        with pytest.raises(TableError, match=re.escape(source["refused"])):
+            compare_csv(path, options)
+        return
+    if options.yes:  # what is not the only reading waits for a yes
+        with pytest.raises(DoubtfulTableError):
+            compare_csv(path)
+    compared = compare_csv(path, options)
+    results = compared.results()
+    real, sim = numbers(path, source["columns"], source["scale"])
+    np.testing.assert_allclose(rates(compared.groups), (real, sim), atol=1e-9)
+    r = results.get("agreement.pearson_r").value
+    assert r == pytest.approx(np.corrcoef(real, sim)[0, 1], abs=1e-9)
+    mmrv = results.get("agreement.mmrv_recorded_gap").value
+    assert mmrv == pytest.approx(max_violation(real, real, sim), abs=1e-9)
+    if printed := source.get("printed", {}).get("pearson_r"):
+        assert r == pytest.approx(float(printed), abs=0.005)

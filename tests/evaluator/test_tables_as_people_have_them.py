@@ -54,6 +54,47 @@ def counts(task: str, real: str, sim: str, policies: str = "ACT DP") -> Rates:
 
 
 READ: dict[str, tuple[str, Rates | Trials]] = {
+    "count and percent, in wide brackets, and a dash for not tried": (
+        "| Task | Method | Sim Success | Real Success | Gap |\n|---|---|---|---|---|\n"
+        "| Gear | A | 74/80 (92.50%) | 13/20 (65.0%) | -27.50 |\n"
+        "| Gear | B | 80/80 (100.00%) | 25%（5/20） | -75.00 |\n"
+        "| Peg | A | 4/8 (50%) | — | — |\n",
+        {
+            ("Gear", "A", "sim"): (74, 80),
+            ("Gear", "A", "real"): (13, 20),
+            ("Gear", "B", "sim"): (80, 80),
+            ("Gear", "B", "real"): (5, 20),
+            ("Peg", "A", "sim"): (4, 8),
+        },
+    ),
+    "tables of one header below each other": (
+        "**Open the Box**\n\n| 方法 | Sim (%) | Real (%) |\n|---|---|---|\n| A | 95.8 | 21.5 |\n"
+        "| **B** | 84.4 | **82.5** |\n\n**Lift the Lid**\n\n| 方法 | Sim (%) | Real (%) |\n"
+        "|---|---|---|\n| A | 80.1 | 29.9 |\n| **B** | 70.0 | **70.6** |\n",
+        {
+            ("Open the Box", "A", "sim"): Fraction("0.958"),
+            ("Open the Box", "A", "real"): Fraction("0.215"),
+            ("Open the Box", "B", "sim"): Fraction("0.844"),
+            ("Open the Box", "B", "real"): Fraction("0.825"),
+            ("Lift the Lid", "A", "sim"): Fraction("0.801"),
+            ("Lift the Lid", "A", "real"): Fraction("0.299"),
+            ("Lift the Lid", "B", "sim"): Fraction("0.7"),
+            ("Lift the Lid", "B", "real"): Fraction("0.706"),
+        },
+    ),
+    "words without blanks between them": (
+        "| 方法 | 推理时间 (ms) | 仿真成功率 | 真实世界成功率 |\n|---|---|---|---|\n"
+        "| ACT | 225 | 0.48 | 0.69 |\n| DP | 360 | 0.86 | 0.83 |\n",
+        fractions("table", "0.69 0.83", "0.48 0.86"),
+    ),
+    "a first column of another name, and a further side": (
+        "Backbone,real_sr_pct,wm_sr_pct\nACT,12.6,10.8\nDP,12.1,12.3\n",
+        fractions("table", "0.126 0.121", "0.108 0.123"),
+    ),
+    "axes of a figure": (
+        "task,policy,x_real,y_sim,unit_x\ncup,ACT,0.56,0.28,rate\ncup,DP,0.4,0.5,rate\n",
+        fractions("cup", "0.56 0.4", "0.28 0.5"),
+    ),
     "a column outcome": (
         "trial_id,task,policy,start_id,outcome\n1,cup,ACT,s1,success\n2,cup,ACT,s2,failure\n",
         [("cup", "ACT", True, None), ("cup", "ACT", False, None)],
@@ -264,6 +305,16 @@ DOUBTED: dict[str, tuple[str, str, Rates | Trials]] = {
         r"'ACT \(sim\)'",
         {("table", "ACT", "real"): (7, 10), ("table", "ACT (sim)", "real"): (8, 10)},
     ),
+    "rows that share a name": (
+        "colour,real_success,sim_success\npink,0.25,0.5\npink,0.75,0.5\n",
+        "rows of one name are read as different policies",
+        {
+            ("table", "pink row 2", "real"): Fraction(1, 4),
+            ("table", "pink row 2", "sim"): Fraction(1, 2),
+            ("table", "pink row 3", "real"): Fraction(3, 4),
+            ("table", "pink row 3", "sim"): Fraction(1, 2),
+        },
+    ),
     "columns that may be tasks": (
         "policy,side,cup,hook\nACT,real,0.5,0.3\nACT,sim,0.75,0.25\n",
         "'cup', 'hook'",
@@ -442,3 +493,17 @@ def test_nothing_read_ends_with_2(tmp_path: Path, text: str) -> None:
         evaluate(write(tmp_path, text), out=tmp_path / "out")
     assert caught.value.exit_code == 2
     assert not (tmp_path / "out").exists()
+
+
+def test_a_column_that_tells_panels_apart_is_their_condition(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    lines = ["panel,task,policy,real,sim,source", "all,cup,ACT,0.56,0.28,figure 3"]
+    lines += ["all,cup,DP,0.4,0.5,figure 3", "dark,cup,ACT,0.3,0.2,figure 3"]
+    path.write_text("\n".join(lines) + "\n")
+    taken = take(path)
+    assert [(r.condition, r.policy, float(r.rate)) for r in taken.rates if r.side == "real"] == [
+        ("all", "ACT", 0.56),
+        ("all", "DP", 0.4),
+        ("dark", "ACT", 0.3),
+    ]
+    assert "first column read as condition" in taken.summary

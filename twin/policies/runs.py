@@ -8,7 +8,7 @@ from typing import Any
 
 from bridge.episode.catalogue import find_episodes
 from bridge.episode.catalogue_query import CatalogueQuery
-from bridge.episode.metadata import WITH
+from bridge.episode.metadata import CHECKPOINT_TAG, WITH, tagged
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
@@ -17,14 +17,24 @@ from bridge.terminal import Output
 from bridge.whole_file import write_whole
 from twin.policies.config import RolloutConfig
 from twin.policies.mapping import read_mapping
-from twin.policies.rollout import ROLLOUT, RolloutJob, roll_out, row_of_file
+from twin.policies.rollout import HASHES, ROLLOUT, RolloutJob, roll_out, row_of_file
 from twin.policies.starts import trial_episodes
 
 RESULTS = {"success": True, "failure": False}
 """Outcomes that count."""
 TABLE = "rollouts.csv"
-COLUMNS = ("trial_id", "task", "policy", "start_id", "recorded", "sim_planned", "stand_in")
-"""As ``robot-gst evaluate`` reads them; ``sim_planned`` is the rollout in the twin."""
+COLUMNS = (
+    "trial_id",
+    "task",
+    "policy",
+    "start_id",
+    "recorded",
+    "sim_planned",
+    "stand_in",
+    "checkpoint",
+)
+"""As ``robot-gst evaluate`` reads them; ``sim_planned`` is the rollout in the twin, and the
+checkpoint who acted: the recorded trial's in a row of its own where it was another."""
 
 
 def jobs_of(run: RunFolder, config: RolloutConfig) -> Iterator[RolloutJob]:
@@ -97,11 +107,17 @@ def write_table(run: RunFolder) -> Path:
             continue
         key = (row["policy"], row["task"], row["start_id"])
         outcomes, number = recorded.get(key, []), row["number"]
-        outcome = int(outcomes[number]) if number < len(outcomes) else ""  # each counts once
+        outcome, who = outcomes[number] if number < len(outcomes) else ("", "")  # each counts once
         name = f"{row['policy']} {row['start_id']} {number}"
         about = (row["task"], row["policy"], row["start_id"])
-        stand_in = str(row["stand_in"]).lower()
-        rows[row["task"], name] = (name, *about, outcome, int(row["success"]), stand_in)
+        stand_in, acted = str(row["stand_in"]).lower(), row.get("checkpoint", "")
+        if acted.startswith(HASHES):
+            acted = f"{who} {acted}".strip()
+        elif who and not f"{acted} ".startswith(f"{who} "):
+            of_cell = f"{name} recorded"
+            rows[row["task"], of_cell] = (of_cell, *about, outcome, "", stand_in, who)
+            outcome = ""
+        rows[row["task"], name] = (name, *about, outcome, int(row["success"]), stand_in, acted)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerows([COLUMNS, *sorted(rows.values())])
@@ -110,13 +126,15 @@ def write_table(run: RunFolder) -> Path:
     return path
 
 
-def _recorded(run: RunFolder) -> dict[tuple[str, str, str], list[bool]]:
-    """By policy, task and start: the outcomes in the cell, without what replanning added."""
-    found: dict[tuple[str, str, str], list[bool]] = {}
+def _recorded(run: RunFolder) -> dict[tuple[str, str, str], list[tuple[int | str, str]]]:
+    """By policy, task and start: outcomes in the cell and who acted, not what replanning added."""
+    found: dict[tuple[str, str, str], list[tuple[int | str, str]]] = {}
     for trial in find_episodes(run, CatalogueQuery(kind=("trial",), outcome=tuple(RESULTS))):
         if trial.condition != WITH:
             key = (trial.policy, trial.task, trial.start_id or trial.id)
-            found.setdefault(key, []).append(RESULTS[trial.outcome])
+            found.setdefault(key, []).append(
+                (int(RESULTS[trial.outcome]), tagged(trial.tags, CHECKPOINT_TAG))
+            )
     return found
 
 

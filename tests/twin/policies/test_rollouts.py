@@ -25,7 +25,7 @@ from twin.policies.runs import TABLE, describe_rollouts, roll_out_run
 QUIET = Output(quiet=True)
 
 
-def write_trial(run: RunFolder, name: str, start_id: str, **more: str) -> None:
+def write_trial(run: RunFolder, name: str, start_id: str, **more: Any) -> None:
     """A further trial, of which only the metadata counts."""
     with EpisodeWriter(run.episodes_dir / f"{name}.mcap") as writer:
         about = {"task": "cube_into_box", "policy": "Scripted", **more}
@@ -70,6 +70,30 @@ def test_of_several_settings_the_newest_counts(run: RunFolder) -> None:
     roll_out_run(run, config("Scripted", max_s=30.0), QUIET)
     roll_out_run(run, config("Scripted", max_s=1.0), QUIET)  # too short to do it
     assert [trial.sim_planned for trial in read_trials(run.path / TABLE)] == [False, False]
+
+
+def test_who_acted_stands_in_the_table_and_another_checkpoint_apart(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_trial(run, "trial_3", "start 1", tags=("checkpoint:b",))
+    for name in ("trial_1", "trial_3"):
+        label_episode(run, name, Outcome(result="failure"))
+
+    def who(**metadata: str) -> list[tuple[str, int | None, str]]:
+        monkeypatch.setattr(Scripted, "metadata", metadata)
+        roll_out_run(run, config("Scripted", max_s=1.0, times=2, force=True), QUIET)
+        trials = [t for t in read_trials(run.path / TABLE) if t.start_id == "start 1"]
+        return [(t.trial_id[-10:], t.recorded, t.checkpoint) for t in trials]
+
+    (_, first, served), (_, second, both) = who(name="scripted")
+    assert (first, second) == (False, False)
+    assert both == f"b {served}"
+    assert served == who(name="scripted")[0][2] != who(name="another")[0][2]
+    (_, _, mine), (_, alone, same), (name, recorded, other) = who(checkpoint="c")
+    assert mine == same
+    assert mine.startswith("c map=")
+    assert (alone, recorded, other, name[-9:]) == (None, False, "b", " recorded")
+    assert [who(checkpoint="b")[1][place] for place in (1, 2)] == [False, mine.replace("c", "b", 1)]
 
 
 @pytest.mark.parametrize(
