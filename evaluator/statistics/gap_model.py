@@ -201,9 +201,10 @@ class GapModel:
         table = np.stack([_likelihood(group, odds) for group in self.groups])
         seeing = there.seeing @ table.reshape(len(table), -1).T.astype(np.float32)
         rows = np.flatnonzero(there.share)
-        blind_pairs = there.recorded[rows, :, None].astype(np.float64) * there.blind[rows, None, :]
+        recorded, said = (side[rows].astype(np.float64) for side in (there.recorded, there.blind))
         blind = np.zeros(seeing.shape)
-        blind[rows] = blind_pairs.reshape(len(rows), -1) @ table.reshape(len(table), -1).T
+        for place, likely in enumerate(table):
+            blind[rows, place] = ((recorded @ likely) * said).sum(axis=1)
         share = there.share[:, None]
         chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
         logs = np.log(chance).sum(axis=1) / self.design_effect
