@@ -38,7 +38,7 @@ MOST_UNUSED = 0.2
 ABANDONED_S = 3600.0
 """A half-written file this old has lost its writer."""
 SUMMING_UP = {
-    evaluator: ("cache.py", "compare", "metrics", "run_reader"),
+    evaluator: ("cache.py", "compare", "metrics", "run_reader", "statistics"),
     bridge: ("clock.py", "episode", "geometry", "media", "task"),
 }
 """The code that reads episodes and sums them up."""

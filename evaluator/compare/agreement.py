@@ -1,10 +1,12 @@
 """Do the twin's success rates of groups follow the recorded ones, and how far off are they?"""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import lru_cache, partial
+from functools import partial
+from typing import Any
 
+from evaluator.cache import SummaryCache
 from evaluator.compare.measure import measured
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.success import of_group
@@ -23,7 +25,6 @@ from evaluator.measurements import (
 from evaluator.result import Interval, Measurement
 from evaluator.statistics import agreement
 from evaluator.statistics.agreement import counted_groups
-from evaluator.statistics.gap_model import GapModel, GroupCounts
 
 MODEL_FROM = 4
 """Groups from which r and the bias have an interval."""
@@ -48,8 +49,8 @@ def says_nothing(r: Measurement) -> bool:
     return r.interval is not None and r.interval.high - r.interval.low >= SAYS_NOTHING
 
 
-def counts_of(groups: Sequence[RateGroup]) -> tuple[GroupCounts, ...]:
-    """Return what was counted in each group, paired trials apart from those without a partner.
+def counts_of(groups: Sequence[RateGroup]) -> list[dict[str, Any]]:
+    """Return the ``GroupCounts`` of each group, paired trials apart from those without a partner.
 
     Raises:
         UndefinedStatisticError: When a rate has no n.
@@ -67,37 +68,50 @@ def counts_of(groups: Sequence[RateGroup]) -> tuple[GroupCounts, ...]:
                 raise UndefinedStatisticError(statistic="model of agreement", reason=reason)
             paired = (common.k or 0, common.n or 0) if group.trial_table and common else (0, 0)
             counted.append((side.k - paired[0], side.n - paired[1]))
-        found.append(
-            GroupCounts(
-                recorded=counted[0],
-                sim=counted[1],
-                pairs=pairs,
-                shares=(group.task, group.policy, group.condition),
-            )
-        )
-    return tuple(found)
+        shares = (group.task, group.policy, group.condition)
+        found.append({"recorded": counted[0], "sim": counted[1], "pairs": pairs, "shares": shares})
+    return found
 
 
-@lru_cache(maxsize=16)
-def _fitted(counts: tuple[GroupCounts, ...]) -> GapModel:
-    return GapModel(groups=counts)
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """What the model says of some groups; equal counts give the same, so it is kept."""
+
+    r: Interval
+    bias: Interval
+    """Of rates from 0 to 1."""
+    blind_share: tuple[float, Interval]
+    blind_groups: tuple[float, ...]
 
 
-def model_of(groups: Sequence[RateGroup]) -> GapModel:
-    """Return the model of some groups with both rates; equal counts are weighed once.
-
-    Raises:
-        UndefinedStatisticError: Below four groups, or without counts.
-    """
+def _fitted(groups: Sequence[RateGroup], cache: SummaryCache) -> Fitted | str:
+    """Return the model of some groups with both rates, or why there is none."""
     if len(groups) < MODEL_FROM:
-        reason = f"{counted_groups(len(groups))}; it needs {MODEL_FROM}"
-        raise UndefinedStatisticError(statistic="interval over groups", reason=reason)
-    return _fitted(counts_of(groups))
+        return f"{counted_groups(len(groups))}; it needs {MODEL_FROM}"
+
+    def fit() -> tuple[Fitted]:
+        from evaluator.statistics import gap_model  # noqa: PLC0415  # scipy takes a moment
+
+        model = gap_model.GapModel(groups=tuple(gap_model.GroupCounts(**each) for each in counts))
+        blind = tuple(map(float, model.blind_groups))
+        return (
+            Fitted(r=model.r, bias=model.bias, blind_share=model.blind_share, blind_groups=blind),
+        )
+
+    try:
+        counts = counts_of(groups)
+        return cache.kept_or_made(Fitted, repr(counts), fit)[0]
+    except UndefinedStatisticError as error:
+        return error.reason
 
 
-def group_agreement(groups: Sequence[RateGroup]) -> list[Measurement]:
+def group_agreement(
+    groups: Sequence[RateGroup], cache: SummaryCache | None = None
+) -> list[Measurement]:
     """Measure over groups: r, ranks, bias, errors, MMRV, and where the twin may be blind."""
     usable = usable_groups(groups)
+    cache = SummaryCache(None) if cache is None else cache
+    model = _fitted(usable, cache)
     units = sorted({group.unit for group in usable})
     what = f"over groups (task x condition x policy), n = {len(usable)}"
     what += f", rates counted in different units ({', '.join(units)})" if len(units) > 1 else ""
@@ -112,25 +126,21 @@ def group_agreement(groups: Sequence[RateGroup]) -> list[Measurement]:
         reason_without_interval="it is of these groups; r and the bias have intervals over others",
     )
     return [
-        _over_others(PEARSON_R.of(what=what), usable, "r"),
-        *_by_condition(usable),
+        _over_others(PEARSON_R.of(what=what), usable, model, "r"),
+        *_by_condition(usable, cache),
         make(SPEARMAN.of(what=what), lambda: agreement.spearman(recorded, sim)),
-        _over_others(BIAS.of(what=what), usable, "bias"),
+        _over_others(BIAS.of(what=what), usable, model, "bias"),
         make(MAE.of(what=what), lambda: 100 * agreement.mean_absolute_error(**both)),
         make(MMRV_RECORDED.of(what=what), lambda: agreement.mmrv(**both, gap="recorded")),
-        *_blind(usable),
+        *_blind(usable, model),
     ]
 
 
-def _over_others(defined: Defined, groups: Sequence[RateGroup], statistic: str) -> Measurement:
+def _over_others(
+    defined: Defined, groups: Sequence[RateGroup], model: Fitted | str, statistic: str
+) -> Measurement:
     recorded, sim = sides(groups)
-    reason = ""
-    interval: Interval | None = None
-    try:
-        model = model_of(groups)
-        interval = model.r if statistic == "r" else model.bias
-    except UndefinedStatisticError as error:
-        reason = error.reason
+    interval = None if isinstance(model, str) else getattr(model, statistic)
 
     def compute() -> tuple[float, Interval | None]:
         if statistic == "r":
@@ -145,12 +155,12 @@ def _over_others(defined: Defined, groups: Sequence[RateGroup], statistic: str) 
         compute,
         n=len(groups),
         counted="group",
-        reason_without_interval=reason,
+        reason_without_interval=model if isinstance(model, str) else None,
         episodes=[name for group in groups for name in group.episodes],
     )
 
 
-def _by_condition(groups: Sequence[RateGroup]) -> list[Measurement]:
+def _by_condition(groups: Sequence[RateGroup], cache: SummaryCache) -> list[Measurement]:
     conditions = list(dict.fromkeys(group.condition for group in groups))
     if len(conditions) < 2:
         return []
@@ -158,18 +168,16 @@ def _by_condition(groups: Sequence[RateGroup]) -> list[Measurement]:
     for name in conditions:
         mine = [group for group in groups if group.condition == name]
         defined = PEARSON_R_OF_CONDITION.of(what=f"over groups {name} only", condition=name)
-        found.append(_over_others(defined, mine, "r"))
+        found.append(_over_others(defined, mine, _fitted(mine, cache), "r"))
     return found
 
 
-def _blind(groups: Sequence[RateGroup]) -> list[Measurement]:
+def _blind(groups: Sequence[RateGroup], model: Fitted | str) -> list[Measurement]:
     """In how many groups of this kind the twin is blind, and which of these probably are."""
-    try:
-        model = model_of(groups)
-    except UndefinedStatisticError:
+    if isinstance(model, str):
         return []
     found = [measured(BLIND_SHARE.of(), lambda: model.blind_share, n=len(groups), counted="group")]
-    for group, chance in zip(groups, model.blind_groups.tolist(), strict=True):
+    for group, chance in zip(groups, model.blind_groups, strict=True):
         if chance >= LIKELY_BLIND:
             found.append(
                 measured(

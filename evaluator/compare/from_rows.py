@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from bridge.episode.executions import NO_PLAN
 from bridge.task.protocol import VOID_CAUSES, Protocol
+from evaluator.cache import SummaryCache
 from evaluator.compare.agreement import group_agreement, usable_groups
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.conclusions import conclusions_table
@@ -34,6 +35,7 @@ def compare_rows(
     stand_in: bool | None,
     void_causes: Sequence[str] = VOID_CAUSES,
     protocol: Protocol | None = None,
+    cache: SummaryCache | None = None,
 ) -> Comparison:
     """Measure everything that follows from trial rows alone, wherever they came from."""
     empty = Comparison(run=run, source=source, stand_in=stand_in)
@@ -54,7 +56,7 @@ def compare_rows(
     measurements = (
         *rates,
         *(rate for group in groups for rate in (group.sim_common, group.recorded_common) if rate),
-        *((*agreement(rows), *group_agreement(groups)) if has_twin else ()),
+        *((*agreement(rows), *group_agreement(groups, cache)) if has_twin else ()),
         *compared.measurements,
         *regret_results(usable_groups(groups)),
         *baseline_results(rows),

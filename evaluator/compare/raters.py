@@ -64,7 +64,7 @@ def _agreement(first: str, second: str, raters: Mapping[str, Labels]) -> dict[st
         "why undefined": None,
     }
     try:
-        line["kappa"] = kappa(Confusion.count(pairs))
+        line["kappa"] = kappa(Confusion.of(pairs))
     except UndefinedStatisticError as error:
         line["why undefined"] = error.reason
         return line

@@ -33,6 +33,8 @@ from evaluator.run_reader.contents import ODD, RunContents, broken, read_content
 from evaluator.run_reader.episodes import DerivedIndex
 
 QUIET = Output(quiet=True)
+MADE_FROM = ("source_sha256", "scene_hash", "engine", "seed")
+"""What is told of every derived file."""
 
 
 def compare_run(
@@ -53,7 +55,7 @@ def compare_run(
     views = compare_views(contents.derived, contents.sources, net=net, cache=cache)
     methods = compare_renders(images, contents.derived, contents.sources, net=net)
     motions = _imported_motions(contents)
-    base = compare_read([read], name=read.name)
+    base = compare_read([read], name=read.name, cache=cache)
     # Words of what is missing come first, then those of images and imported motions.
     return replace(
         _with_parts(base, (views, methods, motions)),
@@ -149,6 +151,7 @@ def compare_read(
     *,
     name: str,
     more_rows: Sequence[TrialRow] = (),
+    cache: SummaryCache | None = None,
 ) -> Comparison:
     """Measure everything that the trials of some runs say together."""
     rows = [row for read in reads for row in read.rows]
@@ -168,6 +171,7 @@ def compare_read(
         ),
         void_causes=tuple(dict.fromkeys(cause for r in reads for cause in r.void_causes)),
         protocol=reads[0].protocol if len(reads) == 1 else None,
+        cache=cache,
     )
     trials = [trial for read in reads for trial in read.trials]
     derived = [file for read in reads for file in read.contents.derived]
@@ -253,26 +257,16 @@ def _marks(read: ReadRun) -> Iterator[bool | None]:
 
 
 def _provenance(reads: Sequence[ReadRun]) -> dict[str, Any]:
-    parts = [_provenance_of(read) for read in reads]
+    parts = {}
+    for read in reads:
+        parts[str(read.run.path)] = {
+            "imported_trials": hash_file(trials_path(read.run)) if read.imported else None,
+            "episodes": {each.file.name: each.file.sha256 for each in read.contents.recorded},
+            "derived": {
+                file.name: {"sha256": file.sha256}
+                | {name: getattr(file.derived, name) for name in MADE_FROM}
+                for file in read.contents.derived
+            },
+        }
     common = {"software": software(), "start_limit_m": START_LIMIT_M}
-    if len(parts) == 1:
-        return common | parts[0]
-    return common | {"runs": {str(r.run.path): p for r, p in zip(reads, parts, strict=True)}}
-
-
-def _provenance_of(read: ReadRun) -> dict[str, Any]:
-    contents = read.contents
-    return {
-        "imported_trials": hash_file(trials_path(read.run)) if read.imported else None,
-        "episodes": {each.file.name: each.file.sha256 for each in contents.recorded},
-        "derived": {
-            file.name: {
-                "sha256": file.sha256,
-                "source_sha256": file.derived.source_sha256,
-                "scene_hash": file.derived.scene_hash,
-                "engine": file.derived.engine,
-                "seed": file.derived.seed,
-            }
-            for file in contents.derived
-        },
-    }
+    return common | (next(iter(parts.values())) if len(parts) == 1 else {"runs": parts})

@@ -50,21 +50,21 @@ class _Files:
 
     episode: str
     plan_id: str
-    recorded_path: Path
-    replay_paths: Mapping[str, Path]
-    localised_path: Path | None
+    paths: Mapping[str, Path]
+    """Of the recording, its localisation and its replays."""
 
     @cached_property
     def recorded(self) -> Episode:
-        return Episode.open(self.recorded_path)
+        return Episode.open(self.paths["recorded"])
 
     @cached_property
     def replays(self) -> dict[str, Episode]:
-        return {name: Episode.open(path) for name, path in self.replay_paths.items()}
+        return {n: Episode.open(path) for n, path in self.paths.items() if n in TRAJECTORIES}
 
     @cached_property
     def localised(self) -> Episode | None:
-        return None if self.localised_path is None else Episode.open(self.localised_path)
+        path = self.paths.get("localised")
+        return None if path is None else Episode.open(path)
 
     @cached_property
     def task(self) -> Task | None:
@@ -80,13 +80,9 @@ def recorded_task(episode: Episode) -> Task | None:
 
 
 def _files_of(trial: Trial, plan_id: str) -> _Files:
-    return _Files(
-        episode=trial.row.episode,
-        plan_id=plan_id,
-        recorded_path=trial.file.path,
-        replay_paths={name: replay.path for name, replay in trial.replays.items()},
-        localised_path=None if trial.localised is None else trial.localised.path,
-    )
+    made = dict(trial.replays) | ({} if trial.localised is None else {"localised": trial.localised})
+    paths = {"recorded": trial.file.path, **{name: file.path for name, file in made.items()}}
+    return _Files(episode=trial.row.episode, plan_id=plan_id, paths=paths)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,9 +174,8 @@ def _in_order(found: Iterable[Any], trials: Iterable[Trial]) -> tuple[Any, ...]:
 
 
 def _motions(files: _Files) -> tuple[MotionSummary, ...]:
-    if not files.replays:
-        return ()
-    return summarise_motions(files.recorded, files.replays, plan_id=files.plan_id)
+    there = bool(files.replays)
+    return summarise_motions(files.recorded, files.replays, plan_id=files.plan_id) if there else ()
 
 
 def _states(files: _Files) -> tuple[StateSummary, ...]:

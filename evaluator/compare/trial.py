@@ -101,19 +101,6 @@ def _unlabelled(outcome: Outcome | None) -> list[str]:
     return []
 
 
-def _why_unknown(outcome: Outcome | None) -> str:
-    if outcome is None:
-        return UNLABELLED
-    return (outcome.detail or UNLABELLED) if outcome.result == "unknown" else ""
-
-
-def _nothing_executed(facts: RecordedFacts) -> bool:
-    """Whether no plan was sent; without plans and a word about it, a robot moved by other means."""
-    detail = facts.outcome.detail if facts.outcome is not None else None
-    labelled_so = (detail or "").startswith(NOTHING_EXECUTED)
-    return facts.plan_id is None and (labelled_so or facts.num_plans > 0)
-
-
 def _impossible_count(outcome: Outcome | None) -> str:
     """Say what is wrong with a count of objects or sub-tasks; nothing where it can be."""
     if outcome is None or outcome.unit == "trial":
@@ -131,6 +118,7 @@ def _row(
     replays: Mapping[str, DerivedFile],
 ) -> TrialRow:
     info, outcome, verdict = facts.info, facts.outcome, facts.verdict
+    result, detail = (outcome.result, outcome.detail or "") if outcome else (None, "")
     planned = found["planned"]
     answer = found["executed"] if facts.plan_id == NO_PLAN else planned
     failing = answer.verdict if answer.verdict is not None else verdict
@@ -143,20 +131,22 @@ def _row(
         task=info.task,
         condition=treatment_of(info.condition, info.study_arm),
         study_arm=info.study_arm,
-        why_unknown=_why_unknown(outcome),
+        why_unknown=(detail or UNLABELLED) if result in (None, "unknown") else "",
         policy=info.policy,
         checkpoint=info.checkpoint,
         start_id=info.start_id,
         cell=info.cell,
         stand_in=info.stand_in,
-        recorded=None if outcome is None else _ANSWERS.get(outcome.result),
+        recorded=_ANSWERS.get(result),
         unit="trial" if outcome is None else outcome.unit,
         k=outcome.k if outcome is not None and counted else None,
         n=outcome.n if outcome is not None and counted else None,
         plan_id=facts.plan_id,
         num_plans=facts.num_plans,
         num_plans_sent=facts.num_plans_sent,
-        nothing_executed=_nothing_executed(facts),
+        # Without plans and a word about it, a robot moved by other means.
+        nothing_executed=facts.plan_id is None
+        and (facts.num_plans > 0 or detail.startswith(NOTHING_EXECUTED)),
         sim_planned=planned.accepted,
         sim_executed=found["executed"].accepted,
         verdict=None if verdict is None else verdict.accepted,
@@ -175,7 +165,7 @@ def _row(
     )
 
 
-_ANSWERS = {"success": True, "failure": False}
+_ANSWERS: dict[str | None, bool] = {"success": True, "failure": False}
 
 
 def _stage_at(facts: RecordedFacts, t_ns: int | None) -> str:

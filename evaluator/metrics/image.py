@@ -156,7 +156,7 @@ def score_pair(
     maps = _ssim(recorded, replayed)
     found = {
         RAW: _scored(recorded, replayed, maps, paddings=("valid", "zero")),
-        GAIN: _scored(recorded, brightened, _ssim(recorded, brightened)),
+        GAIN: _scored(recorded, brightened, maps, paddings=()),
     }
     for name, mask in (masks or {}).items():
         own = f"mask_{name}" if name in (RAW, GAIN) else name

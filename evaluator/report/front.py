@@ -155,7 +155,7 @@ def next_trials(results: Results) -> str:
     """
     _, beaten = _standing(results)
     wanted = [
-        (more, f"{row.get('first', 'one')} against {row.get('second', 'another')}")
+        (more, _pair(str(row.get("first", "one")), str(row.get("second", "another"))))
         for row in rows_of(results, "comparisons")
         if row["task"] == ALL_TASKS and row["decided"] == "no"
         if not {row.get("first"), row.get("second")} & {*beaten}
@@ -165,6 +165,13 @@ def next_trials(results: Results) -> str:
         return ""
     more, pair = min(wanted)
     return f"{more} more {noun('trial', more)} of each would likely decide {pair}."
+
+
+def _pair(first: str, second: str) -> str:
+    """Name two candidates by what they do not share."""
+    parts = [*zip(first.split(", "), second.split(", "), strict=False)]
+    differ = [pair for pair in parts if pair[0] != pair[1]]
+    return " against ".join(map(", ".join, zip(*differ, strict=True)))
 
 
 def _bias_words(row: Row) -> str:

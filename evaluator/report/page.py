@@ -123,7 +123,7 @@ def page(
             parts=parts,
             trials=trials,
             excluded=excluded,
-            software=_software(results.provenance.get("software")),
+            software=_made_by(results.provenance.get("software") or {}),
             provenance=json.dumps(dict(_short(results.provenance)), indent=1),
             everything=everything,
             next_table=count(1).__next__,
@@ -174,12 +174,10 @@ def _part(section: Section, results: Results, figures: Sequence[Drawing]) -> Par
     )
 
 
-def _software(software: object) -> str:
-    if not isinstance(software, Mapping):
-        return ""
-    commit = str(software.get("git_commit") or "")
-    told = f"{software.get('name', 'robot-gst')} {software.get('version', '')}"
-    return told + (f", commit {commit[:12]}" if commit else "")
+def _made_by(software: Mapping[str, Any]) -> str:
+    commit = str(software.get("git_commit") or "")[:12]
+    told = f"{software.get('name', 'robot-gst')} {software.get('version', '')}" if software else ""
+    return f"{told}, commit {commit}" if commit else told
 
 
 def _short(provenance: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -5,6 +5,7 @@ import io
 import re
 import shutil
 import textwrap
+from functools import partial
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -38,9 +39,11 @@ def as_text(table: Table, *, width: int | None = None) -> str:
     shown = view(table)
     used = used_columns(shown)
     heads = [shown.columns[index] for index in used]
-    rows = [[_kept_together(cell_text(row[index])) for index in used] for row in shown.rows]
+    together = partial(_TOGETHER.sub, lambda found: found[0].replace(" ", _NO_BREAK))
+    rows = [[together(cell_text(row[index])) for index in used] for row in shown.rows]
     title = table.title
-    if len(rows) > 1 and _whole_width(heads, rows) > width:
+    whole = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+    if len(rows) > 1 and _EDGE + _GAP * len(heads) + sum(whole) > width:
         same = [k for k in range(len(heads)) if len({row[k] for row in rows}) == 1]
         kept = [k for k in range(len(heads)) if k not in same]
         if same and kept:
@@ -59,17 +62,8 @@ _TOGETHER = re.compile(r"\[[^\]]*\]|[\d/]+ = [\d.]+ %|[+-]?[\d.]+ (%|pp|mm|°)")
 """An interval, a share, a number with its unit: each stays on one line."""
 
 
-def _kept_together(text: str) -> str:
-    return _TOGETHER.sub(lambda found: found[0].replace(" ", _NO_BREAK), text)
-
-
 _EDGE, _GAP = 1, 3
 """Characters before the first column, and between two."""
-
-
-def _whole_width(heads: list[str], rows: list[list[str]]) -> int:
-    columns = zip(heads, *rows, strict=True)
-    return _EDGE + sum(_GAP + max(map(len, column)) for column in columns)
 
 
 def _widths(heads: list[str], rows: list[list[str]], width: int) -> list[int] | None:

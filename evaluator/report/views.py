@@ -95,16 +95,20 @@ def _folded(rows: Rows) -> Rows:
             counts[name] = before
     gone = {each for pair in (*ends.values(), *counts.values()) for each in pair}
     gone |= {"interval", "why undefined"} if ends else set()
-
+    kinds = {name: kind for name in names if (kind := _kind(name)) or name in ends}
+    if not kinds:  # as the table of all trials
+        return rows
     return [
         {
             name: _number(
-                name,
+                kinds[name],
                 row[name],
                 [row[each] for each in ends.get(name, ())],
                 [row[each] for each in counts.get(name, ())],
                 row.get("why undefined"),
             )
+            if name in kinds
+            else row[name]
             for name in names
             if name not in gone
         }
@@ -112,25 +116,26 @@ def _folded(rows: Rows) -> Rows:
     ]
 
 
-def _number(
-    name: str, value: Any, ends: Sequence[Any], count: Sequence[Any], why: str | None
-) -> Shown:
-    """Write a cell in the unit that its column names; what is no such number stays as it is.
+def _kind(name: str) -> str:
+    """Say what a column of this name holds: points, a change or a share; empty for others.
 
     Points stand without a unit: the column's name ends in it.
     """
-    is_points = name.endswith("(pp)")
-    is_share = _last_word(name) == "rate"
-    is_change = name.startswith("relative")
-    if not (ends or is_points or is_share or is_change) or isinstance(value, str):
-        return value  # type: ignore[no-any-return]
+    if name.endswith("(pp)"):
+        return "points"
+    return "change" if name.startswith("relative") else "share" * (_last_word(name) == "rate")
+
+
+def _number(
+    kind: str, value: Any, ends: Sequence[Any], count: Sequence[Any], why: str | None
+) -> Shown:
+    """Write a cell with its interval and count; what is no number stays as it is."""
+    if isinstance(value, str):
+        return value
     if not _known(value):
-        return f"undefined: {why}" if why and (is_points or is_share or is_change) else None
-    factor, unit, form = 1.0, "", ".4g"
-    if is_points:
-        form = "+.1f"
-    elif is_share or is_change:
-        factor, unit, form = 100.0, " %", "+.1f" if is_change else ".1f"
+        return f"undefined: {why}" if why and kind else None
+    factor, unit = (100.0, " %") if kind in ("share", "change") else (1.0, "")
+    form = {"points": "+.1f", "change": "+.1f", "share": ".1f"}.get(kind, ".4g")
     known = [_signed(f"{factor * end:{form}}") for end in ends if _known(end)]
     told = Figures(
         _signed(f"{factor * value:{form}}") + unit,
@@ -201,14 +206,9 @@ def _published(rows: Rows) -> Rows:
     ]
 
 
-def _comparisons(rows: Rows) -> Rows:
-    """Leave what the sentences say in words to programs."""
-    return [_picked(row, "answer", "task") for row in rows]
-
-
 _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "conclusions": _conclusions,
-    "comparisons": _comparisons,
+    "comparisons": lambda rows: [_picked(row, "answer", "task") for row in rows],
     "success": _success,
     "published": _published,
 }

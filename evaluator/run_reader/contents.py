@@ -7,7 +7,7 @@ that changed within the last two seconds is hashed again next time.
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -74,20 +74,21 @@ def read_contents(
     """Read what is new or has changed in a run; a broken file is left out and named."""
     recorded, derived, left_out = _take_inventory(run, cache, output)
     labels = _labels(run)
-    means = _Means(cache=cache, output=output, pool=pool, left_out=left_out)
-    facts = _read(
-        recorded,
+    facts, broken_recorded = _read(
+        {f"{file.name} {file.sha256} {labels.get(file.stem, '')}": file for file in recorded},
         RecordedFacts,
-        lambda file: f"{file.name} {file.sha256} {labels.get(file.stem, '')}",
         partial(_tried, partial(read_recorded, run)),
-        means,
+        cache,
+        pool.map,
+        output,
     )
-    made = _read(
-        derived,
+    made, broken_derived = _read(
+        {f"{file.name} {file.sha256}": file for file in derived},
         DerivedFacts,
-        lambda file: f"{file.name} {file.sha256}",
         partial(_tried, read_derived),
-        means,
+        cache,
+        pool.map,
+        output,
     )
     found, doubled = _each_once(
         [RecordedFile(file=file, facts=facts[file.name]) for file in recorded if file.name in facts]
@@ -99,7 +100,7 @@ def read_contents(
             for file in derived
             if file.name in made
         ),
-        left_out=(*left_out, *doubled),
+        left_out=(*left_out, *broken_recorded, *broken_derived, *doubled),
     )
 
 
@@ -108,16 +109,6 @@ class FileHash:
     """What a file's bytes were when it had a certain size, times and inode."""
 
     sha256: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Unknown:
-    """A file whose hash is not known."""
-
-    name: str
-    parts: tuple[Path, ...]
-    key: str
-    """What its hash is kept under; empty where its stamp cannot be relied on."""
 
 
 def _take_inventory(
@@ -132,7 +123,8 @@ def _take_inventory(
     groups = [(run.episodes_dir, parts) for parts in run.episode_parts().values()]
     groups += [(run.derived_dir, [path.name]) for path in run.derived()]
     hashes: dict[str, str | Exception] = {}
-    unknown = []
+    unknown: dict[str, tuple[Path, ...]] = {}
+    keys: dict[str, str] = {}  # what a hash is kept under; none where the stamp cannot be relied on
     for folder, parts in groups:
         name = f"{folder.name}/{parts[0]}"
         stamp = stamp_of([os.path.join(folder, part) for part in parts], now_ns)  # noqa: PTH118
@@ -140,11 +132,11 @@ def _take_inventory(
         known = cache.find(FileHash, key) if key else None
         hashes[name] = known[0].sha256 if known else ""
         if not known:
-            unknown.append(_Unknown(name=name, parts=tuple(folder / p for p in parts), key=key))
-    for each, found in _hashed(unknown, output):
-        hashes[each.name] = found
-        if each.key and isinstance(found, str):
-            cache.keep(FileHash, each.key, (FileHash(sha256=found),))
+            unknown[name], keys[name] = tuple(folder / part for part in parts), key
+    for name, found in _hashed(unknown, output):
+        hashes[name] = found
+        if keys[name] and isinstance(found, str):
+            cache.keep(FileHash, keys[name], (FileHash(sha256=found),))
     left_out = [
         Exclusion(episode=Path(name).name, scope="everything", reason=str(error))
         for name, error in hashes.items()
@@ -159,29 +151,30 @@ def _take_inventory(
     return recorded, files[len(recorded) :], left_out
 
 
-def _hashed(unknown: list[_Unknown], output: Output) -> Iterator[tuple[_Unknown, str | Exception]]:
+def _hashed(
+    unknown: Mapping[str, tuple[Path, ...]], output: Output
+) -> Iterator[tuple[str, str | Exception]]:
     if not unknown:
         return
-    sizes = [sum(map(_size, each.parts)) for each in unknown]
-    workers = min(MOST_THREADS, os.cpu_count() or 1)
+    sizes = [sum(map(_size, parts)) for parts in unknown.values()]
     done = 0
     with (
         output.progress("hash files (MB)", -(-sum(sizes) // MEGABYTE)) as advance,
-        ThreadPoolExecutor(workers) as pool,
+        ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1)) as pool,
     ):
         try:
-            for each, size, found in zip(unknown, sizes, pool.map(_sha256, unknown), strict=True):
+            all_found = pool.map(_sha256, unknown.values())
+            for name, size, found in zip(unknown, sizes, all_found, strict=True):
                 done += size
-                advance(done // MEGABYTE, each.parts[0].name)
-                yield each, found
+                advance(done // MEGABYTE, name)
+                yield name, found
         except BaseException:
             pool.shutdown(cancel_futures=True)  # gigabytes may be waiting
             raise
 
 
-def _sha256(unknown: _Unknown) -> str | Exception:
+def _sha256(parts: tuple[Path, ...]) -> str | Exception:
     try:
-        parts = unknown.parts
         return hash_files(parts if len(parts) == 1 else Episode.open(parts[0]).parts)
     except (GstError, OSError) as error:
         return error
@@ -242,44 +235,38 @@ def _tried(read: Callable[[Path], Facts], file: RunFile) -> Facts | Exclusion:
         return broken(file.path.name, error)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Means:
-    """What reading files takes, and the list of those that cannot be read."""
-
-    cache: SummaryCache
-    output: Output
-    pool: ProcessPool | Serial
-    left_out: list[Exclusion]
-
-
 def _read(
-    files: Sequence[RunFile],
+    files: Mapping[str, RunFile],
     kind: type[Facts],
-    key: Callable[[RunFile], str],
     read: Callable[[RunFile], Facts | Exclusion],
-    means: _Means,
-) -> dict[str, Facts]:
-    """Return what the files say of themselves, by name; a file that is left out is named."""
-    facts: dict[str, Facts] = {}
-    unknown: list[RunFile] = []
-    for file in files:
-        if kept := means.cache.find(kind, key(file)):
-            facts[file.name] = kept[0]
-        else:
-            unknown.append(file)
+    cache: SummaryCache,
+    spread: Callable[..., Iterator[Facts | Exclusion]],
+    output: Output,
+) -> tuple[dict[str, Facts], list[Exclusion]]:
+    """Return what files say of themselves, by name, and those that cannot be read.
+
+    Args:
+        files: By what their facts are kept under.
+    """
+    kept = {file.name: cache.find(kind, key) for key, file in files.items()}
+    facts = {name: found[0] for name, found in kept.items() if found}
+    unknown = {key: file for key, file in files.items() if file.name not in facts}
+    left_out: list[Exclusion] = []
     if not unknown:
-        return facts
-    with means.output.progress("read episodes", len(unknown)) as advance:
-        all_made = zip(unknown, means.pool.map(read, unknown, each_s=READ_S), strict=True)
-        for done, (file, made) in enumerate(all_made, start=1):
+        return facts, left_out
+    with output.progress("read episodes", len(unknown)) as advance:
+        all_made = spread(read, list(unknown.values()), each_s=READ_S)
+        for done, ((key, file), made) in enumerate(
+            zip(unknown.items(), all_made, strict=True), start=1
+        ):
             if isinstance(made, Exclusion):
-                means.left_out.append(made)
+                left_out.append(made)
             else:
                 facts[file.name] = made
                 if not made.broken:  # a message names the folder, which may move
-                    means.cache.keep(kind, key(file), (made,))
+                    cache.keep(kind, key, (made,))
             advance(done, file.path.name)
-    return facts
+    return facts, left_out
 
 
 def broken(name: str, error: Exception, *, scope: str = "everything") -> Exclusion:

@@ -24,7 +24,7 @@ class Confusion(NamedTuple):
     true_negative: int
 
     @staticmethod
-    def count(pairs: Iterable[tuple[bool, bool]]) -> "Confusion":
+    def of(pairs: Iterable[tuple[bool, bool]]) -> "Confusion":
         """Count pairs (said, happened)."""
         sums = Counter((bool(predicted), bool(happened)) for predicted, happened in pairs)
         both = (True, True), (True, False), (False, True), (False, False)

@@ -7,9 +7,10 @@ the median has one that holds for any distribution, from six values on.
 
 import math
 from collections.abc import Hashable, Sequence
+from fractions import Fraction
+from statistics import NormalDist
 
 import numpy as np
-from scipy.special import bdtr, ndtri
 
 from evaluator.errors import EvaluatorError, UndefinedStatisticError
 from evaluator.result import Interval
@@ -63,7 +64,7 @@ def check_count(k: int, n: int) -> None:
 
 def normal_quantile(probability: float) -> float:
     """Return the standard normal's quantile, 1.96 at 0.975."""
-    return float(ndtri(probability))
+    return NormalDist().inv_cdf(probability)
 
 
 ORDER_STATISTICS = "order-statistics"
@@ -96,10 +97,11 @@ def median_interval(values: Sequence[float], *, level: float = LEVEL) -> Interva
 
 def median_rank(n: int, level: float = LEVEL) -> int:
     """Return l, counted from 1; 0 where no two values keep the level."""
-    if not n:
-        return 0
-    below = bdtr(np.arange(n // 2 + 1), n, 0.5)  # P(B <= l - 1) for l = 1, 2 ..
-    return int((1 - 2 * below >= level).sum())
+    rank, below, ways = 0, 0, 1  # ways of fewer than l successes in n, and of l, of 2 ** n
+    most = int(Fraction(1 - level) * 2**n)
+    while 2 * (below + ways) <= most and rank <= n // 2:
+        rank, below, ways = rank + 1, below + ways, ways * (n - rank) // (rank + 1)
+    return rank
 
 
 def cluster_means(values: Sequence[float], clusters: Sequence[Hashable]) -> list[float]:

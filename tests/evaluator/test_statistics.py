@@ -41,7 +41,7 @@ def test_a_relative_gain_from_zero_is_undefined() -> None:
 
 def test_confusion_counts_said_against_happened() -> None:
     pairs = [(True, True), (True, False), (True, False), (False, True), (False, False)]
-    found = Confusion.count(pairs)
+    found = Confusion.of(pairs)
     assert (found.true_positive, found.false_positive) == (1, 2)
     assert (found.false_negative, found.true_negative) == (1, 1)
     assert (found.n, found.agreed, found.predicted_success) == (5, 2, 3)
@@ -51,7 +51,7 @@ def test_confusion_counts_said_against_happened() -> None:
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=40))
 def test_phi_is_pearsons_r_of_the_two_columns(pairs: list[tuple[bool, bool]]) -> None:
     said, happened = np.array(pairs, dtype=float).T
-    table = Confusion.count(pairs)
+    table = Confusion.of(pairs)
     if said.std() == 0 or happened.std() == 0:
         with pytest.raises(UndefinedStatisticError, match="side is the same in all"):
             phi(table)

@@ -168,7 +168,7 @@ def test_every_number_about_views_has_its_stamp(maker: Any) -> None:
     write_views(maker.run.derived_dir)
     results = compare_run(maker.run).results()
     numbers = [m for m in results.measurements if m.id.startswith("views.all.")]
-    for metric in ("ssim_zero", "ssim_gain", "ssim_objects"):
+    for metric in ("ssim_zero", "psnr_gain_db", "ssim_objects"):
         assert any(m.id == f"views.all.{metric}" for m in numbers), metric
     for number in numbers:
         if number.id != "views.all.lpips" and "depth" not in number.id:

@@ -247,8 +247,11 @@ def measure_images(
     found = []
     for variant in variants:
         of_variant = [score[variant] for score in scores if variant in score]
+        asked = {name for score in of_variant for name in (*score.values, *score.reasons)}
         for metric in METRICS.values():
-            if (metric.id == LPIPS and net is None) or (metric.raw_only and variant != RAW):
+            if metric.id == LPIPS and net is None:
+                continue
+            if variant != RAW and metric.id not in asked:
                 continue
             weights = f"weights {net.weights}" if net is not None and metric.id == LPIPS else ""
             parts = (variant_words(variant), protocol, _lacking(metric, of_variant), weights)

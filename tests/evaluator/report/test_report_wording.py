@@ -136,6 +136,10 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
         rows=(("C", 1, 9, "no"), ("A", 8, 9, "yes"), ("B", 8, 9, "yes")),
     )
     assert "A against B" in next_trials(replace(results, tables=(table, beaten)))
+    pair = [compared(ALL_TASKS, "A, without replanning", "no", 9)]
+    pair[0] = (*pair[0][:3], "A, with replanning", *pair[0][4:])
+    words = "9 more trials of each would likely decide without replanning against with replanning."
+    assert next_trials(replace(results, tables=(replace(table, rows=tuple(pair)),))) == words
 
 
 def shown(tmp_path: Path, text: str) -> tuple[str, str]:
