@@ -77,11 +77,11 @@ def _refuse_changed(table: TableText) -> None:
     """Refuse a policy that was another checkpoint before: one name would stand for both."""
     plain = list(map(plain_name, table.header))
     if {"policy", "checkpoint"} <= set(plain):
-        places = [plain.index(name) for name in ("policy", "checkpoint")]
+        name, who = plain.index("policy"), plain.index("checkpoint")
         rows = (
             (f"{table.path} row {n}", [*cells, *[""] * len(plain)]) for n, cells in table.grid[1:]
         )
-        refuse_changed((where, *(row[p].strip() for p in places)) for where, row in rows)
+        refuse_changed((where, row[name].strip(), row[who].strip()) for where, row in rows)
 
 
 def _with_outcome(table: TableText, options: TableOptions) -> TableOptions:

@@ -475,7 +475,7 @@ def _beside(cases: Sequence["_Case"], plan: Plan) -> dict[int, tuple[str, ...]]:
         for measure in MEASURES:
             if not all(map(measure.is_recorded, sides)):
                 continue
-            tries = []
+            tries: list[Try] = []
             for first, second, won in measure.pairs([(t.is_second, t.row) for t in case.tries]):
                 for row, is_second in ((first, False), (second, True)):
                     start, better = str(len(tries) // 2), won > 0 if is_second else won < 0

@@ -204,8 +204,9 @@ def _of_protocol(read: ReadRun) -> Part:
 
 
 def _with_parts(base: Comparison, parts: Sequence[Part]) -> Comparison:
-    added = vars(joined(parts))
-    return replace(base, **{name: (*getattr(base, name), *more) for name, more in added.items()})
+    added: dict[str, Any] = vars(joined(parts))
+    more: dict[str, Any] = {name: (*getattr(base, name), *new) for name, new in added.items()}
+    return replace(base, **more)
 
 
 def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:
