@@ -74,9 +74,7 @@ GONE: dict[str, str] = {
     "evaluate --against": "Evaluate each run; trials.csv has the same trials in both.",
     "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
     "render --rate-hz": "One frame is drawn for each recorded image.",
-    **dict.fromkeys(
-        ("replay --grasp", "gate --grasp"), "A grasp holds by friction, as the robot's does."
-    ),
+    **dict.fromkeys(("replay --grasp", "gate --grasp"), "A grasp holds by friction, as in life."),
     **dict.fromkeys(
         ("replay --engines-must-agree", "gate --engines-must-agree"),
         "--engine both replays in both and says where they differ.",

@@ -204,9 +204,10 @@ def _of_protocol(read: ReadRun) -> Part:
 
 
 def _with_parts(base: Comparison, parts: Sequence[Part]) -> Comparison:
-    added: dict[str, Any] = vars(joined(parts))
-    more: dict[str, Any] = {name: (*getattr(base, name), *new) for name, new in added.items()}
-    return replace(base, **more)
+    both: dict[str, Any] = {
+        name: (*getattr(base, name), *more) for name, more in vars(joined(parts)).items()
+    }
+    return replace(base, **both)
 
 
 def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:
@@ -258,7 +259,7 @@ def _marks(read: ReadRun) -> Iterator[bool | None]:
 
 
 def _provenance(reads: Sequence[ReadRun]) -> dict[str, Any]:
-    parts = {}
+    parts: dict[str, dict[str, Any]] = {}
     for read in reads:
         parts[str(read.run.path)] = {
             "imported_trials": hash_file(trials_path(read.run)) if read.imported else None,
@@ -269,5 +270,5 @@ def _provenance(reads: Sequence[ReadRun]) -> dict[str, Any]:
                 for file in read.contents.derived
             },
         }
-    common = {"software": software(), "start_limit_m": START_LIMIT_M}
+    common: dict[str, Any] = {"software": software(), "start_limit_m": START_LIMIT_M}
     return common | (next(iter(parts.values())) if len(parts) == 1 else {"runs": parts})
