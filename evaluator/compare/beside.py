@@ -7,7 +7,7 @@ tried, else one trial of each in their order.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import mean, median
 
@@ -32,7 +32,7 @@ def _promptness(row: TrialRow) -> float | None:
     return None if row.time_s is None else -row.time_s
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Measure:
     """What is compared beside success."""
 
@@ -54,37 +54,22 @@ class Measure:
         return f"{self.scale * self.of_all(found):.3g}{self.unit}" if found else "none"
 
     def sentence(
-        self,
-        sides: Sequence[Sequence[TrialRow]],
-        counts: tuple[int, int],
-        pairs: float,
-        *,
-        decided: bool,
+        self, second: Sequence[TrialRow], first: Sequence[TrialRow], pairs: str, *, decided: bool
     ) -> str:
-        """Say how the second candidate does beside the first.
-
-        Args:
-            sides: Trials of the second candidate, and of the first.
-            counts: Pairs that the second won, and lost.
-        """
-        second, first = map(self.shown, sides)
-        words = f"{self.name} {second} against {first}, {self.won} in {counts[0]} and {self.lost} "
-        return f"{words}in {counts[1]} of {pairs:g} pairs ({'decided' if decided else 'undecided'})"
+        """Say how the second candidate does beside the first; ``pairs``: won, lost, all of them."""
+        words = f"{self.name} {self.shown(second)} against {self.shown(first)}, {pairs}"
+        return f"{words} ({'decided' if decided else 'undecided'})"
 
     def pairs(
-        self, sides: Sequence[tuple[bool, TrialRow]]
+        self, sides: Iterable[tuple[bool, TrialRow]]
     ) -> Iterator[tuple[TrialRow, TrialRow, float]]:
-        """Pair trials in their order: of the first, of the second, above 0 where the second won.
-
-        Args:
-            sides: Whether a trial is of the second candidate, and the trial.
-        """
+        """Pair trials in their order: of the first, of the second, above 0 where the second won."""
         waiting: dict[tuple[str, str, bool], list[TrialRow]] = {}
         for is_second, row in sides:
-            mine = self.worth(row)
-            partners = waiting.get((row.task, row.start_id or "", not is_second))
+            mine, key = self.worth(row), (row.task, row.start_id or "")
+            partners = waiting.get((*key, not is_second))
             if mine is not None and not partners:
-                waiting.setdefault((row.task, row.start_id or "", is_second), []).append(row)
+                waiting.setdefault((*key, is_second), []).append(row)
             elif mine is not None and partners:
                 other = partners.pop(0)
                 theirs = self.worth(other) or 0.0
@@ -92,11 +77,7 @@ class Measure:
                 yield (other, row, won) if is_second else (row, other, won)
 
 
-PROGRESS = Measure(
-    name="progress", worth=_progress, won="more", lost="less", unit=" %", scale=100.0, of_all=mean
+MEASURES = (
+    Measure("progress", _progress, "more", "less", " %", 100.0, mean),
+    Measure("time to success", _promptness, "sooner", "later", " s", -1.0, median),
 )
-TIME = Measure(
-    name="time to success", worth=_promptness, won="sooner", lost="later", unit=" s", scale=-1.0,
-    of_all=median,
-)  # fmt: skip
-MEASURES = (PROGRESS, TIME)
