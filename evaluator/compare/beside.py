@@ -13,7 +13,7 @@ from statistics import mean, median
 
 from evaluator.compare.rows import TrialRow
 
-Worth = Callable[[TrialRow], float | None]
+Value = Callable[[TrialRow], float | None]
 
 
 def _progress(row: TrialRow) -> float | None:
@@ -37,7 +37,7 @@ class Measure:
     """What is compared beside success."""
 
     name: str
-    worth: Worth
+    value: Value
     won: str
     lost: str
     unit: str
@@ -46,11 +46,11 @@ class Measure:
 
     def is_recorded(self, rows: Sequence[TrialRow]) -> bool:
         """Whether it says more than the outcomes of these do."""
-        return any(w is not None and abs(w) not in (0, 1, math.inf) for w in map(self.worth, rows))
+        return any(w is not None and abs(w) not in (0, 1, math.inf) for w in map(self.value, rows))
 
     def shown(self, rows: Sequence[TrialRow]) -> str:
         """Mean or median of the trials that have one."""
-        found = [w for w in map(self.worth, rows) if w is not None and not math.isinf(w)]
+        found = [w for w in map(self.value, rows) if w is not None and not math.isinf(w)]
         return f"{self.scale * self.of_all(found):.3g}{self.unit}" if found else "none"
 
     def sentence(
@@ -66,13 +66,13 @@ class Measure:
         """Pair trials in their order: of the first, of the second, above 0 where the second won."""
         waiting: dict[tuple[str, str, bool], list[TrialRow]] = {}
         for is_second, row in sides:
-            mine, key = self.worth(row), (row.task, row.start_id or "")
+            mine, key = self.value(row), (row.task, row.start_id or "")
             partners = waiting.get((*key, not is_second))
             if mine is not None and not partners:
                 waiting.setdefault((*key, is_second), []).append(row)
             elif mine is not None and partners:
                 other = partners.pop(0)
-                theirs = self.worth(other) or 0.0
+                theirs = self.value(other) or 0.0
                 won = 0.0 if mine == theirs else mine - theirs if is_second else theirs - mine
                 yield (other, row, won) if is_second else (row, other, won)
 
