@@ -100,7 +100,7 @@ def write_table(run: RunFolder) -> Path:
     Of several with other settings the newest counts.
     """
     recorded = _recorded(run)
-    rows = {}
+    rows: dict[tuple[str, str], tuple[Any, ...]] = {}
     for path in sorted(run.derived(f"*.{ROLLOUT}.*"), key=lambda path: path.stat().st_mtime_ns):
         row = row_of_file(path)
         if row is None or row["success"] is None:
