@@ -7,13 +7,13 @@ tried, else one trial of each in their order.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import mean, median
 
 from evaluator.compare.rows import TrialRow
 
-Worth = Callable[[TrialRow], float | None]
+Value = Callable[[TrialRow], float | None]
 
 
 def _progress(row: TrialRow) -> float | None:
@@ -32,12 +32,12 @@ def _promptness(row: TrialRow) -> float | None:
     return None if row.time_s is None else -row.time_s
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Measure:
     """What is compared beside success."""
 
     name: str
-    worth: Worth
+    value: Value
     won: str
     lost: str
     unit: str
@@ -46,57 +46,38 @@ class Measure:
 
     def is_recorded(self, rows: Sequence[TrialRow]) -> bool:
         """Whether it says more than the outcomes of these do."""
-        return any(w is not None and abs(w) not in (0, 1, math.inf) for w in map(self.worth, rows))
+        return any(w is not None and abs(w) not in (0, 1, math.inf) for w in map(self.value, rows))
 
     def shown(self, rows: Sequence[TrialRow]) -> str:
         """Mean or median of the trials that have one."""
-        found = [w for w in map(self.worth, rows) if w is not None and not math.isinf(w)]
+        found = [w for w in map(self.value, rows) if w is not None and not math.isinf(w)]
         return f"{self.scale * self.of_all(found):.3g}{self.unit}" if found else "none"
 
     def sentence(
-        self,
-        sides: Sequence[Sequence[TrialRow]],
-        counts: tuple[int, int],
-        pairs: float,
-        *,
-        decided: bool,
+        self, second: Sequence[TrialRow], first: Sequence[TrialRow], pairs: str, *, decided: bool
     ) -> str:
-        """Say how the second candidate does beside the first.
-
-        Args:
-            sides: Trials of the second candidate, and of the first.
-            counts: Pairs that the second won, and lost.
-        """
-        second, first = map(self.shown, sides)
-        words = f"{self.name} {second} against {first}, {self.won} in {counts[0]} and {self.lost} "
-        return f"{words}in {counts[1]} of {pairs:g} pairs ({'decided' if decided else 'undecided'})"
+        """Say how the second candidate does beside the first; ``pairs``: won, lost, all of them."""
+        words = f"{self.name} {self.shown(second)} against {self.shown(first)}, {pairs}"
+        return f"{words} ({'decided' if decided else 'undecided'})"
 
     def pairs(
-        self, sides: Sequence[tuple[bool, TrialRow]]
+        self, sides: Iterable[tuple[bool, TrialRow]]
     ) -> Iterator[tuple[TrialRow, TrialRow, float]]:
-        """Pair trials in their order: of the first, of the second, above 0 where the second won.
-
-        Args:
-            sides: Whether a trial is of the second candidate, and the trial.
-        """
+        """Pair trials in their order: of the first, of the second, above 0 where the second won."""
         waiting: dict[tuple[str, str, bool], list[TrialRow]] = {}
         for is_second, row in sides:
-            mine = self.worth(row)
-            partners = waiting.get((row.task, row.start_id or "", not is_second))
+            mine, key = self.value(row), (row.task, row.start_id or "")
+            partners = waiting.get((*key, not is_second))
             if mine is not None and not partners:
-                waiting.setdefault((row.task, row.start_id or "", is_second), []).append(row)
+                waiting.setdefault((*key, is_second), []).append(row)
             elif mine is not None and partners:
                 other = partners.pop(0)
-                theirs = self.worth(other) or 0.0
+                theirs = self.value(other) or 0.0
                 won = 0.0 if mine == theirs else mine - theirs if is_second else theirs - mine
                 yield (other, row, won) if is_second else (row, other, won)
 
 
-PROGRESS = Measure(
-    name="progress", worth=_progress, won="more", lost="less", unit=" %", scale=100.0, of_all=mean
+MEASURES = (
+    Measure("progress", _progress, "more", "less", " %", 100.0, mean),
+    Measure("time to success", _promptness, "sooner", "later", " s", -1.0, median),
 )
-TIME = Measure(
-    name="time to success", worth=_promptness, won="sooner", lost="later", unit=" s", scale=-1.0,
-    of_all=median,
-)  # fmt: skip
-MEASURES = (PROGRESS, TIME)

@@ -284,8 +284,8 @@ def _values(sheet: Sheet) -> list[Value]:
             _label(sheet, labels, "policy", first)
     columns, rest_is = _value_columns(sheet, labels)
     sheet.read |= {column.place for column in columns}
-    is_said = labels["policy"] is not None and labels["policy"].label == "policy"
-    are_rows = _holds_rates(sheet) and not _are_apart(sheet, labels) and not is_said
+    has_policy = labels["policy"] is not None and labels["policy"].label == "policy"
+    are_rows = _holds_rates(sheet) and not _tells_rows(sheet, labels) and not has_policy
     if are_rows:
         sheet.found.doubts.append("rows of one name are read as different policies")
     values = []
@@ -320,7 +320,7 @@ def _holds_rates(sheet: Sheet) -> bool:
     return several and len({column.side for column in sided}) > 1
 
 
-def _are_apart(sheet: Sheet, labels: dict[str, Column | None]) -> bool:
+def _tells_rows(sheet: Sheet, labels: dict[str, Column | None]) -> bool:
     """Whether names tell all rows apart, if need be with those of a further column."""
     named = [labels[name] for name in NAMED if labels[name]]
     free = [c for c in sheet.columns if c.name and not c.label and c.place not in sheet.read]

@@ -10,13 +10,12 @@ from evaluator.compare.agreement import group_agreement, usable_groups
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.conclusions import conclusions_table
 from evaluator.compare.gate import agreement
-from evaluator.compare.measure import refuse_alike
+from evaluator.compare.measure import refuse_alike, refuse_changed
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.policies import (
     compare_policies,
     comparison_part,
     notes_of_trials,
-    refuse_changed,
     void_starts,
 )
 from evaluator.compare.regret import regret_results

@@ -33,7 +33,7 @@ from bridge.exchange.trials_csv import (
 from bridge.exchange.trials_rates import COLUMNS as RATE_COLUMNS
 from bridge.exchange.trials_rates import RateRecord
 from evaluator.compare.found_table import read_found
-from evaluator.compare.policies import refuse_changed
+from evaluator.compare.measure import refuse_changed
 from evaluator.compare.table_words import KNOWN, is_number, is_share
 
 PUBLISHED = "a published table"
@@ -77,11 +77,11 @@ def _refuse_changed(table: TableText) -> None:
     """Refuse a policy that was another checkpoint before: one name would stand for both."""
     plain = list(map(plain_name, table.header))
     if {"policy", "checkpoint"} <= set(plain):
-        name, who = plain.index("policy"), plain.index("checkpoint")
+        policy, who = (plain.index(name) for name in ("policy", "checkpoint"))
         rows = (
             (f"{table.path} row {n}", [*cells, *[""] * len(plain)]) for n, cells in table.grid[1:]
         )
-        refuse_changed((where, row[name].strip(), row[who].strip()) for where, row in rows)
+        refuse_changed((where, row[policy].strip(), row[who].strip()) for where, row in rows)
 
 
 def _with_outcome(table: TableText, options: TableOptions) -> TableOptions:

@@ -1,11 +1,13 @@
 """Turn counts and statistics into ``Measurement`` records; what is undefined keeps its reason."""
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from statistics import median
 from typing import TypeVar
 
+from bridge.errors import UsageError
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.measurements import Defined, quantity_of, slug
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
@@ -94,6 +96,31 @@ def joined(parts: Iterable[Part]) -> Part:
 
 
 Statistic = Callable[[], float | tuple[float, Interval | None]]
+
+
+_HASHES = re.compile(r"\b(server|code|map)=(\S+)")
+"""What a rollout says of who acted, beside or instead of a checkpoint."""
+
+
+def refuse_changed(named: Iterable[tuple[str, str, str]]) -> None:
+    """Refuse a policy that was another checkpoint before: one name would stand for both.
+
+    Args:
+        named: Where it stands, the policy, and who acted.
+
+    Raises:
+        UsageError: Naming both, and where they stand.
+    """
+    seen: dict[tuple[str, str], tuple[str, str]] = {}
+    for where, policy, who in named:
+        parts = {**dict(_HASHES.findall(who)), "checkpoint": _HASHES.sub("", who).strip()}
+        for part, now in parts.items():
+            first, place = seen.setdefault((policy, part), (now, where)) if now else ("", "")
+            if policy and now and first != now:
+                raise UsageError(
+                    f"{where}: policy {policy!r} is {part} {now!r}, in {place} {first!r}. Give "
+                    "each checkpoint a policy name of its own, or leave one of them out."
+                )
 
 
 def refuse_alike(

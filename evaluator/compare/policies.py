@@ -7,7 +7,6 @@ its cause void: a policy that trips the arm must not gain by it.
 """
 
 import math
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +17,6 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from bridge.episode.catalogue_query import UNLABELLED
-from bridge.errors import UsageError
 from bridge.task.protocol import VOID_CAUSES, Protocol
 from evaluator.compare.beside import MEASURES, Measure
 from evaluator.compare.measure import Part, ends, measured
@@ -114,31 +112,6 @@ class Try(NamedTuple):
     succeeded: bool
     has_outcome: bool
     row: TrialRow
-
-
-_HASHES = re.compile(r"\b(server|code|map)=(\S+)")
-"""What a rollout says of who acted, beside or instead of a checkpoint."""
-
-
-def refuse_changed(named: Iterable[tuple[str, str, str]]) -> None:
-    """Refuse a policy that was another checkpoint before: one name would stand for both.
-
-    Args:
-        named: Where it stands, the policy, and who acted.
-
-    Raises:
-        UsageError: Naming both, and where they stand.
-    """
-    seen: dict[tuple[str, str], tuple[str, str]] = {}
-    for where, policy, who in named:
-        parts = {**dict(_HASHES.findall(who)), "checkpoint": _HASHES.sub("", who).strip()}
-        for part, now in parts.items():
-            first, place = seen.setdefault((policy, part), (now, where)) if now else ("", "")
-            if policy and now and first != now:
-                raise UsageError(
-                    f"{where}: policy {policy!r} is {part} {now!r}, in {place} {first!r}. Give "
-                    "each checkpoint a policy name of its own, or leave one of them out."
-                )
 
 
 def made_trials(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[TrialRow]:
@@ -471,24 +444,23 @@ def _beside(cases: Sequence["_Case"], plan: Plan) -> dict[int, tuple[str, ...]]:
     """Compare progress and time to success over all tasks; these share another alpha."""
     asked: list[tuple[_Case, Measure, Course]] = []
     for case in cases:
-        sides = [[t.row for t in case.tries if t.is_second == second] for second in (False, True)]
         for measure in MEASURES:
-            if not all(map(measure.is_recorded, sides)):
+            if not all(map(measure.is_recorded, case.sides)):
                 continue
             tries: list[Try] = []
-            for first, second, won in measure.pairs([(t.is_second, t.row) for t in case.tries]):
-                for row, is_second in ((first, False), (second, True)):
-                    start, better = str(len(tries) // 2), won > 0 if is_second else won < 0
-                    row = replace(row, start_positions_m={})  # noqa: PLW2901
-                    tries.append(Try(row.task, start, is_second, better, True, row))
+            pairs = measure.pairs((t.is_second, t.row) for t in case.tries)
+            for number, (first, second, won) in enumerate(pairs):
+                for row, is_second, better in ((first, False, won < 0), (second, True, won > 0)):
+                    alone = replace(row, start_positions_m={})
+                    tries.append(Try(row.task, str(number), is_second, better, True, alone))
             asked.append((case, measure, Course.of(tries, plan)))
     found: dict[int, tuple[str, ...]] = {}
     readings = with_holm(asked, plan, lambda share, each: each[2].read(share))
     for (case, measure, _), reading in zip(asked, readings, strict=True):
-        strata = reading.evidence.strata
-        counts = (sum(s.improved for s in strata), sum(s.worsened for s in strata))
-        sides = [[t.row for t in case.tries if t.is_second == second] for second in (True, False)]
-        words = measure.sentence(sides, counts, reading.evidence.pairs, decided=reading.better != 0)
+        won, lost, many = reading.evidence.counted
+        told = f"{measure.won} in {won} and {measure.lost} in {lost} of {many} pairs"
+        first_rows, second_rows = case.sides
+        words = measure.sentence(second_rows, first_rows, told, decided=reading.better != 0)
         found[id(case)] = (*found.get(id(case), ()), words)
     return found
 
@@ -500,6 +472,11 @@ class _Case(NamedTuple):
     task: str
     tries: Sequence[Try]
     course: Course
+
+    @property
+    def sides(self) -> list[list[TrialRow]]:
+        """Trials of the first candidate, and of the second."""
+        return [[t.row for t in self.tries if t.is_second == second] for second in (False, True)]
 
 
 def plan_of(protocol: Protocol | None, *, of_task: bool = False) -> Plan:

@@ -132,6 +132,13 @@ class Evidence:
         return sum(each.score for each in self.strata) / self.pairs
 
     @property
+    def counted(self) -> tuple[int, int, int]:
+        """Pairs of one start that improved, that worsened, and all of them."""
+        parts = [(each.improved, each.worsened, each.pairs) for each in self.strata]
+        improved, worsened, pairs = (sum(part) for part in zip(*parts, strict=True))
+        return improved, worsened, pairs
+
+    @property
     def kind(self) -> Kind:
         """Whether starts are shared."""
         shared = any(each.pairs for each in self.strata)

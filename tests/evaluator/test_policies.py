@@ -11,6 +11,7 @@ import pytest
 
 from bridge.errors import UsageError
 from evaluator.compare import Comparison, compare_csv
+from evaluator.compare.beside import MEASURES
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.policies import (
     Answer,
@@ -327,6 +328,17 @@ def test_progress_and_time_stand_beside_the_answer_of_success() -> None:
     sooner = sum(b.time_s < (a.time_s or np.inf) for a, b in both if b.time_s)
     later = sum(a.time_s < (b.time_s or np.inf) for a, b in both if a.time_s)
     assert f"sooner in {sooner} and later in {later} of 40 pairs" in answer.sentence
+
+
+def test_a_failure_is_never_done_and_trials_are_paired_in_their_order() -> None:
+    _, time = MEASURES
+    first = row(1, "A", True, time_s=9.0), row(2, "A", False), row(3, "A", True, time_s=7.0)
+    second = row(4, "B", True, time_s=8.0), row(5, "B", False), row(6, "B", False, time_s=1.0)
+    sides = [*((False, each) for each in first), *((True, each) for each in second)]
+    found = [(a.episode, b.episode, np.sign(won)) for a, b, won in time.pairs(sides)]
+    assert found == [("t1", "t4", 1), ("t2", "t5", 0), ("t3", "t6", -1)]
+    unknown = row(7, "B", True)  # nobody knows how long it took
+    assert list(time.pairs([(False, first[0]), (True, unknown)])) == []
 
 
 def test_progress_that_says_no_more_than_success_is_not_told() -> None:
