@@ -23,7 +23,6 @@ from twin.scene.align.view import LevelPlane, RobotView, find_planes
 STRIDE_PX = 3
 ERROR_CAP_M = 0.05
 FITS_M = 0.015
-NUM_RESAMPLES = 500
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,18 +47,6 @@ class DepthErrors:
         return total / max(len(self.errors_m) + missing, 1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Confidence:
-    """95 % intervals from resampling blocks of points."""
-
-    displacement_m: float
-    """With 95 % probability the robot's surface lies this near to where it was put, on average;
-    says nothing of errors that all points share."""
-    depth_scale_sigma: float
-    residual_low_m: float
-    residual_high_m: float
-
-
 def depth_errors(
     views: Sequence[RobotView], surfaces: Sequence[PosedSurface], pose: ScenePose
 ) -> DepthErrors:
@@ -72,29 +59,6 @@ def depth_errors(
         both = np.isfinite(expected) & (measured > 0)
         errors.append(np.minimum(np.abs(measured[both] - expected[both]), ERROR_CAP_M))
     return DepthErrors(errors_m=np.concatenate(errors).astype(np.float64))
-
-
-def resample(
-    equations: Equations, p_base: Float[np.ndarray, "num_points 3"], *, seed: int = 0
-) -> Confidence:
-    """Draw blocks of points with replacement and solve the linearised fit again (Efron, 1979)."""
-    rng = np.random.default_rng(seed)
-    count = len(equations.weight)
-    drawn = rng.multinomial(count, np.full(count, 1 / count), size=NUM_RESAMPLES)
-    H = np.einsum("sb,bij->sij", drawn, equations.H) + 1e-9 * np.eye(7)
-    g = drawn @ equations.g
-    steps = -np.linalg.solve(H, g[..., None])[..., 0]
-    steps -= steps.mean(axis=0)
-    moved = steps[:, None, :3] + np.cross(steps[:, None, 3:6], p_base[None])
-    far = np.linalg.norm(moved, axis=-1).mean(axis=1)
-    residual = np.sqrt((drawn @ equations.square_m2) / np.maximum(drawn @ equations.weight, 1e-12))
-    low, high = np.quantile(residual, [0.025, 0.975])
-    return Confidence(
-        displacement_m=float(np.quantile(far, 0.95)),
-        depth_scale_sigma=float(steps[:, 6].std()),
-        residual_low_m=float(low),
-        residual_high_m=float(high),
-    )
 
 
 NUM_YAWS = 60
@@ -257,7 +221,6 @@ def _place(yaw_rad: float, p_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 
 
 COARSE_POINTS = 1000
 MAX_COARSE = 6
-NUM_SURFACE = 400
 MIN_FITNESS = 0.8
 """Share of the robot's pixels that must show it within 15 mm."""
 MAX_RESIDUAL_M = 0.006
@@ -280,23 +243,15 @@ class Alignment:
     residual_m: float
     margin: float | None
     """Cost of the second-best place over the best; None where the search was not needed."""
-    sureness: Confidence
     num_points: int
     num_views: int
 
     def to_record(self) -> dict[str, Any]:
         """Return plain numbers."""
-        sure = self.sureness
         return {
             "depth_scale": self.depth_scale,
-            "depth_scale_sigma": sure.depth_scale_sigma,
             "fitness": self.fitness,
-            "residual_m": {
-                "value": self.residual_m,
-                "low": sure.residual_low_m,
-                "high": sure.residual_high_m,
-            },
-            "displacement_m": sure.displacement_m,
+            "residual_m": self.residual_m,
             "yaw_margin": self.margin,
             "num_points": self.num_points,
             "num_postures": self.num_views,
@@ -356,16 +311,12 @@ def align_robot(
         costs = sorted(item.looked.cost_m(least) for item in finals)
         margin = costs[1] / max(costs[0], 1e-9) if others else float("inf")
     _accept(best, margin, len(views))
-    surface_m = np.concatenate(
-        [sample_surface(robot, view.posture, NUM_SURFACE, seed=seed) for view in views]
-    )
     return Alignment(
         T_base_source=best.pose.T_base_source,
         depth_scale=best.pose.depth_scale,
         fitness=best.looked.fitness,
-        residual_m=best.equations.residual_m(),
+        residual_m=best.equations.residual_m,
         margin=margin,
-        sureness=resample(best.equations, surface_m, seed=seed),
         num_points=best.equations.num_points,
         num_views=len(views),
     )
@@ -422,7 +373,7 @@ def _differ(a: ScenePose, b: ScenePose) -> bool:
 
 
 def _accept(best: _Candidate, margin: float | None, num_views: int) -> None:
-    fitness, residual = best.looked.fitness, best.equations.residual_m()
+    fitness, residual = best.looked.fitness, best.equations.residual_m
     more = "Record the robot in another posture, arm stretched out to one side, and use both."
     if best.equations.num_points < MIN_POINTS or fitness < MIN_FITNESS:
         raise RobotNotAlignedError(

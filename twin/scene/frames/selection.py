@@ -32,7 +32,6 @@ from twin.scene.frames.camera_poses import (
 from twin.scene.frames.pairing import (
     UnusableCameraError,
     check_camera,
-    frames_at,
     name_of,
     paired_stamps_ns,
 )
@@ -441,7 +440,8 @@ def _is_stationary(
 
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
     """Yield the frames of a choice that carry one of the stamps, with the poses it chose."""
-    for frame in frames_at(choice.episode, choice.camera_id, choice.poses.tree, stamps_ns):
+    tree = choice.poses.tree
+    for frame in streams.rgbd_frames(choice.episode, choice.camera_id, tree, stamps_ns):
         yield _corrected(frame, choice)
 
 
