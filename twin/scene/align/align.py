@@ -19,6 +19,7 @@ from twin.robot.model import RobotModel
 from twin.robot.surface import PosedSurface, sample_surface
 from twin.scene.align.refine import COARSE, FINE, Equations, ScenePose, refine
 from twin.scene.align.view import LevelPlane, RobotView, find_planes
+from twin.scene.shape.known import pose_of
 
 STRIDE_PX = 3
 ERROR_CAP_M = 0.05
@@ -138,7 +139,7 @@ def _polished(
     around = place + near.reshape(-1, 3)
     finer = _scores(views, samples, plane, near_yaws, around, FINE_CAP_M)
     i, k = np.unravel_index(int(np.argmax(finer)), finer.shape)
-    T_level_base = _place(float(near_yaws[i]), around[k])
+    T_level_base = pose_of(np.array([*around[k], near_yaws[i]]))
     return Hypothesis(
         T_base_source=se3.invert(T_level_base) @ plane.T_level_source, score=float(finer[i, k])
     )
@@ -157,7 +158,7 @@ def _scores(
         T_camera_level = se3.invert(plane.T_level_source @ view.T_source_camera)
         shifts = places @ T_camera_level[:3, :3].T
         for index, yaw in enumerate(yaws):
-            p_camera = se3.apply(T_camera_level @ _place(float(yaw), np.zeros(3)), p_base)
+            p_camera = se3.apply(T_camera_level @ pose_of(np.array([0.0, 0.0, 0.0, yaw])), p_base)
             scores[index] += _credit(view, p_camera, shifts, cap_m)
     return np.asarray(scores / len(views))
 
@@ -211,14 +212,6 @@ def _distinct(
     return found
 
 
-def _place(yaw_rad: float, p_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-    T = np.eye(4)
-    T[:2, :2] = [[c, -s], [s, c]]
-    T[:3, 3] = p_m
-    return T
-
-
 COARSE_POINTS = 1000
 MAX_COARSE = 6
 MIN_FITNESS = 0.8
@@ -251,7 +244,7 @@ class Alignment:
         return {
             "depth_scale": self.depth_scale,
             "fitness": self.fitness,
-            "residual_m": self.residual_m,
+            "residual_m": {"value": self.residual_m},
             "yaw_margin": self.margin,
             "num_points": self.num_points,
             "num_postures": self.num_views,
