@@ -45,6 +45,7 @@ from bridge.task.record import parse_record
 from bridge.task.task_file import TaskFile
 from bridge.task.verdict import Verdict
 
+RgbdPair = tuple[CompressedColor | RawColor, DepthImage]
 PAIRING_TOLERANCE_NS = 20_000_000
 """Colour and depth of one frame lie at most this far apart."""
 
@@ -148,22 +149,22 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
     raise EpisodeError(path=episode.path, found=f"{topic} is empty", hint="Record it again.")
 
 
-def rgbd_pairs(
-    episode: Episode, camera_id: str
-) -> Iterator[tuple[CompressedColor | RawColor, DepthImage]]:
+def rgbd_pairs(episode: Episode, camera_id: str) -> Iterator[RgbdPair]:
     """Yield colour and depth that belong together; colour without depth nearby is passed over."""
     color_topic = _camera_topic(episode, camera_id, "color/image")
     depth_topic = _camera_topic(episode, camera_id, "depth/image")
-    waiting_colors: list[CompressedColor | RawColor] = []
-    waiting_depths: list[DepthImage] = []
+    colors: list[CompressedColor | RawColor] = []
+    depths: list[DepthImage] = []
     for message in episode.messages([color_topic, depth_topic]):
         if message.topic == color_topic:
-            waiting_colors.append(color_from_message(message.type_name, message.data))
+            colors.append(color_from_message(message.type_name, message.data))
         else:
-            waiting_depths.append(DepthImage.from_message(message.type_name, message.data))
-        pair = _pop_pair(waiting_colors, waiting_depths)
-        if pair is not None:
-            yield pair
+            depths.append(DepthImage.from_message(message.type_name, message.data))
+        while colors and depths:
+            if abs(gap_ns := colors[0].stamp_ns - depths[0].stamp_ns) <= PAIRING_TOLERANCE_NS:
+                yield colors.pop(0), depths.pop(0)
+            else:
+                (depths if gap_ns > 0 else colors).pop(0)
 
 
 def rgbd_frames(
@@ -187,17 +188,6 @@ def rgbd_frames(
                 T_base_color=tree.T_root_frame(infos[0].frame_id, color.stamp_ns),
                 T_base_depth=tree.T_root_frame(infos[1].frame_id, depth.stamp_ns),
             )
-
-
-def _pop_pair(
-    colors: list[CompressedColor | RawColor], depths: list[DepthImage]
-) -> tuple[CompressedColor | RawColor, DepthImage] | None:
-    while colors and depths:
-        gap_ns = colors[0].stamp_ns - depths[0].stamp_ns
-        if abs(gap_ns) <= PAIRING_TOLERANCE_NS:
-            return colors.pop(0), depths.pop(0)
-        (depths if gap_ns > 0 else colors).pop(0)
-    return None
 
 
 def joint_track(episode: Episode, ending: str = JOINT_STATES) -> JointTrack:
