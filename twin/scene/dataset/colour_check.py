@@ -80,7 +80,7 @@ def check_colour(
 
 
 def _grey(target: Target) -> Float[np.ndarray, "height width"]:
-    return target.planes_u8.mean(axis=0, dtype=np.float32)
+    return np.asarray(target.planes_u8.mean(axis=0, dtype=np.float32))
 
 
 def _edges(
