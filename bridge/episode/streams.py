@@ -1,6 +1,6 @@
 """Decode what an episode holds: joints, plans, events, cameras, poses."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +45,7 @@ from bridge.task.record import parse_record
 from bridge.task.task_file import TaskFile
 from bridge.task.verdict import Verdict
 
+RgbdPair = tuple[CompressedColor | RawColor, DepthImage]
 PAIRING_TOLERANCE_NS = 20_000_000
 """Colour and depth of one frame lie at most this far apart."""
 
@@ -148,46 +149,45 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
     raise EpisodeError(path=episode.path, found=f"{topic} is empty", hint="Record it again.")
 
 
-def rgbd_frames(
-    episode: Episode, camera_id: str, tree: TransformTree | None = None
-) -> Iterator[RgbdFrame]:
-    """Yield posed frames in time order; colour without depth nearby is passed over."""
-    tree = transform_tree(episode) if tree is None else tree
-    color_info = camera_info(episode, camera_id, "color")
-    depth_info = camera_info(episode, camera_id, "depth")
+def rgbd_pairs(episode: Episode, camera_id: str) -> Iterator[RgbdPair]:
+    """Yield colour and depth that belong together; colour without depth nearby is passed over."""
     color_topic = _camera_topic(episode, camera_id, "color/image")
     depth_topic = _camera_topic(episode, camera_id, "depth/image")
-    waiting_colors: list[CompressedColor | RawColor] = []
-    waiting_depths: list[DepthImage] = []
+    colors: list[CompressedColor | RawColor] = []
+    depths: list[DepthImage] = []
     for message in episode.messages([color_topic, depth_topic]):
         if message.topic == color_topic:
-            waiting_colors.append(color_from_message(message.type_name, message.data))
+            colors.append(color_from_message(message.type_name, message.data))
         else:
-            waiting_depths.append(DepthImage.from_message(message.type_name, message.data))
-        pair = _pop_pair(waiting_colors, waiting_depths)
-        if pair is not None:
-            color, depth = pair
+            depths.append(DepthImage.from_message(message.type_name, message.data))
+        while colors and depths:
+            if abs(gap_ns := colors[0].stamp_ns - depths[0].stamp_ns) <= PAIRING_TOLERANCE_NS:
+                yield colors.pop(0), depths.pop(0)
+            else:
+                (depths if gap_ns > 0 else colors).pop(0)
+
+
+def rgbd_frames(
+    episode: Episode,
+    camera_id: str,
+    tree: TransformTree | None = None,
+    stamps_ns: Collection[int] | None = None,
+) -> Iterator[RgbdFrame]:
+    """Yield posed frames in time order, of these colour stamps alone where some are given."""
+    tree = transform_tree(episode) if tree is None else tree
+    infos = [camera_info(episode, camera_id, stream) for stream in ("color", "depth")]
+    for color, depth in rgbd_pairs(episode, camera_id):
+        if stamps_ns is None or color.stamp_ns in stamps_ns:
             yield RgbdFrame(
                 camera_id=camera_id,
                 stamp_ns=color.stamp_ns,
                 image_u8=color.image_u8(),
                 depth_m=depth.depth_m(),
-                color_camera=color_info.camera,
-                depth_camera=depth_info.camera,
-                T_base_color=tree.T_root_frame(color_info.frame_id, color.stamp_ns),
-                T_base_depth=tree.T_root_frame(depth_info.frame_id, depth.stamp_ns),
+                color_camera=infos[0].camera,
+                depth_camera=infos[1].camera,
+                T_base_color=tree.T_root_frame(infos[0].frame_id, color.stamp_ns),
+                T_base_depth=tree.T_root_frame(infos[1].frame_id, depth.stamp_ns),
             )
-
-
-def _pop_pair(
-    colors: list[CompressedColor | RawColor], depths: list[DepthImage]
-) -> tuple[CompressedColor | RawColor, DepthImage] | None:
-    while colors and depths:
-        gap_ns = colors[0].stamp_ns - depths[0].stamp_ns
-        if abs(gap_ns) <= PAIRING_TOLERANCE_NS:
-            return colors.pop(0), depths.pop(0)
-        (depths if gap_ns > 0 else colors).pop(0)
-    return None
 
 
 def joint_track(episode: Episode, ending: str = JOINT_STATES) -> JointTrack:

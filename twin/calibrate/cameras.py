@@ -326,11 +326,9 @@ def describe_cameras(record: Mapping[str, Any]) -> str:
 
 def _describe(item: Mapping[str, Any]) -> str:
     residual = item["residual_m"]
-    text = (
-        f"{item['mount']}, residual {residual['value'] * 1e3:.2f} mm "
-        f"[{residual['low'] * 1e3:.2f}, {residual['high'] * 1e3:.2f}]"
-    )
+    text = f"{item['mount']}, residual {residual['value'] * 1e3:.2f} mm"
     if "residual_rad" in item:
+        text += f" [{residual['low'] * 1e3:.2f}, {residual['high'] * 1e3:.2f}]"
         turn = {key: float(np.degrees(value)) for key, value in item["residual_rad"].items()}
         text += f" and {turn['value']:.3f} [{turn['low']:.3f}, {turn['high']:.3f}] degrees"
         text += f", {item['num_pairs']} pairs, {item['num_outliers']} outliers"

@@ -60,23 +60,15 @@ class Backdrop:
         if not len(rows):
             return view
         rays = camera.rays()[rows, columns] @ T_base_camera[:3, :3].T
-        places = _places(self._directions(rays, T_base_camera[:3, 3]), self.colors.shape[:2])
+        seen = directions_on_sphere(rays, T_base_camera[:3, 3], self.centre_m, self.radius_m)
+        places = _places(seen, self.colors.shape[:2])
         image = view.image.copy()
         for channel in range(3):
-            behind = ndimage.map_coordinates(
-                self._wrapped(channel), places, order=1, mode="nearest"
-            )
+            # With a column more on either side, for headings near the seam.
+            wrapped = np.pad(self.colors[..., channel], ((0, 0), (1, 1)), mode="wrap")
+            behind = ndimage.map_coordinates(wrapped, places, order=1, mode="nearest")
             image[rows, columns, channel] += weight[rows, columns] * behind
         return replace(view, image=image)
-
-    def _wrapped(self, channel: int) -> Float32[np.ndarray, "num_rows _"]:
-        """With a column more on either side, for headings near the seam."""
-        return np.pad(self.colors[..., channel], ((0, 0), (1, 1)), mode="wrap")
-
-    def _directions(
-        self, rays: Float[np.ndarray, "num_rays 3"], eye_m: Float[np.ndarray, "3"]
-    ) -> Float[np.ndarray, "num_rays 3"]:
-        return directions_on_sphere(rays, eye_m, self.centre_m, self.radius_m)
 
     def write(self, folder: Path) -> dict[str, Any]:
         """Write the picture; returns what ``scene.json`` says of it."""

@@ -140,23 +140,22 @@ def _spread_bits(values: np.ndarray) -> np.ndarray:
 def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:
     """The same Gaussians after a rigid motion; what their colour owes to direction turns along."""
     q, _ = se3.split(T_new_old)
-    w, x, y, z = q
-    w2, x2, y2, z2 = cloud.quats_wxyz.astype(np.float64).T
-    quats = np.stack(
-        [
-            w * w2 - x * x2 - y * y2 - z * z2,
-            w * x2 + x * w2 + y * z2 - z * y2,
-            w * y2 - x * z2 + y * w2 + z * x2,
-            w * z2 + x * y2 - y * x2 + z * w2,
-        ],
-        axis=1,
-    )
     return replace(
         cloud,
         means_m=as_float32(se3.apply(T_new_old, cloud.means_m.astype(np.float64))),
-        quats_wxyz=as_float32(quats),
+        quats_wxyz=as_float32(turned_quats(q, cloud.quats_wxyz)),
         harmonics=turned_harmonics(cloud.harmonics, T_new_old[:3, :3]),
     )
+
+
+def turned_quats(
+    turn: Float[np.ndarray, "*splats 4"], quats: Float[np.ndarray, "num_splats 4"]
+) -> Float[np.ndarray, "num_splats 4"]:
+    """Orientations after a turn, one for all or one for each: the Hamilton product, wxyz."""
+    w, v = turn[..., :1], turn[..., 1:]
+    w2, v2 = np.split(quats.astype(np.float64), [1], axis=1)
+    scalar = w * w2 - (v * v2).sum(axis=1, keepdims=True)
+    return np.concatenate([scalar, w * v2 + w2 * v + np.cross(v, v2)], axis=1)
 
 
 COLUMNS = (

@@ -11,6 +11,7 @@ something else, and changes place when that is known.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -66,6 +67,7 @@ class _Rest:
 class _Change:
     """From here on its pose changes evenly, in the base frame or in that of the tool."""
 
+    power: ClassVar[int] = 1
     start_ns: int
     end_ns: int
     T_start: Float[np.ndarray, "4 4"]
@@ -74,7 +76,7 @@ class _Change:
     def pose(self, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
         """Where it is then."""
         share = (stamp_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
-        return _between(self.T_start, self.T_end, float(np.clip(share, 0.0, 1.0)))
+        return _between(self.T_start, self.T_end, float(np.clip(share, 0.0, 1.0)) ** self.power)
 
 
 class _Push(_Change):
@@ -82,12 +84,9 @@ class _Push(_Change):
 
 
 class _Fall(_Push):
-    """It was let go; poses ``T_base_object``."""
+    """It was let go, and falls ever faster; poses ``T_base_object``."""
 
-    def pose(self, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
-        """Where it is then, ever faster."""
-        share = (stamp_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
-        return _between(self.T_start, self.T_end, float(np.clip(share, 0.0, 1.0)) ** 2)
+    power = 2
 
 
 class _Carry(_Change):

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from twin.errors import TwinError
-from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.gaussians import GaussianCloud, as_float32, turned_quats
 from twin.scene.harmonics import turned_harmonics
 
 NUM_NODES = 8
@@ -99,7 +99,7 @@ def pose_cloud(
     return replace(
         cloud,
         means_m=as_float32(means),
-        quats_wxyz=as_float32(_product(turn, cloud.quats_wxyz.astype(np.float64))),
+        quats_wxyz=as_float32(turned_quats(turn, cloud.quats_wxyz)),
         harmonics=harmonics,
     )
 
@@ -120,12 +120,3 @@ def node_rotations(
     body = se3.nearest_rotation(cross.sum(axis=0)[None])[0]
     size = np.einsum("nka,nka->n", arms_rest, arms_rest)
     return se3.nearest_rotation(cross + BODY_SHARE * size[:, None, None] * body)
-
-
-def _product(
-    a: Float[np.ndarray, "num_splats 4"], b: Float[np.ndarray, "num_splats 4"]
-) -> Float[np.ndarray, "num_splats 4"]:
-    """Hamilton product, row by row, wxyz."""
-    w, v, w2, v2 = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
-    scalar = w * w2 - np.einsum("ni,ni->n", v, v2)[:, None]
-    return np.concatenate([scalar, w * v2 + w2 * v + np.cross(v, v2)], axis=1)

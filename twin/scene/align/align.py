@@ -19,11 +19,11 @@ from twin.robot.model import RobotModel
 from twin.robot.surface import PosedSurface, sample_surface
 from twin.scene.align.refine import COARSE, FINE, Equations, ScenePose, refine
 from twin.scene.align.view import LevelPlane, RobotView, find_planes
+from twin.scene.shape.known import pose_of
 
 STRIDE_PX = 3
 ERROR_CAP_M = 0.05
 FITS_M = 0.015
-NUM_RESAMPLES = 500
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,18 +48,6 @@ class DepthErrors:
         return total / max(len(self.errors_m) + missing, 1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Confidence:
-    """95 % intervals from resampling blocks of points."""
-
-    displacement_m: float
-    """With 95 % probability the robot's surface lies this near to where it was put, on average;
-    says nothing of errors that all points share."""
-    depth_scale_sigma: float
-    residual_low_m: float
-    residual_high_m: float
-
-
 def depth_errors(
     views: Sequence[RobotView], surfaces: Sequence[PosedSurface], pose: ScenePose
 ) -> DepthErrors:
@@ -72,29 +60,6 @@ def depth_errors(
         both = np.isfinite(expected) & (measured > 0)
         errors.append(np.minimum(np.abs(measured[both] - expected[both]), ERROR_CAP_M))
     return DepthErrors(errors_m=np.concatenate(errors).astype(np.float64))
-
-
-def resample(
-    equations: Equations, p_base: Float[np.ndarray, "num_points 3"], *, seed: int = 0
-) -> Confidence:
-    """Draw blocks of points with replacement and solve the linearised fit again (Efron, 1979)."""
-    rng = np.random.default_rng(seed)
-    count = len(equations.weight)
-    drawn = rng.multinomial(count, np.full(count, 1 / count), size=NUM_RESAMPLES)
-    H = np.einsum("sb,bij->sij", drawn, equations.H) + 1e-9 * np.eye(7)
-    g = drawn @ equations.g
-    steps = -np.linalg.solve(H, g[..., None])[..., 0]
-    steps -= steps.mean(axis=0)
-    moved = steps[:, None, :3] + np.cross(steps[:, None, 3:6], p_base[None])
-    far = np.linalg.norm(moved, axis=-1).mean(axis=1)
-    residual = np.sqrt((drawn @ equations.square_m2) / np.maximum(drawn @ equations.weight, 1e-12))
-    low, high = np.quantile(residual, [0.025, 0.975])
-    return Confidence(
-        displacement_m=float(np.quantile(far, 0.95)),
-        depth_scale_sigma=float(steps[:, 6].std()),
-        residual_low_m=float(low),
-        residual_high_m=float(high),
-    )
 
 
 NUM_YAWS = 60
@@ -174,7 +139,7 @@ def _polished(
     around = place + near.reshape(-1, 3)
     finer = _scores(views, samples, plane, near_yaws, around, FINE_CAP_M)
     i, k = np.unravel_index(int(np.argmax(finer)), finer.shape)
-    T_level_base = _place(float(near_yaws[i]), around[k])
+    T_level_base = pose_of(np.array([*around[k], near_yaws[i]]))
     return Hypothesis(
         T_base_source=se3.invert(T_level_base) @ plane.T_level_source, score=float(finer[i, k])
     )
@@ -193,7 +158,7 @@ def _scores(
         T_camera_level = se3.invert(plane.T_level_source @ view.T_source_camera)
         shifts = places @ T_camera_level[:3, :3].T
         for index, yaw in enumerate(yaws):
-            p_camera = se3.apply(T_camera_level @ _place(float(yaw), np.zeros(3)), p_base)
+            p_camera = se3.apply(T_camera_level @ pose_of(np.array([0.0, 0.0, 0.0, yaw])), p_base)
             scores[index] += _credit(view, p_camera, shifts, cap_m)
     return np.asarray(scores / len(views))
 
@@ -247,17 +212,8 @@ def _distinct(
     return found
 
 
-def _place(yaw_rad: float, p_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-    T = np.eye(4)
-    T[:2, :2] = [[c, -s], [s, c]]
-    T[:3, 3] = p_m
-    return T
-
-
 COARSE_POINTS = 1000
 MAX_COARSE = 6
-NUM_SURFACE = 400
 MIN_FITNESS = 0.8
 """Share of the robot's pixels that must show it within 15 mm."""
 MAX_RESIDUAL_M = 0.006
@@ -280,23 +236,15 @@ class Alignment:
     residual_m: float
     margin: float | None
     """Cost of the second-best place over the best; None where the search was not needed."""
-    sureness: Confidence
     num_points: int
     num_views: int
 
     def to_record(self) -> dict[str, Any]:
         """Return plain numbers."""
-        sure = self.sureness
         return {
             "depth_scale": self.depth_scale,
-            "depth_scale_sigma": sure.depth_scale_sigma,
             "fitness": self.fitness,
-            "residual_m": {
-                "value": self.residual_m,
-                "low": sure.residual_low_m,
-                "high": sure.residual_high_m,
-            },
-            "displacement_m": sure.displacement_m,
+            "residual_m": {"value": self.residual_m},
             "yaw_margin": self.margin,
             "num_points": self.num_points,
             "num_postures": self.num_views,
@@ -356,16 +304,12 @@ def align_robot(
         costs = sorted(item.looked.cost_m(least) for item in finals)
         margin = costs[1] / max(costs[0], 1e-9) if others else float("inf")
     _accept(best, margin, len(views))
-    surface_m = np.concatenate(
-        [sample_surface(robot, view.posture, NUM_SURFACE, seed=seed) for view in views]
-    )
     return Alignment(
         T_base_source=best.pose.T_base_source,
         depth_scale=best.pose.depth_scale,
         fitness=best.looked.fitness,
-        residual_m=best.equations.residual_m(),
+        residual_m=best.equations.residual_m,
         margin=margin,
-        sureness=resample(best.equations, surface_m, seed=seed),
         num_points=best.equations.num_points,
         num_views=len(views),
     )
@@ -422,7 +366,7 @@ def _differ(a: ScenePose, b: ScenePose) -> bool:
 
 
 def _accept(best: _Candidate, margin: float | None, num_views: int) -> None:
-    fitness, residual = best.looked.fitness, best.equations.residual_m()
+    fitness, residual = best.looked.fitness, best.equations.residual_m
     more = "Record the robot in another posture, arm stretched out to one side, and use both."
     if best.equations.num_points < MIN_POINTS or fitness < MIN_FITNESS:
         raise RobotNotAlignedError(

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.robot.surface import PosedSurface
 from twin.scene.align.view import RobotView, ViewCloud
-from twin.scene.least_squares import tukey_weights
+from twin.scene.least_squares import normal_equations, tukey_weights
 
 FACING = 0.5
 """Cosine between the measured normal and the description's, below which a match is none."""
@@ -25,8 +25,6 @@ SCALE_SIGMA = 0.03
 """What is known of the depth scale beforehand."""
 STOP = 5e-6
 """Metres, radians and share of the depth: steps below change nothing that can be measured."""
-BLOCK_M = 0.06
-"""Noise of neighbouring pixels is not independent; resampling keeps blocks of this size whole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,17 +54,13 @@ class ScenePose:
 
 @dataclass(frozen=True, kw_only=True)
 class Equations:
-    """Weighted normal equations of matched points, summed in blocks of neighbours."""
+    """Weighted normal equations of matched points."""
 
-    H: Float[np.ndarray, "num_blocks 7 7"]
-    g: Float[np.ndarray, "num_blocks 7"]
-    square_m2: Float[np.ndarray, " num_blocks"]
-    weight: Float[np.ndarray, " num_blocks"]
+    H: Float[np.ndarray, "7 7"]
+    g: Float[np.ndarray, "7"]
+    residual_m: float
+    """Weighted root mean square distance to the surface."""
     num_points: int
-
-    def residual_m(self) -> float:
-        """Weighted root mean square distance to the surface."""
-        return float(np.sqrt(self.square_m2.sum() / max(self.weight.sum(), 1e-12)))
 
 
 def refine(
@@ -141,29 +135,15 @@ def _equations(
         for view, cloud, surface in zip(views, clouds, surfaces, strict=True)
     ]
     J, r, w = (np.concatenate([row[k] for row in rows]) for k in range(3))
-    keys = np.concatenate([row[3] + (index << 48) for index, row in enumerate(rows)])
-    order = np.argsort(keys)
-    J, r, w = J[order], r[order], w[order]
-    _, first, block = np.unique(keys[order], return_index=True, return_inverse=True)
-    num_blocks = len(first)
-    if num_blocks == 0:
-        H, g = np.zeros((0, 7, 7)), np.zeros((0, 7))
-    else:
-        H = np.add.reduceat(w[:, None, None] * J[:, :, None] * J[:, None, :], first, axis=0)
-        g = np.add.reduceat((w * r)[:, None] * J, first, axis=0)
-    return Equations(
-        H=H,
-        g=g,
-        square_m2=np.bincount(block, weights=w * r * r, minlength=num_blocks),
-        weight=np.bincount(block, weights=w, minlength=num_blocks),
-        num_points=int((w > 0).sum()),
-    )
+    H, g = normal_equations(J, r, w)
+    residual_m = float(np.sqrt((w * r * r).sum() / max(w.sum(), 1e-12)))
+    return Equations(H=H, g=g, residual_m=residual_m, num_points=int((w > 0).sum()))
 
 
 def _rows(
     view: RobotView, cloud: ViewCloud, surface: PosedSurface, pose: ScenePose, gate_m: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, Int64[np.ndarray, " num_points"]]:
-    """Jacobian (shift, turn, scale), distance, weight and block of each point."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Jacobian (shift, turn, scale), distance and weight of each point."""
     T = pose.T_base_source @ view.T_source_camera
     p = se3.apply(T, pose.depth_scale * cloud.p_m)
     found = surface.nearest(p)
@@ -174,17 +154,15 @@ def _rows(
     w[(facing < FACING) | (np.abs(p[:, 2]) < TABLE_M)] = 0.0
     stretch = np.einsum("ij,ij->i", n, cloud.p_m @ T[:3, :3].T)
     J = np.concatenate([n, np.cross(p, n), stretch[:, None]], axis=1)
-    cell = np.floor(p / BLOCK_M).astype(np.int64) + 512
-    key = (found.link_ids << 32) | (cell[:, 0] << 20) | (cell[:, 1] << 10) | cell[:, 2]
-    return J, r, w, key
+    return J, r, w
 
 
 def _stepped(
     pose: ScenePose, equations: Equations, with_scale: bool
 ) -> tuple[ScenePose, Float[np.ndarray, "7"]]:
-    H, g = equations.H.sum(axis=0), equations.g.sum(axis=0)
+    H, g = equations.H.copy(), equations.g.copy()
     if with_scale:
-        prior = max(equations.residual_m(), 1e-4) ** 2 / SCALE_SIGMA**2
+        prior = max(equations.residual_m, 1e-4) ** 2 / SCALE_SIGMA**2
         H[6, 6] += prior
         g[6] += prior * (pose.depth_scale - 1.0)
     else:

@@ -40,7 +40,11 @@ class RobotView:
     @cached_property
     def cloud(self) -> "ViewCloud":
         """Points and normals of the trusted pixels; computed once."""
-        return _cloud(self)
+        p = np.moveaxis(self.camera.unproject(self.depth_m.astype(np.float64)), -1, 0)
+        limits = DepthLimits(max_depth_m=6.0, flying_fraction=0.03)
+        trusted = trusted_depth_mask(self.depth_m, limits)
+        row, column, normals = oriented(p, trusted, trusted)
+        return ViewCloud(p_m=p[:, row, column].T, normals=normals.T)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,21 +58,6 @@ class ViewCloud:
     def take(self, index: Int64[np.ndarray, " num_kept"]) -> "ViewCloud":
         """Select points by number."""
         return ViewCloud(p_m=self.p_m[index], normals=self.normals[index])
-
-
-def _cloud(view: RobotView) -> ViewCloud:
-    p = np.moveaxis(view.camera.unproject(view.depth_m.astype(np.float64)), -1, 0)
-    limits = DepthLimits(max_depth_m=6.0, flying_fraction=0.03)
-    trusted = trusted_depth_mask(view.depth_m, limits)
-    row, column, normals = oriented(p, trusted, trusted)
-    return ViewCloud(p_m=p[:, row, column].T, normals=normals.T)
-
-
-def thin(views: Sequence[RobotView], count: int) -> list[ViewCloud]:
-    """Every n-th point of each view, about ``count`` of all views together."""
-    total = sum(len(view.cloud.p_m) for view in views)
-    step = max(1, total // max(count, 1))
-    return [view.cloud.take(np.arange(0, len(view.cloud.p_m), step)) for view in views]
 
 
 NUM_POINTS = 6000
@@ -102,7 +91,8 @@ def find_planes(views: Sequence[RobotView], *, seed: int = 0) -> list[LevelPlane
     Gravity is not known: a wall that faces the camera is told from a table by the camera's upper
     edge, which points up, and what is left over is told by where the robot fits.
     """
-    clouds = thin(views, NUM_POINTS)
+    step = max(1, sum(len(view.cloud.p_m) for view in views) // NUM_POINTS)
+    clouds = [view.cloud.take(np.arange(0, len(view.cloud.p_m), step)) for view in views]
     p = np.concatenate(
         [se3.apply(v.T_source_camera, c.p_m) for v, c in zip(views, clouds, strict=True)]
     )

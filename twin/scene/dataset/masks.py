@@ -100,7 +100,8 @@ class MovingVoxels:
         p_camera = half.camera.unproject(half.depth_m)[known]
         hit = np.zeros_like(known)
         hit[known] = self.contains(se3.apply(view.T_base_color, p_camera).astype(np.float32))
-        return view.without(_grown(hit))
+        around = np.ones((2 * MOVING_GROW_PX + 1, 2 * MOVING_GROW_PX + 1), dtype=bool)
+        return view.without(ndimage.binary_dilation(hit, around))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,14 +192,7 @@ class _Votes:
 def nearest_around(depth_m: np.ndarray) -> np.ndarray:
     """Smallest measurement within a few pixels: beside an outline nothing counts as passed."""
     nearest = np.where(depth_m > 0, depth_m, np.float32(np.inf))
-    for axis in (0, 1):
-        once = nearest.copy()
-        for shift in range(1, OUTLINE_PX + 1):
-            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
-            ahead[axis], behind[axis] = slice(shift, None), slice(None, -shift)
-            for to, source in ((tuple(ahead), tuple(behind)), (tuple(behind), tuple(ahead))):
-                nearest[to] = np.minimum(nearest[to], once[source])
-    return np.asarray(nearest)
+    return np.asarray(ndimage.minimum_filter(nearest, 2 * OUTLINE_PX + 1, mode="nearest"))
 
 
 def _keys(p_m: np.ndarray) -> np.ndarray:
@@ -219,18 +213,6 @@ def _region(cells: np.ndarray) -> MovingRegion:
     x, y, z = ((low + high) / 2).round(3).tolist()
     width, depth, height = (high - low).round(3).tolist()
     return MovingRegion(center_m=(x, y, z), size_m=(width, depth, height))
-
-
-def _grown(mask: np.ndarray) -> np.ndarray:
-    grown: np.ndarray = mask.copy()
-    for axis in (0, 1):
-        once = grown.copy()
-        for shift in range(1, MOVING_GROW_PX + 1):
-            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
-            ahead[axis], behind[axis] = slice(shift, None), slice(None, -shift)
-            grown[tuple(ahead)] |= once[tuple(behind)]
-            grown[tuple(behind)] |= once[tuple(ahead)]
-    return grown
 
 
 MIN_VIEWS, MAX_VIEWS = 6, 24

@@ -36,6 +36,7 @@ ORDERS = {
 AXES = {
     "": np.eye(4),
     "the camera looks along -z with y up (OpenGL axes)": FLIP_YZ,
+    "the images are upside down": np.diag([-1.0, -1.0, 1.0, 1.0]),
     "the camera frame is a body frame (x forward, y left, z up)": BODY_AXES,
 }
 

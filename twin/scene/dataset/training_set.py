@@ -7,7 +7,8 @@ import numpy as np
 
 from bridge.episode.reader import Episode
 from bridge.terminal import Output
-from twin.scene.dataset.geometry_search import check_geometry
+from twin.scene.dataset.colour_check import check_colour
+from twin.scene.dataset.geometry_search import camera_pose_at, check_geometry
 from twin.scene.dataset.masks import (
     EgoMask,
     MovingVoxels,
@@ -96,6 +97,7 @@ def read_training_set(
         again = check_scan(read.cameras, config.frames)
         remarks = [remark for remark in report.found if remark not in before.found]
         report = replace(again, found=(*again.found, *remarks))
+    report = replace(report, found=(*report.found, *_colour_remarks(read)))
     stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
     look_closer(robot, choices, limits_of(config), stride)
     ego_masks = _set_ego_pixels_aside(choices, read, robot)
@@ -162,6 +164,18 @@ def _read(
                 advance(len(read.views), f"camera {frame.camera_id}")
             read.cameras.append(CameraCheck(choice=choice, images=images, trusted=trusted))
     return read
+
+
+def _colour_remarks(read: _Read) -> list[str]:
+    """What is wrong with the colours of moving cameras."""
+    found = []
+    for index, camera in enumerate(read.cameras):
+        if not camera.choice.stationary:
+            pairs = zip(read.views, read.choice_of_view, strict=True)
+            mine = sorted((v for v, owner in pairs if owner == index), key=lambda v: v.stamp_ns)
+            remarks = check_colour(mine, camera_pose_at(camera.choice))
+            found += [f"{camera.name}: {remark}" for remark in remarks]
+    return found
 
 
 def _set_ego_pixels_aside(

@@ -165,10 +165,7 @@ def _measured_offsets(
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         voxel, x, y = voxel[inside], column[inside].astype(np.int32), row[inside].astype(np.int32)
         depth = view.full.depth_m[y, x]
-        ray = np.stack(
-            [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))],
-            axis=1,
-        ).astype(np.float32)
+        ray = as_float32(camera.rays()[y, x])
         p, n = p[voxel], normals[voxel] @ T[:3, :3].T
         cosine = -np.einsum("ni,ni->n", n, ray) / np.linalg.norm(ray, axis=1)
         offset = np.einsum("ni,ni->n", n, depth[:, None] * ray - p)

@@ -25,7 +25,6 @@ MAX_HEADER_BYTES = 100_000_000
 """What the format's own library allows."""
 MAX_PROMPT_CHARACTERS = 200
 SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
-CHECKSUMS = "SHA256SUMS"
 _PICKLED = (".bin", ".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".h5", ".msgpack")
 _TOKENIZERS = (("tokenizer.json",), ("vocab.json", "merges.txt"))
 
@@ -64,8 +63,7 @@ class WeightsKind:
 def check_folder(folder: Path, kind: WeightsKind) -> str:
     """Look whether a folder holds whole weights of one kind; load none of them.
 
-    Sizes are compared with what the headers of the files promise. Where a file ``SHA256SUMS`` lies
-    beside the weights, every file it names is compared with its checksum.
+    Sizes are compared with what the headers of the files promise.
 
     Returns:
         SHA-256 over configuration and weights, for the record of what was used.
@@ -84,7 +82,6 @@ def check_folder(folder: Path, kind: WeightsKind) -> str:
         _check_safetensors(path, kind)
     if not any(all((folder / name).is_file() for name in names) for names in _TOKENIZERS):
         raise kind.refuse(folder, "there is no tokenizer.json")
-    _check_sums(folder, kind)
     return provenance.hash_files([folder / "config.json", *files])
 
 
@@ -146,21 +143,6 @@ def _check_safetensors(path: Path, kind: WeightsKind) -> None:
     if promised != size:
         told = f"{path.name} has {size} bytes where its header promises {promised}"
         raise kind.refuse(folder, told)
-
-
-def _check_sums(folder: Path, kind: WeightsKind) -> None:
-    """Compare with ``SHA256SUMS`` as ``sha256sum`` writes it, where it exists."""
-    path = folder / CHECKSUMS
-    lines = path.read_text("utf-8", "replace").splitlines() if path.is_file() else []
-    for line in filter(str.strip, lines):
-        digest, _, name = line.strip().partition(" ")
-        name = name.lstrip(" *")
-        if Path(name).name != name or not (folder / name).is_file():
-            told = f"{CHECKSUMS} names {name!r}, which is no file of this folder"
-            raise kind.refuse(folder, told)
-        if provenance.hash_file(folder / name) != digest.lower():
-            told = f"{name} does not have the SHA-256 that {CHECKSUMS} states"
-            raise kind.refuse(folder, told)
 
 
 def read_normalisation(folder: Path, kind: WeightsKind) -> Normalisation:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from scipy import ndimage
 
 from bridge.episode import streams
 from bridge.episode.cdr.messages import color_from_message
@@ -32,7 +33,6 @@ from twin.scene.frames.camera_poses import (
 from twin.scene.frames.pairing import (
     UnusableCameraError,
     check_camera,
-    frames_at,
     name_of,
     paired_stamps_ns,
 )
@@ -146,8 +146,7 @@ def sharpness(image_u8: UInt8[np.ndarray, "height width 3"]) -> float:
     height, width = (side // 2 * 2 for side in image_u8.shape[:2])
     grey = image_u8[:height, :width].astype(np.float32).mean(axis=2)
     grey = grey.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
-    inner = 4 * grey[1:-1, 1:-1]
-    laplacian = inner - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
+    laplacian = ndimage.laplace(grey)[1:-1, 1:-1]
     return float(laplacian.var()) if laplacian.size else 0.0
 
 
@@ -441,7 +440,8 @@ def _is_stationary(
 
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
     """Yield the frames of a choice that carry one of the stamps, with the poses it chose."""
-    for frame in frames_at(choice.episode, choice.camera_id, choice.poses.tree, stamps_ns):
+    tree = choice.poses.tree
+    for frame in streams.rgbd_frames(choice.episode, choice.camera_id, tree, stamps_ns):
         yield _corrected(frame, choice)
 
 

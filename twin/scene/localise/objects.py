@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.streams import RgbdFrame
+from bridge.geometry import se3
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.scene.least_squares import normal_equations, tukey_weights
 from twin.scene.localise.mesh_fit import MeshSurface, fit_mesh, known_surface
@@ -148,6 +149,10 @@ def fit_table(
         p_base[:, 2],
         rcond=None,
     )[0]
+    T_new_old = np.eye(4)
+    T_new_old[:3, :3] = se3.rotation_from_vector(np.array([x[2], x[3], 0.0]))
+    lifted = p_base_camera + np.array([0.0, 0.0, x[1]])
+    T_new_old[:3, 3] = lifted - T_new_old[:3, :3] @ p_base_camera
     return TableFit(
         camera_id=camera_id,
         num_points=len(d),
@@ -155,23 +160,8 @@ def fit_table(
         tilt_rad=float(np.hypot(slope[0], slope[1])),
         residual_m=spread,
         depth_factor=float(1 - x[0]),
-        T_new_old=_small_motion(x[1], x[2], x[3], p_base_camera),
+        T_new_old=T_new_old,
     )
-
-
-def _small_motion(
-    height_m: float, about_x_rad: float, about_y_rad: float, p_centre: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """Rotate about a point (Rodrigues), then lift."""
-    rotation = np.array([about_x_rad, about_y_rad, 0.0])
-    angle = float(np.linalg.norm(rotation))
-    T = np.eye(4)
-    if angle > 0:
-        x, y, z = rotation / angle
-        K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        T[:3, :3] = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-    T[:3, 3] = p_centre - T[:3, :3] @ p_centre + np.array([0.0, 0.0, height_m])
-    return T
 
 
 MAX_FRAMES = 3

@@ -18,7 +18,7 @@ from twin.scene.frames.camera_poses import (
     check_connected,
     same_pose,
 )
-from twin.scene.frames.pairing import check_camera, frames_at, paired_stamps_ns
+from twin.scene.frames.pairing import check_camera, paired_stamps_ns
 from twin.scene.frames.selection import rgbd_camera_ids, spread
 from twin.scene.store.calibration import Calibration
 
@@ -74,7 +74,7 @@ def stationary_frames(
             continue
         stamps = np.array(item.stamps_ns, dtype=np.int64)
         chosen = spread(stamps, max_per_camera) if evenly else stamps[-max_per_camera:]
-        found = frames_at(episode, camera_id, item.poses.tree, chosen.tolist())
+        found = streams.rgbd_frames(episode, camera_id, item.poses.tree, set(chosen.tolist()))
         frames.extend(with_true_depth(frame, item.poses) for frame in found)
     return frames
 

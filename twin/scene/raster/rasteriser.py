@@ -330,18 +330,8 @@ class Rasteriser:
         plane_gradients: Float32[np.ndarray, "5 height width"],
     ) -> CloudGradient:
         """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud."""
-        means, quats, scales, opacities, colors, harmonics, pose = self._native.pull(
-            planes, plane_gradients
-        )
-        return CloudGradient(
-            means_m=means,
-            quats_wxyz=quats,
-            scales_log=scales,
-            opacities_logit=opacities,
-            colors=colors,
-            harmonics=harmonics,
-            T_camera_base=pose,
-        )
+        *rows, pose = self._native.pull(planes, plane_gradients)
+        return CloudGradient(**dict(zip(NAMES, rows, strict=True)), T_camera_base=pose)
 
     def draw_features(
         self, features: Float32[np.ndarray, "num_splats num_channels"]

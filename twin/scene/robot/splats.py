@@ -36,14 +36,14 @@ def posed(
     """Put the Gaussians of all links where forward kinematics puts the links.
 
     Returns:
-        One cloud in the base frame, links in the order of the mapping; empty without links.
+        One cloud in the base frame, links in the order of the mapping; there must be one.
     """
     robot = load_robot(urdf)
     placed = [
         moved_cloud(cloud, robot.T_base_link(link, joints_rad, width_m))
         for link, cloud in links.items()
     ]
-    return lighting.on(concatenate(placed)) if placed else _empty()
+    return lighting.on(concatenate(placed))
 
 
 def surface_links(
@@ -101,14 +101,3 @@ def read_links(run: RunFolder, record: Mapping[str, Any]) -> dict[str, GaussianC
         link: read_ply(folder / f"{check_episode_id(link)}.ply")
         for link in record.get("robot", {}).get("links", {})
     }
-
-
-def _empty() -> GaussianCloud:
-    none = np.zeros((0, 3), dtype=np.float32)
-    return GaussianCloud(
-        means_m=none,
-        quats_wxyz=np.zeros((0, 4), dtype=np.float32),
-        scales_log=none,
-        opacities_logit=np.zeros(0, dtype=np.float32),
-        colors=none,
-    )

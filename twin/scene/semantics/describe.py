@@ -35,6 +35,7 @@ from twin.scene.semantics.support import (
     find_support,
     level_frame,
 )
+from twin.scene.shape.known import pose_of
 
 MIN_SPLATS = 20
 """Of a known object with fewer Gaussians nothing can be said."""
@@ -306,15 +307,11 @@ def describe(
         nearest = np.arange(len(p)) if surface_m is None else cKDTree(surface).query(p)[1]
         for name, part in find_parts(surface - up, CELL_M).items():
             parts[name] = np.isin(np.arange(len(cloud)), ids[part[nearest]])
-    T = np.eye(4)
-    cos, sin = np.cos(measured.yaw_rad), np.sin(measured.yaw_rad)
-    T[:2, :2] = [[cos, -sin], [sin, cos]]
-    T[:3, 3] = measured.centre_m + up
     return replace(
         item,
         label=label,
         color_srgb=(int(color[0]), int(color[1]), int(color[2])),
-        T_base_instance=T,
+        T_base_instance=pose_of(np.array([*(measured.centre_m + up), measured.yaw_rad])),
         size_m=measured.size_m,
         parts=parts,
     )

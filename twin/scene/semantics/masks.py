@@ -89,17 +89,14 @@ def observe(
 
 
 def associate(
-    observations: Sequence[Observation], num_splats: int, background_bias: float = 0.0
+    observations: Sequence[Observation], num_splats: int
 ) -> tuple[tuple[Track, ...], UInt16[np.ndarray, " num_splats"]]:
     """Find the things that the masks of many frames agree on, the largest first.
 
     Masks are clustered by the mean of their IoU. A Gaussian goes to the thing with the largest
-    share of its light inside the thing's masks, if that is more than the background's share plus
-    the bias. Frames whose mask of the thing is missing do not count against it: a dropped mask says
-    nothing about the edge.
-
-    Args:
-        background_bias: Positive where masks bleed, negative where they shrink.
+    share of its light inside the thing's masks, if that is more than the background's share.
+    Frames whose mask of the thing is missing do not count against it: a dropped mask says nothing
+    about the edge.
     """
     masks = [
         (frame, int(column))
@@ -117,7 +114,7 @@ def associate(
             kept.append((members, support, seen))
             share.append(of_thing)
     best = np.max(share, axis=0)
-    owner = np.where(best > 1.0 - best + background_bias, np.argmax(share, axis=0), 0)
+    owner = np.where(best > 1.0 - best, np.argmax(share, axis=0), 0)
     tracks = [
         _track(observations, members, support, seen, owner == number)
         for number, (members, support, seen) in enumerate(kept, start=1)

@@ -58,11 +58,8 @@ class MaskedView:
     def points_m(self) -> Float[np.ndarray, "num_points 3"]:
         """Measured points of the object, in ``base`` [m]."""
         depth = self.known_depth_m()
-        row, column = np.nonzero(self.mask & (depth > 0))
-        z = depth[row, column].astype(np.float64)
-        x = (column + 0.5 - self.camera.cx) / self.camera.fx * z
-        y = (row + 0.5 - self.camera.cy) / self.camera.fy * z
-        return se3.apply(self.T_base_camera, np.stack([x, y, z], axis=1))
+        p_camera = self.camera.unproject(depth.astype(np.float64))[self.mask & (depth > 0)]
+        return se3.apply(self.T_base_camera, p_camera)
 
 
 NEAR_M = 0.03

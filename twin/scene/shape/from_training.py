@@ -23,7 +23,7 @@ from twin.errors import TwinError
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import spread
 from twin.scene.shape.carve import MaskedView, ShapeError
-from twin.scene.shape.known import shape_mesh, surface_distances
+from twin.scene.shape.known import pose_of, shape_mesh, surface_distances
 from twin.scene.shape.reconstruct import (
     ObjectShape,
     moved_views,
@@ -99,10 +99,8 @@ def _leaning(
     align_rounds: int,
 ) -> ObjectShape:
     """Reconstruct in a level frame, where the table is a plane of the grid; then lean it."""
-    T_base_level = np.eye(4)
     yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
-    T_base_level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T_base_level[:3, 3] = T_base_object[:3, 3]
+    T_base_level = pose_of(np.array([*T_base_object[:3, 3], yaw]))
     T_level_object = se3.invert(T_base_level) @ T_base_object
     level = reconstruct(moved_views(views, T_level_object), support, align_rounds=align_rounds)
     vertices = se3.apply(se3.invert(T_level_object), level.vertices_m)
@@ -138,9 +136,7 @@ def masked_view(
     row, column = np.nonzero(depth[rows, columns] > 0)
     row, column = row + rows.start, column + columns.start
     z = depth[row, column].astype(np.float64)
-    p_camera = np.stack(
-        [(column + 0.5 - camera.cx) / camera.fx * z, (row + 0.5 - camera.cy) / camera.fy * z, z], 1
-    )
+    p_camera = camera.rays()[row, column] * z[:, None]
     p_base = se3.apply(view.T_base_color, p_camera)
     near = np.flatnonzero(np.linalg.norm(p_base - T[:3, 3], axis=1) < reach)
     near = near[p_base[near, 2] > TABLE_M]

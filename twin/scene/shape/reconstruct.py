@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from twin.scene.shape.carve import (
     Evidence,
@@ -20,7 +22,7 @@ from twin.scene.shape.carve import (
 from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.mesh import Faces, Vertices, face_normals, is_watertight, volume_m3
 from twin.scene.shape.registration import laid_together
-from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
+from twin.scene.shape.sdf import SdfGrid, smoothed
 
 PAD_VOXELS = 4
 """Free voxels around the object, so that distances are known a little beyond it."""
@@ -210,7 +212,6 @@ def moved_views(
     return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]
 
 
-MAX_SAMPLES = 2_000_000
 MEASURED_VOXELS = 2.0
 """Faces this near to a measured point were measured; the rest is somebody's guess."""
 
@@ -220,10 +221,9 @@ def shape_of_mesh(
     faces: Faces,
     points_m: Float[np.ndarray, "num_points 3"],
 ) -> ObjectShape:
-    """Fill a mesh and describe it like a reconstructed shape.
+    """Describe a mesh of closed pieces, which may overlap, like a reconstructed shape.
 
-    It need not be closed: gaps below a voxel or two close, inner faces vanish. Faces that no
-    measured point lies near are marked as completed.
+    Faces that no measured point lies near are marked as completed.
 
     Args:
         vertices_m: In the frame that is wanted, z up.
@@ -231,12 +231,12 @@ def shape_of_mesh(
     """
     low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
     box, truncation = voxel_box(low, high)
-    solid = _filled(vertices_m, faces, box)
-    if int(solid.sum()) < 1:
+    places = box.centres_m(np.arange(box.num_voxels))
+    values = _signed_m(vertices_m, faces, places).reshape(box.counts)
+    solid = values < 0
+    if not solid.any():
         message = f"{len(faces)} triangles enclose no voxel of {box.voxel_m * 1e3:.1f} mm."
         raise ShapeError(message)
-    distances = distances_of_solid(solid, box.voxel_m)
-    values = smoothed(distances, box.voxel_m, SMOOTHING_VOXELS)
     grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
     weight = _near_points(points_m, box).astype(np.float32)
     evidence = Evidence(
@@ -245,47 +245,23 @@ def shape_of_mesh(
     return describe_solid(grid, evidence, 1, truncation)
 
 
-def _filled(
-    vertices_m: Vertices, faces: Faces, box: VoxelBox
-) -> Bool[np.ndarray, "num_x num_y num_z"]:
-    """Voxels inside: the skin is closed and filled, then skin voxels outside are taken off."""
-    p, normals = _dense(vertices_m, faces, box.voxel_m / 2)
-    index = np.rint((p - box.origin_m) / box.voxel_m).astype(np.int64)
-    skin = np.zeros(box.counts, dtype=bool)
-    skin[tuple(np.clip(index, 0, np.array(box.counts) - 1).T)] = True
-    tight = ndimage.binary_closing(skin, iterations=2) | skin
-    solid = np.asarray(ndimage.binary_fill_holes(tight))
-    ids = np.flatnonzero(tight)
-    centres = box.centres_m(ids)
-    _, nearest = cKDTree(p).query(centres)
-    outside = np.einsum("ni,ni->n", centres - p[nearest], normals[nearest]) > 0
-    solid.ravel()[ids[outside]] = False
-    return solid
+def _signed_m(
+    vertices_m: Vertices, faces: Faces, places: Float[np.ndarray, "num_places 3"]
+) -> Float32[np.ndarray, " num_places"]:
+    """Distance of places to the union of closed pieces, negative inside of one."""
+    import open3d  # noqa: PLC0415  # loads 300 modules; who only reads shapes needs none
 
-
-def _dense(vertices_m: Vertices, faces: Faces, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points on a mesh no farther apart than a spacing, and normals that look outwards."""
-    a, b, c = (vertices_m[faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    area = np.linalg.norm(cross, axis=1)
-    longest = np.max([np.linalg.norm(e, axis=1) for e in (b - a, c - b, a - c)], axis=0)
-    steps = np.maximum(np.ceil(longest / spacing_m).astype(np.int64), 1)
-    total = int(((steps + 1) * (steps + 2) // 2).sum())
-    if total > MAX_SAMPLES:
-        message = f"{len(faces)} triangles would need {total} points; the mesh is too fine."
-        raise ShapeError(message)
-    normals = cross / np.maximum(area, 1e-300)[:, None]
-    if volume_m3(vertices_m, faces) < 0:
-        normals = -normals
-    points, triangles = [], []
-    for step in np.unique(steps):
-        own = np.flatnonzero(steps == step)
-        i, j = np.nonzero(np.add.outer(np.arange(step + 1), np.arange(step + 1)) <= step)
-        u, v = (i / step)[None, :, None], (j / step)[None, :, None]
-        p = a[own][:, None] * (1 - u - v) + b[own][:, None] * u + c[own][:, None] * v
-        points.append(p.reshape(-1, 3))
-        triangles.append(np.repeat(own, len(i)))
-    return np.concatenate(points), normals[np.concatenate(triangles)]
+    make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
+    tensor: Any = open3d.core.Tensor
+    count, ends = len(vertices_m), np.concatenate([faces[:, :2], faces[:, 1:]]).T
+    _, piece = connected_components(coo_array((np.ones(ends.shape[1]), ends), shape=(count, count)))
+    nearest = np.full(len(places), np.inf, dtype=np.float32)
+    for number in np.unique(piece[faces[:, 0]]):
+        scene, own = make(), faces[piece[faces[:, 0]] == number].astype(np.uint32)
+        scene.add_triangles(tensor(vertices_m.astype(np.float32)), tensor(own))
+        away = scene.compute_signed_distance(tensor(places.astype(np.float32)))
+        nearest = np.minimum(nearest, away.numpy())
+    return nearest
 
 
 def _near_points(

@@ -90,6 +90,3 @@ def write_record(run: RunFolder, record: Mapping[str, Any]) -> Path:
     path = run.scene_dir / SCENE_FILE
     write_whole(path, (json.dumps(record, indent=2) + "\n").encode())
     return path
-
-
-SPLATS = "gaussians.ply"

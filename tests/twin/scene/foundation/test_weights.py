@@ -1,6 +1,5 @@
 """A folder of weights is looked at before anything in it is loaded."""
 
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -108,8 +107,6 @@ def removed(name: str) -> Callable[[Path], None]:
         (set_text("model.safetensors", "\x02\0\0\0\0\0\0\0[]"), "header of model.safetensors"),
         (a_part_missing, "1 of 2 parts are missing, first model-2"),
         (a_part_elsewhere, "no safetensors file of this folder"),
-        (set_text("SHA256SUMS", "00  ../owl/config.json\n"), "SHA256SUMS names"),
-        (set_text("SHA256SUMS", f"{'0' * 64}  config.json\n"), "does not have the SHA-256"),
     ],
 )
 def test_a_damaged_folder_is_refused_with_one_sentence_that_says_how(
@@ -120,14 +117,6 @@ def test_a_damaged_folder_is_refused_with_one_sentence_that_says_how(
         check_folder(folder, KIND)
     assert said in str(caught.value)
     assert "docs/foundation_models.md" in str(caught.value)
-
-
-def test_checksums_that_agree_are_accepted(folder: Path) -> None:
-    digest = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
-    (folder / "SHA256SUMS").write_text(
-        f"{digest}  model.safetensors\n{digest} *model.safetensors\n"
-    )
-    check_folder(folder, KIND)
 
 
 def test_the_hash_changes_with_the_numbers_alone(folder: Path) -> None:

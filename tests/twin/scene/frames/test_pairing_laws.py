@@ -19,7 +19,7 @@ from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
-from twin.scene.frames.pairing import frames_at, paired_stamps_ns
+from twin.scene.frames.pairing import paired_stamps_ns
 
 CAMERA = Camera(width=8, height=6, fx=8.0, fy=8.0, cx=4.0, cy=3.0)
 S = 1_000_000_000
@@ -67,7 +67,7 @@ def test_each_image_of_a_pair_is_posed_at_its_own_instant(episode: Episode) -> N
     tree = streams.transform_tree(episode)
     stamps = paired_stamps_ns(episode, "eye")
     assert stamps.tolist() == list(range(S, 2 * S, S // 5))
-    chosen = list(frames_at(episode, "eye", tree, stamps.tolist()[1:4]))
+    chosen = list(streams.rgbd_frames(episode, "eye", tree, stamps.tolist()[1:4]))
     assert [frame.stamp_ns for frame in chosen] == stamps.tolist()[1:4]
     for frame in [*chosen, *streams.rgbd_frames(episode, "eye", tree)]:
         x = SPEED_M_S * frame.stamp_ns / S

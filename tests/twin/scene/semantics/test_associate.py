@@ -34,8 +34,8 @@ def frames(count: int = 8, seed: int = 0) -> list[Observation]:
     return [observation(rng, [str(n) for n in rng.permutation(list(THINGS))]) for _ in range(count)]
 
 
-def run(observations: list[Observation], background_bias: float = 0.0) -> tuple[Track, ...]:
-    tracks, labels = associate(observations, NUM_SPLATS, background_bias)
+def run(observations: list[Observation]) -> tuple[Track, ...]:
+    tracks, labels = associate(observations, NUM_SPLATS)
     for number, track in enumerate(tracks, start=1):
         np.testing.assert_array_equal(labels == number, track.mask)
     return tracks
@@ -110,16 +110,6 @@ def test_a_wrong_name_is_outvoted() -> None:
     wrong = tuple("duck" if name == "box" else name for name in items[0].labels)
     items[0] = replace(items[0], labels=wrong)
     assert by_label(run(items)).keys() == THINGS.keys()
-
-
-def test_a_higher_background_bias_never_adds_a_gaussian() -> None:
-    rng = np.random.default_rng(5)
-    noisy = [observation(rng, list(THINGS), noise=0.3) for _ in range(8)]
-    sizes = [
-        sum(int(track.mask.sum()) for track in run(noisy, bias)) for bias in (-0.3, 0.0, 0.3, 0.6)
-    ]
-    assert sizes == sorted(sizes, reverse=True)
-    assert sizes[0] > sizes[-1]
 
 
 def test_a_thing_seen_in_few_frames_needs_masks_in_most_of_them() -> None:

@@ -1,0 +1,242 @@
+"""Colour against depth and poses, before a fit: edges and brightness of a moving camera, once.
+
+Where depth jumps an image has an edge. How edges of both lie to each other says whether colour is
+shifted, late or upside down; points carried from image to image by depth and poses say which images
+are brighter, which poses are off, and which images were sent twice.
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from bridge.geometry import se3
+from twin.scene.frames.downscaled import pixels_of
+from twin.scene.frames.rgbd import Target, TrainingView
+from twin.scene.frames.selection import spread
+
+MAX_VIEWS, EDGE_VIEWS, FEWEST = 60, 24, 8
+LEAST_WIDTH_PX = 100
+"""Narrower images have no edges to judge."""
+TURNED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "upside down": lambda image: image[::-1, ::-1],
+    "mirrored": lambda image: image[:, ::-1],
+}
+REACH_PX = 14
+"""Edges are looked for this far from where depth has them, at half size."""
+MOST_EDGES = 3000
+JUMP = 0.06
+"""Depths of neighbours that differ by more than this share are of two surfaces."""
+LEAST_GAIN = 1.08
+"""So many times as strong an agreement of edges says that something else is true."""
+SHIFT_PX, LATE_S = 2.0, 0.02
+"""Less, at half size, is what cameras and their calibrations do."""
+DELAYS_S = np.arange(-0.2, 0.2001, 0.005)
+STEP_NS = 20_000_000
+BLURRED = 0.78
+"""With more of its gradients left after a further blur an image has no sharp edge."""
+SAME_SURFACE = 0.03
+BRIGHTER = 0.14
+"""Logarithm of the brightness of neighbours, from which exposure jumps."""
+APART_PX = 2.0
+"""Images between which the camera moved by this much differ."""
+SAME_LEVELS = 0.35
+"""Mean difference of two copies of one image, of 255."""
+FITS_AT_ALL = 0.6
+"""Where less of the depth agrees, brightness of the same points says nothing."""
+LOST, FITS = 0.5, 0.75
+"""Of the agreement of its neighbours: a pose with less is off, if they fit without it."""
+
+
+class _Step(NamedTuple):
+    """What one image says of a later one."""
+
+    moved_px: float
+    """How far its points moved in the image."""
+    brighter: float
+    """Logarithm of the brightness of the same points; 0 without any."""
+    agreement: float
+    """Share of the depth that is the same."""
+    difference: float
+    """Mean difference of the two images, in levels."""
+
+
+def check_colour(
+    views: Sequence[TrainingView], pose_at: Callable[[int], Float[np.ndarray, "4 4"]]
+) -> list[str]:
+    """What is wrong with the images of one moving camera, one remark each.
+
+    Args:
+        views: In the order of time.
+        pose_at: Of a camera near by, at any instant: how fast it turned.
+    """
+    chosen = [views[k] for k in spread(np.arange(len(views)), MAX_VIEWS)]
+    if len(chosen) < FEWEST or chosen[0].half.camera.width < LEAST_WIDTH_PX:
+        return []
+    return [*_edges(chosen, pose_at), *_blur(chosen), *_sequence(chosen)]
+
+
+def _grey(target: Target) -> Float[np.ndarray, "height width"]:
+    return np.asarray(target.planes_u8.mean(axis=0, dtype=np.float32))
+
+
+def _edges(
+    views: Sequence[TrainingView], pose_at: Callable[[int], Float[np.ndarray, "4 4"]]
+) -> list[str]:
+    """Shift, delay or turn of colour against depth, whichever makes edges meet.
+
+    Said only where two halves of the views say the same.
+    """
+    some = [views[k] for k in spread(np.arange(len(views)), EDGE_VIEWS)]
+    each = np.stack([_meeting(view, np.asarray) for view in some])
+    maps, middle = each.mean(axis=0), REACH_PX
+    for word, turn in TURNED.items():
+        turned = np.stack([_meeting(view, turn) for view in some])
+        if _is_sure(turned) and turned.mean(axis=0).max() > LEAST_GAIN**2 * maps.max():
+            return [f"its colour images are {word} to its depth"]
+    here = float(maps[middle - 1 : middle + 2, middle - 1 : middle + 2].max())
+    flows = np.array([_flow_px_s(view, pose_at) for view in some])
+    late = np.array([_along(each, flows * delay) for delay in DELAYS_S])
+    delays = [float(DELAYS_S[int(late[:, k::2].mean(axis=1).argmax())]) for k in (0, 1)]
+    delay_s, most = float(np.mean(delays)), float(late.mean(axis=1).max())
+    sure = abs(delays[0] - delays[1]) <= 2 * LATE_S and abs(delay_s) >= LATE_S
+    if sure and most > LEAST_GAIN * here and most > maps.max():
+        word = "later" if delay_s > 0 else "earlier"
+        return [f"its colour was taken {1e3 * abs(delay_s):.0f} ms {word} than its depth"]
+    shift = _peak(maps)
+    if _is_sure(each) and maps.max() > LEAST_GAIN * here and np.hypot(*shift) >= SHIFT_PX:
+        x, y = 2 * shift
+        return [
+            f"its colour lies ({x:+.0f}, {y:+.0f}) pixels beside its depth: principal point, or "
+            "how the two were registered"
+        ]
+    return []
+
+
+def _is_sure(each: np.ndarray) -> bool:
+    """Whether both halves of the views have their peak at one place."""
+    return bool(np.abs(_peak(each[::2].mean(axis=0)) - _peak(each[1::2].mean(axis=0))).max() <= 2)
+
+
+def _peak(found: np.ndarray) -> Float[np.ndarray, "2"]:
+    """Where a map is highest, right and down of its middle."""
+    row, column = np.unravel_index(int(found.argmax()), found.shape)
+    return np.array([column - REACH_PX, row - REACH_PX], dtype=np.float64)
+
+
+def _along(each: np.ndarray, places: np.ndarray) -> Float[np.ndarray, " num_views"]:
+    """The views' maps, each at its own place."""
+    index = np.clip(np.rint(places).astype(int) + REACH_PX, 0, 2 * REACH_PX)
+    return np.asarray(each[np.arange(len(each)), index[:, 1], index[:, 0]])
+
+
+def _flow_px_s(
+    view: TrainingView, pose_at: Callable[[int], Float[np.ndarray, "4 4"]]
+) -> Float[np.ndarray, "2"]:
+    """How fast what a camera sees runs through its half-size image [px/s]."""
+    target = view.half
+    p = target.camera.unproject(target.depth_m)[target.depth_m > 0][::50]
+    if not len(p):
+        return np.zeros(2)
+    before, after = (pose_at(view.stamp_ns + sign * STEP_NS) for sign in (-1, 1))
+    later = se3.apply(se3.invert(after) @ before, p)
+    front = later[:, 2] > 0.05
+    moved = target.camera.project(later[front])[0] - target.camera.project(p[front])[0]
+    return np.median(moved, axis=0) / (2e-9 * STEP_NS) if front.any() else np.zeros(2)
+
+
+def _meeting(
+    view: TrainingView, turn: Callable[[np.ndarray], np.ndarray]
+) -> Float[np.ndarray, "num_rows num_columns"]:
+    """How strong an image's edges are at depth's, for each shift of the image."""
+    target = view.half
+    grey = turn(_grey(target))
+    edges = ndimage.gaussian_gradient_magnitude(grey, 1.0)
+    edges = np.minimum(edges / max(float(np.quantile(edges, 0.9)), 1e-6), 1.0)
+    depth, jumps = target.depth_m, np.zeros(grey.shape, dtype=np.float32)
+    for axis in (0, 1):
+        near, far = (
+            np.moveaxis(depth, axis, 0)[part] for part in (slice(None, -1), slice(1, None))
+        )
+        known = (near > 0) & (far > 0)
+        jump = known & (np.abs(near - far) > JUMP * np.minimum(near, far))
+        np.moveaxis(jumps, axis, 0)[:-1] += jump
+    rows, columns = np.nonzero(jumps)
+    inside = (rows >= REACH_PX) & (rows < len(grey) - REACH_PX)
+    inside &= (columns >= REACH_PX) & (columns < grey.shape[1] - REACH_PX)
+    thinner = max(1, int(inside.sum()) // MOST_EDGES)
+    rows, columns = rows[inside][::thinner], columns[inside][::thinner]
+    steps = np.arange(-REACH_PX, REACH_PX + 1)
+    if not len(rows):
+        return np.zeros((len(steps), len(steps)))
+    found = [[edges[rows + down, columns + right].mean() for right in steps] for down in steps]
+    return np.array(found)
+
+
+def _blur(views: Sequence[TrainingView]) -> list[str]:
+    left = []
+    for view in views[:: max(1, len(views) // 12)]:
+        once = ndimage.gaussian_filter(_grey(view.full), 1.0)
+        twice = ndimage.gaussian_filter(once, 1.5)
+        for axis in (0, 1):
+            before, after = (np.abs(np.gradient(image, axis=axis)) for image in (once, twice))
+            strong = before >= np.quantile(before, 0.98)
+            left.append(float(after[strong].mean() / max(float(before[strong].mean()), 1e-6)))
+    worst = np.median(np.reshape(left, (-1, 2)), axis=0).max()
+    return ["its images are blurred: most of them have no sharp edge"] if worst > BLURRED else []
+
+
+def _sequence(views: Sequence[TrainingView]) -> list[str]:
+    """Images sent twice, jumps of exposure, and poses that neither neighbour confirms."""
+    steps = [_step(a, b) for a, b in pairwise(views)]
+    over = [_step(a, b).agreement for a, b in zip(views, views[2:], strict=False)]
+    twice = sum(each.difference < SAME_LEVELS and each.moved_px > APART_PX for each in steps)
+    usual = float(np.median([each.agreement for each in steps]))
+    sure = [each.brighter for each in steps if each.agreement > max(FITS * usual, FITS_AT_ALL)]
+    jumps = int((np.abs(sure) > BRIGHTER).sum())
+    off = [
+        views[k]
+        for k in range(1, len(views) - 1)
+        if not twice
+        and max(steps[k - 1].agreement, steps[k].agreement) < LOST * usual
+        and over[k - 1] > FITS * usual
+    ]
+    told = []
+    if twice > 1:
+        told.append(f"{twice} of {len(views)} of its images are copies of the one before")
+    if jumps > 1:
+        told.append(
+            f"its exposure jumps between {jumps} of {len(steps)} neighbouring images; fix it while "
+            "scanning"
+        )
+    if off:
+        told.append(
+            f"the poses of {len(off)} of {len(views)} images fit neither the image before nor the "
+            f"one after, the first at {off[0].stamp_ns} ns"
+        )
+    return told
+
+
+def _step(first: TrainingView, second: TrainingView) -> _Step:
+    """Carry every few points of one image into another."""
+    a, b = first.half, second.half
+    part = (slice(None, None, 4), slice(None, None, 4))
+    known = (a.depth_m > 0)[part]
+    p = a.camera.unproject(a.depth_m)[part][known]
+    moved = se3.apply(se3.invert(second.T_base_color) @ first.T_base_color, p)
+    row, column, inside = pixels_of(b.camera, moved)
+    z, measured = moved[inside, 2], b.depth_m[row[inside], column[inside]]
+    met = measured > 0
+    same = met & (np.abs(measured - z) < SAME_SURFACE * z)
+    mine, theirs = _grey(a)[part][known][inside], _grey(b)[row[inside], column[inside]]
+    lit = same & (mine > 10) & (theirs > 10) & (mine < 245) & (theirs < 245)
+    away = a.camera.project(p)[0][inside] - np.stack([column, row], axis=1)[inside]
+    return _Step(
+        moved_px=float(np.median(np.hypot(*away.T))) if inside.any() else np.inf,
+        brighter=float(np.median(np.log(theirs[lit] / mine[lit]))) if lit.sum() > 50 else 0.0,
+        agreement=float(same.sum() / max(met.sum(), 1)),
+        difference=float(np.abs(_grey(a) - _grey(b)).mean()),
+    )
