@@ -26,7 +26,6 @@ from bridge.task.verdict import Factor, Verdict
 from twin.physics.engines import engine_version
 from twin.replay.checks import (
     limited_to_task,
-    path_limit_failures,
     simulated_limit_failures,
     start_failures,
     task_failures,
@@ -38,6 +37,7 @@ from twin.replay.dynamics import Burst, States, free_start, simulate, soft_model
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import Failure, factor_from
 from twin.replay.grasps import grasps_seen
+from twin.replay.motion import held_of, motion_failures, payload_unknown
 from twin.replay.path import JointPath, check_path, path_of_plan
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
@@ -185,7 +185,8 @@ def replay_plan(
     path, failures, unreachable_ns = path_of_plan(
         plan, robot, clearance=free, start_rad=scene.start_rad
     )
-    checks = {"task": task_failures(plan, scene.task), "limits": path_limit_failures(path, robot)}
+    held = held_of(plan, scene.task)
+    checks = {"task": task_failures(plan, scene.task), "limits": motion_failures(path, robot, held)}
     if scene.start_rad is not None:
         checks["start"] = start_failures(plan, path, scene.start_rad, robot)
     commanded = Commanded(
@@ -194,6 +195,7 @@ def replay_plan(
         unreachable_ns=unreachable_ns,
         trajectory="planned",
         checks=checks,
+        unknown=payload_unknown(robot, held),
     )
     return _replay(commanded, plan, scene, config, refuse_early=refuse_early)
 
@@ -222,6 +224,8 @@ class Commanded:
     unreachable_ns: int | None = None
     checks: dict[str, list[Failure]] = field(default_factory=dict)
     """Of the checks beside I(tau)."""
+    unknown: str | None = None
+    """A limit that nobody knows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -367,7 +371,10 @@ def _judge(
         terminal=terminal,
         warnings=warnings_of(scene, result),
         findings=tuple(findings),
-        checks={name: factor_from(found) for name, found in checks.items()},
+        checks={
+            name: factor_from(found, undecided=commanded.unknown if name == "limits" else None)
+            for name, found in checks.items()
+        },
         grasps=grasps_seen(plan, path, result) if planned else (),
         nearest=moved.monitor.nearest() if moved.measured else None,
     )

@@ -76,7 +76,7 @@ def test_of_several_settings_the_newest_counts(run: RunFolder) -> None:
     ("policy", "success", "words"),
     [
         ("still", False, "cube centre is .* outside box"),
-        ("reckless", False, "limits: .* would need 10.00 rad/s"),
+        ("reckless", False, "limits: .* moves at 10.00 rad/s"),
         ("broken", None, "not finite from row 0 on"),
         ("raising", None, "the policy failed: KeyError: 'wrist'"),
     ],

@@ -12,6 +12,7 @@ from bridge.geometry import se3
 from bridge.robots.default import ROBOT, ROBOT_NAME
 from bridge.task.plan import Plan, Waypoint
 from twin.replay.config import ReplayConfig
+from twin.replay.motion import motion_failures
 from twin.replay.path import (
     MAX_WAYPOINTS,
     UnusablePlanError,
@@ -207,7 +208,7 @@ def test_straight_motion_through_a_wrist_singularity_is_a_named_jump() -> None:
     plan = plan_through(Ts, step_s=0.4)
     path, failures, unreachable = path_of_plan(plan, robot)
     assert unreachable is None
-    failures = failures + check_path(path, robot, hulls_of(robot))
+    failures += [*check_path(path, robot, hulls_of(robot)), *motion_failures(path, robot)]
     causes = {failure.cause for failure in failures}
     assert causes & {"joint_jump", "joint_speed"}
     for failure in failures:
