@@ -81,6 +81,7 @@ def jumps(
 
 MAX_DURATION_S = 600.0
 """Longest trajectory that is replayed [s]."""
+STANDS_M = 0.002
 MAX_WAIT_S = 10.0
 """A plan that has waited for longer before it moves was judged in another world."""
 WIDTH_SLACK_M = 0.01
@@ -105,6 +106,7 @@ def check_usable(plan: Plan, robot: RobotModel) -> None:
         _about_times(plan)
         or _about_whose(plan, robot)
         or _about_numbers(plan, robot.record)
+        or _about_waiting(plan)
         or _about_grasps(plan, robot.record)
     )
     if wrong is not None:
@@ -126,11 +128,6 @@ def _about_times(plan: Plan) -> _Wrong | None:
     if times[0] > MAX_WAIT_S * 1e9:
         found = f"begins at {times[0] * 1e-9:.0f} s"
         return found, "t_ns counts from the start of the trajectory, not from 1970."
-    where = [(waypoint.p_m, waypoint.joints_rad, waypoint.g) for waypoint in plan.tau]
-    begins = next((k for k, item in enumerate(where) if item != where[0]), len(where)) - 1
-    if times[begins] > MAX_WAIT_S * 1e9:
-        found = f"waits {times[begins] * 1e-9:.0f} s before it moves"
-        return found, f"At most {MAX_WAIT_S:.0f} s are judged ahead; send it when it is to move."
     if times[-1] > MAX_DURATION_S * 1e9:
         found = f"lasts {times[-1] * 1e-9:.0f} s"
         return found, f"At most {MAX_DURATION_S:.0f} s are replayed; split it."
@@ -157,6 +154,18 @@ def _about_numbers(plan: Plan, robot: Robot) -> _Wrong | None:
         found = f"has gripper widths from {low:.3f} to {high:.3f}"
         return found, f"width_m is the distance between the pads in metres, 0 to {most_m}."
     return None
+
+
+def _about_waiting(plan: Plan) -> _Wrong | None:
+    places, first = plan.positions_m(), plan.tau[0]
+    moves = np.linalg.norm(places - places[0], axis=1) > STANDS_M
+    moves |= np.array([waypoint.g != first.g for waypoint in plan.tau])
+    begins = int(np.argmax(moves)) - 1 if moves.any() else len(moves) - 1
+    wait_s = plan.tau[max(begins, 0)].t_ns * 1e-9
+    if wait_s <= MAX_WAIT_S:
+        return None
+    hint = f"At most {MAX_WAIT_S:.0f} s are judged ahead; send it when it is to move."
+    return f"waits {wait_s:.0f} s before it moves", hint
 
 
 def _about_grasps(plan: Plan, robot: Robot) -> _Wrong | None:

@@ -222,6 +222,7 @@ class ClearanceMonitor:
             for name, c in fixed.items()
         }
         self._late_m = np.zeros(len(self._links))
+        self._hand = [k for k, s in enumerate(self._links) if s.body in self._gripper.links]
         self._object_late_m: dict[str, float] = {}
         self._allowed: dict[int, Allowed] = {}
         self._reach = Reach(hulls)
@@ -275,6 +276,8 @@ class ClearanceMonitor:
         """Note how far each body may be from where it should be, at the speed it has."""
         share = LATE_S / max((now.state.t_ns - before.state.t_ns) * 1e-9, LATE_S / 10)
         self._late_m = np.linalg.norm(now.centres_m - before.centres_m, axis=1) * share
+        if self._hand:  # fingers may be told to close from one instant to the next
+            self._late_m[self._hand] = self._late_m[self._hand].min()
         self._object_late_m = {
             name: hypot(*(T[:3, 3] - before.state.Ts_base_object[name][:3, 3]).tolist()) * share
             for name, T in now.state.Ts_base_object.items()
@@ -282,7 +285,7 @@ class ClearanceMonitor:
         }
 
     def least_m(self, pair: Pair) -> float:
-        """How far a pair that may not touch must be apart now: more when it is fast or not known."""
+        """How far a pair that may not touch must be apart now: farther when it is fast."""
         body, piece, other, _ = pair
         late_m = self._object_late_m.get(body, 0.0) if piece < 0 else float(self._late_m[piece])
         return self.config.eps_col_m + min(late_m, MAX_LEAP_M) + self._sigma_m.get(other, 0.0)
