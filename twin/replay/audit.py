@@ -128,6 +128,9 @@ def audit(
         return Factor(
             value=None, detail="the clearance cannot be audited: install python-fcl ([replay])"
         )
+    blind = hulls_of(load_robot(scene.urdf)).blind()
+    if blind is not None:
+        return Factor(value=None, detail=blind)
     return _Audit(fcl, plan, scene, config, max_queries).of(result)
 
 

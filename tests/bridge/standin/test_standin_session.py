@@ -44,9 +44,7 @@ def verdict_record(plan: dict, accepted: bool | None) -> dict:
         engine="test",
         seed=0,
         basis={
-            "plan_sha256": hashlib.sha256(
-                Plan.to_json(Plan.from_json(json.dumps(plan).encode()))
-            ).hexdigest(),
+            "plan_sha256": hashlib.sha256(as_sent).hexdigest(),
             "joints_rad": plan["tau"][0]["joints_rad"],
             "objects": {},
             "judged_ns": 0,

@@ -40,9 +40,7 @@ def verdict_on(plan: dict[str, Any], accepted: bool | None) -> dict[str, Any]:
         engine="test",
         seed=0,
         basis={
-            "plan_sha256": hashlib.sha256(
-                Plan.to_json(Plan.from_json(json.dumps(plan).encode()))
-            ).hexdigest(),
+            "plan_sha256": hashlib.sha256(as_sent).hexdigest(),
             "joints_rad": plan["tau"][0]["joints_rad"],
             "objects": {},
             "judged_ns": 0,
