@@ -70,9 +70,6 @@ def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task) -> str:
     """Name the first object that a plan has elsewhere than it is seen; "" when there is none.
 
     Objects that look alike may be confused; entities without a position say nothing.
-
-    Args:
-        plan: Its ``entities`` are where its planner expected the objects to be.
     """
     for name, entity in plan.entities.items():
         p_m = entity.get("p_m") if isinstance(entity, Mapping) else None
@@ -96,13 +93,7 @@ def _looks(model: ObjectModel) -> tuple[object, ...]:
 def turn_between(
     T_first: Float[np.ndarray, "4 4"], T_second: Float[np.ndarray, "4 4"], model: ObjectModel
 ) -> float:
-    """Turn about the vertical from one pose to another, among those that look the same [rad].
-
-    Args:
-        T_first: Pose of the object in the base frame.
-        T_second: A later pose of it, same frame.
-        model: Its symmetry says which turns look the same; a soft object has none.
-    """
+    """Turn about the vertical from one pose to another, among those that look the same [rad]."""
     period = 2 * np.pi if model.soft is not None else yaw_period_rad(model)
     yaws = [np.arctan2(T[1, 0], T[0, 0]) for T in (T_first, T_second)]
     return float(abs(np.mod(yaws[1] - yaws[0] + period / 2, period) - period / 2))
@@ -161,12 +152,7 @@ class Perception(Protocol):
         """When the last message arrived."""
 
     def frames(self, *, max_age_ns: int, max_per_camera: int) -> Any:
-        """The latest frames at rest.
-
-        Args:
-            max_age_ns: A camera gives nothing when its last image is older.
-            max_per_camera: At most so many frames of one camera, the newest.
-        """
+        """The latest frames at rest."""
 
 
 @dataclass(frozen=True, kw_only=True)

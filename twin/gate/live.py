@@ -131,12 +131,7 @@ class LiveCell:
 def frames_of(
     camera_id: str, camera: LiveCamera, cell: LiveCell, quiet_since_ns: int, max_frames: int
 ) -> PosedFrames:
-    """The newest frames of one camera, taken at rest since the last execution ended.
-
-    Args:
-        quiet_since_ns: When the last execution ended; images must be later, on the cell's clock.
-        max_frames: At most so many, the newest.
-    """
+    """The newest frames of one camera, taken at rest since the last execution ended."""
     missing = [f"{name}/info" for name in ("color", "depth") if name not in camera.infos]
     if missing:
         raise CameraNotReadyError(f"no calibration on {' and '.join(missing)}")
@@ -400,13 +395,7 @@ class LiveView:
             return self._executing
 
     def frames(self, *, max_age_ns: int, max_per_camera: int) -> LiveFrames:
-        """The newest frames of each camera since the last execution ended.
-
-        Args:
-            max_age_ns: A camera gives nothing when its last image is older than this, on the
-                cell's own clock: the cell went on talking and the camera did not.
-            max_per_camera: At most so many frames of one camera.
-        """
+        """The newest frames of each camera since the last execution ended."""
         with self._lock:  # copy only: decoding must not hold up the network
             cameras = {
                 camera_id: LiveCamera(

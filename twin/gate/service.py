@@ -48,11 +48,7 @@ def make_gate(
     now_ns: Callable[[], int],
     twin: TwinProcess,
 ) -> Gate:
-    """Put the real localisation and replay behind the gate.
-
-    Args:
-        now_ns: The clock on which messages arrive; says how long the cell has been silent.
-    """
+    """Put the real localisation and replay behind the gate."""
     return Gate(
         tasks=tasks,
         config=config,

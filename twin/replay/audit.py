@@ -111,15 +111,7 @@ def audit(
     *,
     max_queries: int = 20_000,
 ) -> Factor:
-    """Say whether python-fcl finds nowhere less distance than a replay's clearance.
-
-    Args:
-        plan: Its stages, with no more contacts than the task allows (``limited_to_task``).
-        max_queries: Pairs asked at most; a replay that needs more is not decided.
-
-    Returns:
-        True, or None with the reason: what was found and what was said, too many pairs, or no fcl.
-    """
+    """Say whether python-fcl finds nowhere less distance than a replay's clearance."""
     try:
         import fcl  # noqa: PLC0415  # [replay] brings it; without it there is no yes
     except ImportError:

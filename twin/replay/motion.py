@@ -8,13 +8,10 @@ nothing between two samples is missed.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
 
 import numpy as np
-import pinocchio as pin
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from bridge.task.causes import Cause
 from bridge.task.plan import Plan
@@ -22,6 +19,7 @@ from bridge.task.task_file import Task
 from twin.replay.config import PATH_STEP_S
 from twin.replay.failure import Failure
 from twin.replay.path import JointPath
+from twin.robot.loads import Load, Loads, Rows, Times
 from twin.robot.model import RobotModel, without_dynamics
 
 ROUNDED_S = 0.04
@@ -34,22 +32,10 @@ SLACK = 1.02
 ACCURACY = {"tool_speed_m_s": 0.05, "elbow_speed_m_s": 0.05, "momentum_kg_m_s": 3.0, "power_W": 10}
 """An arm stops by itself so much before the limits that it is set to: UR's user manual."""
 
-Times = Float[np.ndarray, " _"]
 Stamps = Int[np.ndarray, " _"]
-Rows = Float[np.ndarray, "_ _"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Held:
-    """What may be in the hand while the fingers are closed."""
-
-    name: str
-    mass_kg: float
-    start_ns: int
-    end_ns: int
-
-
-def held_of(plan: Plan, task: Task) -> list[Held]:
+def held_of(plan: Plan, task: Task) -> list[Load]:
     """Name the heaviest object that a plan may hold each time it closes the gripper.
 
     Its stages say which, by the task's tables; without a stage it may be any that the task moves.
@@ -68,11 +54,11 @@ def held_of(plan: Plan, task: Task) -> list[Held]:
         masses = {name: task.objects[name].mass_kg for name in objects}
         if masses:
             name = max(masses, key=lambda key: masses[key])
-            found.append(Held(name=name, mass_kg=masses[name], start_ns=start, end_ns=end))
+            found.append(Load(name=name, mass_kg=masses[name], start_ns=start, end_ns=end))
     return found
 
 
-def motion_failures(path: JointPath, robot: RobotModel, held: Sequence[Held] = ()) -> list[Failure]:
+def motion_failures(path: JointPath, robot: RobotModel, held: Sequence[Load] = ()) -> list[Failure]:
     """Find where a commanded path asks for more than the robot has, each cause at its worst."""
     record = robot.record
     limits = (robot.velocity_limit_rad_s, record.acceleration_rad_s2, record.jerk_rad_s3)
@@ -152,7 +138,7 @@ def _over(
     yield Failure(t_ns=t_ns, cause=cause, bodies=(name,), detail=detail)
 
 
-def _too_heavy(robot: RobotModel, held: Sequence[Held]) -> list[Failure]:
+def _too_heavy(robot: RobotModel, held: Sequence[Load]) -> list[Failure]:
     most_kg = robot.record.payload_kg
     return [
         Failure(
@@ -167,19 +153,19 @@ def _too_heavy(robot: RobotModel, held: Sequence[Held]) -> list[Failure]:
     ][:1]
 
 
-def payload_unknown(robot: RobotModel, held: Sequence[Held]) -> str | None:
+def payload_unknown(robot: RobotModel, held: Sequence[Load]) -> str | None:
     """Say that nobody knows whether the arm may carry what is held; None where it is known."""
     if not held or robot.record.payload_kg is not None:
         return None
     return f"the robot file of {robot.name} does not say what it may carry; set payload_kg"
 
 
-def _stops(path: JointPath, robot: RobotModel, held: Sequence[Held]) -> Iterator[Failure]:
+def _stops(path: JointPath, robot: RobotModel, held: Sequence[Load]) -> Iterator[Failure]:
     """Find where the motors are too weak, and where the arm's safety settings would stop it."""
     times_s, joints, speeds, accelerations = _samples(path)
     if len(path.times_ns) < 2:
         return
-    found = _Loads(robot, held).along(times_s, joints, speeds, accelerations)
+    found = Loads(robot, held).along(times_s, joints, speeds, accelerations)
     torques = found.pop("torques")
     if not any(without_dynamics(robot)):
         effort = robot.model.effortLimit[robot.arm_velocity_ids]
@@ -230,47 +216,3 @@ def _samples(path: JointPath) -> tuple[Times, Rows, Rows, Rows]:
     knots = np.searchsorted(times_ns, path.times_ns)
     accelerations[knots] = _at_corners(path, rises)
     return times_s, joints, np.where(faster[:, None], before, after), accelerations
-
-
-class _Loads:
-    """Inverse dynamics of an arm, alone and with what it holds at its tool."""
-
-    def __init__(self, robot: RobotModel, held: Sequence[Held]) -> None:
-        self._robot, self._held = robot, held
-        self._elbow = robot.model.getJointId(robot.joints[(len(robot.joints) - 1) // 2])
-        self._arms = {0.0: robot.model} | {
-            item.mass_kg: self._loaded(item.mass_kg) for item in held if item.mass_kg > 0
-        }
-        self._data = {mass: model.createData() for mass, model in self._arms.items()}
-
-    def _loaded(self, mass_kg: float) -> Any:
-        model, tool = self._robot.model.copy(), self._robot.model.frames[self._robot.tcp_id]
-        model.appendBodyToJoint(
-            tool.parentJoint, pin.Inertia.FromSphere(mass_kg, 0.03), tool.placement
-        )
-        return model
-
-    def along(
-        self, times_s: Times, joints: Rows, speeds: Rows, accelerations: Rows
-    ) -> dict[str, Any]:
-        """Torques of the joints, and by the name of each setting what it limits."""
-        robot = self._robot
-        ids = robot.arm_velocity_ids
-        masses = np.zeros(len(times_s))
-        for item in self._held:
-            during = (times_s >= item.start_ns * 1e-9) & (times_s <= item.end_ns * 1e-9)
-            masses[during] = item.mass_kg
-        v, a = np.zeros(robot.model.nv), np.zeros(robot.model.nv)
-        torques, rows = np.zeros_like(joints), np.zeros((len(times_s), 4))
-        for index, mass in enumerate(masses.tolist()):
-            model, data = self._arms[mass], self._data[mass]
-            q = robot.configuration(joints[index])
-            v[ids], a[ids] = speeds[index], accelerations[index]
-            pin.computeCentroidalMomentum(model, data, q, v)
-            tool = pin.getFrameVelocity(model, data, robot.tcp_id, pin.LOCAL_WORLD_ALIGNED)
-            elbow = pin.getVelocity(model, data, self._elbow, pin.LOCAL_WORLD_ALIGNED)
-            momentum = np.linalg.norm(data.hg.linear)
-            torques[index] = pin.rnea(model, data, q, v, a)[ids]
-            power = float(np.maximum(torques[index] * speeds[index], 0.0).sum())
-            rows[index] = np.linalg.norm(tool.linear), np.linalg.norm(elbow.linear), momentum, power
-        return {"torques": torques, **dict(zip(ACCURACY, rows.T, strict=True))}

@@ -453,11 +453,7 @@ def _check_given(
 
 
 def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Failure]:
-    """Find joint limits, jumps and self-collision along an interpolated path.
-
-    Args:
-        hulls: The same robot's convex pieces; they are moved along the path.
-    """
+    """Find joint limits, jumps and self-collision along an interpolated path."""
     times = path.dense_times_ns(PATH_STEP_S)
     joints = path.joints_at(times)
     failures = outside_limits(robot, path.times_ns, path.joints_rad)

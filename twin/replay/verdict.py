@@ -62,11 +62,6 @@ def terminal_factor(
 
     A soft body that burst, or is turned inside out, makes it false whatever the task asks: the
     middle of a burst body may well lie in the basket.
-
-    Args:
-        config: Only its mode counts.
-        unreachable_ns: From when on waypoints cannot be reached; None: all can.
-        burst: The soft body that burst first; None: none did.
     """
     if config.mode == "kinematic":
         return Factor(value=None, detail="a kinematic replay does not move objects")
@@ -123,9 +118,6 @@ def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float =
     """What each predicate says of a recorded or replayed rollout, as the verdict keeps it.
 
     The predicate on contacts is asked whether or not the task lists it.
-
-    Args:
-        tolerance_m: Depth up to which contacts do not count, where the task does not say.
     """
     findings = evaluate_success(task, rollout)
     if not any(finding.kind == ALLOWED_CONTACTS for finding in findings):
@@ -262,11 +254,7 @@ def _replay(
 def judge_states(
     commanded: Commanded, states: States, plan: Plan, scene: ReplayScene, config: ReplayConfig
 ) -> ReplayResult:
-    """Judge what physics did while somebody else steered, as a replay of it would be judged.
-
-    Args:
-        plan: What was done, in a plan's words.
-    """
+    """Judge what physics did while somebody else steered, as a replay of it would be judged."""
     hulls = hulls_of(load_robot(scene.urdf))
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     moved = Moved(

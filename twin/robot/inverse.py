@@ -483,15 +483,7 @@ class UrInverse:
         Bool[np.ndarray, "num_poses 8"],
         Bool[np.ndarray, " num_poses"],
     ]:
-        """Solve many poses, on all branches.
-
-        Returns:
-            Joints [rad], one turn of each joint, within the limits; which of them are solutions;
-            and at which poses some branch has a straight wrist: within reach there too, by joints
-            that nobody can number. Out of reach, outside the limits, not a number, or with a joint
-            that may be anything (the wrist point on the first axis, the fifth joint straight): not
-            a solution, and all joints are 0.
-        """
+        """Solve many poses, on all branches."""
         finite = np.isfinite(Ts_base_tcp).all(axis=(1, 2))
         theta, valid, singular = _angles(
             self.geometry, np.where(finite[:, None, None], Ts_base_tcp, 0.0)

@@ -137,11 +137,7 @@ def resampled(grid: Grid, seed: int) -> np.ndarray:
 def calibrate_pushes(
     run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[Mapping[str, Any], str]:
-    """Identify friction on half of a run's pushes, score it on the others, write the calibration.
-
-    Returns:
-        The physics record, and the id of the calibration that holds now.
-    """
+    """Find friction on half of a run's pushes, score it on the others, write the calibration."""
     pushes, skipped = _pushes(run)
     fitted, held_out = split(list(pushes))
     if len(fitted) < FEWEST or not held_out:

@@ -114,11 +114,7 @@ class Reach:
             self._fingers[row] = _per_width(robot, int(frame.parentJoint), reach=ends_m)
 
     def travel_m(self, a: State, b: State) -> Float[np.ndarray, " num_links"]:
-        """How far any point of each link moved at most [m], when the joints moved straight.
-
-        Args:
-            b: The state after; only its joints and gripper width are looked at.
-        """
+        """How far any point of each link moved at most [m], when the joints moved straight."""
         turned = np.abs(b.joints_rad - a.joints_rad)
         return np.asarray(self._per_rad @ turned + self._fingers * abs(b.width_m - a.width_m))
 
@@ -139,12 +135,7 @@ def _per_width(robot: RobotModel, joint: int, *, reach: float) -> float:
 
 
 def object_travel_m(a: State, b: State, name: str, radius_m: float) -> float:
-    """How far any point of an object moved at most [m]; infinite when it is in one state only.
-
-    Args:
-        radius_m: How far its outermost point is from its origin; not used where its nodes are
-            known.
-    """
+    """How far any point of an object moved at most [m]; infinite when it is in one state only."""
     if name in a.nodes_m and name in b.nodes_m:
         return float(np.linalg.norm(b.nodes_m[name] - a.nodes_m[name], axis=1).max())
     if name not in a.Ts_base_object or name not in b.Ts_base_object:
@@ -246,12 +237,6 @@ class ClearanceMonitor:
         the bound is not enough, states in between are measured too, straight in joints and poses.
         A body that comes too close between two calls is therefore missed by half a millimetre at
         most, and the smallest distance in between is returned.
-
-        Args:
-            t_ns: Time from the start of the trajectory; calls come in order.
-            Ts_base_object: Where the movable objects are; those not known are left out.
-            nodes_m: Where the nodes of the soft objects are, base frame; a soft object with a pose
-                only counts as the box around it.
         """
         nodes = (
             {}
@@ -374,11 +359,6 @@ class ClearanceMonitor:
         """Look for links inside objects that still lie where they were localised.
 
         Physics would push the object aside and hide that a finger comes down on it.
-
-        Args:
-            t_ns: When, from the start of the trajectory; failures carry it.
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
         """
         self.hulls.place(joints_rad, width_m)
         R, t = self.hulls.rotations, self.hulls.translations

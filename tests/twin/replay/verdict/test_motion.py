@@ -9,8 +9,9 @@ from scripted_plans import pick_and_place, scene_of_test
 from bridge.robots.default import ROBOT
 from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
-from twin.replay.motion import Held, _derivative, _Loads, held_of, motion_failures, payload_unknown
+from twin.replay.motion import _derivative, held_of, motion_failures, payload_unknown
 from twin.replay.path import JointPath, UnusablePlanError, check_usable
+from twin.robot.loads import Load, Loads
 from twin.robot.model import RobotModel, load_robot
 
 HZ, SIZE_RAD = 7.0, 0.02
@@ -91,10 +92,10 @@ def test_a_limit_of_jerk_is_kept_where_the_robot_file_has_one(
 
 def test_what_is_held_adds_its_weight_times_the_lever(robot: RobotModel) -> None:
     path = path_of(robot, np.zeros(2), np.array([0.0, 1.0]))
-    held = [Held(name="cube", mass_kg=3.0, start_ns=0, end_ns=10**9)]
+    held = [Load(name="cube", mass_kg=3.0, start_ns=0, end_ns=10**9)]
     rest = np.zeros((1, 6))
     args = (np.zeros(1), path.joints_rad[:1], rest, rest)
-    bare, loaded = (_Loads(robot, item).along(*args)["torques"][0] for item in ([], held))
+    bare, loaded = (Loads(robot, item).along(*args)["torques"][0] for item in ([], held))
     skeleton = robot.skeleton_m(path.joints_rad[0])
     lever = np.linalg.norm((skeleton[-1] - skeleton[2])[:2])  # the elbow's axis is level
     assert abs(loaded[1] - bare[1]) == pytest.approx(3.0 * 9.81 * lever, rel=0.01)
@@ -143,7 +144,8 @@ def test_a_stop_that_the_safety_settings_predict_is_named(
     assert motion_failures(path, robot) == []
     monkeypatch.setattr(robot, "record", replace(robot.record, **{setting: limit}))
     (found,) = motion_failures(path, robot)
-    assert words in found.detail and f"the limit is {limit:g}" in found.detail
+    assert words in found.detail
+    assert f"the limit is {limit:g}" in found.detail
 
 
 @pytest.mark.parametrize(
