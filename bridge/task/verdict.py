@@ -9,9 +9,7 @@ from bridge.task.record import check_record, made_of, parse_record
 
 SCHEMA_VERSION = 1
 STAND_IN_ENGINE = "mujoco"
-"""What moves the stand-in cell."""
 SAME_ENGINE = "same engine as the cell"
-"""What such a verdict carries among its warnings."""
 
 
 def is_same_engine(engine: str | None, *, stand_in: bool) -> bool:

@@ -186,7 +186,12 @@ def misfits(
     X: Float[np.ndarray, "4 4"],
     Z: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "num_pairs 6"]:
-    """Translation [m] and rotation vector [rad] of E = (Z B)^-1 A X for each pair."""
+    """Translation [m] and rotation vector [rad] of E = (Z B)^-1 A X for each pair.
+
+    Args:
+        X: The transform behind A, such as ``T_hand_camera``.
+        Z: The transform before B, such as ``T_base_target``.
+    """
     E = se3.invert(Z @ Ts_b) @ Ts_a @ X
     return np.concatenate([E[:, :3, 3], se3.vector_from_rotation(E[:, :3, :3])], axis=1)
 

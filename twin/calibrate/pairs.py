@@ -52,6 +52,10 @@ def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> Po
     """Pair recorded target poses of one camera with the robot's link, robot standing still.
 
     Poses that are no numbers, as some detectors send when they see nothing, are left out.
+
+    Args:
+        episodes: Those without poses of a target from this camera are passed over.
+        link: Robot link whose pose in the base is the other half of a pair.
     """
     hands: list[np.ndarray] = []
     targets: list[np.ndarray] = []

@@ -131,7 +131,11 @@ def rigid_movers(task: Task) -> tuple[str, ...]:
 
 
 def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDraw]:
-    """Spread draws evenly over the priors (Sobol's sequence): the same ones every time."""
+    """Spread draws evenly over the priors (Sobol's sequence): the same ones every time.
+
+    Args:
+        movers: Rigid objects that move, each with edges and a centre of mass of its own.
+    """
     unit = qmc.Sobol(d=6 + 4 * len(movers), scramble=True, seed=0).random(count)
     z = ndtri(np.clip(unit, 1e-6, 1 - 1e-6))
     frictions = FRICTION[0] * (FRICTION[1] / FRICTION[0]) ** unit[:, :2]
@@ -300,7 +304,11 @@ def _ended(piece: Piece) -> Ended:
 def weighed(
     draws: Sequence[PosteriorDraw], trials: Sequence[Trial], *, workers: int | None, output: Output
 ) -> list[PosteriorDraw]:
-    """Give each draw the weight that the trials leave it; in their order, weights sum to 1."""
+    """Give each draw the weight that the trials leave it; in their order, weights sum to 1.
+
+    Args:
+        workers: Processes that replay side by side, one for each core by default; 1: this alone.
+    """
     pieces = [(number, trial, draw) for number, draw in enumerate(draws) for trial in trials]
     logs = np.log([draw.weight for draw in draws])
     counts = np.zeros((len(draws), 2, 2), dtype=int)
@@ -343,7 +351,11 @@ def effective(draws: Sequence[PosteriorDraw]) -> float:
 def calibrate_posterior(
     run: RunFolder, *, num_draws: int, workers: int | None, output: Output
 ) -> tuple[dict[str, Any], str]:
-    """Weigh draws by a run's trials, task by task, and write them to ``calibration.json``."""
+    """Weigh draws by a run's trials, task by task, and write them to ``calibration.json``.
+
+    Returns:
+        The record, and the id of the calibration that holds now.
+    """
     found, tasks = read_trials(run, output), dict[str, Any]()
     for name, trials in found.of_each_task().items():
         beforehand = draw_beforehand(num_draws, rigid_movers(trials[0].scene.task))

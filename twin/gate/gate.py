@@ -482,11 +482,7 @@ class Gate:
         )
 
     def _look_again(self, task: Task, found: Mapping[str, Any], frames: Any, ends_s: float) -> None:
-        """Before a yes: the cell must still be as it was judged.
-
-        Raises:
-            UndecidedError: When something was started or moved meanwhile, or nobody can see.
-        """
+        """Before a yes: the cell must still be as it was judged."""
         running = self._perception.executing()
         if running is not None:
             raise UndecidedError(f"{running} was started while the plan was being judged")

@@ -226,12 +226,7 @@ class LiveView:
     def __init__(
         self, cell: str, calibration: Calibration | None = None, urdf: str | None = None
     ) -> None:
-        """Listen for ``/<cell>/cam/...``, events, joint states, transforms and the URDF.
-
-        Args:
-            calibration: Of the run. Cameras in it are where it says, and never where ``/tf`` does.
-            urdf: The robot description, whatever is published; None: what is published.
-        """
+        """Listen for ``/<cell>/cam/...``, events, joint states, transforms and the URDF."""
         self._cell = cell
         self._calibration = calibration
         self._places = {} if calibration is None else dict(calibration.cameras)
@@ -252,12 +247,7 @@ class LiveView:
         self.malformed = 0
 
     def take(self, topic: str, data: bytes, received_ns: int, type_name: str = "") -> None:
-        """Remember one message; one that cannot be read is counted and passed over.
-
-        Args:
-            received_ns: On the receiver's clock.
-            type_name: Of an image: raw or compressed; "" is what the topic's name promises.
-        """
+        """Remember one message; one that cannot be read is counted and passed over."""
         if is_truth(topic):
             return
         try:

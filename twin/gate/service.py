@@ -145,9 +145,6 @@ def claim_gate(session: Any, cell: str) -> None:
 
     Whoever asks takes the first answer that comes, and of two gates one may know another task or
     an older scene.
-
-    Args:
-        session: An open ``bridge.wire.session``; the claim lasts as long as it.
     """
     key = f"{cell}/gate/alive"
     if session.query_alive(key):

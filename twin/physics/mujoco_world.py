@@ -167,11 +167,7 @@ class MujocoArm:
 
 
 def _refuse_gripper(record: Robot, urdf: str) -> None:
-    """Fingers with motors of their own that slide in proportion to the width, or a fixed tool.
-
-    Raises:
-        PhysicsError: For fingers that turn, follow a lever or a table, or mimic another one.
-    """
+    """Fingers with motors of their own that slide in proportion to the width, or a fixed tool."""
     fingers = record.gripper.fingers
     followers = [item.joint for item in mimics_of(urdf) if item.leader in record.finger_joints]
     others = [item.joint for item in fingers if item.turns or item.link_m or item.table]

@@ -104,9 +104,6 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
         found.append("acceleration limits are not known")
     if record.payload_kg is None:
         found.append("the payload is not known")
-    hulls.place(robot.home_rad, record.gripper.max_width_m)
-    if hulls.self_distance().distance_m <= 0:
-        found.append(f"links touch at home: {' and '.join(hulls.self_distance().links)}")
     return found
 
 

@@ -56,14 +56,7 @@ def solve_ik(
     *,
     warm_start_rad: Float[np.ndarray, " num_joints"] | None = None,
 ) -> IkSolution:
-    """Find joints within their limits that reach a pose, near the warm start where there is one.
-
-    Args:
-        warm_start_rad: Joints to start from; None: ``HOME_RAD``.
-
-    Returns:
-        The best solution found; ``reached`` says whether it is one.
-    """
+    """Find joints within their limits that reach a pose, near the warm start where there is one."""
     start = robot.home_rad if warm_start_rad is None else warm_start_rad
     if UrInverse.for_robot(robot) is not None:
         best = _descend(robot, T_base_tcp, start, config)

@@ -30,12 +30,7 @@ class RobotDescriptionError(TwinError):
 
 
 def mimicked(urdf: str) -> tuple[Mimic, ...]:
-    """Read the joints that follow another joint, which pinocchio takes for free ones.
-
-    Raises:
-        RobotDescriptionError: When one follows a joint that is not there, or follows another one
-            itself, or by a number that is none.
-    """
+    """Read the joints that follow another joint, which pinocchio takes for free ones."""
     root = parse_description(urdf)
     found = mimics_of(urdf)
     leaders = {joint.get("name", "") for joint in root.findall("joint")}

@@ -45,7 +45,7 @@ def verdict_record(plan: dict, accepted: bool | None) -> dict:
         seed=0,
         basis={
             "plan_sha256": hashlib.sha256(as_sent).hexdigest(),
-            "joints_rad": plan["tau"][0]["joints_rad"],
+            "joints_rad": plan["tau"][0]["joints_rad"] if "tau" in plan else [0.0],
             "objects": {},
             "judged_ns": 0,
             "valid_s": 1e12,

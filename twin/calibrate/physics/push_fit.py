@@ -137,7 +137,11 @@ def resampled(grid: Grid, seed: int) -> np.ndarray:
 def calibrate_pushes(
     run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[Mapping[str, Any], str]:
-    """Find friction on half of a run's pushes, score it on the others, write the calibration."""
+    """Identify friction on half of a run's pushes, score it on the others, write the calibration.
+
+    Returns:
+        The physics record, and the id of the calibration that holds now.
+    """
     pushes, skipped = _pushes(run)
     fitted, held_out = split(list(pushes))
     if len(fitted) < FEWEST or not held_out:

@@ -150,7 +150,11 @@ def replay_push(
     config: PhysicsConfig,
     finger_rad: float = 0.0,
 ) -> PushResult:
-    """Let the hand follow a trajectory and the box go where it is pushed."""
+    """Let the hand follow a trajectory and the box go where it is pushed.
+
+    Args:
+        trajectory: ``executed``: the measured tool; ``planned``: the joint schedule.
+    """
     stamps_ns, Ts_world_hand = hand_path(push, trajectory, config.rate_hz)
     Ts_world_box = None
     if push.T_world_box is not None:
