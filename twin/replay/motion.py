@@ -95,15 +95,16 @@ def _speeds(path: JointPath) -> Rows:
 def _at_corners(path: JointPath, speeds: Rows) -> Rows:
     """What rounds each corner; a whole path is at rest before its start and after its end."""
     knots = path.times_ns
-    apart = _apart(knots, knots)
-    if path.waypoints_ns is not None:  # what lies between them is ours, and bends as it must
-        apart = np.where(np.isin(knots, path.waypoints_ns), _apart(knots, path.waypoints_ns), apart)
-    half = np.clip(apart * 0.5e-9, _CYCLE_S, ROUNDED_S)
+    spacing = _spacing(knots, knots)
+    given = path.waypoints_ns
+    if given is not None:  # what lies between them is ours, and bends as it must
+        spacing = np.where(np.isin(knots, given), _spacing(knots, given), spacing)
+    half = np.clip(spacing * 0.5e-9, _CYCLE_S, ROUNDED_S)
     ends = np.pad(speeds, ((1, 1), (0, 0)), mode="edge" if path.moving else "constant")
     return np.asarray(np.diff(ends, axis=0) / (2 * half[:, None]))
 
 
-def _apart(times_ns: Stamps, others_ns: Stamps) -> Stamps:
+def _spacing(times_ns: Stamps, others_ns: Stamps) -> Stamps:
     """How far the nearest of other times is before or after each time."""
     after = others_ns[np.minimum(np.searchsorted(others_ns, times_ns, "right"), len(others_ns) - 1)]
     before = others_ns[np.maximum(np.searchsorted(others_ns, times_ns, "left") - 1, 0)]

@@ -111,7 +111,7 @@ def test_more_than_the_arm_may_carry_is_refused_with_how_much(robot: RobotModel)
         held = held_of(each, loaded)
         assert [(item.name, item.mass_kg) for item in held] == [("cube", 6.0)]
         (found,) = motion_failures(path, robot, held)
-        assert found.cause == "payload"
+        assert found.cause == "over_payload"
         assert "cube weighs 6 kg, 1.00 kg more than the 5 kg" in found.detail
         assert motion_failures(path, robot, held_of(each, task)) == []
     open_ = replace(plan, tau=tuple(replace(w, g=0) for w in plan.tau))
