@@ -7,8 +7,10 @@ unsafe. Goes on where it was interrupted: answers are kept in --folder.
 """
 
 import argparse
+import hashlib
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -19,13 +21,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from measure import ROOT, Target, report_targets
-from plan_mutations import FAMILIES, mutated
+from plan_mutations import FAMILIES, HEAVY_KG, HONEST, OUTSIDE, mutated
 from plan_oracle import Cell, Oracle
 
 CELL, FIRST = "standin", "cube_into_box"
@@ -89,6 +91,8 @@ class Stage:
     messages: list[Any]
     oracle: Oracle
     bases: list[dict[str, Any]]
+    hashes: dict[str, str]
+    """Of the files of tasks, by name."""
 
 
 def prepare(folder: Path, task_name: str) -> Stage:
@@ -132,7 +136,25 @@ def prepare(folder: Path, task_name: str) -> Stage:
             max_width_m=MAX_WIDTH_M,
         )
     )
-    return Stage(run.path, task_name, messages, oracle, plans_from(task, poses, start))
+    bases = plans_from(task, poses, start)
+    for plan in bases:
+        plan["task_sha256"] = hashes_of(run.tasks_dir, task_name)[task_name]
+    return Stage(run.path, task_name, messages, oracle, bases, hashes_of(run.tasks_dir, task_name))
+
+
+def hashes_of(folder: Path, task_name: str) -> dict[str, str]:
+    """Write the task with ever heavier objects beside it; the hash of each file."""
+    from bridge.data_files import dataset_file
+
+    text = dataset_file("tasks", task_name).read_text()
+    folder.mkdir(exist_ok=True)
+    texts = {task_name: text}
+    for kg in HEAVY_KG:
+        name = f"heavy_{kg:g}".replace(".", "_")
+        heavy = re.sub(r"mass_kg = [0-9.]+", f"mass_kg = {kg}", text)
+        texts[name] = heavy.replace(f'name = "{task_name}"', f'name = "{name}"')
+        (folder / f"{name}.toml").write_text(texts[name])
+    return {name: hashlib.sha256(item.encode()).hexdigest() for name, item in texts.items()}
 
 
 def plans_from(task: Any, poses: Any, start: np.ndarray) -> list[dict[str, Any]]:
@@ -173,7 +195,7 @@ def gate_of(stage: Stage, endpoint: str, log: Path) -> Iterator[Any]:
     from bridge.wire.session import open_session
 
     wire = WireConfig(mode="router", connect=(), listen=(endpoint,))
-    command = ["gate", str(stage.run), "--cell", CELL, "--task", stage.task, "--connect", endpoint]
+    command = ["gate", str(stage.run), "--cell", CELL, "--connect", endpoint]
     with open_session(wire) as cell, log.open("w") as said:
         process = subprocess.Popen(
             [sys.executable, "-m", "robot_gst", *command], cwd=ROOT, stdout=said, stderr=said
@@ -213,18 +235,25 @@ def wait_for(holds: Any, process: Any) -> None:
         time.sleep(0.1)
 
 
-def payload_of(seed: int, number: int, bases: Sequence[Any], solve: Any) -> tuple[str, bytes]:
+def payload_of(
+    seed: int, number: int, bases: Sequence[Any], solve: Any, hashes: Any = ()
+) -> tuple[str, bytes]:
     """The plan of a number: its family, and the bytes that are sent."""
     families = list(FAMILIES)
     family = families[number % len(families)]
     rng = np.random.default_rng([seed, number])
     plan = mutated(bases[int(rng.integers(len(bases)))], family, rng, solve)
-    return family, plan if isinstance(plan, bytes) else json.dumps(plan).encode()
+    if isinstance(plan, bytes):
+        return family, plan
+    if hashes and plan["task"] in hashes:
+        plan["task_sha256"] = hashes[plan["task"]]
+    return family, json.dumps(plan).encode()
 
 
-def ask(cell: Any, payload: bytes) -> tuple[str, str]:
-    """The gate's answer, and its cause."""
+def ask(cell: Any, payload: bytes, family: str = "", number: int = 0) -> tuple[str, str]:
+    """The gate's answer, and its cause; of a family of ``OUTSIDE`` whether its yes is obeyed."""
     from bridge.errors import BridgeError
+    from bridge.sources.standin.decisions import why_stale
     from bridge.task.verdict import Verdict
 
     try:
@@ -232,11 +261,37 @@ def ask(cell: Any, payload: bytes) -> tuple[str, str]:
     except BridgeError as error:
         return "refused", type(error).__name__ + ": " + str(error)[:120]
     name = verdict.first_failing
+    if verdict.accepted is True and family in OUTSIDE:
+        basis, rng = verdict.basis or {}, np.random.default_rng([9, number])
+        plan, now_ns, moved = payload, int(basis["judged_ns"]) + 10**9, {}
+        joints = np.array(basis["joints_rad"])
+        if family == "yes_too_old":
+            now_ns += round(float(rng.choice([rng.uniform(4.1, 500), -rng.uniform(1.1, 99)])) * 1e9)
+        elif family == "yes_of_another_plan":
+            plan = payload.replace(b"0.0", b"0.00", 1 + int(rng.integers(9)))
+        elif family == "yes_and_the_arm_moved":
+            joints[int(rng.integers(6))] += float(rng.choice([-1, 1]) * rng.uniform(0.051, 3.0))
+        elif family == "yes_and_an_object_moved":
+            name = str(rng.choice(list(basis["objects"])))
+            way = rng.normal(size=3)
+            far_m = basis["objects"][name]["margin_m"] + float(rng.uniform(0.001, 0.2))
+            moved[name] = way / np.linalg.norm(way) * far_m
+        else:
+            verdict = replace(verdict, basis=None)
+        why = why_stale(verdict, plan, now_ns, joints, moved)
+        return ("no", f"stale: {why[:40]}") if why else ("yes", "")
     if verdict.accepted is True:
         return "yes", ""
     if name is not None:
         return "no", f"{name}: {verdict.factors()[name].cause}"
     return "null", str(verdict.reason)[:160]
+
+
+def unsafe(oracle: Oracle, family: str, payload: bytes) -> str:
+    """What the oracle says of a plan; two meanings of one text, and a yes misused, are unsafe."""
+    if family in OUTSIDE or family.startswith("says_twice"):
+        return family
+    return oracle.unsafe(json.loads(payload))
 
 
 def main() -> None:
@@ -254,13 +309,13 @@ def main() -> None:
     def one(number: int) -> None:
         if time.monotonic() > ends:
             return
-        family, payload = payload_of(options.seed, number, stage.bases, solve)
+        family, payload = payload_of(options.seed, number, stage.bases, solve, stage.hashes)
         before = time.monotonic()
-        answer, cause = ask(cell, payload)
+        answer, cause = ask(cell, payload, family, number)
         row = {"number": number, "family": family, "answer": answer, "cause": cause}
         row["seconds"] = round(time.monotonic() - before, 3)
         with oracle_turn:
-            row["unsafe"] = stage.oracle.unsafe(json.loads(payload))
+            row["unsafe"] = unsafe(stage.oracle, family, payload)
         with writing, kept.open("a") as file:
             file.write(json.dumps(row) + "\n")
             rows.append(row)
@@ -301,14 +356,17 @@ def summarise(
         }
     bad = [row for row in rows if row["answer"] == "yes" and row["unsafe"]]
     nameless = [row for row in rows if row["answer"] != "yes" and not row["cause"].strip(": None")]
-    fine = families["valid"]
+    fine = [row for row in rows if row["family"] in HONEST]
+    accepted = sum(row["answer"] == "yes" for row in fine) / max(1, len(fine))
     targets = [
         Target(what="yes for an unsafe plan", measured=len(bad), limit=0),
         Target(what="answers without a cause", measured=len(nameless), limit=0),
         Target(what="plans asked", measured=len(rows), limit=NUM_PLANS[options.task],
                at_most=False),
-        Target(what="share of valid plans accepted", measured=fine["yes"] / max(1, fine["plans"]),
-               limit=0.8, at_most=False),
+        Target(what="families", measured=len({row["family"] for row in rows}), limit=40,
+               at_most=False),
+        Target(what="share of valid plans accepted", measured=accepted, limit=0.98,
+               at_most=False),
     ]  # fmt: skip
     details = {"seed": options.seed, "families": families, "unsafe_yes": bad}
     if asked:

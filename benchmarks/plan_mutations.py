@@ -1,4 +1,4 @@
-"""Seeded mutations of plans that are fine: one family for each way in which a plan can be wrong."""
+"""Seeded mutations of plans that are fine: one family for each way in which one can be wrong."""
 
 import copy
 import json
@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 Record = dict[str, Any]
 
@@ -300,12 +301,188 @@ def without_joints(plan: Record, rng: Rng, solve: Solver) -> Record:
 
 def two_at_once(plan: Record, rng: Rng, solve: Solver) -> Any:
     """Two families, one after the other."""
-    names = [n for n in FAMILIES if n not in ("valid", "not_a_number", "two_at_once")]
+    names = [n for n in FAMILIES if n in OLD]
     for name in rng.choice(names, 2, replace=False).tolist():
         plan = FAMILIES[name](plan, rng, solve)
     return plan
 
 
+def slower(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """Fine: the same way, stretched in time."""
+    factor = float(rng.uniform(1.01, 1.6))
+    for item in (*plan["tau"], *plan["stages"]):
+        for key in ("t_ns", "t_start_ns", "t_end_ns"):
+            if key in item:
+                item[key] = round(item[key] * factor)
+    return plan
+
+
+def denser(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """Fine: the same way with a waypoint each 10 to 30 ms."""
+    plan = _sampled(plan, float(rng.uniform(0.01, 0.03)))
+    _poses_from_joints(plan, solve)
+    return plan
+
+
+def _chatter(low_hz: float, high_hz: float) -> Callable[[Record, Rng, Solver], Record]:
+    """A joint shakes for a while, softly at first, by 20 to 760 rad/s2."""
+
+    def shaken(plan: Record, rng: Rng, solve: Solver) -> Record:
+        hz, joint = float(rng.uniform(low_hz, high_hz)), int(rng.integers(6))
+        size = float(np.exp(rng.uniform(math.log(32), math.log(760)))) / (2 * math.pi * hz) ** 2
+        plan = _sampled(plan, min(0.02, 1 / hz / float(rng.uniform(5, 12))))
+        long_s = max(4 / hz, 0.3)
+        start = float(rng.uniform(0.1, max(0.2, plan["tau"][-1]["t_ns"] * 1e-9 - long_s)))
+        for w in plan["tau"]:
+            share = (w["t_ns"] * 1e-9 - start) / long_s
+            if 0 < share < 1:
+                wave = math.sin(math.pi * share) ** 2 * math.sin(2 * math.pi * hz * share * long_s)
+                w["joints_rad"][joint] += size * wave
+        _poses_from_joints(plan, solve)
+        return plan
+
+    return shaken
+
+
+def velocity_step(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """A joint goes aside and back at once, from rest to up to 3 rad/s."""
+    speed, joint, long_s = float(rng.uniform(1.3, 3.0)), int(rng.integers(6)), 0.06
+    plan = _sampled(plan, 0.01)
+    start = float(rng.uniform(0.1, 0.9)) * plan["tau"][-1]["t_ns"] * 1e-9
+    for w in plan["tau"]:
+        t = w["t_ns"] * 1e-9 - start
+        if 0 < t < 2 * long_s:
+            w["joints_rad"][joint] += speed * min(t, 2 * long_s - t)
+    _poses_from_joints(plan, solve)
+    return plan
+
+
+def skims(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """On the way to the object the hand sweeps 1 to 4 mm over the table at over 0.5 m/s."""
+    plan = _sampled(plan, 0.02)
+    low, first = float(rng.uniform(0.001, 0.004)) + 0.01, plan["tau"][0]
+    aside = np.array([0.0, float(rng.choice([-1, 1])) * 0.2, 0.0])
+    over = np.array(first["p_m"]) + aside
+    over[2] = low
+    ways = [(np.array(first["p_m"]), over - 1.5 * aside, 1.5), (over - 1.5 * aside, over, 0.75),
+            (over, np.array(first["p_m"]), 1.5)]  # fmt: skip
+    extra, t = [], 0.0
+    for start, end, long_s in ways:
+        for k in range(1, round(long_s / 0.02) + 1):
+            share = k * 0.02 / long_s
+            share = 10 * share**3 - 15 * share**4 + 6 * share**5
+            p = (start + share * (end - start)).tolist()
+            w = {**copy.deepcopy(first), "t_ns": round((t + k * 0.02) * 1e9), "p_m": p}
+            extra.append(w)
+        t += long_s
+    for item in (*plan["tau"], *plan["stages"]):
+        for key in ("t_ns", "t_start_ns", "t_end_ns"):
+            if key in item and (item is not plan["stages"][0] or key != "t_start_ns"):
+                item[key] += round(t * 1e9)
+    plan["tau"] = [copy.deepcopy(first) | {"t_ns": 0}, *extra, *plan["tau"][1:]]
+    _solve_all(plan, solve)
+    return plan
+
+
+def _heavy(least_kg: float, most_kg: float) -> Callable[[Record, Rng, Solver], Record]:
+    """What it grasps is beyond what the arm may carry: another task's file says so."""
+
+    def loaded(plan: Record, rng: Rng, solve: Solver) -> Record:
+        fitting = [kg for kg in HEAVY_KG if least_kg <= kg <= most_kg]
+        plan["task"] = f"heavy_{float(rng.choice(fitting)):g}".replace(".", "_")
+        return plan
+
+    return loaded
+
+
+def heavy_without_stages(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """And no stage says that anything is grasped."""
+    plan["stages"] = []
+    return _heavy(5.0, 99.0)(plan, rng, solve)
+
+
+def says_twice(plan: Record, rng: Rng, solve: Solver) -> bytes:
+    """A key is there twice, and readers differ in which they believe."""
+    key = str(rng.choice(["tau", "robot", "stages", "frame", "task"]))
+    other = json.dumps({"tau": [], "stages": [], "frame": "world"}.get(key, "x"))
+    text = json.dumps(plan)
+    if rng.random() < 0.5:
+        return f'{{"{key}": {other}, {text[1:]}'.encode()
+    return f'{text[:-1]}, "{key}": {json.dumps(plan[key])}}}'.encode()
+
+
+def says_twice_inside(plan: Record, rng: Rng, solve: Solver) -> bytes:
+    """A waypoint has two positions, or two times."""
+    key, text = str(rng.choice(["p_m", "t_ns", "g"])), json.dumps(plan)
+    value = {"p_m": "[0.1, 0.1, 0.1]", "t_ns": "7", "g": "0"}[key]
+    return text.replace(f'"{key}":', f'"{key}": {value}, "{key}":', 1).encode()
+
+
+def waits(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """It stands for minutes before it moves, or begins minutes late."""
+    by_ns = round(float(rng.uniform(15, 500)) * 1e9)
+    for w in plan["tau"][int(rng.integers(2)) :]:
+        w["t_ns"] += by_ns
+    for stage in plan["stages"]:
+        stage["t_start_ns"] += by_ns
+        stage["t_end_ns"] += by_ns
+    return plan
+
+
+def since_1970(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """Times of a clock, not of the trajectory."""
+    for item in (*plan["tau"], *plan["stages"]):
+        for key in ("t_ns", "t_start_ns", "t_end_ns"):
+            if key in item:
+                item[key] += 1_700_000_000_000_000_000
+    return plan
+
+
+def text_for_numbers(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """Words, nulls and truths where numbers belong."""
+    w = plan["tau"][int(rng.integers(len(plan["tau"])))]
+    key = str(rng.choice(["p_m", "q_wxyz", "joints_rad", "t_ns", "g"]))
+    value = [str(w[key]), True, None, [], {}, "0.1"][int(rng.integers(6))]
+    if isinstance(w[key], list):
+        w[key][int(rng.integers(len(w[key])))] = value
+    else:
+        w[key] = value
+    return w and plan
+
+
+def many_waypoints(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """More than anybody can judge in time."""
+    one = {key: plan["tau"][0][key] for key in ("p_m", "q_wxyz", "g")}
+    count = int(rng.choice([25_000, 60_000, 120_000]))
+    plan["tau"] = [{**one, "t_ns": k * 4_000_000} for k in range(count)]
+    return plan
+
+
+def blip(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """One waypoint of a dense path is aside by what no limit of angle forbids."""
+    plan = _sampled(plan, 0.01)
+    w, joint = plan["tau"][int(rng.integers(5, len(plan["tau"]) - 5))], int(rng.integers(6))
+    w["joints_rad"][joint] += float(rng.choice([-1, 1]) * rng.uniform(0.005, 0.02))
+    _poses_from_joints(plan, solve)
+    return plan
+
+
+def sudden_end(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """It ends, or begins, in full motion."""
+    tau = plan["tau"]
+    rows = np.array([w["joints_rad"] for w in tau])
+    speeds = np.abs(np.diff(rows, axis=0)).max(axis=1)
+    fast = np.flatnonzero(speeds > 0.8 * speeds.max())
+    plan["tau"] = tau[: int(rng.choice(fast)) + 1]
+    return plan
+
+
+def outside_use(plan: Record, rng: Rng, solve: Solver) -> Record:
+    """Fine as it is; what comes after its yes is not (``attack_gate.OUTSIDE``)."""
+    return plan
+
+
+HEAVY_KG = (5.5, 6.0, 7.5, 10.0, 20.0, 60.0)
 FAMILIES: dict[str, Callable[[Record, Rng, Solver], Any]] = {
     item.__name__: item
     for item in (
@@ -329,8 +506,54 @@ FAMILIES: dict[str, Callable[[Record, Rng, Solver], Any]] = {
         jumps_in_time,
         without_joints,
         two_at_once,
+        slower,
+        denser,
+        velocity_step,
+        skims,
+        heavy_without_stages,
+        says_twice,
+        says_twice_inside,
+        waits,
+        since_1970,
+        text_for_numbers,
+        many_waypoints,
+        blip,
+        sudden_end,
     )
+} | {
+    "chatter_1_to_3_hz": _chatter(1, 3),
+    "chatter_3_to_7_hz": _chatter(3, 7),
+    "chatter_7_to_15_hz": _chatter(7, 15),
+    "chatter_15_to_30_hz": _chatter(15, 30),
+    "chatter_30_to_60_hz": _chatter(30, 60),
+    "heavy": _heavy(5.0, 8.0),
+    "very_heavy": _heavy(8.0, 99.0),
+    "yes_too_old": outside_use,
+    "yes_of_another_plan": outside_use,
+    "yes_and_the_arm_moved": outside_use,
+    "yes_and_an_object_moved": outside_use,
+    "yes_forged": outside_use,
 }
+OLD = tuple(FAMILIES)[1:19]
+"""Of these two may come together; none is bytes but the one left out."""
+OLD = tuple(name for name in OLD if name != "not_a_number")
+HONEST = ("valid", "slower", "denser")
+OUTSIDE = tuple(name for name in FAMILIES if name.startswith("yes_"))
+
+
+def _sampled(plan: Record, step_s: float) -> Record:
+    """The same joints on a spline, more often."""
+    tau = plan["tau"]
+    times = np.array([w["t_ns"] for w in tau]) * 1e-9
+    curve = CubicSpline(times, [w["joints_rad"] for w in tau], bc_type="clamped")
+    places = CubicSpline(times, [w["p_m"] for w in tau], bc_type="clamped")
+    dense = []
+    for t in np.append(np.arange(0, times[-1] - step_s / 2, step_s), times[-1]):
+        w = copy.deepcopy(tau[int(np.searchsorted(times, t, "left"))])
+        w["t_ns"], w["joints_rad"], w["p_m"] = round(t * 1e9), curve(t).tolist(), places(t).tolist()
+        dense.append(w)
+    plan["tau"] = dense
+    return plan
 
 
 def _turn(waypoint: Record, offset: np.ndarray) -> None:

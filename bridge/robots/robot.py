@@ -19,7 +19,7 @@ from difflib import get_close_matches
 from functools import lru_cache
 from html import unescape
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -148,8 +148,17 @@ class Robot:
     """Limit of each joint [rad/s]; None: those of the URDF."""
     acceleration_rad_s2: tuple[float, ...] | None = None
     """Limit of each joint [rad/s2]; None: not known."""
+    jerk_rad_s3: tuple[float, ...] | None = None
+    """Limit of each joint [rad/s3]; None: not known."""
+    interpolation: Literal["linear", "cubic", "quintic"] = "linear"
+    """How the controller goes from waypoint to waypoint."""
     tool_speed_m_s: float | None = None
-    """Fastest its tool may be commanded [m/s]; None: not known."""
+    """Fastest its tool may be commanded [m/s]; None: not known. This and what follows is where the
+    arm stops by itself: its safety settings."""
+    elbow_speed_m_s: float | None = None
+    momentum_kg_m_s: float | None = None
+    power_W: float | None = None
+    stop_time_s: float | None = None
     contact_force_N: float | None = None
     """Force on the arm beyond which it stops by itself; None: not known."""
     tracking_error_rad: float | None = None
@@ -414,6 +423,10 @@ def _check_names(robot: Robot) -> None:
         raise ValueError("finger_links must be among the gripper's links")
 
 
+_STOPS = ("tool_speed_m_s", "elbow_speed_m_s", "momentum_kg_m_s", "power_W", "stop_time_s")
+_ABOVE_0 = (*_STOPS, "contact_force_N", "tracking_error_rad", "payload_kg")
+
+
 def _check_numbers(robot: Robot) -> None:
     gripper, count = robot.gripper, len(robot.joints)
     if gripper.fingers and not gripper.max_width_m > 0:
@@ -422,7 +435,7 @@ def _check_numbers(robot: Robot) -> None:
         raise ValueError("a gripper with fingers needs two finger_links, between which it holds")
     for finger in gripper.fingers:
         _check_finger(finger, gripper.max_width_m)
-    for what in ("velocity_rad_s", "acceleration_rad_s2"):
+    for what in ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3"):
         limits = getattr(robot, what)
         if limits is not None and (len(limits) != count or not all(x > 0 for x in limits)):
             raise ValueError(f"{what} must hold one positive number per joint")
@@ -431,12 +444,10 @@ def _check_numbers(robot: Robot) -> None:
     ranges = robot.position_rad
     if ranges is not None and (len(ranges) != count or not all(a < b for a, b in ranges)):
         raise ValueError("position_rad must hold a lower and a higher number per joint")
-    for what in ("tool_speed_m_s", "contact_force_N", "tracking_error_rad"):
+    for what in _ABOVE_0:
         limit = getattr(robot, what)
         if limit is not None and not limit > 0:
             raise ValueError(f"{what} must be above 0")
-    if robot.payload_kg is not None and not robot.payload_kg > 0:
-        raise ValueError("payload_kg must be above 0")
 
 
 def _check_finger(finger: Finger, max_width_m: float) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
@@ -81,6 +82,15 @@ def _finite(text: str) -> float:
     return number if math.isfinite(number) else _refuse(text)
 
 
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Refuse an object that says something twice: readers differ in which they believe."""
+    record = dict(pairs)
+    if len(record) < len(pairs):
+        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"{twice[:40]!r} is there twice")
+    return record
+
+
 def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dict[str, Any]:
     """Parse JSON bytes and check them."""
     return dict(check_record(load_record(data, name=name), name=name, package=package))
@@ -89,7 +99,9 @@ def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dic
 def load_record(data: bytes, *, name: str) -> dict[str, Any]:
     """Parse JSON bytes that hold one object of finite numbers, and check no more than that."""
     try:
-        record = json.loads(data, parse_constant=_refuse, parse_float=_finite)
+        record = json.loads(
+            data, parse_constant=_refuse, parse_float=_finite, object_pairs_hook=_once
+        )
     except (ValueError, RecursionError) as error:
         raise InvalidRecordError(name=name, where="", found=f"not JSON ({error})") from error
     if not isinstance(record, dict):

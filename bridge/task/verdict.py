@@ -9,9 +9,7 @@ from bridge.task.record import check_record, made_of, parse_record
 
 SCHEMA_VERSION = 1
 STAND_IN_ENGINE = "mujoco"
-"""What moves the stand-in cell."""
 SAME_ENGINE = "same engine as the cell"
-"""What such a verdict carries among its warnings."""
 
 
 def is_same_engine(engine: str | None, *, stand_in: bool) -> bool:
@@ -64,6 +62,9 @@ class Verdict:
     nearest: Mapping[str, Any] | None = None
     """Where the smallest clearance was, of the pairs that may not touch: t_ns, distance_m, bodies,
     and p_m, the nearest point of each in the base frame. None where nothing was measured."""
+    basis: Mapping[str, Any] | None = None
+    """What a yes holds for: plan_sha256 of the bytes that were judged, joints_rad, objects (p_m and
+    margin_m of each), judged_ns on the cell's clock, and valid_s from then on."""
 
     def factors(self) -> dict[str, Factor]:
         """All factors by name, in the order in which a plan is examined."""
@@ -91,8 +92,9 @@ class Verdict:
         record = json.loads(json.dumps(record))
         if not record["grasps"]:
             del record["grasps"]
-        if record["nearest"] is None:
-            del record["nearest"]
+        for name in ("nearest", "basis"):
+            if record[name] is None:
+                del record[name]
         check_record(record, name="verdict")
         return json.dumps(record, separators=(",", ":")).encode()
 

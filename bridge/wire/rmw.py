@@ -82,11 +82,7 @@ def _store(name: str, folder: Path | None) -> Any:
 
 
 def read_definitions(folder: Path) -> None:
-    """Read a folder of definitions now rather than at the first message.
-
-    Raises:
-        UsageError: When a file in the folder is not a message definition, or there is none.
-    """
+    """Read a folder of definitions now rather than at the first message."""
     _store(_release_names()[0], folder)
 
 

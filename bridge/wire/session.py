@@ -236,13 +236,7 @@ class WireSession:
         qos: Qos = Qos.RELIABLE,
         message_encoding: str | None = None,
     ) -> WirePublisher:
-        """Announce a topic.
-
-        Args:
-            qos: What happens when the network is behind; control loops use ``Qos.CONTROL``.
-            message_encoding: cdr, json, protobuf ...; that of the type where it is left out, and
-                foreign types then count as CDR.
-        """
+        """Announce a topic."""
         if message_encoding is None:
             known = schema.schema_for(type_name)
             message_encoding = known.message_encoding if known else "cdr"
@@ -332,11 +326,7 @@ class WireSession:
         return open_session(own)
 
     def watch_links(self, callback: Callable[[bool], None]) -> Subscriber | None:
-        """Hear of connections that open (True) and close (False), on a thread of zenoh's.
-
-        Returns:
-            What ends it; None when this zenoh cannot tell.
-        """
+        """Hear of connections that open (True) and close (False), on a thread of zenoh's."""
 
         def on_event(event: Any) -> None:
             callback(event.kind == zenoh.SampleKind.PUT)

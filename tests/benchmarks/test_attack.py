@@ -34,7 +34,8 @@ POSES = {
 
 
 QUICK = ("valid", "shifted_start", "deeper_contact", "faster", "more_contacts", "other_stages",
-         "not_a_number", "swapped_objects", "joint_jump")  # fmt: skip
+         "not_a_number", "swapped_objects", "joint_jump", "velocity_step", "blip", "sudden_end",
+         "chatter_3_to_7_hz", "chatter_30_to_60_hz")  # fmt: skip
 """Of these most are refused before physics."""
 
 

@@ -33,11 +33,7 @@ BESIDE_M = 0.06
 
 
 def move_by_hand(cell: StandinCell, poses: Mapping[str, np.ndarray], beside_m: float) -> None:
-    """Carry the cube into the box, posture by posture, as a person at a pendant would.
-
-    Args:
-        poses: Where cube and box stand, ``T_base_object``.
-    """
+    """Carry the cube into the box, posture by posture, as a person at a pendant would."""
     cube, box = (poses[name] for name in ("cube", "box"))
     yaw = float(np.arctan2(cube[1, 0], cube[0, 0]))
     at = cell.home_rad

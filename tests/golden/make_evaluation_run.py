@@ -40,12 +40,7 @@ TRUTH = {WITHOUT: 0.55, WITH: 0.8}
 
 
 def make_evaluation_run(folder: Path, *, trials: Mapping[str, int] | None = None) -> RunFolder:
-    """Write the run into a new folder and return it.
-
-    Args:
-        folder: Must not exist.
-        trials: Trials per condition by task; ``TRIALS`` without it.
-    """
+    """Write the run into a new folder and return it."""
     rng = np.random.default_rng(SEED)
     run = RunFolder.create(folder)
     for name, count in (TRIALS if trials is None else trials).items():

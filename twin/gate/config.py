@@ -36,6 +36,8 @@ class GateConfig:
     deadline_s: Annotated[float, Parameter(name="--deadline", converter=convert_duration)] = 300.0
     """Last resort against what hangs: without an answer after this long on the wall clock (20s,
     5min or plain seconds) there is no verdict, and its reason names this limit."""
+    valid_s: Annotated[float, Parameter(parse=False)] = 5.0
+    """A yes holds for so long on the cell's clock, if neither the arm nor an object moves."""
     waiting: int = 4
     """Plans that may wait while one is judged; more are turned away at once."""
     samples: int = 0
@@ -59,6 +61,7 @@ class GateConfig:
             {
                 "max_steps": (1, 10**9),
                 "deadline_s": (0, day_s),
+                "valid_s": (0, 600),
                 "waiting": (0, 1000),
                 "samples": (0, 100_000),
                 "min_p_success": (0, 1),

@@ -5,6 +5,7 @@ by default. How much is simulated for a verdict is counted in steps, so it does 
 machine's speed; the wall clock is the last resort against what hangs.
 """
 
+import hashlib
 import queue
 import threading
 import time
@@ -69,9 +70,6 @@ def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task) -> str:
     """Name the first object that a plan has elsewhere than it is seen; "" when there is none.
 
     Objects that look alike may be confused; entities without a position say nothing.
-
-    Args:
-        plan: Its ``entities`` are where its planner expected the objects to be.
     """
     for name, entity in plan.entities.items():
         p_m = entity.get("p_m") if isinstance(entity, Mapping) else None
@@ -95,13 +93,7 @@ def _looks(model: ObjectModel) -> tuple[object, ...]:
 def turn_between(
     T_first: Float[np.ndarray, "4 4"], T_second: Float[np.ndarray, "4 4"], model: ObjectModel
 ) -> float:
-    """Turn about the vertical from one pose to another, among those that look the same [rad].
-
-    Args:
-        T_first: Pose of the object in the base frame.
-        T_second: A later pose of it, same frame.
-        model: Its symmetry says which turns look the same; a soft object has none.
-    """
+    """Turn about the vertical from one pose to another, among those that look the same [rad]."""
     period = 2 * np.pi if model.soft is not None else yaw_period_rad(model)
     yaws = [np.arctan2(T[1, 0], T[0, 0]) for T in (T_first, T_second)]
     return float(abs(np.mod(yaws[1] - yaws[0] + period / 2, period) - period / 2))
@@ -119,19 +111,20 @@ ROUNDING = 1e-9
 POLL_S = 0.05
 ANSWER_S = 0.1
 """Kept back from the wall-clock limit for answering."""
-MAX_PLAN_BYTES = 32_000_000
-"""Ten minutes of waypoints with joints at 125 Hz take less."""
+MAX_PLAN_BYTES, MAX_WAYPOINTS = 10_000_000, 20_000
+"""Ten minutes of waypoints with joints at 30 Hz are no more; each takes a while to judge."""
 
 
 class PlanTooLargeError(TwinError):
     """A payload is too large to be read as a plan."""
 
-    def __init__(self, *, num_bytes: int) -> None:
+    def __init__(self, *, num_bytes: int, num_waypoints: int) -> None:
         """Remember the size."""
-        self.num_bytes = num_bytes
+        self.num_bytes, self.num_waypoints = num_bytes, num_waypoints
         super().__init__(
-            f"a payload of {num_bytes / 1e6:.0f} MB is not read as a plan; at most "
-            f"{MAX_PLAN_BYTES / 1e6:.0f} MB are. Send fewer waypoints, or split the plan."
+            f"a payload of {num_bytes / 1e6:.0f} MB with {num_waypoints} waypoints is not read as "
+            f"a plan; at most {MAX_PLAN_BYTES / 1e6:.0f} MB and {MAX_WAYPOINTS} are. Send fewer "
+            "waypoints, or split the plan."
         )
 
 
@@ -159,12 +152,7 @@ class Perception(Protocol):
         """When the last message arrived."""
 
     def frames(self, *, max_age_ns: int, max_per_camera: int) -> Any:
-        """The latest frames at rest.
-
-        Args:
-            max_age_ns: A camera gives nothing when its last image is older.
-            max_per_camera: At most so many frames of one camera, the newest.
-        """
+        """The latest frames at rest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,15 +249,20 @@ class Gate:
         """Judge one plan; the wall-clock limit counts from here, reading it included."""
         ends_s = time.monotonic() + self._config.deadline_s
         arrived_ns = self._now_ns()
-        if len(payload) > MAX_PLAN_BYTES:
-            raise PlanTooLargeError(num_bytes=len(payload))
+        count = payload.count(b'"t_ns"')  # to look at each would take longer than to judge few
+        if len(payload) > MAX_PLAN_BYTES or count > MAX_WAYPOINTS:
+            raise PlanTooLargeError(num_bytes=len(payload), num_waypoints=count)
         plan = Plan.from_json(payload)
         with self._counting:
             if self._inside > self._config.waiting:
                 return no_verdict(plan, f"{self._inside} plans are being judged already; ask later")
             self._inside += 1
         try:
-            return self._in_time(plan, arrived_ns, ends_s)
+            verdict = self._in_time(plan, arrived_ns, ends_s)
+            if verdict.basis is None:
+                return verdict
+            sha256 = hashlib.sha256(payload).hexdigest()
+            return replace(verdict, basis={"plan_sha256": sha256, **verdict.basis})
         finally:
             with self._counting:
                 self._inside -= 1
@@ -393,7 +386,24 @@ class Gate:
         if verdict.accepted is True:
             self._look_again(task, found, frames, ends_s)
             self._feel_again(start_rad, robot_of(urdf))
+            verdict = replace(verdict, basis=self._basis(start_rad, found))
         return verdict
+
+    def _basis(self, start_rad: Joints, found: Mapping[str, Any]) -> dict[str, Any]:
+        """What a yes holds for, but for the plan."""
+        objects = {
+            name: {
+                "p_m": item.T_base_object[:3, 3].tolist(),
+                "margin_m": max(MOVED_M, SIGMAS * _sigmas(item)[0]),
+            }
+            for name, item in found.items()
+        }
+        return {
+            "joints_rad": start_rad.tolist(),
+            "objects": objects,
+            "judged_ns": self._perception.newest_ns(),
+            "valid_s": self._config.valid_s,
+        }
 
     def _check(self, plan: Plan) -> str:
         """Refuse plans this gate cannot judge; return the robot description."""
@@ -472,11 +482,7 @@ class Gate:
         )
 
     def _look_again(self, task: Task, found: Mapping[str, Any], frames: Any, ends_s: float) -> None:
-        """Before a yes: the cell must still be as it was judged.
-
-        Raises:
-            UndecidedError: When something was started or moved meanwhile, or nobody can see.
-        """
+        """Before a yes: the cell must still be as it was judged."""
         running = self._perception.executing()
         if running is not None:
             raise UndecidedError(f"{running} was started while the plan was being judged")

@@ -131,12 +131,7 @@ class LiveCell:
 def frames_of(
     camera_id: str, camera: LiveCamera, cell: LiveCell, quiet_since_ns: int, max_frames: int
 ) -> PosedFrames:
-    """The newest frames of one camera, taken at rest since the last execution ended.
-
-    Args:
-        quiet_since_ns: When the last execution ended; images must be later, on the cell's clock.
-        max_frames: At most so many, the newest.
-    """
+    """The newest frames of one camera, taken at rest since the last execution ended."""
     missing = [f"{name}/info" for name in ("color", "depth") if name not in camera.infos]
     if missing:
         raise CameraNotReadyError(f"no calibration on {' and '.join(missing)}")
@@ -231,12 +226,7 @@ class LiveView:
     def __init__(
         self, cell: str, calibration: Calibration | None = None, urdf: str | None = None
     ) -> None:
-        """Listen for ``/<cell>/cam/...``, events, joint states, transforms and the URDF.
-
-        Args:
-            calibration: Of the run. Cameras in it are where it says, and never where ``/tf`` does.
-            urdf: The robot description, whatever is published; None: what is published.
-        """
+        """Listen for ``/<cell>/cam/...``, events, joint states, transforms and the URDF."""
         self._cell = cell
         self._calibration = calibration
         self._places = {} if calibration is None else dict(calibration.cameras)
@@ -257,12 +247,7 @@ class LiveView:
         self.malformed = 0
 
     def take(self, topic: str, data: bytes, received_ns: int, type_name: str = "") -> None:
-        """Remember one message; one that cannot be read is counted and passed over.
-
-        Args:
-            received_ns: On the receiver's clock.
-            type_name: Of an image: raw or compressed; "" is what the topic's name promises.
-        """
+        """Remember one message; one that cannot be read is counted and passed over."""
         if is_truth(topic):
             return
         try:
@@ -400,13 +385,7 @@ class LiveView:
             return self._executing
 
     def frames(self, *, max_age_ns: int, max_per_camera: int) -> LiveFrames:
-        """The newest frames of each camera since the last execution ended.
-
-        Args:
-            max_age_ns: A camera gives nothing when its last image is older than this, on the
-                cell's own clock: the cell went on talking and the camera did not.
-            max_per_camera: At most so many frames of one camera.
-        """
+        """The newest frames of each camera since the last execution ended."""
         with self._lock:  # copy only: decoding must not hold up the network
             cameras = {
                 camera_id: LiveCamera(

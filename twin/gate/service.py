@@ -48,11 +48,7 @@ def make_gate(
     now_ns: Callable[[], int],
     twin: TwinProcess,
 ) -> Gate:
-    """Put the real localisation and replay behind the gate.
-
-    Args:
-        now_ns: The clock on which messages arrive; says how long the cell has been silent.
-    """
+    """Put the real localisation and replay behind the gate."""
     return Gate(
         tasks=tasks,
         config=config,
@@ -149,9 +145,6 @@ def claim_gate(session: Any, cell: str) -> None:
 
     Whoever asks takes the first answer that comes, and of two gates one may know another task or
     an older scene.
-
-    Args:
-        session: An open ``bridge.wire.session``; the claim lasts as long as it.
     """
     key = f"{cell}/gate/alive"
     if session.query_alive(key):

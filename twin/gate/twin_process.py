@@ -77,10 +77,6 @@ def answer(question: Question) -> Verdict:
 
     Nothing here looks at a clock: the same question has the same answer on every machine.
     Rounds of one start are tried against the same variations: their identity is the start's name.
-
-    Raises:
-        UndecidedError: When the scene is another robot's or another than the plan was made in, or
-            the nominal replay alone needs more steps than there may be.
     """
     from twin.replay.agreement import in_each_engine  # noqa: PLC0415
     from twin.replay.audit import audit  # noqa: PLC0415
@@ -169,15 +165,7 @@ def _steps_of(question: Question, config: ReplayConfig) -> int:
 
 
 def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
-    """Ask the twin in this process as a gate asks it in its own.
-
-    Args:
-        run_path: Run folder with the rebuilt scene, or without one.
-        scene: Task, poses and robot; where the arm stands.
-
-    Returns:
-        What judges one plan; it raises ``UndecidedError`` where a replay takes too many steps.
-    """
+    """Ask the twin in this process as a gate asks it in its own."""
     config = GateConfig()
 
     def judge(plan: Plan) -> Verdict:

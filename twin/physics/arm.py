@@ -28,15 +28,7 @@ Hulls = Mapping[str, Sequence[Float[np.ndarray, "num_points 3"]]]
 
 
 def write_description(urdf: str, mesh_hulls_m: Hulls, folder: Path) -> Path:
-    """Write ``robot.urdf`` and its hull meshes into a folder.
-
-    Args:
-        mesh_hulls_m: Per link, the hulls that stand for its mesh collision elements, in the
-            link's frame [m].
-
-    Returns:
-        The path of the URDF file.
-    """
+    """Write ``robot.urdf`` and its hull meshes into a folder."""
     root = ET.fromstring(urdf)
     for number, link in enumerate(root.findall("link")):
         for visual in link.findall("visual"):
@@ -286,11 +278,6 @@ class Arm:
         """Set the position targets that the motors follow from the next step on.
 
         Motors keep their orders: one that is already followed is not given again.
-
-        Args:
-            joints_rad: Where the arm is to be, from base to hand.
-            width_m: Distance between the finger pads; beyond what the gripper can, the nearest it
-                can.
         """
         order = (_numbers(joints_rad), _numbers(velocity_rad_s))
         if order != self._arm_order:
@@ -411,12 +398,7 @@ class Arm:
     def push(
         self, link: str | None, force_N: tuple[float, ...], point_m: tuple[float, ...]
     ) -> None:
-        """Apply a force at a point of the base frame during the next step.
-
-        Args:
-            link: What it acts on; None: what carries the fingers.
-            force_N: The force, base frame.
-        """
+        """Apply a force at a point of the base frame during the next step."""
         pybullet.applyExternalForce(
             self.id,
             self._finger_parent if link is None else self.links[link],
@@ -460,11 +442,7 @@ class Press:
         self._found = 0
 
     def update(self, *, anew: bool) -> None:
-        """Drive the fingers for the next step. Call once per step.
-
-        Args:
-            anew: Contacts begin anew: fingers may find less in their way than there is.
-        """
+        """Drive the fingers for the next step. Call once per step."""
         self._steps += 1
         if anew:
             self._found = 0

@@ -107,12 +107,7 @@ def coarse_lattice(
     tets: Int32[np.ndarray, "num_tets 4"],
     cell_m: float,
 ) -> tuple[Lattice, float] | None:
-    """Fill the solid that a lattice fills with larger cells.
-
-    Returns:
-        The coarse lattice in one piece and its spacing [m]; None where the fine one is the
-        coarsest that is in one piece, or is not finer.
-    """
+    """Fill the solid that a lattice fills with larger cells."""
     return _coarse_lattice(
         np.ascontiguousarray(nodes_m).tobytes(),
         np.ascontiguousarray(tets).tobytes(),
@@ -275,10 +270,6 @@ class SoftModel:
 
         One that is finer than the task asks for (``soft.cell_m``) is replaced by a coarser lattice
         of the same solid, with the fine surface as skin: docs/decisions/0017-contact-physics.md.
-
-        Args:
-            arrays: What ``objects/<id>/soft.npz`` holds: ``nodes_m``, ``tets``, ``mass_fraction``
-                and ``spacing_m`` (``twin.scene.shape.lattice``).
         """
         if model.soft is None:
             raise SoftBodyError(found=f"no soft table: {model.id} is rigid")

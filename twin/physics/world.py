@@ -116,12 +116,7 @@ class World:
         return ids
 
     def add_table(self, height_m: float, size_m: float = 4.0, thickness_m: float = 0.4) -> int:
-        """Add the table: a slab whose top is at the height.
-
-        Args:
-            height_m: Of the top, over the robot's base.
-            size_m: Length of the slab's sides; the robot stands at their middle.
-        """
+        """Add the table: a slab whose top is at the height."""
         centre = np.array([0.0, 0.0, height_m - thickness_m / 2])
         extents = np.array([size_m, size_m, thickness_m])
         body = self.add_static([(centre, extents)], np.eye(4))[0]
@@ -143,11 +138,7 @@ class World:
         T_base_object: Float[np.ndarray, "4 4"],
         unseen: Unseen = EVEN,
     ) -> None:
-        """Add a solid box that moves.
-
-        Args:
-            mass_kg: Spread evenly over the box, but for where its centre is said to be.
-        """
+        """Add a solid box that moves."""
         if unseen == EVEN:
             body = self._box(size_m, mass_kg, T_base_object)
         else:

@@ -1,5 +1,6 @@
 """Physics of the cell between two targets of a policy, and the limits at which it would stop."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,15 +15,13 @@ from twin.physics.engines import PhysicsWorld, open_world
 from twin.policies.errors import StoppedError
 from twin.policies.starts import Start
 from twin.replay.dynamics import Samples, free_start, mesh_hulls, soft_models, spawn
+from twin.replay.motion import motion_failures
 from twin.replay.observed import observed_plan
-from twin.replay.path import JointPath
+from twin.replay.path import JointPath, outside_limits
 from twin.replay.result import ReplayResult
 from twin.replay.verdict import Commanded, judge_states
 from twin.robot.collision import hulls_of
 from twin.robot.model import check_dynamics, load_robot
-
-TOLERANCE = 1e-6
-"""Share by which a number may be beyond its limit: what a policy wrote as the limit is allowed."""
 
 
 class TwinCell:
@@ -133,37 +132,13 @@ class TwinCell:
                 detail=f"{len(robot.joints)} joints and a width were expected, all of them finite; "
                 f"got {np.array2string(joints_rad, precision=3)} and {width_m}",
             )
-        beyond = np.maximum(robot.lower_rad - joints_rad, joints_rad - robot.upper_rad)
-        worst = int(np.argmax(beyond))
-        if beyond[worst] > TOLERANCE:
-            raise StoppedError(
-                name="limits",
-                detail=f"{robot.joints[worst]} at {joints_rad[worst]:.3f} rad is "
-                f"{beyond[worst]:.3f} rad beyond its range "
-                f"[{robot.lower_rad[worst]:.3f}, {robot.upper_rad[worst]:.3f}]",
-            )
-        speed = np.abs(joints_rad - self.target_rad) / duration_s
-        share = speed / robot.velocity_limit_rad_s
-        worst = int(np.argmax(share))
-        if share[worst] > 1 + TOLERANCE:
-            raise StoppedError(
-                name="limits",
-                detail=f"{robot.joints[worst]} would need {speed[worst]:.2f} rad/s, its limit is "
-                f"{robot.velocity_limit_rad_s[worst]:.2f}: go {share[worst]:.1f} x slower",
-            )
-        self._refuse_tool_speed(joints_rad, duration_s)
-
-    def _refuse_tool_speed(
-        self, joints_rad: Float[np.ndarray, " num_joints"], duration_s: float
-    ) -> None:
-        limit = self.robot.record.tool_speed_m_s
-        if limit is None:
-            return
-        Ts = self.robot.Ts_base_tcp(np.stack([self.target_rad, joints_rad]))
-        speed = float(np.linalg.norm(Ts[1, :3, 3] - Ts[0, :3, 3])) / duration_s
-        if speed > limit * (1 + TOLERANCE):
-            detail = f"the tool would go {speed:.2f} m/s, its limit is {limit:.2f}"
-            raise StoppedError(name="limits", detail=detail)
+        length_ns = round(duration_s * 1e9)
+        stood = [(-length_ns, self.target_rad)] if len(self._knots) == 1 else []
+        knots = [*stood, *self._knots[-2:], (self.t_ns + length_ns, joints_rad)]
+        path = replace(self._path(knots), moving=True)
+        failures = outside_limits(robot, path.times_ns[-1:], joints_rad[None])
+        for failure in failures or motion_failures(path, robot):
+            raise StoppedError(name="limits", detail=failure.detail)
 
     def _stop_where_the_arm_would(self) -> None:
         record, found = self.robot.record, self.posture()[0]
@@ -208,11 +183,11 @@ class TwinCell:
             names=(GRIPPER_WIDTH,), stamps_ns=states.stamps_ns, position=states.width_m[:, None]
         )
         plan = observed_plan(arm, widths, self.robot, self.scene.task, info)
-        commanded = Commanded(path=self._path(), trajectory="rollout")
+        commanded = Commanded(path=self._path(self._knots), trajectory="rollout")
         return judge_states(commanded, states, plan, self.scene, self.start.config), plan
 
-    def _path(self) -> JointPath:
-        times, joints = zip(*self._knots, strict=True)
+    def _path(self, knots: list[tuple[int, Float[np.ndarray, " num_joints"]]]) -> JointPath:
+        times, joints = zip(*knots, strict=True)
         width_times, widths = zip(*self._widths, strict=True)
         return JointPath(
             times_ns=np.array(times, dtype=np.int64),

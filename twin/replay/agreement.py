@@ -14,14 +14,7 @@ _DISAGREE = "engines disagree: "
 def in_each_engine(
     task: Task, config: ReplayConfig, judge: Callable[[ReplayConfig], Verdict]
 ) -> list[Verdict]:
-    """Judge in each engine that is asked for; each verdict says where another one differs.
-
-    Returns:
-        Verdicts in the order of ``config.engines()``: the first decides.
-
-    Raises:
-        UsageError: For soft objects in an engine that has none.
-    """
+    """Judge in each engine that is asked for; each verdict says where another one differs."""
     config.refuse_soft(task.soft_objects)
     if config.mode == "kinematic" or config.engine != "both":
         return [judge(config)]

@@ -111,15 +111,7 @@ def audit(
     *,
     max_queries: int = 20_000,
 ) -> Factor:
-    """Say whether python-fcl finds nowhere less distance than a replay's clearance.
-
-    Args:
-        plan: Its stages, with no more contacts than the task allows (``limited_to_task``).
-        max_queries: Pairs asked at most; a replay that needs more is not decided.
-
-    Returns:
-        True, or None with the reason: what was found and what was said, too many pairs, or no fcl.
-    """
+    """Say whether python-fcl finds nowhere less distance than a replay's clearance."""
     try:
         import fcl  # noqa: PLC0415  # [replay] brings it; without it there is no yes
     except ImportError:
@@ -128,6 +120,9 @@ def audit(
         return Factor(
             value=None, detail="the clearance cannot be audited: install python-fcl ([replay])"
         )
+    blind = hulls_of(load_robot(scene.urdf)).blind()
+    if blind is not None:
+        return Factor(value=None, detail=blind)
     return _Audit(fcl, plan, scene, config, max_queries).of(result)
 
 

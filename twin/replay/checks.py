@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Stage
@@ -18,12 +18,6 @@ from twin.replay.dynamics import States
 from twin.replay.failure import Failure
 from twin.replay.path import JointPath
 from twin.robot.model import RobotModel
-
-ACCELERATION_WINDOW_S = 0.1
-"""Accelerations are means over so long on either side: a path of straight lines has corners, which
-a controller rounds."""
-_SLACK = 1.02
-"""Rounded numbers may exceed a limit by as little as this."""
 
 
 def start_failures(
@@ -143,75 +137,7 @@ def limited_to_task(plan: Plan, task: Task) -> Plan:
     return replace(plan, stages=tuple(stages))
 
 
-# What the robot itself would refuse, or stop at.
-
-
-_SPEED = (Cause.JOINT_SPEED, "moves at", "rad/s")
-_ACCELERATION = (Cause.JOINT_ACCELERATION, "is accelerated at", "rad/s^2")
-
-
-def path_limit_failures(path: JointPath, robot: RobotModel) -> list[Failure]:
-    """Find where a commanded path asks for more speed or acceleration than the robot has.
-
-    Speeds are asked between its knots, however near each other they are.
-    """
-    failures, record = [], robot.record
-    times_s = path.times_ns * 1e-9
-    if len(times_s) > 1:
-        speeds = np.abs(np.diff(path.joints_rad, axis=0)) / np.diff(times_s)[:, None]
-        fastest = robot.velocity_limit_rad_s
-        failures += _over(path.times_ns[:-1], speeds, fastest, robot, _SPEED)
-    if record.acceleration_rad_s2 is not None:
-        stamps, values = _accelerations(path)
-        limit = np.array(record.acceleration_rad_s2)
-        failures += _over(stamps, values, limit, robot, _ACCELERATION)
-    if record.tool_speed_m_s is not None and len(times_s) > 1:
-        places = robot.Ts_base_tcp(path.joints_rad)[:, :3, 3]
-        speeds_m_s = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)
-        index = int(np.argmax(speeds_m_s))
-        if speeds_m_s[index] > record.tool_speed_m_s * _SLACK:
-            detail = (
-                f"the tool moves at {speeds_m_s[index]:.2f} m/s, the limit is "
-                f"{record.tool_speed_m_s:g} m/s"
-            )
-            t_ns = int(path.times_ns[index])
-            failures.append(Failure(t_ns=t_ns, cause=Cause.TOOL_SPEED, detail=detail))
-    return failures
-
-
-def _over(
-    times_ns: Int[np.ndarray, " num_times"],
-    values: Float[np.ndarray, "num_times num_joints"],
-    limit: Float[np.ndarray, " num_joints"],
-    robot: RobotModel,
-    words: tuple[Cause, str, str],
-) -> list[Failure]:
-    """Name the first joint that is beyond its limit; ``words`` are cause, verb and unit."""
-    over = ~(values <= limit * _SLACK)
-    if not np.any(over):
-        return []
-    index, joint = _first(over)
-    name, (cause, verb, unit) = robot.record.joints[joint], words
-    detail = f"{name} {verb} {values[index, joint]:.2f} {unit}, the limit is {limit[joint]:.2f}"
-    t_ns = max(0, int(times_ns[index]))
-    return [Failure(t_ns=t_ns, cause=cause, bodies=(name,), detail=f"{detail} {unit}")]
-
-
-def _first(over: Bool[np.ndarray, "num_times num_joints"]) -> tuple[int, int]:
-    """The first time at which something holds, and the first joint it holds of."""
-    index, joint = np.argwhere(over)[0].tolist()
-    return index, joint
-
-
-def _accelerations(
-    path: JointPath,
-) -> tuple[Int[np.ndarray, " num_times"], Float[np.ndarray, "num_times num_joints"]]:
-    """Second differences of the path, which is at rest before its start and after its end."""
-    window_ns = round(ACCELERATION_WINDOW_S * 1e9)
-    end_ns = path.end_ns()
-    stamps = np.arange(path.times_ns[0] - window_ns, end_ns + window_ns + 1, window_ns // 5)
-    before, here, after = (path.joints_at(stamps + k * window_ns) for k in (-1, 0, 1))
-    return stamps, np.abs(after - 2 * here + before) / ACCELERATION_WINDOW_S**2
+# What the robot itself would stop at.
 
 
 def simulated_limit_failures(path: JointPath, states: States, robot: RobotModel) -> list[Failure]:
@@ -222,7 +148,7 @@ def simulated_limit_failures(path: JointPath, states: States, robot: RobotModel)
         off = np.abs(states.joints_rad - path.joints_at(states.stamps_ns))
         over = ~(off <= limit_rad)
         if np.any(over):
-            index, joint = _first(over)
+            index, joint = np.argwhere(over)[0].tolist()
             name = record.joints[joint]
             detail = (
                 f"{name} is {off[index, joint]:.3f} rad from where it is commanded, the limit is "

@@ -47,11 +47,7 @@ LAG_STEP_NS = 66_666_668
 
 
 def lag_s(first: Trace, second: Trace) -> float:
-    """By how much the second tool comes later than the first: least mean distance [s].
-
-    Args:
-        second: The one that may come later; negative answers mean that it comes earlier.
-    """
+    """By how much the second tool comes later than the first: least mean distance [s]."""
     end = min(first.end_ns, second.end_ns)
     times = np.arange(0, max(end, 1), LAG_STEP_NS)
     here = _positions(first, times)
@@ -70,11 +66,7 @@ def _positions(
 
 
 def without_lag(trace: Trace, lag: float) -> Trace:
-    """The same trace with a lag [s] taken out.
-
-    Args:
-        lag: By how much [s]; negative where it comes early.
-    """
+    """The same trace with a lag [s] taken out."""
     shift = round(lag * 1e9)
     return replace(
         trace,
@@ -156,13 +148,7 @@ def diverge(
     findings: Mapping[str, Mapping[tuple[str, str], bool | None]] | None = None,
     not_compared: Sequence[str] = (),
 ) -> Divergence:
-    """Compare every two trajectories of one execution.
-
-    Args:
-        findings: Per side what each predicate (its kind and object) said; compared where nothing
-            else diverges.
-        not_compared: Why a side is missing.
-    """
+    """Compare every two trajectories of one execution."""
     quantities: list[DivergedQuantity] = []
     lags: dict[tuple[str, str], float] = {}
     ordered = sorted(traces, key=lambda trace: SIDES.index(trace.side))

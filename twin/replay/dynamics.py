@@ -61,11 +61,7 @@ def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftShape]
 
 
 def outline_m(model: ObjectModel, soft: SoftShape | None) -> Float[np.ndarray, "num_points 3"]:
-    """Points whose convex hull holds the object, in its own frame [m].
-
-    Args:
-        soft: Its lattice; None: it is rigid, and its box is taken.
-    """
+    """Points whose convex hull holds the object, in its own frame [m]."""
     if soft is not None:
         return np.asarray(soft.nodes_m, dtype=np.float64)
     return box_corners(np.array(model.size_m))
@@ -76,13 +72,7 @@ def lifted(
     points_m: Float[np.ndarray, "num_points 3"],
     table_height_m: float,
 ) -> Float[np.ndarray, "4 4"]:
-    """Raise an object whose localised pose reaches into the table until it stands just above.
-
-    Args:
-        T_base_object: The localised pose; it is not changed.
-        points_m: Outline of the object, in its own frame.
-        table_height_m: Of the table's top, over the robot's base.
-    """
+    """Raise an object whose localised pose reaches into the table until it stands just above."""
     lowest = float(se3.apply(T_base_object, points_m)[:, 2].min())
     T = T_base_object.copy()
     T[2, 3] += max(0.0, table_height_m + LIFT_M - lowest)

@@ -155,10 +155,6 @@ def cut_track(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:
     """The samples of an interval, with the track's value at its very start put first.
 
     A sample at the end is not made up: where the recording stops early, so does the track.
-
-    Args:
-        start_ns: First instant, on the track's clock; the track's value there is interpolated.
-        end_ns: Last instant, same clock.
     """
     inside = (track.stamps_ns > start_ns) & (track.stamps_ns <= end_ns)
     return JointTrack(
@@ -171,11 +167,7 @@ def cut_track(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:
 def stages_as_executed(
     plan: Plan, events: Sequence[Mapping[str, Any]], start_ns: int
 ) -> tuple[Stage, ...]:
-    """The plan's stages at the times at which the recording says they began and ended.
-
-    Args:
-        start_ns: Source time of the execution's start, which becomes time 0.
-    """
+    """The plan's stages at the times at which the recording says they began and ended."""
     spans: dict[tuple[str, str], int] = {}
     for event in events:
         if event.get("plan_id") == plan.id and event["type"] in ("stage_started", "stage_ended"):
@@ -196,12 +188,7 @@ def closed_mask(
     width_m: Float[np.ndarray, " num_samples"],
     plan: Plan,
 ) -> Bool[np.ndarray, " num_samples"]:
-    """Say when the fingers were closed on something, from the plan's wish and their own motion.
-
-    Args:
-        times_ns: When the widths were recorded, ascending, from the start of the execution.
-        width_m: Distance between the finger pads.
-    """
+    """Say when the fingers were closed on something, from the plan's wish and their own motion."""
     closed = np.zeros(len(times_ns), dtype=bool)
     for start_ns, end_ns in _closed_intervals(plan):
         window = np.flatnonzero((times_ns >= start_ns) & (times_ns <= end_ns + _LATENESS_NS))

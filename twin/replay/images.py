@@ -75,12 +75,7 @@ def render_replay(
     executed: bool,
     planned: bool,
 ) -> Iterator[tuple[str, CompressedColor]]:
-    """Yield camera ids with JPEG images, stamped with source times.
-
-    Args:
-        start_ns: Source time that is the replay's time 0.
-        executed: Whether the plan was executed then, so that there are instants to compare with.
-    """
+    """Yield camera ids with JPEG images, stamped with source times."""
     stage = set_up(run, episode, scene)
     rasteriser, robot = open_rasteriser(), load_robot(scene.urdf)
     tree, calibration = base_tree(episode), read_calibration(run)

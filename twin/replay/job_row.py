@@ -75,11 +75,7 @@ def judged(
     *,
     skipped: bool = False,
 ) -> dict[str, Any]:
-    """Return the row of a trajectory with its verdict, and where it diverges from the others.
-
-    Args:
-        divergence: Where planned, executed and recorded part; None: they were not compared.
-    """
+    """Return the row of a trajectory with its verdict, and where it diverges from the others."""
     return {
         **_row(job),
         "skipped": skipped,

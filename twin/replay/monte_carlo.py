@@ -84,11 +84,7 @@ class Variation:
 
 
 def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
-    """The generator of one sample: the same for the same seed, start and index, anywhere.
-
-    Args:
-        identity: Of the start; the same one draws the same variations.
-    """
+    """The generator of one sample: the same for the same seed, start and index, anywhere."""
     digest = hashlib.sha256(f"{seed}/{identity}/{index}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype="<u4").astype(np.uint32))
 
@@ -99,11 +95,6 @@ def with_draw(
     """A start and settings as one draw of a posterior has them.
 
     The objects' own friction stays: what a draw has is that of both surfaces together.
-
-    Args:
-        draw: What is not known.
-        scene: Its movable objects get other masses, edges and centres of mass; all of its objects
-            are shifted.
     """
     own = config.physics.object_friction
     physics = replace(
@@ -154,9 +145,6 @@ def draw_variation(
     Poses of different objects are drawn independently, although they share the cameras' errors.
     What stands on the table goes on standing: its height and tilt are known, so the rest is drawn
     given those. Turns that look the same are the same.
-
-    Args:
-        index: Number of the sample; says which draw of a posterior is its.
     """
     settings = config.variation
     drawn = settings.draw_at(halving(index))
@@ -290,11 +278,7 @@ def replay_samples(
     plan_id: str,
     identity: str,
 ) -> tuple[Sample, ...]:
-    """Run ``config.samples`` varied replays.
-
-    Raises:
-        UsageError: For a kinematic replay, which moves no objects.
-    """
+    """Run ``config.samples`` varied replays."""
     if config.samples and config.mode != "dynamic":
         message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
         raise UsageError(message)

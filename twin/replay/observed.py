@@ -117,9 +117,6 @@ def observed_stages(
     A stage that grasps ends when the tool leaves with what the fingers hold, one that releases when
     it leaves after they opened; stages that do neither share the time up to the next that does.
     What never happens lasts to the end.
-
-    Args:
-        p_tool_m: Tool positions, base frame.
     """
     end_ns, begun_ns = int(times_ns[-1]), 0
     waiting: list[Mapping[str, Any]] = []

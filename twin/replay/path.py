@@ -6,10 +6,14 @@ tolerance, when no joint jumps along the interpolated path, and when no links me
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import groupby, pairwise
+from math import factorial
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
+from scipy.interpolate import CubicSpline, PPoly, make_interp_spline
 
 from bridge.episode.executions import whose
 from bridge.geometry import se3
@@ -32,30 +36,27 @@ IK = IkConfig()
 MAX_JOINT_STEP_RAD = 0.3
 """Largest change of a joint within one path step; more is a jump [rad]."""
 _LIMIT_SLACK_RAD = 1e-3
-_SPEED_SLACK = 1.02
 """Recorded and rounded joints may exceed a limit by as little as this."""
 
 
 def outside_limits(
-    robot: RobotModel, joints_rad: Float[np.ndarray, "num_steps num_joints"]
-) -> Bool[np.ndarray, "num_steps num_joints"]:
-    """Say which joints are beyond their limits by more than rounding."""
-    return (joints_rad < robot.lower_rad - _LIMIT_SLACK_RAD) | (
-        joints_rad > robot.upper_rad + _LIMIT_SLACK_RAD
-    )
-
-
-def limit_failure(
-    robot: RobotModel, t_ns: int, joints_rad: Float[np.ndarray, " num_joints"], joint: int
-) -> Failure:
-    """Name a joint that is beyond its limits."""
-    return Failure(
-        t_ns=t_ns,
-        cause=Cause.JOINT_LIMIT,
-        bodies=(robot.joints[joint],),
-        detail=f"{robot.joints[joint]} is at {joints_rad[joint]:.3f} rad, its limits are "
-        f"{robot.lower_rad[joint]:.3f} to {robot.upper_rad[joint]:.3f} rad",
-    )
+    robot: RobotModel,
+    times_ns: Int[np.ndarray, " num_steps"],
+    joints_rad: Float[np.ndarray, "num_steps num_joints"],
+) -> list[Failure]:
+    """Name the first joint that is beyond its limits by more than rounding."""
+    beyond = np.maximum(robot.lower_rad - joints_rad, joints_rad - robot.upper_rad)
+    return [
+        Failure(
+            t_ns=int(times_ns[index]),
+            cause=Cause.JOINT_LIMIT,
+            bodies=(robot.joints[joint],),
+            detail=f"{robot.joints[joint]} is at {joints_rad[index, joint]:.3f} rad, "
+            f"{beyond[index, joint]:.3f} rad beyond its limits, "
+            f"{robot.lower_rad[joint]:.3f} to {robot.upper_rad[joint]:.3f} rad",
+        )
+        for index, joint in np.argwhere(~(beyond <= _LIMIT_SLACK_RAD)).tolist()[:1]
+    ]
 
 
 def jumps(
@@ -63,35 +64,26 @@ def jumps(
     joints_rad: Float[np.ndarray, "num_times num_joints"],
     robot: RobotModel,
 ) -> list[Failure]:
-    """Find the first jump and the first excess of speed between neighbouring postures."""
-    if len(times_ns) < 2:
-        return []
+    """Find the first jump between neighbouring postures."""
     steps = np.abs(np.diff(joints_rad, axis=0))
-    speeds = steps / (np.diff(times_ns)[:, None] * 1e-9)
-    failures = []
-    for cause, values, limit, unit in (
-        (Cause.JOINT_JUMP, steps, np.full(len(robot.joints), MAX_JOINT_STEP_RAD), "rad"),
-        (Cause.JOINT_SPEED, speeds, robot.velocity_limit_rad_s * _SPEED_SLACK, "rad/s"),
-    ):
-        over = values > limit
-        if np.any(over):
-            index, joint = (int(i) for i in np.argwhere(over)[0])
-            failures.append(
-                Failure(
-                    t_ns=int(times_ns[index]),
-                    cause=cause,
-                    bodies=(robot.joints[joint],),
-                    detail=f"{robot.joints[joint]} changes by {values[index, joint]:.2f} {unit}, "
-                    f"the limit is {limit[joint]:.2f} {unit}",
-                )
-            )
-    return failures
+    over = np.argwhere(~(steps <= MAX_JOINT_STEP_RAD)).tolist()
+    return [
+        Failure(
+            t_ns=int(times_ns[index]),
+            cause=Cause.JOINT_JUMP,
+            bodies=(robot.joints[joint],),
+            detail=f"{robot.joints[joint]} changes by {steps[index, joint]:.2f} rad within "
+            f"{PATH_STEP_S:g} s, the limit is {MAX_JOINT_STEP_RAD:g} rad",
+        )
+        for index, joint in over[:1]
+    ]
 
 
 MAX_DURATION_S = 600.0
 """Longest trajectory that is replayed [s]."""
-MAX_WAYPOINTS = 100_000
-"""Ten minutes at 125 Hz are fewer; all branches of one pose take a few kilobytes."""
+STANDS_M = 0.002
+MAX_WAIT_S = 10.0
+"""A plan that has waited for longer before it moves was judged in another world."""
 WIDTH_SLACK_M = 0.01
 """A gripper may say that it is open or shut by this much more than it can be."""
 _FARTHEST_M = 1e4
@@ -114,6 +106,7 @@ def check_usable(plan: Plan, robot: RobotModel) -> None:
         _about_times(plan)
         or _about_whose(plan, robot)
         or _about_numbers(plan, robot.record)
+        or _about_waiting(plan)
         or _about_grasps(plan, robot.record)
     )
     if wrong is not None:
@@ -126,15 +119,15 @@ _Wrong = tuple[str, str]
 
 
 def _about_times(plan: Plan) -> _Wrong | None:
-    count = len(plan.tau)
-    if count == 0:
+    if not plan.tau:
         return "has no waypoints", "Send tau."
-    if count > MAX_WAYPOINTS:
-        return f"has {count} waypoints", f"At most {MAX_WAYPOINTS} are replayed; send fewer."
     times = [waypoint.t_ns for waypoint in plan.tau]  # of any size: JSON has no largest integer
     if times[0] < 0 or any(b <= a for a, b in pairwise(times)):
         found = "has waypoint times that do not increase from 0"
         return found, "t_ns counts from the start of the trajectory."
+    if times[0] > MAX_WAIT_S * 1e9:
+        found = f"begins at {times[0] * 1e-9:.0f} s"
+        return found, "t_ns counts from the start of the trajectory, not from 1970."
     if times[-1] > MAX_DURATION_S * 1e9:
         found = f"lasts {times[-1] * 1e-9:.0f} s"
         return found, f"At most {MAX_DURATION_S:.0f} s are replayed; split it."
@@ -161,6 +154,18 @@ def _about_numbers(plan: Plan, robot: Robot) -> _Wrong | None:
         found = f"has gripper widths from {low:.3f} to {high:.3f}"
         return found, f"width_m is the distance between the pads in metres, 0 to {most_m}."
     return None
+
+
+def _about_waiting(plan: Plan) -> _Wrong | None:
+    places, first = plan.positions_m(), plan.tau[0]
+    moves = np.linalg.norm(places - places[0], axis=1) > STANDS_M
+    moves |= np.array([waypoint.g != first.g for waypoint in plan.tau])
+    begins = int(np.argmax(moves)) - 1 if moves.any() else len(moves) - 1
+    wait_s = plan.tau[max(begins, 0)].t_ns * 1e-9
+    if wait_s <= MAX_WAIT_S:
+        return None
+    hint = f"At most {MAX_WAIT_S:.0f} s are judged ahead; send it when it is to move."
+    return f"waits {wait_s:.0f} s before it moves", hint
 
 
 def _about_grasps(plan: Plan, robot: Robot) -> _Wrong | None:
@@ -190,7 +195,7 @@ def _about_whose(plan: Plan, robot: RobotModel) -> _Wrong | None:
 
 @dataclass(frozen=True, kw_only=True)
 class JointPath:
-    """Arm joints and commanded gripper width over time, straight lines between the knots."""
+    """Arm joints and commanded gripper width over time; how the controller goes between knots."""
 
     times_ns: Int[np.ndarray, " num_knots"]
     joints_rad: Float[np.ndarray, "num_knots num_joints"]
@@ -199,11 +204,32 @@ class JointPath:
     """Each width holds until the next one is commanded."""
     first_close_ns: int | None
     """When the gripper is first told to close."""
+    interpolation: Literal["linear", "cubic", "quintic"] = "linear"
+    waypoints_ns: Int[np.ndarray, " _"] | None = None
+    """Knots that a plan gave; those between them are ours. None: all are given."""
+    moving: bool = False
+    """A part of a motion: not at rest before its start and after its end."""
+
+    @cached_property
+    def curve(self) -> PPoly | None:
+        """Joints over seconds, at rest at both ends; None: straight lines."""
+        if self.interpolation == "linear" or len(self.times_ns) < 2:
+            return None
+        times_s = self.times_ns * 1e-9
+        if self.interpolation == "cubic":
+            return CubicSpline(times_s, self.joints_rad, bc_type="clamped")
+        rest = [(order, np.zeros(self.joints_rad.shape[1])) for order in (1, 2)]
+        spline = make_interp_spline(times_s, self.joints_rad, k=5, bc_type=(rest, rest))
+        knots = spline.t[5:-5]
+        return PPoly([spline(knots[:-1], 5 - k) / factorial(5 - k) for k in range(6)], knots)
 
     def joints_at(
         self, times_ns: Int[np.ndarray, " num_queries"]
     ) -> Float[np.ndarray, "num_queries num_joints"]:
-        """Interpolate linearly; after the end the last posture holds."""
+        """Where they are commanded; after the end the last posture holds."""
+        if self.curve is not None:
+            ends_s = self.times_ns[[0, -1]] * 1e-9
+            return np.asarray(self.curve(np.clip(times_ns * 1e-9, *ends_s)))
         columns = [np.interp(times_ns, self.times_ns, column) for column in self.joints_rad.T]
         return np.stack(columns, axis=1)
 
@@ -271,6 +297,8 @@ def path_of_plan(
         width_times_ns=plan.times_ns(),
         width_m=np.array([_width(waypoint, robot.record) for waypoint in plan.tau]),
         first_close_ns=next((w.t_ns for w in plan.tau if w.g == 1), None),
+        interpolation=robot.record.interpolation,
+        waypoints_ns=plan.times_ns(),
     )
     return path, knots.failures, knots.unreachable_ns
 
@@ -410,9 +438,9 @@ def _check_given(
     T: Float[np.ndarray, "4 4"],
 ) -> Failure | None:
     """Say why a plan's own joints are no solution for its pose; None when they are."""
-    outside = outside_limits(robot, given[None])[0]
-    if np.any(outside):
-        return limit_failure(robot, t_ns, given, int(np.argmax(outside)))
+    outside = outside_limits(robot, np.array([t_ns]), given[None])
+    if outside:
+        return outside[0]
     offset, angle = pose_error(robot, given, T)
     if offset <= IK.position_tolerance_m and angle <= IK.rotation_tolerance_rad:
         return None
@@ -425,20 +453,12 @@ def _check_given(
 
 
 def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Failure]:
-    """Find joint limits, jumps, excess speed and self-collision along an interpolated path.
-
-    Args:
-        hulls: The same robot's convex pieces; they are moved along the path.
-    """
-    failures = []
-    outside = outside_limits(robot, path.joints_rad)
-    if np.any(outside):
-        knot, joint = (int(i) for i in np.argwhere(outside)[0])
-        failures.append(
-            limit_failure(robot, int(path.times_ns[knot]), path.joints_rad[knot], joint)
-        )
+    """Find joint limits, jumps and self-collision along an interpolated path."""
     times = path.dense_times_ns(PATH_STEP_S)
     joints = path.joints_at(times)
+    failures = outside_limits(robot, path.times_ns, path.joints_rad)
+    if path.curve is not None and not failures:  # it may swing out between its knots
+        failures = outside_limits(robot, times, joints)
     failures += jumps(times, joints, robot)
     widths = path.width_at(times)
     links = own_links(hulls)

@@ -55,10 +55,6 @@ def calibrated(
     """Use calibrated physics, but for the fields that the user set to something of their own.
 
     Samples then vary what was identified by as much as the calibration leaves open.
-
-    Args:
-        calibration: Of the run; None: there is none, and nothing changes.
-        task: Its own draws of a posterior are taken; None: a recording without one takes none.
     """
     if calibration is None:
         return config
@@ -115,9 +111,6 @@ def for_task(config: ReplayConfig, calibration: Calibration | None, task: Task) 
     """Settings of a task's replays: calibrated, and pressing as hard as its gripper is set.
 
     A force that holds a wooden cube crushes a toy. What user or calibration said of it counts.
-
-    Args:
-        calibration: Of the run; None: there is none.
     """
     known = calibrated(config, calibration, task)
     if task.grip_force_N is None or known.physics.grip_force_N != PhysicsConfig().grip_force_N:
@@ -180,12 +173,7 @@ class RebuiltScene:
         reasons: Mapping[str, str] | None = None,
         covariances: Mapping[str, Float[np.ndarray, "6 6"]] | None = None,
     ) -> ReplayScene:
-        """Put objects into the scene: where a replay happens.
-
-        Args:
-            Ts_base_object: Where the objects were localised.
-            reasons: Why others are not.
-        """
+        """Put objects into the scene: where a replay happens."""
         return ReplayScene(
             task=with_heights(task, self.rim_heights_m),
             urdf=urdf,
@@ -201,11 +189,7 @@ class RebuiltScene:
 
 
 def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
-    """Read what the scene folder of a run knows about a task's objects.
-
-    Args:
-        run: Whose scene folder is read; without ``scene.json`` only the calibration is.
-    """
+    """Read what the scene folder of a run knows about a task's objects."""
     sources = dict.fromkeys(task.objects, TASK_SHAPE)
     calibration = read_calibration(run)
     rebuilt = RebuiltScene(

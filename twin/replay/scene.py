@@ -128,9 +128,6 @@ def localised_starts(
     """Localise an episode's objects once, keep the answer as a derived episode, and read it.
 
     An episode that cannot be localised gives states without poses, with the reason.
-
-    Args:
-        scene_hash: Of the scene the poses are meant for; None: there is none.
     """
     phases = quiet_phases(episode)
     try:

@@ -43,11 +43,7 @@ def count_verdicts(rows: Rows) -> dict[str, dict[str, int]]:
 
 
 def recorded_labels(run: RunFolder, episode_ids: Sequence[str]) -> dict[str, str]:
-    """What the operator said of each episode: success, failure or unknown.
-
-    Args:
-        episode_ids: Which are asked for; one that cannot be read counts as unknown.
-    """
+    """What the operator said of each episode: success, failure or unknown."""
     labels = {}
     for episode_id in episode_ids:
         try:

@@ -51,13 +51,7 @@ class Trace:
 
 
 def trace_of_result(result: ReplayResult, side: str, end_ns: int) -> Trace:
-    """The trace of a replay in memory.
-
-    Args:
-        side: What it is called beside the others: planned or executed.
-        end_ns: When the trajectory ends, from its start; what settles after it is not part of the
-            trace.
-    """
+    """The trace of a replay in memory."""
     return Trace(
         side=side,
         tool=poses_over(result.stamps_ns, result.Ts_base_tcp),
@@ -77,12 +71,7 @@ def trace_of_result(result: ReplayResult, side: str, end_ns: int) -> Trace:
 
 
 def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
-    """The trace of a replay that was written before.
-
-    Args:
-        start_ns: Source time that is time 0.
-        end_ns: When the trajectory ended, from time 0.
-    """
+    """The trace of a replay that was written before."""
     episode = Episode.open(path)
     width = streams.joint_track(episode, GRIPPER_STATE)
     tool = next(t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE))

@@ -26,7 +26,6 @@ from bridge.task.verdict import Factor, Verdict
 from twin.physics.engines import engine_version
 from twin.replay.checks import (
     limited_to_task,
-    path_limit_failures,
     simulated_limit_failures,
     start_failures,
     task_failures,
@@ -38,6 +37,7 @@ from twin.replay.dynamics import Burst, States, free_start, simulate, soft_model
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import Failure, factor_from
 from twin.replay.grasps import grasps_seen
+from twin.replay.motion import held_of, motion_failures, payload_unknown
 from twin.replay.path import JointPath, check_path, path_of_plan
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
@@ -62,11 +62,6 @@ def terminal_factor(
 
     A soft body that burst, or is turned inside out, makes it false whatever the task asks: the
     middle of a burst body may well lie in the basket.
-
-    Args:
-        config: Only its mode counts.
-        unreachable_ns: From when on waypoints cannot be reached; None: all can.
-        burst: The soft body that burst first; None: none did.
     """
     if config.mode == "kinematic":
         return Factor(value=None, detail="a kinematic replay does not move objects")
@@ -123,9 +118,6 @@ def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float =
     """What each predicate says of a recorded or replayed rollout, as the verdict keeps it.
 
     The predicate on contacts is asked whether or not the task lists it.
-
-    Args:
-        tolerance_m: Depth up to which contacts do not count, where the task does not say.
     """
     findings = evaluate_success(task, rollout)
     if not any(finding.kind == ALLOWED_CONTACTS for finding in findings):
@@ -185,7 +177,8 @@ def replay_plan(
     path, failures, unreachable_ns = path_of_plan(
         plan, robot, clearance=free, start_rad=scene.start_rad
     )
-    checks = {"task": task_failures(plan, scene.task), "limits": path_limit_failures(path, robot)}
+    held = held_of(plan, scene.task)
+    checks = {"task": task_failures(plan, scene.task), "limits": motion_failures(path, robot, held)}
     if scene.start_rad is not None:
         checks["start"] = start_failures(plan, path, scene.start_rad, robot)
     commanded = Commanded(
@@ -194,6 +187,7 @@ def replay_plan(
         unreachable_ns=unreachable_ns,
         trajectory="planned",
         checks=checks,
+        unknown=payload_unknown(robot, held),
     )
     return _replay(commanded, plan, scene, config, refuse_early=refuse_early)
 
@@ -222,6 +216,8 @@ class Commanded:
     unreachable_ns: int | None = None
     checks: dict[str, list[Failure]] = field(default_factory=dict)
     """Of the checks beside I(tau)."""
+    unknown: str | None = None
+    """A limit that nobody knows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,11 +254,7 @@ def _replay(
 def judge_states(
     commanded: Commanded, states: States, plan: Plan, scene: ReplayScene, config: ReplayConfig
 ) -> ReplayResult:
-    """Judge what physics did while somebody else steered, as a replay of it would be judged.
-
-    Args:
-        plan: What was done, in a plan's words.
-    """
+    """Judge what physics did while somebody else steered, as a replay of it would be judged."""
     hulls = hulls_of(load_robot(scene.urdf))
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     moved = Moved(
@@ -367,7 +359,10 @@ def _judge(
         terminal=terminal,
         warnings=warnings_of(scene, result),
         findings=tuple(findings),
-        checks={name: factor_from(found) for name, found in checks.items()},
+        checks={
+            name: factor_from(found, undecided=commanded.unknown if name == "limits" else None)
+            for name, found in checks.items()
+        },
         grasps=grasps_seen(plan, path, result) if planned else (),
         nearest=moved.monitor.nearest() if moved.measured else None,
     )

@@ -18,7 +18,7 @@ from twin.robot.model import RobotModel, numbers_in, without_dynamics
 _POSES, _SEED = 20, 0
 _MOST_RAD = 8 * np.pi
 """No arm turns more than four times to one side; degrees look like it."""
-_UNFELT_KG, _LONGEST_M, _ROUNDED = 0.01, 10.0, 1e-3
+_ROUNDED = 1e-3
 _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
@@ -104,9 +104,6 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
         found.append("acceleration limits are not known")
     if record.payload_kg is None:
         found.append("the payload is not known")
-    hulls.place(robot.home_rad, record.gripper.max_width_m)
-    if hulls.self_distance().distance_m <= 0:
-        found.append(f"links touch at home: {' and '.join(hulls.self_distance().links)}")
     return found
 
 
@@ -124,11 +121,8 @@ def _findings(robot: RobotModel, hulls: RobotHulls, text: str) -> Iterator[tuple
         yield "dynamic", f"the URDF gives {lacking}"
     watched = Counter(hull.link for hull in hulls.hulls)
     for link in ET.fromstring(text).findall("link"):
-        name, mass = link.get("name", ""), link.find("inertial/mass")
-        weighs = mass is not None and max(numbers_in(mass, "value"), default=0) > _UNFELT_KG
-        shapes = len(link.findall("collision"))
-        seen = weighs or link.find("visual") is not None
-        if watched[name] < shapes or (seen and not shapes):
+        name, shapes = link.get("name", ""), len(link.findall("collision"))
+        if watched[name] < shapes or (name in robot.bodies and not shapes):
             told = f"{watched[name]} of its {shapes} collision shapes are read"
             yield "gate", f"the link {name!r} is not watched: {told}"
         for inertia in link.findall("inertial/inertia"):
@@ -136,11 +130,8 @@ def _findings(robot: RobotModel, hulls: RobotHulls, text: str) -> Iterator[tuple
             moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             if not moments[0] + moments[1] >= moments[2] * (1 - _ROUNDED):
                 yield "dynamic", f"the inertia of the link {name!r} is no body's: A + B < C"
-    for hull in hulls.hulls:
-        length_m = float(np.ptp(hull.points_m, axis=0).max())
-        if length_m > _LONGEST_M:
-            told = f"{length_m:.0f} m long; is it in millimetres? Set scale"
-            yield "gate", f"a collision shape of the link {hull.link!r} is {told}"
+    for links, why in hulls.left_out.items():
+        yield "kinematic", f"{links} are not watched against each other: {why}"
 
 
 def describe_robot(found: dict[str, Any]) -> str:

@@ -1,5 +1,6 @@
 """The robot's convex hulls, shared by pinocchio, coal and PyBullet, and their signed distances."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -54,6 +55,7 @@ def collision_geometry(robot: RobotModel) -> pin.GeometryModel:
 def link_hulls(robot: RobotModel) -> list[LinkHull]:
     """Return one hull for each collision element of the description."""
     geometry = collision_geometry(robot)
+    reach_m = float(sum(np.linalg.norm(T.translation) for T in robot.model.jointPlacements))
     hulls = []
     for item in geometry.geometryObjects:
         frame = robot.model.frames[item.parentFrame]
@@ -63,6 +65,13 @@ def link_hulls(robot: RobotModel) -> list[LinkHull]:
             raise RobotDescriptionError(
                 found=f"has a collision shape without volume at the link {frame.name!r}",
                 hint="Give it three extents above zero, or leave it out.",
+            )
+        length_m = float(np.linalg.norm(np.ptp(points, axis=0)))
+        if frame.parentJoint and not length_m <= reach_m:
+            raise RobotDescriptionError(
+                found=f"has a collision shape of {length_m:.3g} m at the link {frame.name!r}, and "
+                f"the arm reaches {reach_m:.2f} m",
+                hint="Is it in millimetres? Set the scale of its mesh.",
             )
         shape = convex_hull(points)
         corners = np.array(shape.points())
@@ -128,6 +137,8 @@ _ALWAYS = 0.95
 _WIDTH_M = 0.04
 """Opening in those postures, where the gripper is as wide."""
 
+_MOST_LEFT_OUT = 0.2
+
 _SIGNED = coal.DistanceRequest()
 _SIGNED.enable_signed_distance = True
 _DIGITS = 7
@@ -185,6 +196,9 @@ class RobotHulls:
                 for p, c in zip(points, self._centres, strict=True)
             ]
         )
+        self.left_out: dict[str, str] = {}
+        """Pairs of links that are not watched, with the reason."""
+        self.share_left_out = 0.0
         self.pairs = self._pairs()
 
     def place(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
@@ -259,19 +273,38 @@ class RobotHulls:
         low, high = np.maximum(robot.lower_rad, -np.pi), np.minimum(robot.upper_rad, np.pi)
         width_m = min(_WIDTH_M, robot.record.gripper.max_width_m)
         self.place(robot.home_rad, width_m)
-        candidates = [
-            pair for pair in candidates if not self._listed(*pair) and self._distance_m(*pair) > 0
-        ]
+        self._leave_out(candidates, self._listed, "the robot file lists them under may_overlap")
+        self._leave_out(candidates, lambda *p: self._distance_m(*p) <= 0, "they touch at home")
         rng = np.random.default_rng(0)
-        overlaps = np.zeros(len(candidates))
+        overlaps = dict.fromkeys(candidates, 0)
         for _ in range(_SAMPLES):
             self.place(rng.uniform(low, high), width_m)
-            overlaps += [self._distance_m(*pair) <= 0 for pair in candidates]
-        return [
-            pair
-            for pair, count in zip(candidates, overlaps, strict=True)
-            if count < _ALWAYS * _SAMPLES
-        ]
+            for pair in candidates:
+                overlaps[pair] += self._distance_m(*pair) <= 0
+        most = _ALWAYS * _SAMPLES
+        self._leave_out(candidates, lambda *p: overlaps[p] >= most, "they touch in every posture")
+        return candidates
+
+    def _leave_out(
+        self, pairs: list[tuple[int, int]], which: Callable[[int, int], bool], why: str
+    ) -> None:
+        found = [pair for pair in pairs if which(*pair)]
+        pairs[:] = [pair for pair in pairs if pair not in found]
+        links = sorted({f"{self.hulls[a].link} and {self.hulls[b].link}" for a, b in found})
+        self.left_out.update(dict.fromkeys(links, why))
+        self.share_left_out += len(found) / (len(pairs) + len(found) or 1)
+
+    def blind(self) -> str | None:
+        """Say what is not watched, so that no motion of this arm can be called clear of itself."""
+        watched = {hull.link for hull in self.hulls}
+        bare = sorted(self.robot.bodies - watched)
+        if bare:
+            return f"the links {', '.join(bare)} have no collision shapes: nobody watches them"
+        if self.share_left_out > _MOST_LEFT_OUT:
+            return f"{self.share_left_out:.0%} of the pairs of links are not watched: " + "; ".join(
+                f"{links}, for {why}" for links, why in self.left_out.items()
+            )
+        return None
 
     def _listed(self, first: int, second: int) -> bool:
         links = {self.hulls[first].link, self.hulls[second].link}

@@ -55,15 +55,7 @@ def follow_poses(
     config: IkConfig,
     clearance: Clearance | None = None,
 ) -> Followed:
-    """Find joints for every pose of a path.
-
-    Args:
-        robot: Any arm; one with the geometry of a UR is solved in closed form.
-        Ts_base_tcp: Poses of the tool in the order they are passed.
-        start_rad: Posture before the first pose; None when any will do.
-        config: When a pose counts as reached.
-        clearance: Says which postures touch something; asked only about those that are wanted.
-    """
+    """Find joints for every pose of a path."""
     inverse = UrInverse.for_robot(robot)
     count = len(Ts_base_tcp)
     if inverse is None and start_rad is None and count:

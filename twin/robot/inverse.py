@@ -56,14 +56,7 @@ def solve_ik(
     *,
     warm_start_rad: Float[np.ndarray, " num_joints"] | None = None,
 ) -> IkSolution:
-    """Find joints within their limits that reach a pose, near the warm start where there is one.
-
-    Args:
-        warm_start_rad: Joints to start from; None: ``HOME_RAD``.
-
-    Returns:
-        The best solution found; ``reached`` says whether it is one.
-    """
+    """Find joints within their limits that reach a pose, near the warm start where there is one."""
     start = robot.home_rad if warm_start_rad is None else warm_start_rad
     if UrInverse.for_robot(robot) is not None:
         best = _descend(robot, T_base_tcp, start, config)
@@ -483,15 +476,7 @@ class UrInverse:
         Bool[np.ndarray, "num_poses 8"],
         Bool[np.ndarray, " num_poses"],
     ]:
-        """Solve many poses, on all branches.
-
-        Returns:
-            Joints [rad], one turn of each joint, within the limits; which of them are solutions;
-            and at which poses some branch has a straight wrist: within reach there too, by joints
-            that nobody can number. Out of reach, outside the limits, not a number, or with a joint
-            that may be anything (the wrist point on the first axis, the fifth joint straight): not
-            a solution, and all joints are 0.
-        """
+        """Solve many poses, on all branches."""
         finite = np.isfinite(Ts_base_tcp).all(axis=(1, 2))
         theta, valid, singular = _angles(
             self.geometry, np.where(finite[:, None, None], Ts_base_tcp, 0.0)

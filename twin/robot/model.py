@@ -30,12 +30,7 @@ class RobotDescriptionError(TwinError):
 
 
 def mimicked(urdf: str) -> tuple[Mimic, ...]:
-    """Read the joints that follow another joint, which pinocchio takes for free ones.
-
-    Raises:
-        RobotDescriptionError: When one follows a joint that is not there, or follows another one
-            itself, or by a number that is none.
-    """
+    """Read the joints that follow another joint, which pinocchio takes for free ones."""
     root = parse_description(urdf)
     found = mimics_of(urdf)
     leaders = {joint.get("name", "") for joint in root.findall("joint")}
@@ -193,6 +188,20 @@ def _rooted(urdf: str, T_base_root: Float[np.ndarray, "4 4"]) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
+_UNFELT_KG = 0.01
+
+
+def _bodies(urdf: str) -> set[str]:
+    """Name the links that have a mass or can be seen: those that can run into something."""
+    found = set()
+    for link in parse_description(urdf).findall("link"):
+        mass = link.find("inertial/mass")
+        weighs = mass is not None and max(numbers_in(mass, "value"), default=0) > _UNFELT_KG
+        if weighs or link.find("visual") is not None:
+            found.add(link.get("name", ""))
+    return found
+
+
 _OTHER_ROBOT = "Another robot's file is named by --robot FILE.toml."
 
 
@@ -218,6 +227,7 @@ class RobotModel:
         """
         self.record: Robot = robot_of(urdf)
         mimics = mimicked(urdf)
+        self.bodies = _bodies(urdf)
         self.urdf = _with_limits(with_absolute_meshes(urdf), self.record)
         self.model = _built(self.urdf)
         self._check_names()

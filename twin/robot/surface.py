@@ -141,11 +141,7 @@ class PosedSurface:
         rays_camera: Float[np.ndarray, "*shape 3"],
         T_base_camera: Float[np.ndarray, "4 4"],
     ) -> Float32[np.ndarray, "*shape"]:
-        """Depth at which rays with z = 1 in the camera meet the robot; infinite where they miss.
-
-        Args:
-            rays_camera: Directions in the camera's frame, such as ``Camera.rays`` gives.
-        """
+        """Depth at which rays with z = 1 in the camera meet the robot; infinite where they miss."""
         turned = rays_camera @ T_base_camera[:3, :3].T
         origin = np.broadcast_to(T_base_camera[:3, 3], turned.shape)
         rays = np.concatenate([origin, turned], axis=-1).astype(np.float32)

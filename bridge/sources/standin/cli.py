@@ -27,11 +27,6 @@ def publish_standin(
     Example: robot-gst publish standin --trials 3 --seed 1
     Scan only: robot-gst publish standin --trials 0
     Soft toys: robot-gst publish standin --task sloth_into_basket --conditions without_replanning
-
-    Args:
-        config: What the session does.
-        connect: Where the recorder listens.
-        zenoh_config: zenoh configuration (JSON5).
     """
     from bridge.sources.source import run_source
     from bridge.sources.standin.session import StandinSource, describe

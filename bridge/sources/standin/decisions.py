@@ -3,7 +3,9 @@
 Whoever moves the robot asks the gate itself: what a planner says of its plan counts for nothing.
 """
 
+import hashlib
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -102,6 +104,8 @@ class Decision:
     """What will be executed, and why nothing when nothing is."""
 
     plan: Plan | None
+    verdict: Verdict | None = None
+    """The yes by which it is executed; None where no gate was to be obeyed."""
     void: bool
     """Nobody judged the plan, or nobody planned: the trial says nothing about the planner."""
     remark: str
@@ -117,6 +121,8 @@ class Decider:
         self._cell, self._session, self._config = cell, session, config
         self._task_sha256 = task_sha256
         built_in = config.planner == BUILT_IN
+        self._stood: dict[str, np.ndarray] = {}
+        """Where the objects stood when the gate was asked."""
         self.policy = config.policy or (POLICY_NAME if built_in else WIRE_POLICY)
         if built_in and self.policy != POLICY_NAME:
             message = (
@@ -180,7 +186,7 @@ class Decider:
                 parent, why = plan, f"the coin said no to {round_ + 1} plans"
                 continue
             if verdict is not None and verdict.accepted is True:
-                return Decision(plan=plan, void=False, remark="")
+                return Decision(plan=plan, void=False, remark="", verdict=verdict)
             if verdict is None or verdict.accepted is None:
                 return self._unverified(plan, reason)
             self._note_refusal(plan, reason, last=last)
@@ -188,6 +194,17 @@ class Decider:
             parent = plan
             why = f"the gate refused {len(refusals)} plans, the last because {reason}"
         return Decision(plan=None, void=False, remark=f"{NOTHING_EXECUTED}, {why}")
+
+    def still_allowed(self, decision: Decision) -> Decision:
+        """Of a plan that a yes allows: whether it still does, now that the arm is to move."""
+        cell, plan, verdict = self._cell, decision.plan, decision.verdict
+        if plan is None or verdict is None:
+            return decision
+        joints = cell.world.joints_rad + cell.world.slack_rad + cell.hidden.joint_offset_rad
+        places = cell.world.Ts_base_object()
+        moved = {name: T[:3, 3] - self._stood[name] for name, T in places.items()}
+        why = why_stale(verdict, plan.to_json(), cell.now_ns, joints, moved)
+        return decision if not why else self._unverified(plan, f"the gate's yes is void: {why}")
 
     def _request(self, info: EpisodeInfo, start_seed: int, sight: GateSight | None) -> PlanRequest:
         cell = self._cell
@@ -247,6 +264,9 @@ class Decider:
     def _ask_gate(self, plan: Plan) -> tuple[Verdict | None, str]:
         """Return the verdict, None when there is none, and why it is not a yes."""
         key = cell_topic(self._config.cell, GATE)[1:]
+        self._stood = {
+            name: T[:3, 3].copy() for name, T in self._cell.world.Ts_base_object().items()
+        }
         self._cell.streams.joints_again()  # a planner may have thought for seconds
         limit_s, asked_s = self._config.gate_timeout_s, time.monotonic()
         try:
@@ -259,6 +279,41 @@ class Decider:
         if verdict.plan_id != plan.id:
             return None, f"the gate judged {verdict.plan_id!r} instead of {plan.id!r}"
         return verdict, _reason(verdict)
+
+
+MOVED_RAD = 0.05
+
+
+def why_stale(
+    verdict: Verdict,
+    plan: bytes,
+    now_ns: int,
+    joints_rad: np.ndarray,
+    moved_m: Mapping[str, np.ndarray],
+) -> str:
+    """Say why a yes does not allow to execute a plan from here and now; "" when it does.
+
+    Args:
+        plan: The bytes that will be executed.
+        now_ns: On the cell's clock.
+        moved_m: How far objects have been moved since, as far as anybody knows.
+    """
+    basis = verdict.basis
+    if verdict.accepted is not True or basis is None:
+        return "it does not say what it was given for"
+    if basis["plan_sha256"] != hashlib.sha256(plan).hexdigest():
+        return "it was given for another plan"
+    age_s = (now_ns - basis["judged_ns"]) * 1e-9
+    if not 0 <= age_s <= basis["valid_s"]:
+        return f"it is {age_s:.1f} s old, and holds for {basis['valid_s']:g} s"
+    off_rad = np.abs(np.asarray(joints_rad) - basis["joints_rad"]).max()
+    if not off_rad <= MOVED_RAD:
+        return f"a joint is {off_rad:.3f} rad from where it was, and {MOVED_RAD:g} rad are allowed"
+    for name, seen in basis["objects"].items():
+        off_m = np.linalg.norm(moved_m.get(name, np.zeros(3)))
+        if not off_m <= seen["margin_m"]:
+            return f"{name} is {off_m * 1e3:.0f} mm from where it was judged"
+    return ""
 
 
 def _record(object_id: str, T: np.ndarray, stamp_ns: int) -> dict[str, Any]:

@@ -384,7 +384,7 @@ class Operator:
         self._begin(info)
         cell.cameras_running = True
         cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
-        decision = self._decider.decide(info, seed)
+        decision = self._decider.still_allowed(self._decider.decide(info, seed))
         if decision.plan is not None:
             execute_plan(cell, decision.plan)
         else:

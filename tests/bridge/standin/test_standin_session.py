@@ -1,5 +1,6 @@
 """Sessions on a wire in memory: what is published, when, and what is kept back."""
 
+import hashlib
 import json
 import struct
 from collections.abc import Callable
@@ -32,6 +33,7 @@ QUIET = Output(quiet=True)
 
 
 def verdict_record(plan: dict, accepted: bool | None) -> dict:
+    as_sent = json.dumps(plan, separators=(",", ":")).encode()
     verdict = Verdict(
         plan_id=plan["id"],
         trajectory="planned",
@@ -41,6 +43,13 @@ def verdict_record(plan: dict, accepted: bool | None) -> dict:
         terminal=Factor(value=accepted, cause="dropped"),
         engine="test",
         seed=0,
+        basis={
+            "plan_sha256": hashlib.sha256(as_sent).hexdigest(),
+            "joints_rad": plan["tau"][0]["joints_rad"] if "tau" in plan else [0.0],
+            "objects": {},
+            "judged_ns": 0,
+            "valid_s": 1e12,
+        },
     )
     return json.loads(verdict.to_json())
 

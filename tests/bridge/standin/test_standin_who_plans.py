@@ -1,5 +1,6 @@
 """Who plans, who decides: planners on the wire, study arms, and what is kept from a planner."""
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,6 +29,7 @@ Answer = Callable[[PlanRequest], bytes]
 
 
 def verdict_on(plan: dict[str, Any], accepted: bool | None) -> dict[str, Any]:
+    as_sent = json.dumps(plan, separators=(",", ":")).encode()
     verdict = Verdict(
         plan_id=plan["id"],
         trajectory="planned",
@@ -37,6 +39,13 @@ def verdict_on(plan: dict[str, Any], accepted: bool | None) -> dict[str, Any]:
         terminal=Factor(value=accepted, cause="slipped", bodies=("cube",)),
         engine="test",
         seed=0,
+        basis={
+            "plan_sha256": hashlib.sha256(as_sent).hexdigest(),
+            "joints_rad": plan["tau"][0]["joints_rad"],
+            "objects": {},
+            "judged_ns": 0,
+            "valid_s": 1e12,
+        },
     )
     return dict(json.loads(verdict.to_json()))
 

@@ -48,6 +48,14 @@ def test_a_plan_survives_the_round_trip(tau: list[Waypoint]) -> None:
     assert Plan.from_json(original.to_json()) == original
 
 
+@pytest.mark.parametrize("key", ["robot", "p_m", "t_ns"])
+def test_a_plan_that_says_a_thing_twice_is_refused_with_its_name(key: str) -> None:
+    text = plan().to_json().decode()
+    for twice in (f'"{key}":1,"{key}":', f'"{key}":1,"{key}":2,"{key}":'):
+        with pytest.raises(InvalidRecordError, match=f"'{key}' is there twice"):
+            Plan.from_json(text.replace(f'"{key}":', twice, 1).encode())
+
+
 def test_what_plans_had_not_from_the_beginning_is_written_only_where_it_says_something() -> None:
     old = json.loads(plan().to_json())
     later = {"task_sha256", "scene_hash", "candidate", "steered_by", "study_arm"}

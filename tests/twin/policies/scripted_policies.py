@@ -18,7 +18,7 @@ class Scripted:
     def __init__(self) -> None:
         """Solve the plan once."""
         scene = scene_of_test()
-        plan = with_joints(pick_and_place(scene), scene)
+        plan = with_joints(pick_and_place(scene, pace=1.5), scene)
         self.path, _, _ = path_of_plan(plan, load_robot(scene.urdf))
         self.t_ns = 0
 

@@ -78,7 +78,7 @@ def test_a_limit_ends_the_episode_with_its_name(run: RunFolder) -> None:
     start = env.reset()[0]["agent_pos"].astype(float)
     _, reward, over, cut, info = env.step(start + np.array([3.0, 0, 0, 0, 0, 0, 0]))
     assert (reward, over, cut) == (0.0, True, False)
-    assert info["stopped"].startswith("limits: shoulder_pan_joint would need 30.00 rad/s")
+    assert info["stopped"].startswith("limits: shoulder_pan_joint moves at 30.00 rad/s")
     assert info["is_success"] is False
     env.close()
 

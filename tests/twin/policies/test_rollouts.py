@@ -100,7 +100,7 @@ def test_who_acted_stands_in_the_table_and_another_checkpoint_apart(
     ("policy", "success", "words"),
     [
         ("still", False, "cube centre is .* outside box"),
-        ("reckless", False, "limits: .* would need 10.00 rad/s"),
+        ("reckless", False, "limits: .* moves at 10.00 rad/s"),
         ("broken", None, "not finite from row 0 on"),
         ("raising", None, "the policy failed: KeyError: 'wrist'"),
     ],

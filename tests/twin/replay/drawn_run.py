@@ -87,11 +87,7 @@ def write_recording(
     images: tuple[bytes, ...] = (*(b"-", *[b""] * 4) * 2, b"-"),
     **about: str,
 ) -> Episode:
-    """A camera that stands, one in the hand; a motion over two seconds.
-
-    Args:
-        images: Files of eleven instants, the same of both cameras; empty: none was taken.
-    """
+    """A camera that stands, one in the hand; a motion over two seconds."""
     robot, path = load_robot(urdf), run.episodes_dir / f"{name}.mcap"
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id=name, kind="trial", task="cube_into_box", **about))

@@ -106,7 +106,7 @@ def pick_and_place(
     )
 
 
-def with_joints(plan: Plan, scene: ReplayScene, step_s: float = 0.04) -> Plan:
+def with_joints(plan: Plan, scene: ReplayScene, step_s: float = 0.08) -> Plan:
     """The same plan with a waypoint each ``step_s`` and the joints that reach it."""
     robot = load_robot(scene.urdf)
     poses = PoseTrajectory(plan.times_ns(), plan.positions_m(), plan.quaternions_wxyz())

@@ -46,12 +46,7 @@ class Solid:
 def solid_of(
     body: str, shape: coal.CollisionGeometry, points_m: Float[np.ndarray, "num_points 3"]
 ) -> Solid:
-    """Put a box and a sphere around a piece.
-
-    Args:
-        shape: Its geometry, in the body's frame.
-        points_m: Points whose hull holds the shape, same frame.
-    """
+    """Put a box and a sphere around a piece."""
     low, high = points_m.min(axis=0), points_m.max(axis=0)
     centre = (low + high) / 2
     radius = float(np.linalg.norm(points_m - centre, axis=1).max())
@@ -84,12 +79,7 @@ def placement_of(T: Float[np.ndarray, "4 4"]) -> coal.Transform3s:
 def placed_panels(
     model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
 ) -> list[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]]:
-    """The boxes an object is made of: pose of each box's centre, and its extents [m].
-
-    Args:
-        model: The object; a container has a panel for each wall, a basket more: its round corners,
-            its rim and its handles stand out of straight walls.
-    """
+    """The boxes an object is made of: pose of each box's centre, and its extents [m]."""
     if model.mesh == BASKET:
         shape = model.inner_m, model.wall_m
         return [
@@ -139,11 +129,7 @@ class NearPairs:
         )
 
     def nearest_first(self, up_to_m: float = np.inf) -> Iterator[tuple[float, int]]:
-        """Yield a bound that the signed distance is not below [m], and the number of the pair.
-
-        Args:
-            up_to_m: Pairs that are surely farther apart are left out.
-        """
+        """Yield a bound that the signed distance is not below [m], and the number of the pair."""
         count = self._native.nearest_first(
             self.R, self.t, self._bounds, self._order, up_to_m + _SLACK_M
         )
@@ -197,13 +183,7 @@ class Planes:
         R: Float[np.ndarray, "3 3"],
         t: Float[np.ndarray, "3"],
     ) -> float:
-        """Smallest signed distance of points to the placed piece [m], never too large outside.
-
-        Args:
-            points_m: Points in the base frame.
-            R: Rotation of the piece's link in the base frame.
-            t: Origin of that link in the base frame [m].
-        """
+        """Smallest signed distance of points to the placed piece [m], never too large outside."""
         local = (points_m - t) @ R
         return float((local @ self.normals.T + self.offsets_m).max(axis=1).min())
 
@@ -224,14 +204,7 @@ def distances_to_boxes_m(
     p_box_base: Float[np.ndarray, "num_boxes 3"],
     half_m: Float[np.ndarray, "num_boxes 3"],
 ) -> Float[np.ndarray, " num_boxes"]:
-    """Smallest signed distance of points to each box around the origin of its frame [m].
-
-    Args:
-        points_m: Points in the base frame.
-        R_box_base: Rotations from the base frame into that of each box.
-        p_box_base: Origin of the base in the frame of each box [m].
-        half_m: Half the edge lengths of each box.
-    """
+    """Smallest signed distance of points to each box around the origin of its frame [m]."""
     local = R_box_base @ points_m.T + p_box_base[:, :, None]
     q = np.abs(local) - half_m[:, :, None]
     out = np.maximum(q, 0.0)

@@ -74,9 +74,6 @@ class BoundingSpheres:
         """Signed distance of each placed piece to the grid's surface [m].
 
         Never too large; too small by what the finest points leave uncovered, and by 2 % of it.
-
-        Args:
-            t: Origin of each piece's link in the grid's frame [m].
         """
         answers = np.empty(len(R))
         nearest(
@@ -100,12 +97,7 @@ class BoundingSpheres:
         t: Float[np.ndarray, "num_pieces 3"],
         below_m: float,
     ) -> float:
-        """Return the smallest of ``distances_m``, or a number where none is below it [m].
-
-        Args:
-            t: Origin of each piece's link in the grid's frame [m].
-            below_m: The number; the smaller it is, the less is looked at.
-        """
+        """Return the smallest of ``distances_m``, or a number where none is below it [m]."""
         found: float = least(
             lookup.values_m,
             lookup.origin_m,
@@ -127,12 +119,7 @@ class BoundingSpheres:
 def bounding_spheres_of(
     corners_m: Float[np.ndarray, "num_points 3"], fine_m: float = FINE_M
 ) -> BoundingSphereTree:
-    """Cover the convex hull of points so that nothing is farther from a fine one than asked.
-
-    Args:
-        corners_m: Corners of the piece, in the frame the spheres are wanted in.
-        fine_m: No part of the hull's surface lies farther than this from one of the finest points.
-    """
+    """Cover the convex hull of points so that nothing is farther from a fine one than asked."""
     levels = [surface_points(corners_m, fine_m)]
     parents: list[Int[np.ndarray, " num_points"]] = []
     for radius in reversed(PATCHES_M):
@@ -165,12 +152,7 @@ def bounding_spheres_of(
 def surface_points(
     corners_m: Float[np.ndarray, "num_corners 3"], fine_m: float = FINE_M
 ) -> Float[np.ndarray, "num_points 3"]:
-    """Points on the surface of a convex hull, so close that nothing of it is far from all of them.
-
-    Args:
-        corners_m: Corners of the piece; the points are in the same frame.
-        fine_m: No part of the surface lies farther than this from one of the points.
-    """
+    """Points on the surface of a convex hull, so close that no part is far from all."""
     # A triangle with edges of at most e leaves nothing farther from its corners than e / sqrt(3).
     return _divided(corners_m[ConvexHull(corners_m).simplices], fine_m * np.sqrt(3.0))
 

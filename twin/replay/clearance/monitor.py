@@ -114,11 +114,7 @@ class Reach:
             self._fingers[row] = _per_width(robot, int(frame.parentJoint), reach=ends_m)
 
     def travel_m(self, a: State, b: State) -> Float[np.ndarray, " num_links"]:
-        """How far any point of each link moved at most [m], when the joints moved straight.
-
-        Args:
-            b: The state after; only its joints and gripper width are looked at.
-        """
+        """How far any point of each link moved at most [m], when the joints moved straight."""
         turned = np.abs(b.joints_rad - a.joints_rad)
         return np.asarray(self._per_rad @ turned + self._fingers * abs(b.width_m - a.width_m))
 
@@ -139,12 +135,7 @@ def _per_width(robot: RobotModel, joint: int, *, reach: float) -> float:
 
 
 def object_travel_m(a: State, b: State, name: str, radius_m: float) -> float:
-    """How far any point of an object moved at most [m]; infinite when it is in one state only.
-
-    Args:
-        radius_m: How far its outermost point is from its origin; not used where its nodes are
-            known.
-    """
+    """How far any point of an object moved at most [m]; infinite when it is in one state only."""
     if name in a.nodes_m and name in b.nodes_m:
         return float(np.linalg.norm(b.nodes_m[name] - a.nodes_m[name], axis=1).max())
     if name not in a.Ts_base_object or name not in b.Ts_base_object:
@@ -167,6 +158,9 @@ def _slide_m(model: Any, joint: int) -> float:
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 Nodes = Mapping[str, Float[np.ndarray, "num_nodes 3"]]
 
+LATE_S = 0.01
+"""Where a body is at its speed so long earlier or later is not known; distances must allow for
+it."""
 _LOOK_AHEAD_M = 0.01
 """Pairs nearer than this are measured although they keep their distance now, so that what may
 happen before the next state is bounded: steps of up to twice as far need no state in between."""
@@ -190,6 +184,8 @@ class _Look:
     cut_m: float
     """Every pair without a distance is at least this far apart."""
     allowed: Allowed
+    centres_m: Float[np.ndarray, "num_links 3"]
+    """Of the links."""
 
 
 class ClearanceMonitor:
@@ -210,6 +206,15 @@ class ClearanceMonitor:
         self._objects = self._around.objects
         self._centres = np.stack([link.centre for link in self._links])[:, :, None]
         self._radii = np.array([link.radius_m for link in self._links])
+        # How far off a body that stands still may be: as localisation says, one deviation.
+        fixed = {n: c for n, c in scene.covariances.items() if n in scene.containers()}
+        self._sigma_m = {
+            name: float(np.sqrt(np.linalg.eigvalsh(np.asarray(c)[:3, :3]).max()))
+            for name, c in fixed.items()
+        }
+        self._late_m = np.zeros(len(self._links))
+        self._hand = [k for k, s in enumerate(self._links) if s.body in self._gripper.links]
+        self._object_late_m: dict[str, float] = {}
         self._allowed: dict[int, Allowed] = {}
         self._reach = Reach(hulls)
         self._contacts: dict[tuple[str, str, bool], list[Contact]] = {}
@@ -232,12 +237,6 @@ class ClearanceMonitor:
         the bound is not enough, states in between are measured too, straight in joints and poses.
         A body that comes too close between two calls is therefore missed by half a millimetre at
         most, and the smallest distance in between is returned.
-
-        Args:
-            t_ns: Time from the start of the trajectory; calls come in order.
-            Ts_base_object: Where the movable objects are; those not known are left out.
-            nodes_m: Where the nodes of the soft objects are, base frame; a soft object with a pose
-                only counts as the box around it.
         """
         nodes = (
             {}
@@ -252,9 +251,29 @@ class ClearanceMonitor:
             nodes_m=nodes,
         )
         look = self._look(state)
+        if self._last is not None:
+            self._move_on(self._last, look)
         looks = [] if self._last is None else self._between(self._last, look, _MAX_HALVINGS)
         self._last = look
         return min(self._judge_all(item) for item in (*looks, look))
+
+    def _move_on(self, before: _Look, now: _Look) -> None:
+        """Note how far each body may be from where it should be, at the speed it has."""
+        share = LATE_S / max((now.state.t_ns - before.state.t_ns) * 1e-9, LATE_S / 10)
+        self._late_m = np.linalg.norm(now.centres_m - before.centres_m, axis=1) * share
+        if self._hand:  # fingers may be told to close from one instant to the next
+            self._late_m[self._hand] = self._late_m[self._hand].min()
+        self._object_late_m = {
+            name: hypot(*(T[:3, 3] - before.state.Ts_base_object[name][:3, 3]).tolist()) * share
+            for name, T in now.state.Ts_base_object.items()
+            if name in before.state.Ts_base_object
+        }
+
+    def least_m(self, pair: Pair) -> float:
+        """How far a pair that may not touch must be apart now: farther when it is fast."""
+        body, piece, other, _ = pair
+        late_m = self._object_late_m.get(body, 0.0) if piece < 0 else float(self._late_m[piece])
+        return self.config.eps_col_m + min(late_m, MAX_LEAP_M) + self._sigma_m.get(other, 0.0)
 
     def _look(self, state: State) -> _Look:
         """Measure every pair that is near, or the nearest one."""
@@ -265,11 +284,17 @@ class ClearanceMonitor:
         distances, cut = self._around.measure(
             state.Ts_base_object,
             moved,
-            near_m=self.config.eps_col_m + _LOOK_AHEAD_M,
+            near_m=self.config.eps_col_m + self._more_m() + _LOOK_AHEAD_M,
             counts=lambda body, other: not _may_touch(body, other, allowed, self._gripper),
         )
         distances |= self._around.measure_nodes(self._links, state.nodes_m, soft)
-        return _Look(state, distances, cut, allowed)
+        centres = np.matmul(self.hulls.rotations, self._centres)[:, :, 0] + self.hulls.translations
+        return _Look(state, distances, cut, allowed, centres)
+
+    def _more_m(self) -> float:
+        """The most by which a pair must keep more than ``eps_col_m``."""
+        late_m = max([float(self._late_m.max()), *self._object_late_m.values()])
+        return min(late_m, MAX_LEAP_M) + max(self._sigma_m.values(), default=0.0)
 
     def _between(self, a: _Look, b: _Look, halvings: int) -> list[_Look]:
         """States between two that must be measured because the bound allows a touch."""
@@ -288,16 +313,17 @@ class ClearanceMonitor:
         farthest = float(links_m.max()) + max(
             (travel for travel in objects_m.values() if travel <= MAX_LEAP_M), default=0.0
         )
-        eps = self.config.eps_col_m
+        most_m = self.config.eps_col_m + self._more_m()
         if farthest <= _FINE_TRAVEL_M:
             return False  # objects that leapt are nobody's way
-        if a.cut_m + b.cut_m - farthest < 2 * eps:
+        if a.cut_m + b.cut_m - farthest < 2 * most_m:
             return True
         for pair in a.distances.keys() | b.distances.keys():
             body, piece, other, _ = pair
             travel = objects_m.get(body, 0.0) if piece < 0 else float(links_m[piece])
             travel += objects_m.get(other, 0.0)
             first, last = (look.distances.get(pair, look.cut_m) for look in (a, b))
+            eps = self.least_m(pair)
             if travel <= _FINE_TRAVEL_M or first + last - travel >= 2 * eps:
                 continue
             if max(objects_m.get(body, 0.0), objects_m.get(other, 0.0)) > MAX_LEAP_M:
@@ -319,7 +345,7 @@ class ClearanceMonitor:
         ordered = sorted(look.distances.items(), key=lambda item: item[1])
         least_m = float("inf")
         for pair, distance in ordered:
-            counted_m = self._judge(t_ns, pair[0], pair[2], distance, look.allowed)
+            counted_m = self._judge(t_ns, pair, distance, look.allowed)
             if counted_m < least_m:
                 least_m = counted_m
                 if self._nearest is None or counted_m < self._nearest[0]:
@@ -333,11 +359,6 @@ class ClearanceMonitor:
         """Look for links inside objects that still lie where they were localised.
 
         Physics would push the object aside and hide that a finger comes down on it.
-
-        Args:
-            t_ns: When, from the start of the trajectory; failures carry it.
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
         """
         self.hulls.place(joints_rad, width_m)
         R, t = self.hulls.rotations, self.hulls.translations
@@ -402,8 +423,9 @@ class ClearanceMonitor:
             self._allowed[stage] = allowed_pairs(self.stages, t_ns)
         return self._allowed[stage]
 
-    def _judge(self, t_ns: int, body: str, other: str, distance: float, allowed: Allowed) -> float:
+    def _judge(self, t_ns: int, pair: Pair, distance: float, allowed: Allowed) -> float:
         """Note a pair that is too close; returns its distance if the pair may not touch."""
+        body, _, other, _ = pair
         may_touch = _may_touch(body, other, allowed, self._gripper)
         if distance < self.config.eps_col_m:
             self._note(t_ns, (body, other), distance, may_touch)
@@ -414,19 +436,24 @@ class ClearanceMonitor:
             if distance < -MAX_CONTACT_DEPTH_M and solid:
                 self._fail(t_ns, Cause.DEEP_CONTACT, body, other, distance)
             return np.inf
-        if distance < self.config.eps_col_m:
+        least_m = self.least_m(pair)
+        if distance < least_m:
             cause = Cause.COLLISION if distance < 0 else Cause.TOO_CLOSE
-            self._fail(t_ns, cause, body, other, distance)
+            self._fail(t_ns, cause, body, other, distance, least_m)
         return distance
 
-    def _fail(self, t_ns: int, cause: Cause, body: str, other: str, distance: float) -> None:
+    def _fail(
+        self, t_ns: int, cause: Cause, body: str, other: str, distance: float, least_m: float = 0.0
+    ) -> None:
         if any(failure.cause == cause for failure in self.failures):
             return
         if distance < 0:
             where = f"{-distance * 1e3:.1f} mm inside {other}"
         else:
-            least_m = self.config.eps_col_m
-            where = f"{distance * 1e3:.2f} mm from {other}, nearer than {least_m * 1e3:g} mm"
+            where = f"{distance * 1e3:.2f} mm from {other}, nearer than {least_m * 1e3:.3g} mm"
+            if least_m > self.config.eps_col_m:
+                where += f", of which {(least_m - self.config.eps_col_m) * 1e3:.1f} mm are for its "
+                where += "speed and for what localisation does not know"
         self.failures.append(
             Failure(
                 t_ns=t_ns,

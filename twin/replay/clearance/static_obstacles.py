@@ -43,13 +43,6 @@ def unmodelled_obstacles(
     """Take table, foot and containers out of a scene's observed grid.
 
     What nobody saw counts as free, as in the observed grid, and what lies beyond the grid too.
-
-    Args:
-        table_height_m: Height of the table in the base frame [m].
-        foot: Links that stand still; None when there are none.
-
-    Returns:
-        Distances to what is left; None when nothing is.
     """
     grid = _without_table(static, table_height_m, foot)
     return None if grid is None else _without_panels(grid, panels)
@@ -197,11 +190,7 @@ def static_obstacles(
     panels: Sequence[ContainerPanel],
     table_height_m: float,
 ) -> list[StaticObstacle]:
-    """The table and the panels, each in its own frame.
-
-    Args:
-        table_height_m: Of the table's top, over the robot's base.
-    """
+    """The table and the panels, each in its own frame."""
     T_base_table = np.eye(4)
     T_base_table[2, 3] = table_height_m
     found = [StaticObstacle(body=TABLE, piece=0, solid=half_space_solid(TABLE), T=T_base_table)]

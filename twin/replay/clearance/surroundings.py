@@ -114,11 +114,7 @@ class Surroundings:
         near_m: float,
         counts: Callable[[str, str], bool],
     ) -> tuple[dict[Pair, float], float]:
-        """Measure the nearest pairs of the robot, which ``RobotHulls.place`` has placed.
-
-        Returns:
-            Distances [m], and one that all other pairs keep.
-        """
+        """Measure the nearest pairs of the robot, which ``RobotHulls.place`` has placed."""
         pairing = self._pairing(tuple(Ts_base_object), tuple(moved))
         links, near = self._hulls, pairing.near
         num_links = len(self.links)
@@ -234,14 +230,7 @@ class Surroundings:
         nodes_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],
         moved_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],
     ) -> dict[Pair, float]:
-        """Measure soft bodies: the near links against all, what stands still against moved ones.
-
-        Args:
-            links: The robot's pieces in the order of its hulls, which are placed already.
-            nodes_m: Nodes of each soft body, base frame.
-            moved_m: Those of bodies that have left where they had come to rest; only they are
-                measured against what stands still.
-        """
+        """Measure soft bodies: the near links against all, what stands still against moved ones."""
         found: dict[Pair, float] = {}
         for name, nodes in nodes_m.items():
             centre = (nodes.min(axis=0) + nodes.max(axis=0)) / 2
@@ -273,10 +262,6 @@ class Surroundings:
         Of bodies that overlap, the points by which they would be parted soonest. Beside what the
         scene's grid shows, the distance of the two is more than was measured, by what the points
         of a surface leave uncovered.
-
-        Args:
-            pair: As ``measure`` and ``measure_nodes`` name it; the robot has been placed.
-            nodes_m: Where the nodes of the soft objects are, base frame.
         """
         body, index, other, piece = pair
         own_m, is_soft = self._points_of(body, index, Ts_base_object, nodes_m)
@@ -379,11 +364,6 @@ def posture_clearance(
 
     The arm against itself and against what stands still, with ``eps_col_m`` taken off. The gripper
     is where the path says, whatever the arm does, so it is left out; so are objects.
-
-    Args:
-        hulls: The robot's convex pieces; the function moves them.
-        up_to_m: What is farther from contact than this is said to be so far from it; 0 is enough
-            for whoever asks for the sign, and takes a fraction of the time.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
     links, gripper = own_links(hulls), hulls.robot.record.gripper

@@ -7,7 +7,7 @@ import pytest
 from path_scene import WIDTH_M, Pairs
 
 from twin.plan.path.planner import PathConfig, limits_of, timed_path
-from twin.replay.checks import path_limit_failures
+from twin.replay.motion import motion_failures
 from twin.replay.path import JointPath
 
 CONFIG = PathConfig()
@@ -61,7 +61,7 @@ def test_limits_of_speed_acceleration_and_tool_are_kept(pairs: Pairs) -> None:
             width_m=np.array([WIDTH_M]),
             first_close_ns=None,
         )
-        assert path_limit_failures(knots, robot) == []
+        assert motion_failures(knots, robot) == []
 
 
 def test_rounded_corners_are_passed_without_a_stop_and_sharp_ones_with_one(pairs: Pairs) -> None:

@@ -34,20 +34,6 @@ def test_of_several_jumps_the_first_is_named(robot: RobotModel) -> None:
         assert failure.bodies == (ARM_JOINTS[4],)
 
 
-@pytest.mark.parametrize("joint", range(6))
-@pytest.mark.parametrize(("share", "fails"), [(0.99, False), (1.01, False), (1.1, True)])
-def test_a_joint_is_too_fast_from_a_little_beyond_its_limit_on(
-    robot: RobotModel, joint: int, share: float, fails: bool
-) -> None:
-    """Rounding may exceed a limit by a hundredth, a tenth is no rounding."""
-    step = share * robot.velocity_limit_rad_s[joint] * STEP_NS * 1e-9
-    joints = path_with({(3, joint): -step})
-    times = np.arange(len(joints), dtype=np.int64) * STEP_NS
-    assert [found.cause for found in jumps(times, joints, robot)] == (
-        ["joint_speed"] if fails else []
-    )
-
-
 def test_a_width_holds_from_its_own_instant_until_the_next_one() -> None:
     times = np.array([0, 100, 200], dtype=np.int64)
     path = JointPath(

@@ -84,7 +84,7 @@ def test_a_carry_through_the_wall_of_the_box_is_rejected(script: SimpleNamespace
 
 def test_an_unreachable_waypoint_is_rejected_by_ik_at_its_time(script: SimpleNamespace) -> None:
     scene = script.scene()
-    plan = script.with_joints(script.plan(scene), scene)
+    plan = script.with_joints(script.plan(scene), scene, 0.04)
     tau = list(plan.tau)
     tau[40] = replace(tau[40], p_m=(2.0, 0.0, 0.3), joints_rad=None)
     verdict = replay_plan(replace(plan, tau=tuple(tau)), scene, KINEMATIC).verdict
@@ -109,7 +109,7 @@ def test_given_joints_and_solved_joints_lead_to_the_same_motion(script: SimpleNa
     scene = script.scene()
     plan = script.plan(scene)
     solved = replay_plan(plan, scene, KINEMATIC)
-    given = replay_plan(script.with_joints(plan, scene), scene, KINEMATIC)
+    given = replay_plan(script.with_joints(plan, scene, 0.04), scene, KINEMATIC)
     assert given.verdict.ik.value is True
     path = np.array(
         [

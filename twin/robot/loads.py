@@ -1,0 +1,71 @@
+"""Inverse dynamics of an arm, alone and with what it holds at its tool."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float
+
+from twin.robot.model import RobotModel
+
+Times = Float[np.ndarray, " _"]
+Rows = Float[np.ndarray, "_ _"]
+NAMES = ("tool_speed_m_s", "elbow_speed_m_s", "momentum_kg_m_s", "power_W")
+"""The settings of a robot file that limit what ``Loads`` finds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """What may be in the hand while the fingers are closed."""
+
+    name: str
+    mass_kg: float
+    start_ns: int
+    end_ns: int
+
+
+class Loads:
+    """Inverse dynamics of an arm, alone and with what it holds at its tool."""
+
+    def __init__(self, robot: RobotModel, held: Sequence[Load]) -> None:
+        """Take the arm alone, and once more with each load."""
+        self._robot, self._held = robot, held
+        self._elbow = robot.model.getJointId(robot.joints[(len(robot.joints) - 1) // 2])
+        self._arms = {0.0: robot.model} | {
+            item.mass_kg: self._loaded(item.mass_kg) for item in held if item.mass_kg > 0
+        }
+        self._data = {mass: model.createData() for mass, model in self._arms.items()}
+
+    def _loaded(self, mass_kg: float) -> Any:
+        model, tool = self._robot.model.copy(), self._robot.model.frames[self._robot.tcp_id]
+        model.appendBodyToJoint(
+            tool.parentJoint, pin.Inertia.FromSphere(mass_kg, 0.03), tool.placement
+        )
+        return model
+
+    def along(
+        self, times_s: Times, joints: Rows, speeds: Rows, accelerations: Rows
+    ) -> dict[str, Any]:
+        """Torques of the joints, and by the name of each setting what it limits."""
+        robot = self._robot
+        ids = robot.arm_velocity_ids
+        masses = np.zeros(len(times_s))
+        for item in self._held:
+            during = (times_s >= item.start_ns * 1e-9) & (times_s <= item.end_ns * 1e-9)
+            masses[during] = item.mass_kg
+        v, a = np.zeros(robot.model.nv), np.zeros(robot.model.nv)
+        torques, rows = np.zeros_like(joints), np.zeros((len(times_s), 4))
+        for index, mass in enumerate(masses.tolist()):
+            model, data = self._arms[mass], self._data[mass]
+            q = robot.configuration(joints[index])
+            v[ids], a[ids] = speeds[index], accelerations[index]
+            pin.computeCentroidalMomentum(model, data, q, v)
+            tool = pin.getFrameVelocity(model, data, robot.tcp_id, pin.LOCAL_WORLD_ALIGNED)
+            elbow = pin.getVelocity(model, data, self._elbow, pin.LOCAL_WORLD_ALIGNED)
+            momentum = np.linalg.norm(data.hg.linear)
+            torques[index] = pin.rnea(model, data, q, v, a)[ids]
+            power = float(np.maximum(torques[index] * speeds[index], 0.0).sum())
+            rows[index] = np.linalg.norm(tool.linear), np.linalg.norm(elbow.linear), momentum, power
+        return {"torques": torques, **dict(zip(NAMES, rows.T, strict=True))}
