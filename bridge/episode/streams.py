@@ -151,8 +151,10 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
 
 def rgbd_pairs(episode: Episode, camera_id: str) -> Iterator[RgbdPair]:
     """Yield colour and depth that belong together; colour without depth nearby is passed over."""
-    color_topic = _camera_topic(episode, camera_id, "color/image")
-    depth_topic = _camera_topic(episode, camera_id, "depth/image")
+    tails = ("color/image", "depth/image")
+    color_topic, depth_topic = (find_camera_topic(episode, camera_id, tail) for tail in tails)
+    if color_topic is None or depth_topic is None:
+        return
     colors: list[CompressedColor | RawColor] = []
     depths: list[DepthImage] = []
     for message in episode.messages([color_topic, depth_topic]):

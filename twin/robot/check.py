@@ -130,6 +130,9 @@ def _findings(robot: RobotModel, hulls: RobotHulls, text: str) -> Iterator[tuple
             moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             if not moments[0] + moments[1] >= moments[2] * (1 - _ROUNDED):
                 yield "dynamic", f"the inertia of the link {name!r} is no body's: A + B < C"
+    if oversized := hulls.oversized():
+        yield "gate", oversized
+        return
     for links, why in hulls.left_out.items():
         yield "kinematic", f"{links} are not watched against each other: {why}"
 

@@ -55,7 +55,6 @@ def collision_geometry(robot: RobotModel) -> pin.GeometryModel:
 def link_hulls(robot: RobotModel) -> list[LinkHull]:
     """Return one hull for each collision element of the description."""
     geometry = collision_geometry(robot)
-    reach_m = float(sum(np.linalg.norm(T.translation) for T in robot.model.jointPlacements))
     hulls = []
     for item in geometry.geometryObjects:
         frame = robot.model.frames[item.parentFrame]
@@ -65,13 +64,6 @@ def link_hulls(robot: RobotModel) -> list[LinkHull]:
             raise RobotDescriptionError(
                 found=f"has a collision shape without volume at the link {frame.name!r}",
                 hint="Give it three extents above zero, or leave it out.",
-            )
-        length_m = float(np.linalg.norm(np.ptp(points, axis=0)))
-        if frame.parentJoint and not length_m <= reach_m:
-            raise RobotDescriptionError(
-                found=f"has a collision shape of {length_m:.3g} m at the link {frame.name!r}, and "
-                f"the arm reaches {reach_m:.2f} m",
-                hint="Is it in millimetres? Set the scale of its mesh.",
             )
         shape = convex_hull(points)
         corners = np.array(shape.points())
@@ -294,10 +286,23 @@ class RobotHulls:
         self.left_out.update(dict.fromkeys(links, why))
         self.share_left_out += len(found) / (len(pairs) + len(found) or 1)
 
+    def oversized(self) -> str | None:
+        """Name a shape that moves and is longer than the arm, with what may be wrong with it."""
+        model = self.robot.model
+        reach_m = sum(float(np.linalg.norm(T.translation)) for T in model.jointPlacements)
+        for hull in self.hulls:
+            body = model.getFrameId(hull.link, pin.FrameType.BODY)
+            length_m = float(np.ptp(hull.points_m, axis=0).max())
+            if model.frames[body].parentJoint and not length_m <= reach_m:
+                told = f"is {length_m:.0f} m long; is it in millimetres? Set its scale"
+                return f"a collision shape of the link {hull.link!r} {told}"
+        return None
+
     def blind(self) -> str | None:
         """Say what is not watched, so that no motion of this arm can be called clear of itself."""
-        watched = {hull.link for hull in self.hulls}
-        bare = sorted(self.robot.bodies - watched)
+        if oversized := self.oversized():
+            return oversized
+        bare = sorted(self.robot.bodies - {hull.link for hull in self.hulls})
         if bare:
             return f"the links {', '.join(bare)} have no collision shapes: nobody watches them"
         if self.share_left_out > _MOST_LEFT_OUT:

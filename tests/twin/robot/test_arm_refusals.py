@@ -52,6 +52,7 @@ def model(robot: Robot, urdf: str | None = None) -> RobotModel:
 )
 def test_a_record_that_does_not_fit_its_urdf_is_refused(robot: Robot, found: str) -> None:
     robot = replace(robot, name="mine", home_rad=robot.home_rad if "home" in found else None)
+    robot = replace(robot, acceleration_rad_s2=None, jerk_rad_s3=None)
     with pytest.raises(RobotDescriptionError, match=found):
         model(robot)
 

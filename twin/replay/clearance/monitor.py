@@ -263,11 +263,13 @@ class ClearanceMonitor:
         self._late_m = np.linalg.norm(now.centres_m - before.centres_m, axis=1) * share
         if self._hand:  # fingers may be told to close from one instant to the next
             self._late_m[self._hand] = self._late_m[self._hand].min()
-        self._object_late_m = {
-            name: hypot(*(T[:3, 3] - before.state.Ts_base_object[name][:3, 3]).tolist()) * share
+        places = before.state.Ts_base_object
+        steps = {
+            name: hypot(*(T[:3, 3] - places[name][:3, 3]).tolist())
             for name, T in now.state.Ts_base_object.items()
-            if name in before.state.Ts_base_object
-        }
+            if name in places
+        }  # a leap is no speed
+        self._object_late_m = {n: m * share for n, m in steps.items() if m <= MAX_LEAP_M}
 
     def least_m(self, pair: Pair) -> float:
         """How far a pair that may not touch must be apart now: farther when it is fast."""

@@ -200,7 +200,7 @@ def test_reach_bounds_how_far_any_point_of_a_link_moves(hulls: RobotHulls) -> No
 def test_a_post_passed_between_two_states_is_not_missed(
     script: SimpleNamespace, static: StaticSdf | None
 ) -> None:
-    """20 ms apart both states are free, and the gripper went through the post in between.
+    """2 s apart both states are free, and the gripper went through the post in between.
 
     Without the grid the post is not known, and nothing is made up.
     """
@@ -212,13 +212,13 @@ def test_a_post_passed_between_two_states_is_not_missed(
     T[1, 3] += 0.26
     after = solve_ik(robot, T, IkConfig(), warm_start_rad=before).joints_rad
     assert monitor.measure(0, before, 0.0, {}) > 0.01
-    lowest = monitor.measure(20_000_000, after, 0.0, {})
+    lowest = monitor.measure(2_000_000_000, after, 0.0, {})
     if static is None:
         assert not monitor.failures
         return
     assert lowest < -0.005
     collision = next(f for f in monitor.failures if f.cause == "collision")
-    assert 0 < collision.t_ns < 20_000_000
+    assert 0 < collision.t_ns < 2_000_000_000
     assert collision.bodies[1] == SCENE
     again = monitor_of(script, scene)
     assert again.measure(0, after, 0.0, {}) > 0.01
