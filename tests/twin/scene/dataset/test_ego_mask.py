@@ -3,11 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import textured_room
-from scipy.ndimage import gaussian_filter
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.dataset.colour_check import check_colour
 from twin.scene.dataset.masks import EgoMask, find_ego_mask
 from twin.scene.frames.rgbd import PointSet, Target, TrainingView
 
@@ -152,22 +150,3 @@ def test_points_and_pixels_of_the_gripper_are_left_out(views: list[TrainingView]
     np.testing.assert_array_equal(masked.half.static_mask, ~mask.half)
     assert not masked.full.depth_m[~masked.full.static_mask].any()
     assert masked.full.static_mask.mean() == pytest.approx(1 - mask.share)
-
-
-FAULTS = {
-    "": lambda k, planes: planes,
-    "blurred": lambda k, planes: gaussian_filter(planes, (0, 4, 4)),
-    "exposure jumps between 2 of 8": lambda k, planes: planes // (1 + (k == 4)),
-}
-
-
-@pytest.mark.parametrize("says", FAULTS)
-def test_colours_that_cannot_be_are_named(views: list[TrainingView], says: str) -> None:
-    painted = []
-    for k, view in enumerate(views):
-        sharp = [np.where(t.planes_u8 > 127, 220, 30).astype("u1") for t in (view.half, view.full)]
-        half, full = (FAULTS[says](k, planes) for planes in sharp)
-        half, full = replace(view.half, planes_u8=half), replace(view.full, planes_u8=full)
-        painted.append(replace(view, half=half, full=full))
-    told = check_colour(painted, lambda stamp_ns: np.eye(4))
-    assert [says in each for each in told] == [True] * bool(says)
