@@ -372,11 +372,7 @@ def _command(arguments: list[str]) -> list[str]:
 
 
 def step(
-    output: Output,
-    label: str,
-    arguments: list[str],
-    *needed: Background,
-    show_result: bool = False,
+    output: Output, label: str, arguments: list[str], *needed: Background, show_result: bool = False
 ) -> None:
     """Run one command to its end; where it fails, what it needed may be the cause."""
     output.say(label)

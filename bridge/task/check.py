@@ -54,7 +54,8 @@ def task_problems(table: Mapping[str, Any]) -> list[str]:
     if odd := [f"{_place(path)}: {what}" for path, what in _odd(table)]:
         return odd
     found = sorted(_sentence(error) for error in find_problems(table, name="task"))
-    return list(dict.fromkeys(found)) or list(_references(table))
+    checks = (_object_lists, _starts, _stages, _predicates)  # what a good form names and has not
+    return list(dict.fromkeys(found)) or [text for check in checks for text in check(table)]
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -102,14 +103,6 @@ def _sentence(error: "ValidationError") -> str:
             near = nearest(value, known) if isinstance(value, str) else ""
             return f"{place}: {value!r} is unknown. Known: {_names(known)}.{near}"
     return f"{place}: {error.message:.200}"
-
-
-def _references(table: Mapping[str, Any]) -> Iterator[str]:
-    """What a file of the right form names and does not have."""
-    yield from _object_lists(table)
-    yield from _starts(table)
-    yield from _stages(table)
-    yield from _predicates(table)
 
 
 def _is_no_object(place: str, name: str, table: Mapping[str, Any]) -> Iterator[str]:
@@ -236,15 +229,12 @@ def _predicates(table: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{place}.{key}: {name} cannot be in, on or beside itself"
         yield from _direction(place, spec)
         if "support" in spec:
-            yield from _has_no_top(f"{place}.support", spec["support"], table)
+            model = table["objects"].get(spec["support"], {})
+            if CAVITIES[0] in model.values() or CAVITIES[1] in model.values():
+                said = "is open above; what is put there is inside, not on it"
+                yield f"{place}.support: {spec['support']} {said}"
         if spec["kind"] == "moved":
             yield from _moved(place, spec)
-
-
-def _has_no_top(place: str, name: str, table: Mapping[str, Any]) -> Iterator[str]:
-    model = table["objects"].get(name, {})
-    if CAVITIES[0] in model.values() or CAVITIES[1] in model.values():
-        yield f"{place}: {name} is open above; what is put there is inside, not on it"
 
 
 def _direction(place: str, spec: Mapping[str, Any]) -> Iterator[str]:

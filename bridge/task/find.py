@@ -70,7 +70,8 @@ def find_task_file(
             if wanted in ("", file.sha256):
                 return file
             looked.append(f"{path}: another file, its sha256 is {file.sha256[:HASH_DIGITS]}")
-        looked.append(f"{folder}: {_listed(folder, name)}")
+        names = sorted({path.name.split(".")[0] for path in folder.glob("*.toml")})
+        looked.append(f"{folder}: {', '.join(names) or 'nothing'}.{nearest(name, names)}")
     raise MissingTaskError(name=name, sha256=wanted, looked=looked)
 
 
@@ -93,11 +94,6 @@ def _named(folder: Path, name: str) -> Iterator[Path]:
         stem, _, digits = file_name.removesuffix(".toml").rpartition(".")
         if stem == name and len(digits) == HASH_DIGITS:
             yield there[file_name]
-
-
-def _listed(folder: Path, name: str) -> str:
-    names = sorted({path.name.split(".")[0] for path in folder.glob("*.toml")})
-    return f"{', '.join(names) or 'nothing'}.{nearest(name, names)}"
 
 
 def keep_task_file(tasks_dir: Path, name: str, data: bytes) -> Path:

@@ -185,7 +185,8 @@ def beside(spec: Mapping[str, Any], boxes: Boxes) -> Found:
     if "direction" in spec:
         direction = direction_of(spec["direction"])[:2]
         way = (thing.centre_m - other.centre_m)[:2]
-        off_rad = abs(_angle_rad(way, direction))
+        across = way[0] * direction[1] - way[1] * direction[0]
+        off_rad = abs(float(np.arctan2(across, way @ direction)))
         word = spec["direction"] if isinstance(spec["direction"], str) else "its direction"
         detail += f", {np.degrees(off_rad):.0f} degrees off {word}"
         value = value and off_rad <= SECTOR_RAD
@@ -255,10 +256,6 @@ def _overlap_m(a: Box, b: Box) -> float:
     """Height that two boxes have in common; negative: the gap between their heights [m]."""
     low, high = zip(a.heights_m, b.heights_m, strict=True)
     return min(high) - max(low)
-
-
-def _angle_rad(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
-    return float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
 
 
 RELATIONS: dict[str, Callable[[Mapping[str, Any], Boxes], Found]] = {

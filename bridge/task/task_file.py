@@ -225,11 +225,8 @@ def _parsed(data: bytes) -> Task | tuple[str, ...]:
         problems = tuple(task_problems(table))
     except (RecursionError, InvalidRecordError):
         return ("nested too deeply",)
-    return problems or _task_from(table)
-
-
-def _task_from(table: dict[str, Any]) -> Task:
-    """Make a task of a table in which nothing is wrong."""
+    if problems:
+        return problems
     objects = {key: {"id": key, **_sized(about)} for key, about in table["objects"].items()}
     return msgspec.convert({**table, "objects": objects}, Task)
 

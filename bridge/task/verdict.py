@@ -8,8 +8,8 @@ from typing import Any
 from bridge.task.record import check_record, made_of, parse_record
 
 SCHEMA_VERSION = 1
-STAND_IN_ENGINE = "mujoco"
-SAME_ENGINE = "same engine as the cell"
+STAND_IN_ENGINE = "mujoco"  # moves the stand-in cell
+SAME_ENGINE = "same engine as the cell"  # among the warnings of such a verdict
 
 
 def is_same_engine(engine: str | None, *, stand_in: bool) -> bool:

@@ -82,7 +82,7 @@ def _store(name: str, folder: Path | None) -> Any:
 
 
 def read_definitions(folder: Path) -> None:
-    """Read a folder of definitions now rather than at the first message."""
+    """Read definitions before the first message; UsageError: a file that is none, or no file."""
     _store(_release_names()[0], folder)
 
 

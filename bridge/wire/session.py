@@ -233,8 +233,8 @@ class WireSession:
         topic: str,
         type_name: str,
         *,
-        qos: Qos = Qos.RELIABLE,
-        message_encoding: str | None = None,
+        qos: Qos = Qos.RELIABLE,  # when the network is behind; loops use ``Qos.CONTROL``
+        message_encoding: str | None = None,  # cdr, json ...; None: the type's, or CDR
     ) -> WirePublisher:
         """Announce a topic."""
         if message_encoding is None:
@@ -326,7 +326,7 @@ class WireSession:
         return open_session(own)
 
     def watch_links(self, callback: Callable[[bool], None]) -> Subscriber | None:
-        """Hear of connections that open (True) and close (False), on a thread of zenoh's."""
+        """Hear on zenoh's thread of links that open (True), close (False); None: it cannot tell."""
 
         def on_event(event: Any) -> None:
             callback(event.kind == zenoh.SampleKind.PUT)

@@ -67,7 +67,7 @@ def who_moved(before: Mapping[str, Any], after: Mapping[str, Any], task: Task) -
 
 
 def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task) -> str:
-    """Name the first object that a plan has elsewhere than it is seen; "" when there is none.
+    """Name the first object that a plan's ``entities`` have elsewhere than it is seen; "" if none.
 
     Objects that look alike may be confused; entities without a position say nothing.
     """
@@ -93,7 +93,7 @@ def _looks(model: ObjectModel) -> tuple[object, ...]:
 def turn_between(
     T_first: Float[np.ndarray, "4 4"], T_second: Float[np.ndarray, "4 4"], model: ObjectModel
 ) -> float:
-    """Turn about the vertical from one pose to another, among those that look the same [rad]."""
+    """Turn about the base's vertical between two poses, among those that look the same [rad]."""
     period = 2 * np.pi if model.soft is not None else yaw_period_rad(model)
     yaws = [np.arctan2(T[1, 0], T[0, 0]) for T in (T_first, T_second)]
     return float(abs(np.mod(yaws[1] - yaws[0] + period / 2, period) - period / 2))
@@ -152,7 +152,7 @@ class Perception(Protocol):
         """When the last message arrived."""
 
     def frames(self, *, max_age_ns: int, max_per_camera: int) -> Any:
-        """The latest frames at rest."""
+        """The latest frames at rest; none of a camera whose last image is older than the age."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -482,7 +482,7 @@ class Gate:
         )
 
     def _look_again(self, task: Task, found: Mapping[str, Any], frames: Any, ends_s: float) -> None:
-        """Before a yes: the cell must still be as it was judged."""
+        """Before a yes: UndecidedError if something started or moved since, or nobody sees."""
         running = self._perception.executing()
         if running is not None:
             raise UndecidedError(f"{running} was started while the plan was being judged")

@@ -131,7 +131,7 @@ class LiveCell:
 def frames_of(
     camera_id: str, camera: LiveCamera, cell: LiveCell, quiet_since_ns: int, max_frames: int
 ) -> PosedFrames:
-    """The newest frames of one camera, taken at rest since the last execution ended."""
+    """One camera's newest frames at rest, later than the last execution (cell's clock)."""
     missing = [f"{name}/info" for name in ("color", "depth") if name not in camera.infos]
     if missing:
         raise CameraNotReadyError(f"no calibration on {' and '.join(missing)}")
@@ -229,7 +229,7 @@ class LiveView:
         """Listen for ``/<cell>/cam/...``, events, joint states, transforms and the URDF."""
         self._cell = cell
         self._calibration = calibration
-        self._places = {} if calibration is None else dict(calibration.cameras)
+        self._places = {} if calibration is None else dict(calibration.cameras)  # never ``/tf``
         self._joints: deque[bytes] = deque(maxlen=KEPT_JOINTS)
         self._heard_joints: HeardJoints | None = None
         self._lock = threading.Lock()
@@ -247,7 +247,7 @@ class LiveView:
         self.malformed = 0
 
     def take(self, topic: str, data: bytes, received_ns: int, type_name: str = "") -> None:
-        """Remember one message; one that cannot be read is counted and passed over."""
+        """Remember one message (receiver's clock); an unreadable one is counted and passed over."""
         if is_truth(topic):
             return
         try:
@@ -385,7 +385,7 @@ class LiveView:
             return self._executing
 
     def frames(self, *, max_age_ns: int, max_per_camera: int) -> LiveFrames:
-        """The newest frames of each camera since the last execution ended."""
+        """Each camera's newest frames after the last execution; none too old on cell's clock."""
         with self._lock:  # copy only: decoding must not hold up the network
             cameras = {
                 camera_id: LiveCamera(

@@ -45,7 +45,7 @@ def make_gate(
     tasks: JudgedTasks,
     config: GateConfig,
     perception: Perception,
-    now_ns: Callable[[], int],
+    now_ns: Callable[[], int],  # the clock on which messages arrive
     twin: TwinProcess,
 ) -> Gate:
     """Put the real localisation and replay behind the gate."""
@@ -141,7 +141,7 @@ def watch_cell(
 
 
 def claim_gate(session: Any, cell: str) -> None:
-    """Let other gates of this cell see that there is one.
+    """Let other gates of this cell see that there is one, as long as the session is open.
 
     Whoever asks takes the first answer that comes, and of two gates one may know another task or
     an older scene.

@@ -77,6 +77,7 @@ def answer(question: Question) -> Verdict:
 
     Nothing here looks at a clock: the same question has the same answer on every machine.
     Rounds of one start are tried against the same variations: their identity is the start's name.
+    Raises UndecidedError for another robot or scene, or a nominal replay of too many steps.
     """
     from twin.replay.agreement import in_each_engine  # noqa: PLC0415
     from twin.replay.audit import audit  # noqa: PLC0415
@@ -165,7 +166,7 @@ def _steps_of(question: Question, config: ReplayConfig) -> int:
 
 
 def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
-    """Ask the twin in this process as a gate asks it in its own."""
+    """Judge here as a gate does in its own process; UndecidedError: a replay has too many steps."""
     config = GateConfig()
 
     def judge(plan: Plan) -> Verdict:

@@ -28,7 +28,7 @@ Hulls = Mapping[str, Sequence[Float[np.ndarray, "num_points 3"]]]
 
 
 def write_description(urdf: str, mesh_hulls_m: Hulls, folder: Path) -> Path:
-    """Write ``robot.urdf`` and its hull meshes into a folder."""
+    """Write ``robot.urdf`` (returned) with hulls [m, link's frame] for its collision meshes."""
     root = ET.fromstring(urdf)
     for number, link in enumerate(root.findall("link")):
         for visual in link.findall("visual"):
@@ -275,7 +275,7 @@ class Arm:
             )
 
     def command(self, joints_rad: Joints, velocity_rad_s: Joints, width_m: float) -> None:
-        """Set the position targets that the motors follow from the next step on.
+        """Set the targets the motors follow from the next step on; the width as far as it goes.
 
         Motors keep their orders: one that is already followed is not given again.
         """
@@ -398,7 +398,7 @@ class Arm:
     def push(
         self, link: str | None, force_N: tuple[float, ...], point_m: tuple[float, ...]
     ) -> None:
-        """Apply a force at a point of the base frame during the next step."""
+        """Apply a force at a point (base frame) in the next step; None: to the fingers' parent."""
         pybullet.applyExternalForce(
             self.id,
             self._finger_parent if link is None else self.links[link],
@@ -442,7 +442,7 @@ class Press:
         self._found = 0
 
     def update(self, *, anew: bool) -> None:
-        """Drive the fingers for the next step. Call once per step."""
+        """Drive the fingers for the next step, once per step; anew: contacts may be missing yet."""
         self._steps += 1
         if anew:
             self._found = 0

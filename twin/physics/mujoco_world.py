@@ -132,7 +132,7 @@ class MujocoArm:
         self._target_m = min(max(width_m, 0.0), self._record.gripper.max_width_m)
 
     def drive(self, left_s: float) -> None:
-        """Set the motors for one step of the engine, whose positions and velocities are known."""
+        """Set the motors for one step at known state; the command is due ``left_s`` after it."""
         data, count = self._data, len(self._arm)
         # Computed torque: what moves the arm as it should, gravity and inertia taken out.
         far = self._target_rad - left_s * self._speed_rad_s - data.qpos[self._arm]
@@ -167,7 +167,7 @@ class MujocoArm:
 
 
 def _refuse_gripper(record: Robot, urdf: str) -> None:
-    """Fingers with motors of their own that slide in proportion to the width, or a fixed tool."""
+    """Refuse (PhysicsError) fingers that turn, follow a lever or a table, or mimic another one."""
     fingers = record.gripper.fingers
     followers = [item.joint for item in mimics_of(urdf) if item.leader in record.finger_joints]
     others = [item.joint for item in fingers if item.turns or item.link_m or item.table]

@@ -107,7 +107,7 @@ def coarse_lattice(
     tets: Int32[np.ndarray, "num_tets 4"],
     cell_m: float,
 ) -> tuple[Lattice, float] | None:
-    """Fill the solid that a lattice fills with larger cells."""
+    """Fill a lattice's solid with larger cells in one piece, spacing [m]; None: none are larger."""
     return _coarse_lattice(
         np.ascontiguousarray(nodes_m).tobytes(),
         np.ascontiguousarray(tets).tobytes(),
@@ -266,7 +266,7 @@ class SoftModel:
 
     @staticmethod
     def from_lattice(arrays: Mapping[str, np.ndarray], model: ObjectModel) -> "SoftModel":
-        """Take the lattice of a rebuilt scene.
+        """Take the lattice of a rebuilt scene (``objects/<id>/soft.npz``).
 
         One that is finer than the task asks for (``soft.cell_m``) is replaced by a coarser lattice
         of the same solid, with the fine surface as skin: docs/decisions/0017-contact-physics.md.

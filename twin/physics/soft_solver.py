@@ -112,7 +112,7 @@ def add_body(
     young_pa: float,
     friction: float,
 ) -> tuple[int, Float[np.ndarray, " num_nodes"]]:
-    """Hand a body at rest to a solver."""
+    """Hand a body at rest to a solver; its number there, and the masses of its nodes [kg]."""
     rest, surface = model.nodes_m.astype(np.float64), model.surface()
     masses, omega = _node_masses(model), model.slowest_mode_rad_s()
     index = solver.add_body(

@@ -21,7 +21,7 @@ class Unseen:
     """From the box's middle, along its axes."""
 
     def solids(self, size_m: Float[np.ndarray, "3"]) -> list[Float[np.ndarray, "3"]]:
-        """Extents of boxes about one middle that together are the stepped box [m]."""
+        """Extents of boxes about one middle: the stepped box [m]; no step is over its face."""
         size = np.asarray(size_m, dtype=np.float64)
         if self.edge_m <= 0.0:
             return [size]

@@ -116,7 +116,7 @@ class World:
         return ids
 
     def add_table(self, height_m: float, size_m: float = 4.0, thickness_m: float = 0.4) -> int:
-        """Add the table: a slab whose top is at the height."""
+        """Add the table: a slab around the robot's base, whose top is at the height over it."""
         centre = np.array([0.0, 0.0, height_m - thickness_m / 2])
         extents = np.array([size_m, size_m, thickness_m])
         body = self.add_static([(centre, extents)], np.eye(4))[0]
@@ -138,7 +138,7 @@ class World:
         T_base_object: Float[np.ndarray, "4 4"],
         unseen: Unseen = EVEN,
     ) -> None:
-        """Add a solid box that moves."""
+        """Add a solid box that moves; its mass is even, but for where its centre is said to be."""
         if unseen == EVEN:
             body = self._box(size_m, mass_kg, T_base_object)
         else:

@@ -14,8 +14,8 @@ _DISAGREE = "engines disagree: "
 def in_each_engine(
     task: Task, config: ReplayConfig, judge: Callable[[ReplayConfig], Verdict]
 ) -> list[Verdict]:
-    """Judge in each engine that is asked for; each verdict says where another one differs."""
-    config.refuse_soft(task.soft_objects)
+    """Judge in each engine asked for, the deciding one first; each says where another differs."""
+    config.refuse_soft(task.soft_objects)  # UsageError: an engine that has none
     if config.mode == "kinematic" or config.engine != "both":
         return [judge(config)]
     return compared([judge(replace(config, engine=engine)) for engine in config.engines()])

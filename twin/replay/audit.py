@@ -105,13 +105,13 @@ class _States:
 
 def audit(
     result: ReplayResult,
-    plan: Plan,
+    plan: Plan,  # no more contacts in its stages than the task allows (``limited_to_task``)
     scene: ReplayScene,
     config: ReplayConfig,
     *,
-    max_queries: int = 20_000,
+    max_queries: int = 20_000,  # pairs; a replay that needs more is not decided
 ) -> Factor:
-    """Say whether python-fcl finds nowhere less distance than a replay's clearance."""
+    """Whether python-fcl finds nowhere less distance than a replay's clearance; None: why not."""
     try:
         import fcl  # noqa: PLC0415  # [replay] brings it; without it there is no yes
     except ImportError:

@@ -47,7 +47,7 @@ LAG_STEP_NS = 66_666_668
 
 
 def lag_s(first: Trace, second: Trace) -> float:
-    """By how much the second tool comes later than the first: least mean distance [s]."""
+    """By how much the second tool comes later [s], by least mean distance; negative: earlier."""
     end = min(first.end_ns, second.end_ns)
     times = np.arange(0, max(end, 1), LAG_STEP_NS)
     here = _positions(first, times)
@@ -66,7 +66,7 @@ def _positions(
 
 
 def without_lag(trace: Trace, lag: float) -> Trace:
-    """The same trace with a lag [s] taken out."""
+    """The same trace with a lag taken out [s]; negative where it comes early."""
     shift = round(lag * 1e9)
     return replace(
         trace,
@@ -146,9 +146,9 @@ def diverge(
     traces: Sequence[Trace],
     *,
     findings: Mapping[str, Mapping[tuple[str, str], bool | None]] | None = None,
-    not_compared: Sequence[str] = (),
+    not_compared: Sequence[str] = (),  # why a side is missing
 ) -> Divergence:
-    """Compare every two trajectories of one execution."""
+    """Compare every two trajectories, what each predicate (kind, object) said only if all agree."""
     quantities: list[DivergedQuantity] = []
     lags: dict[tuple[str, str], float] = {}
     ordered = sorted(traces, key=lambda trace: SIDES.index(trace.side))

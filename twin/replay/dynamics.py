@@ -61,7 +61,7 @@ def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftShape]
 
 
 def outline_m(model: ObjectModel, soft: SoftShape | None) -> Float[np.ndarray, "num_points 3"]:
-    """Points whose convex hull holds the object, in its own frame [m]."""
+    """Points whose hull holds the object, in its own frame [m]: of its lattice, or else its box."""
     if soft is not None:
         return np.asarray(soft.nodes_m, dtype=np.float64)
     return box_corners(np.array(model.size_m))
@@ -69,8 +69,8 @@ def outline_m(model: ObjectModel, soft: SoftShape | None) -> Float[np.ndarray, "
 
 def lifted(
     T_base_object: Float[np.ndarray, "4 4"],
-    points_m: Float[np.ndarray, "num_points 3"],
-    table_height_m: float,
+    points_m: Float[np.ndarray, "num_points 3"],  # outline in the object's own frame
+    table_height_m: float,  # of its top, over the robot's base
 ) -> Float[np.ndarray, "4 4"]:
     """Raise an object whose localised pose reaches into the table until it stands just above."""
     lowest = float(se3.apply(T_base_object, points_m)[:, 2].min())

@@ -152,7 +152,7 @@ def path_of_execution(
 
 
 def cut_track(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:
-    """The samples of an interval, with the track's value at its very start put first.
+    """An interval's samples (track's clock), with the interpolated value at its start put first.
 
     A sample at the end is not made up: where the recording stops early, so does the track.
     """
@@ -167,7 +167,7 @@ def cut_track(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:
 def stages_as_executed(
     plan: Plan, events: Sequence[Mapping[str, Any]], start_ns: int
 ) -> tuple[Stage, ...]:
-    """The plan's stages at the times at which the recording says they began and ended."""
+    """The plan's stages when the recording says they were; 0 is ``start_ns`` (source time)."""
     spans: dict[tuple[str, str], int] = {}
     for event in events:
         if event.get("plan_id") == plan.id and event["type"] in ("stage_started", "stage_ended"):
@@ -184,8 +184,8 @@ def stages_as_executed(
 
 
 def closed_mask(
-    times_ns: Int[np.ndarray, " num_samples"],
-    width_m: Float[np.ndarray, " num_samples"],
+    times_ns: Int[np.ndarray, " num_samples"],  # ascending, from the start of the execution
+    width_m: Float[np.ndarray, " num_samples"],  # between the finger pads
     plan: Plan,
 ) -> Bool[np.ndarray, " num_samples"]:
     """Say when the fingers were closed on something, from the plan's wish and their own motion."""

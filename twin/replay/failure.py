@@ -31,7 +31,7 @@ class Failure:
 
 
 def factor_from(failures: Sequence[Failure], *, undecided: str | None = None) -> Factor:
-    """Report the earliest failure; without one True, or None when something is undecided."""
+    """Report the earliest failure; without one True, or None with what is ``undecided``."""
     if failures:
         first = min(failures, key=lambda failure: failure.t_ns)
         return Factor(

@@ -71,8 +71,8 @@ def render_replay(
     result: ReplayResult,
     scene: ReplayScene,
     *,
-    start_ns: int,
-    executed: bool,
+    start_ns: int,  # source time that is the replay's time 0
+    executed: bool,  # the plan was executed then: there are instants to compare with
     planned: bool,
 ) -> Iterator[tuple[str, CompressedColor]]:
     """Yield camera ids with JPEG images, stamped with source times."""

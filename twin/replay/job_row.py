@@ -75,7 +75,7 @@ def judged(
     *,
     skipped: bool = False,
 ) -> dict[str, Any]:
-    """Return the row of a trajectory with its verdict, and where it diverges from the others."""
+    """A trajectory's row: verdict, and where it diverges from the others (None: not compared)."""
     return {
         **_row(job),
         "skipped": skipped,

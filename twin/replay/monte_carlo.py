@@ -84,7 +84,7 @@ class Variation:
 
 
 def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
-    """The generator of one sample: the same for the same seed, start and index, anywhere."""
+    """The generator of one sample: the same for one seed, start (identity) and index, anywhere."""
     digest = hashlib.sha256(f"{seed}/{identity}/{index}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype="<u4").astype(np.uint32))
 
@@ -92,7 +92,7 @@ def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
 def with_draw(
     draw: PosteriorDraw, scene: ReplayScene, config: ReplayConfig
 ) -> tuple[ReplayScene, ReplayConfig]:
-    """A start and settings as one draw of a posterior has them.
+    """A start and settings as a draw has them: movers' mass, edges, centre; all objects shifted.
 
     The objects' own friction stays: what a draw has is that of both surfaces together.
     """
@@ -139,8 +139,8 @@ def draw_variation(
 ) -> Variation:
     """Draw poses from the localisation's covariance and physics from the priors.
 
-    Where there is a posterior, what it knows of comes from its draws: the samples take turns, so
-    that each has as many as its weight says.
+    Where there is a posterior, what it knows of comes from its draws: the samples take turns (by
+    index), so that each has as many as its weight says.
 
     Poses of different objects are drawn independently, although they share the cameras' errors.
     What stands on the table goes on standing: its height and tilt are known, so the rest is drawn
@@ -278,7 +278,7 @@ def replay_samples(
     plan_id: str,
     identity: str,
 ) -> tuple[Sample, ...]:
-    """Run ``config.samples`` varied replays."""
+    """Run ``config.samples`` varied replays; UsageError if kinematic, which moves no objects."""
     if config.samples and config.mode != "dynamic":
         message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
         raise UsageError(message)

@@ -110,7 +110,7 @@ def observed_stages(
     tables: Sequence[Mapping[str, Any]],
     grips: Sequence[Grip],
     times_ns: Int[np.ndarray, " num_samples"],
-    p_tool_m: Float[np.ndarray, "num_samples 3"],
+    p_tool_m: Float[np.ndarray, "num_samples 3"],  # base frame
 ) -> tuple[Stage, ...]:
     """Lay a task's stages over an execution.
 

@@ -453,7 +453,7 @@ def _check_given(
 
 
 def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Failure]:
-    """Find joint limits, jumps and self-collision along an interpolated path."""
+    """Find joint limits, jumps, self-collision on an interpolated path; the hulls are moved."""
     times = path.dense_times_ns(PATH_STEP_S)
     joints = path.joints_at(times)
     failures = outside_limits(robot, path.times_ns, path.joints_rad)

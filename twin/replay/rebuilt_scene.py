@@ -54,7 +54,7 @@ def calibrated(
 ) -> ReplayConfig:
     """Use calibrated physics, but for the fields that the user set to something of their own.
 
-    Samples then vary what was identified by as much as the calibration leaves open.
+    Samples then vary what was identified as far as it is open; a posterior's draws are the task's.
     """
     if calibration is None:
         return config
@@ -170,7 +170,7 @@ class RebuiltScene:
         urdf: str,
         Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
         *,
-        reasons: Mapping[str, str] | None = None,
+        reasons: Mapping[str, str] | None = None,  # why other objects were not localised
         covariances: Mapping[str, Float[np.ndarray, "6 6"]] | None = None,
     ) -> ReplayScene:
         """Put objects into the scene: where a replay happens."""
@@ -189,7 +189,7 @@ class RebuiltScene:
 
 
 def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
-    """Read what the scene folder of a run knows about a task's objects."""
+    """Read what a run knows of a task's objects; without ``scene.json`` its calibration only."""
     sources = dict.fromkeys(task.objects, TASK_SHAPE)
     calibration = read_calibration(run)
     rebuilt = RebuiltScene(

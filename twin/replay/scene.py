@@ -127,7 +127,7 @@ def localised_starts(
 ) -> StartStates:
     """Localise an episode's objects once, keep the answer as a derived episode, and read it.
 
-    An episode that cannot be localised gives states without poses, with the reason.
+    An episode that cannot be localised gives no poses, but why. ``scene_hash``: of their scene.
     """
     phases = quiet_phases(episode)
     try:

@@ -43,7 +43,7 @@ def count_verdicts(rows: Rows) -> dict[str, dict[str, int]]:
 
 
 def recorded_labels(run: RunFolder, episode_ids: Sequence[str]) -> dict[str, str]:
-    """What the operator said of each episode: success, failure or unknown."""
+    """What the operator said of each episode: success, failure or unknown (unreadable too)."""
     labels = {}
     for episode_id in episode_ids:
         try:

@@ -51,7 +51,7 @@ class Trace:
 
 
 def trace_of_result(result: ReplayResult, side: str, end_ns: int) -> Trace:
-    """The trace of a replay in memory."""
+    """The trace of a replay in memory until ``end_ns`` from its start: what settles is left out."""
     return Trace(
         side=side,
         tool=poses_over(result.stamps_ns, result.Ts_base_tcp),
@@ -71,7 +71,7 @@ def trace_of_result(result: ReplayResult, side: str, end_ns: int) -> Trace:
 
 
 def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
-    """The trace of a replay that was written before."""
+    """The trace of a written replay: time 0 is ``start_ns`` (source time), the end is after it."""
     episode = Episode.open(path)
     width = streams.joint_track(episode, GRIPPER_STATE)
     tool = next(t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE))

@@ -53,10 +53,10 @@ MANY = 8
 def terminal_factor(
     result: ReplayResult,
     scene: ReplayScene,
-    config: ReplayConfig,
+    config: ReplayConfig,  # only its mode counts
     *,
-    unreachable_ns: int | None,
-    burst: Burst | None,
+    unreachable_ns: int | None,  # from when on waypoints cannot be reached
+    burst: Burst | None,  # the first one
 ) -> Factor:
     """Judge the settled state at the end.
 
@@ -117,7 +117,7 @@ def _once(sentences: Iterable[str]) -> str:
 def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float = 0.0) -> list[Any]:
     """What each predicate says of a recorded or replayed rollout, as the verdict keeps it.
 
-    The predicate on contacts is asked whether or not the task lists it.
+    Contacts are always asked for; up to ``tolerance_m`` deep none counts, if the task is silent.
     """
     findings = evaluate_success(task, rollout)
     if not any(finding.kind == ALLOWED_CONTACTS for finding in findings):
@@ -254,7 +254,7 @@ def _replay(
 def judge_states(
     commanded: Commanded, states: States, plan: Plan, scene: ReplayScene, config: ReplayConfig
 ) -> ReplayResult:
-    """Judge what physics did while somebody else steered, as a replay of it would be judged."""
+    """Judge what physics did while somebody else steered (``plan`` says what), as if replayed."""
     hulls = hulls_of(load_robot(scene.urdf))
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     moved = Moved(

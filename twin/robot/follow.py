@@ -51,11 +51,11 @@ def follow_poses(
     robot: RobotModel,
     Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"],
     *,
-    start_rad: Float[np.ndarray, " num_joints"] | None,
+    start_rad: Float[np.ndarray, " num_joints"] | None,  # before the first pose; None: any
     config: IkConfig,
-    clearance: Clearance | None = None,
+    clearance: Clearance | None = None,  # asked only about postures that are wanted
 ) -> Followed:
-    """Find joints for every pose of a path."""
+    """Find joints for every pose of a path; an arm with a UR's geometry in closed form."""
     inverse = UrInverse.for_robot(robot)
     count = len(Ts_base_tcp)
     if inverse is None and start_rad is None and count:

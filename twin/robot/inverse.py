@@ -56,7 +56,7 @@ def solve_ik(
     *,
     warm_start_rad: Float[np.ndarray, " num_joints"] | None = None,
 ) -> IkSolution:
-    """Find joints within their limits that reach a pose, near the warm start where there is one."""
+    """The best joints within limits for a pose, by the warm start (None: home); see ``reached``."""
     start = robot.home_rad if warm_start_rad is None else warm_start_rad
     if UrInverse.for_robot(robot) is not None:
         best = _descend(robot, T_base_tcp, start, config)
@@ -476,7 +476,11 @@ class UrInverse:
         Bool[np.ndarray, "num_poses 8"],
         Bool[np.ndarray, " num_poses"],
     ]:
-        """Solve many poses, on all branches."""
+        """Joints [rad] on all branches within one turn and the limits; which are solutions.
+
+        The last says where some branch has a straight wrist: in reach too, by joints that nobody
+        can number. Out of reach or limits, not a number, or a joint that may be anything: all 0.
+        """
         finite = np.isfinite(Ts_base_tcp).all(axis=(1, 2))
         theta, valid, singular = _angles(
             self.geometry, np.where(finite[:, None, None], Ts_base_tcp, 0.0)

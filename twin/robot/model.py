@@ -30,9 +30,9 @@ class RobotDescriptionError(TwinError):
 
 
 def mimicked(urdf: str) -> tuple[Mimic, ...]:
-    """Read the joints that follow another joint, which pinocchio takes for free ones."""
+    """Read the joints that follow one; RobotDescriptionError: absent, a follower or bad factor."""
     root = parse_description(urdf)
-    found = mimics_of(urdf)
+    found = mimics_of(urdf)  # pinocchio takes them for free ones
     leaders = {joint.get("name", "") for joint in root.findall("joint")}
     leaders -= {item.joint for item in found}
     for item in found:

@@ -27,7 +27,7 @@ class BackwardTimeError(TwinError):
 def check_clock(
     episode: Episode, endings: Sequence[str], start_ns: int, end_ns: int, plan_id: str
 ) -> None:
-    """Refuse an execution during which the source's clock went back."""
+    """Raises BackwardTimeError where the source's clock went back, or no time passed."""
     if end_ns <= start_ns:
         raise BackwardTimeError(
             f"the execution of {whose(plan_id)} ended {(start_ns - end_ns) * 1e-9:.2f} s before it "

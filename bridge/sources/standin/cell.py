@@ -213,14 +213,11 @@ class StandinCell:
         self._due[name] = max(self._due[name] + period_ns, self.now_ns - period_ns // 2)
         return True
 
-    def _encoders_rad(self) -> Float[np.ndarray, "6"]:
-        noise = self._rng.normal(0.0, self.file.sensors.encoder_noise_rad, 6)
-        motors_rad = self.world.joints_rad + self.world.slack_rad
-        return np.asarray(motors_rad + self.hidden.joint_offset_rad + noise)
-
     def _publish_robot(self) -> None:
-        encoders = self._encoders_rad()
         world, streams = self.world, self.streams
+        noise = self._rng.normal(0.0, self.file.sensors.encoder_noise_rad, 6)
+        motors_rad = world.joints_rad + world.slack_rad
+        encoders = np.asarray(motors_rad + self.hidden.joint_offset_rad + noise)
         streams.joints(encoders, world.joint_speeds_rad_s, world.joint_efforts_Nm, self.now_ns)
         streams.tcp(self.kinematics.T_base_tcp(encoders), self.now_ns)
         if self._is_due("frames", FRAMES_NS):

@@ -16,8 +16,10 @@ STANDIN = SessionConfig()
 def publish_standin(
     *,
     config: Annotated[SessionConfig, Parameter(name="*")] = STANDIN,
-    connect: tuple[str, ...] = LOOPBACK,
-    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    connect: Annotated[tuple[str, ...], Parameter(help="Where the recorder listens.")] = LOOPBACK,
+    zenoh_config: Annotated[
+        Path | None, Parameter(name="--config", help="zenoh configuration (JSON5).")
+    ] = None,
     output: Output = OUTPUT,
 ) -> int:
     """Run the stand-in cell: a simulated laboratory that records a scan, then trials.

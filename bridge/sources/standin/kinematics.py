@@ -69,9 +69,7 @@ class Kinematics:
         return np.array(placement.homogeneous)
 
     def joints_for(
-        self,
-        T_base_tcp: Float[np.ndarray, "4 4"],
-        joints_seed_rad: Float[np.ndarray, "6"],
+        self, T_base_tcp: Float[np.ndarray, "4 4"], joints_seed_rad: Float[np.ndarray, "6"]
     ) -> Float[np.ndarray, "6"]:
         """Solve the inverse problem from a nearby start: Levenberg-Marquardt on SE(3)."""
         target = pinocchio.SE3(T_base_tcp)
@@ -79,7 +77,9 @@ class Kinematics:
         damping = DAMPING_START
         error = self._error(joints, target)
         for _ in range(MAX_ITERATIONS):
-            if _converged(error) and not _past_limit(joints).any():
+            far_m, far_rad = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+            near = far_m < TOLERANCE_M and far_rad < TOLERANCE_RAD
+            if near and not _past_limit(joints).any():
                 return joints
             jacobian = self._jacobian(joints)
             normal = jacobian.T @ jacobian + damping * np.eye(6)
@@ -134,12 +134,6 @@ def tool_down(p_m: Float[np.ndarray, "3"], yaw_rad: float) -> Float[np.ndarray, 
 
 def _past_limit(joints_rad: Float[np.ndarray, "6"]) -> Bool[np.ndarray, "6"]:
     return np.asarray(np.abs(joints_rad) > JOINT_LIMIT_RAD + 1e-9)
-
-
-def _converged(error: Float[np.ndarray, "6"]) -> bool:
-    return bool(
-        np.linalg.norm(error[:3]) < TOLERANCE_M and np.linalg.norm(error[3:]) < TOLERANCE_RAD
-    )
 
 
 def wrap_rad(angle_rad: float) -> float:
@@ -225,34 +219,22 @@ def follow_legs(
     for leg in legs:
         count = max(round(leg.duration_s / leg.step_s), 1)
         while True:
-            Ts, rows = _sample_leg(T_from, leg, joints, count, kinematics)
-            steps = np.abs(np.diff(np.vstack([joints, rows]), axis=0))
+            Ts = slerp_poses(T_from, leg.T_base_tcp, leg.law(np.arange(1, count + 1) / count))
+            rows = [joints]
+            for T in Ts:
+                rows.append(kinematics.joints_for(T, rows[-1]))
+            steps = np.abs(np.diff(rows, axis=0))
             speed = float(steps.max()) / leg.step_s
             if speed <= max_joint_speed_rad_s:
                 break
             count = int(np.ceil(count * 1.02 * speed / max_joint_speed_rad_s))
         begin_ns = t_ns
-        for T, row, width in zip(Ts, rows, _widths(tau[-1].width_m, leg, count), strict=True):
+        for T, row, width in zip(Ts, rows[1:], _widths(tau[-1].width_m, leg, count), strict=True):
             t_ns += ns_from_s(leg.step_s)
             tau.append(_waypoint(t_ns, T, row, leg.g, width))
         bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], t_ns)
         T_from, joints = leg.T_base_tcp, rows[-1]
     return Track(tau=tuple(tau), bounds=bounds, T_base_tcp=T_from)
-
-
-def _sample_leg(
-    T_from: Float[np.ndarray, "4 4"],
-    leg: Leg,
-    joints_rad: Float[np.ndarray, "6"],
-    count: int,
-    kinematics: Kinematics,
-) -> tuple[Float[np.ndarray, "num_poses 4 4"], Float[np.ndarray, "num_poses 6"]]:
-    Ts = slerp_poses(T_from, leg.T_base_tcp, leg.law(np.arange(1, count + 1) / count))
-    rows = []
-    for T in Ts:
-        joints_rad = kinematics.joints_for(T, joints_rad)
-        rows.append(joints_rad)
-    return Ts, np.array(rows)
 
 
 def _widths(before_m: float | None, leg: Leg, count: int) -> list[float]:

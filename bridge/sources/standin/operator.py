@@ -27,11 +27,7 @@ from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.decisions import Decider
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
-from bridge.sources.standin.settings import (
-    CONDITIONS,
-    INTERRUPTED,
-    SessionConfig,
-)
+from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, SessionConfig
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done

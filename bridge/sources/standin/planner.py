@@ -174,10 +174,7 @@ def draw_errors(
 
 
 def perceive(
-    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
-    noise: PlannerNoise,
-    *,
-    start_seed: int,
+    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]], noise: PlannerNoise, *, start_seed: int
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Return the objects' poses as this planner sees them: shifted and turned a little.
 

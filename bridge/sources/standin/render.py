@@ -16,10 +16,7 @@ from bridge.sources.standin.surfaces import Surface, smooth_normals
 AMBIENT = 0.50
 SKY = 0.10
 """Light from everywhere, and how much more of it comes from above."""
-LIGHTS = (
-    ((0.25, -0.35, 0.90), 0.36),
-    ((-0.55, 0.60, 0.58), 0.18),
-)
+LIGHTS = (((0.25, -0.35, 0.90), 0.36), ((-0.55, 0.60, 0.58), 0.18))
 """Directions towards two large ceiling lamps, and their strengths."""
 SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 """Extra rays through pixels on an outline, so that edges are smooth as a lens makes them."""
@@ -120,7 +117,9 @@ class Renderer:
             extra = self._look(posed, moved.reshape(-1, 3).astype(np.float32))
             if backdrop is not None:
                 # The backdrop has no subpixels; its colour at the pixel's centre stands for them.
-                extra = _nearer(extra, _repeat(backdrop, edge, len(SUBPIXELS)))
+                index = np.tile(edge, len(SUBPIXELS))
+                behind = {name: values[index] for name, values in vars(backdrop).items()}
+                extra = _nearer(extra, Layer(**behind))
             colors[edge] = extra.colors.reshape(len(SUBPIXELS), -1, 3).mean(axis=0)
         return colors
 
@@ -239,19 +238,12 @@ def _nearer(front: Layer, back: Layer) -> Layer:
     )
 
 
-def _repeat(layer: Layer, where: Int[np.ndarray, " num_pixels"], times: int) -> Layer:
-    index = np.tile(where, times)
-    return Layer(**{name: values[index] for name, values in vars(layer).items()})
-
-
 def _tensor(array: np.ndarray) -> Any:
     make: Any = open3d.core.Tensor  # its stubs leave out that an array alone is enough
     return make(array)
 
 
-def _outline(
-    surface_ids: Int[np.ndarray, "height width"],
-) -> Bool[np.ndarray, "height width"]:
+def _outline(surface_ids: Int[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """Mark pixels beside which another surface begins."""
     mask = np.zeros(surface_ids.shape, dtype=bool)
     across = surface_ids[:, 1:] != surface_ids[:, :-1]
@@ -288,10 +280,7 @@ EDGE_JUMP = 0.05
 
 
 def measure_depth(
-    picture: Picture,
-    model: SensorModel,
-    hidden: HiddenParameters,
-    rng: np.random.Generator,
+    picture: Picture, model: SensorModel, hidden: HiddenParameters, rng: np.random.Generator
 ) -> UInt16[np.ndarray, "height width"]:
     """Depth in whole millimetres with bias, noise and holes; 0 is "no measurement"."""
     true_m = np.where(np.isfinite(picture.depth_m), picture.depth_m, 0.0)
@@ -318,10 +307,7 @@ def _beside_jump(depth_m: Float[np.ndarray, "height width"]) -> np.ndarray:
 
 
 def measure_color(
-    picture: Picture,
-    model: SensorModel,
-    hidden: HiddenParameters,
-    rng: np.random.Generator,
+    picture: Picture, model: SensorModel, hidden: HiddenParameters, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Colour with the exposure's gain and noise."""
     noise = rng.standard_normal(picture.image.shape, dtype=np.float32)

@@ -120,9 +120,7 @@ def _is_safe(
 
 
 def joint_move(
-    start_rad: Float[np.ndarray, "6"],
-    end_rad: Float[np.ndarray, "6"],
-    max_speed_rad_s: float,
+    start_rad: Float[np.ndarray, "6"], end_rad: Float[np.ndarray, "6"], max_speed_rad_s: float
 ) -> tuple[np.ndarray, Float[np.ndarray, "num_waypoints 6"]]:
     """A smooth move in joint space, as fast as the slowest joint allows: times [ns] and joints."""
     largest = float(np.max(np.abs(end_rad - start_rad)))

@@ -164,11 +164,7 @@ class Streams:
     ) -> None:
         """Publish what the encoders say."""
         sample = JointSample(
-            stamp_ns=stamp_ns,
-            names=ARM_JOINTS,
-            position=position,
-            velocity=velocity,
-            effort=effort,
+            stamp_ns=stamp_ns, names=ARM_JOINTS, position=position, velocity=velocity, effort=effort
         )
         self._latest_joints = sample.to_cdr(), stamp_ns
         self._put(cell_topic(self._cell, JOINT_STATES), *self._latest_joints)

@@ -305,9 +305,7 @@ def _placed(surface: Surface, T_base_body: Float[np.ndarray, "4 4"]) -> Surface:
     vertices = se3.apply(T_base_body, surface.vertices_m.astype(np.float64))
     normals = surface.corner_normals @ T_base_body[:3, :3].T
     return replace(
-        surface,
-        vertices_m=vertices.astype(np.float32),
-        corner_normals=normals.astype(np.float32),
+        surface, vertices_m=vertices.astype(np.float32), corner_normals=normals.astype(np.float32)
     )
 
 

@@ -307,10 +307,7 @@ def _add_table(spec: Any, hidden: HiddenParameters) -> None:
         q, p = se3.split(T_base_table)[0], se3.apply(T_base_table, p)
     body = spec.worldbody.add_body(name="table", pos=p, quat=q)
     body.add_geom(
-        name="table",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[x / 2, y / 2, z / 2],
-        **_WORLD_BITS,
+        name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=[x / 2, y / 2, z / 2], **_WORLD_BITS
     )
 
 

@@ -60,7 +60,8 @@ def fill(
     flipped = volume < 0
     tetrahedra[flipped] = tetrahedra[flipped][:, [1, 0, 2, 3]]
     thick = np.abs(volume) > FLAT_FRACTION * float(np.prod(step))
-    return _without_unused(points, tetrahedra[thick])
+    used, index = np.unique(tetrahedra[thick], return_inverse=True)
+    return Lattice(points_m=points[used], tetrahedra=index.reshape(-1, 4))
 
 
 def volumes_m3(
@@ -97,10 +98,3 @@ def _tetrahedra(
     return np.concatenate(
         [nodes[~odd][:, four] for four in _EVEN] + [nodes[odd][:, four] for four in _ODD]
     )
-
-
-def _without_unused(
-    points: Float[np.ndarray, "num_points 3"], tetrahedra: Int[np.ndarray, "num_tetrahedra 4"]
-) -> Lattice:
-    used, index = np.unique(tetrahedra, return_inverse=True)
-    return Lattice(points_m=points[used], tetrahedra=index.reshape(tetrahedra.shape))

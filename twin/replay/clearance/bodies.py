@@ -46,7 +46,7 @@ class Solid:
 def solid_of(
     body: str, shape: coal.CollisionGeometry, points_m: Float[np.ndarray, "num_points 3"]
 ) -> Solid:
-    """Put a box and a sphere around a piece."""
+    """Put box and sphere around a shape in its body's frame, which the points' hull holds there."""
     low, high = points_m.min(axis=0), points_m.max(axis=0)
     centre = (low + high) / 2
     radius = float(np.linalg.norm(points_m - centre, axis=1).max())
@@ -79,7 +79,7 @@ def placement_of(T: Float[np.ndarray, "4 4"]) -> coal.Transform3s:
 def placed_panels(
     model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
 ) -> list[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]]:
-    """The boxes an object is made of: pose of each box's centre, and its extents [m]."""
+    """An object's boxes (walls, a basket's corners, rim, handles): pose of centre, extents [m]."""
     if model.mesh == BASKET:
         shape = model.inner_m, model.wall_m
         return [
@@ -129,7 +129,7 @@ class NearPairs:
         )
 
     def nearest_first(self, up_to_m: float = np.inf) -> Iterator[tuple[float, int]]:
-        """Yield a bound that the signed distance is not below [m], and the number of the pair."""
+        """Yield a lower bound of the distance [m], and the pair; none that is surely farther."""
         count = self._native.nearest_first(
             self.R, self.t, self._bounds, self._order, up_to_m + _SLACK_M
         )
@@ -179,9 +179,9 @@ class Planes:
 
     def distance_m(
         self,
-        points_m: Float[np.ndarray, "num_points 3"],
-        R: Float[np.ndarray, "3 3"],
-        t: Float[np.ndarray, "3"],
+        points_m: Float[np.ndarray, "num_points 3"],  # base frame
+        R: Float[np.ndarray, "3 3"],  # of the piece's link in the base frame
+        t: Float[np.ndarray, "3"],  # that link's origin, base frame [m]
     ) -> float:
         """Smallest signed distance of points to the placed piece [m], never too large outside."""
         local = (points_m - t) @ R
@@ -199,10 +199,10 @@ def planes_of(hulls: RobotHulls) -> tuple[Planes, ...]:
 
 
 def distances_to_boxes_m(
-    points_m: Float[np.ndarray, "num_points 3"],
+    points_m: Float[np.ndarray, "num_points 3"],  # base frame
     R_box_base: Float[np.ndarray, "num_boxes 3 3"],
     p_box_base: Float[np.ndarray, "num_boxes 3"],
-    half_m: Float[np.ndarray, "num_boxes 3"],
+    half_m: Float[np.ndarray, "num_boxes 3"],  # half the edges
 ) -> Float[np.ndarray, " num_boxes"]:
     """Smallest signed distance of points to each box around the origin of its frame [m]."""
     local = R_box_base @ points_m.T + p_box_base[:, :, None]

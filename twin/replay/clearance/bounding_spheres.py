@@ -69,7 +69,7 @@ class BoundingSpheres:
         self,
         lookup: GridLookup,
         R: Float[np.ndarray, "num_pieces 3 3"],
-        t: Float[np.ndarray, "num_pieces 3"],
+        t: Float[np.ndarray, "num_pieces 3"],  # origin of each piece's link, grid's frame [m]
     ) -> Float[np.ndarray, " num_pieces"]:
         """Signed distance of each placed piece to the grid's surface [m].
 
@@ -94,8 +94,8 @@ class BoundingSpheres:
         self,
         lookup: GridLookup,
         R: Float[np.ndarray, "num_pieces 3 3"],
-        t: Float[np.ndarray, "num_pieces 3"],
-        below_m: float,
+        t: Float[np.ndarray, "num_pieces 3"],  # origin of each piece's link, grid's frame [m]
+        below_m: float,  # that number; the smaller, the less is looked at
     ) -> float:
         """Return the smallest of ``distances_m``, or a number where none is below it [m]."""
         found: float = least(
@@ -119,7 +119,7 @@ class BoundingSpheres:
 def bounding_spheres_of(
     corners_m: Float[np.ndarray, "num_points 3"], fine_m: float = FINE_M
 ) -> BoundingSphereTree:
-    """Cover the convex hull of points so that nothing is farther from a fine one than asked."""
+    """Cover the hull of points, in their frame: no part is over ``fine_m`` from a finest one."""
     levels = [surface_points(corners_m, fine_m)]
     parents: list[Int[np.ndarray, " num_points"]] = []
     for radius in reversed(PATCHES_M):
@@ -152,7 +152,7 @@ def bounding_spheres_of(
 def surface_points(
     corners_m: Float[np.ndarray, "num_corners 3"], fine_m: float = FINE_M
 ) -> Float[np.ndarray, "num_points 3"]:
-    """Points on the surface of a convex hull, so close that no part is far from all."""
+    """Points on the surface of a convex hull: no part is over ``fine_m`` from all of them."""
     # A triangle with edges of at most e leaves nothing farther from its corners than e / sqrt(3).
     return _divided(corners_m[ConvexHull(corners_m).simplices], fine_m * np.sqrt(3.0))
 

@@ -114,7 +114,7 @@ class Reach:
             self._fingers[row] = _per_width(robot, int(frame.parentJoint), reach=ends_m)
 
     def travel_m(self, a: State, b: State) -> Float[np.ndarray, " num_links"]:
-        """How far any point of each link moved at most [m], when the joints moved straight."""
+        """How far any point of each link moved at most [m], if joints and width moved straight."""
         turned = np.abs(b.joints_rad - a.joints_rad)
         return np.asarray(self._per_rad @ turned + self._fingers * abs(b.width_m - a.width_m))
 
@@ -135,7 +135,7 @@ def _per_width(robot: RobotModel, joint: int, *, reach: float) -> float:
 
 
 def object_travel_m(a: State, b: State, name: str, radius_m: float) -> float:
-    """How far any point of an object moved at most [m]; infinite when it is in one state only."""
+    """How far an object's points in a radius moved at most [m]; infinite if in one state only."""
     if name in a.nodes_m and name in b.nodes_m:
         return float(np.linalg.norm(b.nodes_m[name] - a.nodes_m[name], axis=1).max())
     if name not in a.Ts_base_object or name not in b.Ts_base_object:
@@ -225,11 +225,11 @@ class ClearanceMonitor:
 
     def measure(
         self,
-        t_ns: int,
+        t_ns: int,  # from the start of the trajectory; calls come in order
         joints_rad: Float[np.ndarray, " num_joints"],
         width_m: float,
-        Ts_base_object: Poses,
-        nodes_m: Nodes | None = None,
+        Ts_base_object: Poses,  # movable objects; those not known are left out
+        nodes_m: Nodes | None = None,  # base frame; soft with a pose only: the box around it
     ) -> float:
         """Return delta(x_t), the smallest distance over the pairs that may not touch [m].
 

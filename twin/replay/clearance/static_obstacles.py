@@ -40,7 +40,7 @@ class Foot:
 def unmodelled_obstacles(
     static: StaticSdf, table_height_m: float, foot: Foot | None, panels: Sequence[PanelBox]
 ) -> SdfGrid | None:
-    """Take table, foot and containers out of a scene's observed grid.
+    """Take table, foot and containers out of a scene's observed grid; None: nothing is left.
 
     What nobody saw counts as free, as in the observed grid, and what lies beyond the grid too.
     """
@@ -188,7 +188,7 @@ class StaticObstacle:
 
 def static_obstacles(
     panels: Sequence[ContainerPanel],
-    table_height_m: float,
+    table_height_m: float,  # of its top, over the robot's base
 ) -> list[StaticObstacle]:
     """The table and the panels, each in its own frame."""
     T_base_table = np.eye(4)

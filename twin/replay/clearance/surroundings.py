@@ -114,7 +114,7 @@ class Surroundings:
         near_m: float,
         counts: Callable[[str, str], bool],
     ) -> tuple[dict[Pair, float], float]:
-        """Measure the nearest pairs of the robot, which ``RobotHulls.place`` has placed."""
+        """Distances of a placed robot's nearest pairs [m], and one that all other pairs keep."""
         pairing = self._pairing(tuple(Ts_base_object), tuple(moved))
         links, near = self._hulls, pairing.near
         num_links = len(self.links)
@@ -226,9 +226,9 @@ class Surroundings:
 
     def measure_nodes(
         self,
-        links: list[Solid],
-        nodes_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],
-        moved_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],
+        links: list[Solid],  # in the order of the robot's hulls, which are placed already
+        nodes_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],  # base frame
+        moved_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],  # that left where they rested
     ) -> dict[Pair, float]:
         """Measure soft bodies: the near links against all, what stands still against moved ones."""
         found: dict[Pair, float] = {}
@@ -257,7 +257,7 @@ class Surroundings:
     def closest_points(
         self, pair: Pair, Ts_base_object: Poses, nodes_m: Mapping[str, Float[np.ndarray, "_ 3"]]
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Return where the bodies of one pair are nearest to each other, base frame [m].
+        """Return where a pair of ``measure`` or ``measure_nodes`` is nearest, base frame [m].
 
         Of bodies that overlap, the points by which they would be parted soonest. Beside what the
         scene's grid shows, the distance of the two is more than was measured, by what the points
@@ -363,7 +363,8 @@ def posture_clearance(
     """Return a function that says how far postures stay from contact: negative when links touch.
 
     The arm against itself and against what stands still, with ``eps_col_m`` taken off. The gripper
-    is where the path says, whatever the arm does, so it is left out; so are objects.
+    is where the path says, whatever the arm does, so it is left out; so are objects. It moves the
+    hulls, and says ``up_to_m`` of what is farther: 0 is enough for the sign, and much faster.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
     links, gripper = own_links(hulls), hulls.robot.record.gripper
