@@ -136,10 +136,7 @@ def _compare(
 
 
 def _with_reviews(
-    comparison: "Comparison",
-    sources: Sequence[Path],
-    reviews: Sequence[Path],
-    tables: TableOptions,
+    comparison: "Comparison", sources: Sequence[Path], reviews: Sequence[Path], tables: TableOptions
 ) -> "Comparison":
     """Hold the labels against other raters'."""
     from bridge.exchange.reviews import FOLDER, read_reviews

@@ -13,20 +13,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from bridge.media.image_quality import (
-    ALIGNMENTS,
-    PADDINGS,
-    SIGMA,
-    WINDOW,
-    ImageShapeError,
-    Padding,
-    SsimMaps,
-    aligned,
-    as_float,
-    check_same_shape,
-    psnr_db,
-    ssim_maps,
-)
+from bridge.media import image_quality
+from bridge.media.image_quality import ALIGNMENTS, PADDINGS, SIGMA, WINDOW, Padding, SsimMaps
 from evaluator.errors import EvaluatorError, UndefinedStatisticError
 
 
@@ -150,9 +138,9 @@ def score_pair(
     Raises:
         SwappedColourError: When the pair fits much better with red and blue exchanged.
     """
-    recorded, replayed = as_float(recorded_u8), as_float(replayed_u8)
+    recorded, replayed = image_quality.as_float(recorded_u8), image_quality.as_float(replayed_u8)
     refuse_swapped(recorded, replayed)
-    brightened = aligned(recorded_u8, replayed_u8, "gain")
+    brightened = image_quality.aligned(recorded_u8, replayed_u8, "gain")
     maps = _ssim(recorded, replayed)
     found = {
         RAW: _scored(recorded, replayed, maps, paddings=("valid", "zero")),
@@ -175,7 +163,7 @@ def _ssim(
     recorded: Float[np.ndarray, "height width 3"], replayed: Float[np.ndarray, "height width 3"]
 ) -> SsimMaps | UndefinedStatisticError:
     try:
-        return ssim_maps(recorded, replayed)
+        return image_quality.ssim_maps(recorded, replayed)
     except UndefinedStatisticError as error:
         return error
 
@@ -194,7 +182,7 @@ def _scored(
     values: dict[str, float] = {}
     reasons: dict[str, str] = {}
     try:
-        values["psnr_db"] = psnr_db(recorded, replayed, mask=mask)
+        values["psnr_db"] = image_quality.psnr_db(recorded, replayed, mask=mask)
     except UndefinedStatisticError as error:
         reasons["psnr_db"] = error.reason
     for padding in paddings:
@@ -229,7 +217,7 @@ def refuse_swapped(
     replayed: Float[np.ndarray, "replayed_height replayed_width 3"],
 ) -> None:
     """Refuse a pair that fits much better with red and blue exchanged; grey ones cannot tell."""
-    check_same_shape(recorded, replayed)
+    image_quality.check_same_shape(recorded, replayed)
     as_it_is = float(np.square(recorded - replayed).mean())
     swapped = float(np.square(recorded - replayed[..., ::-1]).mean())
     limit = as_it_is * 10.0 ** (-SWAP_MARGIN_DB / 10.0)
@@ -259,7 +247,7 @@ def score_depth(
 ) -> DepthScore:
     """Compare two depth images [m]; 0 is "no measurement"."""
     if recorded_m.shape != rendered_m.shape:
-        raise ImageShapeError(
+        raise image_quality.ImageShapeError(
             found=f"the recorded depth is {recorded_m.shape}, the rendered one {rendered_m.shape}"
         )
     both = (recorded_m > 0) & (rendered_m > 0)

@@ -16,14 +16,7 @@ from evaluator.report.tables import as_csv, as_latex, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
-SHOWN = (
-    "published",
-    "success",
-    "comparisons",
-    "standing",
-    "image_methods",
-    "notes",
-)
+SHOWN = ("published", "success", "comparisons", "standing", "image_methods", "notes")
 """Tables a terminal shows; the others are in the report."""
 
 GROUPS = "success"

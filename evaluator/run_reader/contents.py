@@ -24,14 +24,8 @@ from bridge.process_pool import SERIAL, ProcessPool, Serial
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.result import Exclusion
-from evaluator.run_reader.episodes import (
-    DerivedFacts,
-    DerivedFile,
-    RecordedFacts,
-    RunFile,
-    read_derived,
-    read_recorded,
-)
+from evaluator.run_reader import episodes
+from evaluator.run_reader.episodes import DerivedFacts, DerivedFile, RecordedFacts, RunFile
 
 ODD = (GstError, OSError, TypeError, ValueError, KeyError, RecursionError)
 """What one file of another program, or a failing disk, may raise; it costs that file only."""
@@ -77,7 +71,7 @@ def read_contents(
     facts, broken_recorded = _read(
         {f"{file.name} {file.sha256} {labels.get(file.stem, '')}": file for file in recorded},
         RecordedFacts,
-        partial(_tried, partial(read_recorded, run)),
+        partial(_tried, partial(episodes.read_recorded, run)),
         cache,
         pool.map,
         output,
@@ -85,7 +79,7 @@ def read_contents(
     made, broken_derived = _read(
         {f"{file.name} {file.sha256}": file for file in derived},
         DerivedFacts,
-        partial(_tried, read_derived),
+        partial(_tried, episodes.read_derived),
         cache,
         pool.map,
         output,

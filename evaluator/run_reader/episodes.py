@@ -12,17 +12,9 @@ from typing import Any
 import msgspec
 
 from bridge.clock import NS_PER_S
-from bridge.episode import schema
+from bridge.episode import metadata, schema
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.executions import NO_PLAN, with_execution
-from bridge.episode.metadata import (
-    RETRY,
-    Derived,
-    EpisodeInfo,
-    Outcome,
-    build,
-    why_not_counted,
-)
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import verdicts
@@ -141,10 +133,10 @@ class StageTime:
 class RecordedFacts:
     """What one recorded episode says of itself, with the label given to it afterwards."""
 
-    info: EpisodeInfo
+    info: metadata.EpisodeInfo
     began_ns: int = 0
     """When its recording began; 0 without messages."""
-    outcome: Outcome | None = None
+    outcome: metadata.Outcome | None = None
     """As the operator labelled it; a label given after the fact wins."""
     num_plans: int = 0
     num_plans_sent: int = 0
@@ -174,7 +166,7 @@ class _Log:
     ended_ns: int | None = None
     first_start_ns: dict[str, int] = field(default_factory=dict)
     verdicts: dict[str, Verdict] = field(default_factory=dict)
-    label: Outcome | None = None
+    label: metadata.Outcome | None = None
     localised: list[bytes] = field(default_factory=list)
 
 
@@ -182,7 +174,7 @@ def read_recorded(run: RunFolder, path: Path) -> RecordedFacts:
     """Sum up a recorded episode; of one that is no trial, only who and what."""
     episode = Episode.open(path)
     info, outcome = episode.info, episode.outcome
-    if info.kind == RETRY:
+    if info.kind == metadata.RETRY:
         return RecordedFacts(info=info, outcome=outcome_of(run, episode))
     if info.kind != "trial":
         return RecordedFacts(info=info, outcome=outcome)
@@ -195,7 +187,7 @@ def read_recorded(run: RunFolder, path: Path) -> RecordedFacts:
     return RecordedFacts(info=info, outcome=outcome, broken=broken)
 
 
-def _read_trial(run: RunFolder, episode: Episode, info: EpisodeInfo) -> RecordedFacts:
+def _read_trial(run: RunFolder, episode: Episode, info: metadata.EpisodeInfo) -> RecordedFacts:
     log = _read_log(episode)
     if not log.sent:
         for event in with_execution(episode, ()):
@@ -309,7 +301,7 @@ def _note_event(log: _Log, event: Mapping[str, Any]) -> None:
             names = {"result", "unit", "k", "n", "by", "detail"}
             known = {key: outcome[key] for key in names & outcome.keys()}
             stages = [s for s in outcome.get("stages") or () if isinstance(s, dict)]
-            log.label = build(Outcome, {**known, "stages": stages})
+            log.label = metadata.build(metadata.Outcome, {**known, "stages": stages})
 
 
 def first_divergence(episode: Episode) -> str:
@@ -323,8 +315,8 @@ def first_divergence(episode: Episode) -> str:
 class DerivedFacts:
     """What one derived episode says of itself."""
 
-    info: EpisodeInfo
-    derived: Derived
+    info: metadata.EpisodeInfo
+    derived: metadata.Derived
     verdict: VerdictSummary | None = None
     """Of a dynamic replay: the last verdict on the plan it replays."""
     divergence: str = ""
@@ -342,19 +334,19 @@ class DerivedFile(RunFile):
     facts: DerivedFacts
 
     @property
-    def info(self) -> EpisodeInfo:
+    def info(self) -> metadata.EpisodeInfo:
         """Who, what and when."""
         return self.facts.info
 
     @property
-    def derived(self) -> Derived:
+    def derived(self) -> metadata.Derived:
         """What it was made from."""
         return self.facts.derived
 
     @property
     def why_not_counted(self) -> str:
         """Why it never enters a number, whatever it says; empty where it may."""
-        return why_not_counted(self.derived, stand_in=self.info.stand_in)
+        return metadata.why_not_counted(self.derived, stand_in=self.info.stand_in)
 
     @property
     def episode(self) -> Episode:
@@ -405,7 +397,7 @@ def read_derived(path: Path) -> DerivedFacts:
     return DerivedFacts(info=info, derived=derived)
 
 
-def _without_seed(derived: Derived) -> Derived:
+def _without_seed(derived: metadata.Derived) -> metadata.Derived:
     """Leave the seed out of the settings: it stands beside them, and they are alike without it."""
     config = derived.settings.get("config")
     if not isinstance(config, dict) or "seed" not in config:
@@ -414,7 +406,7 @@ def _without_seed(derived: Derived) -> Derived:
     return replace(derived, settings={**derived.settings, "config": kept})
 
 
-def _is_dynamic(derived: Derived) -> bool:
+def _is_dynamic(derived: metadata.Derived) -> bool:
     return derived.kind == "replay" and derived.mode == "dynamic"
 
 

@@ -19,15 +19,8 @@ from bridge.episode.provenance import software
 from bridge.errors import BridgeError, GstError, PathNotFoundError, UsageError
 from bridge.exchange.csv_export import seconds_text
 from bridge.media.color import JPEG_MAGIC, decode_color, open_image
-from evaluator.compare.images.scores import (
-    RECORDED,
-    RENDERED,
-    images_of,
-    measure_images,
-    open_net,
-    size_words,
-    spread,
-)
+from evaluator.compare.images import scores as image_scores
+from evaluator.compare.images.scores import RECORDED, RENDERED, images_of, measure_images
 from evaluator.compare.images.views import TWIN, Source, agreed_setting, newest_views, opened
 from evaluator.compare.measure import Part
 from evaluator.compare.rows import Comparison
@@ -139,7 +132,7 @@ def compare_folders(options: ImageOptions) -> Comparison:
     if options.reference is None or not options.renders:
         message = "images alone need --reference FOLDER and --renders METHOD=FOLDER."
         raise UsageError(message)
-    net = open_net(options.lpips_vgg)
+    net = image_scores.open_net(options.lpips_vgg)
     part = compare_renders(options, (), {}, net=net)
     return Comparison(
         run=options.reference.resolve().name,
@@ -254,7 +247,9 @@ def _compare(
     """Score every method on every view of the reference, and measure over those in common."""
     wanted = [view for view in sorted(reference.load) if any(view in m.load for m in methods)]
     work = partial(_score_view, reference, methods, net)
-    views = dict(zip(wanted, spread(work, wanted, threads=1 if net else None), strict=True))
+    views = dict(
+        zip(wanted, image_scores.spread(work, wanted, threads=1 if net else None), strict=True)
+    )
     left_out = [gone for method in methods for gone in _unpaired(reference, method)]
     left_out += [
         _gone(f"{method}: {view}" if method else view, reason)
@@ -269,7 +264,7 @@ def _compare(
         if lacking and seen.scores:
             reason = f"left out for every method: no score of {', '.join(lacking)}"
             left_out.append(_gone(view, reason))
-    sizes = size_words(views[view].size for view in common)
+    sizes = image_scores.size_words(views[view].size for view in common)
     numbers: list[Measurement] = []
     rows: list[dict[str, Cell]] = []
     for method in methods:

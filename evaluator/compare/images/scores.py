@@ -16,33 +16,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from bridge.episode import schema
+from bridge.episode import schema, topics
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
-from bridge.episode.topics import (
-    MASK_TOPIC,
-    RECORDED_DEPTH_TOPIC,
-    RECORDED_TOPIC,
-    RENDERED_DEPTH_TOPIC,
-    RENDERED_TOPIC,
-)
 from bridge.errors import GstError, MissingDependencyError
 from bridge.media.color import JPEG_MAGIC, decode_color
 from evaluator.compare.measure import mean_of, measured
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Quantity
-from evaluator.metrics.image import (
-    LPIPS,
-    METRICS,
-    RAW,
-    DepthScore,
-    ImageMetric,
-    ImageScore,
-    PerceptualNet,
-    score_depth,
-    score_pair,
-    variant_words,
-)
+from evaluator.metrics import image as image_metrics
+from evaluator.metrics.image import RAW, DepthScore, ImageMetric, ImageScore, PerceptualNet
 from evaluator.result import Measurement
 
 
@@ -81,8 +64,8 @@ def spread(
 
 
 RENDERED, RECORDED = "rendered", "recorded"
-_COLOR_TOPICS = ((RENDERED, RENDERED_TOPIC), (RECORDED, RECORDED_TOPIC))
-_DEPTH_TOPICS = ((RENDERED, RENDERED_DEPTH_TOPIC), (RECORDED, RECORDED_DEPTH_TOPIC))
+_COLOR_TOPICS = ((RENDERED, topics.RENDERED_TOPIC), (RECORDED, topics.RECORDED_TOPIC))
+_DEPTH_TOPICS = ((RENDERED, topics.RENDERED_DEPTH_TOPIC), (RECORDED, topics.RECORDED_DEPTH_TOPIC))
 
 Key = tuple[str, int]
 """Camera id and stamp [ns]."""
@@ -158,7 +141,7 @@ def read_images(episode: Episode) -> Images:
                 put[topic] = partial(_put_color, images.color[name], match.group(1))
                 break
         else:
-            if match := MASK_TOPIC.search(topic):
+            if match := topics.MASK_TOPIC.search(topic):
                 masks = images.masks.setdefault(match.group(2), {})
                 put[topic] = partial(_put_color, masks, match.group(1))
     for topic in episode.topics_of_type(schema.IMAGE):
@@ -186,7 +169,7 @@ def _score(images: Images, net: PerceptualNet | None, key: Key) -> ViewScore:
         return ViewScore(reason=f"{where}: no recorded image with this stamp")
     try:
         recorded_u8 = decode_color(recorded)
-        scores = score_pair(
+        scores = image_metrics.score_pair(
             recorded_u8, decode_color(rendered), masks=images.masks_of(key), net=net
         )
         depth = _score_depth(images, key)
@@ -207,7 +190,7 @@ def _score_depth(images: Images, key: Key) -> DepthScore | None:
     if pair[0] is None or pair[1] is None:
         return None
     try:
-        return score_depth(
+        return image_metrics.score_depth(
             DepthImage.from_cdr(pair[0]).depth_m(), DepthImage.from_cdr(pair[1]).depth_m()
         )
     except UndefinedStatisticError:
@@ -248,13 +231,22 @@ def measure_images(
     for variant in variants:
         of_variant = [score[variant] for score in scores if variant in score]
         asked = {name for score in of_variant for name in (*score.values, *score.reasons)}
-        for metric in METRICS.values():
-            if metric.id == LPIPS and net is None:
+        for metric in image_metrics.METRICS.values():
+            if metric.id == image_metrics.LPIPS and net is None:
                 continue
             if variant != RAW and metric.id not in asked:
                 continue
-            weights = f"weights {net.weights}" if net is not None and metric.id == LPIPS else ""
-            parts = (variant_words(variant), protocol, _lacking(metric, of_variant), weights)
+            weights = (
+                f"weights {net.weights}"
+                if net is not None and metric.id == image_metrics.LPIPS
+                else ""
+            )
+            parts = (
+                image_metrics.variant_words(variant),
+                protocol,
+                _lacking(metric, of_variant),
+                weights,
+            )
             words = "".join(f"; {part}" for part in parts if part)
             values = [s.values[metric.id] for s in of_variant if metric.id in s.values]
             found.append(
