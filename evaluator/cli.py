@@ -148,11 +148,7 @@ def _with_reviews(
 
 
 def _refuse_only_broken(results: "Results") -> None:
-    """End with an error, after the report, where no episode can be read and nothing else is there.
-
-    Raises:
-        EvaluatorError: Naming them.
-    """
+    """Refuse, after the report, where no episode can be read and nothing else is there."""
     unread = [item.episode for item in results.exclusions if item.scope == "everything"]
     if not unread or any(one.value is not None for one in results.measurements):
         return

@@ -5,7 +5,7 @@ a cell that fits no reading is refused by its row.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,8 +115,8 @@ def _plain(cell: str) -> str:
 def _header(lines: Sequence[Line]) -> tuple[int, int]:
     """Return the first and the last row of names; (0, -1) where there is none."""
     top = 0
-    while top < len(lines) - 1 and _only_first(lines[top][1]):
-        top += 1
+    while top < len(lines) - 1 and lines[top][1][0] and not any(lines[top][1][1:]):
+        top += 1  # a title
     for last in range(top, min(top + HEADERS, len(lines))):
         words = sum(map(_is_word, lines[last][1]))
         if not words or (words == 1 and any(c and _is_figure(c) for c in lines[last][1])):
@@ -125,10 +125,6 @@ def _header(lines: Sequence[Line]) -> tuple[int, int]:
             last += 1  # noqa: PLW2901
         return top, last
     return (top, top) if lines else (0, -1)
-
-
-def _only_first(cells: Sequence[str]) -> bool:
-    return bool(cells[0]) and not any(cells[1:])
 
 
 def _is_word(cell: str) -> bool:
@@ -348,9 +344,7 @@ def _value_columns(sheet: Sheet, labels: dict[str, Column | None]) -> tuple[list
     """Return the columns of figures, and what the rest of their names says: a task or a policy."""
     free = [c for c in sheet.columns if not c.label and c.place not in sheet.read and c.name]
     free = [c for c in free if not table_words.is_summary(c.rest) and not c.is_beside]
-    rest_is = "task" if labels["policy"] else "policy"
-    if labels["task"] and labels["policy"]:
-        rest_is = ""
+    rest_is = "policy" if not labels["policy"] else "" if labels["task"] else "task"
     sided = [c for c in free if c.side]
     plain = [c for c in free if c.figure and not c.side and not c.rest]
     if sided:
@@ -405,7 +399,8 @@ def _unnamed(
 ) -> tuple[list[Column], str]:
     """Columns of figures under names that we do not know: trials by number, or tasks."""
     numbered = [c for c in others if c.name.split()[-1].isdigit() and not c.figure]
-    if numbered and all(_all_answers(sheet.cells(c)) for c in numbered):
+    told = [table_words.read_cell(0, text) for c in numbered for text in sheet.cells(c)]
+    if numbered and all(each is None or each.answer is not None for each in told):
         return numbered, ""
     named = [c for c in others if c.rest and not c.figure]
     figures = [table_words.read_cell(0, text) for c in named for text in sheet.cells(c)]
@@ -416,11 +411,6 @@ def _unnamed(
             f"{names} are read as success rates of a {rest_is or 'task'} each"
         )
     return [*named, *(c for c in plain if c.figure == "n")], rest_is
-
-
-def _all_answers(texts: Iterable[str]) -> bool:
-    figures = [table_words.read_cell(0, text) for text in texts]
-    return all(each is None or each.answer is not None for each in figures)
 
 
 # Trials.

@@ -128,10 +128,8 @@ def _claim(row: SourceRow) -> _Claim:
     return _Claim(
         row=row,
         statistic=statistic,
-        task=row.text("task"),
         side="sim" if side == "sim" else "recorded",
-        condition=row.text("condition"),
-        policy=row.text("policy"),
+        **{name: row.text(name) for name in ("task", "condition", "policy")},
         value=value,
         half=trials_rates.half_digit(value),
     )
@@ -150,8 +148,7 @@ def _read(row: SourceRow) -> tuple[trials_rates.RateRecord, Finding | None]:
     printed = trials_rates.printed_rate(row)
     if printed is None:
         raise refusal
-    names = (row.text("task"), row.text("condition"), row.text("side"))
-    what = " ".join(name for name in names if name)
+    what = " ".join(filter(None, map(row.text, ("task", "condition", "side"))))
     text = row.text("rate_percent") or row.text("rate")
     note = str(refusal).partition(f" row {row.row}: ")[2]
     kept = {name: text for name, text in row.values.items() if name not in ("k", "n")}
@@ -175,11 +172,7 @@ def _judge(
     side = claim.side if claim.statistic in OF_ONE_SIDE else ""
     parts = (claim.statistic, claim.task, side, claim.condition, claim.policy)
     what = " ".join(part for part in parts if part)
-    groups = [
-        group
-        for group in groups
-        if claim.task in ("", group.task) and claim.policy in ("", group.policy)
-    ]
+    groups = [g for g in groups if claim.task in ("", g.task) and claim.policy in ("", g.policy)]
     printed = str(claim.value)
     try:
         value = _value(claim.statistic, claim.side, claim.condition, groups)
@@ -289,12 +282,9 @@ def _reach(claim: _Claim, groups: Sequence[RateGroup], halves: Halves) -> tuple[
 
 def _with_rate(now: RateGroup, printed: RateGroup, side: str, step: Fraction) -> RateGroup:
     name = f"{side}_rate"
-    rate = getattr(printed, name)
-    return (
-        now
-        if rate is None
-        else replace(now, **{name: min(max(rate + step, Fraction(0)), Fraction(1))})
-    )
+    if (rate := getattr(printed, name)) is None:
+        return now
+    return replace(now, **{name: min(max(rate + step, Fraction(0)), Fraction(1))})
 
 
 def _from_rounded(claim: _Claim, claims: Sequence[_Claim]) -> float | None:

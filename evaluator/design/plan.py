@@ -121,42 +121,32 @@ def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
 
 
 def _task(name: str, study: StudyOptions) -> StudyTask:
-    if study.any_task and not name.endswith(".toml"):
-        return StudyTask(task=name, task_sha256=NO_TASK_FILE, session_seed=study.seed, starts=1)
-    file = chosen_task_file(name)
-    return StudyTask(
-        task=file.task().name, task_sha256=file.sha256, session_seed=study.seed, starts=1
-    )
+    sha256 = NO_TASK_FILE
+    if not study.any_task or name.endswith(".toml"):
+        file = chosen_task_file(name)
+        name, sha256 = file.task().name, file.sha256
+    return StudyTask(task=name, task_sha256=sha256, session_seed=study.seed, starts=1)
 
 
 def _endpoints(policies: Sequence[PolicyArms]) -> list[Endpoint]:
     """List the questions, the primary one first."""
     first = policies[0]
-    found = [
+    others = policies[1:] if "without" in first.arms else ()
+    against = [arm for arm in ("without", "control") if {"with", arm} <= set(first.arms)]
+    asked = [(first.policy, "with", arm) for arm in against]
+    asked += [(other.policy, "without", "without") for other in others]
+    if not asked:
+        raise UsageError("there is nothing to compare: give two arms or two policies.")
+    return [
         Endpoint(
             kind="difference",
-            policy=first.policy,
-            arm="with",
+            policy=policy,
+            arm=arm,
             against_policy=first.policy,
-            against_arm=arm,
+            against_arm=against_arm,
         )
-        for arm in ("without", "control")
-        if {"with", arm} <= set(first.arms)
+        for policy, arm, against_arm in asked
     ]
-    if "without" in first.arms:
-        found += [
-            Endpoint(
-                kind="difference",
-                policy=other.policy,
-                arm="without",
-                against_policy=first.policy,
-                against_arm="without",
-            )
-            for other in policies[1:]
-        ]
-    if not found:
-        raise UsageError("there is nothing to compare: give two arms or two policies.")
-    return found
 
 
 def _expected(wanted: Wanted) -> Expected:

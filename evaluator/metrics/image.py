@@ -141,7 +141,11 @@ def score_pair(
     recorded, replayed = image_quality.as_float(recorded_u8), image_quality.as_float(replayed_u8)
     refuse_swapped(recorded, replayed)
     brightened = image_quality.aligned(recorded_u8, replayed_u8, "gain")
-    maps = _ssim(recorded, replayed)
+    maps: SsimMaps | UndefinedStatisticError
+    try:
+        maps = image_quality.ssim_maps(recorded, replayed)
+    except UndefinedStatisticError as error:
+        maps = error
     found = {
         RAW: _scored(recorded, replayed, maps, paddings=("valid", "zero")),
         GAIN: _scored(recorded, brightened, maps, paddings=()),
@@ -157,15 +161,6 @@ def score_pair(
             reasons[LPIPS] = error.reason
         found[RAW] = ImageScore(values=values, reasons=reasons)
     return found
-
-
-def _ssim(
-    recorded: Float[np.ndarray, "height width 3"], replayed: Float[np.ndarray, "height width 3"]
-) -> SsimMaps | UndefinedStatisticError:
-    try:
-        return image_quality.ssim_maps(recorded, replayed)
-    except UndefinedStatisticError as error:
-        return error
 
 
 _SSIM_OF: dict[Padding, str] = {"valid": "ssim", "zero": "ssim_zero"}

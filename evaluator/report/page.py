@@ -17,7 +17,7 @@ from bridge.errors import MissingDependencyError
 from bridge.whole_file import write_whole
 from evaluator.report import sections, wording
 from evaluator.report.figures import DARK, LIGHT, Drawing
-from evaluator.report.front import FIGURES, front, front_tables
+from evaluator.report.front import FIGURES, front
 from evaluator.report.sections import OTHER, SECTIONS, TRIALS, Section
 from evaluator.report.views import Figures, Shown, is_number, used_columns, view
 from evaluator.result import Measurement, Results, Table
@@ -70,7 +70,7 @@ def page(results: Results, figures: Sequence[Drawing] = (), *, everything: bool 
     """Build the page of the results."""
     shown = sections.shown_tables(results, everything=everything)
     shown_first = [each for name in FIGURES for each in figures if each.id == name][:1]
-    tables_first = front_tables(results)
+    tables_first = [table for table in results.tables if table.id == "success" and table.rows]
     later = replace(results, tables=tuple(t for t in shown if t not in tables_first))
     rest = [each for each in figures if each not in shown_first]
     parts = [
@@ -144,21 +144,13 @@ def name_shared(report: Path) -> None:
 
 def _part(section: Section, results: Results, figures: Sequence[Drawing]) -> Part | None:
     """Collect one part, or nothing when the run has nothing for it."""
-    tables = [
-        each
-        for each in results.tables
-        if each.id != TRIALS and sections.section_of(each.id) is section
-    ]
+    found = [table for table in results.tables if sections.section_of(table.id) is section]
+    tables = [(table, is_long(table)) for table in found if table.id != TRIALS]
     drawn = [drawing for drawing in figures if drawing.id in section.figures]
     numbers = sections.numbers_of(section, results.measurements)
     if not tables and not drawn and not any(m.value is not None for _, m in numbers):
         return None
-    return Part(
-        section=section,
-        numbers=numbers,
-        figures=drawn,
-        tables=[(table, is_long(table)) for table in tables],
-    )
+    return Part(section=section, numbers=numbers, figures=drawn, tables=tables)
 
 
 def _made_by(software: Mapping[str, Any]) -> str:

@@ -125,16 +125,15 @@ def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str |
 
 
 def _reviewed(row: TrialRow, off: tuple[float | None, float | None], region: str) -> TrialRow:
-    kind = failure_kind(row)
+    kind, parts = failure_kind(row), ("cause", "stage", "bodies")
+    failure: dict[str, Any] = {f"fail_{part}": getattr(kind, part, "") for part in parts}
     return replace(
         row,
         failed_stage=first_failed_stage(row) if row.recorded is False else "",
         distance_m=off[0],
         lag_s=off[1],
-        fail_cause="" if kind is None else kind.cause,
-        fail_stage="" if kind is None else kind.stage,
-        fail_bodies="" if kind is None else kind.bodies,
         start_region=region,
+        **failure,
     )
 
 

@@ -78,10 +78,11 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
     """Sum a verdict up."""
     name = verdict.first_failing
     factor = None if name is None else verdict.factors()[name]
+    undecided = [each for each, known in verdict.factors().items() if known.value is None]
     probability = None if verdict.p_success is None else verdict.p_success.get("value")
     return VerdictSummary(
         accepted=verdict.accepted,
-        why_undecided=verdict.reason or _undecided(verdict),
+        why_undecided=verdict.reason or f"{' and '.join(undecided)} undecided",
         p_success=None if probability is None else float(probability),
         first_failing=name,
         failing_cause=None if factor is None else factor.cause,
@@ -90,11 +91,6 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
         failing_bodies=() if factor is None else factor.bodies,
         failing_t_ns=None if factor is None else factor.first_t_ns,
     )
-
-
-def _undecided(verdict: Verdict) -> str:
-    names = [name for name, factor in verdict.factors().items() if factor.value is None]
-    return f"{' and '.join(names)} undecided"
 
 
 def _detail(verdict: Verdict) -> str | None:
@@ -217,11 +213,8 @@ def localised_positions(localisations: Iterable[bytes]) -> list[LocalisedPositio
         pose = record.get("T_base_object")
         if record["found"] and pose is not None:
             x, y, z = pose["p_m"]
-            places.append(
-                LocalisedPosition(
-                    object_id=record["object"], stamp_ns=record["stamp_ns"], p_m=(x, y, z)
-                )
-            )
+            about = {"object_id": record["object"], "stamp_ns": record["stamp_ns"]}
+            places.append(LocalisedPosition(**about, p_m=(x, y, z)))
     return places
 
 
@@ -232,11 +225,8 @@ def positions_at_start(
 
     A later one of an object replaces an earlier one.
     """
-    return {
-        place.object_id: place.p_m
-        for place in places
-        if started_ns is None or place.stamp_ns <= started_ns
-    }
+    before = (each for each in places if started_ns is None or each.stamp_ns <= started_ns)
+    return {each.object_id: each.p_m for each in before}
 
 
 def _read_log(episode: Episode) -> _Log:
@@ -382,9 +372,7 @@ def read_derived(path: Path) -> DerivedFacts:
     info, derived = episode.info, _without_seed(derived)
     try:
         if _is_dynamic(derived):
-            mine = [
-                decided for _, decided in verdicts(episode) if decided.plan_id == derived.plan_id
-            ]
+            mine = [each for _, each in verdicts(episode) if each.plan_id == derived.plan_id]
             last = summarise_verdict(mine[-1]) if mine else None
             first = first_divergence(episode) if derived.trajectory == "executed" else ""
             return DerivedFacts(info=info, derived=derived, verdict=last, divergence=first)
@@ -436,27 +424,20 @@ class DerivedIndex:
             return Replay(reason=reason)
         current = _current(made, source_sha256)
         if not current:
-            reason = (
-                f"{made[0].path.name} was made from another version of the episode (its hash "
-                "differs); replay it again"
-            )
-            return Replay(reason=reason)
+            stale = f"{made[0].path.name} was made from another version of the episode (its hash "
+            return Replay(reason=f"{stale}differs); replay it again")
         counted = [file for file in current if not file.why_not_counted]
+        file = _newest(counted or current)
         if not counted:
-            file = _newest(current)
-            why = f"{file.path.name} does not count: {file.why_not_counted}"
-            return Replay(reason=why)
-        file = _newest(counted)
+            return Replay(reason=f"{file.path.name} does not count: {file.why_not_counted}")
         decided = file.facts.verdict
         if file.facts.broken:
             return Replay(file=file, reason=f"{file.path.name}: {file.facts.broken}")
         if decided is None:
             return Replay(file=file, reason=f"{file.path.name} holds no verdict")
-        undecided: str | None = None
-        if decided.accepted is None:
-            why = decided.why_undecided
-            undecided = f"the twin could not decide the {trajectory} replay: {why}"
-        return Replay(file=file, verdict=decided, reason=undecided)
+        undecided = f"the twin could not decide the {trajectory} replay: {decided.why_undecided}"
+        why = undecided if decided.accepted is None else None
+        return Replay(file=file, verdict=decided, reason=why)
 
     def answer_of_cells_engine(
         self, *, source: str, source_sha256: str, plan_id: str
@@ -467,11 +448,8 @@ class DerivedIndex:
         None without such a replay, or where it could not decide.
         """
         made = _current(self._replays.get((source, plan_id, "planned"), []), source_sha256)
-        alone = [
-            file
-            for file in made
-            if file.info.stand_in and (file.derived.engine or "").startswith(STAND_IN_ENGINE)
-        ]
+        stand_in = [file for file in made if file.info.stand_in]
+        alone = [f for f in stand_in if (f.derived.engine or "").startswith(STAND_IN_ENGINE)]
         decided = _newest(alone).facts.verdict if alone else None
         return None if decided is None or " and " in (decided.engine or "") else decided.accepted
 

@@ -101,11 +101,8 @@ class Images:
 
     def masks_of(self, key: Key) -> dict[str, np.ndarray]:
         """Decode the masks of one view; empty ones say nothing and are left out."""
-        found = {
-            name: decode_color(of[key])[..., 0] > 127
-            for name, of in sorted(self.masks.items())
-            if key in of
-        }
+        stored = {name: of[key] for name, of in sorted(self.masks.items()) if key in of}
+        found = {name: decode_color(data)[..., 0] > 127 for name, data in stored.items()}
         return {name: mask for name, mask in found.items() if mask.any()}
 
 
@@ -123,11 +120,8 @@ def images_of(views: Episode, source: Episode | None) -> Images:
     images = read_images(views)
     if source is not None and not images.color[RECORDED]:
         wanted = {stamp for _, stamp in images.color[RENDERED]}
-        images.color[RECORDED] = {
-            key: data
-            for key, data in read_images(source).color[RECORDED].items()
-            if key[1] in wanted
-        }
+        theirs = read_images(source).color[RECORDED]
+        images.color[RECORDED] = {key: theirs[key] for key in theirs if key[1] in wanted}
     return images
 
 
@@ -186,13 +180,12 @@ def _score(images: Images, net: PerceptualNet | None, key: Key) -> ViewScore:
 
 
 def _score_depth(images: Images, key: Key) -> DepthScore | None:
-    pair = [images.depth[name].get(key) for name in (RECORDED, RENDERED)]
-    if pair[0] is None or pair[1] is None:
+    pair = [of[key] for name in (RECORDED, RENDERED) if key in (of := images.depth[name])]
+    if len(pair) < 2:
         return None
     try:
-        return image_metrics.score_depth(
-            DepthImage.from_cdr(pair[0]).depth_m(), DepthImage.from_cdr(pair[1]).depth_m()
-        )
+        recorded_m, rendered_m = (DepthImage.from_cdr(data).depth_m() for data in pair)
+        return image_metrics.score_depth(recorded_m, rendered_m)
     except UndefinedStatisticError:
         return None
 
