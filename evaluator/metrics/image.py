@@ -81,9 +81,8 @@ METRICS: dict[str, ImageMetric] = {
 }
 """Every image metric by its id, in the order of a table's columns."""
 LPIPS = "lpips_vgg_01"
-LPIPS_NOT_COMPUTED = (
-    "not computed: no backbone (its weights are not shipped and nothing is downloaded)"
-)
+_NO_WEIGHTS = "its weights are not shipped and nothing is downloaded"
+LPIPS_NOT_COMPUTED = f"not computed: no backbone ({_NO_WEIGHTS})"
 
 
 @runtime_checkable
@@ -242,9 +241,8 @@ def score_depth(
 ) -> DepthScore:
     """Compare two depth images [m]; 0 is "no measurement"."""
     if recorded_m.shape != rendered_m.shape:
-        raise image_quality.ImageShapeError(
-            found=f"the recorded depth is {recorded_m.shape}, the rendered one {rendered_m.shape}"
-        )
+        found = f"the recorded depth is {recorded_m.shape}, the rendered one {rendered_m.shape}"
+        raise image_quality.ImageShapeError(found=found)
     both = (recorded_m > 0) & (rendered_m > 0)
     if not both.any():
         raise UndefinedStatisticError(statistic="depth error", reason="no pixel has both depths")

@@ -79,13 +79,11 @@ def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
     """
     names = tuple(name for name in recorded.names if name in replayed.names)
     if not names:
-        raise UndefinedStatisticError(
-            statistic="joint error", reason="recorded and replayed joints have no name in common"
-        )
+        reason = "recorded and replayed joints have no name in common"
+        raise UndefinedStatisticError(statistic="joint error", reason=reason)
     common = _common(recorded.stamps_ns, replayed.stamps_ns, "joint error")
     stamps = recorded.stamps_ns[common]
-    mine = [recorded.names.index(name) for name in names]
-    theirs = [replayed.names.index(name) for name in names]
+    mine, theirs = ([side.names.index(name) for name in names] for side in (recorded, replayed))
     difference = recorded.position[common][:, mine] - replayed.at(stamps)[:, theirs]
     wrapped = difference - 2 * np.pi * np.round(difference / (2 * np.pi))
     return JointErrors(names=names, stamps_ns=stamps, error_rad=wrapped)

@@ -87,11 +87,8 @@ def index_run(run: RunFolder, comparison: Comparison, results: Results, began_ns
 
 def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str | None) -> bytes:
     state = review_index.state_of(run)
-    off = {
-        motion.episode: (motion.path_max_m, motion.lag_s)
-        for motion in read.motions
-        if motion.against == "planned"
-    }
+    planned = [motion for motion in read.motions if motion.against == "planned"]
+    off = {motion.episode: (motion.path_max_m, motion.lag_s) for motion in planned}
     regions = start_regions(read.rows)
     trials = sorted(
         (

@@ -202,9 +202,8 @@ def other_names(views: Iterable[str]) -> dict[str, str]:
     for view in views:
         camera, stamp = view.rsplit("/", 1)
         seconds = seconds_text(int(stamp))
-        for name in (stamp, seconds, f"rgb/{seconds}"):
-            found.setdefault(name, []).append(view)
-        for name in (f"{camera}_{stamp}", f"{camera}/{seconds}", f"{camera}/rgb/{seconds}"):
+        named = (f"{camera}_{stamp}", f"{camera}/{seconds}", f"{camera}/rgb/{seconds}")
+        for name in (stamp, seconds, f"rgb/{seconds}", *named):
             found.setdefault(name, []).append(view)
     return {name: of[0] for name, of in found.items() if len(of) == 1}
 
@@ -317,12 +316,13 @@ def _gone(name: str, reason: str) -> Exclusion:
 def _unpaired(reference: ImageSet, method: ImageSet) -> list[Exclusion]:
     """Name images without a counterpart, on either side."""
     theirs, ours = set(method.load), set(reference.load)
-    missing = [(view, f"no image of this name in {method.where}") for view in sorted(ours - theirs)]
-    extra = [
-        (view, f"the reference has no such image ({reference.where})")
-        for view in sorted(theirs - ours)
+    no_image = f"no image of this name in {method.where}"
+    not_asked = f"the reference has no such image ({reference.where})"
+    return [
+        _gone(f"{method.name}: {view}", reason)
+        for views, reason in ((ours - theirs, no_image), (theirs - ours, not_asked))
+        for view in sorted(views)
     ]
-    return [_gone(f"{method.name}: {view}", reason) for view, reason in (*missing, *extra)]
 
 
 def _score_view(

@@ -229,24 +229,15 @@ def measure_images(
                 continue
             if variant != RAW and metric.id not in asked:
                 continue
-            weights = (
-                f"weights {net.weights}"
-                if net is not None and metric.id == image_metrics.LPIPS
-                else ""
-            )
-            parts = (
-                image_metrics.variant_words(variant),
-                protocol,
-                _lacking(metric, of_variant),
-                weights,
-            )
-            words = "".join(f"; {part}" for part in parts if part)
+            told = [image_metrics.variant_words(variant), protocol, _lacking(metric, of_variant)]
+            if net is not None and metric.id == image_metrics.LPIPS:
+                told.append(f"weights {net.weights}")
+            words = "".join(f"; {each}" for each in told if each)
             values = [s.values[metric.id] for s in of_variant if metric.id in s.values]
+            quantity = quantities[metric.id, variant == RAW]
             found.append(
                 measured(
-                    quantities[metric.id, variant == RAW].of(
-                        variant=variant, protocol=words, **part
-                    ),
+                    quantity.of(variant=variant, protocol=words, **part),
                     partial(mean_of, values, metric.column, _first_reason(metric, of_variant)),
                     n=len(values),
                     counted="image",
