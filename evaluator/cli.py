@@ -136,10 +136,7 @@ def _compare(
 
 
 def _with_reviews(
-    comparison: "Comparison",
-    sources: Sequence[Path],
-    reviews: Sequence[Path],
-    tables: TableOptions,
+    comparison: "Comparison", sources: Sequence[Path], reviews: Sequence[Path], tables: TableOptions
 ) -> "Comparison":
     """Hold the labels against other raters'."""
     from bridge.exchange.reviews import FOLDER, read_reviews
@@ -151,11 +148,7 @@ def _with_reviews(
 
 
 def _refuse_only_broken(results: "Results") -> None:
-    """End with an error, after the report, where no episode can be read and nothing else is there.
-
-    Raises:
-        EvaluatorError: Naming them.
-    """
+    """Refuse, after the report, where no episode can be read and nothing else is there."""
     unread = [item.episode for item in results.exclusions if item.scope == "everything"]
     if not unread or any(one.value is not None for one in results.measurements):
         return

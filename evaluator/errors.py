@@ -13,9 +13,7 @@ class AlikeNamesError(EvaluatorError):
 
     def __init__(self, *, kind: str, names: tuple[str, str], places: tuple[str, str]) -> None:
         """Remember both names and where they stand."""
-        self.kind = kind
-        self.names = names
-        self.places = places
+        self.kind, self.names, self.places = kind, names, places
         super().__init__(
             f"{kind} {names[0]!r} ({places[0]}) and {names[1]!r} ({places[1]}) cannot be told "
             "apart in the ids of results. Spell them alike if they are one, else further apart."

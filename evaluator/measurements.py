@@ -4,6 +4,8 @@ An id is a pattern: ``rate.{side}.{task}.{condition}.{policy}``. ``Quantity.of``
 what a ``Measurement`` is made with, so no other module spells an id.
 """
 
+from functools import partial
+
 from evaluator import motion_measurements as motion_measurements
 from evaluator.metrics import image
 from evaluator.metrics.image import METRICS, ImageMetric
@@ -17,6 +19,10 @@ from evaluator.quantity import slug as slug
 
 # ruff: noqa: E501  # one line for each definition
 
+_good, _bad, _plain = (partial(_new, "1", better) for better in ("higher", "lower", "none"))
+_good_pp, _bad_pp = (partial(_new, "pp", better) for better in ("higher", "lower"))
+"""Shares, coefficients and percentage points that are better when higher or lower, or neither."""
+
 
 # Success rates.
 
@@ -27,176 +33,115 @@ _SIDES = {
     "verdict": "plans accepted / plans judged: the gate's verdict on the plan actually sent, before motion; without replanning it was recorded and not obeyed, with replanning it selected these plans",
 }
 RATES = {
-    side: _new(f"rate.{side}.{{task}}.{{condition}}.{{policy}}", "1", "higher", words)
+    side: _good(f"rate.{side}.{{task}}.{{condition}}.{{policy}}", words)
     for side, words in _SIDES.items()
 }
 RATES_IN_COMMON = {
-    side: _new(
+    side: _good(
         f"rate_common.{side}.{{task}}.{{condition}}.{{policy}}",
-        "1",
-        "higher",
         f"{_SIDES[side]}; over the trials where both sides are known",
     )
     for side in ("recorded", "sim_planned")
 }
-RATE_BY_UNIT = _new(
+RATE_BY_UNIT = _good(
     "rate.recorded_{unit}.{task}.{condition}.{policy}",
-    "1",
-    "higher",
     "successes / {unit}s as labelled; {unit}s of one trial are not independent, so the interval is narrower than the trials justify",
 )
-RATE_AS_GIVEN = _new(
-    "rate.{side}.{task}.{condition}.{policy}",
-    "1",
-    "higher",
-    "successes / {unit}s, as given{where}",
+RATE_AS_GIVEN = _good(
+    "rate.{side}.{task}.{condition}.{policy}", "successes / {unit}s, as given{where}"
 )
-STAGE = _new(
+STAGE = _good(
     "stage.{task}.{condition}.{stage}",
-    "1",
-    "higher",
     "trials that passed stage {stage} of {task} / trials that reached it and whose ending is known",
 )
 
 # Which is better, and the protocol.
 
-COMPARED = _new(
+COMPARED = _good_pp(
     "comparison.pp.{second}.against.{first}",
-    "pp",
-    "higher",
     "recorded success of {second} less that of {first}, over all tasks, each weighted by its pairs: {words}",
 )
-COMPARED_IN_TASK = _new(
-    "comparison.pp.{second}.against.{first}.{task}",
-    "pp",
-    "higher",
-    "the same in {task}: {words}",
+COMPARED_IN_TASK = _good_pp(
+    "comparison.pp.{second}.against.{first}.{task}", "the same in {task}: {words}"
 )
 PROTOCOL_DEPARTURES = _new(
-    "protocol.departures",
     "count",
     "lower",
+    "protocol.departures",
     "departures of what was done from the protocol that was locked before the first trial",
 )
 
 # Agreement over groups. ``{what}`` says over which.
 
-PEARSON_R = _new(
-    "agreement.pearson_r",
-    "1",
-    "higher",
-    "Pearson r of the twin's and the recorded success rates {what}",
-    SIGNED,
+PEARSON_R = _good(
+    "agreement.pearson_r", "Pearson r of the twin's and the recorded success rates {what}", SIGNED
 )
-PEARSON_R_OF_CONDITION = _new(
-    "agreement.pearson_r.{condition}",
-    "1",
-    "higher",
-    PEARSON_R.definition,
-    SIGNED,
-)
-BLIND_SHARE = _new(
+PEARSON_R_OF_CONDITION = _good("agreement.pearson_r.{condition}", PEARSON_R.definition, SIGNED)
+BLIND_SHARE = _bad(
     "agreement.blind_share",
-    "1",
-    "lower",
     "share of groups of this kind in which the twin says nothing of what is recorded, by the model of all counts",
 )
-BLIND_GROUP = _new(
+BLIND_GROUP = _bad(
     "agreement.blind.{task}.{condition}.{policy}",
-    "1",
-    "lower",
     "probability that the twin says nothing of what is recorded in this group, where it is above 1/2",
 )
-REGRET = _new(
+REGRET = _bad_pp(
     "decision.regret_pp",
-    "pp",
-    "lower",
     "recorded success rate of the best candidate less that of what the twin ranks first ({words}), mean over the tasks that all have",
     (0.0, 100.0),
 )
-WRONG_PAIRS = _new(
+WRONG_PAIRS = _bad(
     "decision.wrong_pairs",
-    "1",
-    "lower",
     "pairs of candidates that the twin orders wrongly or as level / pairs whose recorded rates differ{words}",
 )
-WRONG_BY = _new(
+WRONG_BY = _bad_pp(
     "decision.wrong_pairs_pp",
-    "pp",
-    "lower",
     "mean recorded difference of the pairs that the twin orders wrongly{words}",
     (0.0, 100.0),
 )
-SPEARMAN = _new(
+SPEARMAN = _good(
     "agreement.spearman_rho",
-    "1",
-    "higher",
     "Spearman rank correlation of the same rates {what}; average ranks",
     SIGNED,
 )
 BIAS = _new(
-    "agreement.bias_pp",
     "pp",
     "none",
+    "agreement.bias_pp",
     "mean of sim rate - recorded rate {what}; above 0 the twin is optimistic",
 )
-MAE = _new(
-    "agreement.mae_pp",
-    "pp",
-    "lower",
-    "mean size of sim rate - recorded rate {what}",
-    (0.0, 100.0),
-)
-MMRV_RECORDED = _new(
+MAE = _bad_pp("agreement.mae_pp", "mean size of sim rate - recorded rate {what}", (0.0, 100.0))
+MMRV_RECORDED = _bad(
     "agreement.mmrv_recorded_gap",
-    "1",
-    "lower",
     "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of groups",
 )
 # Trial by trial: the replay, the verdict, the gate. ``{by}`` is sim_planned, verdict and so on.
 
-AGREED = _new(
-    "agreement.{by}.rate",
-    "1",
-    "higher",
-    "trials where {words} and the labelled outcome say the same / trials",
+AGREED = _good(
+    "agreement.{by}.rate", "trials where {words} and the labelled outcome say the same / trials"
 )
-PHI = _new(
-    "agreement.{by}.phi",
-    "1",
-    "higher",
-    "phi coefficient of {words} and the labelled outcome over trials",
-    SIGNED,
+PHI = _good(
+    "agreement.{by}.phi", "phi coefficient of {words} and the labelled outcome over trials", SIGNED
 )
-PPV = _new(
+PPV = _good(
     "agreement.{by}.ppv",
-    "1",
-    "higher",
     "positive predictive value: trials that succeeded / trials where {words} predicted success",
 )
-NPV = _new(
+NPV = _good(
     "agreement.{by}.npv",
-    "1",
-    "higher",
     "negative predictive value: trials that failed / trials where {words} predicted failure",
 )
 _BESIDE = "over trials where {words}, the forecast and the labelled outcome are known"
-BASE_RATE = _new(
+BASE_RATE = _plain(
     "baseline.{by}.base_rate",
-    "1",
-    "none",
     "trials that succeeded / trials where {words} and the labelled outcome are known: what always saying yes gets right",
 )
-BASELINE_ACCURACY = _new(
+BASELINE_ACCURACY = _plain(
     "baseline.{by}.{baseline}.rate",
-    "1",
-    "none",
     f"trials where the forecast without a twin ({{baseline}}) and the labelled outcome are the same / trials, {_BESIDE}",
 )
-BASELINE_GAIN = _new(
+BASELINE_GAIN = _good_pp(
     "baseline.{by}.{baseline}.twin_gain_pp",
-    "pp",
-    "higher",
     f"share of right answers of the twin minus that of the forecast ({{baseline}}), paired, {_BESIDE}",
 )
 # Images. A mean over views, before and after an alignment or a mask (``{variant}``).
@@ -204,9 +149,9 @@ BASELINE_GAIN = _new(
 
 def _image(images: str, metric: ImageMetric, variant: str) -> Quantity:
     return _new(
-        f"{images}.{metric.named(variant)}",
         metric.unit,
         "higher" if metric.higher_is_better else "lower",
+        f"{images}.{metric.named(variant)}",
         f"{metric.definition}{{protocol}}",
         UP if metric.id.startswith("lpips") else SIGNED if metric.unit == "1" else UP,
     )
@@ -219,23 +164,14 @@ VIEWS, RENDERS = (
     for images in _IMAGES
 )  # fmt: skip
 """By the metric, and whether the images were compared as they are stored."""
-LPIPS_MISSING = _new(
-    "views.{part}.lpips",
-    "1",
-    "lower",
-    "learned perceptual image patch similarity",
-    UP,
-)
+LPIPS_MISSING = _bad("views.{part}.lpips", "learned perceptual image patch similarity", UP)
 DEPTHS = {
     name: _new(
-        f"views.{{part}}.depth_{name}",
         "m",
         "lower",
+        f"views.{{part}}.depth_{name}",
         f"{words} depth error, {image.DEPTH_PROTOCOL}; {{after}}",
     )
-    for name, words in (
-        ("mean_abs_m", "mean absolute"),
-        ("median_abs_m", "median absolute"),
-    )
+    for name, words in (("mean_abs_m", "mean absolute"), ("median_abs_m", "median absolute"))
 }
 """By the field of ``DepthScore``."""

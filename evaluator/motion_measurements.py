@@ -6,9 +6,9 @@ from evaluator.quantity import new_quantity as _new
 
 MOTIONS = {
     name: _new(
-        f"motion.{{against}}.{name}",
         unit,
         "none" if name == "lag_s" else "lower",
+        f"motion.{{against}}.{name}",
         f"tool centre point, {{meaning}}: {words}, mean over trials; aligned by {{how}}",
         (-0.2, 0.6) if name == "lag_s" else None,
     )
@@ -26,9 +26,9 @@ MOTIONS = {
 _BODY = "body.{task}.{engine}.{body}."
 BODY_DISTANCES = {
     name: _new(
-        f"{_BODY}{name.rpartition('_')[0]}_median_{unit}",
         unit,
         "none" if unit == "s" else "lower",
+        f"{_BODY}{name.rpartition('_')[0]}_median_{unit}",
         f"{{what}}: {words}, median over recorded runs; replays against the run that they were made from, other simulated runs against every recorded one",
         (-0.2, 0.6) if unit == "s" else None,
     )
@@ -47,9 +47,9 @@ BODY_DISTANCES = {
 
 STATES = {
     name: _new(
-        f"state.{{by}}_to_{{against}}.{{task}}.{{condition}}.{name}_median_{unit}",
         unit,
         "lower",
+        f"state.{{by}}_to_{{against}}.{{task}}.{{condition}}.{name}_median_{unit}",
         "{quantity} after its last stage, {who} against where it was localised, in {where}: median over {count} episodes of each one's mean over its objects",
     )
     for name, unit in (("position", "m"), ("rotation", "rad"))

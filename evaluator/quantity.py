@@ -64,9 +64,7 @@ class Quantity:
         """Name one measurement."""
         parts = {name: slug(str(word)) for name, word in words.items() if f"{{{name}}}" in self.id}
         return Defined(
-            id=self.id.format(**parts),
-            unit=self.unit,
-            definition=self.definition.format(**words),
+            id=self.id.format(**parts), unit=self.unit, definition=self.definition.format(**words)
         )
 
     @cached_property
@@ -108,14 +106,14 @@ UP = (0.0, INFINITY)
 
 
 def new_quantity(
-    id: str,  # the word everywhere
     unit: str,
     better: Better,
+    id: str,  # the word everywhere
     definition: str,
     allowed: tuple[float, float] | None = None,
 ) -> Quantity:
     """Register a quantity; ids and definitions may hold names of parts in braces."""
-    low, high = RANGES[unit] if allowed is None else allowed
+    low, high = allowed or RANGES[unit]
     quantity = Quantity(id=id, unit=unit, definition=definition, better=better, low=low, high=high)
     REGISTRY.append(quantity)
     _FAMILIES.setdefault(id.partition(".")[0], []).append(quantity)

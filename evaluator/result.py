@@ -124,14 +124,11 @@ class Results:
 
     def get(self, measurement_id: str) -> Measurement:
         """Return one measurement."""
-        for measurement in self.measurements:
-            if measurement.id == measurement_id:
-                return measurement
-        names = ", ".join(measurement.id for measurement in self.measurements)
-        message = (
-            f"no measurement {measurement_id!r} in the results of {self.run}. There are: {names}."
-        )
-        raise EvaluatorError(message)
+        by_id = {measurement.id: measurement for measurement in self.measurements}
+        if measurement_id in by_id:
+            return by_id[measurement_id]
+        message = f"no measurement {measurement_id!r} in the results of {self.run}"
+        raise EvaluatorError(f"{message}. There are: {', '.join(by_id)}.")
 
     def to_record(self) -> dict[str, Any]:
         """Return the JSON record, checked against the schema.

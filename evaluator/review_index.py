@@ -109,11 +109,8 @@ class _Selected:
 
     def takes(self, trial: TrialRow) -> bool:
         """Say whether a trial is selected."""
-        return all(
-            _slug(getattr(trial, name)) == wanted
-            for name in FACETS
-            if (wanted := getattr(self, name))
-        )
+        asked = ((wanted, name) for name in FACETS if (wanted := getattr(self, name)))
+        return all(_slug(getattr(trial, name)) == wanted for wanted, name in asked)
 
     def ordered(self, trials: Sequence[TrialRow]) -> list[TrialRow]:
         """Return trials in the order asked for."""
@@ -176,12 +173,8 @@ class Selection(_Selected):
         return sorted(found, key=keys[0], reverse=is_turned)
 
 
-FAILURE_PARTS = {
-    "cause": "fail_cause",
-    "stage": "fail_stage",
-    "bodies": "fail_bodies",
-    "start": "start_region",
-}
+FAILURE_PARTS = {name: f"fail_{name}" for name in ("cause", "stage", "bodies")}
+FAILURE_PARTS["start"] = "start_region"
 """What failures are sorted by, and the fields that hold it."""
 _FAILED = {
     "": ("all", None),
@@ -223,11 +216,7 @@ class FailureSelection(_Selected):
         if self.failed and _FAILED.get(self.failed, ("", None))[1] != who:
             return False
         asked = ((getattr(self, name), field) for name, field in FAILURE_PARTS.items())
-        return all(
-            getattr(trial, field) == ("" if wanted == NOT_KNOWN else wanted)
-            for wanted, field in asked
-            if wanted
-        )
+        return all(wanted in ("", getattr(trial, field) or NOT_KNOWN) for wanted, field in asked)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -362,16 +351,10 @@ class ReviewIndex:
         if (content.version, content.software) != (VERSION, software()["version"]):
             raise UnusableIndexError("made by another version")
         self._content = content
-
-    @property
-    def about(self) -> dict[str, Any]:
+        self.about = content.about
         """Whatever is not a list of trials or files."""
-        return self._content.about
-
-    @property
-    def measurements(self) -> tuple[Measurement, ...]:
+        self.measurements = content.measurements
         """The numbers of ``results.json``, without the episodes behind them."""
-        return self._content.measurements
 
     def trials(
         self, selection: _Selected, *, limit: int | None = None, offset: int = 0
@@ -402,12 +385,9 @@ class ReviewIndex:
 
     def neighbours(self, selection: Selection, episode: str) -> tuple[str | None, str | None]:
         """Return the episodes before and after one in a selection; none for one outside of it."""
-        names = [each.episode for each in self.trials(selection) if each.file]
-        if episode not in names:
-            return None, None
-        place = names.index(episode)
-        before, after = names[:place][-1:], names[place + 1 :][:1]
-        return next(iter(before), None), next(iter(after), None)
+        names = [None, *(each.episode for each in self.trials(selection) if each.file), None]
+        place = names.index(episode) if episode in names else 0
+        return (names[place - 1], names[place + 1]) if place else (None, None)
 
     def values(self, name: str) -> tuple[tuple[str, str, int], ...]:
         """Return what a facet can be: slug, name as recorded, and number of trials."""

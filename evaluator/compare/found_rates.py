@@ -96,15 +96,8 @@ class _Group:
     def row(self, sheet: Sheet) -> SourceRow:
         """Write it with our names."""
         task, policy, condition, side, row = self.key
-        values = {
-            "task": task or sheet.path.stem,
-            "policy": policy,
-            "condition": condition,
-            "side": side or "real",
-            "unit": self.counted,
-            "n": self.n,
-            "k": self.k,
-        }
+        values = {"task": task or sheet.path.stem, "policy": policy, "condition": condition}
+        values |= {"side": side or "real", "unit": self.counted, "n": self.n, "k": self.k}
         figure = self.figure
         if figure is not None and figure.n is not None:
             values |= {"k": str(figure.k), "n": str(figure.n), "rate_percent": figure.number}
@@ -166,7 +159,6 @@ def _settle_beside_signs(sheet: Sheet, groups: Sequence[_Group]) -> None:
             group.unit = "rate_percent"
 
 
-UNITS = ("k", "rate_percent", "rate")
 WORDS = {"k": "counts", "rate_percent": "percent", "rate": "shares of 1"}
 
 
@@ -180,13 +172,13 @@ def _settle_pool(sheet: Sheet, groups: Sequence[_Group], *, counts: bool) -> Non
     if any(0 < v < 1 for v in numbers) and any(v > 1 for v in numbers):
         _settle_by_side(sheet, groups, counts=counts)
         return
-    units = [u for u in UNITS if (u != "k" or counts) and all(g.may_be(u) for g in groups)]
+    units = [u for u in WORDS if (u != "k" or counts) and all(g.may_be(u) for g in groups)]
     if any(v > 1 for v in numbers):
         units = [u for u in units if u != "rate"]
     elif any(0 < v < 1 for v in numbers):
         units = ["rate"] if "rate" in units else []
     if not units:
-        bad = next((g for g in groups if not any(map(g.may_be, UNITS))), groups[0])
+        bad = next((g for g in groups if not any(map(g.may_be, WORDS))), groups[0])
         text = bad.figure.text if bad.figure else ""
         of_n = f" of {bad.n}" if bad.n else ""
         found = f"{text!r} is neither a count{of_n} nor a rate{of_n}"

@@ -5,7 +5,7 @@ a cell that fits no reading is refused by its row.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,22 +13,10 @@ from bridge.errors import UsageError
 from bridge.exchange.table_text import MEASURED, UNKNOWN, SourceRow, TableOptions, plain_name
 from bridge.exchange.trials_csv import trials_of
 from bridge.exchange.trials_rates import rates_of
+from evaluator.compare import table_words
 from evaluator.compare.found_rates import rate_rows
 from evaluator.compare.found_sheet import NAMED, Found, Line, Sheet, Value, key_of, two_of
-from evaluator.compare.table_words import (
-    CellError,
-    Column,
-    DoubtfulTableError,
-    Figure,
-    folded,
-    is_number,
-    is_share,
-    is_summary,
-    read_cell,
-    read_name,
-    side_of,
-    side_within,
-)
+from evaluator.compare.table_words import CellError, Column, DoubtfulTableError, Figure, folded
 
 HEADERS = 3
 """Rows of names at the most."""
@@ -95,7 +83,7 @@ def _sheet(path: Path, grid: Sequence[Line], options: TableOptions) -> Sheet:
     columns = []
     for place, names in enumerate(zip(*levels, strict=True) if levels else ()):
         mapped = next((theirs[plain_name(n)] for n in names if plain_name(n) in theirs), "")
-        columns.append(read_name(place, [mapped] if mapped else names))
+        columns.append(table_words.read_name(place, [mapped] if mapped else names))
     if any(folded(column.name) == "policy" for column in columns):  # a checkpoint is another thing
         columns = [
             c if c.label != "policy" or folded(c.name) == "policy" else Column(c.place, c.name)
@@ -127,8 +115,8 @@ def _plain(cell: str) -> str:
 def _header(lines: Sequence[Line]) -> tuple[int, int]:
     """Return the first and the last row of names; (0, -1) where there is none."""
     top = 0
-    while top < len(lines) - 1 and _only_first(lines[top][1]):
-        top += 1
+    while top < len(lines) - 1 and lines[top][1][0] and not any(lines[top][1][1:]):
+        top += 1  # a title
     for last in range(top, min(top + HEADERS, len(lines))):
         words = sum(map(_is_word, lines[last][1]))
         if not words or (words == 1 and any(c and _is_figure(c) for c in lines[last][1])):
@@ -139,14 +127,10 @@ def _header(lines: Sequence[Line]) -> tuple[int, int]:
     return (top, top) if lines else (0, -1)
 
 
-def _only_first(cells: Sequence[str]) -> bool:
-    return bool(cells[0]) and not any(cells[1:])
-
-
 def _is_word(cell: str) -> bool:
     if _is_figure(cell):
         return False
-    column = read_name(0, [cell])
+    column = table_words.read_name(0, [cell])
     return bool(column.label or column.side or column.figure)
 
 
@@ -160,7 +144,7 @@ def _names_too(cells: Sequence[str]) -> bool:
 
 def _figure(cell: str) -> Figure | None:
     try:
-        return read_cell(0, cell)
+        return table_words.read_cell(0, cell)
     except CellError:
         return None
 
@@ -173,7 +157,7 @@ def _spread(level: list[str], lowest: Sequence[str]) -> None:
     """Let a merged name stand above all its columns."""
     for place in range(1, len(level)):
         above = level[place - 1]
-        is_label = bool(above and read_name(0, [above]).label)
+        is_label = bool(above and table_words.read_name(0, [above]).label)
         if not level[place] and lowest[place] and above and not is_label:
             level[place] = above
 
@@ -188,11 +172,11 @@ def _body(
     before: list[str] = []
     for number, cells in lines:
         filled = [cell for cell in cells if cell]
-        if len(filled) == 1 and side_of(filled[0]):
-            section = side_of(filled[0])
+        if len(filled) == 1 and table_words.side_of(filled[0]):
+            section = table_words.side_of(filled[0])
         elif cells in levels:
             title, note, before = note or title, "", []  # a further table with a title of its own
-        elif any(is_summary(cells[place]) for place in named):
+        elif any(table_words.is_summary(cells[place]) for place in named):
             sheet.found.notes.append(f"row {number} sums up others")
         elif len(filled) == 1 and len(cells) > 1 and cells[0]:
             note = cells[0]
@@ -232,7 +216,7 @@ def _settle_sides(sheet: Sheet) -> None:
         return
     for place, column in enumerate(sheet.columns):
         texts = [cell for cell in sheet.cells(column) if cell]
-        all_sides = bool(texts) and all(map(side_of, texts))
+        all_sides = bool(texts) and all(map(table_words.side_of, texts))
         if all_sides and not column.side:
             sheet.columns[place] = Column(place=place, name=column.name, label="side")
         elif column.label == "side" and folded(column.name) != "side" and not all_sides:
@@ -245,7 +229,7 @@ def _settle_sides(sheet: Sheet) -> None:
     if any(column.side for column in sheet.columns):
         return
     for column in [c for c in sheet.columns if c.label in NAMED]:
-        split = [side_within(cell) for cell in sheet.cells(column)]
+        split = [table_words.side_within(cell) for cell in sheet.cells(column)]
         if split and all(side for side, _ in split):
             for (_, cells), (side, rest) in zip(sheet.lines, split, strict=True):
                 cells[column.place], cells[width] = rest, side
@@ -300,7 +284,7 @@ def _values(sheet: Sheet) -> list[Value]:
 def _measured(sheet: Sheet, label: str) -> Column | None:
     """Return the one column of progress or of time, where its cells are that."""
     these = [column for column in sheet.columns if column.label == label]
-    is_ours = is_share if label == "progress" else is_number
+    is_ours = table_words.is_share if label == "progress" else table_words.is_number
     fits = [c for c in these if all(is_ours(t) or t in UNKNOWN for t in sheet.cells(c))]
     return fits[0] if len(these) == 1 and fits else None
 
@@ -343,13 +327,13 @@ def _value(
 ) -> Value:
     labels = dict(about)
     word = labels.pop("side")
-    side = column.side or (side_of(word) if word else "")
+    side = column.side or (table_words.side_of(word) if word else "")
     if "side" in sheet.labels and not side and cells[column.place]:
         raise sheet.refuse(row, f"side is {word!r}", "Sides: sim, real, stand-in")
     if column.rest and rest_is:
         labels[rest_is] = column.rest
     try:
-        figure = read_cell(row, cells[column.place])
+        figure = table_words.read_cell(row, cells[column.place])
     except CellError as error:
         text = cells[column.place]
         raise sheet.refuse(row, f"{column.name} is {text!r}, which {error}", "Correct it") from None
@@ -359,10 +343,8 @@ def _value(
 def _value_columns(sheet: Sheet, labels: dict[str, Column | None]) -> tuple[list[Column], str]:
     """Return the columns of figures, and what the rest of their names says: a task or a policy."""
     free = [c for c in sheet.columns if not c.label and c.place not in sheet.read and c.name]
-    free = [c for c in free if not is_summary(c.rest) and not c.is_beside]
-    rest_is = "task" if labels["policy"] else "policy"
-    if labels["task"] and labels["policy"]:
-        rest_is = ""
+    free = [c for c in free if not table_words.is_summary(c.rest) and not c.is_beside]
+    rest_is = "policy" if not labels["policy"] else "" if labels["task"] else "task"
     sided = [c for c in free if c.side]
     plain = [c for c in free if c.figure and not c.side and not c.rest]
     if sided:
@@ -417,10 +399,11 @@ def _unnamed(
 ) -> tuple[list[Column], str]:
     """Columns of figures under names that we do not know: trials by number, or tasks."""
     numbered = [c for c in others if c.name.split()[-1].isdigit() and not c.figure]
-    if numbered and all(_all_answers(sheet.cells(c)) for c in numbered):
+    told = [table_words.read_cell(0, text) for c in numbered for text in sheet.cells(c)]
+    if numbered and all(each is None or each.answer is not None for each in told):
         return numbered, ""
     named = [c for c in others if c.rest and not c.figure]
-    figures = [read_cell(0, text) for c in named for text in sheet.cells(c)]
+    figures = [table_words.read_cell(0, text) for c in named for text in sheet.cells(c)]
     repeats = any(c.name.split()[-1].isdigit() and folded(c.name)[:4] != "task" for c in named)
     if repeats or not all(each is None or each.is_certain for each in figures):
         names = ", ".join(repr(c.name) for c in named)
@@ -428,11 +411,6 @@ def _unnamed(
             f"{names} are read as success rates of a {rest_is or 'task'} each"
         )
     return [*named, *(c for c in plain if c.figure == "n")], rest_is
-
-
-def _all_answers(texts: Iterable[str]) -> bool:
-    figures = [read_cell(0, text) for text in texts]
-    return all(each is None or each.answer is not None for each in figures)
 
 
 # Trials.

@@ -10,26 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bridge.errors import UsageError
-from bridge.exchange.table_text import (
-    AS_SAVED,
-    ENDED,
-    MEASURED,
-    OUTCOME_LIKE,
-    UNKNOWN,
-    TableOptions,
-    TableText,
-    answer_of,
-    open_table,
-    plain_name,
-    rows_of,
-)
-from bridge.exchange.trials_csv import (
-    COLUMNS,
-    SIDES_OF_TRIAL,
-    TrialRecord,
-    open_trials,
-    trials_of,
-)
+from bridge.exchange import table_text, trials_csv
 from bridge.exchange.trials_rates import COLUMNS as RATE_COLUMNS
 from bridge.exchange.trials_rates import RateRecord
 from evaluator.compare.found_table import read_found
@@ -46,25 +27,25 @@ class Taken:
     path: Path
     kind: str
     summary: str
-    trials: tuple[TrialRecord, ...] = ()
+    trials: tuple[trials_csv.TrialRecord, ...] = ()
     rates: tuple[RateRecord, ...] = ()
 
 
-def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
+def take(path: Path, options: table_text.TableOptions = table_text.AS_SAVED) -> Taken:
     """Read a file; its content tells what it is."""
     if path.suffix.lower() == ".json":
         raise UsageError(f"{path} is JSON. Save it as a table: CSV, TSV, text or .xlsx.")
-    known = (*COLUMNS, *RATE_COLUMNS, "statistic", "printed")
+    known = (*trials_csv.COLUMNS, *RATE_COLUMNS, "statistic", "printed")
     _refuse_unknown(options, known)
-    table = open_table(path, known, options, near=False, words=KNOWN)
+    table = table_text.open_table(path, known, options, near=False, words=KNOWN)
     header = set(table.header)
     _refuse_changed(table)
     if "statistic" in header:
         return Taken(path=path, kind=PUBLISHED, summary=f"{path.name}: rates with printed figures")
-    others = {"side", "real", "sim"} & {*header, *map(plain_name, table.left)}
-    if "task" in header and not others and set(SIDES_OF_TRIAL) & header:
-        opened = open_trials(path, _with_outcome(table, options))
-        trials = trials_of(rows_of(opened))
+    others = {"side", "real", "sim"} & {*header, *map(table_text.plain_name, table.left)}
+    if "task" in header and not others and set(trials_csv.SIDES_OF_TRIAL) & header:
+        opened = trials_csv.open_trials(path, _with_outcome(table, options))
+        trials = trials_csv.trials_of(table_text.rows_of(opened))
         understood = opened.understood("trials", len(trials))
         return Taken(path=path, kind="trials", summary=understood, trials=tuple(trials))
     found = read_found(path, table.grid, options)
@@ -73,9 +54,9 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     return Taken(path=path, kind=kind, summary=summary, trials=found.trials, rates=found.rates)
 
 
-def _refuse_changed(table: TableText) -> None:
+def _refuse_changed(table: table_text.TableText) -> None:
     """Refuse a policy that was another checkpoint before: one name would stand for both."""
-    plain = list(map(plain_name, table.header))
+    plain = list(map(table_text.plain_name, table.header))
     if {"policy", "checkpoint"} <= set(plain):
         policy, who = (plain.index(name) for name in ("policy", "checkpoint"))
         rows = (
@@ -84,26 +65,28 @@ def _refuse_changed(table: TableText) -> None:
         refuse_changed((where, row[policy].strip(), row[who].strip()) for where, row in rows)
 
 
-def _with_outcome(table: TableText, options: TableOptions) -> TableOptions:
+def _with_outcome(
+    table: table_text.TableText, options: table_text.TableOptions
+) -> table_text.TableOptions:
     """Map the one column that is called an outcome, and one of progress and of time, by content."""
     found = [options.map] if options.map else []
     for ours, names, is_ours in (
-        ("recorded", OUTCOME_LIKE, _is_answer),
-        ("progress", MEASURED["progress"], is_share),
-        ("time_s", MEASURED["time_s"], is_number),
+        ("recorded", table_text.OUTCOME_LIKE, _is_answer),
+        ("progress", table_text.MEASURED["progress"], is_share),
+        ("time_s", table_text.MEASURED["time_s"], is_number),
     ):
-        named = [name for name in table.left if plain_name(name) in names]
+        named = [name for name in table.left if table_text.plain_name(name) in names]
         if ours in table.header or len(named) != 1:
             continue
         place = table.header.index(named[0])
         texts = [cells[place].strip().lower() for _, cells in table.grid[1:] if place < len(cells)]
-        if all(text in UNKNOWN or is_ours(text) for text in texts):
+        if all(text in table_text.UNKNOWN or is_ours(text) for text in texts):
             found.append(f"{ours}={named[0]}")
     return replace(options, map=",".join(found))
 
 
 def _is_answer(text: str) -> bool:
-    return text in ENDED or answer_of(text) is not None
+    return text in table_text.ENDED or table_text.answer_of(text) is not None
 
 
 def ranges(rates: Sequence[RateRecord]) -> str:
@@ -119,7 +102,7 @@ def ranges(rates: Sequence[RateRecord]) -> str:
     return f"{groups} group{'' if groups == 1 else 's'}; {', '.join(parts)}{lacks}"
 
 
-def _refuse_unknown(options: TableOptions, known: Sequence[str]) -> None:
+def _refuse_unknown(options: table_text.TableOptions, known: Sequence[str]) -> None:
     """Refuse a mapping onto a column that no table has."""
     for name in options.mapped:
         if name not in known:

@@ -13,19 +13,9 @@ from itertools import product
 from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
+from bridge.exchange import trials_rates
 from bridge.exchange.table_text import AS_SAVED, SourceRow, TableError, TableOptions, read_rows
 from bridge.exchange.trials_csv import SIDES
-from bridge.exchange.trials_rates import (
-    COLUMNS,
-    AmbiguousRateError,
-    ImpossibleRateError,
-    RateRecord,
-    check_beside,
-    half_digit,
-    is_figure,
-    printed_rate,
-    read_rate,
-)
 from evaluator.compare.agreement import sides, usable_groups
 from evaluator.compare.notes import with_notes
 from evaluator.compare.rates import compare_records
@@ -37,19 +27,9 @@ from evaluator.statistics.agreement import bias, mean_rate, mmrv, pearson, spear
 from evaluator.statistics.intervals import relative_gain
 
 EXTRA = ("statistic", "printed")
-STATISTICS = (
-    "average_percent",
-    "gain_pp",
-    "gain_relative_percent",
-    "pearson_r",
-    "spearman_rho",
-    "bias_pp",
-    "mae_pp",
-    "rmse_pp",
-    "mmrv",
-)
 OF_ONE_SIDE = ("average_percent", "gain_pp", "gain_relative_percent")
 """Statistics that must say whose rates they are about."""
+STATISTICS = (*OF_ONE_SIDE, *["pearson_r", "spearman_rho", "bias_pp", "mae_pp", "rmse_pp", "mmrv"])
 AS_PRINTED, ROUNDED, DIFFERS = "as printed", "only from rounded figures", "differs"
 WITHIN = "within the rounding of its rates"
 IMPOSSIBLE, UNDEFINED, NOT_PRINTED = "impossible", "undefined", "not in the table"
@@ -109,15 +89,15 @@ def check_published(path: Path, options: TableOptions = AS_SAVED) -> PublishedCh
     Raises:
         TableError: Naming the row that cannot be read at all, or that is there twice.
     """
-    records: list[RateRecord] = []
+    records: list[trials_rates.RateRecord] = []
     claims: list[_Claim] = []
     findings: list[Finding] = []
-    for row in read_rows(path, ("task", "side", *EXTRA), (*COLUMNS, *EXTRA), options):
+    for row in read_rows(path, ("task", "side", *EXTRA), (*trials_rates.COLUMNS, *EXTRA), options):
         if row.text("statistic"):
             claims.append(_claim(row))
             continue
         record, finding = _read(row)
-        check_beside(row, record, records)
+        trials_rates.check_beside(row, record, records)
         records.append(record)
         findings += [] if finding is None else [finding]
     comparison = compare_records(records, path.stem)
@@ -140,7 +120,7 @@ def _claim(row: SourceRow) -> _Claim:
         value = Decimal(row.text("printed").removesuffix("%"))
     except InvalidOperation:
         value = Decimal("NaN")
-    if not is_figure(value):
+    if not trials_rates.is_figure(value):
         raise row.refuse(f"printed is {row.text('printed')!r}", "Give a number")
     side = row.text("side")
     if side not in SIDES and (side or statistic in OF_ONE_SIDE):
@@ -148,34 +128,31 @@ def _claim(row: SourceRow) -> _Claim:
     return _Claim(
         row=row,
         statistic=statistic,
-        task=row.text("task"),
         side="sim" if side == "sim" else "recorded",
-        condition=row.text("condition"),
-        policy=row.text("policy"),
+        **{name: row.text(name) for name in ("task", "condition", "policy")},
         value=value,
-        half=half_digit(value),
+        half=trials_rates.half_digit(value),
     )
 
 
-def _read(row: SourceRow) -> tuple[RateRecord, Finding | None]:
+def _read(row: SourceRow) -> tuple[trials_rates.RateRecord, Finding | None]:
     """Read a rate; one that no count gives, or several, is kept without n, and said."""
     k, n = row.text("k"), row.text("n")
     refusal: TableError
     try:
-        return read_rate(row), None
-    except ImpossibleRateError as error:
+        return trials_rates.read_rate(row), None
+    except trials_rates.ImpossibleRateError as error:
         refusal, instead, verdict = error, f"{k}/{n}" if k else f"no count of {n}", IMPOSSIBLE
-    except AmbiguousRateError as error:
+    except trials_rates.AmbiguousRateError as error:
         refusal, instead, verdict = error, f"several counts of {n}", AMBIGUOUS
-    printed = printed_rate(row)
+    printed = trials_rates.printed_rate(row)
     if printed is None:
         raise refusal
-    names = (row.text("task"), row.text("condition"), row.text("side"))
-    what = " ".join(name for name in names if name)
+    what = " ".join(filter(None, map(row.text, ("task", "condition", "side"))))
     text = row.text("rate_percent") or row.text("rate")
     note = str(refusal).partition(f" row {row.row}: ")[2]
     kept = {name: text for name, text in row.values.items() if name not in ("k", "n")}
-    return read_rate(replace(row, values=kept)), Finding(
+    return trials_rates.read_rate(replace(row, values=kept)), Finding(
         row.row, what, text, None, verdict, note, instead
     )
 
@@ -184,7 +161,7 @@ Halves = Mapping[tuple[str, ...], Fraction]
 """How far each rate may lie from the printed one, by task, condition, policy and side."""
 
 
-def _key_of(record: RateRecord) -> tuple[str, ...]:
+def _key_of(record: trials_rates.RateRecord) -> tuple[str, ...]:
     side = "sim" if record.side == "sim" else "recorded"
     return record.task, record.condition, record.policy, side
 
@@ -195,11 +172,7 @@ def _judge(
     side = claim.side if claim.statistic in OF_ONE_SIDE else ""
     parts = (claim.statistic, claim.task, side, claim.condition, claim.policy)
     what = " ".join(part for part in parts if part)
-    groups = [
-        group
-        for group in groups
-        if claim.task in ("", group.task) and claim.policy in ("", group.policy)
-    ]
+    groups = [g for g in groups if claim.task in ("", g.task) and claim.policy in ("", g.policy)]
     printed = str(claim.value)
     try:
         value = _value(claim.statistic, claim.side, claim.condition, groups)
@@ -309,12 +282,9 @@ def _reach(claim: _Claim, groups: Sequence[RateGroup], halves: Halves) -> tuple[
 
 def _with_rate(now: RateGroup, printed: RateGroup, side: str, step: Fraction) -> RateGroup:
     name = f"{side}_rate"
-    rate = getattr(printed, name)
-    return (
-        now
-        if rate is None
-        else replace(now, **{name: min(max(rate + step, Fraction(0)), Fraction(1))})
-    )
+    if (rate := getattr(printed, name)) is None:
+        return now
+    return replace(now, **{name: min(max(rate + step, Fraction(0)), Fraction(1))})
 
 
 def _from_rounded(claim: _Claim, claims: Sequence[_Claim]) -> float | None:

@@ -33,15 +33,8 @@ FIGURE_WORDS = {
     "percent": "rate_percent success_rate_percent sr_percent percent pct prozent",
     "outcome": "outcome result results success succeeded erfolg succes resultat ergebnis recorded",
 }
-TRANSLATED = {
-    "仿真": "sim",
-    "真实世界": "real",
-    "真机": "real",
-    "真实": "real",
-    "成功率": "success rate",
-    "方法": "method",
-    "任务": "task",
-}
+_CHINESE = "仿真=sim,真实世界=real,真机=real,真实=real,成功率=success rate,方法=method,任务=task"
+TRANSLATED = dict(pair.split("=") for pair in _CHINESE.split(","))
 """Words of a script without blanks between them, each as one of the above."""
 AXES = ("x", "y")
 """Said of which axis of a figure a column is, and nothing more."""
@@ -127,14 +120,8 @@ def read_name(place: int, levels: Sequence[str]) -> Column:
     side = figure = ""
     n: int | None = None
     rest: list[str] = []
-    if (
-        len(
-            set(
-                filter(None, (_SIDE.get(folded(w)) for w in re.split(r"[\W_]+", _translated(name))))
-            )
-        )
-        > 1
-    ):
+    sides = {_SIDE.get(folded(word)) for word in re.split(r"[\W_]+", _translated(name))}
+    if len(sides - {None}) > 1:
         return Column(place=place, name=name, rest="difference")
     for part in map(_translated, parts):
         inside = _N_INSIDE.search(part)

@@ -58,14 +58,5 @@ class Wanted:
 
     def __post_init__(self) -> None:
         """Refuse what is no share."""
-        refuse_outside(
-            self,
-            {
-                "rate": (0, 1),
-                "gain": (-1, 1),
-                "correlation": (-1, 1),
-                "power": (0.05, 0.999),
-                "alpha": (0.0001, 0.5),
-                "starts": (1, 1000),
-            },
-        )
+        shares = {"rate": (0, 1), "gain": (-1, 1), "correlation": (-1, 1), "power": (0.05, 0.999)}
+        refuse_outside(self, shares | {"alpha": (0.0001, 0.5), "starts": (1, 1000)})

@@ -11,29 +11,15 @@ from typing import Any
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.exchange.trials_csv import trials_path
+from bridge.task import protocol as protocols
 from bridge.task.find import chosen_task_file
 from bridge.task.plan import STUDY_ARMS
-from bridge.task.protocol import (
-    FILE_NAME,
-    Endpoint,
-    PolicyArms,
-    Protocol,
-    StudyTask,
-    blinding_codes,
-    read_protocol,
-    with_coins,
-)
+from bridge.task.protocol import Endpoint, PolicyArms, Protocol, StudyTask
 from bridge.whole_file import write_whole
 from evaluator.compare.success import CONDITION_OF_ARM
 from evaluator.design.config import StudyOptions, Wanted
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.sequential import (
-    Chances,
-    chances,
-    look_pairs,
-    pairs_for_power,
-    plan_power,
-)
+from evaluator.statistics import sequential
 
 ORDER_FILE = "order.csv"
 """In the run folder; with its outcomes filled in it is a trials CSV."""
@@ -49,9 +35,9 @@ class Expected:
     correlation: float
 
     @property
-    def of_pair(self) -> Chances:
+    def of_pair(self) -> sequential.Chances:
         """Chances of a pair of one start."""
-        return chances(*self.rates, self.correlation)
+        return sequential.chances(*self.rates, self.correlation)
 
     @property
     def words(self) -> str:
@@ -86,7 +72,9 @@ def design(study: StudyOptions, wanted: Wanted) -> Design:
     needed = None
     if expected.rates[0] != expected.rates[1]:
         try:
-            needed = pairs_for_power(expected.of_pair, power=wanted.power, alpha=wanted.alpha)
+            needed = sequential.pairs_for_power(
+                expected.of_pair, power=wanted.power, alpha=wanted.alpha
+            )
         except UndefinedStatisticError as error:
             raise UsageError(f"{error} Expect a larger difference.") from error
     starts = wanted.starts or math.ceil((needed or 0) / len(base.tasks))
@@ -122,53 +110,43 @@ def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
         primary=primary,
         secondary=tuple(secondary),
         alpha=wanted.alpha,
-        codes=blinding_codes(policies, study.study_seed) if study.blind else {},
+        codes=protocols.blinding_codes(policies, study.study_seed) if study.blind else {},
     )
     if "control" not in study.arms:
         return protocol
     if study.coin is None:
         raise UsageError("the arm control needs --coin, the chance of yes to each plan.")
     coins = {task.task: study.coin for task in protocol.tasks}
-    return with_coins(protocol, coins, "given by --coin")
+    return protocols.with_coins(protocol, coins, "given by --coin")
 
 
 def _task(name: str, study: StudyOptions) -> StudyTask:
-    if study.any_task and not name.endswith(".toml"):
-        return StudyTask(task=name, task_sha256=NO_TASK_FILE, session_seed=study.seed, starts=1)
-    file = chosen_task_file(name)
-    return StudyTask(
-        task=file.task().name, task_sha256=file.sha256, session_seed=study.seed, starts=1
-    )
+    sha256 = NO_TASK_FILE
+    if not study.any_task or name.endswith(".toml"):
+        file = chosen_task_file(name)
+        name, sha256 = file.task().name, file.sha256
+    return StudyTask(task=name, task_sha256=sha256, session_seed=study.seed, starts=1)
 
 
 def _endpoints(policies: Sequence[PolicyArms]) -> list[Endpoint]:
     """List the questions, the primary one first."""
     first = policies[0]
-    found = [
+    others = policies[1:] if "without" in first.arms else ()
+    against = [arm for arm in ("without", "control") if {"with", arm} <= set(first.arms)]
+    asked = [(first.policy, "with", arm) for arm in against]
+    asked += [(other.policy, "without", "without") for other in others]
+    if not asked:
+        raise UsageError("there is nothing to compare: give two arms or two policies.")
+    return [
         Endpoint(
             kind="difference",
-            policy=first.policy,
-            arm="with",
+            policy=policy,
+            arm=arm,
             against_policy=first.policy,
-            against_arm=arm,
+            against_arm=against_arm,
         )
-        for arm in ("without", "control")
-        if {"with", arm} <= set(first.arms)
+        for policy, arm, against_arm in asked
     ]
-    if "without" in first.arms:
-        found += [
-            Endpoint(
-                kind="difference",
-                policy=other.policy,
-                arm="without",
-                against_policy=first.policy,
-                against_arm="without",
-            )
-            for other in policies[1:]
-        ]
-    if not found:
-        raise UsageError("there is nothing to compare: give two arms or two policies.")
-    return found
 
 
 def _expected(wanted: Wanted) -> Expected:
@@ -184,11 +162,11 @@ def _expected(wanted: Wanted) -> Expected:
 
 def _shows(pairs: int, wanted: Wanted, expected: Expected) -> list[str]:
     """Say when a study of so many pairs is looked at, and how likely it is decided by then."""
-    looks = look_pairs(pairs)
+    looks = sequential.look_pairs(pairs)
     listed = ", ".join(map(str, looks))
     found = [f"looked at after {listed} starts that all arms tried; it may stop at each"]
     if expected.rates[0] != expected.rates[1]:
-        by = plan_power(pairs, expected.of_pair, alpha=wanted.alpha)
+        by = sequential.plan_power(pairs, expected.of_pair, alpha=wanted.alpha)
         each = ", ".join(
             f"{100 * chance:.0f} % by {n}" for n, chance in zip(looks, by, strict=True)
         )
@@ -205,7 +183,7 @@ def lock(run_path: Path, made: Design) -> Protocol:
     Raises:
         UsageError: When the run has a protocol or trials already.
     """
-    path = run_path / FILE_NAME
+    path = run_path / protocols.FILE_NAME
     if path.exists():
         raise UsageError(
             f"{path} is locked: a study is designed once. Use another folder for another study."
@@ -215,7 +193,7 @@ def lock(run_path: Path, made: Design) -> Protocol:
         raise UsageError(f"{run_path} holds trials already: a study is designed before the first.")
     write_whole(run_path / ORDER_FILE, order_list(made.protocol))
     write_whole(path, made.protocol.to_json())
-    written = read_protocol(run_path)
+    written = protocols.read_protocol(run_path)
     if written is None:
         raise PathNotFoundError(path=path, what="protocol", hint="It was removed just now.")
     return written
@@ -249,7 +227,7 @@ def design_text(made: Design, written: Protocol, run_path: Path) -> str:
         *([] if made.needed is None else [f"Needed: {made.needed} starts over all tasks"]),
         *(f"At this size: {each}" for each in made.shows),
         made.expected.words.capitalize(),
-        f"Locked: {run_path / FILE_NAME}, sha256 {written.sha256}",
+        f"Locked: {run_path / protocols.FILE_NAME}, sha256 {written.sha256}",
         f"Order: {run_path / ORDER_FILE}, interleaved by --study-seed {protocol.study_seed}"
         + (", arms by code" if protocol.codes else ""),
         f"Then: fill in {ORDER_FILE}, robot-gst import trials {run_path / ORDER_FILE} "

@@ -133,9 +133,7 @@ def _middle(model: ObjectModel) -> Float[np.ndarray, "3"]:
 
 
 def _nearest(
-    poses: Mapping[str, Float[np.ndarray, "4 4"]],
-    task: Task,
-    T_base_tcp: Float[np.ndarray, "4 4"],
+    poses: Mapping[str, Float[np.ndarray, "4 4"]], task: Task, T_base_tcp: Float[np.ndarray, "4 4"]
 ) -> str:
     """The manipulated object whose middle is nearest to the tool."""
     return min(

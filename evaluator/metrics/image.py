@@ -13,20 +13,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from bridge.media.image_quality import (
-    ALIGNMENTS,
-    PADDINGS,
-    SIGMA,
-    WINDOW,
-    ImageShapeError,
-    Padding,
-    SsimMaps,
-    aligned,
-    as_float,
-    check_same_shape,
-    psnr_db,
-    ssim_maps,
-)
+from bridge.media import image_quality
+from bridge.media.image_quality import ALIGNMENTS, PADDINGS, SIGMA, WINDOW, Padding, SsimMaps
 from evaluator.errors import EvaluatorError, UndefinedStatisticError
 
 
@@ -93,9 +81,8 @@ METRICS: dict[str, ImageMetric] = {
 }
 """Every image metric by its id, in the order of a table's columns."""
 LPIPS = "lpips_vgg_01"
-LPIPS_NOT_COMPUTED = (
-    "not computed: no backbone (its weights are not shipped and nothing is downloaded)"
-)
+_NO_WEIGHTS = "its weights are not shipped and nothing is downloaded"
+LPIPS_NOT_COMPUTED = f"not computed: no backbone ({_NO_WEIGHTS})"
 
 
 @runtime_checkable
@@ -150,10 +137,14 @@ def score_pair(
     Raises:
         SwappedColourError: When the pair fits much better with red and blue exchanged.
     """
-    recorded, replayed = as_float(recorded_u8), as_float(replayed_u8)
+    recorded, replayed = image_quality.as_float(recorded_u8), image_quality.as_float(replayed_u8)
     refuse_swapped(recorded, replayed)
-    brightened = aligned(recorded_u8, replayed_u8, "gain")
-    maps = _ssim(recorded, replayed)
+    brightened = image_quality.aligned(recorded_u8, replayed_u8, "gain")
+    maps: SsimMaps | UndefinedStatisticError
+    try:
+        maps = image_quality.ssim_maps(recorded, replayed)
+    except UndefinedStatisticError as error:
+        maps = error
     found = {
         RAW: _scored(recorded, replayed, maps, paddings=("valid", "zero")),
         GAIN: _scored(recorded, brightened, maps, paddings=()),
@@ -171,15 +162,6 @@ def score_pair(
     return found
 
 
-def _ssim(
-    recorded: Float[np.ndarray, "height width 3"], replayed: Float[np.ndarray, "height width 3"]
-) -> SsimMaps | UndefinedStatisticError:
-    try:
-        return ssim_maps(recorded, replayed)
-    except UndefinedStatisticError as error:
-        return error
-
-
 _SSIM_OF: dict[Padding, str] = {"valid": "ssim", "zero": "ssim_zero"}
 
 
@@ -194,7 +176,7 @@ def _scored(
     values: dict[str, float] = {}
     reasons: dict[str, str] = {}
     try:
-        values["psnr_db"] = psnr_db(recorded, replayed, mask=mask)
+        values["psnr_db"] = image_quality.psnr_db(recorded, replayed, mask=mask)
     except UndefinedStatisticError as error:
         reasons["psnr_db"] = error.reason
     for padding in paddings:
@@ -229,7 +211,7 @@ def refuse_swapped(
     replayed: Float[np.ndarray, "replayed_height replayed_width 3"],
 ) -> None:
     """Refuse a pair that fits much better with red and blue exchanged; grey ones cannot tell."""
-    check_same_shape(recorded, replayed)
+    image_quality.check_same_shape(recorded, replayed)
     as_it_is = float(np.square(recorded - replayed).mean())
     swapped = float(np.square(recorded - replayed[..., ::-1]).mean())
     limit = as_it_is * 10.0 ** (-SWAP_MARGIN_DB / 10.0)
@@ -259,9 +241,8 @@ def score_depth(
 ) -> DepthScore:
     """Compare two depth images [m]; 0 is "no measurement"."""
     if recorded_m.shape != rendered_m.shape:
-        raise ImageShapeError(
-            found=f"the recorded depth is {recorded_m.shape}, the rendered one {rendered_m.shape}"
-        )
+        found = f"the recorded depth is {recorded_m.shape}, the rendered one {rendered_m.shape}"
+        raise image_quality.ImageShapeError(found=found)
     both = (recorded_m > 0) & (rendered_m > 0)
     if not both.any():
         raise UndefinedStatisticError(statistic="depth error", reason="no pixel has both depths")

@@ -79,19 +79,11 @@ def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
     """
     names = tuple(name for name in recorded.names if name in replayed.names)
     if not names:
-        raise UndefinedStatisticError(
-            statistic="joint error", reason="recorded and replayed joints have no name in common"
-        )
-    first = max(int(recorded.stamps_ns[0]), int(replayed.stamps_ns[0]))
-    last = min(int(recorded.stamps_ns[-1]), int(replayed.stamps_ns[-1]))
-    common = (recorded.stamps_ns >= first) & (recorded.stamps_ns <= last)
-    if not common.any():
-        raise UndefinedStatisticError(
-            statistic="joint error", reason="recorded and replayed stamps do not overlap"
-        )
+        reason = "recorded and replayed joints have no name in common"
+        raise UndefinedStatisticError(statistic="joint error", reason=reason)
+    common = _common(recorded.stamps_ns, replayed.stamps_ns, "joint error")
     stamps = recorded.stamps_ns[common]
-    mine = [recorded.names.index(name) for name in names]
-    theirs = [replayed.names.index(name) for name in names]
+    mine, theirs = ([side.names.index(name) for name in names] for side in (recorded, replayed))
     difference = recorded.position[common][:, mine] - replayed.at(stamps)[:, theirs]
     wrapped = difference - 2 * np.pi * np.round(difference / (2 * np.pi))
     return JointErrors(names=names, stamps_ns=stamps, error_rad=wrapped)
@@ -112,7 +104,7 @@ def pose_errors(recorded: PoseTrajectory, replayed: PoseTrajectory) -> PoseError
     Absolute pose error without alignment, its length and its angle: Sturm et al. (2012).
     Range: 0 m and up, 0 is perfect. Undefined when: the two share no instant.
     """
-    common = _common(recorded.stamps_ns, replayed)
+    common = _common(recorded.stamps_ns, replayed.stamps_ns)
     stamps = recorded.stamps_ns[common]
     other = replayed.at(stamps)
     return PoseErrors(
@@ -128,22 +120,22 @@ def position_errors(
     replayed: PoseTrajectory,
 ) -> Float[np.ndarray, " num_common"]:
     """Return the distances [m] of ``pose_errors``, to the bit, where no angle is asked for."""
-    common = _common(stamps_ns, replayed)
+    common = _common(stamps_ns, replayed.stamps_ns)
     other_m = replayed.positions_at(stamps_ns[common])
     return np.asarray(np.linalg.norm(p_recorded_m[common] - other_m, axis=1))
 
 
 def _common(
-    stamps_ns: Int[np.ndarray, " num_samples"], replayed: PoseTrajectory
+    stamps_ns: Int[np.ndarray, " num_samples"],
+    other_ns: Int[np.ndarray, " num_others"],
+    statistic: str = "trajectory error",
 ) -> Bool[np.ndarray, " num_samples"]:
-    first = max(int(stamps_ns[0]), int(replayed.stamps_ns[0]))
-    last = min(int(stamps_ns[-1]), int(replayed.stamps_ns[-1]))
-    common = (stamps_ns >= first) & (stamps_ns <= last)
+    """Which stamps lie in the time that others cover."""
+    common = (stamps_ns >= other_ns[0]) & (stamps_ns <= other_ns[-1])
     if not common.any():
-        raise UndefinedStatisticError(
-            statistic="trajectory error", reason="recorded and replayed stamps do not overlap"
-        )
-    return common
+        reason = "recorded and replayed stamps do not overlap"
+        raise UndefinedStatisticError(statistic=statistic, reason=reason)
+    return np.asarray(common)
 
 
 def angles_rad(

@@ -13,13 +13,8 @@ from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.compare.success import WITH
 from evaluator.result import Measurement
 
-NAMES = {
-    "soft": "quiet",
-    "line": "edge",
-    "sim": "twin-planned",
-    "executed": "twin-executed",
-    "rec": "recorded",
-}
+NAMES = {"soft": "quiet", "line": "edge", "sim": "twin-planned"}
+NAMES |= {"executed": "twin-executed", "rec": "recorded"}
 """Short names of colours, and what they mean in the palette."""
 LIGHT = {**palette.LIGHT, **{name: palette.LIGHT[meaning] for name, meaning in NAMES.items()}}
 """Colours of the files."""
@@ -134,9 +129,8 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
         taken[at] = taken.get(at, 0) + 1
         x, y = left + side * (at[0] + inwards[0]), top + side * (1 - at[1] - inwards[1])
         if sim.interval is not None:
-            marks.append(
-                _line(left + side * sim.interval.low, y, left + side * sim.interval.high, y)
-            )
+            ends = [left + side * end for end in (sim.interval.low, sim.interval.high)]
+            marks.append(_line(ends[0], y, ends[1], y))
         if real.interval is not None:
             ends = [top + side * (1 - end) for end in (real.interval.low, real.interval.high)]
             marks.append(_line(x, ends[0], x, ends[1]))

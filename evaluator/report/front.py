@@ -9,7 +9,7 @@ from evaluator.compare.policies import ALL_TASKS
 from evaluator.quantity import noun
 from evaluator.report.sections import HEADLINES
 from evaluator.report.wording import agreeing_side
-from evaluator.result import Cell, Measurement, Results, Table
+from evaluator.result import Cell, Measurement, Results
 from evaluator.statistics.intervals import wilson
 
 SHOWN_TASKS = 8
@@ -64,7 +64,10 @@ def front(results: Results) -> Front:
         next_step=next_trials(results),
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
-        notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
+        notes=[
+            (HEADLINES.get(name, name.replace("_", " ")), _short(text, LONGEST_NOTE))
+            for name, text in about[:2]
+        ],
         missing=[_short(text) for text in missing[:SHOWN_MISSING]],
         more_missing=max(0, len(missing) - SHOWN_MISSING),
     )
@@ -257,17 +260,7 @@ def _number(cell: Cell) -> float | None:
     return float(cell) if is_number and cell is not None else None
 
 
-def _about(name: str) -> str:
-    """Write what a note is about in words."""
-    return HEADLINES.get(name, name.replace("_", " "))
-
-
 def _short(text: str, longest: int = LONGEST) -> str:
     if len(text) <= longest:
         return text
     return text[:longest].rsplit(" ", 1)[0].rstrip(",;:") + " ..."
-
-
-def front_tables(results: Results) -> list[Table]:
-    """Return the table of the first page: rates beside each other."""
-    return [table for table in results.tables if table.id == "success" and table.rows]

@@ -15,20 +15,10 @@ from urllib.parse import quote
 
 from bridge.errors import MissingDependencyError
 from bridge.whole_file import write_whole
-from evaluator.report import wording
+from evaluator.report import sections, wording
 from evaluator.report.figures import DARK, LIGHT, Drawing
-from evaluator.report.front import FIGURES, front, front_tables
-from evaluator.report.sections import FIGURES as DECIDED
-from evaluator.report.sections import (
-    OTHER,
-    SECTIONS,
-    TRIALS,
-    Section,
-    decides,
-    numbers_of,
-    section_of,
-    shown_tables,
-)
+from evaluator.report.front import FIGURES, front
+from evaluator.report.sections import OTHER, SECTIONS, TRIALS, Section
 from evaluator.report.views import Figures, Shown, is_number, used_columns, view
 from evaluator.result import Measurement, Results, Table
 
@@ -76,16 +66,11 @@ class Part:
     """Each with whether a click shows it."""
 
 
-def page(
-    results: Results,
-    figures: Sequence[Drawing] = (),
-    *,
-    everything: bool = False,
-) -> str:
+def page(results: Results, figures: Sequence[Drawing] = (), *, everything: bool = False) -> str:
     """Build the page of the results."""
-    shown = shown_tables(results, everything=everything)
+    shown = sections.shown_tables(results, everything=everything)
     shown_first = [each for name in FIGURES for each in figures if each.id == name][:1]
-    tables_first = front_tables(results)
+    tables_first = [table for table in results.tables if table.id == "success" and table.rows]
     later = replace(results, tables=tuple(t for t in shown if t not in tables_first))
     rest = [each for each in figures if each not in shown_first]
     parts = [
@@ -159,19 +144,13 @@ def name_shared(report: Path) -> None:
 
 def _part(section: Section, results: Results, figures: Sequence[Drawing]) -> Part | None:
     """Collect one part, or nothing when the run has nothing for it."""
-    tables = [
-        table for table in results.tables if table.id != TRIALS and section_of(table.id) is section
-    ]
+    found = [table for table in results.tables if sections.section_of(table.id) is section]
+    tables = [(table, is_long(table)) for table in found if table.id != TRIALS]
     drawn = [drawing for drawing in figures if drawing.id in section.figures]
-    numbers = numbers_of(section, results.measurements)
+    numbers = sections.numbers_of(section, results.measurements)
     if not tables and not drawn and not any(m.value is not None for _, m in numbers):
         return None
-    return Part(
-        section=section,
-        numbers=numbers,
-        figures=drawn,
-        tables=[(table, is_long(table)) for table in tables],
-    )
+    return Part(section=section, numbers=numbers, figures=drawn, tables=tables)
 
 
 def _made_by(software: Mapping[str, Any]) -> str:
@@ -204,7 +183,7 @@ def environment() -> Environment:
     environment.filters |= {
         function.__name__: function
         for function in (
-            *(breakable, minus, thousands, grid, footnotes, reason, is_long, decides),
+            *(breakable, minus, thousands, grid, footnotes, reason, is_long, sections.decides),
             *(wording.cell_text, wording.value_text, wording.ends_text, wording.count_text),
             *(wording.method_text, wording.measurement_text),
         )
@@ -214,7 +193,7 @@ def environment() -> Environment:
         "policy": POLICY,
         "light": LIGHT,
         "dark": DARK,
-        "decided": DECIDED,
+        "decided": sections.FIGURES,
         "shown_rows": SHOWN_ROWS,
         "shown_numbers": SHOWN_NUMBERS,
         "shown_measurements": SHOWN_MEASUREMENTS,

@@ -13,6 +13,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError
 from bridge.exchange.trials_csv import trials_text
 from bridge.whole_file import write_whole
+from evaluator import review_index
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare.failures import failure_kind, start_regions
 from evaluator.compare.measure import refuse_alike
@@ -27,15 +28,6 @@ from evaluator.report.front import CLOSE_PP, answer, front, rows_of, sentence
 from evaluator.report.page import grid
 from evaluator.report.wording import cell_text
 from evaluator.result import Results, Table, load_results
-from evaluator.review_index import (
-    FACETS,
-    NO_RESULTS,
-    IndexedFile,
-    index_path,
-    severity,
-    state_of,
-    written_index,
-)
 
 SHOWN_EXCLUSIONS = 200
 """Of those left out; ``results.json`` has all."""
@@ -65,7 +57,7 @@ def refresh(run: RunFolder) -> bytes:
     try:
         with without_collecting(), SummaryCache(run.results_dir / FOLDER) as kept:
             found = read_run(RunFolder.open(run.path), kept)
-        for kind in FACETS:
+        for kind in review_index.FACETS:
             refuse_alike(kind, ((getattr(row, kind), row.episode) for row in found.rows))
         derived = {file.name for file in found.contents.derived}
         motions = found.summaries.motions
@@ -75,7 +67,7 @@ def refresh(run: RunFolder) -> bytes:
     try:
         return _write(run, read, load_results(run.path), None)
     except PathNotFoundError:
-        return _write(run, read, None, NO_RESULTS)
+        return _write(run, read, None, review_index.NO_RESULTS)
     except GstError as error:
         return _write(run, read, None, str(error))
 
@@ -94,19 +86,16 @@ def index_run(run: RunFolder, comparison: Comparison, results: Results, began_ns
 
 
 def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str | None) -> bytes:
-    state = state_of(run)
-    off = {
-        motion.episode: (motion.path_max_m, motion.lag_s)
-        for motion in read.motions
-        if motion.against == "planned"
-    }
+    state = review_index.state_of(run)
+    planned = [motion for motion in read.motions if motion.against == "planned"]
+    off = {motion.episode: (motion.path_max_m, motion.lag_s) for motion in planned}
     regions = start_regions(read.rows)
     trials = sorted(
         (
             _reviewed(row, off.get(row.episode, (None, None)), regions.get(row.episode, ""))
             for row in read.rows
         ),
-        key=severity,
+        key=review_index.severity,
     )
     about = {
         "state": state.digest,
@@ -122,8 +111,8 @@ def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str |
     }
     numbers = () if results is None else results.measurements
     files = _files(run, read, {trial.file for trial in trials})
-    content = written_index(trials, files, about, numbers)
-    path = index_path(run)
+    content = review_index.written_index(trials, files, about, numbers)
+    path = review_index.index_path(run)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, content)
@@ -133,16 +122,15 @@ def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str |
 
 
 def _reviewed(row: TrialRow, off: tuple[float | None, float | None], region: str) -> TrialRow:
-    kind = failure_kind(row)
+    kind, parts = failure_kind(row), ("cause", "stage", "bodies")
+    failure: dict[str, Any] = {f"fail_{part}": getattr(kind, part, "") for part in parts}
     return replace(
         row,
         failed_stage=first_failed_stage(row) if row.recorded is False else "",
         distance_m=off[0],
         lag_s=off[1],
-        fail_cause="" if kind is None else kind.cause,
-        fail_stage="" if kind is None else kind.stage,
-        fail_bodies="" if kind is None else kind.bodies,
         start_region=region,
+        **failure,
     )
 
 
@@ -202,7 +190,7 @@ def _outdated(run: RunFolder, rows: Sequence[TrialRow]) -> str | None:
     return None
 
 
-def _files(run: RunFolder, read: _Read, trials: set[str]) -> Iterator[IndexedFile]:
+def _files(run: RunFolder, read: _Read, trials: set[str]) -> Iterator[review_index.IndexedFile]:
     """Name what is no trial; derived files that were read well are not opened again."""
     for path in run.episodes():
         if path.name not in trials:
@@ -214,14 +202,14 @@ def _files(run: RunFolder, read: _Read, trials: set[str]) -> Iterator[IndexedFil
                 yield found
     for path in run.unfinished():
         reason = "not finished: still being recorded, or its recorder was stopped"
-        yield IndexedFile(name=str(path.relative_to(run.path)), error=reason)
+        yield review_index.IndexedFile(name=str(path.relative_to(run.path)), error=reason)
 
 
-def _file(run: RunFolder, path: Path) -> IndexedFile:
+def _file(run: RunFolder, path: Path) -> review_index.IndexedFile:
     try:
         episode = Episode.open(path)
         info = episode.info
-        return IndexedFile(
+        return review_index.IndexedFile(
             name=path.stem,
             kind=info.kind,
             task=info.task,
@@ -229,7 +217,7 @@ def _file(run: RunFolder, path: Path) -> IndexedFile:
             duration_s=episode.duration_s,
         )
     except GstError as error:
-        return IndexedFile(name=str(path.relative_to(run.path)), error=str(error))
+        return review_index.IndexedFile(name=str(path.relative_to(run.path)), error=str(error))
 
 
 if __name__ == "__main__":  # the dashboard reads a large run in another process

@@ -1,5 +1,6 @@
 """What a report shows, in the order a reader needs it: parts, their tables, their numbers."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -52,7 +53,7 @@ NAMES: dict[str, str] = HEADLINES | {
 """All numbers that a report calls by name; the others stand in ``results.json``."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Section:
     """One part: which numbers, tables and figures it holds. Names may end in ``*``."""
 
@@ -66,94 +67,50 @@ class Section:
     figures: tuple[str, ...] = ()
 
 
-SECTIONS: tuple[Section, ...] = (
-    Section(
-        id="conclusions",
-        title="Task by task",
-        lead="The numbers behind the sentences of the first page.",
-        tables=("conclusions",),
-    ),
-    Section(
-        id="published",
-        title="The printed figures, recomputed",
-        lead="A published table is taken at its rows; every printed figure that does not follow "
-        "from them is named.",
-        tables=("published",),
-    ),
-    Section(
-        id="protocol",
-        title="The study against its protocol",
-        lead="What was fixed before the first trial, what it found, and every departure from it.",
-        numbers=("protocol.*",),
-        tables=("protocol_departures",),
-    ),
-    Section(
-        id="success",
-        title="Success rates",
-        lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
-        "plan actually sent, replayed with physics.",
-        tables=("success", "notes"),
-        figures=("success",),
-    ),
-    Section(
-        id="agreement",
-        title="Agreement over groups",
-        lead="Whether the twin's rates move with the labelled ones, and how far off they are. A "
-        "high r does not show that the right decision follows, nor that there is no bias.",
-        numbers=("agreement.[!sv]*", "agreement.spearman_rho", "decision.*"),
-        figures=("scatter",),
-    ),
-    Section(
-        id="comparisons",
-        title="Which is better",
-        lead="Policies, and each without and with replanning, as recorded.",
-        tables=("comparisons", "standing"),
-    ),
-    Section(
-        id="gate",
-        title="Trial by trial: the gate's scorecard",
-        lead="What the twin said of each plan against how it ended, and what obeying it costs "
-        "and avoids.",
-        numbers=("agreement.sim_planned.*", "agreement.verdict*", "baseline.*"),
-        tables=("confusion",),
-    ),
-    Section(
-        id="raters",
-        title="Other raters",
-        lead="How far raters of the same trials agree.",
-        tables=("raters",),
-    ),
-    Section(
-        id="stages",
-        title="Where trials are lost",
-        lead="Which stage ends a trial, and what failed first on each side.",
-        tables=("funnel", "failures"),
-    ),
-    Section(
-        id="motion",
-        title="Motions",
-        lead="How far the recorded robot lies from the replayed one: planned tells about the "
-        "controller, executed about kinematics and calibration.",
-        numbers=("motion.*",),
-        tables=("motion*", "end_points_*"),
-    ),
-    Section(
-        id="states",
-        title="Predicted states",
-        lead="How far from where they were predicted objects were localised.",
-        tables=("final_states",),
-    ),
-    Section(
-        id="views",
-        title="Images",
-        lead="Rendered against held-out recorded images. No value stands without its protocol: it "
-        "is in the definition of each number in results.json.",
-        numbers=("views.*",),
-        tables=("views*", "image*"),
-    ),
-)
+_TEXT = """
+conclusions | Task by task |  | conclusions
+    The numbers behind the sentences of the first page.
+published | The printed figures, recomputed |  | published
+    A published table is taken at its rows; every printed figure that does not follow from them
+    is named.
+protocol | The study against its protocol | protocol.* | protocol_departures
+    What was fixed before the first trial, what it found, and every departure from it.
+success | Success rates |  | success notes | success
+    How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the plan
+    actually sent, replayed with physics.
+agreement | Agreement over groups | agreement.[!sv]* agreement.spearman_rho decision.* |  | scatter
+    Whether the twin's rates move with the labelled ones, and how far off they are. A high r
+    does not show that the right decision follows, nor that there is no bias.
+comparisons | Which is better |  | comparisons standing
+    Policies, and each without and with replanning, as recorded.
+gate | Trial by trial: the gate's scorecard | agreement.sim_planned.* agreement.verdict* baseline.* | confusion
+    What the twin said of each plan against how it ended, and what obeying it costs and avoids.
+raters | Other raters |  | raters
+    How far raters of the same trials agree.
+stages | Where trials are lost |  | funnel failures
+    Which stage ends a trial, and what failed first on each side.
+motion | Motions | motion.* | motion* end_points_*
+    How far the recorded robot lies from the replayed one: planned tells about the controller,
+    executed about kinematics and calibration.
+states | Predicted states |  | final_states
+    How far from where they were predicted objects were localised.
+views | Images | views.* | views* image*
+    Rendered against held-out recorded images. No value stands without its protocol: it is in
+    the definition of each number in results.json.
+"""  # noqa: E501
+"""One section each: id, title, numbers, tables, figures; and what it leads in with."""
 
-OTHER = Section(id="other", title="More tables", lead="", tables=("*",))
+
+def _section(text: str) -> Section:
+    head, _, lead = text.partition("\n")
+    id_, title, *names = (part.strip() for part in head.split("|"))
+    numbers, tables, figures = (tuple(part.split()) for part in (*names, "", "")[:3])
+    return Section(id_, title, " ".join(lead.split()), numbers, tables, figures)
+
+
+SECTIONS = tuple(map(_section, re.split(r"\n(?=\w)", _TEXT.strip())))
+
+OTHER = Section("other", "More tables", "", tables=("*",))
 TRIALS = "trials"
 """The table that is as long as the run; it comes last."""
 MOST_TABLES = 12

@@ -60,8 +60,6 @@ _NO_BREAK = "\ue000"
 """Stands for a space while lines are broken: rich breaks at every kind of space."""
 _TOGETHER = re.compile(r"\[[^\]]*\]|[\d/]+ = [\d.]+ %|[+-]?[\d.]+ (%|pp|mm|°)")
 """An interval, a share, a number with its unit: each stays on one line."""
-
-
 _EDGE, _GAP = 1, 3
 """Characters before the first column, and between two."""
 
@@ -69,9 +67,7 @@ _EDGE, _GAP = 1, 3
 def _widths(heads: list[str], rows: list[list[str]], width: int) -> list[int] | None:
     """Give each column its longest word and a share of what is left; None: not even that fits."""
     columns = list(zip(heads, *rows, strict=True))
-    least = [
-        max(len(word) for text in column for word in text.split() or [""]) for column in columns
-    ]
+    least = [max(map(len, " ".join(column).split()), default=0) for column in columns]
     whole = [max(map(len, column)) for column in columns]
     spare = width - _EDGE - _GAP * len(columns) - sum(least)
     if spare < 0:

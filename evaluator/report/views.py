@@ -129,7 +129,7 @@ def _kind(name: str) -> str:
 def _number(
     kind: str, value: Any, ends: Sequence[Any], count: Sequence[Any], why: str | None
 ) -> Shown:
-    """Write a cell with its interval and count; what is no number stays as it is."""
+    """Write a cell with its interval and count; what is not a number stays as it is."""
     if isinstance(value, str):
         return value
     if not _known(value):
@@ -178,18 +178,15 @@ def _success(rows: Rows) -> Rows:
 def _conclusions(rows: Rows) -> Rows:
     """Put a yes beside those that were right, and what succeeded at all."""
 
-    def shown(row: Record, folded: Record) -> Record:
-        right = succeeded = None
-        if row["yes"]:
-            right = Figures(f"{row['yes and right']} of {row['yes']}")
-            succeeded = Figures(f"{row['succeeded']} of {row['trials']}")
-        return {
-            **_picked(folded, "task", "groups", "bias (pp)"),
-            "yes and right": right,
-            "succeeded at all": succeeded,
-        }
+    def of(row: Record, k: str, n: str) -> Shown:
+        return Figures(f"{row[k]} of {row[n]}") if row["yes"] else None
 
-    return [shown(row, folded) for row, folded in zip(rows, _folded(rows), strict=True)]
+    return [
+        _picked(folded, "task", "groups", "bias (pp)")
+        | {"yes and right": of(row, "yes and right", "yes")}
+        | {"succeeded at all": of(row, "succeeded", "trials")}
+        for row, folded in zip(rows, _folded(rows), strict=True)
+    ]
 
 
 def _published(rows: Rows) -> Rows:
@@ -199,11 +196,8 @@ def _published(rows: Rows) -> Rows:
             return str(row["instead"])
         return f"{value:.4g}" if abs(value) < 1 else f"{value:.2f}"
 
-    return [
-        {name: cell for name, cell in row.items() if name != "instead"}
-        | {"recomputed": recomputed(row)}
-        for row in rows
-    ]
+    kept = [name for name in rows[0] if name != "instead"]
+    return [_picked(row, *kept) | {"recomputed": recomputed(row)} for row in rows]
 
 
 _VIEWS: dict[str, Callable[[Rows], Rows]] = {

@@ -135,10 +135,8 @@ def stand_in_sentence(results: Results) -> str | None:
     """Return the warning every page made from a simulated laboratory carries."""
     if not results.stand_in:
         return None
-    return (
-        "Stand-in: every recorded outcome here comes from a simulated laboratory, "
-        "not from a real robot."
-    )
+    where = "from a simulated laboratory, not from a real robot"
+    return f"Stand-in: every recorded outcome here comes {where}."
 
 
 def cell_text(cell: Shown) -> str:

@@ -16,14 +16,7 @@ from evaluator.report.tables import as_csv, as_latex, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
-SHOWN = (
-    "published",
-    "success",
-    "comparisons",
-    "standing",
-    "image_methods",
-    "notes",
-)
+SHOWN = ("published", "success", "comparisons", "standing", "image_methods", "notes")
 """Tables a terminal shows; the others are in the report."""
 
 GROUPS = "success"
@@ -129,11 +122,8 @@ def _write_parquet(
     except ModuleNotFoundError as error:
         if error.name not in PARQUET_PACKAGES:
             raise
-        reason = (
-            f"trials, groups and measurements.parquet not written: {error.name} is not installed "
-            f"({INSTALL})"
-        )
-        return [], reason
+        lacking = f"{error.name} is not installed ({INSTALL})"
+        return [], f"trials, groups and measurements.parquet not written: {lacking}"
     written = [parquet.write_measurements(folder / "measurements.parquet", results.measurements)]
     groups = next((table for table in results.tables if table.id == GROUPS), None)
     if groups is not None:
@@ -145,10 +135,7 @@ def _write_parquet(
 
 def summary_text(results: Results, written: Written) -> str:
     """Write what the terminal shows: the success table, the headlines, what was left out."""
-    parts = []
-    banner = stand_in_sentence(results)
-    if banner:
-        parts.append(banner)
+    parts = [banner] if (banner := stand_in_sentence(results)) else []
     understood = results.provenance.get("read_as")
     if isinstance(understood, list) and understood:
         parts.append("Read:\n" + "\n".join(f"  {line}" for line in understood))

@@ -24,14 +24,8 @@ from bridge.process_pool import SERIAL, ProcessPool, Serial
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.result import Exclusion
-from evaluator.run_reader.episodes import (
-    DerivedFacts,
-    DerivedFile,
-    RecordedFacts,
-    RunFile,
-    read_derived,
-    read_recorded,
-)
+from evaluator.run_reader import episodes
+from evaluator.run_reader.episodes import DerivedFacts, DerivedFile, RecordedFacts, RunFile
 
 ODD = (GstError, OSError, TypeError, ValueError, KeyError, RecursionError)
 """What one file of another program, or a failing disk, may raise; it costs that file only."""
@@ -74,31 +68,19 @@ def read_contents(
     """Read what is new or has changed in a run; a broken file is left out and named."""
     recorded, derived, left_out = _take_inventory(run, cache, output)
     labels = _labels(run)
-    facts, broken_recorded = _read(
-        {f"{file.name} {file.sha256} {labels.get(file.stem, '')}": file for file in recorded},
-        RecordedFacts,
-        partial(_tried, partial(read_recorded, run)),
-        cache,
-        pool.map,
-        output,
-    )
-    made, broken_derived = _read(
-        {f"{file.name} {file.sha256}": file for file in derived},
-        DerivedFacts,
-        partial(_tried, read_derived),
-        cache,
-        pool.map,
-        output,
-    )
+    by_label = {f"{f.name} {f.sha256} {labels.get(f.stem, '')}": f for f in recorded}
+    reading = partial(_tried, partial(episodes.read_recorded, run))
+    facts, broken_recorded = _read(by_label, RecordedFacts, reading, cache, pool.map, output)
+    by_bytes = {f"{file.name} {file.sha256}": file for file in derived}
+    reading_derived = partial(_tried, episodes.read_derived)
+    made, broken_derived = _read(by_bytes, DerivedFacts, reading_derived, cache, pool.map, output)
     found, doubled = _each_once(
         [RecordedFile(file=file, facts=facts[file.name]) for file in recorded if file.name in facts]
     )
     return RunContents(
         recorded=tuple(found),
         derived=tuple(
-            DerivedFile(**vars(file), facts=made[file.name])
-            for file in derived
-            if file.name in made
+            DerivedFile(**vars(f), facts=made[f.name]) for f in derived if f.name in made
         ),
         left_out=(*left_out, *broken_recorded, *broken_derived, *doubled),
     )

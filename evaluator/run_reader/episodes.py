@@ -12,17 +12,9 @@ from typing import Any
 import msgspec
 
 from bridge.clock import NS_PER_S
-from bridge.episode import schema
+from bridge.episode import metadata, schema
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.executions import NO_PLAN, with_execution
-from bridge.episode.metadata import (
-    RETRY,
-    Derived,
-    EpisodeInfo,
-    Outcome,
-    build,
-    why_not_counted,
-)
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import verdicts
@@ -86,10 +78,11 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
     """Sum a verdict up."""
     name = verdict.first_failing
     factor = None if name is None else verdict.factors()[name]
+    undecided = [each for each, known in verdict.factors().items() if known.value is None]
     probability = None if verdict.p_success is None else verdict.p_success.get("value")
     return VerdictSummary(
         accepted=verdict.accepted,
-        why_undecided=verdict.reason or _undecided(verdict),
+        why_undecided=verdict.reason or f"{' and '.join(undecided)} undecided",
         p_success=None if probability is None else float(probability),
         first_failing=name,
         failing_cause=None if factor is None else factor.cause,
@@ -98,11 +91,6 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
         failing_bodies=() if factor is None else factor.bodies,
         failing_t_ns=None if factor is None else factor.first_t_ns,
     )
-
-
-def _undecided(verdict: Verdict) -> str:
-    names = [name for name, factor in verdict.factors().items() if factor.value is None]
-    return f"{' and '.join(names)} undecided"
 
 
 def _detail(verdict: Verdict) -> str | None:
@@ -141,10 +129,10 @@ class StageTime:
 class RecordedFacts:
     """What one recorded episode says of itself, with the label given to it afterwards."""
 
-    info: EpisodeInfo
+    info: metadata.EpisodeInfo
     began_ns: int = 0
     """When its recording began; 0 without messages."""
-    outcome: Outcome | None = None
+    outcome: metadata.Outcome | None = None
     """As the operator labelled it; a label given after the fact wins."""
     num_plans: int = 0
     num_plans_sent: int = 0
@@ -174,7 +162,7 @@ class _Log:
     ended_ns: int | None = None
     first_start_ns: dict[str, int] = field(default_factory=dict)
     verdicts: dict[str, Verdict] = field(default_factory=dict)
-    label: Outcome | None = None
+    label: metadata.Outcome | None = None
     localised: list[bytes] = field(default_factory=list)
 
 
@@ -182,7 +170,7 @@ def read_recorded(run: RunFolder, path: Path) -> RecordedFacts:
     """Sum up a recorded episode; of one that is no trial, only who and what."""
     episode = Episode.open(path)
     info, outcome = episode.info, episode.outcome
-    if info.kind == RETRY:
+    if info.kind == metadata.RETRY:
         return RecordedFacts(info=info, outcome=outcome_of(run, episode))
     if info.kind != "trial":
         return RecordedFacts(info=info, outcome=outcome)
@@ -195,7 +183,7 @@ def read_recorded(run: RunFolder, path: Path) -> RecordedFacts:
     return RecordedFacts(info=info, outcome=outcome, broken=broken)
 
 
-def _read_trial(run: RunFolder, episode: Episode, info: EpisodeInfo) -> RecordedFacts:
+def _read_trial(run: RunFolder, episode: Episode, info: metadata.EpisodeInfo) -> RecordedFacts:
     log = _read_log(episode)
     if not log.sent:
         for event in with_execution(episode, ()):
@@ -225,11 +213,8 @@ def localised_positions(localisations: Iterable[bytes]) -> list[LocalisedPositio
         pose = record.get("T_base_object")
         if record["found"] and pose is not None:
             x, y, z = pose["p_m"]
-            places.append(
-                LocalisedPosition(
-                    object_id=record["object"], stamp_ns=record["stamp_ns"], p_m=(x, y, z)
-                )
-            )
+            about = {"object_id": record["object"], "stamp_ns": record["stamp_ns"]}
+            places.append(LocalisedPosition(**about, p_m=(x, y, z)))
     return places
 
 
@@ -240,11 +225,8 @@ def positions_at_start(
 
     A later one of an object replaces an earlier one.
     """
-    return {
-        place.object_id: place.p_m
-        for place in places
-        if started_ns is None or place.stamp_ns <= started_ns
-    }
+    before = (each for each in places if started_ns is None or each.stamp_ns <= started_ns)
+    return {each.object_id: each.p_m for each in before}
 
 
 def _read_log(episode: Episode) -> _Log:
@@ -309,7 +291,7 @@ def _note_event(log: _Log, event: Mapping[str, Any]) -> None:
             names = {"result", "unit", "k", "n", "by", "detail"}
             known = {key: outcome[key] for key in names & outcome.keys()}
             stages = [s for s in outcome.get("stages") or () if isinstance(s, dict)]
-            log.label = build(Outcome, {**known, "stages": stages})
+            log.label = metadata.build(metadata.Outcome, {**known, "stages": stages})
 
 
 def first_divergence(episode: Episode) -> str:
@@ -323,8 +305,8 @@ def first_divergence(episode: Episode) -> str:
 class DerivedFacts:
     """What one derived episode says of itself."""
 
-    info: EpisodeInfo
-    derived: Derived
+    info: metadata.EpisodeInfo
+    derived: metadata.Derived
     verdict: VerdictSummary | None = None
     """Of a dynamic replay: the last verdict on the plan it replays."""
     divergence: str = ""
@@ -342,19 +324,19 @@ class DerivedFile(RunFile):
     facts: DerivedFacts
 
     @property
-    def info(self) -> EpisodeInfo:
+    def info(self) -> metadata.EpisodeInfo:
         """Who, what and when."""
         return self.facts.info
 
     @property
-    def derived(self) -> Derived:
+    def derived(self) -> metadata.Derived:
         """What it was made from."""
         return self.facts.derived
 
     @property
     def why_not_counted(self) -> str:
         """Why it never enters a number, whatever it says; empty where it may."""
-        return why_not_counted(self.derived, stand_in=self.info.stand_in)
+        return metadata.why_not_counted(self.derived, stand_in=self.info.stand_in)
 
     @property
     def episode(self) -> Episode:
@@ -390,9 +372,7 @@ def read_derived(path: Path) -> DerivedFacts:
     info, derived = episode.info, _without_seed(derived)
     try:
         if _is_dynamic(derived):
-            mine = [
-                decided for _, decided in verdicts(episode) if decided.plan_id == derived.plan_id
-            ]
+            mine = [each for _, each in verdicts(episode) if each.plan_id == derived.plan_id]
             last = summarise_verdict(mine[-1]) if mine else None
             first = first_divergence(episode) if derived.trajectory == "executed" else ""
             return DerivedFacts(info=info, derived=derived, verdict=last, divergence=first)
@@ -405,7 +385,7 @@ def read_derived(path: Path) -> DerivedFacts:
     return DerivedFacts(info=info, derived=derived)
 
 
-def _without_seed(derived: Derived) -> Derived:
+def _without_seed(derived: metadata.Derived) -> metadata.Derived:
     """Leave the seed out of the settings: it stands beside them, and they are alike without it."""
     config = derived.settings.get("config")
     if not isinstance(config, dict) or "seed" not in config:
@@ -414,7 +394,7 @@ def _without_seed(derived: Derived) -> Derived:
     return replace(derived, settings={**derived.settings, "config": kept})
 
 
-def _is_dynamic(derived: Derived) -> bool:
+def _is_dynamic(derived: metadata.Derived) -> bool:
     return derived.kind == "replay" and derived.mode == "dynamic"
 
 
@@ -444,27 +424,20 @@ class DerivedIndex:
             return Replay(reason=reason)
         current = _current(made, source_sha256)
         if not current:
-            reason = (
-                f"{made[0].path.name} was made from another version of the episode (its hash "
-                "differs); replay it again"
-            )
-            return Replay(reason=reason)
+            stale = f"{made[0].path.name} was made from another version of the episode (its hash "
+            return Replay(reason=f"{stale}differs); replay it again")
         counted = [file for file in current if not file.why_not_counted]
+        file = _newest(counted or current)
         if not counted:
-            file = _newest(current)
-            why = f"{file.path.name} does not count: {file.why_not_counted}"
-            return Replay(reason=why)
-        file = _newest(counted)
+            return Replay(reason=f"{file.path.name} does not count: {file.why_not_counted}")
         decided = file.facts.verdict
         if file.facts.broken:
             return Replay(file=file, reason=f"{file.path.name}: {file.facts.broken}")
         if decided is None:
             return Replay(file=file, reason=f"{file.path.name} holds no verdict")
-        undecided: str | None = None
-        if decided.accepted is None:
-            why = decided.why_undecided
-            undecided = f"the twin could not decide the {trajectory} replay: {why}"
-        return Replay(file=file, verdict=decided, reason=undecided)
+        undecided = f"the twin could not decide the {trajectory} replay: {decided.why_undecided}"
+        why = undecided if decided.accepted is None else None
+        return Replay(file=file, verdict=decided, reason=why)
 
     def answer_of_cells_engine(
         self, *, source: str, source_sha256: str, plan_id: str
@@ -475,11 +448,8 @@ class DerivedIndex:
         None without such a replay, or where it could not decide.
         """
         made = _current(self._replays.get((source, plan_id, "planned"), []), source_sha256)
-        alone = [
-            file
-            for file in made
-            if file.info.stand_in and (file.derived.engine or "").startswith(STAND_IN_ENGINE)
-        ]
+        stand_in = [file for file in made if file.info.stand_in]
+        alone = [f for f in stand_in if (f.derived.engine or "").startswith(STAND_IN_ENGINE)]
         decided = _newest(alone).facts.verdict if alone else None
         return None if decided is None or " and " in (decided.engine or "") else decided.accepted
 

@@ -35,10 +35,8 @@ class Tracks:
 
     def shifted(self, shift_ns: int) -> "Tracks":
         """Return the same motion on a clock that is so much ahead."""
-        started_ns, ended_ns = (
-            None if stamp is None else stamp + shift_ns
-            for stamp in (self.started_ns, self.ended_ns)
-        )
+        ends = (self.started_ns, self.ended_ns)
+        started_ns, ended_ns = (None if end is None else end + shift_ns for end in ends)
         tool = None if self.tool is None else self.tool.shifted(shift_ns)
         return Tracks(tool=tool, started_ns=started_ns, ended_ns=ended_ns)
 
@@ -51,11 +49,8 @@ def read_tracks(episode: Episode, plan_id: str) -> Tracks:
     poses = [t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE)]
     events = episode.topics_of_type(schema.EVENT)
     of_tool, of_events = episode.payloads(poses[:1], events)
-    records = [
-        parse_record(data, name="event", package="bridge.episode")
-        for data in of_events
-        if b"execution_" in data
-    ]
+    known = (data for data in of_events if b"execution_" in data)
+    records = [parse_record(data, name="event", package="bridge.episode") for data in known]
     if plan_id == NO_PLAN:
         records = with_execution(episode, records)
     started_ns, ended_ns = execution_ns(records, plan_id)

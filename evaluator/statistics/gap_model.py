@@ -11,7 +11,7 @@ much their rates have in common.
 """
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -218,34 +218,26 @@ class GapModel:
         """Correlation of true rates over all groups of this kind."""
         above = float(self.weights @ (self.populations.r > 0))
         below, beyond = (BEYOND + (TOWARD_0 - BEYOND) * sure**3 for sure in (above, 1 - above))
-        low, high = self._ends("r", below, beyond)
-        return Interval(
-            low=-1.0 if low < AT_END - 1 else low,
-            high=1.0 if high > 1 - AT_END else high,
-            level=LEVEL,
-            method=METHOD,
-        )
+        found = self._interval("r", below, beyond)
+        low = -1.0 if found.low < AT_END - 1 else found.low
+        return replace(found, low=low, high=1.0 if found.high > 1 - AT_END else found.high)
 
     @property
     def bias(self) -> Interval:
         """Mean of the twin's rate - recorded rate over all groups of this kind."""
-        low, high = self._ends("bias")
-        return Interval(low=low, high=high, level=LEVEL, method=METHOD)
+        return self._interval("bias")
 
     @property
     def blind_share(self) -> tuple[float, Interval]:
         """Share of groups of this kind in which the twin is blind: mean and interval."""
-        share = self.populations.share
-        low, high = self._ends("share")
-        found = Interval(low=low, high=high, level=LEVEL, method=METHOD)
-        return float(self.weights @ share), found
+        return float(self.weights @ self.populations.share), self._interval("share")
 
-    def _ends(self, what: str, below: float = TAIL, beyond: float = TAIL) -> tuple[float, float]:
+    def _interval(self, what: str, below: float = TAIL, beyond: float = TAIL) -> Interval:
         order = self.populations.orders[what]
         values = getattr(self.populations, what)
         middle = np.cumsum(self.weights[order]) - self.weights[order] / 2
         low, high = np.interp([below, 1 - beyond], middle, values[order])
-        return float(low), float(high)
+        return Interval(low=float(low), high=float(high), level=LEVEL, method=METHOD)
 
 
 def chances_in(

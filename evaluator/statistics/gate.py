@@ -55,16 +55,11 @@ def phi(confusion: Confusion) -> float:
     tp, fp, fn, tn = confusion
     if confusion.n == 0:
         raise UndefinedStatisticError(statistic="phi", reason="there are no pairs")
-    constant = [
-        name
-        for name, positives in (("twin", tp + fp), ("recorded", tp + fn))
-        if positives in (0, confusion.n)
-    ]
+    positives = {"twin": tp + fp, "recorded": tp + fn}
+    constant = [name for name, count in positives.items() if count in (0, confusion.n)]
     if constant:
-        sides = " and ".join(constant)
-        raise UndefinedStatisticError(
-            statistic="phi", reason=f"the {sides} side is the same in all {confusion.n} pairs"
-        )
+        reason = f"the {' and '.join(constant)} side is the same in all {confusion.n} pairs"
+        raise UndefinedStatisticError(statistic="phi", reason=reason)
     margins = math.sqrt((tp + fp) * (tp + fn) * (tn + fp) * (tn + fn))
     return (tp * tn - fp * fn) / margins
 
@@ -81,7 +76,6 @@ def kappa(confusion: Confusion) -> float:
     happened = confusion.true_positive + confusion.false_negative
     by_chance = Fraction(predicted * happened + (n - predicted) * (n - happened), n * n)
     if by_chance == 1:
-        raise UndefinedStatisticError(
-            statistic="kappa", reason=f"both sides are the same in all {n} pairs"
-        )
+        reason = f"both sides are the same in all {n} pairs"
+        raise UndefinedStatisticError(statistic="kappa", reason=reason)
     return float((Fraction(confusion.agreed, n) - by_chance) / (1 - by_chance))

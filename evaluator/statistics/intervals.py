@@ -23,8 +23,7 @@ class ImpossibleCountError(EvaluatorError):
 
     def __init__(self, *, k: int, n: int) -> None:
         """Remember the count."""
-        self.k = k
-        self.n = n
+        self.k, self.n = k, n
         super().__init__(f"{k} successes of {n} is not a possible count. Check k and n.")
 
 
@@ -41,16 +40,10 @@ def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
 
 
 def relative_gain(before: float, after: float) -> float:
-    """Return (after - before) / before; 1.0 means doubled. Not a gain in percentage points.
-
-    Args:
-        before: Rate that the gain is relative to; not 0.
-        after: Rate in the same unit.
-    """
+    """Return (after - before) / before; 1.0 means doubled. Not a gain in percentage points."""
     if before == 0:
-        raise UndefinedStatisticError(
-            statistic="relative gain", reason="the rate before is 0, nothing to be relative to"
-        )
+        reason = "the rate before is 0, nothing to be relative to"
+        raise UndefinedStatisticError(statistic="relative gain", reason=reason)
     return (after - before) / before
 
 
@@ -81,18 +74,12 @@ def median_interval(values: Sequence[float], *, level: float = LEVEL) -> Interva
     """
     place = median_rank(len(values), level)
     if place == 0:
-        raise UndefinedStatisticError(
-            statistic="median interval",
-            reason=f"{len(values)} values; at {100 * level:g} % it needs at least "
-            f"{math.ceil(1 - math.log2(1 - level))}",
-        )
-    ordered = np.sort(np.asarray(values, dtype=np.float64))
-    return Interval(
-        low=float(ordered[place - 1]),
-        high=float(ordered[-place]),
-        level=level,
-        method=ORDER_STATISTICS,
-    )
+        least = math.ceil(1 - math.log2(1 - level))
+        reason = f"{len(values)} values; at {100 * level:g} % it needs at least {least}"
+        raise UndefinedStatisticError(statistic="median interval", reason=reason)
+    ordered = sorted(map(float, values))
+    low, high = ordered[place - 1], ordered[-place]
+    return Interval(low=low, high=high, level=level, method=ORDER_STATISTICS)
 
 
 def median_rank(n: int, level: float = LEVEL) -> int:

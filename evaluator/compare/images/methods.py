@@ -19,15 +19,8 @@ from bridge.episode.provenance import software
 from bridge.errors import BridgeError, GstError, PathNotFoundError, UsageError
 from bridge.exchange.csv_export import seconds_text
 from bridge.media.color import JPEG_MAGIC, decode_color, open_image
-from evaluator.compare.images.scores import (
-    RECORDED,
-    RENDERED,
-    images_of,
-    measure_images,
-    open_net,
-    size_words,
-    spread,
-)
+from evaluator.compare.images import scores as image_scores
+from evaluator.compare.images.scores import RECORDED, RENDERED, images_of, measure_images
 from evaluator.compare.images.views import TWIN, Source, agreed_setting, newest_views, opened
 from evaluator.compare.measure import Part
 from evaluator.compare.rows import Comparison
@@ -139,7 +132,7 @@ def compare_folders(options: ImageOptions) -> Comparison:
     if options.reference is None or not options.renders:
         message = "images alone need --reference FOLDER and --renders METHOD=FOLDER."
         raise UsageError(message)
-    net = open_net(options.lpips_vgg)
+    net = image_scores.open_net(options.lpips_vgg)
     part = compare_renders(options, (), {}, net=net)
     return Comparison(
         run=options.reference.resolve().name,
@@ -209,9 +202,8 @@ def other_names(views: Iterable[str]) -> dict[str, str]:
     for view in views:
         camera, stamp = view.rsplit("/", 1)
         seconds = seconds_text(int(stamp))
-        for name in (stamp, seconds, f"rgb/{seconds}"):
-            found.setdefault(name, []).append(view)
-        for name in (f"{camera}_{stamp}", f"{camera}/{seconds}", f"{camera}/rgb/{seconds}"):
+        named = (f"{camera}_{stamp}", f"{camera}/{seconds}", f"{camera}/rgb/{seconds}")
+        for name in (stamp, seconds, f"rgb/{seconds}", *named):
             found.setdefault(name, []).append(view)
     return {name: of[0] for name, of in found.items() if len(of) == 1}
 
@@ -254,7 +246,9 @@ def _compare(
     """Score every method on every view of the reference, and measure over those in common."""
     wanted = [view for view in sorted(reference.load) if any(view in m.load for m in methods)]
     work = partial(_score_view, reference, methods, net)
-    views = dict(zip(wanted, spread(work, wanted, threads=1 if net else None), strict=True))
+    views = dict(
+        zip(wanted, image_scores.spread(work, wanted, threads=1 if net else None), strict=True)
+    )
     left_out = [gone for method in methods for gone in _unpaired(reference, method)]
     left_out += [
         _gone(f"{method}: {view}" if method else view, reason)
@@ -269,7 +263,7 @@ def _compare(
         if lacking and seen.scores:
             reason = f"left out for every method: no score of {', '.join(lacking)}"
             left_out.append(_gone(view, reason))
-    sizes = size_words(views[view].size for view in common)
+    sizes = image_scores.size_words(views[view].size for view in common)
     numbers: list[Measurement] = []
     rows: list[dict[str, Cell]] = []
     for method in methods:
@@ -322,12 +316,13 @@ def _gone(name: str, reason: str) -> Exclusion:
 def _unpaired(reference: ImageSet, method: ImageSet) -> list[Exclusion]:
     """Name images without a counterpart, on either side."""
     theirs, ours = set(method.load), set(reference.load)
-    missing = [(view, f"no image of this name in {method.where}") for view in sorted(ours - theirs)]
-    extra = [
-        (view, f"the reference has no such image ({reference.where})")
-        for view in sorted(theirs - ours)
+    no_image = f"no image of this name in {method.where}"
+    not_asked = f"the reference has no such image ({reference.where})"
+    return [
+        _gone(f"{method.name}: {view}", reason)
+        for views, reason in ((ours - theirs, no_image), (theirs - ours, not_asked))
+        for view in sorted(views)
     ]
-    return [_gone(f"{method.name}: {view}", reason) for view, reason in (*missing, *extra)]
 
 
 def _score_view(

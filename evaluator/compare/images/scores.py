@@ -16,33 +16,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from bridge.episode import schema
+from bridge.episode import schema, topics
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
-from bridge.episode.topics import (
-    MASK_TOPIC,
-    RECORDED_DEPTH_TOPIC,
-    RECORDED_TOPIC,
-    RENDERED_DEPTH_TOPIC,
-    RENDERED_TOPIC,
-)
 from bridge.errors import GstError, MissingDependencyError
 from bridge.media.color import JPEG_MAGIC, decode_color
 from evaluator.compare.measure import mean_of, measured
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Quantity
-from evaluator.metrics.image import (
-    LPIPS,
-    METRICS,
-    RAW,
-    DepthScore,
-    ImageMetric,
-    ImageScore,
-    PerceptualNet,
-    score_depth,
-    score_pair,
-    variant_words,
-)
+from evaluator.metrics import image as image_metrics
+from evaluator.metrics.image import RAW, DepthScore, ImageMetric, ImageScore, PerceptualNet
 from evaluator.result import Measurement
 
 
@@ -81,8 +64,8 @@ def spread(
 
 
 RENDERED, RECORDED = "rendered", "recorded"
-_COLOR_TOPICS = ((RENDERED, RENDERED_TOPIC), (RECORDED, RECORDED_TOPIC))
-_DEPTH_TOPICS = ((RENDERED, RENDERED_DEPTH_TOPIC), (RECORDED, RECORDED_DEPTH_TOPIC))
+_COLOR_TOPICS = ((RENDERED, topics.RENDERED_TOPIC), (RECORDED, topics.RECORDED_TOPIC))
+_DEPTH_TOPICS = ((RENDERED, topics.RENDERED_DEPTH_TOPIC), (RECORDED, topics.RECORDED_DEPTH_TOPIC))
 
 Key = tuple[str, int]
 """Camera id and stamp [ns]."""
@@ -118,11 +101,8 @@ class Images:
 
     def masks_of(self, key: Key) -> dict[str, np.ndarray]:
         """Decode the masks of one view; empty ones say nothing and are left out."""
-        found = {
-            name: decode_color(of[key])[..., 0] > 127
-            for name, of in sorted(self.masks.items())
-            if key in of
-        }
+        stored = {name: of[key] for name, of in sorted(self.masks.items()) if key in of}
+        found = {name: decode_color(data)[..., 0] > 127 for name, data in stored.items()}
         return {name: mask for name, mask in found.items() if mask.any()}
 
 
@@ -140,11 +120,8 @@ def images_of(views: Episode, source: Episode | None) -> Images:
     images = read_images(views)
     if source is not None and not images.color[RECORDED]:
         wanted = {stamp for _, stamp in images.color[RENDERED]}
-        images.color[RECORDED] = {
-            key: data
-            for key, data in read_images(source).color[RECORDED].items()
-            if key[1] in wanted
-        }
+        theirs = read_images(source).color[RECORDED]
+        images.color[RECORDED] = {key: theirs[key] for key in theirs if key[1] in wanted}
     return images
 
 
@@ -158,7 +135,7 @@ def read_images(episode: Episode) -> Images:
                 put[topic] = partial(_put_color, images.color[name], match.group(1))
                 break
         else:
-            if match := MASK_TOPIC.search(topic):
+            if match := topics.MASK_TOPIC.search(topic):
                 masks = images.masks.setdefault(match.group(2), {})
                 put[topic] = partial(_put_color, masks, match.group(1))
     for topic in episode.topics_of_type(schema.IMAGE):
@@ -186,7 +163,7 @@ def _score(images: Images, net: PerceptualNet | None, key: Key) -> ViewScore:
         return ViewScore(reason=f"{where}: no recorded image with this stamp")
     try:
         recorded_u8 = decode_color(recorded)
-        scores = score_pair(
+        scores = image_metrics.score_pair(
             recorded_u8, decode_color(rendered), masks=images.masks_of(key), net=net
         )
         depth = _score_depth(images, key)
@@ -203,13 +180,12 @@ def _score(images: Images, net: PerceptualNet | None, key: Key) -> ViewScore:
 
 
 def _score_depth(images: Images, key: Key) -> DepthScore | None:
-    pair = [images.depth[name].get(key) for name in (RECORDED, RENDERED)]
-    if pair[0] is None or pair[1] is None:
+    pair = [of[key] for name in (RECORDED, RENDERED) if key in (of := images.depth[name])]
+    if len(pair) < 2:
         return None
     try:
-        return score_depth(
-            DepthImage.from_cdr(pair[0]).depth_m(), DepthImage.from_cdr(pair[1]).depth_m()
-        )
+        recorded_m, rendered_m = (DepthImage.from_cdr(data).depth_m() for data in pair)
+        return image_metrics.score_depth(recorded_m, rendered_m)
     except UndefinedStatisticError:
         return None
 
@@ -248,20 +224,20 @@ def measure_images(
     for variant in variants:
         of_variant = [score[variant] for score in scores if variant in score]
         asked = {name for score in of_variant for name in (*score.values, *score.reasons)}
-        for metric in METRICS.values():
-            if metric.id == LPIPS and net is None:
+        for metric in image_metrics.METRICS.values():
+            if metric.id == image_metrics.LPIPS and net is None:
                 continue
             if variant != RAW and metric.id not in asked:
                 continue
-            weights = f"weights {net.weights}" if net is not None and metric.id == LPIPS else ""
-            parts = (variant_words(variant), protocol, _lacking(metric, of_variant), weights)
-            words = "".join(f"; {part}" for part in parts if part)
+            told = [image_metrics.variant_words(variant), protocol, _lacking(metric, of_variant)]
+            if net is not None and metric.id == image_metrics.LPIPS:
+                told.append(f"weights {net.weights}")
+            words = "".join(f"; {each}" for each in told if each)
             values = [s.values[metric.id] for s in of_variant if metric.id in s.values]
+            quantity = quantities[metric.id, variant == RAW]
             found.append(
                 measured(
-                    quantities[metric.id, variant == RAW].of(
-                        variant=variant, protocol=words, **part
-                    ),
+                    quantity.of(variant=variant, protocol=words, **part),
                     partial(mean_of, values, metric.column, _first_reason(metric, of_variant)),
                     n=len(values),
                     counted="image",
