@@ -96,15 +96,14 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
         found.append(f"the URDF lacks the finger joints {', '.join(lost)}: no dynamic replay")
     if not record.gripper.fingers:
         found.append("a fixed tool: plans that grasp are refused")
-    linked = {hull.link for hull in hulls.hulls}
-    bare = [link for link in record.gripper.finger_links if link not in linked]
+    bare = sorted({*record.gripper.finger_links} - {hull.link for hull in hulls.hulls})
     if bare:
         found.append(f"{', '.join(bare)} have no collision shapes: they touch nothing")
-    if record.acceleration_rad_s2 is None:
-        found.append("acceleration limits are not known")
-    if record.payload_kg is None:
-        found.append("the payload is not known")
-    return found
+    limits = {
+        "acceleration limits are": record.acceleration_rad_s2,
+        "payload is": record.payload_kg,
+    }
+    return found + [f"{name} not known" for name, value in limits.items() if value is None]
 
 
 def _findings(robot: RobotModel, hulls: RobotHulls, text: str) -> Iterator[tuple[str, str]]:

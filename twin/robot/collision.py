@@ -300,16 +300,13 @@ class RobotHulls:
 
     def blind(self) -> str | None:
         """Say what is not watched, so that no motion of this arm can be called clear of itself."""
-        if oversized := self.oversized():
-            return oversized
         bare = sorted(self.robot.bodies - {hull.link for hull in self.hulls})
         if bare:
             return f"the links {', '.join(bare)} have no collision shapes: nobody watches them"
         if self.share_left_out > _MOST_LEFT_OUT:
-            return f"{self.share_left_out:.0%} of the pairs of links are not watched: " + "; ".join(
-                f"{links}, for {why}" for links, why in self.left_out.items()
-            )
-        return None
+            pairs = "; ".join(f"{links}, for {why}" for links, why in self.left_out.items())
+            return f"{self.share_left_out:.0%} of the pairs of links are not watched: {pairs}"
+        return self.oversized()
 
     def _listed(self, first: int, second: int) -> bool:
         links = {self.hulls[first].link, self.hulls[second].link}

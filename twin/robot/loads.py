@@ -33,16 +33,14 @@ class Loads:
         """Take the arm alone, and once more with each load."""
         self._robot, self._held = robot, held
         self._elbow = robot.model.getJointId(robot.joints[(len(robot.joints) - 1) // 2])
-        self._arms = {0.0: robot.model} | {
-            item.mass_kg: self._loaded(item.mass_kg) for item in held if item.mass_kg > 0
-        }
+        masses = {item.mass_kg for item in held if item.mass_kg > 0}
+        self._arms = {0.0: robot.model, **{mass_kg: self._loaded(mass_kg) for mass_kg in masses}}
         self._data = {mass: model.createData() for mass, model in self._arms.items()}
 
     def _loaded(self, mass_kg: float) -> Any:
         model, tool = self._robot.model.copy(), self._robot.model.frames[self._robot.tcp_id]
-        model.appendBodyToJoint(
-            tool.parentJoint, pin.Inertia.FromSphere(mass_kg, 0.03), tool.placement
-        )
+        ball = pin.Inertia.FromSphere(mass_kg, 0.03)
+        model.appendBodyToJoint(tool.parentJoint, ball, tool.placement)
         return model
 
     def along(
@@ -64,8 +62,7 @@ class Loads:
             pin.computeCentroidalMomentum(model, data, q, v)
             tool = pin.getFrameVelocity(model, data, robot.tcp_id, pin.LOCAL_WORLD_ALIGNED)
             elbow = pin.getVelocity(model, data, self._elbow, pin.LOCAL_WORLD_ALIGNED)
-            momentum = np.linalg.norm(data.hg.linear)
             torques[index] = pin.rnea(model, data, q, v, a)[ids]
             power = float(np.maximum(torques[index] * speeds[index], 0.0).sum())
-            rows[index] = np.linalg.norm(tool.linear), np.linalg.norm(elbow.linear), momentum, power
+            rows[index] = *map(np.linalg.norm, (tool.linear, elbow.linear, data.hg.linear)), power
         return {"torques": torques, **dict(zip(NAMES, rows.T, strict=True))}
