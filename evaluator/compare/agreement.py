@@ -1,13 +1,13 @@
 """Do the twin's success rates of groups follow the recorded ones, and how far off are they?"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from typing import Any
 
 from evaluator.cache import SummaryCache
-from evaluator.compare.measure import measured
+from evaluator.compare.measure import grouped, measured, percent
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.success import of_group
 from evaluator.errors import UndefinedStatisticError
@@ -50,19 +50,13 @@ def says_nothing(r: Measurement) -> bool:
 
 
 def counts_of(groups: Sequence[RateGroup]) -> list[dict[str, Any]]:
-    """Return the ``GroupCounts`` of each group, paired trials apart from those without a partner.
-
-    Raises:
-        UndefinedStatisticError: When a rate has no n.
-    """
+    """Return the ``GroupCounts`` of each group, pairs apart; a rate without n is undefined."""
     found = []
     for group in groups:
         counted = []
         pairs = group.trial_table or (0, 0, 0, 0)
-        for side, common in (
-            (group.recorded, group.recorded_common),
-            (group.sim, group.sim_common),
-        ):
+        both = (group.recorded, group.recorded_common), (group.sim, group.sim_common)
+        for side, common in both:
             if side.k is None or not side.n:
                 reason = f"the number of trials of {group.label} is not known"
                 raise UndefinedStatisticError(statistic="model of agreement", reason=reason)
@@ -94,9 +88,8 @@ def _fitted(groups: Sequence[RateGroup], cache: SummaryCache) -> Fitted | str:
 
         model = gap_model.GapModel(groups=tuple(gap_model.GroupCounts(**each) for each in counts))
         blind = tuple(map(float, model.blind_groups))
-        return (
-            Fitted(r=model.r, bias=model.bias, blind_share=model.blind_share, blind_groups=blind),
-        )
+        share = model.blind_share
+        return (Fitted(r=model.r, bias=model.bias, blind_share=share, blind_groups=blind),)
 
     try:
         counts = counts_of(groups)
@@ -117,12 +110,11 @@ def group_agreement(
     what += f", rates counted in different units ({', '.join(units)})" if len(units) > 1 else ""
     recorded, sim = sides(usable)
     both = {"recorded": [*recorded], "sim": [*sim]}
-    episodes = [name for group in usable for name in group.episodes]
     make = partial(
         measured,
         n=len(usable),
         counted="group",
-        episodes=episodes,
+        episodes=[name for group in usable for name in group.episodes],
         reason_without_interval="it is of these groups; r and the bias have intervals over others",
     )
     return [
@@ -145,10 +137,7 @@ def _over_others(
     def compute() -> tuple[float, Interval | None]:
         if statistic == "r":
             return agreement.pearson(recorded, sim), interval
-        value = 100 * agreement.bias(recorded=recorded, sim=sim)
-        if interval is None:
-            return value, None
-        return value, replace(interval, low=100 * interval.low, high=100 * interval.high)
+        return 100 * agreement.bias(recorded=recorded, sim=sim), percent(interval)
 
     return measured(
         defined,
@@ -161,12 +150,9 @@ def _over_others(
 
 
 def _by_condition(groups: Sequence[RateGroup], cache: SummaryCache) -> list[Measurement]:
-    conditions = list(dict.fromkeys(group.condition for group in groups))
-    if len(conditions) < 2:
-        return []
+    conditions = grouped(groups, lambda group: group.condition)
     found = []
-    for name in conditions:
-        mine = [group for group in groups if group.condition == name]
+    for name, mine in conditions.items() if len(conditions) > 1 else ():
         defined = PEARSON_R_OF_CONDITION.of(what=f"over groups {name} only", condition=name)
         found.append(_over_others(defined, mine, _fitted(mine, cache), "r"))
     return found
@@ -176,16 +162,16 @@ def _blind(groups: Sequence[RateGroup], model: Fitted | str) -> list[Measurement
     """In how many groups of this kind the twin is blind, and which of these probably are."""
     if isinstance(model, str):
         return []
-    found = [measured(BLIND_SHARE.of(), lambda: model.blind_share, n=len(groups), counted="group")]
-    for group, chance in zip(groups, model.blind_groups, strict=True):
-        if chance >= LIKELY_BLIND:
-            found.append(
-                measured(
-                    of_group(BLIND_GROUP, (group.task, group.condition, group.policy)),
-                    lambda chance=chance: chance,  # type: ignore[misc]
-                    n=(group.recorded.n or 0) + (group.sim.n or 0),
-                    counted="trial",
-                    reason_without_interval="a probability",
-                )
-            )
-    return found
+    share = measured(BLIND_SHARE.of(), lambda: model.blind_share, n=len(groups), counted="group")
+    likely = [
+        measured(
+            of_group(BLIND_GROUP, (group.task, group.condition, group.policy)),
+            partial(float, chance),
+            n=(group.recorded.n or 0) + (group.sim.n or 0),
+            counted="trial",
+            reason_without_interval="a probability",
+        )
+        for group, chance in zip(groups, model.blind_groups, strict=True)
+        if chance >= LIKELY_BLIND
+    ]
+    return [share, *likely]

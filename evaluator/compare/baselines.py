@@ -4,6 +4,7 @@ Every one of them is asked of the plan that was sent: the base rate (always yes)
 rule, and whatever else a row carries.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +21,7 @@ from evaluator.compare.gate import known_to, unheeded_verdict
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.states import AFTER, sent_plan
-from evaluator.compare.success import Answer, names_of
+from evaluator.compare.success import Answer, answered, names_of
 from evaluator.measurements import BASE_RATE, BASELINE_ACCURACY, BASELINE_GAIN
 from evaluator.metrics.geometric_rule import judge_by_geometry
 from evaluator.result import Measurement
@@ -85,20 +86,18 @@ def baseline_results(rows: Sequence[TrialRow]) -> list[Measurement]:
 
     Nothing is found where no trial has both the twin's answer and an outcome.
     """
-    names = list(dict.fromkeys(name for row in rows for name, _ in row.baselines))
+    names = dict.fromkeys(name for row in rows for name, _ in row.baselines)
     found: list[Measurement] = []
     for by, words, answer_of in SIDES:
         known = known_to(rows, answer_of)
         if not known:
             continue
         found.append(
-            proportion(
+            answered(
                 BASE_RATE.of(by=by, words=words),
-                sum(row.recorded is True for row in known),
-                len(known),
-                counted="trial",
+                known,
+                lambda row: row.recorded,
                 reason_if_undefined="no trial",
-                episodes=names_of(known),
             )
         )
         for name in names:
@@ -112,26 +111,20 @@ def _beside(
     by: str, words: str, name: str, both: Sequence[tuple[TrialRow, bool]], answer_of: Answer
 ) -> list[Measurement]:
     """Measure how often one forecast is right, and how much more often the twin is."""
-    better = worse = right = 0
-    for row, forecast in both:
-        twin, other = answer_of(row) == row.recorded, forecast == row.recorded
-        right += other
-        better += twin and not other
-        worse += other and not twin
+    right = Counter((answer_of(r) == r.recorded, other == r.recorded) for r, other in both)
     parts = {"by": by, "baseline": name, "words": words}
     episodes = names_of(row for row, _ in both)
     return [
         proportion(
             BASELINE_ACCURACY.of(**parts),
-            right,
+            right[True, True] + right[False, True],
             len(both),
-            counted="trial",
             reason_if_undefined=f"no trial has an outcome, {words} and the forecast of: {name}",
             episodes=episodes,
         ),
         measured(
             BASELINE_GAIN.of(**parts),
-            partial(paired_points, better, worse, len(both)),
+            partial(paired_points, right[True, False], right[False, True], len(both)),
             n=len(both),
             counted="trial",
             episodes=episodes,

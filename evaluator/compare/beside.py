@@ -53,13 +53,6 @@ class Measure:
         found = [w for w in map(self.value, rows) if w is not None and not math.isinf(w)]
         return f"{self.scale * self.of_all(found):.3g}{self.unit}" if found else "none"
 
-    def sentence(
-        self, second: Sequence[TrialRow], first: Sequence[TrialRow], pairs: str, *, decided: bool
-    ) -> str:
-        """Say how the second candidate does beside the first; ``pairs``: won, lost, all of them."""
-        words = f"{self.name} {self.shown(second)} against {self.shown(first)}, {pairs}"
-        return f"{words} ({'decided' if decided else 'undecided'})"
-
     def pairs(
         self, sides: Iterable[tuple[bool, TrialRow]]
     ) -> Iterator[tuple[TrialRow, TrialRow, float]]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from evaluator.compare.agreement import usable_groups
-from evaluator.compare.measure import ends
+from evaluator.compare.measure import ends, grouped
 from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.result import Cell, Interval, Table
 from evaluator.statistics.differences import points_of
@@ -21,10 +21,10 @@ def conclusions_table(
     The bias is of pairs, else of both sides' own trials, over a task's groups.
     """
     usable = usable_groups(groups)
-    tasks = list(dict.fromkeys(group.task for group in usable))
+    tasks = grouped(usable, lambda group: group.task)
     if not tasks or len(tasks) > MOST_TASKS:
         return ()
-    lines = [_line(task, [group for group in usable if group.task == task], rows) for task in tasks]
+    lines = [_line(task, members, rows) for task, members in tasks.items()]
     note = (
         "Bias: sim minus recorded, mean of the task's groups. A yes: trials in which sim said "
         "success, and those that then succeeded; beside it what succeeded whatever sim said."
@@ -51,11 +51,8 @@ def _line(task: str, members: Sequence[RateGroup], rows: Sequence[TrialRow]) -> 
 
 def _bias(members: Sequence[RateGroup]) -> tuple[float, Interval | None]:
     value = 100 * sum(float(group.gap or 0) for group in members) / len(members)
-    strata = [_counted(group) for group in members]
-    known = [each for each in strata if each is not None]
-    if len(known) < len(members):
-        return value, None
-    return points_of(known)
+    known = [each for each in map(_counted, members) if each is not None]
+    return (value, None) if len(known) < len(members) else points_of(known)
 
 
 def _counted(group: RateGroup) -> Stratum | None:

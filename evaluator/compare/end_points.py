@@ -8,7 +8,6 @@ belongs to no single recorded run is compared with each of them. It says that it
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from statistics import median
 
 import numpy as np
@@ -21,22 +20,12 @@ from bridge.episode.streams import object_pose_topics, pose_track
 from bridge.episode.topics import TCP_POSE
 from bridge.errors import BridgeError
 from bridge.geometry.trajectory import PoseTrajectory
-from evaluator.compare.measure import (
-    Part,
-    ends,
-    interval_or_reason,
-    joined,
-    measured,
-    median_of,
-    millimetres,
-    milliseconds,
-)
+from evaluator.compare.measure import Part, ends, joined, measured_median, millimetres, milliseconds
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.trajectory import find_lag_s, position_errors
 from evaluator.motion_measurements import BODY_DISTANCES
 from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
-from evaluator.statistics.intervals import median_interval
 
 TOOL_BODY = "tool"
 MOVED_M = 0.01
@@ -139,12 +128,12 @@ def compare_end_points(
             for name, quantity in BODY_DISTANCES.items():
                 values = [found[episode][name] for episode in counted]
                 words = f"{body}, {len(counted)} recorded runs against {engine}"
-                by_name[name] = measured(
+                by_name[name] = measured_median(
                     quantity.of(task=task, engine=engine, body=body, what=words),
-                    partial(median_of, values, "median", "no recorded run is left to compare with"),
+                    values,
+                    reason_if_undefined="no recorded run is left to compare with",
                     n=len(values),
                     counted="run",
-                    reason_without_interval=interval_or_reason(median_interval, values)[1],
                     episodes=counted,
                 )
             measurements += by_name.values()
@@ -232,17 +221,15 @@ def _runs(
             reason = "no end-effector poses (a topic ending with /tcp/pose)"
             left_out.append(Exclusion(episode=episode.info.id, scope="motions", reason=reason))
             continue
-        info = episode.info
-        objects = {
-            name: pose_track(episode, topic) for name, topic in object_pose_topics(episode).items()
-        }
+        info, topics_of = episode.info, object_pose_topics(episode)
+        objects = {name: pose_track(episode, topic) for name, topic in topics_of.items()}
+        moving = {name: each for name, each in objects.items() if len(each) > 1}
         runs.append(
             Run(
                 episode=episode.path.stem if derived and derived.source_episode else info.id,
                 task=info.task,
                 engine=engine,
-                bodies={TOOL_BODY: track}
-                | {name: each for name, each in objects.items() if len(each) > 1},
+                bodies={TOOL_BODY: track} | moving,
                 replayed_from=None if derived is None else derived.source_episode or None,
                 fitted_to=_fitted_to(derived),
             )
@@ -269,8 +256,7 @@ def _newest(files: Sequence[DerivedFile]) -> list[DerivedFile]:
 
 def _side_name(derived: Derived) -> str:
     """Name an engine; a replay of a recorded run says which trajectory it followed, too."""
-    engine = derived.engine or "unnamed engine"
-    if not derived.source_episode:
-        return engine
-    words = [engine, derived.trajectory or "", "calibrated" if derived.calibration_id else ""]
-    return " ".join(word for word in words if word)
+    words = [derived.engine or "unnamed engine"]
+    if derived.source_episode:
+        words += [derived.trajectory or "", "calibrated" if derived.calibration_id else ""]
+    return " ".join(filter(None, words))

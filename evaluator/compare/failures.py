@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evaluator.compare.measure import grouped
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.stages import NO_STAGE, NOT_LABELLED, first_failed_stage
 
@@ -57,10 +58,8 @@ def start_regions(rows: Sequence[TrialRow]) -> dict[str, str]:
     In each task it is the object whose start varies most. Halves are parted at the median of the
     task's trials, along x (ahead) and y (left) of the robot's base.
     """
-    tasks: dict[str, list[TrialRow]] = {}
-    for row in rows:
-        tasks.setdefault(row.task, []).append(row)
-    return {name: text for group in tasks.values() for name, text in _regions(group)}
+    tasks = grouped(rows, lambda row: row.task).values()
+    return {name: text for group in tasks for name, text in _regions(group)}
 
 
 def _regions(rows: Sequence[TrialRow]) -> Iterator[tuple[str, str]]:

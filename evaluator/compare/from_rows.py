@@ -84,10 +84,6 @@ def compare_rows(
     )
 
 
-NO_DATA = (("stage.", "stage funnel", "no trial has labelled stages or counts sub-tasks"),)
-"""Parts of the evaluation whose input a run may not have."""
-
-
 def _missing(
     rows: Sequence[TrialRow], measurements: Sequence[Measurement], source: str
 ) -> list[str]:
@@ -113,9 +109,6 @@ def _missing(
         without = sum(getattr(row, side) is None for row in asked)
         if without and (source == "run" or without < len(asked)):
             found.append(f"{side}: {without} of {len(rows)} trials have no {words[2:]}")
-    found += [
-        f"{words}: no data ({why})"
-        for start, words, why in (NO_DATA if source == "run" else ())
-        if not any(m.id.startswith(start) for m in measurements)
-    ]
+    if source == "run" and not any(m.id.startswith("stage.") for m in measurements):
+        found.append("stage funnel: no data (no trial has labelled stages or counts sub-tasks)")
     return found

@@ -1,12 +1,11 @@
 """Trial by trial: does what the twin said agree with what happened?"""
 
 from collections.abc import Sequence
-from functools import partial
 
 from bridge.episode.metadata import CONTROL
-from evaluator.compare.measure import measured, proportion
+from evaluator.compare.measure import measured
 from evaluator.compare.rows import TrialRow
-from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
+from evaluator.compare.success import WITH, WITHOUT, Answer, answered, names_of
 from evaluator.measurements import AGREED, NPV, PHI, PPV
 from evaluator.result import Measurement
 from evaluator.statistics.gate import Confusion, phi
@@ -56,35 +55,26 @@ def _agreement_of(
     seen = known_to(rows, answer_of)
     counts = confusion_of(seen, answer_of)
     nothing = f"no trial has both {words} and a known outcome"
-    make = partial(proportion, counted="trial")
-    coefficient = partial(
-        measured,
+
+    def right(row: TrialRow) -> bool:
+        return answer_of(row) == row.recorded
+
+    predictive = (
+        answered(
+            quantity.of(by=name, words=words),
+            [row for row in seen if answer_of(row) == answer],
+            right,
+            reason_if_undefined=f"it never predicted {word}" if seen else nothing,
+        )
+        for quantity, answer, word in ((PPV, True, "success"), (NPV, False, "failure"))
+    )
+    coefficient = measured(
+        PHI.of(by=name, words=words),
+        lambda: phi(counts),
         n=counts.n,
         counted="trial",
         episodes=names_of(seen),
         reason_without_interval="the four counts are beside it",
     )
-    return [
-        make(
-            AGREED.of(by=name, words=words),
-            counts.agreed,
-            counts.n,
-            reason_if_undefined=nothing,
-            episodes=names_of(seen),
-        ),
-        coefficient(PHI.of(by=name, words=words), lambda: phi(counts)),
-        make(
-            PPV.of(by=name, words=words),
-            counts.true_positive,
-            counts.predicted_success,
-            reason_if_undefined=nothing if not counts.n else "it never predicted success",
-            episodes=names_of(row for row in seen if answer_of(row)),
-        ),
-        make(
-            NPV.of(by=name, words=words),
-            counts.true_negative,
-            counts.n - counts.predicted_success,
-            reason_if_undefined=nothing if not counts.n else "it never predicted failure",
-            episodes=names_of(row for row in seen if not answer_of(row)),
-        ),
-    ]
+    share = answered(AGREED.of(by=name, words=words), seen, right, reason_if_undefined=nothing)
+    return [share, coefficient, *predictive]

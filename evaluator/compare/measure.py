@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from statistics import median
 from typing import TypeVar
 
@@ -14,27 +15,26 @@ from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.intervals import median_interval, wilson
 
 Item = TypeVar("Item")
-DEGREES = math.degrees(1.0)
+Group = TypeVar("Group")
 
 
-def millimetres(value_m: float | None) -> float | None:
-    """Return a length [mm]; None stays None, and so does what is not a number."""
-    return _rounded(value_m, 1e3)
+def _rounded(value: float | None, factor: float) -> float | None:
+    """Return a value in another unit; None where there is none, or it is not a number."""
+    return None if value is None or not math.isfinite(value) else round(factor * value, 2)
 
 
-def degrees(value_rad: float | None) -> float | None:
-    """Return an angle [deg]; None stays None, and so does what is not a number."""
-    return _rounded(value_rad, DEGREES)
+millimetres = milliseconds = partial(_rounded, factor=1e3)
+degrees = partial(_rounded, factor=math.degrees(1.0))
 
 
-def milliseconds(value_s: float | None) -> float | None:
-    """Return a duration [ms]; None stays None, and so does what is not a number."""
-    return _rounded(value_s, 1e3)
+def ends(interval: Interval | None) -> tuple[float | None, float | None]:
+    """Return both ends of an interval; unknown without one."""
+    return (None, None) if interval is None else (interval.low, interval.high)
 
 
-def ends(interval: Interval | None, factor: float = 1.0) -> tuple[float | None, float | None]:
-    """Return both ends of an interval, multiplied into another unit; unknown without one."""
-    return (None, None) if interval is None else (factor * interval.low, factor * interval.high)
+def percent(interval: Interval | None) -> Interval | None:
+    """Return an interval of shares in per cent."""
+    return interval and replace(interval, low=100 * interval.low, high=100 * interval.high)
 
 
 RATE_COLUMNS = ("k", "n", "rate", "low", "high", "interval")
@@ -48,6 +48,14 @@ def rate_row(rate: Measurement) -> tuple[Cell, ...]:
     return (*counts, rate.value, *ends(rate.interval), method)
 
 
+def grouped(items: Iterable[Item], key: Callable[[Item], Group]) -> dict[Group, list[Item]]:
+    """Gather items by their key, in the order in which keys come first."""
+    groups: dict[Group, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
 def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> float | None:
     """Return the mean of what is known; None when nothing is."""
     values = [value for item in items if (value := read(item)) is not None]
@@ -59,19 +67,6 @@ def mean_of(values: Sequence[float], statistic: str, reason: str) -> float:
     if not values:
         raise UndefinedStatisticError(statistic=statistic, reason=reason)
     return sum(values) / len(values)
-
-
-def median_of(
-    values: Sequence[float], statistic: str, reason: str
-) -> tuple[float, Interval | None]:
-    """Return the median with its interval; undefined for the reason given without a value."""
-    if not values:
-        raise UndefinedStatisticError(statistic=statistic, reason=reason)
-    return float(median(values)), interval_or_reason(median_interval, values)[0]
-
-
-def _rounded(value: float | None, factor: float) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(factor * value, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,9 +90,6 @@ def joined(parts: Iterable[Part]) -> Part:
     )
 
 
-Statistic = Callable[[], float | tuple[float, Interval | None]]
-
-
 _HASHES = re.compile(r"\b(server|code|map)=(\S+)")
 """What a rollout says of who acted, beside or instead of a checkpoint."""
 
@@ -105,11 +97,7 @@ _HASHES = re.compile(r"\b(server|code|map)=(\S+)")
 def refuse_changed(named: Iterable[tuple[str, str, str]]) -> None:
     """Refuse a policy that was another checkpoint before: one name would stand for both.
 
-    Args:
-        named: Where it stands, the policy, and who acted.
-
-    Raises:
-        UsageError: Naming both, and where they stand.
+    ``named``: where it stands, the policy, and who acted.
     """
     seen: dict[tuple[str, str], tuple[str, str]] = {}
     for where, policy, who in named:
@@ -137,19 +125,9 @@ def refuse_alike(
             raise AlikeNamesError(kind=kind, names=(owner, name), places=(places[owner], where))
 
 
-def interval_or_reason(
-    interval_of: Callable[[Sequence[float]], Interval], values: Sequence[float]
-) -> tuple[Interval | None, str | None]:
-    """Return the interval of some values, or None and the reason why they have none."""
-    try:
-        return interval_of(values), None
-    except UndefinedStatisticError as error:
-        return None, error.reason
-
-
 def measured(
     defined: Defined,
-    compute: Statistic,
+    compute: Callable[[], float | tuple[float, Interval | None]],
     *,
     n: int | None = None,
     counted: str | None = None,
@@ -191,13 +169,38 @@ def measured(
     )
 
 
+def measured_median(
+    defined: Defined,
+    values: Sequence[float],
+    *,
+    reason_if_undefined: str,
+    n: int,
+    counted: str,
+    episodes: Iterable[str],
+) -> Measurement:
+    """Measure a median with its interval, or the reason why it has none."""
+    interval, reason = None, None
+    try:
+        interval = median_interval(values)
+    except UndefinedStatisticError as error:
+        reason = error.reason
+
+    def compute() -> tuple[float, Interval | None]:
+        if not values:
+            raise UndefinedStatisticError(statistic="median", reason=reason_if_undefined)
+        return float(median(values)), interval
+
+    more = {"counted": counted, "reason_without_interval": reason}
+    return measured(defined, compute, n=n, episodes=episodes, **more)
+
+
 def proportion(
     defined: Defined,
     k: int,
     n: int,
     *,
-    counted: str,
     reason_if_undefined: str,
+    counted: str = "trial",
     episodes: Iterable[str] = (),
 ) -> Measurement:
     """Measure k/n with Wilson's interval; undefined for n = 0."""

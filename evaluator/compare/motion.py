@@ -7,8 +7,7 @@ Recorded against the executed replay: how well kinematics and base calibration f
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import compress
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from evaluator.compare.measure import (
     Part,
     average,
     degrees,
+    grouped,
     mean_of,
     measured,
     millimetres,
@@ -151,31 +151,35 @@ Groups = Mapping[str, Sequence[MotionSummary]]
 """By what the motions are held against: planned or executed."""
 
 
+COLUMNS = (
+    ("lag (ms)", milliseconds, "lag_s"),
+    ("path (mm)", millimetres, "path_mean_m"),
+    ("path, largest (mm)", millimetres, "path_max_m"),
+    ("at equal times (mm)", millimetres, "position_mean_m"),
+    ("end point (mm)", millimetres, "end_point_m"),
+    ("mean angle (deg)", degrees, "rotation_mean_rad"),
+)
+"""Columns of means, their units, and the fields of ``MotionErrors``."""
+
+
 def group_table(groups: Groups) -> Table:
     """Means of each task and condition."""
     rows: list[dict[str, Cell]] = []
     for name, motions in groups.items():
-        of_group: dict[tuple[str, str], list[MotionSummary]] = {}
-        for motion in motions:
-            of_group.setdefault((motion.task, motion.condition), []).append(motion)
-        for task, condition in sorted(of_group):
-            members = of_group[task, condition]
-            rows.append(
-                {
-                    "task": task,
-                    "condition": condition.replace("_", " "),
-                    "against": name,
-                    "trials": len(members),
-                    "lag (ms)": milliseconds(average(members, attrgetter("lag_s"))),
-                    "path (mm)": millimetres(average(members, attrgetter("path_mean_m"))),
-                    "path, largest (mm)": millimetres(average(members, attrgetter("path_max_m"))),
-                    "at equal times (mm)": millimetres(
-                        average(members, attrgetter("position_mean_m"))
-                    ),
-                    "end point (mm)": millimetres(average(members, attrgetter("end_point_m"))),
-                    "mean angle (deg)": degrees(average(members, attrgetter("rotation_mean_rad"))),
-                }
-            )
+        of_group = grouped(motions, attrgetter("task", "condition"))
+        rows += [
+            {
+                "task": task,
+                "condition": condition.replace("_", " "),
+                "against": name,
+                "trials": len(members),
+                **{
+                    column: shown(average(members, attrgetter(field)))
+                    for column, shown, field in COLUMNS
+                },
+            }
+            for (task, condition), members in sorted(of_group.items(), key=itemgetter(0))
+        ]
     return Table.of(
         rows,
         id="motion",
@@ -200,37 +204,26 @@ def motion_results(motions: Sequence[MotionSummary]) -> Part:
     if not motions:
         reason = "no trial has both a recorded tool pose and a dynamic replay's"
         return Part(missing=(f"motion errors: no data ({reason})",))
-    groups: dict[str, list[MotionSummary]] = {name: [] for name in MEANING}
-    for motion in motions:
-        groups[motion.against].append(motion)
+    groups = {name: [m for m in motions if m.against == name] for name in MEANING}
     found = [m for name, members in groups.items() for m in _measure(name, members)]
-    return Part(
-        measurements=tuple(found),
-        tables=(group_table(groups),),
-    )
+    return Part(measurements=tuple(found), tables=(group_table(groups),))
 
 
 def _measure(name: str, motions: Sequence[MotionSummary]) -> list[Measurement]:
-    how = sorted({motion.aligned_by for motion in motions})
-    everything = [motion.episode for motion in motions]
+    how = " or ".join(sorted({motion.aligned_by for motion in motions})) or "stamps"
+    why = f"no trial knows it of {MEANING[name].split(' (')[0]}"
     measurements = []
     for field, quantity in MOTIONS.items():
-        values = list(map(attrgetter(field), motions))
-        there = [value is not None for value in values]
-        known = list(compress(values, there))
+        known = [motion for motion in motions if getattr(motion, field) is not None]
+        values = list(map(attrgetter(field), known))
         measurements.append(
             measured(
-                quantity.of(against=name, meaning=MEANING[name], how=" or ".join(how) or "stamps"),
-                partial(
-                    mean_of,
-                    known,
-                    "motion error",
-                    f"no trial knows it of {MEANING[name].split(' (')[0]}",
-                ),
+                quantity.of(against=name, meaning=MEANING[name], how=how),
+                partial(mean_of, values, "motion error", why),
                 n=len(known),
                 counted="trial",
                 reason_without_interval=SHARED,
-                episodes=compress(everything, there),
+                episodes=[motion.episode for motion in known],
             )
         )
     return measurements

@@ -2,10 +2,11 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from fractions import Fraction
 from itertools import chain
 from typing import Any
 
+from evaluator.compare.agreement import sides, usable_groups
+from evaluator.compare.measure import grouped
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.trial import Trial
 from evaluator.errors import UndefinedStatisticError
@@ -38,12 +39,11 @@ def notes_table(found: Iterable[Note]) -> tuple[Table, ...]:
 
 def with_notes(tables: Iterable[Table], found: Iterable[Note]) -> tuple[Table, ...]:
     """Put notes before those that are among some tables already."""
-    kept, found = list(tables), list(found)
+    kept, found = tuple(tables), list(found)
     if not found:
-        return tuple(kept)
+        return kept
     old = [(str(a), str(b)) for table in kept if table.id == "notes" for a, b in table.rows]
-    others = [table for table in kept if table.id != "notes"]
-    return (*others, *notes_table([*found, *old]))
+    return (*(table for table in kept if table.id != "notes"), *notes_table([*found, *old]))
 
 
 def _units(groups: Sequence[RateGroup]) -> list[Note]:
@@ -52,13 +52,11 @@ def _units(groups: Sequence[RateGroup]) -> list[Note]:
     for task, group in found.items():
         n = group.recorded.n or group.sim.n
         count = f" (n = {n})" if n else ""
-        notes.append(
-            (
-                task,
-                f"counted in {group.unit}s{count}, not in trials: {group.unit}s of one trial are "
-                "not independent, so intervals and tests claim more than the trials justify",
-            )
+        words = (
+            f"counted in {group.unit}s{count}, not in trials: {group.unit}s of one trial are not "
         )
+        words += "independent, so intervals and tests claim more than the trials justify"
+        notes.append((task, words))
     units = sorted({group.unit for group in groups})
     if len(units) > 1:
         words = f"averages and r mix rates counted in {' and in '.join(f'{u}s' for u in units)}"
@@ -68,25 +66,20 @@ def _units(groups: Sequence[RateGroup]) -> list[Note]:
 
 def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list[Note]:
     """Say that r within tasks tells another story than r over all groups (Simpson 1951)."""
-    tasks: dict[str, list[tuple[Fraction, Fraction]]] = {}
-    for group in groups:
-        if group.recorded_rate is not None and group.sim_rate is not None:
-            tasks.setdefault(group.task, []).append((group.recorded_rate, group.sim_rate))
-    if not 1 < len(tasks) < sum(map(len, tasks.values())):
+    usable = usable_groups(groups)
+    tasks = grouped(usable, lambda group: group.task)
+    if not 1 < len(tasks) < len(usable):
         return []
     try:
-        within, between = within_and_between(list(tasks.values()))
+        pairs = [list(zip(*sides(members), strict=True)) for members in tasks.values()]
+        within, between = within_and_between(pairs)
     except UndefinedStatisticError:
         return []
     if within * between >= 0:
         return []
     r = by_id.get("agreement.pearson_r")
-    whole = (
-        "" if r is None or r.value is None else f"r = {r.value:.2f} over all groups hides this: "
-    )
-    text = (
-        f"{whole}inside tasks r = {within:.2f}, between tasks r = {between:.2f} (Simpson's paradox)"
-    )
+    text = "" if r is None or r.value is None else f"r = {r.value:.2f} over all groups hides this: "
+    text += f"inside tasks r = {within:.2f}, between tasks r = {between:.2f} (Simpson's paradox)"
     if within < 0:
         text += ". Inside a task, what the twin ranks higher did worse: do not choose by it"
     return [("agreement.pearson_r", text)]

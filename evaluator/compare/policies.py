@@ -14,12 +14,10 @@ from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple, TypeVar
 
-import numpy as np
-
 from bridge.episode.catalogue_query import UNLABELLED
 from bridge.task.protocol import VOID_CAUSES, Protocol
 from evaluator.compare.beside import MEASURES, Measure
-from evaluator.compare.measure import Part, ends, measured
+from evaluator.compare.measure import Part, ends, grouped, measured, percent
 from evaluator.compare.rows import RateGroup, TrialRow, in_order
 from evaluator.compare.success import CONDITION_OF_ARM, WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
@@ -45,6 +43,11 @@ class Candidate:
 
     policy: str
     condition: str
+
+    @staticmethod
+    def of(one: TrialRow | RateGroup) -> "Candidate":
+        """Return whose trial or rate it is."""
+        return Candidate(policy=one.policy, condition=one.condition)
 
     @property
     def words(self) -> str:
@@ -128,19 +131,10 @@ def made_trials(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[Tr
 
 def tries_of(made: Sequence[TrialRow], question: Question) -> list[Try]:
     """Return the trials of both candidates among those that count."""
-    sides = {
-        (c.policy, c.condition): is_second
-        for is_second, c in ((False, question.first), (True, question.second))
-    }
+    first, second = ((c.policy, c.condition) for c in (question.first, question.second))
+    sides = {first: False, second: True}
     return [
-        Try(
-            task=row.task,
-            start=row.start_id or "",
-            is_second=side,
-            succeeded=row.recorded is True,
-            has_outcome=row.recorded is not None,
-            row=row,
-        )
+        Try(row.task, row.start_id or "", side, row.recorded is True, row.recorded is not None, row)
         for row in made
         if (side := sides.get((row.policy, row.condition))) is not None
     ]
@@ -180,25 +174,18 @@ class _Count:
         """Count one more; the first of each side on a start are a pair."""
         self.k[each.is_second] += each.succeeded
         self.n[each.is_second] += 1
-        self._pair(each)
-        self.num_pairs = self.pairs + pairs_equivalent(*self.n)
-
-    def _pair(self, each: Try) -> None:
-        if not each.start:
-            return
         firsts = self.starts.setdefault(each.start, [None, None])
-        if firsts[each.is_second] is not None:
-            return
-        firsts[each.is_second] = each
-        first, second = firsts
-        if first is None or second is None or not _is_same_start(first.row, second.row):
-            return
-        self.pairs += 1
-        self.improved += second.succeeded and not first.succeeded
-        self.worsened += first.succeeded and not second.succeeded
-        for side, member in enumerate((first, second)):
-            self.k[side] -= member.succeeded
-            self.n[side] -= 1
+        if each.start and firsts[each.is_second] is None:
+            firsts[each.is_second] = each
+            first, second = firsts
+            if first and second and _is_same_start(first.row, second.row):
+                self.pairs += 1
+                self.improved += second.succeeded and not first.succeeded
+                self.worsened += first.succeeded and not second.succeeded
+                for side, member in enumerate((first, second)):
+                    self.k[side] -= member.succeeded
+                    self.n[side] -= 1
+        self.num_pairs = self.pairs + pairs_equivalent(*self.n)
 
     def stratum(self) -> Stratum:
         """Return what was counted so far."""
@@ -223,6 +210,10 @@ class Course:
         """Count trials in their order."""
         counts: dict[str, _Count] = {}
         at: dict[float, Evidence] = {}
+
+        def so_far() -> Evidence:
+            return Evidence(strata=tuple(count.stratum() for count in counts.values()))
+
         places, total = plan.places(), 0.0
         place = next(places)
         for each in tries:
@@ -231,28 +222,18 @@ class Course:
             count.add(each)
             total += count.num_pairs
             while total >= place - 1e-9:
-                at[place] = _evidence(counts)
+                at[place] = so_far()
                 place = next(places)
-        return Course(all_=_evidence(counts), at=at)
+        return Course(all_=so_far(), at=at)
 
     def read(self, plan: Plan) -> "Reading":
         """Look at the trials as planned."""
         return read(plan, self.all_, lambda pairs: self.at.get(pairs, self.all_))
 
 
-def _evidence(counts: Mapping[str, _Count]) -> Evidence:
-    return Evidence(strata=tuple(count.stratum() for count in counts.values()))
-
-
 def _is_same_start(first: TrialRow, second: TrialRow) -> bool:
-    if not (first.start_positions_m and second.start_positions_m):
-        return True
-    shared = first.start_positions_m.keys() & second.start_positions_m.keys()
-    gaps = (
-        np.subtract(first.start_positions_m[name], second.start_positions_m[name])
-        for name in shared
-    )
-    return all(float(np.linalg.norm(gap)) <= START_LIMIT_M for gap in gaps)
+    one, other = first.start_positions_m, second.start_positions_m
+    return all(math.dist(one[n], other[n]) <= START_LIMIT_M for n in one.keys() & other.keys())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,9 +264,8 @@ class Reading:
 def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence] | None = None) -> Reading:
     """Look at the trials as planned.
 
-    Args:
-        until: Gives what was counted after so many pairs; without it the last look that was due
-            sees all of it.
+    ``until`` gives what was counted after so many pairs; without it the last look that was due sees
+    all of it.
     """
     limit = math.inf
     decided, better = None, 0
@@ -308,18 +288,14 @@ def with_holm(
     items: Sequence[Item], plan: Plan, read_one: Callable[[Plan, Item], Reading]
 ) -> list[Reading]:
     """Read several questions that share alpha; each that is decided leaves its share."""
-    found: list[Reading | None] = [None] * len(items)
+    found: dict[int, Reading] = {}
     open_ = list(range(len(items)))
     while open_:
         shared = replace(plan, alpha=plan.alpha / len(open_))
-        now = {place: read_one(shared, items[place]) for place in open_}
-        for place, reading in now.items():
-            found[place] = reading
-        left = [place for place in open_ if now[place].decided is None]
-        if len(left) == len(open_):
-            break
-        open_ = left
-    return [each for each in found if each is not None]
+        found |= {place: read_one(shared, items[place]) for place in open_}
+        left = [place for place in open_ if found[place].decided is None]
+        open_ = left if len(left) < len(open_) else []
+    return [found[place] for place in range(len(items))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,11 +313,6 @@ class Answer:
     episodes: tuple[str, ...] = field(default=(), repr=False)
     beside: tuple[str, ...] = ()
     """What progress and time to success say."""
-
-    @property
-    def _without_these(self) -> str:
-        sign = -1 if self.reading.better < 0 else 1
-        return f"{round(100 * sign * (self.without_these or 0.0)):+d} without them"
 
     @property
     def sentence(self) -> str:
@@ -364,7 +335,8 @@ class Answer:
         points = f"{round(difference):+d} points [{round(low):+d}, {round(high):+d}]"
         if lost := sum(self.no_outcome):
             points += f" ({lost} without an outcome as {noun('failure', lost)}"
-            points += f"; {self._without_these})" if self.without_these is not None else ")"
+            without = 100 * (self.without_these or 0.0) * (-1 if self.reading.better < 0 else 1)
+            points += ")" if self.without_these is None else f"; {round(without):+d} without them)"
         if self.reading.better:
             words = f"{second} is better than {first}: {' against '.join(counts)}, {points}"
             look = self.reading.decided
@@ -384,23 +356,19 @@ class Answer:
 
 def notes_of_trials(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[tuple[str, str]]:
     """Say which trials have no outcome, and which starts a candidate tried again."""
-    groups: dict[tuple[str, Candidate], list[TrialRow]] = {}
-    for row in made_trials(rows, void_causes):
-        who = Candidate(policy=row.policy, condition=row.condition)
-        groups.setdefault((row.task, who), []).append(row)
+    made = made_trials(rows, void_causes)
+    groups = grouped(made, lambda row: (row.task, Candidate.of(row)))
     found = []
     for (task, who), made in groups.items():
         about = f"{who.words}, {task}" if len({t for t, _ in groups}) > 1 else who.words
-        lost = [row for row in made if row.recorded is None]
-        if lost:
+        if lost := [row for row in made if row.recorded is None]:
             k, n = sum(row.recorded is True for row in made), len(made)
             why = ", ".join(dict.fromkeys(row.why_unknown or "nothing executed" for row in lost))
             words = f"{len(lost)} of {n} trials have no outcome ({why}): {k} of {n} succeeded where"
             words += f" they count as failures, as in comparisons, {k} of {n - len(lost)} without"
             found.append((about, f"{words} them, as in its rate"))
         starts = Counter(row.start_id for row in made if row.start_id)
-        again = [f"{name} {times} times" for name, times in starts.items() if times > 1]
-        if again:
+        if again := [f"{name} {times} times" for name, times in starts.items() if times > 1]:
             more = f" and {len(again) - 3} more" if len(again) > 3 else ""
             words = f"starts tried more than once: {', '.join(again[:3])}{more}; the first trial "
             found.append((about, f"{words}of a start is paired, the others count without a pair"))
@@ -413,19 +381,16 @@ def compare_policies(
     void_causes: Sequence[str] = VOID_CAUSES,
 ) -> list[Answer]:
     """Answer every question over all tasks, then in each task where there are several."""
-    found = (Candidate(policy=row.policy, condition=row.condition) for row in rows)
     made = made_trials(rows, void_causes)
     plan, of_task = plan_of(protocol), plan_of(protocol, of_task=True)
     asked: list[_Case] = []
     parts: list[_Case] = []
-    for question in questions(found, protocol):
+    for question in questions(map(Candidate.of, rows), protocol):
         tries = tries_of(made, question)
         if len({each.is_second for each in tries}) < 2:
             continue
         asked.append(_Case(question, "", tries, Course.of(tries, plan)))
-        tasks: dict[str, list[Try]] = {}
-        for each in tries:
-            tasks.setdefault(each.task, []).append(each)
+        tasks = grouped(tries, lambda each: each.task)
         if len(tasks) > 1:
             parts += [_Case(question, t, own, Course.of(own, of_task)) for t, own in tasks.items()]
     primary = [case for case in asked if case.question.is_primary]
@@ -458,9 +423,10 @@ def _beside(cases: Sequence["_Case"], plan: Plan) -> dict[int, tuple[str, ...]]:
     readings = with_holm(asked, plan, lambda share, each: each[2].read(share))
     for (case, measure, _), reading in zip(asked, readings, strict=True):
         won, lost, many = reading.evidence.counted
-        told = f"{measure.won} in {won} and {measure.lost} in {lost} of {many} pairs"
-        first_rows, second_rows = case.sides
-        words = measure.sentence(second_rows, first_rows, told, decided=reading.better != 0)
+        theirs, mine = map(measure.shown, case.sides)
+        words = f"{measure.name} {mine} against {theirs}, {measure.won} in {won} and "
+        words += f"{measure.lost} in {lost} of {many} pairs"
+        words += f" ({'decided' if reading.better else 'undecided'})"
         found[id(case)] = (*found.get(id(case), ()), words)
     return found
 
@@ -492,16 +458,14 @@ def _answer(case: _Case, reading: Reading, beside: tuple[str, ...] = ()) -> Answ
     sides = [[t for t in case.tries if t.is_second == second] for second in (False, True)]
     counts = [(sum(t.succeeded for t in side), len(side)) for side in sides]
     unknown = [sum(not t.has_outcome for t in side) for side in sides]
-    known = (
-        Course.of([t for t in case.tries if t.has_outcome], Plan()).all_ if any(unknown) else None
-    )
+    known = Course.of([t for t in case.tries if t.has_outcome], Plan()).all_
     return Answer(
         question=case.question,
         task=case.task,
         counts=(counts[0], counts[1]),
         reading=reading,
         no_outcome=(unknown[0], unknown[1]),
-        without_these=known.difference if known is not None and known.pairs else None,
+        without_these=known.difference if any(unknown) and known.pairs else None,
         episodes=tuple(each.row.episode for each in case.tries),
         beside=beside,
     )
@@ -509,22 +473,17 @@ def _answer(case: _Case, reading: Reading, beside: tuple[str, ...] = ()) -> Answ
 
 def compare_counts(groups: Sequence[RateGroup]) -> list[Answer]:
     """Answer the same of a table of rates; nothing of what has no n, or counts parts of trials."""
-    counted = [g for g in groups if g.unit == "trial" and g.recorded.k is not None and g.recorded.n]
     cells = {
-        (g.task, Candidate(policy=g.policy, condition=g.condition)): (
-            g.recorded.k or 0,
-            g.recorded.n or 0,
-        )
-        for g in counted
+        (g.task, Candidate.of(g)): (g.recorded.k, g.recorded.n)
+        for g in groups
+        if g.unit == "trial" and g.recorded.k is not None and g.recorded.n
     }
     asked: list[tuple[Question, str, list[Stratum]]] = []
     parts: list[tuple[Question, str, list[Stratum]]] = []
     for question in questions(c for _, c in cells):
-        tasks = [t for t, c in cells if c == question.first and (t, question.second) in cells]
-        strata = [
-            Stratum(first=cells[task, question.first], second=cells[task, question.second])
-            for task in tasks
-        ]
+        first, second = question.first, question.second
+        tasks = [task for task, c in cells if c == first and (task, second) in cells]
+        strata = [Stratum(first=cells[t, first], second=cells[t, second]) for t in tasks]
         if tasks:
             asked.append((question, "", strata))
         if len(tasks) > 1:
@@ -535,14 +494,14 @@ def compare_counts(groups: Sequence[RateGroup]) -> list[Answer]:
             cases, Plan(), lambda plan, case: read(plan, Evidence(strata=tuple(case[2])))
         )
         for (question, task, strata), reading in zip(cases, readings, strict=True):
-            first, second = ([s.first for s in strata], [s.second for s in strata])
-            counts = (_sum(first), _sum(second))
+            counts = _sum(s.first for s in strata), _sum(s.second for s in strata)
             found.append(Answer(question=question, task=task, counts=counts, reading=reading))
     return found
 
 
-def _sum(side: Sequence[tuple[int, int]]) -> tuple[int, int]:
-    return sum(k for k, _ in side), sum(n for _, n in side)
+def _sum(side: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    k, n = map(sum, zip(*side, strict=True))
+    return k, n
 
 
 def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None) -> Part:
@@ -563,11 +522,8 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         for each in answers
     ]
     plan = plan_of(protocol)
-    words = (
-        f"planned: {plan.pairs} pairs"
-        if plan.locked
-        else f"no plan was locked: as if {plan.pairs} pairs had been planned"
-    )
+    words = f"no plan was locked: as if {plan.pairs} pairs had been planned"
+    words = f"planned: {plan.pairs} pairs" if plan.locked else words
     table = Table.of(
         rows,
         id="comparisons",
@@ -578,29 +534,25 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         "at every look. Trials without an outcome are failures.",
     )
     return Part(
-        measurements=tuple(_measured(each) for each in answers),
-        tables=(table, *_standing(answers)),
+        measurements=tuple(_measured(each) for each in answers), tables=(table, *_standing(answers))
     )
 
 
 def _measured(answer: Answer) -> Measurement:
     question, evidence = answer.question, answer.reading.evidence
-    parts = {
-        "second": f"{question.second.policy}_{question.second.condition}".strip("_") or "unnamed",
-        "first": f"{question.first.policy}_{question.first.condition}".strip("_") or "unnamed",
-        "words": answer.sentence,
-    }
-    defined = (
-        COMPARED_IN_TASK.of(**parts, task=answer.task) if answer.task else COMPARED.of(**parts)
+    second, first = (
+        f"{side.policy}_{side.condition}".strip("_") or "unnamed"
+        for side in (question.second, question.first)
     )
+    parts = {"second": second, "first": first, "words": answer.sentence}
+    quantity = COMPARED_IN_TASK if answer.task else COMPARED
+    defined = quantity.of(**parts, task=answer.task)
 
     def compute() -> tuple[float, Interval | None]:
-        if not evidence.pairs or answer.reading.interval is None:
+        if not evidence.pairs:
             reason = "no task was tried by both"
             raise UndefinedStatisticError(statistic="comparison", reason=reason)
-        found = answer.reading.interval
-        points = replace(found, low=100 * found.low, high=100 * found.high)
-        return 100 * evidence.difference, points
+        return 100 * evidence.difference, percent(answer.reading.interval)
 
     n = sum(n for _, n in answer.counts)
     return measured(defined, compute, n=n, counted="trial", episodes=answer.episodes)
@@ -625,8 +577,7 @@ def _standing(answers: Sequence[Answer]) -> tuple[Table, ...]:
     rows: list[dict[str, Cell]] = [
         {
             "candidate": candidate.words,
-            "k": rates[candidate][0],
-            "n": rates[candidate][1],
+            **dict(zip("kn", rates[candidate], strict=True)),
             "may be best": "no" if by else "yes",
             "beaten by": ", ".join(by) or None,
         }

@@ -34,8 +34,7 @@ def as_designed(rows: Sequence[TrialRow], protocol: Protocol | None) -> list[Tri
     policies = {each.policy for each in protocol.policies}
     found = []
     for row in rows:
-        is_blank = not row.file and row.recorded is None and row.sim_planned is None
-        if is_blank and row.plan_id is None:
+        if not row.file and {row.recorded, row.sim_planned, row.plan_id} == {None}:
             continue
         if row.policy in arms:
             policy, arm = arms[row.policy]
@@ -56,11 +55,7 @@ def protocol_results(
     left_out: Sequence[Exclusion] = (),
     task_hashes: Mapping[str, frozenset[str]] | None = None,
 ) -> Part:
-    """Compare a study with its design; nothing without one.
-
-    Args:
-        answers: What the comparisons say that the design asked for.
-    """
+    """Compare a study, and the answers its design asked for, with it; nothing without one."""
     if protocol is None or protocol.primary is None:
         return Part()
     mine = [row for row in rows if row.study_arm]
@@ -140,8 +135,7 @@ def _of_starts(rows: Sequence[TrialRow], protocol: Protocol) -> Iterable[Departu
         tried = {row.start_id or "unnamed" for row in rows if row.task == task.task}
         if other := sorted(tried - planned):
             yield "other starts", task.task, "none", _listed(other)
-        missing = sorted(planned - tried)
-        if missing and tried:
+        if tried and (missing := sorted(planned - tried)):
             yield "starts not tried", task.task, "none", _listed(missing)
     again = Counter((row.task, row.policy, row.study_arm, row.start_id) for row in rows)
     for (name, policy, arm, start_id), count in again.items():

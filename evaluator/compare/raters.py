@@ -22,16 +22,13 @@ Labels = Mapping[str, bool]
 def with_reviews(comparison: Comparison, reviews: Sequence[Review]) -> Comparison:
     """Add what other raters say to an evaluation: kappa of each two raters."""
     rows = {row.episode: row for row in comparison.rows}
-    raters: dict[str, dict[str, bool]] = {OPERATOR: {}}
-    for row in comparison.rows:
-        if row.recorded is not None:
-            raters[OPERATOR][row.episode] = row.recorded
+    labelled = {name: row.recorded for name, row in rows.items() if row.recorded is not None}
+    raters: dict[str, dict[str, bool]] = {OPERATOR: labelled}
     for review in reviews:
         if review.trial_id in rows and review.success is not None:
             raters.setdefault(review.rater, {})[review.trial_id] = review.success
-    strange = sorted({r.trial_id for r in reviews} - rows.keys())
     missing = comparison.missing
-    if strange:
+    if strange := sorted({r.trial_id for r in reviews} - rows.keys()):
         shown = ", ".join(strange[:3])
         missing = (*missing, f"reviews: {len(strange)} of trials that are not there ({shown})")
     agreement = [_agreement(a, b, raters) for a, b in combinations(raters, 2)]

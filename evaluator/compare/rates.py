@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from bridge.exchange.trials_rates import RateRecord
 from evaluator.compare.agreement import group_agreement, usable_groups
@@ -11,7 +12,7 @@ from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.policies import compare_counts, comparison_part
 from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import Comparison, RateGroup
-from evaluator.compare.success import WITH
+from evaluator.compare.success import WITH, of_group
 from evaluator.compare.tables import success_table
 from evaluator.measurements import RATE_AS_GIVEN
 from evaluator.result import Exclusion, Measurement
@@ -34,14 +35,9 @@ def compare_records(records: Sequence[RateRecord], name: str) -> Comparison:
     counted = all(rate.n for group in usable_groups(groups) for rate in (group.recorded, group.sim))
     agreement = group_agreement(groups)
     if not counted:  # nothing says how far a rate without n would move if it was counted again
-        agreement = [
-            each
-            if each.value is None
-            else replace(each, interval=None, reason_without_interval=NO_COUNTS)
-            for each in agreement
-        ]
-    answers = compare_counts(groups)
-    compared = comparison_part(answers)
+        bare = partial(replace, interval=None, reason_without_interval=NO_COUNTS)
+        agreement = [each if each.value is None else bare(each) for each in agreement]
+    compared = comparison_part(compare_counts(groups))
     measurements = (
         *(side for group in groups for side in (group.recorded, group.sim)),
         *agreement,
@@ -63,9 +59,7 @@ def compare_records(records: Sequence[RateRecord], name: str) -> Comparison:
     )
 
 
-def _rate_groups(
-    records: Sequence[RateRecord],
-) -> tuple[tuple[RateGroup, ...], list[Exclusion]]:
+def _rate_groups(records: Sequence[RateRecord]) -> tuple[tuple[RateGroup, ...], list[Exclusion]]:
     """Lay both sides of each group beside each other, and name what lacks one."""
     cells: dict[Key, dict[str, RateRecord]] = {}
     for record in records:
@@ -100,19 +94,17 @@ def _rate_groups(
 
 
 def _rate(record: RateRecord | None, side: str, key: Key) -> Measurement:
-    task, condition, policy, unit = key
     k, n = (None, None) if record is None else (record.k, record.n)
     interval = None if k is None or n is None else wilson(k, n)
     where = "" if record is None else f" in row {record.row} ({record.side})"
-    parts = {"task": task, "condition": condition, "policy": policy, "unit": unit}
-    defined = RATE_AS_GIVEN.of(side=side, where=where, **parts)
+    defined = of_group(RATE_AS_GIVEN, key[:3], unit=key[3], side=side, where=where)
     return Measurement(
         **vars(defined),
         value=None if record is None else float(record.rate),
         interval=interval,
         k=k,
         n=n,
-        counted=unit,
+        counted=key[3],
         reason_if_undefined="not in the table" if record is None else None,
         reason_without_interval=None if interval is not None else "no n",
     )

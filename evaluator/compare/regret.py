@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
-from evaluator.compare.measure import measured
+from evaluator.compare.measure import mean_of, measured
 from evaluator.compare.rows import RateGroup
-from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import REGRET, WRONG_BY, WRONG_PAIRS
 from evaluator.result import Interval, Measurement
 from evaluator.statistics.intervals import LEVEL, normal_quantile
@@ -49,58 +49,40 @@ def choice_of(groups: Sequence[RateGroup]) -> Choice | None:
 
 
 def regret_results(groups: Sequence[RateGroup]) -> list[Measurement]:
-    """Measure the loss of taking the twin's first, and the pairs that it orders wrongly.
-
-    Args:
-        groups: With both rates.
-    """
+    """Of groups with both rates: the loss of the twin's first, and the pairs it orders wrongly."""
     choice = choice_of(groups)
     if choice is None:
         return []
     recorded, sim = choice.rates("recorded"), choice.rates("sim")
     first = [place for place, rate in enumerate(sim) if rate == max(sim)]
     words = " or ".join(choice.names[place].replace("_", " ") for place in first)
-    episodes = [name for each in choice.members for group in each for name in group.episodes]
     loss = 100 * (max(recorded) - sum(recorded[place] for place in first) / len(first))
-    interval = _with_the_best(choice, first)
     count = len(choice.names)
-    found = [
-        measured(
-            REGRET.of(words=words),
-            lambda: (loss, interval),
-            n=count,
-            counted=choice.kind,
-            reason_without_interval="the number of trials of a group is not known",
-            episodes=episodes,
-        )
-    ]
+    regret = measured(
+        REGRET.of(words=words),
+        lambda: (loss, _with_the_best(choice, first)),
+        n=count,
+        counted=choice.kind,
+        reason_without_interval="the number of trials of a group is not known",
+        episodes=[name for each in choice.members for group in each for name in group.episodes],
+    )
     pairs = [(i, j) for j in range(count) for i in range(j) if recorded[i] != recorded[j]]
     wrong = [(i, j) for i, j in pairs if (recorded[i] - recorded[j]) * (sim[i] - sim[j]) <= 0]
     named = [f"{choice.names[i]} and {choice.names[j]}" for i, j in wrong[:4]]
 
-    def share() -> float:
-        if not pairs:
-            reason = "all candidates have the same recorded rate"
-            raise UndefinedStatisticError(statistic="wrong pairs", reason=reason)
-        return len(wrong) / len(pairs)
-
-    def size() -> float:
-        if not wrong:
-            raise UndefinedStatisticError(statistic="wrong pairs", reason="no pair is wrong")
-        return 100 * sum(abs(recorded[i] - recorded[j]) for i, j in wrong) / len(wrong)
-
+    are_wrong = [float(pair in wrong) for pair in pairs]
+    same = "all candidates have the same recorded rate"
+    off = [100 * abs(recorded[i] - recorded[j]) for i, j in wrong]
     shown = f": {', '.join(named).replace('_', ' ')}" if named else ""
-    for quantity, compute in ((WRONG_PAIRS, share), (WRONG_BY, size)):
-        found.append(
-            measured(
-                quantity.of(words=shown),
-                compute,
-                n=len(pairs),
-                counted="pair",
-                reason_without_interval="the pairs are these; each has its comparison",
-            )
-        )
-    return found
+    why = "the pairs are these; each has its comparison"
+    of_pairs = partial(measured, n=len(pairs), counted="pair", reason_without_interval=why)
+    return [
+        regret,
+        of_pairs(WRONG_PAIRS.of(words=shown), partial(mean_of, are_wrong, "wrong pairs", same)),
+        of_pairs(
+            WRONG_BY.of(words=shown), partial(mean_of, off, "wrong pairs", "no pair is wrong")
+        ),
+    ]
 
 
 def _with_the_best(choice: Choice, first: Sequence[int]) -> Interval | None:
@@ -127,7 +109,6 @@ def _difference(
             continue  # parts of one trial are not independent
         if a.recorded.k is None or not a.recorded.n or b.recorded.k is None or not b.recorded.n:
             return None
-        strata.append(
-            Stratum(first=(a.recorded.k, a.recorded.n), second=(b.recorded.k, b.recorded.n))
-        )
+        counts = (a.recorded.k, a.recorded.n), (b.recorded.k, b.recorded.n)
+        strata.append(Stratum(first=counts[0], second=counts[1]))
     return Evidence(strata=tuple(strata)).interval(z) if strata else None

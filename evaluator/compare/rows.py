@@ -44,7 +44,6 @@ class RateGroup:
     """Over the trials where both sides are known, with its interval; the scatter draws these two,
     so that a point never compares different trials. None for a rates CSV."""
     sim_common: Measurement | None = None
-
     trial_table: tuple[int, int, int, int] | None = None
     """Trials in which both succeed, only sim, only recorded, neither; None where not paired."""
     executed: Measurement | None = None

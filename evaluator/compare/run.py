@@ -2,6 +2,7 @@
 
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 from bridge.episode.provenance import hash_file, software
@@ -154,8 +155,7 @@ def compare_read(
     cache: SummaryCache | None = None,
 ) -> Comparison:
     """Measure everything that the trials of some runs say together."""
-    rows = [row for read in reads for row in read.rows]
-    rows += more_rows
+    rows = [*(row for read in reads for row in read.rows), *more_rows]
     summaries = Summaries(
         **{
             part: tuple(item for read in reads for item in getattr(read.summaries, part))
@@ -176,37 +176,34 @@ def compare_read(
     trials = [trial for read in reads for trial in read.trials]
     derived = [file for read in reads for file in read.contents.derived]
     missing = [] if rows else ["trials: the run holds no recorded trial"]
-    left_out = [item for read in reads for item in read.exclusions]
     base = replace(
         base,
         tables=with_notes(base.tables, check_settings(trials, derived)),
-        exclusions=(*left_out, *base.exclusions, *summaries.left_out),
+        exclusions=tuple(
+            chain(*(r.exclusions for r in reads), base.exclusions, summaries.left_out)
+        ),
         missing=(*missing, *base.missing),
         motions=summaries.motions,
         provenance=_provenance(reads),
     )
-    parts = (
-        motion_results(summaries.motions),
-        state_results(summaries.states),
-        *(_of_protocol(read) for read in reads if len(reads) == 1),
+    of_protocol = (
+        protocol_results(
+            read.rows,
+            read.protocol,
+            answers=compare_policies(read.rows, read.protocol, read.void_causes),
+            left_out=read.unread,
+            task_hashes=_task_hashes(read.contents),
+        )
+        for read in reads
+        if len(reads) == 1
     )
+    parts = (motion_results(summaries.motions), state_results(summaries.states), *of_protocol)
     return _with_parts(base, parts)
 
 
-def _of_protocol(read: ReadRun) -> Part:
-    return protocol_results(
-        read.rows,
-        read.protocol,
-        answers=compare_policies(read.rows, read.protocol, read.void_causes),
-        left_out=read.unread,
-        task_hashes=_task_hashes(read.contents),
-    )
-
-
 def _with_parts(base: Comparison, parts: Sequence[Part]) -> Comparison:
-    both: dict[str, Any] = {
-        name: (*getattr(base, name), *more) for name, more in vars(joined(parts)).items()
-    }
+    more = vars(joined(parts)).items()
+    both: dict[str, Any] = {name: (*getattr(base, name), *items) for name, items in more}
     return replace(base, **both)
 
 
@@ -215,17 +212,13 @@ def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:
     index = DerivedIndex(contents.derived)
     trials, left_out = [], []
     for recorded in contents.recorded:
-        facts = recorded.facts
-        if facts.info.kind != "trial":
-            continue
-        if facts.broken:
-            left_out.append(
-                Exclusion(episode=facts.info.id, scope="everything", reason=facts.broken)
-            )
-            continue
-        trial = lay_out(recorded.file, facts, index)
-        trials.append(trial)
-        left_out += trial.exclusions
+        facts, name = recorded.facts, recorded.facts.info.id
+        if facts.info.kind == "trial" and facts.broken:
+            left_out.append(Exclusion(episode=name, scope="everything", reason=facts.broken))
+        elif facts.info.kind == "trial":
+            trial = lay_out(recorded.file, facts, index)
+            trials.append(trial)
+            left_out += trial.exclusions
     return trials, left_out
 
 

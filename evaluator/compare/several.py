@@ -49,19 +49,12 @@ class _Gathered:
 
 
 def compare_csv(path: Path, options: TableOptions = AS_SAVED) -> Comparison:
-    """Compare one table: trials, rates, or rates with printed figures; its content tells which.
-
-    Raises:
-        TableError: Naming the row that contradicts itself.
-    """
+    """Compare one table: trials, rates, or rates with printed figures; its content tells which."""
     return compare_several([path], options=options)
 
 
 def compare_several(
-    sources: Sequence[Path],
-    *,
-    options: TableOptions = AS_SAVED,
-    output: Output = QUIET,
+    sources: Sequence[Path], *, options: TableOptions = AS_SAVED, output: Output = QUIET
 ) -> Comparison:
     """Compare runs and tables as one study.
 
@@ -78,11 +71,10 @@ def compare_several(
         return check_published(sources[0], options).comparison
     with_rates = [each for each in gathered.taken if each.rates]
     if with_rates and (len(with_rates) < len(gathered.taken) or gathered.reads):
-        message = (
+        raise UsageError(
             f"{with_rates[0].path} holds rates, and other sources hold trials: rates that rest on "
             "them would count twice. Evaluate it alone."
         )
-        raise UsageError(message)
     return _rates(gathered) if with_rates else _trials(gathered)
 
 
@@ -105,9 +97,8 @@ def refuse_twice(sources: Sequence[Path]) -> None:
 def _gather(
     sources: Sequence[Path], options: TableOptions, output: Output, caches: ExitStack
 ) -> _Gathered:
-    name = " + ".join(source.resolve().name for source in sources)
-    if len(sources) == 1 and sources[0].is_file():
-        name = sources[0].stem
+    alone = len(sources) == 1 and sources[0].is_file()
+    name = sources[0].stem if alone else " + ".join(source.resolve().name for source in sources)
     gathered = _Gathered(name=name)
     for source in sources:
         if is_run(source):
@@ -171,11 +162,7 @@ def _rates(gathered: _Gathered) -> Comparison:
 
 
 def refuse_slips(named: Iterable[tuple[TrialRow | RateRecord, str]]) -> None:
-    """Refuse names of a table that differ only by case, blanks or signs.
-
-    Raises:
-        AlikeNamesError: Naming both and where they stand.
-    """
+    """Refuse names of a table that differ only by case, blanks or signs, and name both."""
     found = list(named)
     for kind in ("task", "condition", "policy"):
         names = ((getattr(each, kind), where) for each, where in found)

@@ -23,21 +23,14 @@ def row_from_record(record: TrialRecord) -> TrialRow:
 def imported_rows(
     run: RunFolder, recorded_ids: Container[str]
 ) -> tuple[list[TrialRow], list[Exclusion]]:
-    """Read the run's imported trials; one that was recorded too is left out and named.
-
-    Raises:
-        TableError: When somebody has changed the file so that a row contradicts itself.
-    """
+    """Read the run's imported trials; one that was recorded too is left out and named."""
     path = trials_path(run)
     if not path.is_file():
         return [], []
     rows = [row_from_record(record) for record in read_trials(path)]
+    why = f"notes/{path.name} has a row for it, but the recorded episode counts"
     doubled = [
-        Exclusion(
-            episode=row.episode,
-            scope="everything",
-            reason=f"notes/{path.name} has a row for it, but the recorded episode counts",
-        )
+        Exclusion(episode=row.episode, scope="everything", reason=why)
         for row in rows
         if row.episode in recorded_ids
     ]

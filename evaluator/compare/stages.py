@@ -4,14 +4,13 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from evaluator.compare.measure import proportion
+from evaluator.compare.measure import grouped, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.measurements import STAGE
 from evaluator.result import Exclusion, Measurement, Table
 
 NOT_LABELLED, NO_STAGE = "stage not labelled", "no stage, but the task"
 """Stand for the stage of a failure of which nobody named one."""
-Trial = tuple[TrialRow, tuple[tuple[str, bool | None], ...]]
 
 
 def stages_of(row: TrialRow) -> tuple[tuple[str, bool | None], ...]:
@@ -45,9 +44,7 @@ def funnel(trials: Sequence[Sequence[bool | None]], names: Sequence[str]) -> lis
 
     A stage after a failed one is not reached, even when it is labelled a success: a later success
     then rests on a person or on luck. Passed / (reached - unknown) is the stage's own rate.
-
-    Args:
-        trials: How each stage ended, one sequence per trial; None is unknown.
+    Of each trial ``trials`` has how each stage ended; None is unknown.
     """
     going, stages = list(trials), []
     for place, name in enumerate(names):
@@ -61,11 +58,8 @@ def stage_results(
     rows: Sequence[TrialRow],
 ) -> tuple[list[Measurement], tuple[Table, ...], list[Exclusion]]:
     """Measure each stage of each task and condition."""
-    groups: dict[tuple[str, str], list[Trial]] = {}
-    for row in rows:
-        stages = stages_of(row)
-        if stages:
-            groups.setdefault((row.task, row.condition), []).append((row, stages))
+    staged = ((row, stages) for row in rows if (stages := stages_of(row)))
+    groups = grouped(staged, lambda trial: (trial[0].task, trial[0].condition))
     measurements: list[Measurement] = []
     left_out: list[Exclusion] = []
     lines: list[tuple[str | int | None, ...]] = []
@@ -75,15 +69,13 @@ def stage_results(
         differ = [row.episode for row, stages in trials if [name for name, _ in stages] != names]
         left_out += [Exclusion(episode=e, scope="stage funnel", reason=reason) for e in differ]
         alike = [trial for trial in trials if trial[0].episode not in differ]
-        words = condition.replace("_", " ")
         for stage in funnel([[answer for _, answer in stages] for _, stages in alike], names):
-            lines.append((task, words, *stage[:3], stage.unknown or None))
+            lines.append((task, condition.replace("_", " "), *stage[:3], stage.unknown or None))
             measurements.append(
                 proportion(
                     STAGE.of(task=task, condition=condition, stage=stage.name),
                     stage.passed,
                     stage.reached - stage.unknown,
-                    counted="trial",
                     reason_if_undefined="no trial reached it, or none is labelled",
                     episodes=[row.episode for row, _ in alike],
                 )
@@ -114,21 +106,18 @@ def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
     ]
     if not lines:
         return ()
-    return (
-        Table(
-            id="failures",
-            title="What failed first",
-            columns=("side", "clause or stage", "cause", "trials"),
-            rows=tuple(lines),
-            note="In the twin: the first clause of the acceptance indicator that is false. "
-            "Recorded: the first stage labelled a failure.",
-        ),
+    table = Table(
+        id="failures",
+        title="What failed first",
+        columns=("side", "clause or stage", "cause", "trials"),
+        rows=tuple(lines),
+        note="In the twin: the first clause of the acceptance indicator that is false. "
+        "Recorded: the first stage labelled a failure.",
     )
+    return (table,)
 
 
 def first_failed_stage(row: TrialRow) -> str:
     """Name the first stage labelled a failure, or say that none was."""
-    stages = stages_of(row)
-    if not stages:
-        return NOT_LABELLED
-    return next((name for name, answer in stages if answer is False), NO_STAGE)
+    without = NO_STAGE if (stages := stages_of(row)) else NOT_LABELLED
+    return next((name for name, answer in stages if answer is False), without)

@@ -7,7 +7,7 @@ localised after the execution.
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -21,19 +21,11 @@ from bridge.errors import BridgeError
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
-from evaluator.compare.measure import (
-    Part,
-    degrees,
-    ends,
-    interval_or_reason,
-    measured,
-    median_of,
-    millimetres,
-)
+from evaluator.compare.measure import Part, degrees, ends, grouped, measured_median, millimetres
 from evaluator.metrics.state import turn_between_rad, turns_alike
 from evaluator.motion_measurements import STATES
 from evaluator.result import Cell, Exclusion, Measurement, Table
-from evaluator.statistics.intervals import cluster_means, median_interval
+from evaluator.statistics.intervals import cluster_means
 
 PLAN, RECORDED = "plan", "recorded"
 PREDICTED_BY = (PLAN, "planned", "executed")
@@ -146,18 +138,17 @@ def _settled(replay: Episode, wanted: Mapping[str, Any]) -> dict[str, Pose]:
                 last[message.topic] = message
         if len(last) == len(named):
             break
-    found: dict[str, Pose] = {}
-    for name in wanted:
-        chosen = last.get(topics.get(name, ""))
-        if chosen is None:
-            found[name] = "the replay holds no poses of it"
-            continue
-        try:
-            T = PoseSample.from_cdr(chosen.data).T_frame_body
-            found[name] = T if np.isfinite(T).all() else "its replayed pose is not a number"
-        except BridgeError as error:
-            found[name] = str(error)
-    return found
+    return {name: _pose_in(last.get(topics.get(name, ""))) for name in wanted}
+
+
+def _pose_in(message: RawMessage | None) -> Pose:
+    if message is None:
+        return "the replay holds no poses of it"
+    try:
+        T = PoseSample.from_cdr(message.data).T_frame_body
+    except BridgeError as error:
+        return str(error)
+    return T if np.isfinite(T).all() else "its replayed pose is not a number"
 
 
 def _difference(first: Pose, second: Pose, task: Task | None, name: str) -> dict[str, Any]:
@@ -176,13 +167,10 @@ WHO = {
     "planned": "the planned replay's",
     "executed": "the executed replay's",
 }
+NO_TURN = "the task file is not known, so neither is the symmetry"
 QUANTITIES = (
     ("position_m", "distance of the object", "no position is known"),
-    (
-        "rotation_rad",
-        "angle modulo the object's symmetry",
-        "the task file is not known, so neither is the symmetry",
-    ),
+    ("rotation_rad", "angle modulo the object's symmetry", NO_TURN),
 )
 """Field, words, and why there is no value although there is a position."""
 
@@ -196,14 +184,11 @@ def state_results(states: Sequence[StateSummary]) -> Part:
     if not states:
         reason = "no plan that was sent predicts where a stage leaves its objects"
         return Part(missing=(f"final states: no data ({reason})",))
-    groups: dict[tuple[str, str, int], list[StateSummary]] = {}
-    for state in states:
-        key = (state.task, state.condition, PREDICTED_BY.index(state.predicted_by))
-        groups.setdefault(key, []).append(state)
+    groups = grouped(states, lambda s: (s.task, s.condition, PREDICTED_BY.index(s.predicted_by)))
     measurements: list[Measurement] = []
     rows: list[dict[str, Cell]] = []
-    for key in sorted(groups):
-        position, rotation = _measure(groups[key])
+    for key, members in sorted(groups.items(), key=itemgetter(0)):
+        position, rotation = _measure(members)
         low, high = (millimetres(end) for end in ends(position.interval))
         measurements += [position, rotation]
         rows.append(
@@ -233,9 +218,7 @@ def state_results(states: Sequence[StateSummary]) -> Part:
         if s.reason is not None
     )
     return Part(
-        measurements=tuple(measurements),
-        tables=(table,),
-        exclusions=tuple(dict.fromkeys(left_out)),
+        measurements=tuple(measurements), tables=(table,), exclusions=tuple(dict.fromkeys(left_out))
     )
 
 
@@ -248,7 +231,7 @@ def _measure(states: Sequence[StateSummary]) -> list[Measurement]:
         of_episode = cluster_means([getattr(state, field) for state in known], episodes)
         why = "; ".join(sorted({state.reason for state in states if state.reason})) or unknown
         found.append(
-            measured(
+            measured_median(
                 STATES[field.partition("_")[0]].of(
                     by=first.predicted_by,
                     against=RECORDED,
@@ -259,11 +242,11 @@ def _measure(states: Sequence[StateSummary]) -> list[Measurement]:
                     where=f"{first.task}, {first.condition.replace('_', ' ')}",
                     count=len(of_episode),
                 ),
-                partial(median_of, of_episode, "final state", why),
+                of_episode,
+                reason_if_undefined=why,
                 n=len(known),
                 counted="object",
-                episodes=list(dict.fromkeys(episodes)),
-                reason_without_interval=interval_or_reason(median_interval, of_episode)[1],
+                episodes=dict.fromkeys(episodes),
             )
         )
     return found

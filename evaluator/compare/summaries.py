@@ -80,8 +80,8 @@ def recorded_task(episode: Episode) -> Task | None:
 
 
 def _files_of(trial: Trial, plan_id: str) -> _Files:
-    made = dict(trial.replays) | ({} if trial.localised is None else {"localised": trial.localised})
-    paths = {"recorded": trial.file.path, **{name: file.path for name, file in made.items()}}
+    made = {"recorded": trial.file, **trial.replays, "localised": trial.localised}
+    paths = {name: file.path for name, file in made.items() if file is not None}
     return _Files(episode=trial.row.episode, plan_id=plan_id, paths=paths)
 
 
@@ -192,10 +192,8 @@ def _rules(files: _Files) -> tuple[RuleSummary, ...]:
 def _hashes(trial: Trial) -> dict[str, str]:
     """Name the bytes that a trial's summaries follow from."""
     recorded, plan_id = trial.file.sha256, trial.row.plan_id
-    replays = [
-        trial.replays[name].sha256 if name in trial.replays else "-" for name in TRAJECTORIES
-    ]
-    localised = "-" if trial.localised is None else trial.localised.sha256
+    made = [*map(trial.replays.get, TRAJECTORIES), trial.localised]
+    *replays, localised = ("-" if file is None else file.sha256 for file in made)
     task = _task_sha256(trial.row.task, trial.file.folder)
     return {
         "replays": " ".join([recorded, *replays, str(plan_id)]),
@@ -215,10 +213,7 @@ def _task_sha256(name: str, folder: Path) -> str:
 PARTS = (
     _Part(kind=MotionSummary, scope="motion", make=_motions, made_from=("replays",)),
     _Part(
-        kind=StateSummary,
-        scope="final states",
-        make=_states,
-        made_from=("replays", "localised"),
+        kind=StateSummary, scope="final states", make=_states, made_from=("replays", "localised")
     ),
     _Part(kind=RuleSummary, scope="baselines", make=_rules, made_from=("localised",)),
 )

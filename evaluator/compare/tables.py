@@ -17,11 +17,7 @@ SIM_NOTE = (
     "nothing new. "
     "A trial in which no plan was sent has an outcome and no sim."
 )
-
-
 UNPAIRED_NOTE = "Each side counts its own trials; none was made on both."
-
-
 METHOD_NAMES = {
     "wilson": "Wilson",
     "score": "score",
@@ -52,11 +48,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
         parts.append("The difference is over trials where both sides are known.")
     rows = tuple(
         (
-            group.task,
-            group.condition,
-            group.policy,
-            side,
-            group.unit,
+            *(group.task, group.condition, group.policy, side, group.unit),
             *rate_row(rate),
             None if (gap := group.gap) is None else round(float(100 * gap), 1),
             rate.reason_if_undefined,

@@ -51,13 +51,11 @@ class Trial:
 
 def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
     """Find what was made from a recorded trial, build its row, and say what it lacks."""
-    source, sha256 = facts.info.id, file.sha256
+    made_from = {"source": facts.info.id, "source_sha256": file.sha256}
     lacking = _unlabelled(facts.outcome)
     gate = facts.verdict
     if gate is not None and is_same_engine(gate.engine, stand_in=facts.info.stand_in):
-        lacking.append(
-            f"the gate's verdict does not count: made in {gate.engine}, the {SAME_ENGINE}"
-        )
+        lacking += [f"the gate's verdict does not count: made in {gate.engine}, the {SAME_ENGINE}"]
         facts = replace(facts, verdict=None)
     found = dict.fromkeys(TRAJECTORIES, Replay())
     cells_engine: bool | None = None
@@ -65,17 +63,11 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
         lacking.append("no execution_started event: no plan was sent")
     else:
         asked = TRAJECTORIES if facts.plan_id != NO_PLAN else ("executed",)
-        found |= {
-            trajectory: index.replay(
-                source=source, source_sha256=sha256, plan_id=facts.plan_id, trajectory=trajectory
-            )
-            for trajectory in asked
-        }
+        sent = {**made_from, "plan_id": facts.plan_id}
+        found |= {name: index.replay(**sent, trajectory=name) for name in asked}
         lacking += [replay.reason for replay in found.values() if replay.reason is not None]
-        cells_engine = index.answer_of_cells_engine(
-            source=source, source_sha256=sha256, plan_id=facts.plan_id
-        )
-    localised = index.localised(source=source, source_sha256=sha256)
+        cells_engine = index.answer_of_cells_engine(**sent)
+    localised = index.localised(**made_from)
     if localised is not None and localised.facts.broken:
         lacking.append(f"{localised.path.name}: {localised.facts.broken}")
     replays = {name: replay.file for name, replay in found.items() if replay.file is not None}
@@ -95,10 +87,8 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
 def _unlabelled(outcome: Outcome | None) -> list[str]:
     if outcome is None:
         return ["the outcome was not labelled"]
-    if outcome.result == "unknown":
-        why = f": {outcome.detail}" if outcome.detail else ""
-        return [f"the outcome is labelled unknown{why}"]
-    return []
+    why = f": {outcome.detail}" if outcome.detail else ""
+    return [f"the outcome is labelled unknown{why}"] if outcome.result == "unknown" else []
 
 
 def _impossible_count(outcome: Outcome | None) -> str:
@@ -170,9 +160,7 @@ _ANSWERS: dict[str | None, bool] = {"success": True, "failure": False}
 
 def _stage_at(facts: RecordedFacts, t_ns: int | None) -> str:
     """Name the stage of the plan that an instant is in; what is after the last is in the last."""
-    if t_ns is None:
-        return ""
-    begun = [each.id for each in facts.plan_stages if t_ns >= each.t_start_ns]
+    begun = [e.id for e in facts.plan_stages if t_ns is not None and t_ns >= e.t_start_ns]
     return next(reversed(begun), "")
 
 
