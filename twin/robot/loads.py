@@ -64,5 +64,6 @@ class Loads:
             elbow = pin.getVelocity(model, data, self._elbow, pin.LOCAL_WORLD_ALIGNED)
             torques[index] = pin.rnea(model, data, q, v, a)[ids]
             power = float(np.maximum(torques[index] * speeds[index], 0.0).sum())
-            rows[index] = *map(np.linalg.norm, (tool.linear, elbow.linear, data.hg.linear)), power
+            vectors = (tool.linear, elbow.linear, data.hg.linear)
+            rows[index] = *(float(np.linalg.norm(each)) for each in vectors), power
         return {"torques": torques, **dict(zip(NAMES, rows.T, strict=True))}

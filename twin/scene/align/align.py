@@ -19,7 +19,6 @@ from twin.robot.model import RobotModel
 from twin.robot.surface import PosedSurface, sample_surface
 from twin.scene.align.refine import COARSE, FINE, Equations, ScenePose, refine
 from twin.scene.align.view import LevelPlane, RobotView, find_planes
-from twin.scene.shape.known import pose_of
 
 STRIDE_PX = 3
 ERROR_CAP_M = 0.05
@@ -139,10 +138,11 @@ def _polished(
     around = place + near.reshape(-1, 3)
     finer = _scores(views, samples, plane, near_yaws, around, FINE_CAP_M)
     i, k = np.unravel_index(int(np.argmax(finer)), finer.shape)
-    T_level_base = pose_of(np.array([*around[k], near_yaws[i]]))
-    return Hypothesis(
-        T_base_source=se3.invert(T_level_base) @ plane.T_level_source, score=float(finer[i, k])
-    )
+    T_level_base = np.eye(4)
+    T_level_base[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, near_yaws[i]]))
+    T_level_base[:3, 3] = around[k]
+    T_base_source = se3.invert(T_level_base) @ plane.T_level_source
+    return Hypothesis(T_base_source=T_base_source, score=float(finer[i, k]))
 
 
 def _scores(
@@ -158,8 +158,8 @@ def _scores(
         T_camera_level = se3.invert(plane.T_level_source @ view.T_source_camera)
         shifts = places @ T_camera_level[:3, :3].T
         for index, yaw in enumerate(yaws):
-            p_camera = se3.apply(T_camera_level @ pose_of(np.array([0.0, 0.0, 0.0, yaw])), p_base)
-            scores[index] += _credit(view, p_camera, shifts, cap_m)
+            turned = p_base @ se3.rotation_from_vector(np.array([0.0, 0.0, yaw])).T
+            scores[index] += _credit(view, se3.apply(T_camera_level, turned), shifts, cap_m)
     return np.asarray(scores / len(views))
 
 
