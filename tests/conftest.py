@@ -17,6 +17,7 @@ import lean_checks
 
 if TYPE_CHECKING:
     from bridge.episode.run_folder import RunFolder
+    from bridge.wire.session import WireSession
 
 lean_checks.install()  # before any room is imported
 gc.disable()  # until all is imported
@@ -57,6 +58,16 @@ def endpoint() -> str:
     from loopback import free_endpoint
 
     return free_endpoint()
+
+
+@pytest.fixture
+def router(endpoint: str) -> Iterator["WireSession"]:
+    """A session to which others connect, over real TCP on the loopback address."""
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
+        yield session
 
 
 @pytest.fixture

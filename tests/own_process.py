@@ -1,8 +1,10 @@
 """Code in a Python process of its own, in which nothing is loaded yet."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
@@ -38,4 +40,15 @@ def imports_from(folder: Path) -> str:
             "sys.meta_path.insert(0, Finder)",
             "",
         )
+    )
+
+
+def begun(*arguments: str, **options: Any) -> "subprocess.Popen[str]":
+    """A process of Python that finds our packages, and whose words can be read."""
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        text=True,
+        **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options},
     )

@@ -7,15 +7,7 @@ from types import ModuleType
 import numpy as np
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import (
-    CameraInfo,
-    CompressedColor,
-    DepthImage,
-    FrameTransform,
-    PoseSample,
-    string_to_cdr,
-    transforms_to_cdr,
-)
+from bridge.episode.cdr import messages
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -75,9 +67,9 @@ def write_cell_run(folder: Path, synthetic: ModuleType) -> RunFolder:
 
 def extra(start: int, description: str) -> list[tuple[str, str, bytes, int]]:
     """Two frames of a moving camera, the robot description, and truth nobody may show."""
-    info = CameraInfo(stamp_ns=start, frame_id="hand_color_optical", camera=CAMERA)
+    info = messages.CameraInfo(stamp_ns=start, frame_id="hand_color_optical", camera=CAMERA)
     found = [
-        ("/robot_description", schema.STRING, string_to_cdr(description), start),
+        ("/robot_description", schema.STRING, messages.string_to_cdr(description), start),
         ("/standin/cam/hand/color/info", schema.CAMERA_INFO, info.to_cdr(), start),
         ("/standin/cam/hand/depth/info", schema.CAMERA_INFO, info.to_cdr(), start),
     ]
@@ -85,21 +77,21 @@ def extra(start: int, description: str) -> list[tuple[str, str, bytes, int]]:
         ns = start + index * SECOND_NS
         T = T_BASE_CAMERA.copy()
         T[0, 3] += 0.1 * index
-        moved = FrameTransform(
+        moved = messages.FrameTransform(
             stamp_ns=ns, parent="base_link", child="hand_color_optical", T_parent_child=T
         )
         image = np.full((12, 16, 3), 60 * index, dtype=np.uint8)
-        color = CompressedColor(
+        color = messages.CompressedColor(
             stamp_ns=ns, frame_id="hand_color_optical", format="jpeg", data=encode_jpeg(image)
         )
-        depth = DepthImage(
+        depth = messages.DepthImage(
             stamp_ns=ns,
             frame_id="hand_color_optical",
             depth_mm=np.full((12, 16), 700 + index, dtype=np.uint16),
         )
-        truth = PoseSample(stamp_ns=ns, frame_id="base_link", T_frame_body=np.eye(4))
+        truth = messages.PoseSample(stamp_ns=ns, frame_id="base_link", T_frame_body=np.eye(4))
         found += [
-            ("/tf", schema.TF_MESSAGE, transforms_to_cdr([moved]), ns),
+            ("/tf", schema.TF_MESSAGE, messages.transforms_to_cdr([moved]), ns),
             ("/standin/cam/hand/color/image", schema.COMPRESSED_IMAGE, color.to_cdr(), ns),
             ("/standin/cam/hand/depth/image", schema.IMAGE, depth.to_cdr(), ns),
             (object_topic(TRUTH, "secret", "pose"), schema.POSE_STAMPED, truth.to_cdr(), ns),

@@ -5,21 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dashboards.figures import (
-    RateGroup,
-    Signal,
-    Span,
-    axis,
-    nice_ticks,
-    scatter,
-    stage_chart,
-    time_plot,
-)
+from dashboards import figures
 from evaluator.result import Interval, Measurement
 
 
-def signal(values: np.ndarray) -> Signal:
-    return Signal(
+def signal(values: np.ndarray) -> figures.Signal:
+    return figures.Signal(
         name="a", style="recorded", t_s=np.linspace(0, 1, len(values)), values=np.asarray(values)
     )
 
@@ -31,7 +22,7 @@ def signal(values: np.ndarray) -> Signal:
 )
 def test_ticks_are_inside_few_and_evenly_spaced(low: float, span: float, wanted: int) -> None:
     high = low + span
-    ticks = nice_ticks(low, high, wanted)
+    ticks = figures.nice_ticks(low, high, wanted)
     rounding = 4 * np.spacing(max(abs(low), abs(high)))
     margin = 1e-6 * span + rounding
     assert len(ticks) <= wanted + 1
@@ -42,7 +33,7 @@ def test_ticks_are_inside_few_and_evenly_spaced(low: float, span: float, wanted:
 
 
 def test_tick_labels_tell_neighbours_apart() -> None:
-    drawn = axis(-0.02, 0.05, 0, 100)
+    drawn = figures.axis(-0.02, 0.05, 0, 100)
     labels = [tick.label for tick in drawn.ticks]
     assert len(set(labels)) == len(labels)
     assert "−0.02" in labels
@@ -52,7 +43,7 @@ def test_tick_labels_tell_neighbours_apart() -> None:
 def test_thinning_keeps_a_single_spike() -> None:
     values = np.zeros(50_000)
     values[31_234] = 7.0
-    plot = time_plot("t", "m", [signal(values)], span_s=(0, 1))
+    plot = figures.time_plot("t", "m", [signal(values)], span_s=(0, 1))
     assert plot is not None
     points = plot.lines[0].pieces[0].split()
     assert len(points) < 1000
@@ -61,18 +52,18 @@ def test_thinning_keeps_a_single_spike() -> None:
 
 
 def test_nothing_to_draw_is_none_and_not_an_empty_plot() -> None:
-    assert time_plot("t", "m", [], span_s=(0, 1)) is None
-    assert time_plot("t", "m", [signal(np.full(3, np.nan))], span_s=(0, 1)) is None
-    assert stage_chart([("planned", [])], [], span_s=(0, 1)) is None
-    assert scatter([]) is None
+    assert figures.time_plot("t", "m", [], span_s=(0, 1)) is None
+    assert figures.time_plot("t", "m", [signal(np.full(3, np.nan))], span_s=(0, 1)) is None
+    assert figures.stage_chart([("planned", [])], [], span_s=(0, 1)) is None
+    assert figures.scatter([]) is None
 
 
 def test_stage_bars_keep_their_order_and_lose_labels_that_do_not_fit() -> None:
     spans = [
-        Span(start_s=0, end_s=5, label="approach", style="stage-0"),
-        Span(start_s=5, end_s=5.05, label="grasp", style="stage-1"),
+        figures.Span(start_s=0, end_s=5, label="approach", style="stage-0"),
+        figures.Span(start_s=5, end_s=5.05, label="grasp", style="stage-1"),
     ]
-    chart = stage_chart([("planned", spans)], [(11.0, "late", "failure")], span_s=(0, 10))
+    chart = figures.stage_chart([("planned", spans)], [(11.0, "late", "failure")], span_s=(0, 10))
     assert chart is not None
     first, second = chart.lanes[0].bars
     assert first.x + first.width < second.x + second.width
@@ -90,8 +81,8 @@ def rate(value: float, side: str) -> Measurement:
     )
 
 
-def group(replayed: float, recorded: float) -> RateGroup:
-    return RateGroup(
+def group(replayed: float, recorded: float) -> figures.RateGroup:
+    return figures.RateGroup(
         label="a",
         series="a",
         task="a",
@@ -104,7 +95,7 @@ def group(replayed: float, recorded: float) -> RateGroup:
 
 
 def test_a_group_in_agreement_lies_on_the_identity_line() -> None:
-    drawn = scatter([group(0.7, 0.7)])
+    drawn = figures.scatter([group(0.7, 0.7)])
     assert drawn is not None
     point = drawn.points[0]
     across = (point.x - drawn.axis_x.px(0)) / (drawn.axis_x.px(1) - drawn.axis_x.px(0))

@@ -14,13 +14,7 @@ from visible import words
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from bridge.exchange.reviews import (
-    Review,
-    ReviewConflictError,
-    read_reviews,
-    readable_reviews,
-    save_review,
-)
+from bridge.exchange import reviews
 from dashboards.comparison import judge
 from dashboards.guard import Admission
 from dashboards.label_page import OPERATOR, next_unrated, rater_name, trials_to_label
@@ -50,7 +44,7 @@ def pages(run: RunFolder, synthetic: ModuleType) -> Any:
 def test_a_label_is_on_disk_as_the_evaluator_reads_it(pages: Any, run: RunFolder) -> None:
     answer = pages.post(ANN, json=label(result="failure", cause="dropped it", note="é", flag=True))
     assert answer.status_code == 200
-    (kept,) = read_reviews(run.path / "reviews")
+    (kept,) = reviews.read_reviews(run.path / "reviews")
     assert (kept.trial_id, kept.rater, kept.success) == ("trial_0001", "Ann", False)
     assert kept.says == ("failure", "dropped it", "é", True)
     assert kept.time.endswith("Z")
@@ -82,7 +76,9 @@ def test_nothing_that_anybody_else_said_changes_what_a_rater_sees(
             synthetic.write_trial(run, trial)
             synthetic.write_replay(run, trial, "planned", twin)
             heard = "success" if recorded else "failure"
-            other = Review(trial_id=trial.id, rater="Bob", result=heard, note=heard, flag=recorded)
+            other = reviews.Review(
+                trial_id=trial.id, rater="Bob", result=heard, note=heard, flag=recorded
+            )
             other.write(run.path)
         browser = synthetic.browser_of(run)
         seen = []
@@ -126,13 +122,13 @@ def test_the_second_of_two_tabs_is_told_and_may_replace(pages: Any, run: RunFold
     assert "changed elsewhere" in late.json()["message"]
     assert late.json()["saved"]["cause"] == "collision"
     assert late.json()["version"] == first.json()["version"]
-    assert read_reviews(run.path / "reviews")[0].result == "failure"
+    assert reviews.read_reviews(run.path / "reviews")[0].result == "failure"
     # The same answer once more is no conflict: a page asks again when it heard nothing.
     again = pages.post(ANN, json=label(result="failure", cause="collision"))
     assert (again.status_code, again.json()["version"]) == (200, first.json()["version"])
     replaced = pages.post(ANN, json=label(result="success", seen=late.json()["version"]))
     assert replaced.status_code == 200
-    assert read_reviews(run.path / "reviews")[0].result == "success"
+    assert reviews.read_reviews(run.path / "reviews")[0].result == "success"
 
 
 def test_of_many_who_save_at_once_one_wins_and_the_others_are_told(tmp_path: Path) -> None:
@@ -140,17 +136,17 @@ def test_of_many_who_save_at_once_one_wins_and_the_others_are_told(tmp_path: Pat
 
     def save(number: int) -> bool:
         start.wait()
-        review = Review(trial_id="t", rater="Ann", note=str(number))
+        review = reviews.Review(trial_id="t", rater="Ann", note=str(number))
         try:
-            save_review(tmp_path, "t", "Ann", review, seen="")
-        except ReviewConflictError:
+            reviews.save_review(tmp_path, "t", "Ann", review, seen="")
+        except reviews.ReviewConflictError:
             return False
         return True
 
     with ThreadPoolExecutor(8) as pool:
         won = list(pool.map(save, range(8)))
     assert sum(won) == 1
-    (kept,) = read_reviews(tmp_path / "reviews")
+    (kept,) = reviews.read_reviews(tmp_path / "reviews")
     assert kept.note == str(won.index(True))
     assert len(list((tmp_path / "reviews").iterdir())) == 1
 
@@ -165,7 +161,7 @@ def test_undo_brings_back_what_was_there_even_nothing(pages: Any, run: RunFolder
     gone = pages.post(ANN, json=label(result=None, seen=back["version"]))  # type: ignore[arg-type]
     assert gone.json()["saved"] is None
     assert gone.json()["next"] is not None
-    assert read_reviews(run.path / "reviews") == []
+    assert reviews.read_reviews(run.path / "reviews") == []
 
 
 def test_a_flag_without_an_answer_is_no_label(pages: Any, run: RunFolder) -> None:
@@ -175,7 +171,7 @@ def test_a_flag_without_an_answer_is_no_label(pages: Any, run: RunFolder) -> Non
     assert "look again" not in pages.get("/queue").text
     comparison = judge(run).comparison
     assert comparison is not None
-    missing = with_reviews(comparison, read_reviews(run.path / "reviews")).missing
+    missing = with_reviews(comparison, reviews.read_reviews(run.path / "reviews")).missing
     assert "raters: no trial has two known labels" in missing
 
 
@@ -197,7 +193,7 @@ def test_agreement_is_held_back_until_everybody_is_done(pages: Any, run: RunFold
     assert comparison is not None
     tables = {
         table.id: table
-        for table in with_reviews(comparison, read_reviews(run.path / "reviews")).tables
+        for table in with_reviews(comparison, reviews.read_reviews(run.path / "reviews")).tables
     }
     at = tables["raters"].columns.index("kappa")
     assert len(tables["raters"].rows) == 3  # the operator is a rater, too
@@ -217,14 +213,14 @@ def test_a_label_from_a_table_is_shown_to_its_rater_and_can_be_replaced(
     assert 'data-result="failure"' in page
     assert "from a table" in page
     assert pages.post(ANN, json=label(result="success")).status_code == 200
-    assert [r.result for r in read_reviews(run.path / "reviews")] == ["success"]
+    assert [r.result for r in reviews.read_reviews(run.path / "reviews")] == ["success"]
 
 
 def test_a_broken_label_file_is_named_and_hides_no_other(pages: Any, run: RunFolder) -> None:
     pages.post(ANN, json=label())
     (run.path / "reviews" / "broken.json").write_text("{")
     assert "broken.json" in words(pages.get("/queue").text)
-    found, problems = readable_reviews(run.path)
+    found, problems = reviews.readable_reviews(run.path)
     assert ([r.rater for r in found], len(problems)) == (["Ann"], 1)
 
 
@@ -260,7 +256,7 @@ def test_what_is_no_label_of_this_page_changes_nothing(
 ) -> None:
     body = {} if {"json", "content"} & options.keys() else {"json": label()}
     assert pages.post(ANN, **body, **options).status_code == status
-    assert readable_reviews(run.path) == ([], [])
+    assert reviews.readable_reviews(run.path) == ([], [])
 
 
 def test_without_the_token_nothing_is_written(run: RunFolder, synthetic: ModuleType) -> None:

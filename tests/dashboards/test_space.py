@@ -17,15 +17,7 @@ from serving import dashboard
 
 from bridge.data_files import dataset_file
 from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import (
-    CameraInfo,
-    CompressedColor,
-    FrameTransform,
-    PointCloudSample,
-    PoseSample,
-    string_to_cdr,
-    transforms_to_cdr,
-)
+from bridge.episode.cdr import messages
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -110,17 +102,17 @@ def write_space_run(folder: Path, synthetic: ModuleType) -> RunFolder:
     start = synthetic.START_NS
     opened = Episode.open(recorded)
     frame = "eye_color_optical"
-    seen = FrameTransform(
+    seen = messages.FrameTransform(
         stamp_ns=start, parent="base_link", child=frame, T_parent_child=T_BASE_CAMERA
     )
     image = encode_jpeg(np.full((CAMERA.height, CAMERA.width, 3), 90, dtype=np.uint8))
-    color = CompressedColor(stamp_ns=start, frame_id=frame, format="jpeg", data=image)
-    info = CameraInfo(stamp_ns=start, frame_id=frame, camera=CAMERA)
+    color = messages.CompressedColor(stamp_ns=start, frame_id=frame, format="jpeg", data=image)
+    info = messages.CameraInfo(stamp_ns=start, frame_id=frame, camera=CAMERA)
     with EpisodeWriter(run.episodes_dir / recorded.name) as writer:
         writer.describe(opened.info, outcome=opened.outcome)
         for topic, type_name, data in (
-            ("/robot_description", schema.STRING, string_to_cdr(ROBOT.description())),
-            ("/tf_static", schema.TF_MESSAGE, transforms_to_cdr([seen])),
+            ("/robot_description", schema.STRING, messages.string_to_cdr(ROBOT.description())),
+            ("/tf_static", schema.TF_MESSAGE, messages.transforms_to_cdr([seen])),
             ("/standin/cam/eye/color/info", schema.CAMERA_INFO, info.to_cdr()),
             ("/standin/cam/eye/color/image", schema.COMPRESSED_IMAGE, color.to_cdr()),
         ):
@@ -208,9 +200,9 @@ def soften(run: RunFolder, rest_m: np.ndarray) -> None:
             about = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.publish_time_ns}
             writer.write(message.topic, message.data, type_name=message.type_name, **about)
             if message.topic == topic:
-                pose = PoseSample.from_cdr(message.data)
+                pose = messages.PoseSample.from_cdr(message.data)
                 nodes_m = bent_nodes(pose.T_frame_body, rest_m, message.publish_time_ns * 1e-9)
-                cloud = PointCloudSample(
+                cloud = messages.PointCloudSample(
                     stamp_ns=pose.stamp_ns, frame_id="base_link", points_m=nodes_m
                 )
                 nodes = f"{topic.removesuffix('pose')}nodes"

@@ -9,7 +9,6 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
-from loopback import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "tests" / "twin" / "scene")]
@@ -52,12 +51,6 @@ def _recorder(run: Path, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
 def gst() -> Gst:
     """Give the function that runs one command to its end."""
     return run_command
-
-
-@pytest.fixture
-def endpoint() -> str:
-    """Give a loopback endpoint nobody uses."""
-    return free_endpoint()
 
 
 @pytest.fixture

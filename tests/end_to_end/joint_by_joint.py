@@ -12,18 +12,10 @@ import numpy as np
 
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.robots.default import MAX_WIDTH_M
-from bridge.sources.standin import session
+from bridge.sources.standin import operator, session
 from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.cli import publish_standin
 from bridge.sources.standin.kinematics import tool_down
-from bridge.sources.standin.operator import (
-    LOOK_S,
-    SETTLE_S,
-    Operator,
-    Treatment,
-    label_trial,
-    wait_s,
-)
 from bridge.sources.standin.scan import joint_move
 from bridge.sources.standin.settings import SessionConfig
 
@@ -48,20 +40,20 @@ def move_by_hand(cell: StandinCell, poses: Mapping[str, np.ndarray], beside_m: f
                 cell.wait(0.8)
 
 
-class Pendant(Operator):
+class Pendant(operator.Operator):
     """Moves the arm from posture to posture."""
 
-    def _attempt(self, info: EpisodeInfo, treatment: Treatment, seed: int) -> Outcome:
+    def _attempt(self, info: EpisodeInfo, treatment: operator.Treatment, seed: int) -> Outcome:
         cell = self._cell
         poses = self.start_poses(info.start_seed or 0, treatment.name)
         cell.reset(poses)
         self._begin(info)
         cell.cameras_running = True
-        rest_s = wait_s(LOOK_S, cell.config.rate_hz)
+        rest_s = operator.wait_s(operator.LOOK_S, cell.config.rate_hz)
         cell.wait(rest_s)
         move_by_hand(cell, poses, BESIDE_M * ((info.trial or 0) % 2 == 0))
-        cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
-        outcome = label_trial(cell.world.task, cell.truth, executed=False)
+        cell.wait(operator.wait_s(operator.SETTLE_S, cell.config.rate_hz))
+        outcome = operator.label_trial(cell.world.task, cell.truth, executed=False)
         cell.cameras_running = False
         self._end(outcome)
         return outcome

@@ -9,13 +9,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import (
-    CompressedColor,
-    DepthImage,
-    JointSample,
-    PointCloudSample,
-    PoseSample,
-)
+from bridge.episode.cdr import messages
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS
@@ -106,7 +100,9 @@ class Log:
             for step, p_m, press in zip(steps, path, (1.0, 0.97, 0.97), strict=True):
                 nodes = p_m + CORNERS * np.array(model.size_m) / 2 * [1.0, 1.0, press]
                 stamp_ns = START_NS + step * STEP_NS
-                sample = PointCloudSample(stamp_ns=stamp_ns, frame_id="base_link", points_m=nodes)
+                sample = messages.PointCloudSample(
+                    stamp_ns=stamp_ns, frame_id="base_link", points_m=nodes
+                )
                 topic = f"object/{name}/nodes"
                 self.raw(topic, schema.POINT_CLOUD, sample.to_cdr(), stamp_ns)
 
@@ -116,7 +112,7 @@ class Log:
         for step, p_m in zip(steps, path_m, strict=True):
             stamp_ns = START_NS + step * STEP_NS
             T = se3.transform_from(np.array([1.0, 0, 0, 0]), np.asarray(p_m, dtype=np.float64))
-            sample = PoseSample(stamp_ns=stamp_ns, frame_id="base_link", T_frame_body=T)
+            sample = messages.PoseSample(stamp_ns=stamp_ns, frame_id="base_link", T_frame_body=T)
             self.raw(topic, schema.POSE_STAMPED, sample.to_cdr(), stamp_ns)
 
     def joints(self, position: Float[np.ndarray, "num_steps num_joints"]) -> None:
@@ -124,7 +120,7 @@ class Log:
         for step, row in enumerate(position):
             stamp_ns = START_NS + step * STEP_NS
             none = np.zeros(0)
-            sample = JointSample(
+            sample = messages.JointSample(
                 stamp_ns=stamp_ns, names=ARM_JOINTS, position=row, velocity=none, effort=none
             )
             self.raw("joint_states", schema.JOINT_STATE, sample.to_cdr(), stamp_ns)
@@ -158,7 +154,7 @@ class Log:
         """Write one image, lossless."""
         buffer = io.BytesIO()
         Image.fromarray(image_u8).save(buffer, format="png")
-        image = CompressedColor(
+        image = messages.CompressedColor(
             stamp_ns=stamp_ns, frame_id=camera, format="png", data=buffer.getvalue()
         )
         self.raw(f"cam/{camera}/{name}", schema.COMPRESSED_IMAGE, image.to_cdr(), stamp_ns)
@@ -168,5 +164,5 @@ class Log:
     ) -> None:
         """Write one depth image."""
         depth_mm = np.rint(1000 * depth_m).astype(np.uint16)
-        image = DepthImage(stamp_ns=stamp_ns, frame_id=camera, depth_mm=depth_mm)
+        image = messages.DepthImage(stamp_ns=stamp_ns, frame_id=camera, depth_mm=depth_mm)
         self.raw(f"cam/{camera}/{name}", schema.IMAGE, image.to_cdr(), stamp_ns)

@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from bridge.episode import metadata, schema
+from bridge.episode.mcap.format import Payload
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 
 
@@ -42,6 +44,13 @@ def read_all(path: Path) -> list[Stored]:
             by_index = sum(1 for _ in reader.iter_messages(topics=[topic]))
             assert by_index == sum(item.topic == topic for item in found)
     return found
+
+
+def summary_of(path: Path) -> Summary:
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary
 
 
 def linear(path: Path) -> list[Stored]:
@@ -88,6 +97,23 @@ TYPES = {
     "/cam/a/depth/image": schema.IMAGE,
     "/cam/a/color/image": schema.COMPRESSED_IMAGE,
 }
+
+
+def put_foreign(
+    writer: EpisodeWriter,
+    item: Stored,
+    kind: schema.Schema | None = None,
+    data: Payload | None = None,
+) -> None:
+    """Write one message of a type that the writer need not know."""
+    writer.write_foreign(
+        item.topic,
+        item.data if data is None else data,
+        schema_record=kind,
+        log_time_ns=item.log_time,
+        publish_time_ns=item.publish_time,
+        sequence=item.sequence,
+    )
 
 
 def put(writer: EpisodeWriter, item: Stored) -> None:

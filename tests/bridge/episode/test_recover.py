@@ -9,7 +9,15 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
-from mcap_samples import linear, put, read_all, some_messages, write_official, write_ours
+from mcap_samples import (
+    linear,
+    put,
+    read_all,
+    some_messages,
+    summary_of,
+    write_official,
+    write_ours,
+)
 
 from bridge.episode.recover import RecoveryError, recover, recover_parts
 from bridge.episode.run_folder import RunFolder
@@ -82,10 +90,7 @@ def test_whole_messages_of_a_cut_chunk_are_kept(tmp_path: Path) -> None:
 def test_foxgloves_unfinished_tail_chunk_is_understood(tmp_path: Path) -> None:
     whole = write_official(tmp_path / "w.mcap", MESSAGES, compression=CompressionType.NONE)
     data = bytearray(whole.read_bytes())
-    with whole.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    last = summary.chunk_indexes[-1]
+    last = summary_of(whole).chunk_indexes[-1]
     head = last.chunk_start_offset
     data[head + 1 : head + 9] = b"\xff" * 8  # length of the record
     data[head + 9 : head + 37] = bytes(28)  # times, size and CRC are filled in at the end

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from mcap_samples import read_all, some_messages, write_official, write_ours
+from mcap_samples import (
+    put_foreign,
+    read_all,
+    some_messages,
+    summary_of,
+    write_official,
+    write_ours,
+)
 
 from bridge.episode import schema
 from bridge.episode.check import check_episode
@@ -16,24 +23,25 @@ from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
 from bridge.episode.mcap.scan import Chunk, scan
 from bridge.episode.mcap.walk import MAX_CHUNK_BYTES
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.recover import recover
+from bridge.episode.recover import RecoveryReport, recover
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 
 MESSAGES = some_messages(40)
 
 
+def recovered(folder: Path, data: bytes) -> RecoveryReport:
+    part = folder / "d.mcap.part"
+    part.write_bytes(data)
+    return recover(part)
+
+
 def test_damage_inside_costs_only_the_damaged_chunk(tmp_path: Path) -> None:
     whole = write_ours(tmp_path / "w.mcap", MESSAGES, compress=False)
-    with whole.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    hit = summary.chunk_indexes[3]
+    hit = summary_of(whole).chunk_indexes[3]
     for offset in (hit.chunk_start_offset + 200, hit.chunk_start_offset + 5):
         data = bytearray(whole.read_bytes())
         data[offset] ^= 0x40
-        part = tmp_path / "d.mcap.part"
-        part.write_bytes(data)
-        report = recover(part)
+        report = recovered(tmp_path, data)
         assert report.output is not None
         assert len(MESSAGES) - 25 < report.messages < len(MESSAGES)
         assert report.bytes_lost >= hit.chunk_length
@@ -47,9 +55,7 @@ def test_damage_inside_costs_only_the_damaged_chunk(tmp_path: Path) -> None:
 
 def damaged_chunks(whole: Path, numbers: set[int], *, cut: bool) -> bytearray:
     """Flip a bit in some chunks, by their place in the file; ``cut`` also takes the summary."""
-    with whole.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
+    summary = summary_of(whole)
     data = bytearray(whole.read_bytes())
     places = sorted(item.chunk_start_offset for item in summary.chunk_indexes)
     last = max(summary.chunk_indexes, key=lambda item: item.chunk_start_offset)
@@ -65,9 +71,7 @@ def test_one_damaged_chunk_leaves_no_message_without_its_name(
 ) -> None:
     """Law: definitions stand in another chunk too, and in a summary that is there."""
     whole = write_ours(tmp_path / "w.mcap", MESSAGES, compress=False)
-    part = tmp_path / "d.mcap.part"
-    part.write_bytes(damaged_chunks(whole, {number}, cut=cut))
-    report = recover(part)
+    report = recovered(tmp_path, damaged_chunks(whole, {number}, cut=cut))
     assert report.output is not None
     assert not [topic for topic in report.topics if topic.startswith("/recovered/")]
     assert set(read_all(report.output)) < set(MESSAGES)
@@ -75,9 +79,7 @@ def test_one_damaged_chunk_leaves_no_message_without_its_name(
 
 def test_messages_whose_definitions_are_all_lost_keep_their_bytes(tmp_path: Path) -> None:
     whole = write_ours(tmp_path / "w.mcap", MESSAGES, compress=False)
-    part = tmp_path / "d.mcap.part"
-    part.write_bytes(damaged_chunks(whole, {0, 1, 2, 3, 4, 5}, cut=True))
-    report = recover(part)
+    report = recovered(tmp_path, damaged_chunks(whole, {0, 1, 2, 3, 4, 5}, cut=True))
     assert report.output is not None
     assert any(topic.startswith("/recovered/channel_") for topic in report.topics)
     found = {(item.sequence, item.data) for item in read_all(report.output)}
@@ -96,14 +98,7 @@ def write_whole(path: Path, *, compress: bool) -> Path:
             record = schema.Schema(
                 name=kind, schema_encoding="ros2msg", message_encoding="cdr", data=b"uint8 a\n" * 20
             )
-            writer.write_foreign(
-                item.topic,
-                item.data,
-                schema_record=record,
-                log_time_ns=item.log_time,
-                publish_time_ns=item.publish_time,
-                sequence=item.sequence,
-            )
+            put_foreign(writer, item, record)
         writer.attach("a.bin", bytes(3000), media_type="x/y", log_time_ns=5)
     return path
 
@@ -177,9 +172,7 @@ def test_a_message_that_calls_itself_an_index_is_not_lost_unsaid(tmp_path: Path)
     at = data.index(MESSAGES[20].data) - MESSAGE_HEAD.size
     assert data[at] == MESSAGE
     data[at] = MESSAGE_INDEX
-    part = tmp_path / "d.mcap.part"
-    part.write_bytes(data)
-    report = recover(part)
+    report = recovered(tmp_path, data)
     assert report.output is not None
     assert set(MESSAGES) - set(read_all(report.output)) == {MESSAGES[20]}
     assert report.bytes_lost >= len(MESSAGES[20].data)
@@ -188,14 +181,9 @@ def test_a_message_that_calls_itself_an_index_is_not_lost_unsaid(tmp_path: Path)
 def test_a_chunk_head_that_lies_about_its_times_is_put_right(tmp_path: Path) -> None:
     """No CRC of the format covers it."""
     whole = write_whole(tmp_path / "w.mcap", compress=False)
-    with whole.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
     data = bytearray(whole.read_bytes())
-    data[summary.chunk_indexes[0].chunk_start_offset + 9 + 6] ^= 1
-    part = tmp_path / "d.mcap.part"
-    part.write_bytes(data)
-    report = recover(part)
+    data[summary_of(whole).chunk_indexes[0].chunk_start_offset + 9 + 6] ^= 1
+    report = recovered(tmp_path, data)
     assert report.output is not None
     assert read_all(report.output) == read_all(whole)
     assert check_episode(report.output).num_faults == 0
@@ -205,9 +193,7 @@ def test_a_damaged_record_about_the_episode_is_kept_aside(tmp_path: Path) -> Non
     whole = write_whole(tmp_path / "w.mcap", compress=False)
     data = whole.read_bytes().replace(b'"imported"', b'"importe\0"'[:9] + b'"', 1)
     data = data.replace(b"stand_in\x05\0\0\0false", b"stand_in\x05\0\0\0fals*", 1)
-    part = tmp_path / "d.mcap.part"
-    part.write_bytes(data)
-    report = recover(part)
+    report = recovered(tmp_path, data)
     assert report.output is not None
     with report.output.open("rb") as stream:
         names = [record.name for record in make_reader(stream).iter_metadata()]
@@ -218,9 +204,7 @@ def test_a_damaged_record_about_the_episode_is_kept_aside(tmp_path: Path) -> Non
 def test_a_chunk_that_claims_terabytes_is_refused(tmp_path: Path) -> None:
     whole = write_official(tmp_path / "w.mcap", MESSAGES)
     data = bytearray(whole.read_bytes())
-    with whole.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
+    summary = summary_of(whole)
     for size in (1 << 50, MAX_CHUNK_BYTES + 1):
         for item in summary.chunk_indexes:
             struct.pack_into("<Q", data, item.chunk_start_offset + 25, size)

@@ -6,27 +6,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.episode.run_folder import (
-    RunFolder,
-    grouped_parts,
-    part_name,
-    part_paths,
-)
+from bridge.episode import run_folder
 
 
-def run_with(folder: Path, *names: str) -> RunFolder:
-    run = RunFolder.create(folder / "run")
+def run_with(folder: Path, *names: str) -> run_folder.RunFolder:
+    run = run_folder.RunFolder.create(folder / "run")
     for name in names:
         (run.episodes_dir / name).write_bytes(b"")
     return run
 
 
-def listed(run: RunFolder) -> list[str]:
+def listed(run: run_folder.RunFolder) -> list[str]:
     return [path.name for path in run.episodes()]
 
 
 def test_a_split_episode_is_listed_once_and_all_its_parts_are_found(tmp_path: Path) -> None:
-    names = [part_name("t1", index) for index in range(1, 12)]
+    names = [run_folder.part_name("t1", index) for index in range(1, 12)]
     run = run_with(tmp_path, *reversed(names), "t2.mcap")
     assert listed(run) == ["t1.mcap", "t2.mcap"]
     assert [path.name for path in run.parts(run.episodes()[0])] == names
@@ -72,9 +67,11 @@ def test_derived_files_are_found_by_a_pattern_and_unfinished_ones_are_told_apart
 
 @given(st.sets(st.integers(1, 12)))
 def test_every_file_belongs_to_exactly_one_episode(indices: set[int]) -> None:
-    names = [part_name("a", index) for index in sorted(indices)]
-    assert list(grouped_parts(names[::-1]).items()) == [(name, names) for name in names[:1]]
+    names = [run_folder.part_name("a", index) for index in sorted(indices)]
+    assert list(run_folder.grouped_parts(names[::-1]).items()) == [
+        (name, names) for name in names[:1]
+    ]
 
 
 def test_parts_of_a_file_that_is_not_there_are_the_file_alone(tmp_path: Path) -> None:
-    assert part_paths(tmp_path / "t9.mcap") == [tmp_path / "t9.mcap"]
+    assert run_folder.part_paths(tmp_path / "t9.mcap") == [tmp_path / "t9.mcap"]

@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 
 from bridge.episode import metadata, schema, streams
-from bridge.episode.cdr.messages import (
-    CameraInfo,
-    CompressedColor,
-    DepthImage,
-    FrameTransform,
-    JointSample,
-    PoseSample,
-    transforms_to_cdr,
-)
+from bridge.episode.cdr import messages
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, EpisodeError, SchemaVersionError
@@ -26,7 +18,7 @@ INFO = metadata.EpisodeInfo(id="e1", kind="trial", task="cube_into_box", tags=("
 
 
 def joint(stamp_ns: int) -> bytes:
-    return JointSample(
+    return messages.JointSample(
         stamp_ns=stamp_ns,
         names=("a", "b"),
         position=np.array([stamp_ns * 1e-9, 2.0]),
@@ -38,51 +30,42 @@ def joint(stamp_ns: int) -> bytes:
 def write_episode(path: Path) -> Path:
     with EpisodeWriter(path) as writer:
         for stream in ("color", "depth"):
-            record = CameraInfo(stamp_ns=0, frame_id=f"side_{stream}_optical", camera=CAMERA)
+            record = messages.CameraInfo(
+                stamp_ns=0, frame_id=f"side_{stream}_optical", camera=CAMERA
+            )
             topic = f"/c/cam/side/{stream}/info"
             writer.write(topic, record.to_cdr(), type_name=schema.CAMERA_INFO, log_time_ns=1)
         T = np.eye(4)
         T[:3, 3] = [0.1, 0.2, 0.3]
         transforms = [
-            FrameTransform(
+            messages.FrameTransform(
                 stamp_ns=0, parent="base_link", child=f"side_{stream}_optical", T_parent_child=T
             )
             for stream in ("color", "depth")
         ]
-        data = transforms_to_cdr(transforms)
+        data = messages.transforms_to_cdr(transforms)
         writer.write("/tf_static", data, type_name=schema.TF_MESSAGE, log_time_ns=1)
         for index in range(3):
             stamp_ns = 10 + index * 100_000_000
             image = np.full((24, 32, 3), 40 * index, dtype=np.uint8)
-            color = CompressedColor(
+            color = messages.CompressedColor(
                 stamp_ns=stamp_ns,
                 frame_id="side_color_optical",
                 format="jpeg",
                 data=encode_jpeg(image),
             )
-            depth = DepthImage(
+            depth = messages.DepthImage(
                 stamp_ns=stamp_ns,
                 frame_id="side_depth_optical",
                 depth_mm=np.full((24, 32), 500 + index, dtype=np.uint16),
             )
-            for topic, record, name in (
-                ("/c/cam/side/color/image", color, schema.COMPRESSED_IMAGE),
-                ("/c/cam/side/depth/image", depth, schema.IMAGE),
+            for topic, data, name, late_ns in (
+                ("/c/cam/side/color/image", color.to_cdr(), schema.COMPRESSED_IMAGE, 5),
+                ("/c/cam/side/depth/image", depth.to_cdr(), schema.IMAGE, 5),
+                ("/c/joint_states", joint(stamp_ns), schema.JOINT_STATE, 7),
             ):
-                writer.write(
-                    topic,
-                    record.to_cdr(),
-                    type_name=name,
-                    log_time_ns=stamp_ns + 5,
-                    publish_time_ns=stamp_ns,
-                )
-            writer.write(
-                "/c/joint_states",
-                joint(stamp_ns),
-                type_name=schema.JOINT_STATE,
-                log_time_ns=stamp_ns + 7,
-                publish_time_ns=stamp_ns,
-            )
+                times = {"log_time_ns": stamp_ns + late_ns, "publish_time_ns": stamp_ns}
+                writer.write(topic, data, type_name=name, **times)
         writer.describe(INFO, outcome=metadata.Outcome(result="success", k=1))
         writer.attach("robot.urdf", b"<robot/>", media_type="application/xml", log_time_ns=9)
     return path
@@ -152,7 +135,7 @@ def test_an_unknown_camera_is_answered_with_those_that_exist(episode_path: Path)
 
 def test_stand_in_truth_is_never_offered_as_a_stream(tmp_path: Path) -> None:
     path = tmp_path / "truth.mcap"
-    pose = PoseSample(stamp_ns=1, frame_id="base_link", T_frame_body=np.eye(4)).to_cdr()
+    pose = messages.PoseSample(stamp_ns=1, frame_id="base_link", T_frame_body=np.eye(4)).to_cdr()
     with EpisodeWriter(path) as writer:
         topic = "/standin/truth/object/cube/pose"
         writer.write(topic, pose, type_name=schema.POSE_STAMPED, log_time_ns=1)

@@ -15,9 +15,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap.summary import Summary
-from mcap_samples import Stored, put, read_all, some_messages, write_ours
+from mcap_samples import Stored, put, put_foreign, read_all, some_messages, summary_of, write_ours
 
 from bridge.episode import schema
 from bridge.episode.recover import RecoveryError, recover
@@ -26,13 +24,6 @@ from bridge.errors import BridgeError, UsageError
 
 MESSAGES = some_messages(60)
 NO_FLUSH = WriterConfig(chunk_bytes=1500)
-
-
-def summary_of(path: Path) -> Summary:
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    return summary
 
 
 U64 = st.integers(0, 2**64 - 1)
@@ -56,14 +47,8 @@ def test_every_message_comes_back_with_its_times_and_sequence(
     with EpisodeWriter(path, config=WriterConfig(chunk_bytes=chunk_bytes)) as writer:
         for item in messages:
             middle = len(item.data) // 2
-            writer.write_foreign(
-                item.topic,
-                [item.data[:middle], memoryview(item.data)[middle:]],
-                schema_record=image if item.topic.endswith("image") else None,
-                log_time_ns=item.log_time,
-                publish_time_ns=item.publish_time,
-                sequence=item.sequence,
-            )
+            kind = image if item.topic.endswith("image") else None
+            put_foreign(writer, item, kind, [item.data[:middle], memoryview(item.data)[middle:]])
     assert sorted(read_all(path)) == sorted(messages)
 
 
@@ -179,14 +164,14 @@ def test_a_full_disk_is_said_at_once_and_nothing_is_lost_when_it_has_room_again(
     assert 100 < len(taken) < len(items)
     for _ in range(3):
         with pytest.raises(OSError, match="No space"):
-            write_plain(writer, items[len(taken)])
+            put_foreign(writer, items[len(taken)])
     with pytest.raises(OSError, match="No space"):
         writer.close()
     with pytest.raises(OSError, match="No space"):
         writer.tick()
     ballast.unlink()
     last = Stored("/t", 10_000, 10_000, 10_000, b"last")
-    write_plain(writer, last)
+    put_foreign(writer, last)
     assert read_all(writer.close()) == [*taken, last]
 
 
@@ -195,24 +180,13 @@ def write_until_refused(writer: EpisodeWriter, items: list[Stored]) -> list[Stor
     taken = []
     for item in items:
         try:
-            write_plain(writer, item)
+            put_foreign(writer, item)
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EFBIG):
                 raise
             break
         taken.append(item)
     return taken
-
-
-def write_plain(writer: EpisodeWriter, item: Stored) -> None:
-    writer.write_foreign(
-        item.topic,
-        item.data,
-        schema_record=None,
-        log_time_ns=item.log_time,
-        publish_time_ns=item.publish_time,
-        sequence=item.sequence,
-    )
 
 
 def test_what_a_full_disk_holds_can_be_recovered_elsewhere(full_disk: Path, tmp_path: Path) -> None:

@@ -1,21 +1,11 @@
 """Laws of the writer: when a message is in the file, how large a chunk is, which times it says."""
 
-from pathlib import Path
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap.summary import Summary
+from mcap_samples import summary_of
 
 from bridge.episode.writer import EpisodeWriter, WriterConfig
-
-
-def summary_of(path: Path) -> Summary:
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    return summary
 
 
 @given(

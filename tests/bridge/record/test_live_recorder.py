@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from live_recorder import LiveRecorder, open_recorder
 from mcap.reader import make_reader
+from patience import wait_until
 
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
@@ -44,20 +45,13 @@ def client(live: LiveRecorder, endpoint: str) -> Iterator[WireSession]:
         yield session
 
 
-def wait_for(is_so: Callable[[], object]) -> None:
-    end_s = time.monotonic() + WAIT_S
-    while not is_so():
-        assert time.monotonic() < end_s, "it never came"
-        time.sleep(0.02)
-
-
 def test_recording_from_python(tmp_path: Path, wire: WireConfig, endpoint: str) -> None:
     with open_recorder(tmp_path / "run", wire=wire) as recorder:
         recorder.start("t1", task="cube", operator="ada", tags=("x",), cell="lab")
         with open_session(WireConfig(connect=(endpoint,))) as session:
             publisher = session.publisher("/lab/note", "odd/Type")
             publisher.put(b"1", source_ns=1)
-            wait_for(lambda: recorder.status()["messages"] == 1)
+            wait_until(lambda: recorder.status()["messages"] == 1)
         recorder.core.mark("here")
         recorder.core.pause()
         recorder.core.resume()
@@ -83,7 +77,7 @@ def test_the_status_is_published_and_fits_its_schema(
     live.start("t1")
     publisher = client.publisher("/lab/event", schema.EVENT)
     publisher.put(b"{}", source_ns=time.time_ns())
-    wait_for(lambda: any(b'"messages": 1' in sample.data for sample in got))
+    wait_until(lambda: any(b'"messages": 1' in sample.data for sample in got))
     status = parse_record(got[-1].data, name="status", package="bridge.episode")
     assert (status["state"], status["episode"]) == ("recording", "t1")
     assert status["topics"]["/lab/event"]["received"] == 1
@@ -98,14 +92,14 @@ def test_the_recorder_is_seen_while_it_lives(
     with open_session(wire) as router:
         config = WireConfig(connect=(endpoint,))
         with open_recorder(tmp_path / "run", wire=config):
-            wait_for(lambda: router.query_alive("rec/*/alive") == ["rec/main/alive"])
-        wait_for(lambda: router.query_alive("rec/*/alive") == [])
+            wait_until(lambda: router.query_alive("rec/*/alive") == ["rec/main/alive"])
+        wait_until(lambda: router.query_alive("rec/*/alive") == [])
 
 
 def test_every_command_is_answered_over_the_wire(live: LiveRecorder, client: WireSession) -> None:
     ask = RecorderClient(client, timeout_s=WAIT_S).ask
     client.publisher("/lab/x", "odd/Type").put(b"1", source_ns=1)
-    wait_for(lambda: "/lab/x" in live.status()["seen"])
+    wait_until(lambda: "/lab/x" in live.status()["seen"])
     assert ask("snapshot", {"id": "s1"})["messages"] == 1
     ask("start", {"id": "t1", "info": {"task": "cube"}})
     assert ask("pause", {})["ok"]
@@ -128,15 +122,15 @@ def test_a_preview_is_made_only_while_somebody_looks(
     message = CompressedColor(stamp_ns=5, frame_id="c", format="jpeg", data=encode_jpeg(pixels))
     publisher = client.publisher("/lab/cam/eye/color/image", schema.COMPRESSED_IMAGE)
     publisher.put(message.to_cdr(), source_ns=1)
-    wait_for(lambda: "/lab/cam/eye/color/image" in live.status()["seen"])
+    wait_until(lambda: "/lab/cam/eye/color/image" in live.status()["seen"])
     assert live.core.input_queue.watched == frozenset()
     looking = client.subscribe("rec/main/preview/eye", got.append)
-    wait_for(lambda: live.core.input_queue.watched)
+    wait_until(lambda: live.core.input_queue.watched)
     publisher.put(message.to_cdr(), source_ns=1)
-    wait_for(lambda: got)
+    wait_until(lambda: got)
     assert decode_color(CompressedColor.from_cdr(got[0].data).data).shape == (240, 320, 3)
     looking.close()
-    wait_for(lambda: not live.core.input_queue.watched)
+    wait_until(lambda: not live.core.input_queue.watched)
 
 
 def test_what_a_departed_source_said_is_not_repeated(
@@ -146,10 +140,10 @@ def test_what_a_departed_source_said_is_not_repeated(
     with open_session(WireConfig(connect=(endpoint,))) as source:
         source.declare_alive("lab/alive")
         source.publisher("/lab/cam/a/color/info", schema.CAMERA_INFO).put(b"x", source_ns=1)
-        wait_for(lambda: len(live.status()["seen"]) == 2)
+        wait_until(lambda: len(live.status()["seen"]) == 2)
         live.start("t1")
         live.stop()
-    wait_for(lambda: len(live.core._life.latched.all()) == 1)
+    wait_until(lambda: len(live.core._life.latched.all()) == 1)
     live.start("t2")
     live.stop()
     topics = [

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import pytest
+from patience import wait_until
 
 from bridge.clock import AnchoredClock, StepWatch
 from bridge.episode import schema
@@ -47,13 +48,6 @@ def episode_of(run: RunFolder, name: str = "t1") -> Episode:
 
 def data_of(episode: Episode, topic: str = JOINTS) -> list[bytes]:
     return [message.data for message in episode.messages([topic])]
-
-
-def wait_until(is_so: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + 10.0
-    while not is_so():
-        assert time.monotonic() < end_s, "it never came"
-        time.sleep(0.01)
 
 
 def info(name: str = "t1") -> EpisodeInfo:

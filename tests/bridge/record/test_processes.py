@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -13,29 +12,17 @@ from pathlib import Path
 import pytest
 from loopback import free_endpoint
 from mcap.reader import make_reader
+from own_process import begun
 
 from bridge.errors import BridgeError
 from bridge.record.control import RecorderClient
 from bridge.wire.config import WireConfig
 from bridge.wire.session import open_session
 
-ROOT = Path(__file__).resolve().parents[3]
 CHILD = Path(__file__).with_name("publisher_child.py")
 WAIT_S = 30.0
 
 pytestmark = pytest.mark.slow
-
-
-def spawn(*arguments: str, **options: object) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [sys.executable, *arguments],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        **options,  # type: ignore[call-overload]
-    )
 
 
 class Cell:
@@ -49,12 +36,12 @@ class Cell:
 
     def record(self, *arguments: str, **options: object) -> "subprocess.Popen[str]":
         command = ("robot_gst.py", "record", str(self.run_path), "--listen", self.endpoint)
-        child = spawn(*command, *arguments, **options)
+        child = begun(*command, *arguments, **options)
         self.children.append(child)
         return child
 
     def publish(self, account: Path, *arguments: str) -> "subprocess.Popen[str]":
-        child = spawn(str(CHILD), self.endpoint, str(account), *arguments)
+        child = begun(str(CHILD), self.endpoint, str(account), *arguments)
         self.children.append(child)
         return child
 
@@ -81,7 +68,7 @@ class Cell:
             time.sleep(0.02)
 
     def command(self, *arguments: str) -> "subprocess.CompletedProcess[str]":
-        child = spawn("robot_gst.py", *arguments, "--connect", self.endpoint)
+        child = begun("robot_gst.py", *arguments, "--connect", self.endpoint)
         self.children.append(child)
         out, err = child.communicate(timeout=WAIT_S)
         return subprocess.CompletedProcess(child.args, child.returncode, out, err)

@@ -10,17 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.episode import schema
+from bridge.record import queue
 from bridge.record.config import QueueConfig
 from bridge.record.inspection import MessageState
 from bridge.record.ledger import Ledger
-from bridge.record.queue import (
-    Command,
-    Dropped,
-    Entry,
-    InputQueue,
-    Item,
-    Merge,
-)
 from bridge.wire.session import WireSample
 
 MakeSample = Callable[..., WireSample]
@@ -31,21 +24,21 @@ class Queues:
 
     def __init__(self, **limits: object) -> None:
         """Open the queues."""
-        self.images: deque[Item] = deque()
+        self.images: deque[queue.Item] = deque()
         self.kinds: dict[str, str] = {}
-        self.input_queue = InputQueue(QueueConfig(**limits), self.images.append, self.kinds)  # type: ignore[arg-type]
+        self.input_queue = queue.InputQueue(QueueConfig(**limits), self.images.append, self.kinds)  # type: ignore[arg-type]
 
     def encode(self, count: int | None = None) -> None:
         for _ in range(len(self.images) if count is None else count):
             self.input_queue.put_image(self.images.popleft(), 0)
 
-    def drain(self) -> list[Entry]:
+    def drain(self) -> list[queue.Entry]:
         self.encode()
-        merge = Merge()
+        merge = queue.Merge()
         merge.feed(*self.input_queue.take())
         entries = list(merge.ready())
         for entry in entries:
-            if isinstance(entry, Item):
+            if isinstance(entry, queue.Item):
                 self.input_queue.release(entry)
         return entries
 
@@ -64,8 +57,8 @@ def image(number: int, size: int, **changes: object) -> WireSample:
     return replace(sample, **changes)  # type: ignore[arg-type]
 
 
-def command() -> Command:
-    return Command(action=lambda command: None, received_ns=0)
+def command() -> queue.Command:
+    return queue.Command(action=lambda command: None, received_ns=0)
 
 
 @settings(max_examples=50, deadline=None)
@@ -91,9 +84,9 @@ def test_every_message_is_kept_or_counted(
         if number == encoded:
             queues.encode()
     for entry in queues.drain():
-        if isinstance(entry, Item):
+        if isinstance(entry, queue.Item):
             ledger.count_received(entry, MessageState.GOOD)
-        elif isinstance(entry, Dropped):
+        elif isinstance(entry, queue.Dropped):
             ledger.count_dropped(entry)
     total = ledger.total()
     assert total.received + total.queue_drops + total.shed == len(messages)
@@ -111,8 +104,8 @@ def test_images_never_evict_joints(make_sample: MakeSample) -> None:
     for _ in range(100):
         queues.input_queue.put(make_sample())
     entries = queues.drain()
-    joints = [e for e in entries if isinstance(e, Item) and "joint" in e.sample.topic]
-    dropped = [e for e in entries if isinstance(e, Dropped)]
+    joints = [e for e in entries if isinstance(e, queue.Item) and "joint" in e.sample.topic]
+    dropped = [e for e in entries if isinstance(e, queue.Dropped)]
     assert len(joints) == 100
     assert sum(c.messages for d in dropped for c in d.counts.values()) == 20 - 4
 
@@ -121,14 +114,14 @@ def test_small_messages_have_a_bound_of_their_own(make_sample: MakeSample) -> No
     queues = Queues(small_queue_mb=1)
     for _ in range(3000):
         queues.input_queue.put(make_sample(data=bytes(500)))
-    kept = [entry for entry in queues.drain() if isinstance(entry, Item)]
+    kept = [entry for entry in queues.drain() if isinstance(entry, queue.Item)]
     assert len(kept) == 1_000_000 // (500 + 512)
 
 
 def test_commands_keep_their_place_and_wait_for_the_images_before_them(
     make_sample: MakeSample,
 ) -> None:
-    queues, merge = Queues(), Merge()
+    queues, merge = Queues(), queue.Merge()
     stop = command()
     queues.input_queue.put(image(0, 10))
     before = make_sample()
@@ -140,7 +133,7 @@ def test_commands_keep_their_place_and_wait_for_the_images_before_them(
 
     def ready() -> list[object]:
         merge.feed(*queues.input_queue.take())
-        return [e.sample if isinstance(e, Item) else e for e in merge.ready()]
+        return [e.sample if isinstance(e, queue.Item) else e for e in merge.ready()]
 
     assert ready() == [before]  # small messages wait for no image
     assert merge.is_waiting
@@ -151,7 +144,7 @@ def test_commands_keep_their_place_and_wait_for_the_images_before_them(
 
 
 def test_an_image_from_behind_a_command_does_not_overtake_it() -> None:
-    queues, merge = Queues(), Merge()
+    queues, merge = Queues(), queue.Merge()
     queues.input_queue.put(image(0, 10, topic="/slow/cam/a/color/image"))
     queues.input_queue.put_command(command())
     queues.input_queue.put(image(1, 10))
@@ -162,7 +155,7 @@ def test_an_image_from_behind_a_command_does_not_overtake_it() -> None:
     queues.input_queue.put_image(slow, 0)
     merge.feed(*queues.input_queue.take())
     kinds = [type(entry) for entry in merge.ready()]
-    assert kinds == [Item, Command, Item]
+    assert kinds == [queue.Item, queue.Command, queue.Item]
 
 
 def test_a_quiet_intake_queues_only_what_is_latched(make_sample: MakeSample) -> None:
@@ -171,12 +164,12 @@ def test_a_quiet_intake_queues_only_what_is_latched(make_sample: MakeSample) -> 
     queues.input_queue.put(make_sample())
     queues.input_queue.put(make_sample(topic="/tf_static"))
     queues.input_queue.put(image(0, 10))
-    assert [e.sample.topic for e in queues.drain() if isinstance(e, Item)] == ["/tf_static"]
+    assert [e.sample.topic for e in queues.drain() if isinstance(e, queue.Item)] == ["/tf_static"]
     assert queues.input_queue.seen()["/cell/joint_states"] == 1
     queues.input_queue.put_command(command())
     queues.input_queue.be_quiet(0)  # too late: a command is on its way
     queues.input_queue.put(make_sample())
-    assert [type(entry) for entry in queues.drain()] == [Command, Item]
+    assert [type(entry) for entry in queues.drain()] == [queue.Command, queue.Item]
 
 
 def test_too_large_and_too_many_are_dropped_and_said(make_sample: MakeSample) -> None:
@@ -189,8 +182,8 @@ def test_too_large_and_too_many_are_dropped_and_said(make_sample: MakeSample) ->
     ledger = Ledger()
     kept = 0
     for entry in queues.drain():
-        kept += isinstance(entry, Item)
-        if isinstance(entry, Dropped):
+        kept += isinstance(entry, queue.Item)
+        if isinstance(entry, queue.Dropped):
             ledger.count_dropped(entry)
     assert kept == 5 + 1
     assert ledger.total().queue_drops == 3 + 1
@@ -216,4 +209,4 @@ def test_threads_that_put_at_once_lose_nothing(make_sample: MakeSample) -> None:
         thread.join()
     entries = queues.drain()
     assert len(entries) == 4 * len(samples)
-    assert sum(entry.step.gap for entry in entries if isinstance(entry, Item)) == 0
+    assert sum(entry.step.gap for entry in entries if isinstance(entry, queue.Item)) == 0

@@ -1,16 +1,16 @@
 """A ROS 2 node over rmw_zenoh in a process of its own, recorded and read by others' readers."""
 
-import os
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from loopback import free_endpoint
 from mcap.reader import make_reader
+from own_process import begun
+from patience import wait_until
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bridge.episode.metadata import EpisodeInfo
@@ -20,7 +20,6 @@ from bridge.record.ros2 import Ros2Graph, watch_ros2
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSample, WireSession, open_session
 
-ROOT = Path(__file__).resolve().parents[3]
 CHILD = Path(__file__).with_name("rmw_child.py")
 STRING = "std_msgs/msg/String"
 
@@ -32,14 +31,8 @@ class Robot:
 
     def __init__(self, endpoint: str, *arguments: str) -> None:
         """Start it; it says nothing yet."""
-        self.process = subprocess.Popen(
-            [sys.executable, str(CHILD), endpoint, *arguments],
-            cwd=ROOT,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        pipe = subprocess.PIPE
+        self.process = begun(str(CHILD), endpoint, *arguments, stdin=pipe, stderr=None)
 
     def speak(self) -> None:
         """Send its messages and wait until they are on their way."""
@@ -80,12 +73,6 @@ class Cell:
         self.robots.append(Robot(self.endpoint, *arguments))
         return self.robots[-1]
 
-    def wait_for(self, condition: Callable[[], bool], what: str) -> None:
-        end_s = time.monotonic() + 30.0
-        while not condition():
-            assert time.monotonic() < end_s, f"{what} did not happen"
-            time.sleep(0.01)
-
 
 @pytest.fixture
 def cell(run: RunFolder) -> Iterator[Cell]:
@@ -116,8 +103,8 @@ def test_a_topic_is_recorded_so_that_others_can_decode_it(cell: Cell, form: str)
     cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
     robot = cell.robot(form, "20")
     robot.speak()
-    cell.wait_for(lambda: len(cell.got) == 20, "the messages")
-    cell.wait_for(lambda: bool(graph.endpoints()), "the token")
+    wait_until(lambda: len(cell.got) == 20, "the messages")
+    wait_until(lambda: bool(graph.endpoints()), "the token")
     answer = cell.recorder.stop()
     found = read(cell.run.episodes_dir / "t1.mcap")
     assert (len(found), answer["lost"]) == (20, 0)
@@ -144,7 +131,7 @@ def test_a_topic_is_recorded_so_that_others_can_decode_it(cell: Cell, form: str)
     ]
     assert graph.warnings() == []
     robot.leave()
-    cell.wait_for(lambda: graph.endpoints() == [], "the end of the token")
+    wait_until(lambda: graph.endpoints() == [], "the end of the token")
     assert graph.warnings() == ["/chatter: the publisher in /talker left"]
 
 
@@ -154,9 +141,9 @@ def test_what_was_said_before_we_came_is_recorded_once(cell: Cell, flag: str) ->
     robot.speak()
     cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
     cell.listen()
-    cell.wait_for(lambda: len(cell.got) == 5, "the history")
+    wait_until(lambda: len(cell.got) == 5, "the history")
     robot.speak()
-    cell.wait_for(lambda: len(cell.got) >= 10, "the news")
+    wait_until(lambda: len(cell.got) >= 10, "the news")
     time.sleep(0.2)
     answer = cell.recorder.stop()
     assert [sample.sequence for sample in cell.got] == list(range(10))
@@ -169,9 +156,9 @@ def test_what_was_said_before_we_came_is_recorded_once(cell: Cell, flag: str) ->
 def test_what_a_transient_local_publisher_said_last_begins_the_next_episode(cell: Cell) -> None:
     cell.listen()
     robot = cell.robot("33", "3", "latched")
-    cell.wait_for(lambda: "/chatter" in cell.recorder.input_queue.latched, "the token")
+    wait_until(lambda: "/chatter" in cell.recorder.input_queue.latched, "the token")
     robot.speak()
-    cell.wait_for(lambda: len(cell.got) == 3, "the messages")
+    wait_until(lambda: len(cell.got) == 3, "the messages")
     cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
     cell.recorder.stop()
     found = read(cell.run.episodes_dir / "t1.mcap")
@@ -183,7 +170,7 @@ def test_a_publisher_that_comes_later_is_not_recorded_twice(cell: Cell) -> None:
     robot = cell.robot("33", "50", "latched")
     for _ in range(10):
         robot.speak()
-    cell.wait_for(lambda: len(cell.got) >= 500, "the messages")
+    wait_until(lambda: len(cell.got) >= 500, "the messages")
     graph.close()
     numbers = [sample.sequence for sample in cell.got]
     assert sorted(numbers) == list(range(500))
@@ -194,8 +181,8 @@ def test_another_definition_is_flagged_and_kept_apart(cell: Cell) -> None:
     cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
     cell.robot("33", "3").speak()
     cell.robot("33", "3", "other-hash").speak()
-    cell.wait_for(lambda: len(cell.got) == 6, "the messages of both")
-    cell.wait_for(lambda: bool(graph.warnings()), "the warning")
+    wait_until(lambda: len(cell.got) == 6, "the messages of both")
+    wait_until(lambda: bool(graph.warnings()), "the warning")
     cell.recorder.stop()
     assert graph.warnings()[0].startswith(
         "/chatter: /talker was built with another definition of std_msgs/msg/String (RIHS01_555"
@@ -210,8 +197,8 @@ def test_an_unknown_type_is_recorded_by_its_name_and_flagged(cell: Cell) -> None
     graph = cell.listen()
     cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
     cell.robot("33", "3", "unknown").speak()
-    cell.wait_for(lambda: len(cell.got) == 3, "the messages")
-    cell.wait_for(lambda: bool(graph.warnings()), "the warning")
+    wait_until(lambda: len(cell.got) == 3, "the messages")
+    wait_until(lambda: bool(graph.warnings()), "the warning")
     cell.recorder.stop()
     assert "type my_msgs/msg/Grip is not known here" in graph.warnings()[0]
     found = read(cell.run.episodes_dir / "t1.mcap")
@@ -222,9 +209,9 @@ def test_an_unknown_type_is_recorded_by_its_name_and_flagged(cell: Cell) -> None
 def test_a_killed_robot_is_noticed(cell: Cell) -> None:
     graph = cell.listen()
     robot = cell.robot("33", "1")
-    cell.wait_for(lambda: bool(graph.endpoints()), "the token")
+    wait_until(lambda: bool(graph.endpoints()), "the token")
     robot.process.kill()
-    cell.wait_for(lambda: bool(graph.warnings()), "the end of the token")
+    wait_until(lambda: bool(graph.warnings()), "the end of the token")
     assert graph.endpoints() == []
 
 
@@ -234,6 +221,6 @@ def test_hostile_tokens_change_nothing(cell: Cell) -> None:
         other.declare_alive("@ros2_lv/0/z/0/1/MP/%/%/n/%$*/a::msg::B_/RIHS01_x/:1:,1")
         other.declare_alive("@ros2_lv/nonsense")
         other.declare_alive("@ros2_lv/0/z/0/1/NN/%/%/" + "n" * 10_000)
-        cell.wait_for(lambda: bool(graph.endpoints()), "the long name")
-    cell.wait_for(lambda: not graph.endpoints(), "its end")
+        wait_until(lambda: bool(graph.endpoints()), "the long name")
+    wait_until(lambda: not graph.endpoints(), "its end")
     assert graph.warnings() == []

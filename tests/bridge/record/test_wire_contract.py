@@ -2,12 +2,10 @@
 
 import ast
 import json
-import os
 import re
 import shutil
 import struct
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +15,7 @@ from typing import Any
 import pytest
 import zenoh
 from mcap.reader import make_reader
+from patience import wait_until
 
 from bridge.episode import schema
 from bridge.episode.cdr import codec
@@ -38,33 +37,7 @@ JOINTS = "/demo/joint_states"
 WAIT_S = 20.0
 
 
-@pytest.fixture
-def router(endpoint: str) -> Iterator[WireSession]:
-    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
-        yield session
-
-
 Spawn = Callable[..., "subprocess.Popen[str]"]
-
-
-@pytest.fixture
-def spawn() -> Iterator[Spawn]:
-    children: list[subprocess.Popen[str]] = []
-
-    def start(*arguments: str) -> "subprocess.Popen[str]":
-        pipe = subprocess.PIPE
-        env = {**os.environ, "PYTHONPATH": str(ROOT)}
-        child = subprocess.Popen(
-            [sys.executable, *arguments], env=env, stdout=pipe, stderr=pipe, text=True
-        )
-        children.append(child)
-        return child
-
-    yield start
-    for child in children:
-        if child.poll() is None:
-            child.kill()
-        child.communicate()
 
 
 def test_the_example_knows_nothing_of_us_and_is_short() -> None:
@@ -225,10 +198,7 @@ def listen(router: WireSession, act: Callable[[], None], *, messages: int) -> li
 
 
 def wait_for(listener: WireListener, messages: int) -> None:
-    ends_s = time.monotonic() + WAIT_S
-    while sum(each.messages for each in listener._heard.values()) < messages:
-        assert time.monotonic() < ends_s
-        time.sleep(0.01)
+    wait_until(lambda: sum(each.messages for each in listener._heard.values()) >= messages)
 
 
 def test_who_keeps_the_contract_has_no_findings(router: WireSession, wild: Wild) -> None:

@@ -1,10 +1,8 @@
 """An episode played back: recorded again it is the same; what cannot be played is refused."""
 
 import json
-import os
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,7 +28,6 @@ from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSample, WireSession, open_session
 
-ROOT = Path(__file__).resolve().parents[3]
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 2_000_000
 WAIT_S = 30.0
@@ -113,39 +110,18 @@ def stored(path: Path) -> list[tuple[str, tuple[str, str, bytes] | None, str, in
         ]
 
 
-@pytest.fixture
-def spawn() -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
-    children: list[subprocess.Popen[str]] = []
-
-    def start(*arguments: str) -> "subprocess.Popen[str]":
-        children.append(
-            subprocess.Popen(
-                [sys.executable, str(ROOT / "robot_gst.py"), *arguments],
-                env={**os.environ, "PYTHONPATH": str(ROOT)},
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                cwd=ROOT,
-            )
-        )
-        return children[-1]
-
-    yield start
-    for child in children:
-        if child.poll() is None:
-            child.kill()
-        child.communicate()
-
-
 @pytest.mark.slow
 def test_an_episode_played_and_recorded_again_is_the_same(
     path: Path, tmp_path: Path, spawn: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
     endpoint = free_endpoint()
-    recorder = spawn("record", str(tmp_path / "run"), "--listen", endpoint, "--min-free-mb", "1")
+    recorder = spawn(
+        "robot_gst.py", "record", str(tmp_path / "run"), "--listen", endpoint, "--min-free-mb", "1"
+    )
     assert recorder.stderr is not None
     assert "listens on" in recorder.stderr.readline()
     player = spawn(
+        "robot_gst.py",
         "publish",
         "episode",
         str(path),

@@ -9,50 +9,42 @@ from hypothesis import strategies as st
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
+from bridge.sources.ur import rtde
 from bridge.sources.ur.config import UrConfig, parse_signal
 from bridge.sources.ur.messages import tool_pose
-from bridge.sources.ur.rtde import (
-    BrokenPackageError,
-    Kind,
-    Package,
-    PackageSplitter,
-    Recipe,
-    encode_package,
-    text_of,
-)
 
 
 @given(
-    st.lists(st.tuples(st.sampled_from(list(Kind)), st.binary(max_size=80)), max_size=20),
+    st.lists(st.tuples(st.sampled_from(list(rtde.Kind)), st.binary(max_size=80)), max_size=20),
     st.integers(1, 40),
 )
 def test_packages_survive_any_way_of_being_cut(
-    packages: list[tuple[Kind, bytes]], size: int
+    packages: list[tuple[rtde.Kind, bytes]], size: int
 ) -> None:
-    stream = b"".join(encode_package(kind, payload) for kind, payload in packages)
-    splitter = PackageSplitter()
+    stream = b"".join(rtde.encode_package(kind, payload) for kind, payload in packages)
+    splitter = rtde.PackageSplitter()
     found = [
         package
         for start in range(0, len(stream), size)
         for package in splitter.feed(stream[start : start + size])
     ]
-    assert found == [Package(kind=kind, payload=payload) for kind, payload in packages]
+    assert found == [rtde.Package(kind=kind, payload=payload) for kind, payload in packages]
 
 
 @given(st.binary(max_size=300))
 def test_bytes_that_are_no_rtde_are_refused_or_waited_for(data: bytes) -> None:
-    splitter = PackageSplitter()
+    splitter = rtde.PackageSplitter()
     try:
         found = list(splitter.feed(data))
-    except BrokenPackageError:
+    except rtde.BrokenPackageError:
         return
-    assert all(package.kind in set(Kind) for package in found)
+    assert all(package.kind in set(rtde.Kind) for package in found)
 
 
 @pytest.mark.parametrize("greeting", [b"SSH-2.0-OpenSSH_9.6\r\n", b"HTTP/1.1 400 Bad", b"\0\0V"])
 def test_another_protocol_is_recognised_at_once(greeting: bytes) -> None:
-    with pytest.raises(BrokenPackageError, match="it sent"):
-        list(PackageSplitter().feed(greeting))
+    with pytest.raises(rtde.BrokenPackageError, match="it sent"):
+        list(rtde.PackageSplitter().feed(greeting))
 
 
 def test_a_recipe_reads_every_type() -> None:
@@ -60,7 +52,7 @@ def test_a_recipe_reads_every_type() -> None:
     types += ("VECTOR6INT32", "VECTOR6UINT32")
     names = tuple(name.lower() for name in types)
     payload = struct.pack(">B?BIQid3d6d6i6I", 7, True, 1, 2, 3, -4, 0.5, *range(21))
-    values = Recipe(names, types, 7).unpack(payload)
+    values = rtde.Recipe(names, types, 7).unpack(payload)
     assert values["bool"] is True
     assert (values["uint64"], values["int32"], values["double"]) == (3, -4, 0.5)
     assert values["vector6d"] == (3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
@@ -68,19 +60,19 @@ def test_a_recipe_reads_every_type() -> None:
 
 
 def test_data_of_another_length_or_recipe_is_refused() -> None:
-    recipe = Recipe(("timestamp",), ("DOUBLE",), 1)
-    with pytest.raises(BrokenPackageError, match="8 bytes, expected 9"):
+    recipe = rtde.Recipe(("timestamp",), ("DOUBLE",), 1)
+    with pytest.raises(rtde.BrokenPackageError, match="8 bytes, expected 9"):
         recipe.unpack(bytes(8))
-    with pytest.raises(BrokenPackageError, match="recipe 2, expected 1"):
+    with pytest.raises(rtde.BrokenPackageError, match="recipe 2, expected 1"):
         recipe.unpack(b"\x02" + bytes(8))
-    with pytest.raises(BrokenPackageError, match="MATRIX"):
-        Recipe(("a",), ("MATRIX",), 1)
+    with pytest.raises(rtde.BrokenPackageError, match="MATRIX"):
+        rtde.Recipe(("a",), ("MATRIX",), 1)
 
 
 @given(st.binary(max_size=40))
 def test_any_text_message_can_be_read(payload: bytes) -> None:
-    text_of(payload)
-    assert text_of(b"\x02hi\x03urc\x01") == "urc: hi"
+    rtde.text_of(payload)
+    assert rtde.text_of(b"\x02hi\x03urc\x01") == "urc: hi"
 
 
 def test_a_gripper_on_a_tool_input() -> None:

@@ -8,19 +8,13 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
+from bridge.sources.standin import planner
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters
 from bridge.sources.standin.kinematics import (
     UnreachablePoseError,
     arm_kinematics,
     tool_down,
     yaw_of,
-)
-from bridge.sources.standin.planner import (
-    NO_ERROR,
-    GraspError,
-    draw_error,
-    perceive,
-    plan_pick_and_place,
 )
 from bridge.sources.standin.world import World
 from bridge.task.plan import Plan
@@ -36,8 +30,8 @@ def world(task: Task, nominal: HiddenParameters) -> World:
 
 @pytest.fixture
 def plan_of(task: Task, starts: dict[str, np.ndarray], cell_file: CellFile) -> Callable[..., Plan]:
-    def plan(error: GraspError = NO_ERROR, **more: Any) -> Plan:
-        return plan_pick_and_place(
+    def plan(error: planner.GraspError = planner.NO_ERROR, **more: Any) -> Plan:
+        return planner.plan_pick_and_place(
             task,
             starts,
             error,
@@ -96,10 +90,10 @@ def test_the_error_of_a_candidate_depends_on_start_and_round_only(
     cell_file: CellFile, starts: dict[str, np.ndarray]
 ) -> None:
     noise = cell_file.planner
-    first = draw_error(noise, start_seed=9_000_001, round_=0)
-    assert first == draw_error(noise, start_seed=9_000_001, round_=0)
-    assert first != draw_error(noise, start_seed=9_000_001, round_=1)
-    seen = [perceive(starts, noise, start_seed=9_000_001)["cube"] for _ in range(2)]
+    first = planner.draw_error(noise, start_seed=9_000_001, round_=0)
+    assert first == planner.draw_error(noise, start_seed=9_000_001, round_=0)
+    assert first != planner.draw_error(noise, start_seed=9_000_001, round_=1)
+    seen = [planner.perceive(starts, noise, start_seed=9_000_001)["cube"] for _ in range(2)]
     np.testing.assert_array_equal(*seen)
     assert not np.array_equal(seen[0], starts["cube"])
 
@@ -124,10 +118,10 @@ def test_a_wrist_that_is_wound_up_turns_back_before_the_next_object(
         start = ducks.start[name]
         seen[name] = lying((np.mean(start.x_m), np.mean(start.y_m), 0.03), yaw)
     limit = toys_cell.max_joint_speed_rad_s
-    plan = plan_pick_and_place(
+    plan = planner.plan_pick_and_place(
         ducks,
         seen,
-        replace(NO_ERROR, release_m=(-0.08, 0.04)),
+        replace(planner.NO_ERROR, release_m=(-0.08, 0.04)),
         kinematics=arm_kinematics(),
         joints_start_rad=HOME,
         max_joint_speed_rad_s=limit,

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from verdicts import verdict_of
 
 from bridge.sources.standin.decisions import why_stale
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Verdict
 
 PLAN = b'{"a": 0.0}'
 BASIS: dict[str, Any] = {
@@ -20,18 +21,7 @@ BASIS: dict[str, Any] = {
 
 
 def verdict(value: bool | None = True, basis: dict[str, Any] | None = BASIS) -> Verdict:
-    yes = Factor(value=True)
-    return Verdict(
-        plan_id="p",
-        trajectory="planned",
-        mode="dynamic",
-        ik=yes,
-        clearance=yes,
-        terminal=Factor(value=value),
-        engine="test",
-        seed=0,
-        basis=basis,
-    )
+    return verdict_of(terminal=value, basis=basis)
 
 
 @pytest.mark.parametrize(

@@ -15,15 +15,12 @@ from bridge.episode.cdr.messages import PointCloudSample, PoseSample
 from bridge.episode.metadata import Outcome
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.sources.standin import planner
 from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, draw_hidden
 from bridge.sources.standin.destination import release_slots
 from bridge.sources.standin.kinematics import yaw_of
 from bridge.sources.standin.operator import execute_plan, label_trial
-from bridge.sources.standin.planner import (
-    draw_error,
-    draw_errors,
-)
 from bridge.sources.standin.render import Renderer
 from bridge.sources.standin.soft import SoftBody
 from bridge.sources.standin.streams import Streams
@@ -166,8 +163,8 @@ def test_each_object_has_its_own_error_and_the_first_keeps_the_old_one(
     toys_cell: CellFile,
 ) -> None:
     noise = toys_cell.noise_for("five_ducks_into_basket")
-    errors = draw_errors(noise, 5, start_seed=SEED, round_=1)
-    assert errors[0] == draw_error(noise, start_seed=SEED, round_=1)
+    errors = planner.draw_errors(noise, 5, start_seed=SEED, round_=1)
+    assert errors[0] == planner.draw_error(noise, start_seed=SEED, round_=1)
     assert len({error.along_m for error in errors}) == 5
     assert noise.release_m < toys_cell.noise_for("sloth_into_basket").release_m
 

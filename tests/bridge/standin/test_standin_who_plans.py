@@ -1,6 +1,5 @@
 """Who plans, who decides: planners on the wire, study arms, and what is kept from a planner."""
 
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from standin_verdicts import verdict_on
 
 from bridge.episode.metadata import study_arm_of
 from bridge.errors import UsageError
@@ -20,34 +20,12 @@ from bridge.sources.standin.settings import SessionConfig
 from bridge.task.find import chosen_task_file
 from bridge.task.plan import Plan
 from bridge.task.plan_request import PlanAnswer, PlanRequest
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Factor
 from bridge.wire.errors import NoReplyError, RemoteError
 
 FILE = chosen_task_file("cube_into_box")
 ARMS = ("without", "with", "control")
 Answer = Callable[[PlanRequest], bytes]
-
-
-def verdict_on(plan: dict[str, Any], accepted: bool | None) -> dict[str, Any]:
-    as_sent = json.dumps(plan, separators=(",", ":")).encode()
-    verdict = Verdict(
-        plan_id=plan["id"],
-        trajectory="planned",
-        mode="dynamic",
-        ik=Factor(value=True),
-        clearance=Factor(value=True),
-        terminal=Factor(value=accepted, cause="slipped", bodies=("cube",)),
-        engine="test",
-        seed=0,
-        basis={
-            "plan_sha256": hashlib.sha256(as_sent).hexdigest(),
-            "joints_rad": plan["tau"][0]["joints_rad"],
-            "objects": {},
-            "judged_ns": 0,
-            "valid_s": 1e12,
-        },
-    )
-    return dict(json.loads(verdict.to_json()))
 
 
 @pytest.fixture
@@ -83,7 +61,8 @@ def wire(make_session: Callable[..., Any], starts: dict[str, np.ndarray]) -> Cal
                     return self.answers[-1]
                 return bytes(super().query(key, payload, timeout_s=timeout_s))
 
-        session = Wire(gate=lambda record: verdict_on(record, accepted))
+        terminal = Factor(value=accepted, cause="slipped", bodies=("cube",))
+        session = Wire(gate=lambda plan: verdict_on(plan, terminal))
         session.requests, session.answers = [], []
         return session
 

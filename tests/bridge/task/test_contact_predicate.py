@@ -5,22 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bridge.task.predicate import (
-    ALLOWED_CONTACTS,
-    Contact,
-    Rollout,
-    all_hold,
-    evaluate_contacts,
-    evaluate_success,
-)
+from bridge.task import predicate
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 
 CUBE = load_task("cube_into_box")
 
 
-def touch(depth_m: float, *, allowed: bool = False, start_s: float = 1.0) -> Contact:
-    return Contact(
+def touch(depth_m: float, *, allowed: bool = False, start_s: float = 1.0) -> predicate.Contact:
+    return predicate.Contact(
         start_ns=round(start_s * 1e9),
         end_ns=round(start_s * 1e9) + 10,
         bodies=("forearm_link", "box"),
@@ -29,15 +22,15 @@ def touch(depth_m: float, *, allowed: bool = False, start_s: float = 1.0) -> Con
     )
 
 
-def rollout(*contacts: Contact, **change: object) -> Rollout:
-    state = Rollout(
+def rollout(*contacts: predicate.Contact, **change: object) -> predicate.Rollout:
+    state = predicate.Rollout(
         stamps_ns=np.array([0, 1]), Ts_base_object={}, finger_contact={}, contacts=contacts
     )
     return replace(state, **change)
 
 
 def test_nothing_is_said_where_contacts_are_not_known() -> None:
-    assert evaluate_contacts(CUBE, rollout(contacts=None)).value is None
+    assert predicate.evaluate_contacts(CUBE, rollout(contacts=None)).value is None
 
 
 @pytest.mark.parametrize(
@@ -51,34 +44,36 @@ def test_nothing_is_said_where_contacts_are_not_known() -> None:
     ],
 )
 def test_only_a_touch_that_was_not_allowed_breaks_it(
-    contacts: tuple[Contact, ...], holds: bool
+    contacts: tuple[predicate.Contact, ...], holds: bool
 ) -> None:
-    assert evaluate_contacts(CUBE, rollout(*contacts)).value is holds
+    assert predicate.evaluate_contacts(CUBE, rollout(*contacts)).value is holds
 
 
 def test_the_first_wrong_touch_is_told_with_its_time_and_depth() -> None:
-    finding = evaluate_contacts(CUBE, rollout(touch(0.004, start_s=3.0), touch(0.002, start_s=2.0)))
+    finding = predicate.evaluate_contacts(
+        CUBE, rollout(touch(0.004, start_s=3.0), touch(0.002, start_s=2.0))
+    )
     assert "forearm_link touched box at 2.00 s, 2.0 mm deep" in finding.detail
 
 
 def test_inferred_contacts_say_so_and_take_a_tolerance() -> None:
     state = rollout(touch(0.004), contacts_inferred=True)
-    assert evaluate_contacts(CUBE, state, tolerance_m=0.005).value is True
-    finding = evaluate_contacts(CUBE, state, tolerance_m=0.003)
+    assert predicate.evaluate_contacts(CUBE, state, tolerance_m=0.005).value is True
+    finding = predicate.evaluate_contacts(CUBE, state, tolerance_m=0.003)
     assert (finding.value, finding.detail.startswith("inferred: ")) == (False, True)
 
 
 def test_a_task_may_ask_for_it_like_for_any_other_predicate() -> None:
-    task = replace(CUBE, success=({"kind": ALLOWED_CONTACTS, "tolerance_m": 0.003},))
-    assert all_hold(evaluate_success(task, rollout(touch(0.002)))) is True
-    assert all_hold(evaluate_success(task, rollout(touch(0.004)))) is False
-    listed = evaluate_contacts(task, rollout(touch(0.002)), tolerance_m=0.0)
+    task = replace(CUBE, success=({"kind": predicate.ALLOWED_CONTACTS, "tolerance_m": 0.003},))
+    assert predicate.all_hold(predicate.evaluate_success(task, rollout(touch(0.002)))) is True
+    assert predicate.all_hold(predicate.evaluate_success(task, rollout(touch(0.004)))) is False
+    listed = predicate.evaluate_contacts(task, rollout(touch(0.002)), tolerance_m=0.0)
     assert listed.value is True, "the task's own tolerance counts"
 
 
 def test_a_task_may_ask_it_of_one_object_only() -> None:
-    task = replace(CUBE, success=({"kind": ALLOWED_CONTACTS, "object": "cube"},))
-    assert all_hold(evaluate_success(task, rollout(touch(0.01)))) is True
+    task = replace(CUBE, success=({"kind": predicate.ALLOWED_CONTACTS, "object": "cube"},))
+    assert predicate.all_hold(predicate.evaluate_success(task, rollout(touch(0.01)))) is True
 
 
 def test_a_broken_body_has_no_shape_whatever_its_extents() -> None:
@@ -90,12 +85,12 @@ def test_a_broken_body_has_no_shape_whatever_its_extents() -> None:
         broken={"sloth": "burst: an edge is 9.0 times as long as at rest"},
     )
     task = replace(task, success=({"kind": "shape", "object": "sloth", "tolerance_fraction": 0.2},))
-    (finding,) = evaluate_success(task, state)
+    (finding,) = predicate.evaluate_success(task, state)
     assert (finding.value, "burst" in finding.detail) == (False, True)
-    whole = evaluate_success(task, replace(state, broken={}))
+    whole = predicate.evaluate_success(task, replace(state, broken={}))
     assert whole[0].value is True
     nowhere = replace(state, broken={}, extents_m={"sloth": np.full((2, 3), np.nan)})
-    assert evaluate_success(task, nowhere)[0].value is False
+    assert predicate.evaluate_success(task, nowhere)[0].value is False
 
 
 def test_a_verdict_keeps_warnings_and_findings_on_disk() -> None:

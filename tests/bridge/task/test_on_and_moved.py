@@ -11,13 +11,7 @@ from hypothesis import strategies as st
 
 import bridge.task
 from bridge.geometry import se3
-from bridge.task.predicate import (
-    PredicateResult,
-    Rollout,
-    already_true_at_start,
-    evaluate_success,
-    is_goal,
-)
+from bridge.task import predicate
 from bridge.task.summary import describe_predicate
 from bridge.task.task_file import Task, TaskFile
 
@@ -36,12 +30,12 @@ def pose(x: float, y: float, z: float, yaw_rad: float = 0.0) -> np.ndarray:
 
 def asked(
     spec: dict[str, Any], poses: dict[str, list[np.ndarray]], task: Task = TASK
-) -> PredicateResult:
+) -> predicate.PredicateResult:
     count = max(map(len, poses.values()))
     stacked = {name: np.stack(Ts if len(Ts) > 1 else Ts * count) for name, Ts in poses.items()}
     stamps = np.arange(count, dtype=np.int64)
-    rollout = Rollout(stamps_ns=stamps, Ts_base_object=stacked, finger_contact={})
-    return evaluate_success(replace(task, success=(spec,)), rollout)[0]
+    rollout = predicate.Rollout(stamps_ns=stamps, Ts_base_object=stacked, finger_contact={})
+    return predicate.evaluate_success(replace(task, success=(spec,)), rollout)[0]
 
 
 def on(T_cube: np.ndarray, T_block: np.ndarray | None = None, **limits: float) -> bool | None:
@@ -91,14 +85,14 @@ def test_the_face_that_looks_up_counts_whichever_it_is() -> None:
 
 def test_on_a_soft_thing_its_present_extents_count() -> None:
     task = replace(TASK, success=(ON,))
-    rollout = Rollout(
+    rollout = predicate.Rollout(
         stamps_ns=np.array([0]),
         Ts_base_object={"cube": pose(0.5, 0.2, 0.055)[None], "block": pose(0.5, 0.2, 0.025)[None]},
         finger_contact={},
     )
-    assert evaluate_success(task, rollout)[0].value is False
+    assert predicate.evaluate_success(task, rollout)[0].value is False
     pressed = replace(rollout, extents_m={"cube": np.array([[0.05, 0.05, 0.012]])})
-    assert evaluate_success(task, pressed)[0].value is True
+    assert predicate.evaluate_success(task, pressed)[0].value is True
 
 
 @given(metres, metres, st.floats(0.05, 0.09), st.floats(0.0, 0.05), st.floats(0.0, 0.02))
@@ -158,8 +152,8 @@ def test_limits_are_monotone(x: float, y: float, z: float, limit: float, more: f
 
 def start_of(T_cube: np.ndarray, *success: dict[str, Any]) -> bool:
     poses = {"cube": T_cube[None], "block": pose(0.5, 0.2, 0.025)[None]}
-    rollout = Rollout(stamps_ns=np.array([0]), Ts_base_object=poses, finger_contact={})
-    return already_true_at_start(replace(TASK, success=success), rollout)
+    rollout = predicate.Rollout(stamps_ns=np.array([0]), Ts_base_object=poses, finger_contact={})
+    return predicate.already_true_at_start(replace(TASK, success=success), rollout)
 
 
 def test_a_goal_that_holds_at_the_start_is_noticed_whatever_its_kind() -> None:
@@ -172,7 +166,7 @@ def test_a_goal_that_holds_at_the_start_is_noticed_whatever_its_kind() -> None:
     assert not start_of(elsewhere, ON)
     assert not start_of(there, ON, {**MOVED, "at_least_m": 0.1})
     assert not start_of(there, still)  # to leave a thing where it is, is no goal
-    assert [is_goal(spec) for spec in (ON, still, target)] == [True, False, True]
+    assert [predicate.is_goal(spec) for spec in (ON, still, target)] == [True, False, True]
 
 
 def test_words_name_every_limit() -> None:

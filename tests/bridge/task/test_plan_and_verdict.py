@@ -6,6 +6,7 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from verdicts import verdict_of
 
 from bridge.errors import InvalidRecordError
 from bridge.task.plan import Plan, Ranking, Stage, SteeredBy, Waypoint
@@ -116,16 +117,8 @@ def test_the_stage_of_an_instant_is_found() -> None:
 
 
 def verdict(ik: bool | None, clearance: bool | None, terminal: bool | None) -> Verdict:
-    return Verdict(
-        plan_id="p1",
-        trajectory="planned",
-        mode="dynamic",
-        ik=Factor(value=ik),
-        clearance=Factor(value=clearance, first_t_ns=5, bodies=("wrist", "table")),
-        terminal=Factor(value=terminal),
-        engine="pybullet",
-        seed=0,
-    )
+    close = Factor(value=clearance, first_t_ns=5, bodies=("wrist", "table"))
+    return verdict_of("p1", ik=ik, clearance=close, terminal=terminal, engine="pybullet")
 
 
 values = st.sampled_from([True, False, None])

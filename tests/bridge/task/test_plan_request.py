@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from verdicts import verdict_of
 
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.plan_request import PlanAnswer, PlanRequest, Refusal
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Factor
 
 POSE = se3.pose_record(
     se3.transform_from(np.array([0.92, 0, 0, 0.39]), np.array([0.5, -0.15, 0.02]))
@@ -35,15 +36,9 @@ PLAN = Plan(
     entities={"cube": POSE},
     joint_names=("one", "two"),
 )
-NO = Verdict(
-    plan_id="plan_0",
-    trajectory="planned",
-    mode="dynamic",
-    ik=Factor(value=True),
-    clearance=Factor(value=True),
+NO = verdict_of(
+    "plan_0",
     terminal=Factor(value=False, cause="inside", bodies=("cube", "box")),
-    engine="test",
-    seed=0,
     grasps=({"object": "cube", "touched": True, "held": False, "p_object_m": [0.0, 0.01, 0.0]},),
 )
 REQUEST = PlanRequest(

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from verdicts import verdict_of
 
 from bridge.geometry import se3
 from bridge.task.predicate import Rollout, all_hold, already_true_at_start, evaluate_success
 from bridge.task.task_file import Task, load_task
-from bridge.task.verdict import Factor, Verdict
 
 STEP_NS = 20_000_000
 STEPS = 100
@@ -142,14 +142,7 @@ def test_a_verdict_is_the_and_of_its_factors_and_names_the_first_that_fails(
     ik: bool | None, clearance: bool | None, terminal: bool | None
 ) -> None:
     factors = {"ik": ik, "clearance": clearance, "terminal": terminal}
-    verdict = Verdict(
-        plan_id="p",
-        trajectory="planned",
-        mode="dynamic",
-        engine="none",
-        seed=0,
-        **{name: Factor(value=value) for name, value in factors.items()},
-    )
+    verdict = verdict_of(**factors)
     failing = [name for name, value in factors.items() if value is False]
     assert verdict.first_failing == (failing[0] if failing else None)
     # Kleene's logic: false beats unknown, unknown beats true.

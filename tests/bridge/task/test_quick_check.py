@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
+from verdicts import verdict_of
 
 import bridge.task
 from bridge.errors import InvalidRecordError
 from bridge.task.record import check_record
-from bridge.task.verdict import Factor, Verdict
 
 SCHEMAS = Path(str(bridge.task.__file__)).parent / "schemas"
 OUTCOME = Draft202012Validator(json.loads((SCHEMAS / "outcome.schema.json").read_text()))
@@ -42,12 +42,7 @@ def test_what_is_no_json_and_what_is_too_deep_is_refused() -> None:
 
 
 def test_what_does_not_fit_is_named_with_its_place() -> None:
-    fine = Factor(value=True)
-    verdict = Verdict(
-        plan_id="p", trajectory="planned", mode="dynamic", ik=fine, clearance=fine, terminal=fine,
-        engine="e", seed=1,
-    )  # fmt: skip
-    record = json.loads(verdict.to_json())
+    record = json.loads(verdict_of().to_json())
     assert check_record(record, name="verdict") is record
     record["ik"]["bodies"] = ["arm", 7]
     with pytest.raises(InvalidRecordError, match=r'ik/bodies/1.*7 is not of type "string"'):

@@ -13,13 +13,8 @@ from scipy.optimize import linprog
 
 import bridge.task
 from bridge.geometry import se3
+from bridge.task import predicate
 from bridge.task.check import task_problems
-from bridge.task.predicate import (
-    PredicateResult,
-    Rollout,
-    bodies_of,
-    evaluate_success,
-)
 from bridge.task.relations import SIDES, WAYS, Box, footprint_gap_m
 from bridge.task.summary import describe_predicate
 from bridge.task.task_file import Task, TaskFile, load_task
@@ -52,12 +47,12 @@ def rotation(axis: np.ndarray, angle_rad: float) -> np.ndarray:
     return np.asarray(se3.rotation_from_quaternion(q))
 
 
-def found(spec: dict[str, Any], task: Task = TASK, **Ts: np.ndarray) -> PredicateResult:
+def found(spec: dict[str, Any], task: Task = TASK, **Ts: np.ndarray) -> predicate.PredicateResult:
     """What a predicate says of poses; of an array of two, first and last."""
     stacked = {name: T if T.ndim == 3 else np.stack([T, T]) for name, T in Ts.items()}
     stamps = np.arange(2, dtype=np.int64)
-    rollout = Rollout(stamps_ns=stamps, Ts_base_object=stacked, finger_contact={})
-    return evaluate_success(replace(task, success=(spec,)), rollout)[0]
+    rollout = predicate.Rollout(stamps_ns=stamps, Ts_base_object=stacked, finger_contact={})
+    return predicate.evaluate_success(replace(task, success=(spec,)), rollout)[0]
 
 
 BESIDE = {"kind": "beside", "object": "cube", "reference": "block"}
@@ -227,7 +222,7 @@ def test_what_is_not_localised_or_not_a_number_stays_open(spec: dict[str, Any]) 
         "long": pose(0.3, 0.0, 0.03),
         "box": pose(0.5, 0.5, 0.0),
     }
-    named = bodies_of(spec)
+    named = predicate.bodies_of(spec)
     for name in named:
         missing = {key: T for key, T in Ts.items() if key != name}
         answer = found(spec, **missing)

@@ -10,12 +10,7 @@ from hypothesis import strategies as st
 from bridge.data_files import dataset_file
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.task.predicate import (
-    Rollout,
-    all_hold,
-    already_true_at_start,
-    evaluate_success,
-)
+from bridge.task import predicate
 from bridge.task.task_file import Task, load_task
 
 
@@ -31,7 +26,7 @@ def rollout(
     speed_m_s: float = 0.0,
     touching: bool = False,
     yaw_rad: float = 0.3,
-) -> Rollout:
+) -> predicate.Rollout:
     steps = 50
     stamps_ns = np.arange(steps, dtype=np.int64) * 20_000_000
     q = np.array([np.cos(yaw_rad / 2), 0, 0, np.sin(yaw_rad / 2)])
@@ -40,15 +35,15 @@ def rollout(
     Ts_cube = np.tile(np.eye(4), (steps, 1, 1))
     Ts_cube[:, :3, 3] = end
     Ts_cube[:, 0, 3] -= speed_m_s * (stamps_ns[-1] - stamps_ns) * 1e-9
-    return Rollout(
+    return predicate.Rollout(
         stamps_ns=stamps_ns,
         Ts_base_object={"cube": Ts_cube, "box": np.tile(T_base_box, (steps, 1, 1))},
         finger_contact={"cube": np.full(steps, touching)},
     )
 
 
-def succeeded(task: Task, state: Rollout) -> bool | None:
-    return all_hold(evaluate_success(task, state))
+def succeeded(task: Task, state: predicate.Rollout) -> bool | None:
+    return predicate.all_hold(predicate.evaluate_success(task, state))
 
 
 def test_a_cube_at_rest_in_the_box_is_a_success(task: Task) -> None:
@@ -70,7 +65,7 @@ def test_a_cube_still_held_is_not_a_success(task: Task) -> None:
 
 def test_unknown_contact_leaves_the_verdict_open(task: Task) -> None:
     state = rollout(task, (0, 0, 0.026))
-    unknown = Rollout(
+    unknown = predicate.Rollout(
         stamps_ns=state.stamps_ns, Ts_base_object=state.Ts_base_object, finger_contact={}
     )
     assert succeeded(task, unknown) is None
@@ -78,7 +73,7 @@ def test_unknown_contact_leaves_the_verdict_open(task: Task) -> None:
 
 def test_an_object_nobody_found_leaves_the_verdict_open(task: Task) -> None:
     state = rollout(task, (0, 0, 0.026))
-    blind = Rollout(
+    blind = predicate.Rollout(
         stamps_ns=state.stamps_ns,
         Ts_base_object={"box": state.Ts_base_object["box"]},
         finger_contact={},
@@ -97,8 +92,8 @@ def test_turning_the_whole_scene_changes_nothing(yaw: float, x: float, y: float)
 
 
 def test_a_goal_that_holds_before_anything_moves_is_noticed(task: Task) -> None:
-    assert already_true_at_start(task, rollout(task, (0, 0, 0.026)))
-    assert not already_true_at_start(task, rollout(task, (0.2, 0, 0.026)))
+    assert predicate.already_true_at_start(task, rollout(task, (0, 0, 0.026)))
+    assert not predicate.already_true_at_start(task, rollout(task, (0.2, 0, 0.026)))
 
 
 def test_starts_are_drawn_inside_their_ranges_and_repeat_with_the_seed(task: Task) -> None:

@@ -1,4 +1,4 @@
-"""A router and a client of it over real TCP on the loopback address."""
+"""A client of the router."""
 
 from collections.abc import Iterator
 
@@ -6,12 +6,6 @@ import pytest
 
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
-
-
-@pytest.fixture
-def router(endpoint: str) -> Iterator[WireSession]:
-    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
-        yield session
 
 
 @pytest.fixture

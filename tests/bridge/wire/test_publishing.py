@@ -1,9 +1,7 @@
 """Quality of service, shared memory, liveliness, caches and zenoh's own numbers."""
 
-import time
-from collections.abc import Callable
-
 import pytest
+from patience import wait_until
 
 from bridge.episode import schema
 from bridge.wire import publisher as publishing
@@ -17,13 +15,6 @@ PRESETS = (Qos.CAMERA, Qos.CONTROL, Qos.RELIABLE, Qos.PREVIEW)
 TYPE_HASH = "RIHS01_" + "a" * 64
 
 
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    end_s = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < end_s, f"{what} did not happen"
-        time.sleep(0.005)
-
-
 @pytest.mark.parametrize("qos", PRESETS, ids=lambda qos: qos.name)
 def test_every_preset_delivers_and_keeps_its_word(
     router: WireSession, client: WireSession, qos: Qos
@@ -33,9 +24,9 @@ def test_every_preset_delivers_and_keeps_its_word(
     got: list[WireSample] = []
     router.subscribe("a/b", got.append)
     made = client.publisher("/a/b", schema.IMAGE, qos=qos)
-    wait_for(made.has_subscribers, "the subscription")
+    wait_until(made.has_subscribers, "the subscription")
     made.put(b"x" * 10_000, source_ns=5)
-    wait_for(lambda: len(got) == 1, "the message")
+    wait_until(lambda: len(got) == 1, "the message")
     assert (got[0].data, got[0].source_ns, got[0].sequence) == (b"x" * 10_000, 5, 0)
     inner = made._inner
     assert str(inner.priority).lower().endswith(qos.priority)
@@ -49,9 +40,9 @@ def test_without_a_subscriber_nothing_need_be_made(
     made = client.publisher("/rec/main/preview/a", schema.COMPRESSED_IMAGE, qos=Qos.PREVIEW)
     assert not made.has_subscribers()
     subscriber = router.subscribe("rec/*/preview/*", lambda sample: None)
-    wait_for(made.has_subscribers, "the subscription")
+    wait_until(made.has_subscribers, "the subscription")
     subscriber.close()
-    wait_for(lambda: not made.has_subscribers(), "its end")
+    wait_until(lambda: not made.has_subscribers(), "its end")
 
 
 def test_images_travel_through_shared_memory_and_arrive_as_plain_bytes(
@@ -66,11 +57,11 @@ def test_images_travel_through_shared_memory_and_arrive_as_plain_bytes(
     with open_session(WireConfig(connect=(endpoint,), shared_memory_mb=4)) as session:
         image = session.publisher("/cell/image", schema.IMAGE, qos=Qos.CAMERA)
         small = session.publisher("/cell/joints", schema.JOINT_STATE, qos=Qos.CAMERA)
-        wait_for(image.has_subscribers, "the subscription")
+        wait_until(image.has_subscribers, "the subscription")
         for number in range(20):
             image.put(bytes([number]) * 300_000, source_ns=number)
             small.put(bytes([number]) * 300, source_ns=number)
-            wait_for(lambda: len(got) == 2 * number + 2, "both messages")  # noqa: B023
+            wait_until(lambda: len(got) == 2 * number + 2, "both messages")  # noqa: B023
     frames = [sample for sample in got if sample.topic == "/cell/image"]
     assert [sample.data for sample in frames] == [bytes([n]) * 300_000 for n in range(20)]
     assert [type(sample.data) for sample in frames] == [bytes] * 20
@@ -88,13 +79,13 @@ def test_a_full_pool_falls_back_to_the_network_and_never_waits(
     router.subscribe("cell/image", got.append)
     with open_session(WireConfig(connect=(endpoint,), shared_memory_mb=1)) as session:
         image = session.publisher("/cell/image", schema.IMAGE, qos=Qos.CAMERA)
-        wait_for(image.has_subscribers, "the subscription")
+        wait_until(image.has_subscribers, "the subscription")
         for number in range(10):
             image.put(bytes([number]) * 300_000, source_ns=number)
-            wait_for(lambda: len(got) == number + 1, "the message")  # noqa: B023
+            wait_until(lambda: len(got) == number + 1, "the message")  # noqa: B023
         assert image.not_shared >= 7  # three of them fill the megabyte
         image.put(b"y" * 2_000_000, source_ns=10)  # larger than the pool
-        wait_for(lambda: len(got) == 11, "the large message")
+        wait_until(lambda: len(got) == 11, "the large message")
     assert [sample.data[0] for sample in got] == [*range(10), ord("y")]
     assert [sample.sequence for sample in got] == list(range(11))
 
@@ -119,15 +110,15 @@ def test_more_shared_memory_than_there_is_is_wrong_use(
 def test_who_comes_and_goes_is_seen(router: WireSession, client: WireSession) -> None:
     early = client.declare_alive("rec/one/alive")
     seen: list[tuple[str, bool]] = []
-    wait_for(lambda: bool(router.query_alive("rec/*/alive")), "the token")
+    wait_until(lambda: bool(router.query_alive("rec/*/alive")), "the token")
     router.watch_alive("rec/*/alive", lambda key, alive: seen.append((key, alive)))
-    wait_for(lambda: seen == [("rec/one/alive", True)], "the history")
+    wait_until(lambda: seen == [("rec/one/alive", True)], "the history")
     client.declare_alive("rec/two/alive")
-    wait_for(lambda: len(seen) == 2, "the second token")
+    wait_until(lambda: len(seen) == 2, "the second token")
     early.close()
-    wait_for(lambda: ("rec/one/alive", False) in seen, "the goodbye")
+    wait_until(lambda: ("rec/one/alive", False) in seen, "the goodbye")
     client.close()
-    wait_for(lambda: ("rec/two/alive", False) in seen, "the end of the session")
+    wait_until(lambda: ("rec/two/alive", False) in seen, "the end of the session")
 
 
 @pytest.mark.parametrize("key", ["", "/a", "a//b"])
@@ -165,7 +156,7 @@ def test_numbers_of_zenoh_itself_are_read(router: WireSession, client: WireSessi
     for number in range(3):
         for each in inner:
             each.put(bytes([number]))
-    wait_for(lambda: len(got) == 6, "all six")
+    wait_until(lambda: len(got) == 6, "all six")
     by_topic = {topic: [s for s in got if s.topic == topic] for topic in ("/a/x", "/a/y")}
     for samples in by_topic.values():
         numbers = [sample.sequence for sample in samples]
@@ -182,7 +173,7 @@ def test_a_plain_publisher_of_others_has_no_number(
     got: list[WireSample] = []
     router.subscribe("**", got.append)
     client._inner.put(f"0/chatter/std_msgs::msg::dds_::String_/{TYPE_HASH}", b"data")
-    wait_for(lambda: len(got) == 1, "the message")
+    wait_until(lambda: len(got) == 1, "the message")
     sample = got[0]
     assert (sample.topic, sample.type_name) == ("/chatter", schema.STRING)
     assert (sample.type_hash, sample.message_encoding) == (TYPE_HASH, "cdr")

@@ -3,9 +3,6 @@
 import contextlib
 import ipaddress
 import json
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -16,6 +13,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
+from own_process import begun
 
 from bridge.episode import schema
 from bridge.record.control import RecorderClient
@@ -210,24 +208,14 @@ def test_a_huge_message_is_stopped_at_the_door(
 
 @pytest.mark.slow
 def test_the_commands_take_the_documented_files(pki: Path, tls: str, tmp_path: Path) -> None:
-    def spawn(*arguments: str) -> "subprocess.Popen[str]":
-        return subprocess.Popen(
-            [sys.executable, "robot_gst.py", *arguments],
-            cwd=ROOT,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
     def status_as(name: str) -> tuple[int, str]:
         asking = ("--connect", tls, "--config", str(pki / f"{name}.json5"), "--json")
-        child = spawn("ctl", "status", *asking)
+        child = begun("robot_gst.py", "ctl", "status", *asking)
         out, err = child.communicate(timeout=60.0)
         return child.returncode, out if child.returncode == 0 else err
 
     listening = ("--listen", tls, "--config", str(pki / "recorder.json5"))
-    recorder = spawn("record", str(tmp_path / "run"), *listening)
+    recorder = begun("robot_gst.py", "record", str(tmp_path / "run"), *listening)
     try:
         end_s = time.monotonic() + 60.0
         while (answer := status_as("operator"))[0] != 0:

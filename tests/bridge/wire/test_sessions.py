@@ -8,15 +8,8 @@ import pytest
 
 from bridge.episode import schema
 from bridge.errors import UsageError
+from bridge.wire import errors
 from bridge.wire.config import WireConfig
-from bridge.wire.errors import (
-    BadTopicError,
-    NoPeerError,
-    NoReplyError,
-    PortTakenError,
-    RemoteError,
-    WireConfigError,
-)
 from bridge.wire.session import WireSample, WireSession, open_session
 
 
@@ -64,7 +57,7 @@ def test_a_refusal_carries_the_message(router: WireSession, client: WireSession)
         raise UsageError(f"cannot do {payload.decode()}")
 
     router.serve("rec/x", refuse)
-    with pytest.raises(RemoteError, match="cannot do that"):
+    with pytest.raises(errors.RemoteError, match="cannot do that"):
         client.query("rec/x", b"that", timeout_s=5.0)
 
 
@@ -85,7 +78,7 @@ def test_more_requests_than_may_wait_are_refused_at_once(
     def ask() -> None:
         try:
             answers.append(client.query("cell/slow", b"plan", timeout_s=20.0))
-        except RemoteError as error:
+        except errors.RemoteError as error:
             refusals.put(str(error))
 
     asking = [threading.Thread(target=ask) for _ in range(4)]
@@ -128,32 +121,34 @@ def test_several_requests_are_answered_side_by_side_where_asked_for(
 
 
 def test_a_request_nobody_answers_is_reported(client: WireSession) -> None:
-    with pytest.raises(NoReplyError, match="nobody answered on rec/other"):
+    with pytest.raises(errors.NoReplyError, match="nobody answered on rec/other"):
         client.query("rec/other", b"", timeout_s=0.5)
 
 
 def test_no_peer_is_one_sentence(endpoint: str) -> None:
     config = WireConfig(connect=(endpoint,), connect_timeout_s=0.2)
-    with pytest.raises(NoPeerError, match=r"no zenoh peer at tcp/127.0.0.1:\d+; start robot-gst"):
+    with pytest.raises(
+        errors.NoPeerError, match=r"no zenoh peer at tcp/127.0.0.1:\d+; start robot-gst"
+    ):
         open_session(config)
 
 
 def test_a_taken_port_is_one_sentence(router: WireSession, endpoint: str) -> None:
-    with pytest.raises(PortTakenError, match="in use by another process"):
+    with pytest.raises(errors.PortTakenError, match="in use by another process"):
         open_session(WireConfig(mode="router", connect=(), listen=(endpoint,)))
 
 
 def test_a_bad_endpoint_is_wrong_use() -> None:
-    with pytest.raises(WireConfigError, match="An endpoint looks like"):
+    with pytest.raises(errors.WireConfigError, match="An endpoint looks like"):
         open_session(WireConfig(connect=("127.0.0.1:7447",)))
 
 
 def test_a_bad_configuration_file_is_wrong_use(tmp_path: Path) -> None:
     path = tmp_path / "zenoh.json5"
-    with pytest.raises(WireConfigError, match="cannot be read"):
+    with pytest.raises(errors.WireConfigError, match="cannot be read"):
         open_session(WireConfig(config=path))
     path.write_text("{mode: 'nonsense'}")
-    with pytest.raises(WireConfigError, match="nonsense") as caught:
+    with pytest.raises(errors.WireConfigError, match="nonsense") as caught:
         open_session(WireConfig(config=path))
     assert ".rs:" not in str(caught.value)  # the library's own source paths help nobody
 
@@ -171,5 +166,5 @@ def test_a_configuration_file_does_not_turn_scouting_on(tmp_path: Path, endpoint
 
 
 def test_a_bad_topic_is_refused_when_announced(client: WireSession) -> None:
-    with pytest.raises(BadTopicError):
+    with pytest.raises(errors.BadTopicError):
         client.publisher("/a//b", schema.STRING)

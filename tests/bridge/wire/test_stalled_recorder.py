@@ -1,17 +1,15 @@
 """A recorder must never hold a controller up: it is stopped under a running publisher."""
 
-import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
+from own_process import begun
 
-ROOT = Path(__file__).resolve().parents[3]
 CHILD = Path(__file__).with_name("stall_child.py")
 PUTS = 3000
 """More than the network's buffers take: those of a reliable publisher are full before."""
@@ -23,15 +21,7 @@ pytestmark = pytest.mark.slow
 
 
 def spawn(*arguments: str) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [sys.executable, *arguments],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
+    return begun(*arguments, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)
 
 
 @pytest.fixture

@@ -10,14 +10,7 @@ from joint_samples import at_positions
 
 import robot_gst
 from bridge.episode import schema
-from bridge.episode.cdr.messages import (
-    CameraInfo,
-    DepthImage,
-    FrameTransform,
-    PoseSample,
-    string_to_cdr,
-    transforms_to_cdr,
-)
+from bridge.episode.cdr import messages
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -55,7 +48,7 @@ class Recording:
         self.path, self.postures = path, postures
         self.writer = EpisodeWriter(path)
         self.writer.describe(EpisodeInfo(id=path.stem, kind="probe", cell="c", stand_in=True))
-        self.put("/robot_description", string_to_cdr(URDF), schema.STRING, 1)
+        self.put("/robot_description", messages.string_to_cdr(URDF), schema.STRING, 1)
         for index, joints in enumerate(postures):
             for part in (-0.45, -0.2, 0.0, 0.2, 0.45):
                 self.joints(joints, self.stamp(index) + round(part * SECOND))
@@ -76,12 +69,14 @@ class Recording:
             self.put(topic, sample.to_cdr(), schema.JOINT_STATE, stamp_ns)
 
     def target(self, camera_id: str, T_camera_target: np.ndarray, stamp_ns: int) -> None:
-        sample = PoseSample(stamp_ns=stamp_ns, frame_id="cam", T_frame_body=T_camera_target)
+        sample = messages.PoseSample(
+            stamp_ns=stamp_ns, frame_id="cam", T_frame_body=T_camera_target
+        )
         topic = f"/c/cam/{camera_id}/target/pose"
         self.put(topic, sample.to_cdr(), schema.POSE_STAMPED, stamp_ns)
 
     def depth(self, camera_id: str, depth_m: np.ndarray, stamp_ns: int) -> None:
-        image = DepthImage(
+        image = messages.DepthImage(
             stamp_ns=stamp_ns,
             frame_id=f"{camera_id}_optical",
             depth_mm=np.rint(depth_m * 1e3).astype(np.uint16),
@@ -89,18 +84,18 @@ class Recording:
         self.put(f"/c/cam/{camera_id}/depth/image", image.to_cdr(), schema.IMAGE, stamp_ns)
 
     def intrinsics(self, camera_id: str) -> None:
-        info = CameraInfo(stamp_ns=1, frame_id=f"{camera_id}_optical", camera=CAMERA)
+        info = messages.CameraInfo(stamp_ns=1, frame_id=f"{camera_id}_optical", camera=CAMERA)
         for stream in ("color", "depth"):
             self.put(f"/c/cam/{camera_id}/{stream}/info", info.to_cdr(), schema.CAMERA_INFO, 1)
 
     def transform(self, camera_id: str, T_base_camera: np.ndarray, stamp_ns: int) -> None:
-        item = FrameTransform(
+        item = messages.FrameTransform(
             stamp_ns=stamp_ns,
             parent="base_link",
             child=f"{camera_id}_optical",
             T_parent_child=T_base_camera,
         )
-        self.put("/tf", transforms_to_cdr([item]), schema.TF_MESSAGE, stamp_ns)
+        self.put("/tf", messages.transforms_to_cdr([item]), schema.TF_MESSAGE, stamp_ns)
 
 
 def some_postures(count: int) -> np.ndarray:
@@ -221,10 +216,10 @@ def test_the_search_begins_where_tf_believes_the_camera_also_below_a_world(
     recording = Recording(run.episodes_dir / "scan.mcap", np.array(cell_views.POSTURES[:1]))
     recording.intrinsics("side")
     recording.depth("side", np.ones((240, 320)), recording.stamp(0))
-    world = FrameTransform(
+    world = messages.FrameTransform(
         stamp_ns=1, parent="world", child="base_link", T_parent_child=T_BASE_TARGET
     )
-    recording.put("/tf_static", transforms_to_cdr([world]), schema.TF_MESSAGE, 1)
+    recording.put("/tf_static", messages.transforms_to_cdr([world]), schema.TF_MESSAGE, 1)
     recording.transform("side", believed, 1)
     recording.writer.close()
     begun: list[np.ndarray | None] = []

@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from twin.calibrate.hand_eye import (
-    UndeterminedCameraError,
-    find_camera,
-    solve,
-    solve_hand_eye,
-)
+from twin.calibrate import hand_eye
 from twin.calibrate.pairs import PosePairs
 
 SHARED = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).parents[4] / "shared" / "data"))
@@ -50,14 +45,14 @@ def angle(T_a: np.ndarray, T_b: np.ndarray) -> float:
 @pytest.mark.parametrize("seed", range(5))
 def test_exact_pairs_give_the_exact_answer_by_the_closed_form(seed: int) -> None:
     Ts_a, Ts_b, X, _ = made_pairs(seed, 6)
-    np.testing.assert_allclose(solve_hand_eye(Ts_a, Ts_b), X, atol=1e-9)
+    np.testing.assert_allclose(hand_eye.solve_hand_eye(Ts_a, Ts_b), X, atol=1e-9)
 
 
 def test_the_error_shrinks_with_the_number_of_pairs() -> None:
     errors = {
         count: np.median(
             [
-                distance(solve(*made[:2]).X, made[2])
+                distance(hand_eye.solve(*made[:2]).X, made[2])
                 for made in (made_pairs(s, count, metres=2e-3, radians=2e-3) for s in range(5))
             ]
         )
@@ -70,7 +65,7 @@ def test_the_error_shrinks_with_the_number_of_pairs() -> None:
 def test_the_choice_of_base_frame_changes_only_what_lies_in_it() -> None:
     Ts_a, Ts_b, _, _ = made_pairs(1, 12, metres=1e-3, radians=1e-3)
     G = transform(np.random.default_rng(9))
-    before, after = solve(Ts_a, Ts_b), solve(G @ Ts_a, Ts_b)
+    before, after = hand_eye.solve(Ts_a, Ts_b), hand_eye.solve(G @ Ts_a, Ts_b)
     np.testing.assert_allclose(after.X, before.X, atol=1e-8)
     np.testing.assert_allclose(after.Z, G @ before.Z, atol=1e-8)
     assert after.residual_m.value == pytest.approx(before.residual_m.value, rel=1e-6)
@@ -78,11 +73,11 @@ def test_the_choice_of_base_frame_changes_only_what_lies_in_it() -> None:
 
 def test_wrong_pairs_are_counted_and_have_no_say() -> None:
     Ts_a, Ts_b, X, _ = made_pairs(5, 30, metres=5e-4, radians=5e-4)
-    clean = solve(Ts_a, Ts_b)
+    clean = hand_eye.solve(Ts_a, Ts_b)
     rng = np.random.default_rng(0)
     for index in range(6):
         Ts_b[index] = Ts_b[index] @ transform(rng, 0.2, 0.5)
-    dirty = solve(Ts_a, Ts_b)
+    dirty = hand_eye.solve(Ts_a, Ts_b)
     assert dirty.num_outliers == 6
     assert clean.num_outliers == 0
     assert distance(dirty.X, X) < 2 * distance(clean.X, X) + 3e-4
@@ -92,7 +87,7 @@ def test_the_bootstrap_knows_how_wrong_the_position_is() -> None:
     found, missed = [], []
     for seed in range(12):
         Ts_a, Ts_b, X, _ = made_pairs(seed + 50, 20, metres=2e-3, radians=2e-3)
-        solution = solve(Ts_a, Ts_b)
+        solution = hand_eye.solve(Ts_a, Ts_b)
         found.append(solution.x_sigma_m)
         missed.append(distance(solution.X, X))
         assert solution.residual_m.low <= solution.residual_m.value <= solution.residual_m.high
@@ -116,22 +111,22 @@ def about_one_axis(count: int, wobble_rad: float) -> tuple[np.ndarray, np.ndarra
 
 
 def test_turning_about_one_axis_is_refused_and_about_two_is_not() -> None:
-    with pytest.raises(UndeterminedCameraError, match=r"one axis only.*Tilt the tool"):
-        solve(*about_one_axis(15, 0.002))
-    assert solve(*about_one_axis(15, 0.2)).residual_m.value < 1e-6
+    with pytest.raises(hand_eye.UndeterminedCameraError, match=r"one axis only.*Tilt the tool"):
+        hand_eye.solve(*about_one_axis(15, 0.002))
+    assert hand_eye.solve(*about_one_axis(15, 0.2)).residual_m.value < 1e-6
 
 
 def test_not_turning_at_all_is_refused() -> None:
     Ts_a, Ts_b, _, _ = made_pairs(0, 8)
     Ts_a[:, :3, :3] = np.eye(3)
-    with pytest.raises(UndeterminedCameraError, match="does not turn at all"):
-        solve(Ts_a, Ts_b)
+    with pytest.raises(hand_eye.UndeterminedCameraError, match="does not turn at all"):
+        hand_eye.solve(Ts_a, Ts_b)
 
 
 def test_too_few_pairs_are_refused() -> None:
     Ts_a, Ts_b, _, _ = made_pairs(0, 3)
-    with pytest.raises(UndeterminedCameraError, match=r"3 pair\(s\)"):
-        solve(Ts_a, Ts_b)
+    with pytest.raises(hand_eye.UndeterminedCameraError, match=r"3 pair\(s\)"):
+        hand_eye.solve(Ts_a, Ts_b)
 
 
 def pairs_of(Ts_a: np.ndarray, Ts_b: np.ndarray) -> PosePairs:
@@ -142,13 +137,13 @@ def pairs_of(Ts_a: np.ndarray, Ts_b: np.ndarray) -> PosePairs:
 def test_the_mounting_is_found_and_the_wrong_one_is_refused(mount: str) -> None:
     Ts_a, Ts_b, X, Z = made_pairs(4, 15, metres=5e-4, radians=5e-4)
     pairs = pairs_of(Ts_a, se3.invert(Ts_b) if mount == "hand" else Ts_b)
-    found = find_camera(pairs, "auto")
+    found = hand_eye.find_camera(pairs, "auto")
     assert found.mount == mount
     assert distance(found.solution.X, X) < 2e-3
     assert distance(found.solution.Z, Z) < 4e-3
     other = "fixed" if mount == "hand" else "hand"
-    with pytest.raises(UndeterminedCameraError, match=f"--mount {mount}, or invert"):
-        find_camera(pairs, other)  # type: ignore[arg-type]
+    with pytest.raises(hand_eye.UndeterminedCameraError, match=f"--mount {mount}, or invert"):
+        hand_eye.find_camera(pairs, other)  # type: ignore[arg-type]
 
 
 def least_squares(Ts_a: np.ndarray, Ts_b: np.ndarray) -> np.ndarray:
@@ -164,7 +159,7 @@ def least_squares(Ts_a: np.ndarray, Ts_b: np.ndarray) -> np.ndarray:
     def residual(values: np.ndarray) -> np.ndarray:
         return (Ts_a @ unpacked(values[:6]) - unpacked(values[6:]) @ Ts_b)[:, :3].ravel()
 
-    X = solve_hand_eye(Ts_a, Ts_b)
+    X = hand_eye.solve_hand_eye(Ts_a, Ts_b)
     Z = Ts_a[0] @ X @ se3.invert(Ts_b[0])
     start = [[Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]] for T in (X, Z)]
     return unpacked(minimise(residual, np.ravel(start)).x[:6])
@@ -174,7 +169,7 @@ def least_squares(Ts_a: np.ndarray, Ts_b: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_scipy_finds_the_same_camera_in_noisy_pairs(seed: int) -> None:
     Ts_a, Ts_b, X, _ = made_pairs(seed, 40, metres=1e-3, radians=1e-3)
-    theirs, ours = least_squares(Ts_a, Ts_b), solve(Ts_a, Ts_b).X
+    theirs, ours = least_squares(Ts_a, Ts_b), hand_eye.solve(Ts_a, Ts_b).X
     assert distance(ours, theirs) < max(distance(theirs, X), 3e-4)
     assert angle(ours, theirs) < 1e-3
 
@@ -186,7 +181,7 @@ def test_opencv_finds_the_same_camera_in_recorded_pairs() -> None:
     if not hasattr(cv2, "calibrateHandEye"):
         pytest.skip("this OpenCV has no calibrateHandEye (the main module of version 5 lacks it)")
     A, B = np.moveaxis(np.array(json.loads(MOVEIT.read_text())), 1, 0)
-    found = find_camera(pairs_of(A, B), "auto")
+    found = hand_eye.find_camera(pairs_of(A, B), "auto")
     Ts_seen = B if found.mount == "hand" else se3.invert(B)
     R, t = cv2.calibrateHandEye(
         A[:, :3, :3], A[:, :3, 3], Ts_seen[:, :3, :3], Ts_seen[:, :3, 3],
@@ -195,7 +190,7 @@ def test_opencv_finds_the_same_camera_in_recorded_pairs() -> None:
     theirs = np.eye(4)
     theirs[:3, :3], theirs[:3, 3] = R, t[:, 0]
     Ts_b = se3.invert(Ts_seen)
-    ours = solve_hand_eye(A, Ts_b)
+    ours = hand_eye.solve_hand_eye(A, Ts_b)
     assert distance(ours, theirs) < 5e-4
     assert angle(ours, theirs) < 1e-3
     assert distance(found.solution.X, theirs) < 5e-3

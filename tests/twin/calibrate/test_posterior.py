@@ -33,23 +33,8 @@ from twin.calibrate.posterior import (
     rigid_movers,
     weighed,
 )
+from twin.replay import monte_carlo, rebuilt_scene
 from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
-from twin.replay.monte_carlo import (
-    draw_variation,
-    halving,
-    replay_samples,
-    sample_rng,
-    with_draw,
-    with_probability,
-)
-from twin.replay.rebuilt_scene import (
-    ALL_TASKS,
-    OTHER_TASKS,
-    UnreadablePosteriorError,
-    calibrated,
-    posterior_of,
-    read_rebuilt_scene,
-)
 from twin.replay.scene import ReplayScene
 from twin.scene.store.calibration import Calibration, read_calibration, write_posterior
 
@@ -176,7 +161,7 @@ def test_an_end_elsewhere_counts_against_a_draw_but_not_without_bound() -> None:
 def test_a_draw_shifts_every_object_and_keeps_the_objects_own_friction() -> None:
     draw = replace(draw_beforehand(2)[1], bias_m=(0.004, -0.002), mass_scale=1.5)
     before, config = scene(), ReplayConfig()
-    after, settings = with_draw(draw, before, config)
+    after, settings = monte_carlo.with_draw(draw, before, config)
     for name, T in before.Ts_base_object.items():
         np.testing.assert_allclose(after.Ts_base_object[name][:2, 3] - T[:2, 3], draw.bias_m)
     own = settings.physics.object_friction
@@ -206,14 +191,16 @@ def test_each_rigid_mover_has_edges_and_weight_of_its_own_within_the_priors() ->
 
 
 def test_samples_take_turns_among_the_draws_as_their_weights_say() -> None:
-    shares = [halving(index) for index in range(16)]
+    shares = [monte_carlo.halving(index) for index in range(16)]
     np.testing.assert_allclose(np.diff(sorted(shares)), 1 / 17, atol=0.04)
     few = [
         replace(draw, weight=w) for draw, w in zip(draw_beforehand(2), (0.75, 0.25), strict=True)
     ]
     config = ReplayConfig(variation=VariationConfig(posterior=tuple(few)))
     frictions = [
-        draw_variation(sample_rng(0, "s", k), scene(), config, index=k).physics.finger_friction
+        monte_carlo.draw_variation(
+            monte_carlo.sample_rng(0, "s", k), scene(), config, index=k
+        ).physics.finger_friction
         for k in range(16)
     ]
     first = few[0].finger_pair_friction / config.physics.object_friction
@@ -228,8 +215,8 @@ def test_the_success_probability_counts_each_answer_as_far_as_it_is_trusted() ->
     def replay(there: ReplayScene, settings: ReplayConfig) -> Verdict:
         return replace(VERDICT, terminal=Factor(value=next(answers)))
 
-    samples = replay_samples(replay, scene(), config, plan_id="p", identity="s")
-    p = with_probability(VERDICT, samples).p_success
+    samples = monte_carlo.replay_samples(replay, scene(), config, plan_id="p", identity="s")
+    p = monte_carlo.with_probability(VERDICT, samples).p_success
     assert p is not None
     assert p["value"] == pytest.approx((0.6 + 0.6 + 0.1 + 0.1) / 4)
     assert (p["k"], p["n"]) == (2, 4)
@@ -258,7 +245,7 @@ def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
     before = write_posterior(run, record)["calibration_id"]
     known = read_calibration(run)
     assert known is not None
-    assert calibrated(ReplayConfig(), known, TASK).variation.posterior == tuple(draws)
+    assert rebuilt_scene.calibrated(ReplayConfig(), known, TASK).variation.posterior == tuple(draws)
     told = describe_posterior(record, str(before))
     assert f"{TASK.name}: 4 draws weighed by 1 trials, 1 of which succeeded" in told
     assert "cube_into_box: no trial of it can be used" in told
@@ -268,8 +255,8 @@ def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
     assert again is not None
     assert again.calibration_id != before
     damaged = {**known.record, "posterior": {"tasks": {TASK.name: {"draws": [{"weight": 1.0}]}}}}
-    with pytest.raises(UnreadablePosteriorError, match="finger_pair_friction"):
-        posterior_of(Calibration(record=damaged, cameras={}), TASK)
+    with pytest.raises(rebuilt_scene.UnreadablePosteriorError, match="finger_pair_friction"):
+        rebuilt_scene.posterior_of(Calibration(record=damaged, cameras={}), TASK)
 
 
 def test_a_task_takes_its_own_draws_and_never_silently_anothers(tmp_path: Path) -> None:
@@ -278,12 +265,12 @@ def test_a_task_takes_its_own_draws_and_never_silently_anothers(tmp_path: Path) 
     write_posterior(run, record_of({TASK.name: draws[:1], other.name: draws[1:]}))
     known = read_calibration(run)
     assert known is not None
-    assert posterior_of(known, TASK) == tuple(draws[:1])
-    assert posterior_of(known, other) == tuple(draws[1:])
-    assert read_rebuilt_scene(run, TASK).notes == ()
+    assert rebuilt_scene.posterior_of(known, TASK) == tuple(draws[:1])
+    assert rebuilt_scene.posterior_of(known, other) == tuple(draws[1:])
+    assert rebuilt_scene.read_rebuilt_scene(run, TASK).notes == ()
     alone = load_task("cube_into_box")
-    assert calibrated(ReplayConfig(), known, alone).variation.posterior == ()
-    assert read_rebuilt_scene(run, alone).notes == (OTHER_TASKS,)
+    assert rebuilt_scene.calibrated(ReplayConfig(), known, alone).variation.posterior == ()
+    assert rebuilt_scene.read_rebuilt_scene(run, alone).notes == (rebuilt_scene.OTHER_TASKS,)
 
 
 def test_a_file_older_than_draws_of_each_task_is_read_and_says_what_it_is(tmp_path: Path) -> None:
@@ -291,8 +278,8 @@ def test_a_file_older_than_draws_of_each_task_is_read_and_says_what_it_is(tmp_pa
     write_posterior(run, {**of_one_task(draws), "skipped": {}})
     known = read_calibration(run)
     assert known is not None
-    assert posterior_of(known, TASK) == tuple(draws)
-    assert read_rebuilt_scene(run, TASK).notes == (ALL_TASKS,)
+    assert rebuilt_scene.posterior_of(known, TASK) == tuple(draws)
+    assert rebuilt_scene.read_rebuilt_scene(run, TASK).notes == (rebuilt_scene.ALL_TASKS,)
 
 
 def test_a_task_is_weighed_by_its_own_trials_alone(
@@ -317,8 +304,10 @@ def test_a_task_is_weighed_by_its_own_trials_alone(
     for task, mine in ((TASK, fell), (other, held)):
         movers = rigid_movers(task)
         alone = weighed(draw_beforehand(16, movers), mine, workers=1, output=QUIET)
-        assert posterior_of(known, task) == tuple(alone), "as from a run of this task alone"
-    assert posterior_of(known, TASK) != posterior_of(known, other)
+        assert rebuilt_scene.posterior_of(known, task) == tuple(alone), (
+            "as from a run of this task alone"
+        )
+    assert rebuilt_scene.posterior_of(known, TASK) != rebuilt_scene.posterior_of(known, other)
 
 
 def test_a_run_without_executed_trials_says_so(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from planned_start import problem_of_test
 from scripted_plans import pick_and_place
+from verdicts import verdict_of
 
 from bridge.geometry import se3
 from bridge.task.plan import Plan
@@ -52,17 +53,8 @@ def listed(problem: Problem) -> Listed:
 
 
 def said(plan: Plan, accepted: bool | None, cause: str = "exploded", **more: object) -> Verdict:
-    return Verdict(
-        plan_id=plan.id,
-        trajectory="planned",
-        mode="dynamic",
-        ik=YES,
-        clearance=YES,
-        terminal=Factor(value=accepted, cause=cause, bodies=("cube",)),
-        engine="test",
-        seed=0,
-        **more,  # type: ignore[arg-type]
-    )
+    terminal = Factor(value=accepted, cause=cause, bodies=("cube",))
+    return verdict_of(plan.id, terminal=terminal, **more)
 
 
 def chosen(

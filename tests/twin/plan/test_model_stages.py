@@ -13,8 +13,9 @@ import pytest
 sys.path += [str(Path(__file__).parent / "ground"), str(Path(__file__).parent / "constrain")]
 
 from hostile_replies import TASK, valid_reply
-from scripted_plans import scene_of_test
+from planned_start import problem_of_test
 from test_model_client import SECRET, Server, says, serving
+from verdicts import verdict_of
 
 import robot_gst
 from bridge.data_files import datasets_folder
@@ -25,30 +26,18 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.plan import Plan
 from bridge.task.task_file import TaskFile
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Verdict
 from twin.gate import twin_process
 from twin.plan import model_stages, once
 from twin.plan.constrain.relations import constraint_of, predicate_of
 from twin.plan.constrain.reply import read_reply
 from twin.plan.constrain.schema import Vocabulary
-from twin.plan.problem import Problem
-from twin.plan.shapes import shapes_of
-from twin.robot.model import load_robot
 
 HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
 TOP = {"obj": "cube", "anchor": "top"}
 LOW = {"kind": "height", "a": TOP, "min": -0.01, "max": 0.5}
 NEVER = {"kind": "height", "a": TOP, "min": 0.9}
 INSIDE = {"kind": "inside", "obj": "cube", "container": "box"}
-
-
-def problem_of_test() -> Problem:
-    scene = scene_of_test()
-    return Problem(
-        scene=replace(scene, start_rad=HOME),
-        robot=load_robot(scene.urdf),
-        shapes=shapes_of(None, scene.task),
-    )
 
 
 def reply(*path: dict[str, Any], task: str = TASK) -> dict[str, Any]:
@@ -78,11 +67,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
         return once.Start(episode=episode, seen_ns=1, localised={}, problem=problem, urdf=urdf)
 
     def judge_of(path: Path, scene: Any) -> Callable[[Plan], Verdict]:
-        yes = Factor(value=True)
-        return lambda plan: Verdict(
-            plan_id=plan.id, trajectory="planned", mode="dynamic", engine="test", seed=0,
-            ik=yes, clearance=yes, terminal=yes,
-        )  # fmt: skip
+        return lambda plan: verdict_of(plan.id)
 
     monkeypatch.setattr(once, "start_of", start_of)
     monkeypatch.setattr(twin_process, "judge_of", judge_of)

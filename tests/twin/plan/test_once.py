@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scripted_plans import scene_of_test
+from verdicts import verdict_of
 
 from bridge.data_files import datasets_folder
 from bridge.episode import streams
@@ -33,13 +34,9 @@ SEEN_NS = 5_000_000_000
 
 
 def verdict(plan: Plan, accepted: bool) -> Verdict:
-    yes = Factor(value=True)
     terminal = Factor(value=accepted, cause=None if accepted else "inside", bodies=("cube", "box"))
     nearest = {"t_ns": 0, "distance_m": 0.1, "bodies": ["gripper", "box"], "p_m": [[0.0] * 3] * 2}
-    return Verdict(
-        plan_id=plan.id, trajectory="planned", mode="dynamic", engine="test", seed=0,
-        ik=yes, clearance=yes, terminal=terminal, nearest=nearest,
-    )  # fmt: skip
+    return verdict_of(plan.id, terminal=terminal, nearest=nearest)
 
 
 def planned(run: RunFolder, answers: list[bool]) -> Planned:

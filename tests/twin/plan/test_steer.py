@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scripted_plans import pick_and_place, scene_of_test
+from verdicts import verdict_of
 
 from bridge.geometry import se3
 from bridge.task.plan_request import Refusal
@@ -22,16 +23,7 @@ def verdict(name: str, cause: str, *bodies: str, grasps: tuple[dict, ...] = ()) 
     three = dict.fromkeys(("ik", "clearance", "terminal"), YES)
     checks = {"start": YES, "task": YES, "limits": YES, "audit": YES}
     (three if name in three else checks)[name] = no
-    return Verdict(
-        plan_id="p",
-        trajectory="planned",
-        mode="dynamic",
-        engine="test",
-        seed=0,
-        checks=checks,
-        grasps=grasps,
-        **three,
-    )
+    return verdict_of(checks=checks, grasps=grasps, **three)
 
 
 def grasp(*, touched: bool, held: bool) -> tuple[dict, ...]:

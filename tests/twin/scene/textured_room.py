@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+from written_messages import depth_image, put
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
-    DepthImage,
     FrameTransform,
     transforms_to_cdr,
 )
@@ -92,42 +92,17 @@ def write_episode(
                 FrameTransform(stamp_ns=stamp, parent="base_link", child=child, T_parent_child=T)
                 for child, T in zip(names, (item.T_base_color, item.T_base_depth), strict=True)
             ]
-            depth_mm = np.rint(item.depth_m * 1e3).astype(np.uint16)
-            messages = [
-                ("/tf", transforms_to_cdr(transforms), schema.TF_MESSAGE),
-                (
-                    "/room/cam/wrist/color/image",
-                    CompressedColor(
-                        stamp_ns=stamp,
-                        frame_id=names[0],
-                        format="png",
-                        data=encode_png(item.image_u8),
-                    ).to_cdr(),
-                    schema.COMPRESSED_IMAGE,
-                ),
-                (
-                    "/room/cam/wrist/depth/image",
-                    DepthImage(stamp_ns=stamp, frame_id=names[1], depth_mm=depth_mm).to_cdr(),
-                    schema.IMAGE,
-                ),
-            ]
+            sent = stamp + sent_late_ns
+            data = transforms_to_cdr(transforms)
+            writer.write("/tf", data, type_name=schema.TF_MESSAGE, log_time_ns=sent)
+            png = encode_png(item.image_u8)
+            color = CompressedColor(stamp_ns=stamp, frame_id=names[0], format="png", data=png)
+            put(writer, "/room/cam/wrist/color/image", color, sent)
+            depth = depth_image(stamp, names[1], item.depth_m)
+            put(writer, "/room/cam/wrist/depth/image", depth, sent)
             if index == 0:
-                messages += [
-                    (
-                        f"/room/cam/wrist/{stream}/info",
-                        CameraInfo(stamp_ns=stamp, frame_id=name, camera=camera).to_cdr(),
-                        schema.CAMERA_INFO,
-                    )
-                    for stream, name, camera in (
-                        ("color", names[0], COLOR),
-                        ("depth", names[1], DEPTH),
-                    )
-                ]
-            for topic, data, type_name in messages:
-                writer.write(
-                    topic,
-                    data,
-                    type_name=type_name,
-                    log_time_ns=stamp + sent_late_ns,
-                    publish_time_ns=stamp + sent_late_ns,
-                )
+                for stream, name, camera in zip(
+                    ("color", "depth"), names, (COLOR, DEPTH), strict=True
+                ):
+                    info = CameraInfo(stamp_ns=stamp, frame_id=name, camera=camera)
+                    put(writer, f"/room/cam/wrist/{stream}/info", info, sent)

@@ -3,18 +3,16 @@
 import base64
 import contextlib
 import json
-import os
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from loopback import free_endpoint
+from own_process import begun
 
-ROOT = Path(__file__).resolve().parents[4]
 CHILD = Path(__file__).with_name("fault_publisher.py")
 WAIT_S = 60.0
 
@@ -37,16 +35,7 @@ class Child:
         """Start it."""
         self.log = log
         with log.open("wb") as stream:
-            self.process = subprocess.Popen(
-                [sys.executable, *arguments],
-                cwd=ROOT,
-                env={**os.environ, "PYTHONPATH": str(ROOT)},
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=stream,
-                text=True,
-                **options,
-            )
+            self.process = begun(*arguments, stdin=subprocess.PIPE, stderr=stream, **options)
 
     def said(self) -> str:
         return self.log.read_text()

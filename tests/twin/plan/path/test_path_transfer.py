@@ -7,18 +7,12 @@ import pytest
 from path_scene import Pairs, at, joints_at, tool_down
 
 from bridge.geometry import se3
-from twin.plan.path.planner import (
-    CONTACT_M_S,
-    NoPathError,
-    PathConfig,
-    plan_straight,
-    reversed_path,
-)
+from twin.plan.path import planner
 from twin.plan.path.transfer import nearest_solutions, plan_transfer
 from twin.plan.problem import Grasp, Problem, Release
 from twin.robot.config import IkConfig
 
-CONFIG = PathConfig()
+CONFIG = planner.PathConfig()
 
 
 def grasp_of(problem: Problem) -> Grasp:
@@ -46,7 +40,7 @@ def test_a_straight_line_is_straight_on_one_branch_and_slow(pairs: Pairs) -> Non
     goal = T.copy()
     goal[2, 3] += 0.1
     allowed = problem.contacts_of("grasp", "cube")
-    path = plan_straight(
+    path = planner.plan_straight(
         problem, grasp.joints_rad, goal, CONFIG, width_m=0.085, allowed=allowed
     ).path
     tips = robot.Ts_base_tcp(path.joints_rad)
@@ -56,8 +50,8 @@ def test_a_straight_line_is_straight_on_one_branch_and_slow(pairs: Pairs) -> Non
     assert (np.diff(tips[:, 2, 3]) > 0).all()
     assert np.abs(np.diff(path.joints_rad, axis=0)).max() < 0.1
     speeds = np.linalg.norm(np.diff(tips[:, :3, 3], axis=0), axis=1) / np.diff(path.times_s)
-    assert speeds.max() <= 1.01 * CONTACT_M_S
-    back = reversed_path(path)
+    assert speeds.max() <= 1.01 * planner.CONTACT_M_S
+    back = planner.reversed_path(path)
     assert np.array_equal(back.joints_rad[0], path.joints_rad[-1])
     assert back.times_s[0] == 0.0
     assert (np.diff(back.times_s) > 0).all()
@@ -67,10 +61,12 @@ def test_a_straight_line_into_something_or_out_of_reach_is_refused(pairs: Pairs)
     problem = pairs.problem
     start = joints_at(problem, tool_down(0.42, -0.1, 0.1, 0.0), None)
     assert start is not None
-    with pytest.raises(NoPathError, match=r"refused: gripper_.* and wall"):
-        plan_straight(problem, start, tool_down(0.42, 0.1, 0.1, 0.0), CONFIG, width_m=0.085)
-    with pytest.raises(NoPathError, match=r"unreachable .* of 1\d{3} mm"):
-        plan_straight(problem, start, tool_down(0.42, -1.5, 0.1, 0.0), CONFIG, width_m=0.085)
+    with pytest.raises(planner.NoPathError, match=r"refused: gripper_.* and wall"):
+        planner.plan_straight(problem, start, tool_down(0.42, 0.1, 0.1, 0.0), CONFIG, width_m=0.085)
+    with pytest.raises(planner.NoPathError, match=r"unreachable .* of 1\d{3} mm"):
+        planner.plan_straight(
+            problem, start, tool_down(0.42, -1.5, 0.1, 0.0), CONFIG, width_m=0.085
+        )
 
 
 def test_a_cube_is_taken_into_the_box_around_what_stands_between(pairs: Pairs) -> None:
@@ -98,10 +94,10 @@ def test_the_movement_that_does_not_exist_is_named(pairs: Pairs) -> None:
     problem = pairs.problem
     grasp = grasp_of(problem)
     beyond = release_of(grasp, at(1.6, 0.2, 0.03))
-    with pytest.raises(NoPathError, match="unreachable"):
+    with pytest.raises(planner.NoPathError, match="unreachable"):
         plan_transfer(problem, grasp, beyond, problem.robot.home_rad, CONFIG)
     in_wall = release_of(grasp, at(0.42, 0.05, 0.03))
-    with pytest.raises(NoPathError, match="for 'lower'") as caught:
+    with pytest.raises(planner.NoPathError, match="for 'lower'") as caught:
         plan_transfer(problem, grasp, in_wall, problem.robot.home_rad, CONFIG)
     assert caught.value.leg == "lower"
 

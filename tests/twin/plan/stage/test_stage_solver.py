@@ -8,16 +8,7 @@ from scipy.optimize import minimize
 
 from bridge.geometry import se3
 from twin.plan.problem import State
-from twin.plan.stage.objective import (
-    ANGLE_RAD,
-    LAMBDA_REG,
-    LENGTH_M,
-    MARGIN,
-    CostTerm,
-    StageProblem,
-    Zeta,
-    moved,
-)
+from twin.plan.stage import objective
 from twin.plan.stage.solver import SolveConfig, distinct, draw_starts, solve
 
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -45,20 +36,20 @@ def wide(state: State) -> object:
 
 
 SUBGOAL = (
-    CostTerm(name="height", violation=height),
-    CostTerm(name="inside", violation=inside),
-    CostTerm(name="leaning", violation=leaning, scale=ANGLE_RAD),
-    CostTerm(name="wide", violation=wide),
+    objective.CostTerm(name="height", violation=height),
+    objective.CostTerm(name="inside", violation=inside),
+    objective.CostTerm(name="leaning", violation=leaning, scale=objective.ANGLE_RAD),
+    objective.CostTerm(name="wide", violation=wide),
 )
-STAGE = StageProblem(nominal_T_base_tcp=DOWN, nominal_width_m=0.05, subgoal=SUBGOAL)
+STAGE = objective.StageProblem(nominal_T_base_tcp=DOWN, nominal_width_m=0.05, subgoal=SUBGOAL)
 
 
 def test_it_finds_what_slsqp_finds() -> None:
     """What is allowed lies beside the nominal pose, so there is one nearest point."""
 
     def cost(x: np.ndarray) -> float:
-        T = moved(DOWN[None], x[None, :6])
-        return float(STAGE.cost(Zeta(T_base_tcp=T, width_m=x[6:7]))[0])
+        T = objective.moved(DOWN[None], x[None, :6])
+        return float(STAGE.cost(objective.Zeta(T_base_tcp=T, width_m=x[6:7]))[0])
 
     start = np.array([0.04, 0.0, -0.02, 0.0, 0.0, 0.0, 0.07])
     reference = minimize(cost, start, method="SLSQP", options={"ftol": 1e-14, "maxiter": 500})
@@ -76,13 +67,13 @@ def test_answers_are_feasible_distinct_and_ordered() -> None:
     assert costs == sorted(costs)
     for index, one in enumerate(solution.candidates):
         assert max(one.violations.values()) <= 0
-        zeta = Zeta(T_base_tcp=one.T_base_tcp[None], width_m=np.array([one.width_m]))
+        zeta = objective.Zeta(T_base_tcp=one.T_base_tcp[None], width_m=np.array([one.width_m]))
         assert all((parts <= 0).all() for parts in STAGE.violations(zeta))
         assert STAGE.cost(zeta)[0] == pytest.approx(one.cost)
         for other in solution.candidates[:index]:
             away = np.linalg.norm(one.T_base_tcp[:3, 3] - other.T_base_tcp[:3, 3])
             R = one.T_base_tcp[:3, :3].T @ other.T_base_tcp[:3, :3]
-            assert away > LENGTH_M or se3.rotation_angle_rad(R) > ANGLE_RAD
+            assert away > objective.LENGTH_M or se3.rotation_angle_rad(R) > objective.ANGLE_RAD
 
 
 def test_the_same_seed_gives_the_same_bytes() -> None:
@@ -97,16 +88,16 @@ def test_j_is_the_sum_of_the_paper() -> None:
     T = DOWN.copy()
     T[:3, 3] += (0.1, 0.0, 0.03)
     T[:3, :3] = T[:3, :3] @ se3.rotation_from_vector(np.array([0.0, 0.3, 0.0]))
-    zeta = Zeta(T_base_tcp=T[None], width_m=np.array([0.04]))
+    zeta = objective.Zeta(T_base_tcp=T[None], width_m=np.array([0.04]))
     f = [0.15 - 0.1 - 0.005, 0.6 - 0.56 - 0.03, 0.3 - np.radians(5.0), 0.07 - 0.04]
-    x = np.array(f) / (0.01, 0.01, ANGLE_RAD, 0.01) + MARGIN
-    omega = (0.1**2 + 0.03**2 + 0.01**2) / 0.01**2 + (0.3 / ANGLE_RAD) ** 2
-    wanted = (np.clip(x, 0.0, None) ** 2).sum() + LAMBDA_REG * omega
+    x = np.array(f) / (0.01, 0.01, objective.ANGLE_RAD, 0.01) + objective.MARGIN
+    omega = (0.1**2 + 0.03**2 + 0.01**2) / 0.01**2 + (0.3 / objective.ANGLE_RAD) ** 2
+    wanted = (np.clip(x, 0.0, None) ** 2).sum() + objective.LAMBDA_REG * omega
     assert STAGE.cost(zeta)[0] == pytest.approx(wanted, rel=1e-5)
 
 
 def test_what_contradicts_itself_has_no_answer_and_says_what_is_wrong() -> None:
-    high = CostTerm(name="high", violation=lambda state: 0.2 - state.T_base_tcp[:, 2, 3])
+    high = objective.CostTerm(name="high", violation=lambda state: 0.2 - state.T_base_tcp[:, 2, 3])
     solution = solve(replace(STAGE, subgoal=(*SUBGOAL, high)))
     assert solution.candidates == ()
     assert not solution.feasible.any()
@@ -115,17 +106,17 @@ def test_what_contradicts_itself_has_no_answer_and_says_what_is_wrong() -> None:
 
 
 def test_what_is_carried_moves_with_the_tool() -> None:
-    T_tcp_object = moved(np.eye(4)[None], np.array([[0.01, 0.0, 0.03, 0.2, 0.0, 0.5]]))[0]
+    T_tcp_object = objective.moved(np.eye(4)[None], np.array([[0.01, 0.0, 0.03, 0.2, 0.0, 0.5]]))[0]
     seen = {}
 
     def look(state: State) -> object:
         seen.update(state.Ts_base_object)
         return state.T_base_tcp[:, 0, 3] - 1.0
 
-    problem = StageProblem(
+    problem = objective.StageProblem(
         nominal_T_base_tcp=DOWN,
         nominal_width_m=0.05,
-        subgoal=(CostTerm(name="look", violation=look),),
+        subgoal=(objective.CostTerm(name="look", violation=look),),
         Ts_base_object={"box": np.eye(4)},
         Ts_tcp_object={"cube": T_tcp_object},
     )

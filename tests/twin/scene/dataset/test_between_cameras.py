@@ -9,14 +9,7 @@ import textured_room
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
-from twin.scene.dataset.scan_check import (
-    BODY_AXES,
-    FLIP_YZ,
-    CameraCheck,
-    PoseConventionError,
-    check_between,
-    check_scan,
-)
+from twin.scene.dataset import scan_check
 from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
 from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.settings import FrameConfig
@@ -46,7 +39,7 @@ def reordered(T: np.ndarray) -> np.ndarray:
 
 
 def test_a_camera_where_it_is_said_to_be_agrees() -> None:
-    report = check_between(side(), thumbs())
+    report = scan_check.check_between(side(), thumbs())
     assert report.agreement is not None
     assert report.agreement > 0.9
     assert report.better is None
@@ -56,15 +49,15 @@ def test_a_camera_where_it_is_said_to_be_agrees() -> None:
     ("change", "found"),
     [
         (se3.invert, "world-to-camera"),
-        (lambda T: T @ FLIP_YZ, "OpenGL"),
-        (lambda T: T @ se3.invert(BODY_AXES), "body frame"),
+        (lambda T: T @ scan_check.FLIP_YZ, "OpenGL"),
+        (lambda T: T @ se3.invert(scan_check.BODY_AXES), "body frame"),
         (reordered, "w x y z were read as x y z w"),
     ],
 )
 def test_a_pose_in_another_convention_is_named(
     change: Callable[[np.ndarray], np.ndarray], found: str
 ) -> None:
-    report = check_between(side(change), thumbs())
+    report = scan_check.check_between(side(change), thumbs())
     assert report.better is not None
     assert found in report.better.describe()
 
@@ -75,16 +68,16 @@ def test_a_fixed_camera_elsewhere_is_said_and_one_read_wrongly_is_refused(
     run = RunFolder.create(tmp_path_factory.mktemp("run"))
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=8)
     choice = choose_frames(find_sources(run), CONFIG).choices[0]
-    wrist = CameraCheck(choice=choice, images=thumbs(), trusted=[1.0] * NUM)
+    wrist = scan_check.CameraCheck(choice=choice, images=thumbs(), trusted=[1.0] * NUM)
     still = replace(choice, camera_id="side", stationary=True)
 
     def judged(change: Callable[[np.ndarray], np.ndarray]) -> list[str]:
-        fixed = CameraCheck(choice=still, images=side(change), trusted=[1.0] * 3)
-        return check_scan([wrist, fixed], CONFIG).remarks()
+        fixed = scan_check.CameraCheck(choice=still, images=side(change), trusted=[1.0] * 3)
+        return scan_check.check_scan([wrist, fixed], CONFIG).remarks()
 
     assert judged(lambda T: T) == []
     about, advice = judged(shifted)
     assert about.startswith("camera side of episode scan: only")
     assert "robot-gst calibrate RUN --cameras" in advice
-    with pytest.raises(PoseConventionError, match=r"camera side .*OpenGL axes"):
-        judged(lambda T: T @ FLIP_YZ)
+    with pytest.raises(scan_check.PoseConventionError, match=r"camera side .*OpenGL axes"):
+        judged(lambda T: T @ scan_check.FLIP_YZ)

@@ -5,31 +5,22 @@ import pytest
 import textured_room
 from seen_colors import view_directions
 
-from twin.scene.fit.appearance import (
-    RIDGE_COLOR,
-    RIDGE_HARMONICS,
-    ImageObservation,
-    conjugate_gradients,
-    solve_appearance,
-)
+from twin.scene import gaussians
+from twin.scene.fit import appearance
 from twin.scene.fit.exposure import gain_between, gain_exposure, solve_exposures
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
-from twin.scene.gaussians import (
-    GaussianCloud,
-    as_float32,
-    with_harmonics,
-)
 from twin.scene.harmonics import harmonic_terms
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 
+Room = tuple[gaussians.GaussianCloud, list[appearance.ImageObservation]]
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 GAINS = np.array([[1.1, 0.9, 1.0], [0.8, 1.2, 1.05], [1.1, 0.9, 0.95]])
 
 
 @pytest.fixture(scope="module")
-def room() -> tuple[GaussianCloud, list[ImageObservation]]:
+def room() -> Room:
     """Sixty Gaussians and three half-size images, each with a hole and a brightness of its own."""
     surfaces = [FrameSurface(textured_room.frame(i, 3), LIMITS) for i in range(3)]
     cloud = fuse(
@@ -41,7 +32,7 @@ def room() -> tuple[GaussianCloud, list[ImageObservation]]:
         mask = view.half.static_mask.copy()
         mask[5:12, 6 + 4 * index : 14 + 4 * index] = False
         observations.append(
-            ImageObservation(
+            appearance.ImageObservation(
                 target=replace(view.half, static_mask=mask),
                 T_base_camera=view.T_base_color,
                 exposure=gain_exposure(GAINS[index]),
@@ -54,7 +45,7 @@ def rasteriser() -> Rasteriser:
     return Rasteriser(RasterConfig(threads=1))
 
 
-def weights(cloud: GaussianCloud, item: ImageObservation) -> np.ndarray:
+def weights(cloud: gaussians.GaussianCloud, item: appearance.ImageObservation) -> np.ndarray:
     """The matrix A of one view, (pixels, Gaussians): each column drawn by itself in white."""
     draw = rasteriser()
     columns = []
@@ -62,15 +53,17 @@ def weights(cloud: GaussianCloud, item: ImageObservation) -> np.ndarray:
         colors = np.zeros((len(cloud), 3), dtype=np.float32)
         for channel, index in enumerate(range(first, min(first + 3, len(cloud)))):
             colors[index, channel] = 1.0
-        plain = replace(with_harmonics(cloud, 0), colors=colors)
+        plain = replace(gaussians.with_harmonics(cloud, 0), colors=colors)
         columns += list(draw.draw_planes(plain, item.target.camera, item.T_base_camera)[:3])
     return np.stack([column.ravel() for column in columns[: len(cloud)]], axis=1)
 
 
-def dense_solution(start: GaussianCloud, observations: list[ImageObservation]) -> np.ndarray:
+def dense_solution(
+    start: gaussians.GaussianCloud, observations: list[appearance.ImageObservation]
+) -> np.ndarray:
     """Colour and harmonics (terms, Gaussians, channels) by one least squares of all channels."""
     count, terms = len(start), 1 + start.num_harmonics
-    ridge = np.array([RIDGE_COLOR] + [RIDGE_HARMONICS] * start.num_harmonics)
+    ridge = np.array([appearance.RIDGE_COLOR] + [appearance.RIDGE_HARMONICS] * start.num_harmonics)
     normal = np.diag(np.repeat(ridge, 3 * count))
     right = np.zeros((terms * count, 3))
     origin = np.concatenate([start.colors[:, None], start.harmonics], axis=1).transpose(1, 0, 2)
@@ -92,21 +85,16 @@ def dense_solution(start: GaussianCloud, observations: list[ImageObservation]) -
 
 
 @pytest.mark.parametrize("num_harmonics", [0, 3])
-def test_the_solution_is_that_of_a_dense_least_squares(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-    num_harmonics: int,
-) -> None:
+def test_the_solution_is_that_of_a_dense_least_squares(room: Room, num_harmonics: int) -> None:
     cloud, observations = room
-    start = with_harmonics(cloud, num_harmonics)
-    solved = solve_appearance(start, observations, rasteriser(), steps=250).cloud
+    start = gaussians.with_harmonics(cloud, num_harmonics)
+    solved = appearance.solve_appearance(start, observations, rasteriser(), steps=250).cloud
     found = np.concatenate([solved.colors[:, None], solved.harmonics], axis=1)
     expected = dense_solution(start, observations)
     np.testing.assert_allclose(found.transpose(1, 0, 2), expected, atol=3e-3)
 
 
-def test_what_a_mask_hides_does_not_matter(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_what_a_mask_hides_does_not_matter(room: Room) -> None:
     cloud, observations = room
     spoilt = []
     for item in observations:
@@ -114,7 +102,7 @@ def test_what_a_mask_hides_does_not_matter(
         planes[:, ~item.target.static_mask] = 255
         spoilt.append(replace(item, target=replace(item.target, planes_u8=planes)))
     clean, other = (
-        solve_appearance(cloud, items, rasteriser(), steps=3).cloud
+        appearance.solve_appearance(cloud, items, rasteriser(), steps=3).cloud
         for items in (observations, spoilt)
     )
     np.testing.assert_array_equal(clean.colors, other.colors)
@@ -124,21 +112,17 @@ def test_what_a_mask_hides_does_not_matter(
     )
 
 
-def test_a_gaussian_that_no_pixel_shows_keeps_its_colour(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_a_gaussian_that_no_pixel_shows_keeps_its_colour(room: Room) -> None:
     cloud, observations = room
     means = cloud.means_m.copy()
     means[7] = (0.0, -30.0, 0.0)
     moved = replace(cloud, means_m=means)
-    solved = solve_appearance(moved, observations, rasteriser(), steps=3).cloud
+    solved = appearance.solve_appearance(moved, observations, rasteriser(), steps=3).cloud
     np.testing.assert_array_equal(solved.colors[7], cloud.colors[7])
     assert not np.array_equal(solved.colors[8], cloud.colors[8])
 
 
-def test_gains_are_found_up_to_their_mean(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_gains_are_found_up_to_their_mean(room: Room) -> None:
     cloud, observations = room
     true = np.array([[0.8, 1.0, 0.9], [0.9, 0.7, 0.6], [0.7, 0.8, 0.9]])
     draw = rasteriser()
@@ -153,16 +137,14 @@ def test_gains_are_found_up_to_their_mean(
     np.testing.assert_allclose(found.mean(axis=0), np.eye(3, 4), rtol=1e-12)
 
 
-def test_a_saturated_pixel_says_nothing_about_the_gain(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_a_saturated_pixel_says_nothing_about_the_gain(room: Room) -> None:
     cloud, observations = room
     item = observations[0]
     drawn = rasteriser().draw_planes(cloud, item.target.camera, item.T_base_camera)[:3]
     recorded = np.rint(np.clip(drawn, 0, 0.9) * 255).astype(np.uint8)
     recorded[:, :4] = 255
     target = replace(item.target, planes_u8=recorded)
-    np.testing.assert_allclose(gain_between(as_float32(drawn), target), 1.0, atol=0.03)
+    np.testing.assert_allclose(gain_between(gaussians.as_float32(drawn), target), 1.0, atol=0.03)
 
 
 def test_conjugate_gradients_end_after_as_many_steps_as_unknowns() -> None:
@@ -171,7 +153,7 @@ def test_conjugate_gradients_end_after_as_many_steps_as_unknowns() -> None:
     A = (A @ A.T + np.eye(5)).astype(np.float32)
     right = rng.normal(size=(5, 1, 2)).astype(np.float32)
     diagonal = np.ones_like(right) * np.diag(A)[:, None, None]
-    x, steps = conjugate_gradients(
+    x, steps = appearance.conjugate_gradients(
         lambda v: np.einsum("ij,jkc->ikc", A, v), right, diagonal, steps=50
     )
     assert steps < 20

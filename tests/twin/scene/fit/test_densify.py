@@ -13,11 +13,12 @@ from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import SAME_EXPOSURE, RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 
+Room = tuple[GaussianCloud, list[ImageObservation]]
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 
 
 @pytest.fixture(scope="module")
-def room() -> tuple[GaussianCloud, list[ImageObservation]]:
+def room() -> Room:
     surfaces = [FrameSurface(textured_room.frame(i, 3), LIMITS) for i in range(3)]
     cloud = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=400))
     views = [training_view(surface) for surface in surfaces]
@@ -33,9 +34,7 @@ def even_scores(cloud: GaussianCloud) -> Scores:
     return Scores(error=ones, pixels=10 * ones, size_px=3 * ones, size_fraction=0.01 * ones)
 
 
-def test_the_error_of_a_pixel_goes_to_the_gaussians_that_made_it(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_the_error_of_a_pixel_goes_to_the_gaussians_that_made_it(room: Room) -> None:
     cloud, observations = room
     rasteriser = Rasteriser(RasterConfig(threads=1))
     before = score(cloud, observations, rasteriser)
@@ -49,9 +48,7 @@ def test_the_error_of_a_pixel_goes_to_the_gaussians_that_made_it(
     assert 0.5 * total < before.pixels.sum() <= total * 1.001
 
 
-def test_the_worst_are_split_and_the_budget_holds(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_the_worst_are_split_and_the_budget_holds(room: Room) -> None:
     cloud = room[0]
     scores = even_scores(cloud)
     scores.error[[3, 50, 91]] = 5.0
@@ -65,9 +62,7 @@ def test_the_worst_are_split_and_the_budget_holds(
     assert densify(cloud, scores, max_splats=10, most=100).num_split == 0
 
 
-def test_two_halves_have_the_mean_and_the_covariance_of_the_whole(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_two_halves_have_the_mean_and_the_covariance_of_the_whole(room: Room) -> None:
     cloud = room[0].take(np.array([11]))
     cloud = replace(cloud, scales_log=as_float32(np.log([[0.02, 0.05, 0.004]])))
     halves = densify(cloud, even_scores(cloud), max_splats=2, most=1).cloud
@@ -85,9 +80,7 @@ def test_two_halves_have_the_mean_and_the_covariance_of_the_whole(
     np.testing.assert_array_equal(halves.colors, cloud.colors[[0, 0]])
 
 
-def test_what_is_transparent_unseen_or_huge_goes(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_what_is_transparent_unseen_or_huge_goes(room: Room) -> None:
     cloud = room[0]
     opacities = cloud.opacities_logit.copy()
     opacities[5] = -6.0
@@ -101,17 +94,13 @@ def test_what_is_transparent_unseen_or_huge_goes(
     assert len(done.cloud) == len(cloud) - 3
 
 
-def test_nothing_is_lost_when_nothing_is_seen(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_nothing_is_lost_when_nothing_is_seen(room: Room) -> None:
     cloud = room[0]
     scores = replace(even_scores(cloud), pixels=np.zeros(len(cloud), dtype=np.float32))
     assert len(densify(cloud, scores, max_splats=len(cloud), most=0).cloud) == len(cloud)
 
 
-def test_what_no_image_can_resolve_is_not_split(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
+def test_what_no_image_can_resolve_is_not_split(room: Room) -> None:
     cloud = room[0]
     scores = replace(even_scores(cloud), size_px=np.full(len(cloud), 0.2, dtype=np.float32))
     assert densify(cloud, scores, max_splats=10_000, most=100).num_split == 0

@@ -7,26 +7,21 @@ import textured_room
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from twin.scene.fit.initialise import NoSurfaceError, fuse
-from twin.scene.frames.rgbd import (
-    DepthLimits,
-    FrameSurface,
-    training_view,
-    trusted_depth_mask,
-)
+from twin.scene.frames import rgbd
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 
-LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
+LIMITS = rgbd.DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 
 
 def room_cloud(config: InitialiseConfig) -> GaussianCloud:
-    surfaces = [FrameSurface(textured_room.frame(i, 6), LIMITS) for i in range(6)]
+    surfaces = [rgbd.FrameSurface(textured_room.frame(i, 6), LIMITS) for i in range(6)]
     return fuse([surface.points() for surface in surfaces], config)
 
 
 def test_points_lie_on_the_surfaces_and_carry_their_colour() -> None:
-    points = FrameSurface(textured_room.frame(2, 6), LIMITS).points()
+    points = rgbd.FrameSurface(textured_room.frame(2, 6), LIMITS).points()
     assert len(points.p_m) > 1000
     on_table = np.abs(points.p_m[:, 2]) < 0.003
     on_wall = np.abs(points.p_m[:, 1] - 0.6) < 0.003
@@ -42,7 +37,7 @@ def test_pixels_without_a_measurement_never_enter() -> None:
     depth = item.depth_m.copy()
     depth[:, ::2] = 0.0
     depth[::5] = np.float32(65.535)
-    surface = FrameSurface(replace(item, depth_m=depth), LIMITS)
+    surface = rgbd.FrameSurface(replace(item, depth_m=depth), LIMITS)
     assert not surface.trusted[:, ::2].any()
     assert not surface.trusted[::5].any()
     assert surface.depth_in_color_camera().max() < 5.0
@@ -52,7 +47,7 @@ def test_a_flying_pixel_is_not_trusted() -> None:
     depth = np.full((9, 9), 1.0, dtype=np.float32)
     depth[:, 5:] = 2.0
     depth[4, 4] = 1.5
-    trusted = trusted_depth_mask(depth, LIMITS)
+    trusted = rgbd.trusted_depth_mask(depth, LIMITS)
     assert not trusted[4, 4]
     assert trusted[1, 1]
     assert trusted[1, 8]
@@ -61,7 +56,7 @@ def test_a_flying_pixel_is_not_trusted() -> None:
 def test_depth_moves_to_the_colour_camera() -> None:
     item = textured_room.frame(3, 6)
     expected, _ = textured_room.depth_and_points(textured_room.COLOR, item.T_base_color)
-    found = FrameSurface(item, LIMITS).depth_in_color_camera()
+    found = rgbd.FrameSurface(item, LIMITS).depth_in_color_camera()
     known = found > 0
     assert known.mean() > 0.6
     assert np.median(np.abs(found - expected)[known]) < 0.01
@@ -97,9 +92,9 @@ def registered_frame(index: int, depth_factor: float) -> RgbdFrame:
 def test_views_that_disagree_make_one_surface_and_not_layers() -> None:
     """The nearest of several layers would hide the others, and depth come out too near."""
     factors = 1.0 + np.array([-0.012, 0.008, -0.004, 0.004, -0.008, 0.012])
-    surfaces = [FrameSurface(registered_frame(i, f), LIMITS) for i, f in enumerate(factors)]
+    surfaces = [rgbd.FrameSurface(registered_frame(i, f), LIMITS) for i, f in enumerate(factors)]
     points = [surface.points() for surface in surfaces]
-    views = [training_view(surface) for surface in surfaces]
+    views = [rgbd.training_view(surface) for surface in surfaces]
     layers, surface = fuse(points, InitialiseConfig()), fuse(points, InitialiseConfig(), views)
     assert len(surface) < 0.9 * len(layers)
     height_m = {}
@@ -122,7 +117,7 @@ def test_frames_without_depth_are_refused() -> None:
     item = textured_room.frame(0, 1)
     empty = replace(item, depth_m=np.zeros_like(item.depth_m))
     with pytest.raises(NoSurfaceError, match="0 usable points"):
-        fuse([FrameSurface(empty, LIMITS).points()], InitialiseConfig())
+        fuse([rgbd.FrameSurface(empty, LIMITS).points()], InitialiseConfig())
 
 
 @pytest.mark.parametrize("nothing", [np.nan, np.inf])
@@ -131,16 +126,16 @@ def test_depth_that_is_no_number_is_no_measurement(nothing: float) -> None:
     item = textured_room.frame(2, 6)
     depth = item.depth_m.copy()
     depth[10, 10] = nothing
-    surface = FrameSurface(replace(item, depth_m=depth), LIMITS)
+    surface = rgbd.FrameSurface(replace(item, depth_m=depth), LIMITS)
     zero = depth.copy()
     zero[10, 10] = 0.0
     np.testing.assert_array_equal(
-        surface.trusted, FrameSurface(replace(item, depth_m=zero), LIMITS).trusted
+        surface.trusted, rgbd.FrameSurface(replace(item, depth_m=zero), LIMITS).trusted
     )
     assert np.isfinite(surface.depth_in_color_camera()).all()
 
 
 def test_normals_face_the_camera() -> None:
-    points = FrameSurface(textured_room.frame(2, 6), LIMITS).points()
+    points = rgbd.FrameSurface(textured_room.frame(2, 6), LIMITS).points()
     table = (np.abs(points.p_m[:, 2]) < 0.003) & (points.p_m[:, 1] < 0.5)
     np.testing.assert_allclose(np.median(points.normals[table], axis=0), [0, 0, 1], atol=0.05)

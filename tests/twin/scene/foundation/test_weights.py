@@ -8,15 +8,9 @@ import numpy as np
 import pytest
 from small_files import write_safetensors
 
-from twin.scene.foundation.loading import (
-    WeightsError,
-    WeightsKind,
-    check_folder,
-    read_normalisation,
-    weight_files,
-)
+from twin.scene.foundation import loading
 
-KIND = WeightsKind(
+KIND = loading.WeightsKind(
     name="Owl",
     model_types=("owl",),
     origin="makers/owl",
@@ -45,18 +39,18 @@ def split_in_two(folder: Path) -> None:
 
 
 def test_a_whole_folder_is_accepted_in_one_file_or_in_parts(folder: Path) -> None:
-    check_folder(folder, KIND)
+    loading.check_folder(folder, KIND)
     split_in_two(folder)
-    check_folder(folder, KIND)
-    assert [path.name for path in weight_files(folder, KIND)] == [
+    loading.check_folder(folder, KIND)
+    assert [path.name for path in loading.weight_files(folder, KIND)] == [
         "model-1.safetensors",
         "model-2.safetensors",
     ]
 
 
 def test_the_refusal_names_the_files_that_are_needed_and_the_licence(tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match="no such folder") as caught:
-        check_folder(tmp_path / "nothing", KIND)
+    with pytest.raises(loading.WeightsError, match="no such folder") as caught:
+        loading.check_folder(tmp_path / "nothing", KIND)
     for word in ("config.json", "model.safetensors", "tokenizer.json", "makers/owl", "on request"):
         assert word in str(caught.value)
     assert caught.value.exit_code == 2
@@ -113,27 +107,27 @@ def test_a_damaged_folder_is_refused_with_one_sentence_that_says_how(
     folder: Path, damage: Callable[[Path], None], said: str
 ) -> None:
     damage(folder)
-    with pytest.raises(WeightsError) as caught:
-        check_folder(folder, KIND)
+    with pytest.raises(loading.WeightsError) as caught:
+        loading.check_folder(folder, KIND)
     assert said in str(caught.value)
     assert "docs/foundation_models.md" in str(caught.value)
 
 
 def test_the_hash_changes_with_the_numbers_alone(folder: Path) -> None:
-    before = check_folder(folder, KIND)
+    before = loading.check_folder(folder, KIND)
     write_safetensors(folder / "model.safetensors", {"a": np.full((2, 3), 2.0), "b": np.zeros(4)})
-    assert check_folder(folder, KIND) != before
+    assert loading.check_folder(folder, KIND) != before
 
 
 def test_colours_are_normalised_as_the_folder_says(folder: Path) -> None:
-    assert read_normalisation(folder, KIND) == KIND.colours
+    assert loading.read_normalisation(folder, KIND) == KIND.colours
     about = folder / "preprocessor_config.json"
     about.write_text(json.dumps({"image_mean": [0.1, 0.2, 0.3], "size": 4}))
-    assert read_normalisation(folder, KIND) == ((0.1, 0.2, 0.3), KIND.colours[1])
+    assert loading.read_normalisation(folder, KIND) == ((0.1, 0.2, 0.3), KIND.colours[1])
     for broken in ([0.1], "x", [0.1, None, 0.2], [1, 2, 300]):
         about.write_text(json.dumps({"image_std": broken}))
-        with pytest.raises(WeightsError, match="image_std is"):
-            read_normalisation(folder, KIND)
+        with pytest.raises(loading.WeightsError, match="image_std is"):
+            loading.read_normalisation(folder, KIND)
     about.write_text(json.dumps({"image_std": [0.5, 0.0, 0.5]}))
-    with pytest.raises(WeightsError, match="holds a 0"):
-        read_normalisation(folder, KIND)
+    with pytest.raises(loading.WeightsError, match="holds a 0"):
+        loading.read_normalisation(folder, KIND)

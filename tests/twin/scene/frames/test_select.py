@@ -11,13 +11,7 @@ from hypothesis import strategies as st
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from twin.scene.frames.selection import (
-    choose_frames,
-    find_sources,
-    path_length_m,
-    pick,
-    smear_px,
-)
+from twin.scene.frames import selection
 from twin.scene.settings import FrameConfig
 
 
@@ -31,7 +25,7 @@ def test_a_camera_that_pauses_gives_no_more_frames_there() -> None:
     path = np.concatenate(
         [np.linspace(0, 1, 10), 1 + 1e-6 * np.arange(80), np.linspace(1.1, 2, 10)]
     )
-    picked = pick(stamps, path, np.zeros(100), 10, rated(dict.fromkeys(range(100), 1.0)))
+    picked = selection.pick(stamps, path, np.zeros(100), 10, rated(dict.fromkeys(range(100), 1.0)))
     assert len(picked) <= 10
     assert ((picked >= 10) & (picked < 90)).sum() <= 2
 
@@ -40,14 +34,14 @@ def test_the_sharpest_of_the_still_frames_of_a_stretch_is_taken() -> None:
     stamps = np.arange(30)
     smear = np.where(stamps % 10 < 5, 10.0, 0.1)
     sharp = {int(s): 100.0 if s % 10 < 5 else float(s % 10) for s in stamps}
-    picked = pick(stamps, np.linspace(0, 1, 30), smear, 3, rated(sharp))
+    picked = selection.pick(stamps, np.linspace(0, 1, 30), smear, 3, rated(sharp))
     assert (picked % 10).tolist() == [9, 9, 9]
 
 
 def test_a_frame_much_blurrier_than_its_neighbours_is_left_out() -> None:
     stamps = np.arange(12)
     values = {int(s): 1.0 if s == 5 else 10.0 for s in stamps}
-    picked = pick(
+    picked = selection.pick(
         stamps,
         np.linspace(0, 1, 12),
         np.zeros(12),
@@ -69,8 +63,8 @@ def test_never_more_frames_than_wanted_always_in_order_always_the_same(
     path -= path[0]
     smear = rng.uniform(0, 2, num_frames)
     values = {int(s): float(v) for s, v in zip(stamps, rng.uniform(1, 2, num_frames), strict=True)}
-    picked = pick(stamps, path, smear, count, rated(values))
-    again = pick(stamps, path, smear, count, rated(values))
+    picked = selection.pick(stamps, path, smear, count, rated(values))
+    again = selection.pick(stamps, path, smear, count, rated(values))
     assert 1 <= len(picked) <= count
     assert picked.tolist() == sorted(set(picked.tolist())) == again.tolist()
     assert set(picked.tolist()) <= set(stamps.tolist())
@@ -79,9 +73,9 @@ def test_never_more_frames_than_wanted_always_in_order_always_the_same(
 def test_smear_is_focal_length_times_angular_speed_times_exposure(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path)
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
-    (choice,) = choose_frames(find_sources(run), FrameConfig()).choices
+    (choice,) = selection.choose_frames(selection.find_sources(run), FrameConfig()).choices
     stamps = np.array([1_400_000_000])
-    (found,) = smear_px(choice.poses.tree, "wrist_color_optical", stamps, 60.0)
+    (found,) = selection.smear_px(choice.poses.tree, "wrist_color_optical", stamps, 60.0)
     a, b = textured_room.camera_pose(3, 9), textured_room.camera_pose(5, 9)
     speed = np.linalg.norm(a[:3, 3] - b[:3, 3]) / 0.2 / 0.7
     turn = np.arccos((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2) / 0.2
@@ -93,8 +87,8 @@ def test_a_fixed_protocol_learns_from_every_fifth_and_holds_out_the_one_two_afte
 ) -> None:
     run = RunFolder.create(tmp_path)
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=20)
-    (choice,) = choose_frames(
-        find_sources(run), FrameConfig(train_every=5, holdout_every=5, holdout_offset=2)
+    (choice,) = selection.choose_frames(
+        selection.find_sources(run), FrameConfig(train_every=5, holdout_every=5, holdout_offset=2)
     ).choices
     index = {1_000_000_000 + 100_000_000 * k: k for k in range(20)}
     assert sorted(index[s] for s in choice.train_ns) == [0, 5, 10, 15]
@@ -117,8 +111,8 @@ def test_protocols_that_make_no_sense_are_refused(settings: dict[str, int], foun
 def test_turning_counts_as_path_and_standing_still_hardly_does() -> None:
     turned = np.stack([textured_room.camera_pose(k, 5) for k in range(5)])
     turned[:, :3, 3] = 0.0
-    path = path_length_m(turned)
+    path = selection.path_length_m(turned)
     assert path[-1] > 0.3
     assert (np.diff(path) > 0).all()
-    still = path_length_m(np.stack([np.eye(4)] * 3))
+    still = selection.path_length_m(np.stack([np.eye(4)] * 3))
     assert 0 < still[-1] < 1e-4

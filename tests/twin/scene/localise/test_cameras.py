@@ -6,22 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from written_messages import put_calibration, put_frame
 
-from bridge.episode import schema
-from bridge.episode.cdr.messages import (
-    CameraInfo,
-    CompressedColor,
-    DepthImage,
-    FrameTransform,
-    transforms_to_cdr,
-)
+from bridge.episode.cdr import messages
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame, localisations
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
-from bridge.media.color import encode_jpeg
 from bridge.task.task_file import Task
 from twin.scene.localise.episode import localise_episode, write_localised
 from twin.scene.localise.stationary_frames import stationary_frames
@@ -48,45 +41,12 @@ def frame(stage: Callable[..., Any], kept: list[RgbdFrame]) -> RgbdFrame:
     return kept[0]
 
 
-def put(writer: EpisodeWriter, topic: str, record: Any, type_name: str, stamp_ns: int) -> None:
-    writer.write(
-        topic,
-        record if isinstance(record, bytes) else record.to_cdr(),
-        type_name=type_name,
-        log_time_ns=stamp_ns,
-        publish_time_ns=stamp_ns,
-    )
-
-
 def put_camera(writer: EpisodeWriter, frame: RgbdFrame, root: str | None, num: int = 4) -> None:
     """A camera that stands still and sends the same image every second."""
-    topic, names = f"/c/cam/{frame.camera_id}", {}
-    for stream, camera in (("color", frame.color_camera), ("depth", frame.depth_camera)):
-        names[stream] = f"{frame.camera_id}_{stream}_optical"
-        info = CameraInfo(stamp_ns=0, frame_id=names[stream], camera=camera)
-        put(writer, f"{topic}/{stream}/info", info, schema.CAMERA_INFO, 0)
-    if root is not None:
-        poses = {"color": frame.T_base_color, "depth": frame.T_base_depth}
-        tf = [
-            FrameTransform(stamp_ns=0, parent=root, child=names[stream], T_parent_child=T)
-            for stream, T in poses.items()
-        ]
-        put(writer, "/tf_static", transforms_to_cdr(tf), schema.TF_MESSAGE, 0)
+    topic = f"/c/cam/{frame.camera_id}"
+    put_calibration(writer, frame, topic, root)
     for index in range(1, num + 1):
-        stamp = index * S
-        color = CompressedColor(
-            stamp_ns=stamp,
-            frame_id=names["color"],
-            format="jpeg",
-            data=encode_jpeg(frame.image_u8),
-        )
-        depth = DepthImage(
-            stamp_ns=stamp,
-            frame_id=names["depth"],
-            depth_mm=np.rint(frame.depth_m * 1e3).astype(np.uint16),
-        )
-        put(writer, f"{topic}/color/image", color, schema.COMPRESSED_IMAGE, stamp)
-        put(writer, f"{topic}/depth/image", depth, schema.IMAGE, stamp)
+        put_frame(writer, frame, topic, index * S)
 
 
 def write(run: RunFolder, *cameras: tuple[RgbdFrame, str | None], num: int = 4) -> Episode:
@@ -112,8 +72,10 @@ def test_a_long_scan_is_not_decoded_for_a_few_of_its_frames(
 ) -> None:
     """A minute of two cameras at 30 Hz would not fit into the memory of a laptop."""
     episode = write(run, (frame, "base_link"), num=20)
-    decode, count = CompressedColor.image_u8, []
-    monkeypatch.setattr(CompressedColor, "image_u8", lambda self: count.append(1) or decode(self))
+    decode, count = messages.CompressedColor.image_u8, []
+    monkeypatch.setattr(
+        messages.CompressedColor, "image_u8", lambda self: count.append(1) or decode(self)
+    )
     found = stationary_frames(episode, 3, evenly=True)
     assert [item.stamp_ns for item in found] == [1 * S, 11 * S, 20 * S]
     assert len(count) == 4  # these, and one to see how large images are

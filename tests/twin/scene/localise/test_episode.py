@@ -6,29 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from written_messages import put, put_calibration, put_frame
 
 from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import (
-    CameraInfo,
-    CompressedColor,
-    DepthImage,
-    FrameTransform,
-    PoseSample,
-    transforms_to_cdr,
-)
+from bridge.episode.cdr import messages
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
-from bridge.media.color import encode_jpeg
 from bridge.task.task_file import Task
 from twin.scene.frames.selection import rgbd_camera_ids
-from twin.scene.localise.episode import (
-    localise_episode,
-    quiet_phases,
-    write_localised,
-)
+from twin.scene.localise.episode import localise_episode, quiet_phases, write_localised
 from twin.scene.localise.stationary_frames import stationary_frames
 from twin.scene.shape.known import pose_of
 
@@ -41,61 +30,9 @@ START = {
 END = {**START, "cube": START["box"] @ pose_of(np.array([0.0, 0.01, 0.026, 0.2]))}
 
 
-def put_frame(writer: EpisodeWriter, frame: RgbdFrame, stamp_ns: int, prefix: str) -> None:
-    color = CompressedColor(
-        stamp_ns=stamp_ns,
-        frame_id="side_color_optical",
-        format="jpeg",
-        data=encode_jpeg(frame.image_u8),
-    )
-    depth = DepthImage(
-        stamp_ns=stamp_ns,
-        frame_id="side_depth_optical",
-        depth_mm=np.rint(frame.depth_m * 1e3).astype(np.uint16),
-    )
-    for topic, record, type_name in (
-        ("color/image", color, schema.COMPRESSED_IMAGE),
-        ("depth/image", depth, schema.IMAGE),
-    ):
-        writer.write(
-            f"{prefix}/{topic}",
-            record.to_cdr(),
-            type_name=type_name,
-            log_time_ns=stamp_ns,
-            publish_time_ns=stamp_ns,
-        )
-
-
-def put_calibration(writer: EpisodeWriter, frame: RgbdFrame, prefix: str) -> None:
-    for stream, camera in (("color", frame.color_camera), ("depth", frame.depth_camera)):
-        info = CameraInfo(stamp_ns=0, frame_id=f"side_{stream}_optical", camera=camera)
-        writer.write(
-            f"{prefix}/{stream}/info",
-            info.to_cdr(),
-            type_name=schema.CAMERA_INFO,
-            log_time_ns=0,
-        )
-    poses = {"color": frame.T_base_color, "depth": frame.T_base_depth}
-    transforms = [
-        FrameTransform(
-            stamp_ns=0, parent="base_link", child=f"side_{stream}_optical", T_parent_child=T
-        )
-        for stream, T in poses.items()
-    ]
-    writer.write(
-        "/tf_static", transforms_to_cdr(transforms), type_name=schema.TF_MESSAGE, log_time_ns=0
-    )
-
-
 def put_event(writer: EpisodeWriter, kind: str, stamp_ns: int) -> None:
     record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": "plan_1"}
-    writer.write_json(
-        "/standin/event",
-        record,
-        type_name=schema.EVENT,
-        log_time_ns=stamp_ns,
-        publish_time_ns=stamp_ns,
-    )
+    writer.write_json("/standin/event", record, type_name=schema.EVENT, log_time_ns=stamp_ns)
 
 
 @pytest.fixture(scope="module")
@@ -117,21 +54,16 @@ def episode(
         prefix, truth = "/standin/cam/side", "/standin/truth/cam/spy"
         put_calibration(writer, frames["start"], prefix)
         put_calibration(writer, frames["start"], truth)
-        put_frame(writer, frames["end"], 1, truth)
-        lie = PoseSample(stamp_ns=1, frame_id="base_link", T_frame_body=np.eye(4))
-        writer.write(
-            "/standin/truth/object/cube/pose",
-            lie.to_cdr(),
-            type_name=schema.POSE_STAMPED,
-            log_time_ns=1,
-        )
+        put_frame(writer, frames["end"], truth, 1)
+        lie = messages.PoseSample(stamp_ns=1, frame_id="base_link", T_frame_body=np.eye(4))
+        put(writer, "/standin/truth/object/cube/pose", lie, 1)
         for second in (1, 2, 3):
-            put_frame(writer, frames["start"], second * S, prefix)
+            put_frame(writer, frames["start"], prefix, second * S)
         put_event(writer, "execution_started", 4 * S)
-        put_frame(writer, frames["end"], 5 * S, prefix)
+        put_frame(writer, frames["end"], prefix, 5 * S)
         put_event(writer, "execution_ended", 6 * S)
         for second in (7, 8):
-            put_frame(writer, frames["end"], second * S, prefix)
+            put_frame(writer, frames["end"], prefix, second * S)
         writer.describe(EpisodeInfo(id="trial_1", kind="trial", cell="standin", stand_in=True))
     return Episode.open(run.episodes_dir / "trial_1.mcap")
 

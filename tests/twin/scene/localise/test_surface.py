@@ -8,18 +8,13 @@ import open3d as o3d
 from toy_frames import AT, DUCK, DUCKS, only, shoot, table_with
 
 from bridge.task.meshes.catalogue import object_mesh
-from twin.scene.localise.mesh_fit import (
-    agreeing,
-    known_surface,
-    mesh_surface,
-    seen_through,
-)
+from twin.scene.localise import mesh_fit
 from twin.scene.localise.points import fuse_stationary
 
 
 def test_samples_lie_on_the_mesh_evenly_and_face_outwards() -> None:
     mesh = object_mesh(DUCK)
-    surface = mesh_surface(mesh.vertices_m, mesh.triangles, 2000)
+    surface = mesh_fit.mesh_surface(mesh.vertices_m, mesh.triangles, 2000)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
         o3d.core.Tensor(mesh.vertices_m.astype(np.float32)),
@@ -45,8 +40,8 @@ def test_a_mesh_of_which_no_camera_measures_anything_is_not_believed(
     task = only(DUCKS, "duck_1")
     frames = shoot(table_with(stage, (DUCK, AT)))
     views = fuse_stationary(frames, 3, 8, task)
-    surface, below = known_surface(DUCK, 1000), AT.copy()
+    surface, below = mesh_fit.known_surface(DUCK, 1000), AT.copy()
     below[2, 3] -= 0.2  # hidden by the table, so nothing sees through it either
-    assert agreeing(AT, surface, views, 0.012) > 0.8
-    assert seen_through(below, surface, views, 0.012) < 0.05
-    assert agreeing(below, surface, views, 0.012) < 0.05
+    assert mesh_fit.agreeing(AT, surface, views, 0.012) > 0.8
+    assert mesh_fit.seen_through(below, surface, views, 0.012) < 0.05
+    assert mesh_fit.agreeing(below, surface, views, 0.012) < 0.05

@@ -18,6 +18,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from twin.replay.config import ReplayRunConfig
 from twin.replay.runner import replay_run
+from twin.scene import settings
 from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects import placement as parts_module
@@ -25,12 +26,6 @@ from twin.scene.objects.decompose import read_objects
 from twin.scene.objects.placement import find_placements
 from twin.scene.rebuild.record import describe_scene
 from twin.scene.rebuild.run import rebuild
-from twin.scene.settings import (
-    FitConfig,
-    FrameConfig,
-    InitialiseConfig,
-    RenderConfig,
-)
 from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene, scene_hash_of
 
 pytestmark = pytest.mark.usefixtures("few_voxels")
@@ -131,7 +126,7 @@ def test_objects_are_not_looked_for_in_held_out_frames(
     monkeypatch.setattr(parts_module, "localise_episode", localise)
     monkeypatch.setattr(Episode, "info", EpisodeInfo(id="s", kind="scan", task="cube_into_box"))
     sources = find_sources(room)
-    choices = choose_frames(sources, FrameConfig(holdout_every=3)).choices
+    choices = choose_frames(sources, settings.FrameConfig(holdout_every=3)).choices
     find_placements(sources, choices, QUIET)
     assert len(choices[0].holdout_ns) == 3
     assert asked["held_out_ns"] == {"wrist": choices[0].holdout_ns}
@@ -144,7 +139,7 @@ def test_objects_are_not_cut_out_of_a_scene_in_a_frame_of_its_own(
     monkeypatch.setattr(parts_module, "localise_episode", lambda *a, **k: pytest.fail("localised"))
     monkeypatch.setattr(Episode, "info", EpisodeInfo(id="s", kind="scan", task="cube_into_box"))
     sources = find_sources(room)
-    (choice,) = choose_frames(sources, FrameConfig()).choices
+    (choice,) = choose_frames(sources, settings.FrameConfig()).choices
     followed = replace(choice, poses=replace(choice.poses, source="odometry"))
     apart = find_placements(sources, [followed], QUIET)
     assert "followed by its images" in apart.remark
@@ -165,22 +160,22 @@ def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(
 @pytest.mark.parametrize(
     ("make", "found"),
     [
-        (lambda: FrameConfig(holdout_every=1), "--holdout-every 1 is too small"),
-        (lambda: FrameConfig(holdout_every=0), "at least 2"),
-        (lambda: FrameConfig(max_train_frames=0), "--max-train-frames"),
-        (lambda: InitialiseConfig(max_splats=0), "--max-splats"),
-        (lambda: FitConfig(budget_s=0.0), "--budget"),
-        (lambda: FitConfig(iterations=-1), "--iterations"),
-        (lambda: FitConfig(budget_s=float("inf")), "--budget"),
-        (lambda: FitConfig(seed=-1), "--seed"),
-        (lambda: FitConfig(threads=-2), "--threads"),
-        (lambda: FrameConfig(max_depth_m=float("nan")), "--max-depth-m"),
-        (lambda: FrameConfig(max_depth_m=-1.0), "--max-depth-m"),
-        (lambda: InitialiseConfig(flying_fraction=float("nan")), "--flying-fraction"),
-        (lambda: RenderConfig(at_s=float("nan")), "--at-s"),
-        (lambda: RenderConfig(out=Path("a.ply")), "background.ply"),
-        (lambda: RenderConfig(width_m=-0.1), "--width-m"),
-        (lambda: RenderConfig(eye=(0.0, 0.0, float("nan"))), "--eye"),
+        (lambda: settings.FrameConfig(holdout_every=1), "--holdout-every 1 is too small"),
+        (lambda: settings.FrameConfig(holdout_every=0), "at least 2"),
+        (lambda: settings.FrameConfig(max_train_frames=0), "--max-train-frames"),
+        (lambda: settings.InitialiseConfig(max_splats=0), "--max-splats"),
+        (lambda: settings.FitConfig(budget_s=0.0), "--budget"),
+        (lambda: settings.FitConfig(iterations=-1), "--iterations"),
+        (lambda: settings.FitConfig(budget_s=float("inf")), "--budget"),
+        (lambda: settings.FitConfig(seed=-1), "--seed"),
+        (lambda: settings.FitConfig(threads=-2), "--threads"),
+        (lambda: settings.FrameConfig(max_depth_m=float("nan")), "--max-depth-m"),
+        (lambda: settings.FrameConfig(max_depth_m=-1.0), "--max-depth-m"),
+        (lambda: settings.InitialiseConfig(flying_fraction=float("nan")), "--flying-fraction"),
+        (lambda: settings.RenderConfig(at_s=float("nan")), "--at-s"),
+        (lambda: settings.RenderConfig(out=Path("a.ply")), "background.ply"),
+        (lambda: settings.RenderConfig(width_m=-0.1), "--width-m"),
+        (lambda: settings.RenderConfig(eye=(0.0, 0.0, float("nan"))), "--eye"),
     ],
 )
 def test_settings_that_nothing_can_be_made_with_are_refused(

@@ -13,26 +13,20 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.media.color import decode_color
 from bridge.terminal import Output
+from twin.scene import settings
 from twin.scene.frames.selection import find_sources
 from twin.scene.rebuild.record import describe_scene
 from twin.scene.rebuild.run import rebuild
 from twin.scene.render import render
-from twin.scene.settings import (
-    FitConfig,
-    InitialiseConfig,
-    RebuildConfig,
-    RenderConfig,
-    parse_duration_s,
-)
 from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene
 
 pytestmark = pytest.mark.usefixtures("few_voxels")
 
 
 QUIET = Output(quiet=True)
-CONFIG = RebuildConfig(
-    fit=FitConfig(iterations=120, threads=1),
-    initialise=InitialiseConfig(max_splats=2000, flying_fraction=0.1),
+CONFIG = settings.RebuildConfig(
+    fit=settings.FitConfig(iterations=120, threads=1),
+    initialise=settings.InitialiseConfig(max_splats=2000, flying_fraction=0.1),
 )
 
 
@@ -110,14 +104,14 @@ def test_done_work_is_skipped_and_other_settings_redo_it(
 @pytest.mark.parametrize(
     ("config", "found"),
     [
-        (RenderConfig(episode="nope"), "There are: scan"),
-        (RenderConfig(camera="nope"), "There are: wrist"),
-        (RenderConfig(eye=(0.0, 0.0, 1.0)), "belong together"),
-        (RenderConfig(eye=(0.0, 0.0, 1.0), target=(0.0, 0.0, 0.0)), "straight above"),
+        (settings.RenderConfig(episode="nope"), "There are: scan"),
+        (settings.RenderConfig(camera="nope"), "There are: wrist"),
+        (settings.RenderConfig(eye=(0.0, 0.0, 1.0)), "belong together"),
+        (settings.RenderConfig(eye=(0.0, 0.0, 1.0), target=(0.0, 0.0, 0.0)), "straight above"),
     ],
 )
 def test_a_view_that_cannot_be_drawn_is_refused(
-    room: RunFolder, config: RenderConfig, found: str
+    room: RunFolder, config: settings.RenderConfig, found: str
 ) -> None:
     with pytest.raises(UsageError, match=found):
         render(room, config)
@@ -153,4 +147,4 @@ def test_scans_are_preferred_and_their_absence_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "soon", "-3s", "3 days", "1e3"])
 def test_other_durations_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="60s, 2min"):
-        parse_duration_s(text)
+        settings.parse_duration_s(text)

@@ -10,13 +10,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import decode_color
-from twin.scene.backdrop import (
-    BACKDROP,
-    OPAQUE,
-    Backdrop,
-    backdrop_of,
-    read_backdrop,
-)
+from twin.scene import backdrop
 from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
@@ -44,7 +38,7 @@ def painted(directions: np.ndarray) -> np.ndarray:
     return (directions + 1) / 2
 
 
-def shell() -> Backdrop:
+def shell() -> backdrop.Backdrop:
     rows, columns = 90, 180
     down = (np.arange(rows)[:, None] + 0.5) / rows * np.pi
     heading = ((np.arange(columns) + 0.5) / columns - 0.5) * 2 * np.pi
@@ -55,7 +49,7 @@ def shell() -> Backdrop:
         axis=-1,
     )
     colors = painted(directions).astype(np.float32)
-    return Backdrop(colors=colors, centre_m=np.zeros(3), radius_m=2.0)
+    return backdrop.Backdrop(colors=colors, centre_m=np.zeros(3), radius_m=2.0)
 
 
 def nothing(alpha: float = 0.0) -> View:
@@ -71,7 +65,7 @@ HEADINGS = (-3.1, -1.5, 0.0, 1.0, 3.1)
 
 
 def test_what_is_drawn_keeps_its_bits_and_less_of_it_shows_more_of_the_shell() -> None:
-    for alpha in (OPAQUE, 0.99, 1.0):
+    for alpha in (backdrop.OPAQUE, 0.99, 1.0):
         view = nothing(alpha)
         assert shell().behind(view, CAMERA, looking(0.0)).image is view.image
     added = [
@@ -118,7 +112,7 @@ def empty_cloud() -> GaussianCloud:
 
 def test_the_shell_shows_what_views_saw_and_goes_on_smoothly_where_none_looked() -> None:
     views = seen_views((-3.0, -2.2, -1.4))
-    made = backdrop_of(empty_cloud(), views, Rasteriser(RasterConfig(threads=1)))
+    made = backdrop.backdrop_of(empty_cloud(), views, Rasteriser(RasterConfig(threads=1)))
     black = replace(nothing(), image=np.zeros((48, 64, 3), np.float32))
     for view in views:
         drawn = made.behind(black, CAMERA, view.T_base_color).image
@@ -140,15 +134,15 @@ def test_it_comes_back_as_it_was_written_and_is_missing_without_harm(tmp_path: P
     run = RunFolder.create(tmp_path / "run")
     run.scene_dir.mkdir(parents=True)
     about = shell().write(run.scene_dir)
-    back = read_backdrop(run, {"backdrop": about})
+    back = backdrop.read_backdrop(run, {"backdrop": about})
     assert back is not None
     np.testing.assert_allclose(back.colors, shell().colors, atol=0.5 / 255 + 1e-6)
     assert back.radius_m == 2.0
-    assert read_backdrop(run, {}) is None
+    assert backdrop.read_backdrop(run, {}) is None
     with pytest.raises(UnreadableSceneError, match="centre"):
-        read_backdrop(run, {"backdrop": {"radius_m": 1.0}})
-    (run.scene_dir / BACKDROP).unlink()
-    assert read_backdrop(run, {"backdrop": about}) is None
+        backdrop.read_backdrop(run, {"backdrop": {"radius_m": 1.0}})
+    (run.scene_dir / backdrop.BACKDROP).unlink()
+    assert backdrop.read_backdrop(run, {"backdrop": about}) is None
 
 
 def test_a_corner_that_nobody_saw_is_drawn_and_counts_as_unseen(room: RunFolder) -> None:
@@ -188,7 +182,7 @@ def test_pixels_that_moved_say_nothing() -> None:
     static = np.ones(masked.shape[1:], dtype=bool)
     static[:, :32] = False
     target = replace(view.half, planes_u8=masked, static_mask=static)
-    made = backdrop_of(
+    made = backdrop.backdrop_of(
         empty_cloud(),
         [replace(view, half=target, full=target)],
         Rasteriser(RasterConfig(threads=1)),

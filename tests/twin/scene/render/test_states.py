@@ -13,20 +13,12 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
+from twin.scene import gaussians
 from twin.scene import render as render_module
-from twin.scene.gaussians import (
-    GaussianCloud,
-    as_float32,
-    write_ply,
-)
 from twin.scene.render import object_places, posture_of, render
 from twin.scene.robot.splats import write_links
 from twin.scene.settings import RenderConfig
-from twin.scene.store.folder import (
-    read_record,
-    read_scene,
-    write_record,
-)
+from twin.scene.store import folder
 from twin.scene.trial import open_trial
 
 pytestmark = pytest.mark.usefixtures("few_voxels")
@@ -36,15 +28,15 @@ T_BLOB = se3.transform_from(np.array([0.9, 0.1, 0.2, 0.3]), np.array([0.05, 0.1,
 HOME = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
 
 
-def blob(seed: int = 0, count: int = 60) -> GaussianCloud:
+def blob(seed: int = 0, count: int = 60) -> gaussians.GaussianCloud:
     rng = np.random.default_rng(seed)
-    return GaussianCloud(
-        means_m=as_float32(rng.uniform(-0.05, 0.05, (count, 3))),
-        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
-        scales_log=as_float32(np.full((count, 3), np.log(0.01))),
-        opacities_logit=as_float32(np.full(count, 3.0)),
-        colors=as_float32(np.tile([0.9, 0.1, 0.1], (count, 1))),
-        harmonics=as_float32(rng.normal(0, 0.1, (count, 3, 3))),
+    return gaussians.GaussianCloud(
+        means_m=gaussians.as_float32(rng.uniform(-0.05, 0.05, (count, 3))),
+        quats_wxyz=gaussians.as_float32(rng.normal(size=(count, 4))),
+        scales_log=gaussians.as_float32(np.full((count, 3), np.log(0.01))),
+        opacities_logit=gaussians.as_float32(np.full(count, 3.0)),
+        colors=gaussians.as_float32(np.tile([0.9, 0.1, 0.1], (count, 1))),
+        harmonics=gaussians.as_float32(rng.normal(0, 0.1, (count, 3, 3))),
     )
 
 
@@ -52,16 +44,16 @@ def blob(seed: int = 0, count: int = 60) -> GaussianCloud:
 def rebuilt_once(rebuilt_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small scene with one object, which stands at T_BLOB."""
     run = RunFolder(shutil.copytree(rebuilt_once, tmp_path_factory.mktemp("blob") / "monday"))
-    record = read_record(run)
+    record = folder.read_record(run)
     assert record is not None
     place = run.scene_dir / "objects" / "blob"
     place.mkdir(parents=True)
-    write_ply(place / "gaussians.ply", blob())
+    gaussians.write_ply(place / "gaussians.ply", blob())
     q, p = se3.split(T_BLOB)
     pose = {"p_m": p.tolist(), "q_wxyz": q.tolist()}
     (place / "object.json").write_text(json.dumps({"T_base_object": pose}))
     record["objects"] = {"blob": {"folder": "objects/blob", "files": {"gaussians.ply": ""}}}
-    write_record(run, record)
+    folder.write_record(run, record)
     return run.path
 
 
@@ -105,9 +97,9 @@ def test_seconds_count_from_the_first_stamp_whenever_messages_arrived(
 
 @pytest.fixture
 def with_robot(room: RunFolder, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
-    scene = read_scene(room)
+    scene = folder.read_scene(room)
     links = {"base_link": blob(1), "tool0": blob(2)}
-    write_record(room, {**scene.record, "robot": {"links": write_links(room, links)}})
+    folder.write_record(room, {**scene.record, "robot": {"links": write_links(room, links)}})
     urdf = ROBOT.urdf_text()
     monkeypatch.setattr(render_module.streams, "robot_description", lambda _episode: urdf)
     return room
@@ -115,7 +107,7 @@ def with_robot(room: RunFolder, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
 
 def test_given_joints_move_the_hand_and_not_the_base(with_robot: RunFolder) -> None:
     episode = Episode.open(with_robot.episodes_dir / "scan.mcap")
-    trial = open_trial(with_robot, read_scene(with_robot), episode)
+    trial = open_trial(with_robot, folder.read_scene(with_robot), episode)
 
     def robot(*joints: float) -> np.ndarray:
         config = RenderConfig(joints=joints)

@@ -6,16 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from joint_samples import at_positions
+from written_messages import depth_image, put
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import (
-    CameraInfo,
-    CompressedColor,
-    DepthImage,
-    FrameTransform,
-    string_to_cdr,
-    transforms_to_cdr,
-)
+from bridge.episode.cdr import messages
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
@@ -38,42 +32,35 @@ SECOND = 1_000_000_000
 def write_scan(path: Path, root: str, T_root_base: np.ndarray, *, with_joints: bool = True) -> None:
     """A side camera with exact depth sees the robot stop at four postures."""
     camera = cell_views.load_cell("standin").cameras["side"].camera
-    pose = FrameTransform(
+    pose = messages.FrameTransform(
         stamp_ns=1,
         parent=root,
         child="side_optical",
         T_parent_child=T_root_base @ cell_views.side_camera_pose(),
     )
-    info = CameraInfo(stamp_ns=1, frame_id="side_optical", camera=camera).to_cdr()
+    info = messages.CameraInfo(stamp_ns=1, frame_id="side_optical", camera=camera)
     grey = encode_png(np.full((camera.height, camera.width, 3), 128, dtype=np.uint8))
     with EpisodeWriter(path) as writer:
-
-        def put(topic: str, data: bytes, type_name: str, stamp_ns: int) -> None:
-            writer.write(topic, data, type_name=type_name, log_time_ns=stamp_ns)
-
         writer.describe(EpisodeInfo(id=path.stem, kind="scan", cell="c", stand_in=True))
-        put("/tf_static", transforms_to_cdr([pose]), schema.TF_MESSAGE, 1)
-        put("/robot_description", string_to_cdr(ROBOT.urdf_text()), schema.STRING, 1)
+        tf, text = messages.transforms_to_cdr([pose]), messages.string_to_cdr(ROBOT.urdf_text())
+        writer.write("/tf_static", tf, type_name=schema.TF_MESSAGE, log_time_ns=1)
+        writer.write("/robot_description", text, type_name=schema.STRING, log_time_ns=1)
         for stream in ("color", "depth"):
-            put(f"/c/cam/side/{stream}/info", info, schema.CAMERA_INFO, 1)
+            put(writer, f"/c/cam/side/{stream}/info", info, 1)
         for index, joints in enumerate(cell_views.POSTURES):
             stamp = 2 * (index + 1) * SECOND
             for part in (-0.4, 0.0, 0.4) if with_joints else ():
                 sample = at_positions(
                     stamp + round(part * SECOND), tuple(ARM_JOINTS), np.array(joints)
                 )
-                put("/c/joint_states", sample.to_cdr(), schema.JOINT_STATE, sample.stamp_ns)
+                put(writer, "/c/joint_states", sample, sample.stamp_ns)
             depth_m = cell_views.take(joints, cell_views.CellErrors(), seed=index, width_m=0.0)
-            color = CompressedColor(
+            color = messages.CompressedColor(
                 stamp_ns=stamp, frame_id="side_optical", format="png", data=grey
             )
-            depth = DepthImage(
-                stamp_ns=stamp,
-                frame_id="side_optical",
-                depth_mm=np.rint(depth_m * 1e3).astype(np.uint16),
-            )
-            put("/c/cam/side/color/image", color.to_cdr(), schema.COMPRESSED_IMAGE, stamp)
-            put("/c/cam/side/depth/image", depth.to_cdr(), schema.IMAGE, stamp)
+            put(writer, "/c/cam/side/color/image", color, stamp)
+            depth = depth_image(stamp, "side_optical", depth_m)
+            put(writer, "/c/cam/side/depth/image", depth, stamp)
 
 
 def test_in_the_robots_own_frame_its_links_are_collected(run: RunFolder) -> None:

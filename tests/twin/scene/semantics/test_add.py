@@ -8,14 +8,8 @@ import pytest
 from table_scene import World, make_world, table
 
 from bridge.geometry import se3
+from twin.naming import scene_file
 from twin.naming.phrases import Asker
-from twin.naming.scene_file import (
-    UnreadableSemanticsError,
-    read_semantics,
-    read_vectors,
-    write_semantics,
-    write_vectors,
-)
 from twin.naming.things import Mask, MaskSet
 from twin.scene.foundation.stage import find_things
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
@@ -41,7 +35,7 @@ def written(
         **options,  # type: ignore[arg-type]
     )
     rows = {"background": len(background)} | ({"red_cube": len(cube)} if len(cube) else {})
-    return write_semantics(folder, scene, rows)
+    return scene_file.write_semantics(folder, scene, rows)
 
 
 def rows_of(world: World) -> dict[str, int]:
@@ -55,7 +49,7 @@ def test_what_is_written_comes_back(tabletop: World, tmp_path: Path) -> None:
     assert [done for done, _ in told] == sorted(done for done, _ in told)
     assert told[0] == (30, "4 things found")
     assert told[-1][0] == 100
-    scene = read_semantics(tmp_path, rows_of(tabletop))
+    scene = scene_file.read_semantics(tmp_path, rows_of(tabletop))
     assert {item.label for item in scene.instances} == set(tabletop.names.values())
     assert record["source"] == scene.source == "default segmenter"
     about = {item["label"]: item for item in record["instances"]}  # type: ignore[attr-defined]
@@ -74,12 +68,12 @@ def test_what_is_written_comes_back(tabletop: World, tmp_path: Path) -> None:
 def test_semantics_of_other_splats_are_refused(tabletop: World, tmp_path: Path) -> None:
     added(tmp_path, tabletop)
     rows = rows_of(tabletop)
-    with pytest.raises(UnreadableSemanticsError, match="made for files with"):
-        read_semantics(tmp_path, {**rows, "red_cube": rows["red_cube"] + 1})
+    with pytest.raises(scene_file.UnreadableSemanticsError, match="made for files with"):
+        scene_file.read_semantics(tmp_path, {**rows, "red_cube": rows["red_cube"] + 1})
     path = tmp_path / "semantics.npz"
     path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(UnreadableSemanticsError, match="unreadable"):
-        read_semantics(tmp_path, rows)
+    with pytest.raises(scene_file.UnreadableSemanticsError, match="unreadable"):
+        scene_file.read_semantics(tmp_path, rows)
 
 
 def test_completed_gaussians_are_nothing_and_change_no_thing(
@@ -99,7 +93,7 @@ def test_completed_gaussians_are_nothing_and_change_no_thing(
         cube = tabletop.cloud.take(is_cube)
         written(folder, whole, cube, tabletop)
         rows = {"background": len(whole), "red_cube": len(cube)}
-        labels.append(read_semantics(folder, rows).labels)
+        labels.append(scene_file.read_semantics(folder, rows).labels)
     plain, ghostly = labels
     first = len(background)
     assert plain.any()
@@ -112,7 +106,7 @@ def test_an_empty_table_is_a_remark_not_an_error(tmp_path: Path) -> None:
     record = written(tmp_path, world.cloud, world.cloud.take(np.zeros(0, dtype=int)), world)
     assert record["instances"] == []
     assert str(record["remark"]).startswith("nothing stands on the level plane")
-    scene = read_semantics(tmp_path, {"background": len(world.cloud)})
+    scene = scene_file.read_semantics(tmp_path, {"background": len(world.cloud)})
     assert not scene.labels.any()
 
 
@@ -139,13 +133,13 @@ def test_vectors_lie_beside_the_labels_and_fit_this_scene_only(
     tabletop: World, tmp_path: Path
 ) -> None:
     added(tmp_path, tabletop)
-    scene = read_semantics(tmp_path, rows_of(tabletop))
-    assert read_vectors(tmp_path, scene) is None
+    scene = scene_file.read_semantics(tmp_path, rows_of(tabletop))
+    assert scene_file.read_vectors(tmp_path, scene) is None
     vectors = np.random.default_rng(0).normal(size=(len(scene.instances), 3)).astype(np.float32)
-    write_vectors(tmp_path, scene, vectors, "made model")
-    back = read_vectors(tmp_path, scene)
+    scene_file.write_vectors(tmp_path, scene, vectors, "made model")
+    back = scene_file.read_vectors(tmp_path, scene)
     assert back is not None
     np.testing.assert_array_equal(back[0], vectors)
     assert back[1] == "made model"
-    with pytest.raises(UnreadableSemanticsError, match="made for another scene"):
-        read_vectors(tmp_path, replace(scene, instances=scene.instances[1:]))
+    with pytest.raises(scene_file.UnreadableSemanticsError, match="made for another scene"):
+        scene_file.read_vectors(tmp_path, replace(scene, instances=scene.instances[1:]))

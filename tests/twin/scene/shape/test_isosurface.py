@@ -10,14 +10,8 @@ from hypothesis import strategies as st
 from skimage.measure import marching_cubes
 
 from bridge.errors import PathNotFoundError
+from twin.scene.shape import mesh
 from twin.scene.shape.isosurface import isosurface
-from twin.scene.shape.mesh import (
-    UnreadableMeshError,
-    is_watertight,
-    mesh_ply,
-    read_mesh,
-    volume_m3,
-)
 
 
 def sphere(radius_m: float, step_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -34,8 +28,8 @@ def test_any_values_whatever_give_a_closed_surface(seed: int, share: float) -> N
     values = (rng.random((7, 6, 5)) - share).astype(np.float32)
     vertices, faces = isosurface(values, np.zeros(3), 1.0)
     if (values < 0).any():
-        assert is_watertight(faces)
-        assert volume_m3(vertices, faces) > 0
+        assert mesh.is_watertight(faces)
+        assert mesh.volume_m3(vertices, faces) > 0
         assert vertices.min() > -1.0
 
 
@@ -47,34 +41,34 @@ def test_the_surface_lies_where_scikit_image_puts_it() -> None:
     step = axis[1] - axis[0]
     vertices, faces = isosurface(ring, np.full(3, -1.0), step)
     theirs, their_faces, _, _ = marching_cubes(ring, 0.0, spacing=(step,) * 3)
-    assert is_watertight(faces)
+    assert mesh.is_watertight(faces)
     assert len(vertices) == len(theirs)
     ours = vertices[np.lexsort(vertices.round(5).T)]
     np.testing.assert_allclose(ours, (theirs - 1.0)[np.lexsort((theirs - 1.0).round(5).T)],
                                atol=0.02 * step)  # fmt: skip
-    their_volume = abs(volume_m3(theirs.astype(np.float64), their_faces.astype(np.int64)))
-    assert volume_m3(vertices, faces) == pytest.approx(their_volume, rel=5e-3)
+    their_volume = abs(mesh.volume_m3(theirs.astype(np.float64), their_faces.astype(np.int64)))
+    assert mesh.volume_m3(vertices, faces) == pytest.approx(their_volume, rel=5e-3)
 
 
 def test_an_open_mesh_a_flipped_face_and_no_mesh_are_not_watertight() -> None:
     _, faces = sphere(0.05, 0.01)
-    assert is_watertight(faces)
-    assert not is_watertight(faces[1:])
+    assert mesh.is_watertight(faces)
+    assert not mesh.is_watertight(faces[1:])
     flipped = faces.copy()
     flipped[0] = flipped[0][::-1]
-    assert not is_watertight(flipped)
-    assert not is_watertight(np.concatenate([faces, faces[:1]]))
-    assert not is_watertight(np.zeros((0, 3), dtype=np.int64))
+    assert not mesh.is_watertight(flipped)
+    assert not mesh.is_watertight(np.concatenate([faces, faces[:1]]))
+    assert not mesh.is_watertight(np.zeros((0, 3), dtype=np.int64))
     degenerate = faces.copy()
     degenerate[0, 1] = degenerate[0, 0]
-    assert not is_watertight(degenerate)
+    assert not mesh.is_watertight(degenerate)
 
 
 def test_a_written_mesh_is_read_back_and_open3d_reads_it_too(tmp_path: Path) -> None:
     vertices, faces = sphere(0.05, 0.01)
     path = tmp_path / "mesh.ply"
-    path.write_bytes(mesh_ply(vertices, faces))
-    again, same = read_mesh(path)
+    path.write_bytes(mesh.mesh_ply(vertices, faces))
+    again, same = mesh.read_mesh(path)
     np.testing.assert_allclose(again, vertices, atol=1e-7)
     np.testing.assert_array_equal(same, faces)
     other = o3d.io.read_triangle_mesh(str(path))
@@ -95,10 +89,10 @@ def test_a_written_mesh_is_read_back_and_open3d_reads_it_too(tmp_path: Path) -> 
 )
 def test_a_damaged_mesh_is_refused(tmp_path: Path, old: bytes, new: bytes, says: str) -> None:
     path = tmp_path / "mesh.ply"
-    data = mesh_ply(np.eye(3), np.array([[0, 1, 2]]))
+    data = mesh.mesh_ply(np.eye(3), np.array([[0, 1, 2]]))
     assert old in data
     path.write_bytes(data.replace(old, new, 1))
-    with pytest.raises(UnreadableMeshError, match=says):
-        read_mesh(path)
+    with pytest.raises(mesh.UnreadableMeshError, match=says):
+        mesh.read_mesh(path)
     with pytest.raises(PathNotFoundError):
-        read_mesh(tmp_path / "none.ply")
+        mesh.read_mesh(tmp_path / "none.ply")

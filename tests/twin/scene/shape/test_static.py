@@ -11,14 +11,9 @@ from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.npz import UnreadableArraysError
 from twin.scene.frames.rgbd import TrainingView
+from twin.scene.shape import from_training
 from twin.scene.shape import static as made
 from twin.scene.shape.carve import ShapeError
-from twin.scene.shape.from_training import (
-    from_outside_m,
-    rim_height_m,
-    with_heights,
-    write_static,
-)
 from twin.scene.shape.known import pose_of, surface_distances
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import FREE, SURFACE, UNSEEN, Distance, StaticSdf, static_sdf
@@ -108,7 +103,7 @@ def test_a_basket_takes_its_handles_its_rim_and_its_cavity_out_of_the_scene() ->
     inside = np.array([[0.0, 0.0, 0.05]])
     beside = np.array([[basket.inner_m[0] / 2 + 0.06, 0.0, 0.05]])
     for points, is_taken in ((arch, True), (rim, True), (inside, True), (beside, False)):
-        away = from_outside_m(se3.apply(T, points), basket, T)
+        away = from_training.from_outside_m(se3.apply(T, points), basket, T)
         assert np.all(away < 0.001) if is_taken else np.all(away > 0.03)
 
 
@@ -116,10 +111,10 @@ def test_a_rim_is_as_high_as_it_is_seen_whatever_is_published(views: list[Traini
     box = TASK.objects["box"]
     for share in (0.8, 1.0, 1.25):
         published = replace(box, size_m=(*box.size_m[:2], share * box.size_m[2]))
-        height_m = rim_height_m(views, published, POSES["box"])
+        height_m = from_training.rim_height_m(views, published, POSES["box"])
         assert height_m == pytest.approx(box.size_m[2], abs=0.003)
-    assert rim_height_m(views[:0], box, POSES["box"]) is None
-    seen = with_heights(TASK, {"box": 0.07})
+    assert from_training.rim_height_m(views[:0], box, POSES["box"]) is None
+    seen = from_training.with_heights(TASK, {"box": 0.07})
     assert seen.objects["box"].inner_m[2] == pytest.approx(0.07 - box.wall_m)
     assert seen.objects["cube"] == TASK.objects["cube"]
 
@@ -137,7 +132,7 @@ def test_without_views_there_is_no_static_scene_but_a_reason(tmp_path: Path) -> 
     with pytest.raises(ShapeError, match="0 points"):
         static_sdf([], 0.0)
     (tmp_path / "sdf.npz").write_bytes(b"old")
-    about = write_static(tmp_path, [], [])
+    about = from_training.write_static(tmp_path, [], [])
     assert about["file"] is None
     assert "0 points" in about["remark"]
     assert not (tmp_path / "sdf.npz").exists()
