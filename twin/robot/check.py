@@ -34,7 +34,6 @@ def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
     if urdf_out is not None:
         urdf_out.parent.mkdir(parents=True, exist_ok=True)
         urdf_out.write_text(text)
-    gripper = record.gripper
     return {
         "name": record.name,
         "base_frame": record.base_frame,
@@ -54,7 +53,7 @@ def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
             }
             for index, joint in enumerate(robot.joints)
         ],
-        "gripper": _widths(gripper),
+        "gripper": _widths(record.gripper),
         "mass_kg": float(sum(inertia.mass for inertia in robot.model.inertias)),
         "payload_kg": record.payload_kg,
         "hulls": len(hulls.hulls),

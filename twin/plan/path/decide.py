@@ -89,11 +89,12 @@ def decide(
                 )
             )
             break
-    limits: dict[str, float] = {Cause.DEEP_CONTACT: -MAX_CONTACT_DEPTH_M}
     refusals += [
         PathRefusal(
             bodies=(failure.bodies[0], failure.bodies[1]),
-            lacking_m=limits.get(failure.cause, config.eps_col_m) - _least(monitor, failure.bodies),
+            lacking_m=monitor.lacking_m[failure.bodies]
+            if failure.cause != Cause.DEEP_CONTACT
+            else -MAX_CONTACT_DEPTH_M - _least(monitor, failure.bodies),
             t_ns=failure.t_ns,
             detail=failure.detail,
         )
@@ -113,7 +114,6 @@ def _least(monitor: ClearanceMonitor, bodies: Sequence[str]) -> float:
 
 def _plan(problem: Problem, contacts: tuple[tuple[str, str], ...]) -> Plan:
     """The one stage that a movement is, as the monitor reads it."""
-    stage = Stage(id=_STAGE, text="", allowed_contacts=contacts)
     return Plan(
         id=_STAGE,
         planner="",
@@ -122,6 +122,6 @@ def _plan(problem: Problem, contacts: tuple[tuple[str, str], ...]) -> Plan:
         robot=problem.robot.name,
         frame=problem.robot.record.base_frame,
         instruction="",
-        stages=(stage,),
+        stages=(Stage(id=_STAGE, text="", allowed_contacts=contacts),),
         tau=(),
     )

@@ -92,7 +92,7 @@ class Movement:
     carried: Carried | None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Asked:
     """What every movement is asked with: the scene, the hand, what may touch."""
 
@@ -138,9 +138,7 @@ def plan_move(
 ) -> Movement:
     """Find a collision-free, short, timed movement to one of some postures."""
     check_numbers(start_rad, goals_rad)
-    asked = _Asked(
-        problem=problem, config=config, width_m=width_m, carried=carried, allowed=allowed
-    )
+    asked = _Asked(problem, config, width_m, carried, allowed)
     wider: dict[frozenset[str], float] = {}
     work: dict[str, float] = {}
     refusals: tuple[PathRefusal, ...] = ()
@@ -148,7 +146,9 @@ def plan_move(
         world = asked.world(wider)
         _let_ends_be(world, np.vstack([start_rad[None], goals_rad]), wider)
         knots = _searched(world, start_rad, goals_rad, config, turn, work, refusals)
-        path = timed_path(world, knots, config)
+        # A margin grows with speed: what was refused is searched again wider, and driven slower.
+        slower = replace(config, speed_share=config.speed_share * 0.75**turn)
+        path = timed_path(world, knots, slower)
         movement = asked.decided(path)
         work["rounds"] = float(turn + 1)
         if movement.decision.accepted:

@@ -212,6 +212,7 @@ class ClearanceMonitor:
             name: float(np.sqrt(np.linalg.eigvalsh(np.asarray(c)[:3, :3]).max()))
             for name, c in fixed.items()
         }
+        self.lacking_m: dict[tuple[str, ...], float] = {}  # of bodies: how much farther apart
         self._late_m = np.zeros(len(self._links))
         self._hand = [k for k, s in enumerate(self._links) if s.body in self._gripper.links]
         self._object_late_m: dict[str, float] = {}
@@ -440,6 +441,8 @@ class ClearanceMonitor:
             return np.inf
         least_m = self.least_m(pair)
         if distance < least_m:
+            lacking_m = self.lacking_m.get((body, other), 0.0)
+            self.lacking_m[body, other] = max(lacking_m, least_m - distance)
             cause = Cause.COLLISION if distance < 0 else Cause.TOO_CLOSE
             self._fail(t_ns, cause, body, other, distance, least_m)
         return distance
@@ -456,14 +459,8 @@ class ClearanceMonitor:
             if least_m > self.config.eps_col_m:
                 where += f", of which {(least_m - self.config.eps_col_m) * 1e3:.1f} mm are for its "
                 where += "speed and for what localisation does not know"
-        self.failures.append(
-            Failure(
-                t_ns=t_ns,
-                cause=cause,
-                bodies=(body, other),
-                detail=f"{body} is {where}",
-            )
-        )
+        bodies, detail = (body, other), f"{body} is {where}"
+        self.failures.append(Failure(t_ns=t_ns, cause=cause, bodies=bodies, detail=detail))
 
     def _note(self, t_ns: int, bodies: tuple[str, str], distance: float, may_touch: bool) -> None:
         stretches = self._contacts.setdefault((*bodies, may_touch), [])

@@ -151,7 +151,7 @@ def test_what_is_refused_is_searched_again_with_the_pair_farther_apart(
 
     monkeypatch.setattr(planner, "decide", strict)
     farther = moved(pairs, index)
-    assert farther.path.work["rounds"] == 2
+    assert 2 <= farther.path.work["rounds"] <= CONFIG.rounds  # margins grow with speed
     assert least_m(farther.path.joints_rad, nearer) >= wanted_m
 
 
