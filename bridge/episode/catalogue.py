@@ -7,12 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.episode.assigned import assign
-from bridge.episode.catalogue_query import (
-    LABEL_SUFFIX,
-    UNLABELLED,
-    CatalogueQuery,
-    printable,
-)
+from bridge.episode.catalogue_query import LABEL_SUFFIX, UNLABELLED, CatalogueQuery, printable
 from bridge.episode.catalogue_query import Entry as Entry
 from bridge.episode.contract import PRESENCE_RECORD, health_lines
 from bridge.episode.health import RECORD_NAME

@@ -272,11 +272,7 @@ def _judge_topics(
 
 
 def _judge_presence(
-    report: CheckReport,
-    episode: Episode,
-    watch: _Watch,
-    faults: Faults,
-    contract: Contract | None,
+    report: CheckReport, episode: Episode, watch: _Watch, faults: Faults, contract: Contract | None
 ) -> None:
     records = episode.metadata_records
     if contract is None and RECORD_NAME in records:

@@ -77,10 +77,7 @@ def _statistics_faults(
     pairs = {
         "messages": (said.message_count, sum(seen.counts.values())),
         "schemas": (said.schema_count, _either(said.schema_count, seen.schemas, num_schemas)),
-        "channels": (
-            said.channel_count,
-            _either(said.channel_count, seen.channels, num_channels),
-        ),
+        "channels": (said.channel_count, _either(said.channel_count, seen.channels, num_channels)),
         "attachments": (said.attachment_count, num_attachments),
         "metadata records": (said.metadata_count, len(seen.metadata)),
         "chunks": (said.chunk_count, seen.num_chunks),

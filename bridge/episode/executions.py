@@ -62,8 +62,7 @@ def _motion_of(track: JointTrack) -> tuple[int, int] | None:
 
 
 def _left_rest(
-    position: Float[np.ndarray, "num_samples num_joints"],
-    resting: Bool[np.ndarray, " num_samples"],
+    position: Float[np.ndarray, "num_samples num_joints"], resting: Bool[np.ndarray, " num_samples"]
 ) -> int | None:
     """The last sample at rest before a joint is clearly elsewhere; None: none ever is."""
     away = np.abs(position - np.median(position[resting], axis=0))

@@ -18,12 +18,7 @@ from bridge.episode.chunk_queue import JOURNAL, journal_path
 from bridge.episode.mcap.damaged import RecordFile, finished_data
 from bridge.episode.mcap.part_file import lock_dead, sync_folder
 from bridge.episode.mcap.scan import scan
-from bridge.episode.recovery_report import (
-    RECORD_NAME,
-    RecoveryReport,
-    RecoveryTally,
-    to_metadata,
-)
+from bridge.episode.recovery_report import RECORD_NAME, RecoveryReport, RecoveryTally, to_metadata
 from bridge.episode.run_folder import PART, SUFFIX, RunFolder
 from bridge.episode.salvage import CopyTarget, scan_with_journal
 from bridge.errors import BridgeError, GstError, PathNotFoundError

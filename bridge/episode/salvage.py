@@ -21,15 +21,7 @@ from bridge.episode.mcap.damaged import (
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
 from bridge.episode.mcap.format import Buffer, crc32
 from bridge.episode.mcap.part_file import PartFile
-from bridge.episode.mcap.scan import (
-    AttachmentSpan,
-    Chunk,
-    CutChunk,
-    Found,
-    Plain,
-    TopMessage,
-    scan,
-)
+from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
 

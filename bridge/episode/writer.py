@@ -71,11 +71,7 @@ class Channels:
         self._known: dict[tuple[str, int, str, About], tuple[Channel, schema.Schema | None]] = {}
 
     def find(
-        self,
-        topic: str,
-        record: schema.Schema | None,
-        message_encoding: str,
-        about: About = (),
+        self, topic: str, record: schema.Schema | None, message_encoding: str, about: About = ()
     ) -> Channel:
         """Return the channel of a topic."""
         # Comparing schemas by identity spares hashing their text for every message; the value
@@ -386,11 +382,7 @@ class EpisodeWriter:
         """Add an attachment, for example ``robot.urdf``; it is in the file at once."""
         self.wait_for_disk()
         self._section.add_attachment(
-            name,
-            data,
-            media_type=media_type,
-            log_time_ns=log_time_ns,
-            create_time_ns=log_time_ns,
+            name, data, media_type=media_type, log_time_ns=log_time_ns, create_time_ns=log_time_ns
         )
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:

@@ -25,12 +25,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.schema import StampedMessage
-from bridge.episode.streams import (
-    camera_ids,
-    camera_info,
-    find_camera_topic,
-    transform_tree,
-)
+from bridge.episode.streams import camera_ids, camera_info, find_camera_topic, transform_tree
 from bridge.episode.transforms import TransformTree
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError, MissingDependencyError
@@ -207,28 +202,15 @@ def _write_cameras(
 
 def _camera_record(camera: Camera) -> dict[str, int | float]:
     fx, fy, cx, cy = camera.to_ros()
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": fx,
-        "fy": fy,
-        "cx": cx,
-        "cy": cy,
-    }
+    return {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
 
 
 def write_scan(
-    run: RunFolder,
-    info: EpisodeInfo,
-    messages: Iterable[StampedMessage],
-    *,
-    source: dict[str, Any],
+    run: RunFolder, info: EpisodeInfo, messages: Iterable[StampedMessage], *, source: dict[str, Any]
 ) -> Path:
     """Write one episode; on any error nothing with its final name is left.
 
-    Args:
-        messages: In time order; log time is their source time.
-        source: Where they come from and what was rounded; kept as metadata ``source``.
+    Messages come in time order, logged at their source time; ``source`` is kept as metadata.
     """
     check_episode_id(info.id)
     writer = EpisodeWriter(run.episodes_dir / f"{info.id}.mcap")

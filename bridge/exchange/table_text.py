@@ -27,19 +27,8 @@ NO = (
 )
 UNKNOWN = (
     "",
-    "unknown",
-    "undecided",
     "not evaluated",
-    "none",
-    "na",
-    "n/a",
-    "nan",
-    "null",
-    "-",
-    "–",
-    "—",
-    "?",
-    "未评",
+    *["unknown", "undecided", "none", "na", "n/a", "nan", "null", "-", "–", "—", "?", "未评"],
 )
 ENDED = (
     *("aborted", "abort", "interrupted", "void", "crashed", "protective stop", "protective_stop"),
@@ -257,11 +246,9 @@ def open_table(
     near: bool = True,
     words: Sequence[str] = (),
 ) -> TableText:
-    """Find out how a table is written and which of its columns are ours.
+    """Find out how a table is written, by ``known`` and ``words``, and which columns are ours.
 
-    Args:
-        near: Refuse names that are almost ours, and names that stand twice.
-        words: Further names by which the delimiter is known.
+    ``near``: names that are almost ours, and names that stand twice, are refused.
     """
     delimiter, grid = load_grid(path, (*known, *words))
     row, names = (grid[0][0], [name.strip() for name in grid[0][1]]) if grid else (0, [])

@@ -1,8 +1,6 @@
 """Trials CSV in and out: one row per trial, as people keep them in a spreadsheet.
 
-Columns: trial_id, task, condition, policy, start_id, unit, k, n, recorded, sim_planned,
-sim_executed, verdict, p_success, cell, stand_in, why_unknown, checkpoint,
-progress (0 to 1), time_s (of successes). Only task must be there (rows without trial_id are
+Columns are the fields of ``TrialRecord``. Only task must be there (rows without trial_id are
 numbered); an empty field means unknown and stays unknown.
 """
 
@@ -52,12 +50,9 @@ class TrialRecord:
     stand_in: bool | None = None
     why_unknown: str = ""
     """What was said of an outcome that is not known: aborted, protective stop ..."""
-    checkpoint: str = ""
-    """Which weights acted under the policy's name, where somebody says so."""
-    progress: float | None = None
-    """Part of the task that was done, 0 to 1."""
-    time_s: float | None = None
-    """How long a success took."""
+    checkpoint: str = ""  # which weights acted under the policy's name, where somebody says so
+    progress: float | None = None  # part of the task that was done, 0 to 1
+    time_s: float | None = None  # how long a success took
 
 
 COLUMNS = tuple(field.name for field in fields(TrialRecord))
@@ -115,11 +110,7 @@ def _group_and_id(trial: TrialRecord) -> tuple[str, ...]:
 
 
 def check_unit(row: SourceRow, trial: TrialRecord, units: dict[str, tuple[str, int]]) -> None:
-    """Refuse a second unit in one task; ``units`` remembers each task's unit and first row.
-
-    Args:
-        units: By task: its unit and the row that gave it first; a new task is added.
-    """
+    """Refuse a second unit in one task; ``units`` keeps each task's unit and the row it is from."""
     unit, first = units.setdefault(trial.task, (trial.unit, row.row))
     if unit != trial.unit:
         raise row.refuse(

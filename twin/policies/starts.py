@@ -110,7 +110,5 @@ def drawn_starts(start: Start, count: int, seed: int) -> Iterator[Start]:
         rng = np.random.default_rng([seed, number])
         places = {**start.scene.Ts_base_object, **start.task.draw_start(rng)}
         yield replace(
-            start,
-            id=f"drawn_{seed}_{number}",
-            scene=replace(start.scene, Ts_base_object=places),
+            start, id=f"drawn_{seed}_{number}", scene=replace(start.scene, Ts_base_object=places)
         )

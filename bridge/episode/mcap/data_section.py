@@ -186,12 +186,7 @@ class OpenChunk:
             struct.error: When a number does not fit its field; nothing is appended then.
         """
         head = MESSAGE_HEAD.pack(
-            MESSAGE,
-            MESSAGE_FIELDS + length,
-            channel_id,
-            sequence,
-            log_time_ns,
-            publish_time_ns,
+            MESSAGE, MESSAGE_FIELDS + length, channel_id, sequence, log_time_ns, publish_time_ns
         )
         entries = self._index.get(channel_id)
         if entries is None:

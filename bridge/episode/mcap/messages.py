@@ -15,12 +15,7 @@ from jaxtyping import Bool, Int64, UInt16, UInt64
 from mcap import records
 
 from bridge.episode.mcap.file import McapFile, damaged
-from bridge.episode.mcap.format import (
-    CHUNK,
-    MESSAGE,
-    MESSAGE_HEAD,
-    RECORD_HEAD,
-)
+from bridge.episode.mcap.format import CHUNK, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
 from bridge.episode.mcap.walk import (
     DAMAGE,
     BrokenRecordError,
