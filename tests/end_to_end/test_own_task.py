@@ -13,7 +13,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE, MissingTaskError, keep_task_file
 from bridge.task.task_file import TaskFile, load_task
-from evaluator.compare.known_task import recorded_task
+from evaluator.compare.summaries import recorded_task
 from twin.scene.frames.selection import Sources
 from twin.scene.objects.placement import scanned_tasks
 
