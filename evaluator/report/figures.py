@@ -83,20 +83,21 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | None:
         return None
     shown = known[:MOST]
     bottom = 40 + 52 * len(shown)
-    marks = [*_axis(12, 340, bottom, 30), *_key(word)]
+    has_twin = any(group.shown_sim.value is not None for group in known)
+    marks = [*_axis(12, 340, bottom, 30), *(_key(word) if has_twin else ())]
     for index, group in enumerate(shown):
         y = 50 + 52 * index
         marks.append(_text(12, y, _words(group.task, group.condition, group.policy), "ink"))
-        for rate, below, name in ((group.shown_sim, 14, "sim"), (group.recorded, 30, "rec")):
-            marks += _rate(rate, y + below, name)
+        marks += _rate(group.shown_sim, y + 14, "sim") if has_twin else ()
+        marks += _rate(group.recorded, y + 30, "rec")
     more = len(known) - len(shown)
     rest = f" The first {MOST} of {len(known)} groups; the table has all." if more else ""
     side = "planned" if any(group.executed is None for group in known) else "executed"
     return Drawing(
         id="success",
-        title=f"Success rates in the twin and {word}",
-        caption=f"Circle: {side}-in-twin; square: as labelled. Bars are 95 % intervals; the counts "
-        f"stand at the right.{rest}",
+        title=f"Success rates in the twin and {word}" if has_twin else f"Success rates, {word}",
+        caption=f"{f'Circle: {side}-in-twin; square' if has_twin else 'Square'}: as labelled. Bars "
+        f"are 95 % intervals; the counts stand at the right.{rest}",
         alt=_alt("Rates", word, [(g.label, g.shown_sim, g.recorded) for g in known]),
         height=bottom + 42,
         marks=tuple(marks),

@@ -15,6 +15,8 @@ from evaluator.statistics.intervals import wilson
 SHOWN_TASKS = 8
 """Tasks with a line; the table holds the others."""
 SHOWN_MISSING = 6
+SAYS_LITTLE = 10
+"""Fewer trials that all end alike say little of anything."""
 SHOWN_ANSWERS = 3
 LONGEST = 150
 """Characters of one reason; the whole stands further down."""
@@ -90,8 +92,8 @@ def _compared(results: Results) -> list[str]:
         f"{text[0].upper()}{text[1:]}." if text.startswith(heads) else f"{text}."
         for text in sentences[: SHOWN_ANSWERS - len(standing)]
     ]
-    if alike := _all_alike(results):
-        return [*alike, *found]
+    if alike := _all_alike(results)[0]:
+        return [alike]
     regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
     if regret is not None and regret.value is not None:
         ends = _ends(regret, ".0f")
@@ -154,8 +156,11 @@ def answer(row: Row) -> str:
 def next_trials(results: Results) -> str:
     """Name the comparison that the fewest trials are likely to decide; empty where none is open.
 
-    Candidates that are shown to be worse than another are left out.
+    Candidates that are shown to be worse than another are left out. Where all trials ended alike
+    it is what would tell candidates apart.
     """
+    if step := _all_alike(results)[1]:
+        return step
     _, beaten = _standing(results)
     wanted = [
         (more, _pair(str(row.get("first", "one")), str(row.get("second", "another"))))
@@ -232,20 +237,18 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
     return parts
 
 
-def _all_alike(results: Results) -> list[str]:
-    """Say that nothing, or everything, succeeded: then no rate here ranks or judges anything."""
+def _all_alike(results: Results) -> tuple[str, str]:
+    """Say that nothing, or everything, succeeded, and what to do: no rate here ranks anything."""
     rates = [m for m in results.measurements if m.id.startswith("rate.recorded.") and m.n]
     k, n = sum(m.k or 0 for m in rates), sum(m.n or 0 for m in rates)
     if not n or any(m.k is None for m in rates) or 0 < k < n:
-        return []
-    word = "Nothing" if k == 0 else "Everything"
+        return "", ""
+    word, task = ("Nothing", "an easier") if k == 0 else ("Everything", "a harder")
     ends = wilson(k, n)
     reach = f"{100 * ends.low:.0f} to {100 * ends.high:.0f} %"
-    task = "an easier task" if k == 0 else "a harder task"
-    return [
-        f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies in {reach}. "
-        f"That ranks no candidate; {task}, or more trials, would."
-    ]
+    said = f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies in {reach}."
+    few = f"record more trials; {n} {'say' if n > 1 else 'says'} next to nothing."
+    return said, few if n < SAYS_LITTLE else f"try {task} task: this one ranks no candidate."
 
 
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:
