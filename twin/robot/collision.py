@@ -303,10 +303,10 @@ class RobotHulls:
         bare = sorted(self.robot.bodies - {hull.link for hull in self.hulls})
         if bare:
             return f"the links {', '.join(bare)} have no collision shapes: nobody watches them"
-        if self.share_left_out > _MOST_LEFT_OUT:
-            pairs = "; ".join(f"{links}, for {why}" for links, why in self.left_out.items())
-            return f"{self.share_left_out:.0%} of the pairs of links are not watched: {pairs}"
-        return self.oversized()
+        many = self.share_left_out > _MOST_LEFT_OUT
+        pairs = "; ".join(f"{links}, for {why}" for links, why in self.left_out.items())
+        told = f"{self.share_left_out:.0%} of the pairs of links are not watched: {pairs}"
+        return self.oversized() or (told if many else None)
 
     def _listed(self, first: int, second: int) -> bool:
         links = {self.hulls[first].link, self.hulls[second].link}
