@@ -136,13 +136,13 @@ def test_a_lens_that_distorts_is_refused_by_the_name_of_its_camera(
 def test_a_camera_whose_images_never_come_in_pairs_is_named(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make = textured_room.messages.DepthImage
+    make = textured_room.depth_image
 
-    def late(**fields: Any) -> object:
-        return make(**{**fields, "stamp_ns": fields["stamp_ns"] + 50_000_000})
+    def late(stamp_ns: int, *more: Any) -> object:
+        return make(stamp_ns + 50_000_000, *more)
 
     with monkeypatch.context() as spoilt:
-        spoilt.setattr(textured_room.messages, "DepthImage", late)
+        spoilt.setattr(textured_room, "depth_image", late)
         textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=6)
     with pytest.raises(GstError, match="camera wrist of episode scan has a depth image within 20"):
         choose_frames(find_sources(run), FrameConfig(), QUIET)
