@@ -246,9 +246,9 @@ def _all_alike(results: Results) -> tuple[str, str]:
     word, task = ("Nothing", "an easier") if k == 0 else ("Everything", "a harder")
     ends = wilson(k, n)
     reach = f"{100 * ends.low:.0f} to {100 * ends.high:.0f} %"
-    said = f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies in {reach}."
+    told = f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies in {reach}."
     few = f"record more trials; {n} {'say' if n > 1 else 'says'} next to nothing."
-    return said, few if n < SAYS_LITTLE else f"try {task} task: this one ranks no candidate."
+    return told, few if n < SAYS_LITTLE else f"try {task} task: this one ranks no candidate."
 
 
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:
