@@ -6,6 +6,7 @@ The only place that spells them. A name that begins after the cell (``/joint_sta
 """
 
 import re
+from functools import lru_cache
 from typing import Literal
 
 from bridge.episode import schema
@@ -106,6 +107,7 @@ def object_topic(cell: str, object_id: str, what: Literal["pose", "nodes"]) -> s
     return f"/{cell}{OBJECTS}{object_id}/{what}"
 
 
+@lru_cache(maxsize=1024)
 def type_of_topic(topic: str) -> str | None:
     """Return the message type a topic of ours carries, or None for a foreign topic."""
     return next((name for pattern, name in _TYPES if re.search(pattern, topic)), None)

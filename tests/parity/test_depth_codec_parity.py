@@ -1,6 +1,7 @@
 """RVL in C++, and nibble by nibble as the paper tells it; PNG against OpenCV."""
 
 from collections.abc import Iterator
+from itertools import groupby
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
@@ -37,18 +38,18 @@ def reference_encode(values: list[int]) -> bytes:
             number >>= 3
         nibbles.append(number)
 
-    at, before = 0, 0
-    while at < len(values):
-        zeros = next((i for i, v in enumerate(values[at:]) if v), len(values) - at)
-        put(zeros)
-        at += zeros
-        run = next((i for i, v in enumerate(values[at:]) if not v), len(values) - at)
-        put(run)
-        for value in values[at : at + run]:
+    before = 0
+    for is_zero, group in groupby(values, key=lambda value: value == 0):
+        run = list(group)
+        if not is_zero and not nibbles:
+            put(0)  # no zeros before the first run
+        put(len(run))
+        for value in () if is_zero else run:
             delta = value - before
             put(2 * delta if delta >= 0 else -2 * delta - 1)
             before = value
-        at += run
+    if values and not values[-1]:
+        put(0)  # no run after the last zeros
     digits = "".join(f"{nibble:x}" for nibble in nibbles)
     digits += "0" * (-len(digits) % 8)
     return b"".join(bytes.fromhex(digits[i : i + 8])[::-1] for i in range(0, len(digits), 8))

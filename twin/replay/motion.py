@@ -200,7 +200,8 @@ _SETTINGS = {
 
 def _samples(path: JointPath) -> tuple[Times, Rows, Rows, Rows]:
     """Joints, their speeds and accelerations at each knot and at most a step apart [s, rad]."""
-    times_ns = np.union1d(path.times_ns, path.dense_times_ns(PATH_STEP_S))
+    dense_ns = path.dense_times_ns(PATH_STEP_S)
+    times_ns = np.union1d(path.times_ns, dense_ns[dense_ns > path.times_ns[0]])  # at rest before
     times_s = times_ns * 1e-9
     if path.curve is not None:
         speeds, accelerations = (path.curve(times_s, order) for order in (1, 2))
