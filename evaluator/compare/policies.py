@@ -140,6 +140,19 @@ def tries_of(made: Sequence[TrialRow], question: Question) -> list[Try]:
     ]
 
 
+def in_rounds(tries: Sequence[Try]) -> list[Try]:
+    """Take a trial of each candidate on each task, then the next of each.
+
+    In the order of a lab that goes task after task a look would see the first tasks only.
+    """
+    seen: Counter[tuple[str, bool]] = Counter()
+    rounds = []
+    for each in tries:
+        seen[each.task, each.is_second] += 1
+        rounds.append(seen[each.task, each.is_second])
+    return [each for _, each in sorted(zip(rounds, tries, strict=True), key=lambda item: item[0])]
+
+
 def void_starts(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[Exclusion]:
     """Name the trials that enter no comparison, and why: void ones, in a study with their start."""
     void = [r for r in rows if r.recorded is None and r.why_unknown.startswith(tuple(void_causes))]
@@ -388,8 +401,9 @@ def compare_policies(
         tries = tries_of(made, question)
         if len({each.is_second for each in tries}) < 2:
             continue
-        asked.append(_Case(question, "", tries, Course.of(tries, plan)))
         tasks = grouped(tries, lambda each: each.task)
+        tries = in_rounds(tries)
+        asked.append(_Case(question, "", tries, Course.of(tries, plan)))
         if len(tasks) > 1:
             parts += [_Case(question, t, own, Course.of(own, of_task)) for t, own in tasks.items()]
     primary = [case for case in asked if case.question.is_primary]
@@ -528,7 +542,7 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         id="comparisons",
         title="Which is better, as recorded",
         note=f"Group-sequential score test, {words}, extended by doubling; alpha {plan.alpha:g} "
-        "holds however often one looks. All questions share it (Holm), a primary one has it alone, "
+        "holds however often one looks; over all tasks each is counted in turn. All questions share it (Holm), a primary one has it alone, "
         "the same in each task share another, progress and time to success a third. Intervals hold "
         "at every look. Trials without an outcome are failures.",
     )

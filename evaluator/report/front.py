@@ -17,6 +17,8 @@ from evaluator.statistics.intervals import wilson
 SHOWN_TASKS = 8
 """Tasks with a line; the table holds the others."""
 SHOWN_MISSING = 6
+NAMED_TASKS = 4
+"""More are counted where a step says on which to try."""
 SAYS_LITTLE = 10
 """Fewer trials that all end alike say little of anything."""
 SHOWN_ANSWERS = 3
@@ -89,6 +91,7 @@ def _compared(results: Results) -> list[str]:
     rows = rows_of(results, "comparisons")
     sentences = [str(row["answer"]) for row in rows if row["task"] == ALL_TASKS]
     heads = ("undecided", "no difference")  # others begin with a name, which keeps its letters
+    split = _by_task(results)
     standing, beaten = _standing(results)
     if standing:  # it says who is worse; what is open between those who may be best is left
         sentences = [
@@ -99,17 +102,34 @@ def _compared(results: Results) -> list[str]:
         ]
     found = standing + [
         f"{text[0].upper()}{text[1:]}." if text.startswith(heads) else f"{text}."
-        for text in sentences[: SHOWN_ANSWERS - len(standing)]
+        for text in sentences[: SHOWN_ANSWERS - len(standing) - 2 * len(split)]
     ]
     if alike := _all_alike(results)[0]:
         return [alike]
     regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
     if regret is not None and regret.value is not None:
-        lost = f"{_points(regret.value)} of success against the best one{_ends(regret, '.0f')}"
         found.append(
-            f"If you take the {regret.counted} that the twin ranks first, you lose {lost}."
+            f"Had you taken the {regret.counted} that the twin ranks first, you would have lost "
+            f"{_points(regret.value)} of recorded success{_ends(regret, '.0f')}."
         )
-    return found
+    return [*split, *found]
+
+
+def _by_task(results: Results) -> list[str]:
+    """Say where one candidate is better on one task, and worse on another."""
+    won: dict[tuple[str, str], dict[str, str]] = {}
+    for row in rows_of(results, "comparisons"):
+        first, second = str(row.get("first")), str(row.get("second"))
+        if row["task"] != ALL_TASKS and row["decided"] != "no":
+            better = second if row["decided"] == "better" else first
+            won.setdefault((first, second), {}).setdefault(better, str(row["task"]))
+    split = [found for found in won.values() if len(found) > 1]
+    if not split:
+        return []
+    (one, here), (other, there) = split[0].items()
+    words = f"Which is better depends on the task: {one} on {here}, {other} on {there}"
+    more = f"; {len(split) - 1} more {noun('pair', len(split) - 1)} too" if split[1:] else ""
+    return [f"{words}{more}."]
 
 
 def _standing(results: Results) -> tuple[list[str], list[str]]:
@@ -127,8 +147,13 @@ def _standing(results: Results) -> tuple[list[str], list[str]]:
         more = " ..." if len(best) > SHOWN_TASKS else ""
         return [f"{len(best)} of {len(rows)} candidates may be best: {listed}{more}."], beaten
     words = " ".join(f"{row['candidate']} ({row['k']} of {row['n']})" for row in best)
-    words += f" is the best of {len(rows)} candidates: each of the others lost a comparison"
-    return [f"{words}; stop here."], beaten
+    over_all = all(
+        f", {best[0]['candidate']}, " in f", {row['beaten by']}, "
+        for row in rows
+        if row["may be best"] == "no"
+    )
+    why = "it is better than each of the others" if over_all else "only it lost no comparison"
+    return [f"{words} is the best of {len(rows)} candidates: {why}; stop here."], beaten
 
 
 def rows_of(results: Results, table_id: str) -> list[Row]:
@@ -183,15 +208,28 @@ def next_trials(results: Results) -> str:
         if row["decided"] == "no" and not {*pair} & {*beaten}
         if isinstance(more := row["more trials of each"], int) and more > 0
     ]
-    if not wanted:
-        return _settled([row for row, _ in of_all], rows_of(results, "standing"))
+    settled = "" if wanted else _settled([row for row, _ in of_all], rows_of(results, "standing"))
+    if settled or not (wanted or _by_task(results)):
+        return settled
+    if _by_task(results):
+        return f"{TAKE}for each task the candidate that is better there; none is on all tasks."
     more, pair = min(wanted)
-    tasks = sum(each == pair for _, each in asked) - 1
-    split = f" (in total: {-(-more // tasks)} on each of {tasks} tasks)" if tasks > 1 else ""
+    tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
+    one = -(-more // max(1, len(tasks)))
+    first, second = (n if n.startswith("with") else f"of {n}" for n in _apart(pair))
+    where = f": {', '.join(tasks)}" if len(tasks) <= NAMED_TASKS else ""
+    split = f" on each of {len(tasks)} tasks{where}" if len(tasks) > 1 else ""
+    words = f"make {one} more {noun('trial', one)} {first} and {one} {second}{split}"
+    then = "that would likely decide between them"
+    if len(wanted) > 1:
+        then += f", all that is open after up to {max(wanted)[0]} of each"
+    return f"{words}; {then}."
+
+
+def _apart(pair: tuple[str, str]) -> list[str]:
+    """Name two candidates without what they have in common."""
     parts = [both for both in zip(*(n.split(", ") for n in pair), strict=False) if len({*both}) > 1]
-    differ = " and ".join(map(", ".join, zip(*parts, strict=True)))  # without what they share
-    words = f"try {differ} {more} more {noun('time', more)} each{split}"
-    return f"{words}; that would likely decide between them."
+    return [", ".join(each) for each in zip(*parts, strict=True)]
 
 
 def _settled(compared: Sequence[Row], standing: Sequence[Row]) -> str:
@@ -301,7 +339,7 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
         parts.append(
             f"Their correlation, {size}{_ends(r, '.2f')}, {SAYS_NOTHING}: its interval is too wide."
             if says_nothing(r)
-            else f"Their correlation is {size}{_ends(r, '.2f')}."
+            else f"Their correlation is {size}{_ends(r, '.2f')}{_may_be_none(r)}."
             if not r.is_beyond
             else f"Measured {size}; without the noise of counting r lies in{_ends(r, '.2f')}."
         )
@@ -325,9 +363,14 @@ def _all_alike(results: Results) -> tuple[str, str]:
     ends = wilson(k, n)
     told = f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies between "
     told += f"{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
-    few = f"record more trials; {n} {'say' if n > 1 else 'says'} next to nothing."
+    few = f"record at least {SAYS_LITTLE} trials of each candidate on each task; {n} "
+    few += f"{'say' if n > 1 else 'says'} next to nothing."
     alike = f"try {task} task: where all trials end alike, no candidate is better."
     return told, few if n < SAYS_LITTLE else alike
+
+
+def _may_be_none(r: Measurement) -> str:
+    return ", and may be none" if r.interval is not None and r.interval.low <= 0 else ""
 
 
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:

@@ -127,13 +127,21 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     ]
     table = Table(id="comparisons", title="t", columns=columns, rows=tuple(rows))
     results = Results(run="r", source="trials", stand_in=None, tables=(table,))
-    words = "try C and B 1 more time each; that would likely decide between them."
-    assert next_trials(results) == words
+    words = "make 1 more trial of C and 1 of B; that would likely decide between them, all that is"
+    assert next_trials(results) == f"{words} open after up to 40 of each."
     in_tasks = replace(
         table, rows=(rows[0], *(compared(t, "A", "no", 9) for t in ("pour", "stir")))
     )
     of_tasks = next_trials(replace(results, tables=(in_tasks,)))
-    assert of_tasks.startswith("try A and B 40 more times each (in total: 20 on each of 2 tasks);")
+    assert of_tasks.startswith(
+        "make 20 more trials of A and 20 of B on each of 2 tasks: pour, stir;"
+    )
+    opposed = replace(
+        in_tasks,
+        rows=tuple(compared(*w, 0) for w in zip("xy", "AA", ("better", "worse"), strict=True)),
+    )
+    assert "for each task the candidate" in next_trials(replace(results, tables=(opposed,)))
+    assert "B on x, A on y." in " ".join(front(replace(results, tables=(opposed,))).sentences)
     decided = replace(table, rows=tuple(rows[2:]))
     assert next_trials(replace(results, tables=(decided,))) == ""
     beaten = Table(
@@ -142,11 +150,11 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
         columns=("candidate", "k", "n", "may be best"),
         rows=(("C", 1, 9, "no"), ("A", 8, 9, "yes"), ("B", 8, 9, "yes")),
     )
-    assert "try A and B" in next_trials(replace(results, tables=(table, beaten)))
+    assert "of A and 40 of B" in next_trials(replace(results, tables=(table, beaten)))
     pair = [compared(ALL_TASKS, "A, without replanning", "no", 9)]
     pair[0] = (*pair[0][:3], "A, with replanning", *pair[0][4:])
     next_step = next_trials(replace(results, tables=(replace(table, rows=tuple(pair)),)))
-    assert next_step.startswith("try without replanning and with replanning 9 more times each;")
+    assert next_step.startswith("make 9 more trials without replanning and 9 with replanning;")
 
 
 def shown(tmp_path: Path, text: str) -> tuple[str, str]:
