@@ -542,9 +542,10 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         id="comparisons",
         title="Which is better, as recorded",
         note=f"Group-sequential score test, {words}, extended by doubling; alpha {plan.alpha:g} "
-        "holds however often one looks; over all tasks each is counted in turn. All questions share it (Holm), a primary one has it alone, "
-        "the same in each task share another, progress and time to success a third. Intervals hold "
-        "at every look. Trials without an outcome are failures.",
+        "holds however often one looks; over all tasks each is counted in turn. All questions "
+        "share it (Holm), a primary one has it alone, the same in each task share another, "
+        "progress and time to success a third. Intervals hold at every look. Trials without an "
+        "outcome are failures.",
     )
     return Part(
         measurements=tuple(_measured(each) for each in answers), tables=(table, *_standing(answers))
