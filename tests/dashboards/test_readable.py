@@ -28,11 +28,12 @@ def page(
         yield tab, url
 
 
-@pytest.mark.parametrize("width", [390, 1440])
-@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize(
+    ("width", "dark"), [(390, False), (1440, True)]
+)  # neither hangs on the other
 @pytest.mark.parametrize("address", PAGES)
 def test_every_page_can_be_read_by_everyone(
-    page: tuple[Browser, str], address: str, dark: bool, width: int
+    page: tuple[Browser, str], address: str, width: int, dark: bool
 ) -> None:
     tab, url = page
     tab.show(url + address, width=width, dark=dark)
