@@ -1,6 +1,6 @@
 """What segmentation gives: masks in images, instances in the scene."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,17 +30,6 @@ class Mask:
     """What the segmenter calls it; may be empty."""
     score: float = 1.0
     """The segmenter's confidence, 0..1."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MaskSet:
-    """All masks of one frame; ids need not agree between frames, masks may overlap."""
-
-    camera_id: str
-    stamp_ns: int
-    masks: Sequence[Mask]
-    source: str = "supplied masks"
-    """Which segmenter made them."""
 
 
 @dataclass(frozen=True, kw_only=True)

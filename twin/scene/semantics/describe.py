@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from bridge.terminal import Advance
 from twin.naming.colours import colour_name
-from twin.naming.things import NAMED, Instance, MaskSet, SemanticScene
+from twin.naming.things import NAMED, Instance, Mask, SemanticScene
 from twin.naming.words import kind_of, label_of
 from twin.scene.frames.rgbd import NEAR_M
 from twin.scene.gaussians import GaussianCloud, moved_cloud
@@ -21,7 +21,6 @@ from twin.scene.semantics.masks import associate, observe
 from twin.scene.semantics.part_segmentation import find_parts
 from twin.scene.semantics.segment import (
     SOURCE,
-    SegmentConfig,
     Thing,
     points_of,
     segment,
@@ -30,7 +29,6 @@ from twin.scene.semantics.segment import (
 from twin.scene.semantics.shape_descriptors import CONTAINER, measure_shape
 from twin.scene.semantics.support import (
     NoSupportError,
-    SupportConfig,
     SupportPlane,
     find_support,
     level_frame,
@@ -60,36 +58,20 @@ Item = TypeVar("Item")
 
 def scene_from_masks(
     cloud: GaussianCloud,
-    frames: Iterable[tuple[Viewpoint, MaskSet]],
+    frames: Iterable[tuple[Viewpoint, Sequence[Mask]]],
     rasteriser: Rasteriser,
+    source: str,
     advance: Advance = lambda done, note: None,
 ) -> SemanticScene:
     """Fuse the masks of a 2D segmenter into the Gaussians of a scene."""
-    observations, sources = [], []
-    for viewpoint, masks in _told(frames, 0, SHOWN, advance, "masks lifted"):
-        observations.append(observe(rasteriser, cloud, viewpoint, masks))
-        sources.append(masks.source)
-    source = ", ".join(dict.fromkeys(sources)) or "no masks"
-    tracks, labels = associate(observations, len(cloud))
+    observations = [
+        observe(rasteriser, cloud, viewpoint, masks)
+        for viewpoint, masks in _told(frames, 0, SHOWN, advance, "masks lifted")
+    ]
+    found, labels = associate(observations, len(cloud), source)
     plane = support_of(cloud)
-    instances = tuple(
-        describe(
-            cloud,
-            Instance(
-                id=number,
-                label=track.label,
-                mask=track.mask,
-                support=track.support,
-                seen=track.seen,
-                score=track.score,
-                source=source,
-            ),
-            plane,
-        )
-        for number, track in enumerate(
-            _told(tracks, SHOWN, 100, advance, "things measured"), start=1
-        )
-    )
+    told = _told(found, SHOWN, 100, advance, "things measured")
+    instances = tuple(describe(cloud, thing, plane) for thing in told)
     num_masks = sum(len(item.labels) for item in observations)
     remark = (
         f"{num_masks} masks in {len(observations)} frames gave no instance: each needs matching "
@@ -103,7 +85,6 @@ def scene_by_default(
     cloud: GaussianCloud,
     viewpoints: Iterable[Viewpoint],
     rasteriser: Rasteriser,
-    config: SegmentConfig | None = None,
     known: Mapping[str, Bool[np.ndarray, " num_splats"]] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
     fused: GaussianCloud | None = None,
@@ -125,12 +106,11 @@ def scene_by_default(
             in the scene's Gaussians, which a fit put where colours change.
     """
     frames, surfaces_m = list(viewpoints), surfaces_m or {}
-    config = config or SegmentConfig()
     ids = np.flatnonzero(solid_splats(cloud))
     searched = cloud.take(ids) if fused is None else fused
     points = points_of(searched)
     Ts = [frame.T_base_camera for frame in frames]
-    T_level_base = level_frame(points.p_m, points.normals, Ts, config.support)
+    T_level_base = level_frame(points, Ts)
     is_level = np.array_equal(T_level_base, np.eye(4))
     if not is_level:
         cloud, searched = (moved_cloud(item, T_level_base) for item in (cloud, searched))
@@ -141,7 +121,7 @@ def scene_by_default(
     things: tuple[Thing, ...] = ()
     plane: SupportPlane | None = None
     try:
-        found = segment(points, config)
+        found = segment(points)
     except NoSupportError as error:
         remark = str(error)
     else:
@@ -268,9 +248,8 @@ def _within_edges(
 
 def support_of(cloud: GaussianCloud) -> SupportPlane | None:
     """The plane that things stand on, if there is one."""
-    points = points_of(cloud.take(solid_splats(cloud)))
     try:
-        return find_support(points.p_m, points.normals, SupportConfig())
+        return find_support(points_of(cloud.take(solid_splats(cloud))))
     except NoSupportError:
         return None
 

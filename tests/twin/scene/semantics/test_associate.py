@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from twin.scene.semantics.masks import Observation, Track, associate
+from twin.naming.things import Instance
+from twin.scene.semantics.masks import Observation, associate
 
 NUM_SPLATS = 400
 THINGS = {"cube": range(100), "duck": range(150, 230), "box": range(260, 400)}
@@ -34,14 +35,14 @@ def frames(count: int = 8, seed: int = 0) -> list[Observation]:
     return [observation(rng, [str(n) for n in rng.permutation(list(THINGS))]) for _ in range(count)]
 
 
-def run(observations: list[Observation]) -> tuple[Track, ...]:
+def run(observations: list[Observation]) -> tuple[Instance, ...]:
     tracks, labels = associate(observations, NUM_SPLATS)
     for number, track in enumerate(tracks, start=1):
         np.testing.assert_array_equal(labels == number, track.mask)
     return tracks
 
 
-def by_label(tracks: tuple[Track, ...]) -> dict[str, np.ndarray]:
+def by_label(tracks: tuple[Instance, ...]) -> dict[str, np.ndarray]:
     return {track.label: track.mask for track in tracks}
 
 
