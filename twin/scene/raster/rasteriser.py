@@ -114,6 +114,8 @@ class StepReport:
     """How much of it one thread spent alone: by Amdahl's law it bounds what more threads gain."""
 
 
+L1_SHARE = 0.8
+"""Of the L1 term in the loss 3dgs."""
 OFTEN, RARELY = 32, 256
 """Steps from one with the slower number of threads to the next: rarely where it is far slower."""
 FAR_SLOWER = 1.3
@@ -165,12 +167,11 @@ class FitSession:
         *,
         loss: Literal["3dgs", "paper"] = "3dgs",
         depth_weight: float = 0.1,
-        l1_share: float = 0.8,
     ) -> None:
         """Copy the cloud; moments start at zero."""
         self.config = config or RasterConfig()
         self.steps = 0
-        self._loss = (loss == "3dgs", l1_share, depth_weight)
+        self._loss = (loss == "3dgs", L1_SHARE, depth_weight)
         self._native = load_native().FitSession(self.config.threads, self.config.isa)
         self._pace = ThreadPace(self.config.threads or os.cpu_count() or 1)
         self._cloud = _own_copy(cloud)
@@ -225,20 +226,10 @@ class FitSession:
             serial_s=serial_s,
         )
 
-    def planes(self) -> Float32[np.ndarray, "5 height width"]:
-        """A copy of what the last step drew, before the exposure."""
-        drawn: np.ndarray = self._native.planes()
-        return drawn
-
     def gradient(self, report: StepReport) -> CloudGradient:
         """A copy of the last step's gradient; ``report`` is that step's."""
         named = dict(zip(NAMES, self._native.gradients(), strict=True))
         return CloudGradient(**named, T_camera_base=report.T_camera_base)
-
-    def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
-        """Say which Gaussians could touch the last image."""
-        mask: np.ndarray = self._native.visible()
-        return mask
 
     def rearrange(
         self, cloud: GaussianCloud, parents: Int64[np.ndarray, " num_splats"] | None = None
