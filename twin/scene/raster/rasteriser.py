@@ -68,21 +68,6 @@ class RasterConfig:
     """What ``backend.open_rasteriser`` opens; ``Rasteriser`` itself is the CPU."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CloudGradient:
-    """Gradient of a scalar with respect to each array of a ``GaussianCloud``."""
-
-    means_m: Float32[np.ndarray, "num_splats 3"]
-    quats_wxyz: Float32[np.ndarray, "num_splats 4"]
-    scales_log: Float32[np.ndarray, "num_splats 3"]
-    opacities_logit: Float32[np.ndarray, " num_splats"]
-    colors: Float32[np.ndarray, "num_splats 3"]
-    harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"]
-    T_camera_base: Float[np.ndarray, "3 4"]
-    """With respect to the twelve entries of the upper part of that matrix, the camera centre of
-    the viewing directions being -R^T t of them."""
-
-
 def native_camera(
     camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float32[np.ndarray, "3 4"], tuple[int, int, float, float, float, float]]:
@@ -107,7 +92,8 @@ class StepReport:
     gain: Float[np.ndarray, "3"]
     """Gradient of the loss on the diagonal of the exposure."""
     T_camera_base: Float[np.ndarray, "3 4"]
-    """Gradient of the loss on the camera's pose, as in ``CloudGradient``."""
+    """Gradient of the loss on the entries of that matrix, the camera centre of the viewing
+    directions being -R^T t of them."""
     seconds: Mapping[str, float]
     """Wall time of each stage: draw, compare, pull, learn."""
     serial_s: float
@@ -226,11 +212,6 @@ class FitSession:
             serial_s=serial_s,
         )
 
-    def gradient(self, report: StepReport) -> CloudGradient:
-        """A copy of the last step's gradient; ``report`` is that step's."""
-        named = dict(zip(NAMES, self._native.gradients(), strict=True))
-        return CloudGradient(**named, T_camera_base=report.T_camera_base)
-
     def rearrange(
         self, cloud: GaussianCloud, parents: Int64[np.ndarray, " num_splats"] | None = None
     ) -> None:
@@ -314,15 +295,6 @@ class Rasteriser:
             cloud.harmonics if cloud.num_harmonics else None,
         )
         return planes
-
-    def pull_back(
-        self,
-        planes: Float32[np.ndarray, "5 height width"],
-        plane_gradients: Float32[np.ndarray, "5 height width"],
-    ) -> CloudGradient:
-        """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud."""
-        *rows, pose = self._native.pull(planes, plane_gradients)
-        return CloudGradient(**dict(zip(NAMES, rows, strict=True)), T_camera_base=pose)
 
     def draw_features(
         self, features: Float32[np.ndarray, "num_splats num_channels"]
