@@ -40,10 +40,6 @@ class Instance:
     """Its value in ``SemanticScene.labels``; from 1."""
     label: str
     mask: Bool[np.ndarray, " num_splats"]
-    support: int
-    """Frames that vouch for it: a mask of theirs was matched, or they show it."""
-    seen: int
-    """Frames in which enough of it is visible."""
     score: float
     """0..1: mean confidence of its masks; of the default segmenter the share of firm points."""
     source: str

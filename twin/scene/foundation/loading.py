@@ -6,7 +6,6 @@ are resized and normalised in torch, without torchvision.
 
 import importlib
 import json
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -136,12 +135,11 @@ def read_normalisation(folder: Path, kind: WeightsKind) -> Normalisation:
     content, values = _json(path, kind), []
     for name, standard in zip(("image_mean", "image_std"), kind.colours, strict=True):
         given = content.get(name, list(standard))
-        is_numbers = isinstance(given, list) and all(isinstance(v, int | float) for v in given)
-        if not is_numbers or len(given) != 3 or not all(0 <= v < 10 for v in given):
+        is_three = isinstance(given, list) and len(given) == 3
+        is_numbers = is_three and all(isinstance(v, int | float) and 0 <= v < 10 for v in given)
+        if not is_numbers or (name == "image_std" and 0 in given):
             raise kind.refuse(folder, f"{path.name}: {name} is {given!r}")
         values.append(tuple(float(v) for v in given))
-    if math.prod(values[1]) == 0.0:
-        raise kind.refuse(folder, f"{path.name}: image_std holds a 0")
     return values[0], values[1]
 
 

@@ -1,12 +1,11 @@
 """Semantics as a stage of ``rebuild``: ask the models, find what is what, write it down."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import UsageError
@@ -147,8 +146,6 @@ def find_things(
     Nothing found is a remark, not an error: the scene is good without.
 
     Args:
-        background: Those that nobody measured are guessed surfaces: without masks no thing is
-            looked for in them.
         objects: Moved to where they were scanned; without masks each is an instance of that name.
         masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
         surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
@@ -161,40 +158,18 @@ def find_things(
         if masks:
             return scene_from_masks(cloud, masks, rasteriser, Sam3Segmenter.kind.name, advance)
         owner = np.repeat(np.arange(len(sizes)), sizes)
-        measured = np.ones(len(cloud), dtype=bool)
-        measured[: len(background)] = ~background.completed
-        scene = scene_by_default(
-            cloud.take(measured),
+        return scene_by_default(
+            cloud,
             viewpoints[:: -(-len(viewpoints) // MAX_VIEWPOINTS) or 1],
             rasteriser,
-            known={key: (owner == n)[measured] for n, key in enumerate(objects, start=1)},
+            known={key: owner == n for n, key in enumerate(objects, start=1)},
             surfaces_m=surfaces_m,
             fused=fused,
             advance=advance,
         )
-        return _among_all(scene, measured)
     except SemanticsError as error:
         nothing = np.zeros(len(cloud), dtype=np.uint16)
         return SemanticScene(instances=(), labels=nothing, source=SOURCE, remark=str(error))
-
-
-def _among_all(scene: SemanticScene, measured: Bool[np.ndarray, " num_splats"]) -> SemanticScene:
-    """The same things among all Gaussians; only the measured ones were looked at."""
-
-    def spread_out(values: np.ndarray) -> np.ndarray:
-        spread_values = np.zeros(len(measured), dtype=values.dtype)
-        spread_values[measured] = values
-        return spread_values
-
-    things = tuple(
-        replace(
-            item,
-            mask=spread_out(item.mask),
-            parts={name: spread_out(mask) for name, mask in item.parts.items()},
-        )
-        for item in scene.instances
-    )
-    return replace(scene, instances=things, labels=spread_out(scene.labels))
 
 
 def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFrame]:

@@ -143,8 +143,6 @@ def make_patches(
 
 MAX_COLOURS = 4
 """Colours to look for in one group."""
-LIGHTNESS_WEIGHT = 0.3
-"""Shading changes lightness, not the ratios of a and b to it."""
 COLOUR_NOISE = 5.0
 """Spread of one colour, in Lab units; groups tighter than this gain nothing by a cut."""
 MIN_COLOUR_GAP = 20.0
@@ -282,7 +280,7 @@ def split_by_colour(
     pieces of one colour. A piece much smaller than its neighbour is a marking (a beak, a label)
     and joins it, unless it lies in the neighbour's cavity.
     """
-    colour = without_shading(voxels.lab, LIGHTNESS_WEIGHT)
+    colour = without_shading(voxels.lab)
     classes = _colour_classes(colour)
     if classes.max(initial=0) == 0:
         return classes

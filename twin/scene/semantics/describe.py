@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64, UInt16
+from jaxtyping import Bool, Float, UInt16
 from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
@@ -21,7 +21,6 @@ from twin.scene.semantics.masks import associate, observe
 from twin.scene.semantics.part_segmentation import find_parts
 from twin.scene.semantics.segment import (
     SOURCE,
-    Thing,
     points_of,
     segment,
     solid_splats,
@@ -92,21 +91,22 @@ def scene_by_default(
 ) -> SemanticScene:
     """Segment the scene with the default segmenter.
 
-    Support and seen count the viewpoints that show an instance; what fewer than two of them show
-    whole is left out. A scene without a level plane, or with nothing on it, gives only what is
-    known already, and a remark that says so. Where z of the scene's frame does not point up, the
-    work is done in a frame where it does, and a remark says that, too.
+    What fewer than two viewpoints show whole is left out. A scene without a level plane, or with
+    nothing on it, gives only what is known already, and a remark that says so. Where z of the
+    scene's frame does not point up, the work is done in a frame where it does, and a remark says
+    that, too.
 
     Args:
         known: Gaussians of the objects that a task names, by their ids. They come first, under
-            their names.
+            their names. In others that nobody measured no thing is looked for.
         surfaces_m: Points of the reconstructed surfaces of some of them, where they stand: parts
             are told apart on these, which are thinner than any coat of Gaussians.
         fused: The surface as it was measured, evenly sampled: things are looked for in it. None:
             in the scene's Gaussians, which a fit put where colours change.
     """
-    frames, surfaces_m = list(viewpoints), surfaces_m or {}
-    ids = np.flatnonzero(solid_splats(cloud))
+    frames, surfaces_m, known = list(viewpoints), surfaces_m or {}, known or {}
+    is_measured = np.any([~cloud.completed, *known.values()], axis=0)
+    ids = np.flatnonzero(solid_splats(cloud) & is_measured)
     searched = cloud.take(ids) if fused is None else fused
     points = points_of(searched)
     Ts = [frame.T_base_camera for frame in frames]
@@ -118,17 +118,15 @@ def scene_by_default(
         frames = [replace(f, T_base_camera=T_level_base @ f.T_base_camera) for f in frames]
         surfaces_m = {key: se3.apply(T_level_base, p) for key, p in surfaces_m.items()}
     labels = np.zeros(len(cloud), dtype=np.uint16)
-    things: tuple[Thing, ...] = ()
-    plane: SupportPlane | None = None
-    try:
-        found = segment(points)
-    except NoSupportError as error:
-        remark = str(error)
-    else:
-        labels[ids] = _nearest_label(found.labels, points.p_m, cloud.means_m[ids])
-        things, plane, remark = found.things, found.plane, found.remark
+    found = segment(points)
+    far_m, nearest = cKDTree(points.p_m).query(
+        cloud.means_m[ids], distance_upper_bound=NEAR_POINT_M
+    )
+    of_point = np.append(found.labels, 0)  # the query gives the number of points where none is near
+    labels[ids] = np.where(np.isfinite(far_m), of_point[nearest], 0)
+    things, remark = found.things, found.remark
     advance(FOUND, f"{len(things)} things found")
-    keys, others, labels = numbered(labels, known or {})
+    keys, others, labels = numbered(labels, known)
     named = [(key, "", 1.0, NAMED) for key in keys]
     named += [("", things[n - 1].label, things[n - 1].score, SOURCE) for n in others]
     looked = _told(frames, FOUND, SHOWN, advance, "frames looked at")
@@ -149,29 +147,16 @@ def scene_by_default(
             id=int(new_number[old]),
             label=label,
             mask=labels == new_number[old],
-            support=shown[old],
-            seen=shown[old],
             score=score,
             source=source,
         )
-        item = describe(cloud, item, plane, key, surfaces_m.get(key))
+        item = describe(cloud, item, found.plane, key, surfaces_m.get(key))
         T = se3.invert(T_level_base) @ item.T_base_instance
         instances.append(item if is_level else replace(item, T_base_instance=T))
     if not is_level:
         up = ", ".join(f"{value:.2f}" for value in T_level_base[2, :3])
         remark = " ".join(filter(None, [remark, f"z does not point up here, ({up}) does"]))
     return SemanticScene(instances=tuple(instances), labels=labels, source=SOURCE, remark=remark)
-
-
-def _nearest_label(
-    labels: Int64[np.ndarray, " num_points"],
-    p_m: Float[np.ndarray, "num_points 3"],
-    wanted_m: Float32[np.ndarray, "num_splats 3"],
-) -> UInt16[np.ndarray, " num_splats"]:
-    """What the nearest point belongs to; nothing where none is near."""
-    far_m, nearest = cKDTree(p_m).query(wanted_m, distance_upper_bound=NEAR_POINT_M)
-    known = np.append(labels, 0)  # the query gives the number of points where none is near
-    return np.asarray(np.where(np.isfinite(far_m), known[nearest], 0), dtype=np.uint16)
 
 
 def numbered(

@@ -90,20 +90,13 @@ def associate(
         of_thing = _share(observations, members, num_splats)
         support, seen = _counts(observations, members, of_thing > INSIDE)
         if support >= MIN_SUPPORT and support > MIN_HITS * seen:
-            kept.append((members, support, seen))
+            kept.append(members)
             share.append(of_thing)
     best = np.max(share, axis=0)
     owner = np.where(best > 1.0 - best, np.argmax(share, axis=0), 0)
     things = [
-        Instance(
-            id=0,
-            mask=owner == number,
-            support=support,
-            seen=seen,
-            source=source,
-            **_named(observations, members),
-        )
-        for number, (members, support, seen) in enumerate(kept, start=1)
+        Instance(id=0, mask=owner == number, source=source, **_named(observations, members))
+        for number, members in enumerate(kept, start=1)
         if int((owner == number).sum()) >= MIN_SPLATS
     ]
     things.sort(key=lambda item: (-int(item.mask.sum()), item.label, int(item.mask.argmax())))

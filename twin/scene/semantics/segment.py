@@ -18,7 +18,6 @@ from bridge.geometry import se3
 from twin.naming.colours import colour_name, lab_from_srgb, without_shading
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.semantics.cluster import (
-    LIGHTNESS_WEIGHT,
     SurfacePoints,
     Voxels,
     extents_m,
@@ -106,14 +105,9 @@ class Segmentation:
     """Why nothing was found; empty otherwise."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Look:
-    """What belongs together, seen with voxels of one size."""
-
-    labels: Int[np.ndarray, " num_points"]
-    """Index of the thing plus one, the largest first; 0 is the background."""
-    voxel_m: float
-    """Cells in which the shape of a thing is measured."""
+Look = tuple[Int[np.ndarray, " num_points"], float]
+"""What belongs together, seen with voxels of one size: index of each point's thing plus one, the
+largest first, 0 is the background; and the size of the cells in which their shape is measured."""
 
 
 def segment(points: SurfacePoints) -> Segmentation:
@@ -130,7 +124,7 @@ def segment(points: SurfacePoints) -> Segmentation:
         labels[mask] = number
     things = tuple(ground.thing(mask, voxel_m) for mask, voxel_m in kept)
     remark = "" if things else ground.nothing
-    if not things and looks[0].labels.any():
+    if not things and looks[0][0].any():
         remark = f"of what stands out, no two of {len(looks)} sizes of voxels find the same"
     return Segmentation(labels=labels, things=things, plane=ground.plane, remark=remark)
 
@@ -138,16 +132,16 @@ def segment(points: SurfacePoints) -> Segmentation:
 def stable(looks: Sequence[Look]) -> list[tuple[Bool[np.ndarray, " num_points"], float]]:
     """What at least half the other looks find again, with the voxels it was found with."""
     found = []
-    for look in looks:
-        others = [other for other in looks if other is not look]
-        for number in range(1, int(look.labels.max(initial=0)) + 1):
-            mask = look.labels == number
-            best = np.array([_best_iou(mask, other.labels) for other in others])
+    for labels, voxel_m in looks:
+        others = [other for other, _ in looks if other is not labels]
+        for number in range(1, int(labels.max(initial=0)) + 1):
+            mask = labels == number
+            best = np.array([_best_iou(mask, other) for other in others])
             share = float((best >= SAME_IOU).mean())
             if share >= 0.5:
-                found.append((share + float(best.mean()), mask, look.voxel_m))
+                found.append((share + float(best.mean()), mask, voxel_m))
     kept: list[tuple[np.ndarray, float]] = []
-    taken = np.zeros(len(looks[0].labels), dtype=bool)
+    taken = np.zeros(len(looks[0][0]), dtype=bool)
     for _, mask, voxel_m in sorted(found, key=lambda item: -item[0]):
         if taken[mask].mean() <= MAX_TAKEN:
             kept.append((mask & ~taken, voxel_m))
@@ -178,7 +172,7 @@ class OverPlane:
         self._points, self.plane = points, plane
         self._height = height = plane.height_m(points.p_m)
         under = plane.under(points.p_m)
-        self._lab = without_shading(lab_from_srgb(points.colors), LIGHTNESS_WEIGHT)
+        self._lab = without_shading(lab_from_srgb(points.colors))
         free = under & (height < limits.max_height_m)
         raised = free & (height > limits.min_height_m)
         self._low = free & (np.abs(height) <= limits.min_height_m)
@@ -203,7 +197,7 @@ class OverPlane:
         labels = _largest_first(labels)
         _add_floors(labels, points.p_m, self._lab, self._low)
         labels = _without_relief(labels, self._lab, self._low, height, limits)
-        return Look(labels=labels, voxel_m=voxel_m)
+        return labels, voxel_m
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""
@@ -229,9 +223,7 @@ class WithoutPlane:
     def look(self, scale: float) -> Look:
         """Cut them, with voxels so many times as large as their spacing asks for."""
         labels = cut_into_patches(self._points, self._spacing_m, scale)
-        if not labels.any():
-            raise NoSupportError(self.nothing)
-        return Look(labels=_largest_first(labels), voxel_m=VOXEL_M)
+        return _largest_first(labels), VOXEL_M
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""

@@ -189,10 +189,20 @@ def _word(
     return _bulk(xyh_m)
 
 
+def _along_principal(p_m: np.ndarray) -> np.ndarray:
+    away = p_m - p_m.mean(axis=0)
+    return np.asarray(away @ np.linalg.eigh(away.T @ away)[1])
+
+
+def sides_m(p_m: np.ndarray) -> np.ndarray:
+    """Extents along the principal axes without the outermost 2 %, largest first."""
+    low, high = np.quantile(_along_principal(p_m), [0.02, 0.98], axis=0)
+    return np.asarray(np.sort(high - low)[::-1])
+
+
 def _bulk(points: np.ndarray) -> str:
     """Of a shape that stands askew, or is half seen: thin, or filling its box, or neither."""
-    away = points - points.mean(axis=0)
-    along = away @ np.linalg.eigh(away.T @ away)[1]
+    along = _along_principal(points)
     low, high = np.quantile(along, [0.02, 0.98], axis=0)
     short, middle, long = np.sort(high - low)
     if short < SLAB * middle:

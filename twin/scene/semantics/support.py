@@ -201,12 +201,14 @@ def _largest_plane(p_m: np.ndarray) -> SupportPlane | None:
     votes = (np.abs(normals @ some.T - offsets[:, None]) < TOLERANCE_M).sum(axis=1)
     best = int(np.argmax(votes))
     normal, offset = normals[best], float(offsets[best])
-    for refined in (True, True, True, False):
-        inside = np.abs(p_m @ normal - offset) < TOLERANCE_M
+    inside = np.abs(p_m @ normal - offset) < TOLERANCE_M
+    for _ in range(3):
         if inside.sum() < MIN_POINTS:
             return None
-        if refined:
-            normal, offset = _refined(p_m[inside])
+        normal, offset = _refined(p_m[inside])
+        inside = np.abs(p_m @ normal - offset) < TOLERANCE_M
+    if inside.sum() < MIN_POINTS:
+        return None
     footprint, corner = _footprint(p_m[inside])
     return SupportPlane(
         normal=normal,

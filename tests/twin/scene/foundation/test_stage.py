@@ -65,8 +65,6 @@ def things(labels: np.ndarray) -> SemanticScene:
             id=number,
             label=label,
             mask=labels == number,
-            support=3,
-            seen=3,
             score=1.0,
             source="test",
             color_srgb=(0, 0, 0),

@@ -18,7 +18,7 @@ def looked(*found: list[range]) -> list[Look]:
         labels = np.zeros(100, dtype=np.int64)
         for number, members in enumerate(things, start=1):
             labels[list(members)] = number
-        looks.append(Look(labels=labels, voxel_m=0.004))
+        looks.append((labels, 0.004))
     return looks
 
 
