@@ -19,7 +19,7 @@ from twin.scene.gaussians import (
 )
 from twin.scene.movable_scene import MovableScene
 from twin.scene.objects.decompose import ObjectSplats
-from twin.scene.raster.rasteriser import FitSession, RasterConfig, Rasteriser, available_isas
+from twin.scene.raster.rasteriser import NAMES, FitSession, RasterConfig, Rasteriser, available_isas
 from twin.scene.sequence import Artist, Frame
 
 VGA = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
@@ -65,8 +65,8 @@ def surface_cloud(camera: Camera, count: int) -> GaussianCloud:
 
 def native(cloud: GaussianCloud, camera: Camera, rasteriser: Rasteriser) -> tuple[np.ndarray, ...]:
     planes = rasteriser.draw_planes(cloud, camera, np.eye(4))
-    gradient = rasteriser.pull_back(planes, np.ones_like(planes))
-    return planes, gradient.colors
+    gradients = rasteriser._native.pull(planes, np.ones_like(planes))
+    return planes, gradients[NAMES.index("colors")]
 
 
 def against_numba(counts: tuple[int, ...], repeats: int) -> list[Target]:

@@ -157,7 +157,7 @@ def scene_lattice(mesh: str, size_m: tuple[float, float, float]) -> dict[str, np
     """The arrays that rebuilding a scene would write of a toy that was seen from all sides."""
     surface = toy_mesh(mesh, size_m)
     points = surface.vertices_m
-    found = lattice(shape_of_mesh(points, surface.triangles, points))
+    found = lattice(shape_of_mesh(points, surface.triangles))
     return {
         "nodes_m": found.nodes_m,
         "tets": found.tets,

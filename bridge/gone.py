@@ -50,14 +50,13 @@ GONE: dict[str, str] = {
         ("rebuild --align-poses", "rebuild --refine-poses", "rebuild --align-holdout"),
         "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them.",
     ),
+    "rebuild --correct-geometry": "Import again: import rgbd --depth-unit-m, --depth-intrinsics.",
     "rebuild --features": "Nothing read them; with --clip robot-gst find goes by meaning.",
     "rebuild --feature-channels": "Nothing read features; see rebuild --clip.",
     "rebuild --feature-stride": "Nothing read features; see rebuild --clip.",
     "rebuild --depth-model": "rebuild needs depth images: it finds no depth of its own.",
-    **dict.fromkeys(
-        ("rebuild --generator", "rebuild --generator-timeout-s"),
-        "Shapes are carved from what the cameras saw.",
-    ),
+    "rebuild --generator": "Shapes are carved from what the cameras saw.",
+    "rebuild --generator-timeout-s": "Shapes are carved from what the cameras saw.",
     **dict.fromkeys(
         ("evaluate --live", "evaluate --recorder", "evaluate --connect", "evaluate --goal"),
         "evaluate says how many more trials would likely decide a comparison.",

@@ -33,8 +33,6 @@ def asker() -> Asker:
                 id=number,
                 label=label,
                 mask=mask,
-                support=5,
-                seen=5,
                 score=1.0,
                 source="test",
                 color_srgb=color,

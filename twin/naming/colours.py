@@ -20,6 +20,8 @@ _WHITE = _XYZ_FROM_RGB.sum(axis=1)
 GREY_CHROMA = 11.0
 """Less colourful is black, grey or white."""
 GREYS = ("black", "grey", "white")
+LIGHTNESS_WEIGHT = 0.3
+"""Shading changes lightness, not the ratios of a and b to it."""
 DULL_CHROMA = 42.0
 """Warm colours below this are brown or beige."""
 _HUES = (
@@ -94,12 +96,10 @@ def near_colours(color_srgb: tuple[int, int, int]) -> set[str]:
     }
 
 
-def without_shading(
-    lab: Float[np.ndarray, "num_colours 3"], lightness_weight: float
-) -> Float[np.ndarray, "num_colours 3"]:
+def without_shading(lab: Float[np.ndarray, "num_colours 3"]) -> Float[np.ndarray, "num_colours 3"]:
     """Lab as it would be at lightness 50, and a little of the lightness itself.
 
     Light that is s times as strong multiplies a, b and L + 16 by the cube root of s.
     """
     strength = np.maximum(lab[:, :1] + 16.0, 25.0) / 66.0
-    return np.concatenate([lightness_weight * lab[:, :1], lab[:, 1:] / strength], axis=1)
+    return np.concatenate([LIGHTNESS_WEIGHT * lab[:, :1], lab[:, 1:] / strength], axis=1)

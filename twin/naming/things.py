@@ -1,6 +1,6 @@
 """What segmentation gives: masks in images, instances in the scene."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,17 +33,6 @@ class Mask:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MaskSet:
-    """All masks of one frame; ids need not agree between frames, masks may overlap."""
-
-    camera_id: str
-    stamp_ns: int
-    masks: Sequence[Mask]
-    source: str = "supplied masks"
-    """Which segmenter made them."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Instance:
     """One thing of the scene, as a set of its Gaussians."""
 
@@ -51,10 +40,6 @@ class Instance:
     """Its value in ``SemanticScene.labels``; from 1."""
     label: str
     mask: Bool[np.ndarray, " num_splats"]
-    support: int
-    """Frames that vouch for it: a mask of theirs was matched, or they show it."""
-    seen: int
-    """Frames in which enough of it is visible."""
     score: float
     """0..1: mean confidence of its masks; of the default segmenter the share of firm points."""
     source: str

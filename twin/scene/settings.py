@@ -70,10 +70,6 @@ class FrameConfig:
     check_poses: Annotated[bool, RARE] = True
     """Refuse poses that fit the depth only when read in another convention, and cameras that move
     while their poses stand still."""
-    correct_geometry: Annotated[bool, RARE] = False
-    """Where one number makes the depth of a moving camera agree clearly better (a factor of its
-    depth, its focal length, or how late its poses are), use that number instead of the recorded
-    one. Without this it is said, and refused where the difference is large."""
 
     def __post_init__(self) -> None:
         """Refuse to hold out every frame, or to learn from none."""

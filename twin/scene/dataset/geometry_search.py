@@ -50,6 +50,12 @@ LEAST_AGREEMENT = 0.35
 """With less agreement even at the best, one number does not explain it."""
 SMALLEST = {"depth": 0.03, "focal": 0.03, "delay": 0.6}
 """Deviations below are within what cameras and clocks do; of the delay in frames."""
+MENDED = {
+    "depth": "Import it again with another --depth-unit-m, or set the unit of the camera's driver",
+    "focal": "Import it again with --depth-intrinsics, or correct what the driver sends",
+    "delay": "Record images and poses by one clock",
+}
+"""What to do."""
 
 PoseAt = Callable[[int], Float[np.ndarray, "4 4"]]
 """``T_base_depth`` of the camera at an instant."""
@@ -277,58 +283,31 @@ def _thinned(image: DownscaledDepth) -> DownscaledDepth:
 
 
 class WrongGeometryError(TwinError):
-    """One number of a camera's geometry is off, or nothing makes its depth agree."""
+    """One number of a camera's geometry is off."""
 
 
 def check_geometry(
     cameras: Sequence[CameraCheck], report: ScanReport, config: FrameConfig
-) -> tuple[ScanReport, list[FrameChoice]]:
-    """Look for a wrong number in each moving camera; refuse, remark, or correct it.
+) -> ScanReport:
+    """Look for a wrong number in each moving camera; refuse it, or remark on it.
 
     Raises:
-        WrongGeometryError: When depth agrees much better with another number and nobody said what
-            to do; or when correction was asked for and depth agrees under no number.
+        WrongGeometryError: When depth agrees much better with another number.
     """
-    choices, remarks = [], []
+    remarks = []
     for camera in cameras:
         choice, poses = camera.choice, report.poses.get(camera.name)
-        choices.append(choice)
         if choice.stationary or poses is None or poses.better is not None:
             continue
         images = sorted(camera.images, key=lambda image: image.stamp_ns)
         found = search_geometry(images, camera_pose_at(choice), frame_ns_of(choice))
-        if found is None and config.correct_geometry and not poses.fits:
-            message = (
-                f"--correct-geometry: {camera.name}: {poses.remark()}; nor does any depth scale, "
-                "focal length or delay of its poses. Use --poses odometry, or record it again."
-            )
-            raise WrongGeometryError(message)
         if found is None:
             continue
-        if config.correct_geometry:
-            choices[-1] = corrected(choice, found)
-            remarks.append(f"{camera.name}: {found.describe()}; corrected")
-            continue
-        message = f"{camera.name}: {found.describe()}. Correct it with --correct-geometry"
+        message = f"{camera.name}: {found.describe()}. {MENDED[found.kind]}"
         if config.check_poses and found.after >= found.before + CLEARLY_BETTER:
             raise WrongGeometryError(f"{message}, or insist with --no-check-poses.")
         remarks.append(message)
-    return replace(report, found=(*report.found, *remarks)), choices
-
-
-def corrected(choice: FrameChoice, found: Correction) -> FrameChoice:
-    """A camera with one number of its geometry changed, in all its frames."""
-    if found.kind == "depth":
-        scale = choice.poses.depth_scale * found.value
-        return replace(choice, poses=replace(choice.poses, depth_scale=scale))
-    if found.kind == "focal":
-        return replace(choice, focal_scale=choice.focal_scale * found.value)
-    pose_at, late_ns = camera_pose_at(choice), round(found.value)
-    moved = dict(choice.corrections)
-    for stamp_ns in choice.train_ns | choice.holdout_ns | choice.spare_ns:
-        T_new_old = pose_at(stamp_ns + late_ns) @ se3.invert(pose_at(stamp_ns))
-        moved[stamp_ns] = T_new_old @ moved.get(stamp_ns, np.eye(4))
-    return replace(choice, corrections=moved)
+    return replace(report, found=(*report.found, *remarks))
 
 
 def camera_pose_at(choice: FrameChoice) -> PoseAt:

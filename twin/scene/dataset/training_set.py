@@ -89,14 +89,8 @@ def read_training_set(
     if not read.views:
         message = "no frame of this run has colour, depth and a pose together. Record it again."
         raise NoFramesError(message)
-    before = check_scan(read.cameras, config.frames)
-    report, corrected = check_geometry(read.cameras, before, config.frames)
-    if any(new is not old for new, old in zip(corrected, choices, strict=True)):
-        choices, robot = corrected, find_robot(corrected, output)
-        read = _read(choices, config, robot, output)
-        again = check_scan(read.cameras, config.frames)
-        remarks = [remark for remark in report.found if remark not in before.found]
-        report = replace(again, found=(*again.found, *remarks))
+    report = check_scan(read.cameras, config.frames)
+    report = check_geometry(read.cameras, report, config.frames)
     report = replace(report, found=(*report.found, *_colour_remarks(read)))
     stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
     look_closer(robot, choices, limits_of(config), stride)

@@ -48,17 +48,6 @@ class Scores:
     """Whether all views that were chosen could be asked in time; else not seen says nothing."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Densified:
-    """A rearranged cloud."""
-
-    cloud: GaussianCloud
-    parents: Int64[np.ndarray, " num_splats"]
-    """Which Gaussian of the cloud before each one comes from."""
-    num_split: int
-    num_pruned: int
-
-
 def score(
     cloud: GaussianCloud,
     observations: Sequence[ImageObservation],
@@ -93,8 +82,14 @@ def score(
     )
 
 
-def densify(cloud: GaussianCloud, scores: Scores, *, max_splats: int, most: int) -> Densified:
-    """Drop what shows nothing or hides everything, and split where the error is large."""
+def densify(
+    cloud: GaussianCloud, scores: Scores, *, max_splats: int, most: int
+) -> tuple[GaussianCloud, Int64[np.ndarray, " num_splats"]]:
+    """Drop what shows nothing or hides everything, and split where the error is large.
+
+    Returns:
+        The rearranged cloud, and which Gaussian of the one before each comes from.
+    """
     kept = _kept_mask(cloud, scores)
     free = max(min(max_splats - int(kept.sum()), most), 0)
     wanting = np.flatnonzero(kept & (scores.size_px > FINEST_PX) & (scores.error > 0))
@@ -105,12 +100,7 @@ def densify(cloud: GaussianCloud, scores: Scores, *, max_splats: int, most: int)
     halves = _halves(cloud.take(worst))
     everything = concatenate([cloud.take(whole), *halves])
     order = morton_order(everything.means_m)
-    return Densified(
-        cloud=everything.take(order),
-        parents=ids[order],
-        num_split=len(worst),
-        num_pruned=int((~kept).sum()),
-    )
+    return everything.take(order), ids[order]
 
 
 def _kept_mask(cloud: GaussianCloud, scores: Scores) -> Bool[np.ndarray, " num_splats"]:

@@ -64,11 +64,7 @@ class SurfacePrior:
 
     def take(self, parents: Int64[np.ndarray, " num_rows"]) -> "SurfacePrior":
         """The planes of Gaussians that come from some of these."""
-        return SurfacePrior(
-            normals=self.normals[parents],
-            heights_m=self.heights_m[parents],
-            sizes_m=self.sizes_m[parents],
-        )
+        return SurfacePrior(**{name: rows[parents] for name, rows in vars(self).items()})
 
     def hold(self, cloud: GaussianCloud) -> None:
         """Move centres that left the slab back to its border, in place."""
@@ -118,8 +114,6 @@ class FitState:
     coarse_steps: int = 0
     events_done: int = 0
     """How much of the schedule of colour solutions and splits is behind."""
-    num_split: int = 0
-    num_pruned: int = 0
     colour_steps: int = 0
     errors: list[float] = field(default_factory=list)
     """Mean squared errors of the last images."""
@@ -186,12 +180,7 @@ class Event:
 class Events:
     """The schedule of a fit, and what it says to do."""
 
-    def __init__(
-        self,
-        views: list[TrainingView],
-        max_splats: int,
-        rasteriser: Rasteriser,
-    ) -> None:
+    def __init__(self, views: list[TrainingView], max_splats: int, rasteriser: Rasteriser) -> None:
         """Plan; nothing is done yet."""
         self._views = views
         self._max_splats = max_splats
@@ -199,12 +188,12 @@ class Events:
 
     @cached_property
     def _schedule(self) -> list[Event]:
-        events = []
-        events += [Event(at=at, share=SPLIT_SHARE, act=self._densify) for at in SPLIT_AT]
-        events += [
-            Event(at=at, share=EXPOSURES_SHARE, act=self._solve_exposures) for at in EXPOSURES_AT
-        ]
-        events += [Event(at=at, share=SOLVE_SHARE, act=self._solve_colours) for at in SOLVE_AT]
+        planned = (
+            (SPLIT_AT, SPLIT_SHARE, self._densify),
+            (EXPOSURES_AT, EXPOSURES_SHARE, self._solve_exposures),
+            (SOLVE_AT, SOLVE_SHARE, self._solve_colours),
+        )
+        events = [Event(at=at, share=share, act=act) for ats, share, act in planned for at in ats]
         return sorted(events, key=lambda event: event.at)
 
     def keep(self, state: FitState, at: Progress) -> None:
@@ -253,11 +242,10 @@ class Events:
         scores = score(cloud, self._observations(state, coarse), self._rasteriser, allowance)
         left = sum(event.act == self._densify for event in self._schedule[state.events_done :])
         left_over = max(self._max_splats - len(cloud), 0)
-        done = densify(cloud, scores, max_splats=self._max_splats, most=-(-left_over // left))
-        state.session.rearrange(done.cloud, done.parents)
-        state.surface = state.surface.take(done.parents)
-        state.num_split += done.num_split
-        state.num_pruned += done.num_pruned
+        most = -(-left_over // left)
+        cloud, parents = densify(cloud, scores, max_splats=self._max_splats, most=most)
+        state.session.rearrange(cloud, parents)
+        state.surface = state.surface.take(parents)
 
 
 def keep_colors_in_range(cloud: GaussianCloud) -> None:
@@ -314,8 +302,6 @@ class FitResult:
     exposures: Float[np.ndarray, "num_views 3 4"]
     """How the colours (red, green, blue, 1) of the scene came out in each training image; on
     average they did not change."""
-    num_split: int
-    num_pruned: int
     colour_steps: int
     """Conjugate gradient steps that solved colours; 0 when there was no time for them."""
 
@@ -347,7 +333,9 @@ def fit(
     """
     learner = _Learner(views, config)
     events = Events(views, max_splats or len(cloud), learner.rasteriser)
-    state = first_state(learner.session(with_harmonics(cloud)), len(views))
+    raster = learner.rasteriser.config
+    session = FitSession(with_harmonics(cloud), raster, depth_weight=DEPTH_WEIGHT)
+    state = first_state(session, len(views))
     state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
     cpu_start = time.process_time()
     for at in _steps(config, state, clock):
@@ -365,8 +353,6 @@ def fit(
         cpu_seconds=time.process_time() - cpu_start,
         train_psnr_db=_recent_psnr_db(state, len(views)),
         exposures=state.exposures,
-        num_split=state.num_split,
-        num_pruned=state.num_pruned,
         colour_steps=state.colour_steps,
     )
 
@@ -404,14 +390,6 @@ class _Learner:
         self._views = views
         self._config = config
         self.rasteriser = Rasteriser(RasterConfig(threads=config.threads))
-
-    def session(self, cloud: GaussianCloud) -> FitSession:
-        """What draws, compares and learns, from a cloud on."""
-        return FitSession(
-            cloud,
-            self.rasteriser.config,
-            depth_weight=DEPTH_WEIGHT,
-        )
 
     def step(self, state: FitState, at: Progress) -> None:
         """Draw one image and follow its gradient."""

@@ -5,7 +5,6 @@ torchvision's region pooling. CLIP (Radford et al. 2021): words and pieces of im
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from bridge.errors import UsageError
-from twin.naming.things import Mask, MaskSet
+from twin.naming.things import Mask
 from twin.scene.foundation.loading import Network, WeightsKind, import_torch
 
 MAX_PROMPTS = 64
 MARGIN_FRACTION = 0.1
 """A crop is this much larger than the mask on each side: a little context helps."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sam3Config:
-    """What counts as a mask."""
-
-    min_score: float = 0.5
-    """Masks with less are dropped. A score is the product of "this region is one" and "the image
-    holds one"."""
-    mask_threshold: float = 0.5
-    """Probability above which a pixel belongs to a mask."""
-    min_pixels: int = 16
-    """Smaller masks are dropped."""
 
 
 class Sam3Segmenter(Network):
@@ -45,16 +31,17 @@ class Sam3Segmenter(Network):
         origin="facebook/sam3",
         licence="SAM License, access on request",
     )
-    config = Sam3Config()
+    min_score = 0.5
+    """Masks with less are dropped. A score is the product of "this region is one" and "the image
+    holds one"."""
+    mask_threshold = 0.5
+    """Probability above which a pixel belongs to a mask."""
+    min_pixels = 16
+    """Smaller masks are dropped."""
 
     def segment(
-        self,
-        image_u8: UInt8[np.ndarray, "height width 3"],
-        prompts: Sequence[str],
-        *,
-        camera_id: str,
-        stamp_ns: int,
-    ) -> MaskSet:
+        self, image_u8: UInt8[np.ndarray, "height width 3"], prompts: Sequence[str]
+    ) -> list[Mask]:
         """Find what the prompts name; they become the labels.
 
         The image is looked at once, however many prompts there are. Masks of different prompts may
@@ -76,7 +63,7 @@ class Sam3Segmenter(Network):
                     attention_mask=attention[row : row + 1],
                 )
                 masks += self._masks(found, prompt, image_u8.shape[:2])
-        return MaskSet(camera_id=camera_id, stamp_ns=stamp_ns, masks=masks, source=self.kind.name)
+        return masks
 
     def _masks(self, found: Any, prompt: str, size: tuple[int, ...]) -> list[Mask]:
         torch = import_torch()
@@ -85,15 +72,15 @@ class Sam3Segmenter(Network):
         if presence is not None:
             scores = scores * presence[0].float().sigmoid()
         order = torch.argsort(scores, descending=True, stable=True)
-        order = order[scores[order] >= self.config.min_score]
+        order = order[scores[order] >= self.min_score]
         masks = []
         for index in order.tolist():  # one by one: 200 masks of a whole image would fill the memory
             probability = found.pred_masks[0, index][None, None].float().sigmoid()
             probability = torch.nn.functional.interpolate(
                 probability, size=tuple(size), mode="bilinear", align_corners=False
             )
-            image = (probability[0, 0] > self.config.mask_threshold).cpu().numpy()
-            if int(image.sum()) >= self.config.min_pixels:
+            image = (probability[0, 0] > self.mask_threshold).cpu().numpy()
+            if int(image.sum()) >= self.min_pixels:
                 masks.append(Mask(image=image, label=prompt, score=float(scores[index])))
         return masks
 
@@ -117,8 +104,6 @@ class ClipEmbedder(Network):
 
     def encode(self, texts: Sequence[str]) -> Float32[np.ndarray, "num_texts num_channels"]:
         """Unit vectors of words."""
-        if not texts:
-            return np.zeros((0, self.num_channels), dtype=np.float32)
         ids, attention = self._tokens(texts)
         with import_torch().inference_mode():
             return _unit(self._model.get_text_features(input_ids=ids, attention_mask=attention))
@@ -131,13 +116,8 @@ class ClipEmbedder(Network):
         """Unit vectors of what the masks cut out, each cropped to its square on a neutral ground.
 
         Args:
-            masks: Of the same sizes, none empty.
+            masks: Of the same sizes, none empty; at least one.
         """
-        if len(images_u8) != len(masks):
-            message = f"{len(images_u8)} images for {len(masks)} masks; give each mask its image."
-            raise UsageError(message)
-        if not masks:
-            return np.zeros((0, self.num_channels), dtype=np.float32)
         ground = np.rint(np.array(self._normalisation[0]) * 255.0).astype(np.uint8)
         crops = [
             masked_crop(image, mask, ground) for image, mask in zip(images_u8, masks, strict=True)
@@ -158,12 +138,6 @@ def masked_crop(
     Args:
         ground_u8: sRGB of everything around it.
     """
-    if image_u8.shape[:2] != mask.shape or not mask.any():
-        message = (
-            f"a mask of {mask.shape[1]} x {mask.shape[0]} pixels with {int(mask.sum())} set does "
-            f"not cut anything out of an image of {image_u8.shape[1]} x {image_u8.shape[0]}."
-        )
-        raise UsageError(message)
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     top, left = int(rows[0]), int(columns[0])
     height, width = int(rows[-1]) - top + 1, int(columns[-1]) - left + 1

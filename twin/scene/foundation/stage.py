@@ -1,12 +1,11 @@
 """Semantics as a stage of ``rebuild``: ask the models, find what is what, write it down."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import UsageError
@@ -19,7 +18,7 @@ from twin.naming.scene_file import (
     write_semantics,
     write_vectors,
 )
-from twin.naming.things import MaskSet, SemanticScene, SemanticsError
+from twin.naming.things import Mask, SemanticScene, SemanticsError
 from twin.naming.words import spoken_name
 from twin.scene.foundation.loading import check_folder, device_of, import_transformers
 from twin.scene.foundation.models import ClipEmbedder, Sam3Segmenter, sam3_folder
@@ -80,16 +79,13 @@ def masks_in(
     frames: Sequence[RgbdFrame],
     task: Task | None,
     advance: Advance = lambda done, note: None,
-) -> list[tuple[Viewpoint, MaskSet]]:
+) -> list[tuple[Viewpoint, list[Mask]]]:
     """Run the segmenter over frames."""
     segmenter = Sam3Segmenter(sam3_folder(config.segmenter), config.device)
     prompts = prompts_of(config, task)
     masks = []
     for done, frame in enumerate(frames, 1):
-        found = segmenter.segment(
-            frame.image_u8, prompts, camera_id=frame.camera_id, stamp_ns=frame.stamp_ns
-        )
-        masks.append((viewpoint_of(frame), found))
+        masks.append((viewpoint_of(frame), segmenter.segment(frame.image_u8, prompts)))
         advance(done, segmenter.kind.name)
     return masks
 
@@ -139,7 +135,7 @@ def find_things(
     objects: Mapping[str, GaussianCloud],
     viewpoints: Sequence[Viewpoint],
     *,
-    masks: Sequence[tuple[Viewpoint, MaskSet]] = (),
+    masks: Sequence[tuple[Viewpoint, Sequence[Mask]]] = (),
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
     fused: GaussianCloud | None = None,
     rasteriser: Rasteriser,
@@ -147,11 +143,9 @@ def find_things(
 ) -> SemanticScene:
     """Say what is what among the Gaussians of the background and of the objects, in this order.
 
-    Nothing found, or masks that do not fit, is a remark, not an error: the scene is good without.
+    Nothing found is a remark, not an error: the scene is good without.
 
     Args:
-        background: Those that nobody measured are guessed surfaces: without masks no thing is
-            looked for in them.
         objects: Moved to where they were scanned; without masks each is an instance of that name.
         masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
         surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
@@ -162,43 +156,20 @@ def find_things(
     sizes = [len(background), *(len(part) for part in objects.values())]
     try:
         if masks:
-            return scene_from_masks(cloud, masks, rasteriser, advance=advance)
+            return scene_from_masks(cloud, masks, rasteriser, Sam3Segmenter.kind.name, advance)
         owner = np.repeat(np.arange(len(sizes)), sizes)
-        measured = np.ones(len(cloud), dtype=bool)
-        measured[: len(background)] = ~background.completed
-        scene = scene_by_default(
-            cloud.take(measured),
+        return scene_by_default(
+            cloud,
             viewpoints[:: -(-len(viewpoints) // MAX_VIEWPOINTS) or 1],
             rasteriser,
-            known={key: (owner == n)[measured] for n, key in enumerate(objects, start=1)},
+            known={key: owner == n for n, key in enumerate(objects, start=1)},
             surfaces_m=surfaces_m,
             fused=fused,
             advance=advance,
         )
-        return _among_all(scene, measured)
     except SemanticsError as error:
         nothing = np.zeros(len(cloud), dtype=np.uint16)
-        source = masks[0][1].source if masks else SOURCE
-        return SemanticScene(instances=(), labels=nothing, source=source, remark=str(error))
-
-
-def _among_all(scene: SemanticScene, measured: Bool[np.ndarray, " num_splats"]) -> SemanticScene:
-    """The same things among all Gaussians; only the measured ones were looked at."""
-
-    def spread_out(values: np.ndarray) -> np.ndarray:
-        spread_values = np.zeros(len(measured), dtype=values.dtype)
-        spread_values[measured] = values
-        return spread_values
-
-    things = tuple(
-        replace(
-            item,
-            mask=spread_out(item.mask),
-            parts={name: spread_out(mask) for name, mask in item.parts.items()},
-        )
-        for item in scene.instances
-    )
-    return replace(scene, instances=things, labels=spread_out(scene.labels))
+        return SemanticScene(instances=(), labels=nothing, source=SOURCE, remark=str(error))
 
 
 def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFrame]:
@@ -238,11 +209,11 @@ def write_scene_semantics(
     num = len(decomposed.background) + sum(len(part) for part in placed.values())
     output.say(f"name what is in the scene: {num} Gaussians, {len(objects)} objects known")
     frames = training_frames(choices, models.model_frames) if models.any_named else []
-    masks: list[tuple[Viewpoint, MaskSet]] = []
+    masks: list[tuple[Viewpoint, list[Mask]]] = []
     if models.segmenter:
         with output.progress("ask the segmenter", len(frames)) as advance:
             masks = masks_in(models, frames, task, advance)
-        num_masks = sum(len(found.masks) for _, found in masks)
+        num_masks = sum(len(found) for _, found in masks)
         output.say(f"{num_masks} masks in {len(frames)} frames")
     with output.progress("name things", 100) as advance:
         scene = find_things(

@@ -35,12 +35,7 @@ class PointSet:
 
     def take(self, chosen: Bool[np.ndarray, " num_points"]) -> "PointSet":
         """Return some of the points."""
-        return PointSet(
-            p_m=self.p_m[chosen],
-            normals=self.normals[chosen],
-            colors=self.colors[chosen],
-            footprint_m=self.footprint_m[chosen],
-        )
+        return PointSet(**{name: rows[chosen] for name, rows in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True)

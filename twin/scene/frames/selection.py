@@ -6,7 +6,7 @@ camera's path the slowest and sharpest frame is taken.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -208,10 +208,6 @@ class FrameChoice:
     poses: CameraPoses
     spare_ns: frozenset[int] = frozenset()
     """Neither chosen nor held out: the background does not need them, the robot may."""
-    corrections: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
-    """``T_new_old`` in the root frame for frames whose poses came early or late, by stamp."""
-    focal_scale: float = 1.0
-    """True focal length divided by the recorded one, of both images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -442,23 +438,11 @@ def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
     """Yield the frames of a choice that carry one of the stamps, with the poses it chose."""
     tree = choice.poses.tree
     for frame in streams.rgbd_frames(choice.episode, choice.camera_id, tree, stamps_ns):
-        yield _corrected(frame, choice)
+        yield with_true_depth(frame, choice.poses)
 
 
-def _corrected(frame: RgbdFrame, choice: FrameChoice) -> RgbdFrame:
-    if choice.poses.depth_scale != 1.0:
-        frame = replace(frame, depth_m=frame.depth_m * choice.poses.depth_scale)
-    if choice.focal_scale != 1.0:
-        color, depth = (
-            replace(each, fx=each.fx * choice.focal_scale, fy=each.fy * choice.focal_scale)
-            for each in (frame.color_camera, frame.depth_camera)
-        )
-        frame = replace(frame, color_camera=color, depth_camera=depth)
-    T_new_old = choice.corrections.get(frame.stamp_ns)
-    if T_new_old is None:
+def with_true_depth(frame: RgbdFrame, poses: CameraPoses) -> RgbdFrame:
+    """A frame whose depth is what a calibration makes of what was measured."""
+    if poses.depth_scale == 1.0:
         return frame
-    return replace(
-        frame,
-        T_base_color=T_new_old @ frame.T_base_color,
-        T_base_depth=T_new_old @ frame.T_base_depth,
-    )
+    return replace(frame, depth_m=frame.depth_m * np.float32(poses.depth_scale))

@@ -10,7 +10,7 @@ prior on each shares the blame (maximum a posteriori, linearised about the recor
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -58,52 +58,18 @@ NOISE_SIGMA_M = 0.002
 """Of one table point."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TableFit:
-    """What one camera saw of the table, and how it was corrected."""
-
-    camera_id: str
-    num_points: int
-    offset_m: float
-    """Mean height of the table before the correction; 0 is where it should be."""
-    tilt_rad: float
-    """Slope of the table before the correction."""
-    residual_m: float
-    """Robust spread of table points about z = 0 after the correction."""
-    depth_factor: float
-    """Depth is multiplied with this."""
-    T_new_old: Float[np.ndarray, "4 4"]
-    """The camera's motion in the base frame."""
-
-    def to_record(self) -> dict[str, float | int]:
-        """Return the numbers a reader wants to see."""
-        return {
-            "num_points": self.num_points,
-            "offset_m": self.offset_m,
-            "tilt_rad": self.tilt_rad,
-            "residual_m": self.residual_m,
-            "depth_factor": self.depth_factor,
-        }
-
-
-def correct_for_table(
-    views: Sequence[CameraView],
-    task: Task,
-) -> tuple[list[CameraView], dict[str, TableFit]]:
+def correct_for_table(views: Sequence[CameraView], task: Task) -> list[CameraView]:
     """Move each view so that its table lies at z = 0; views that see too little stay.
 
     Points of the task's objects do not count as table.
     """
-    corrected, fits = [], {}
+    corrected = []
     for view in views:
         p = _table_points(view, task)
-        if len(p) < MIN_TABLE_POINTS:
-            corrected.append(view)
-            continue
-        fit = fit_table(p, view.T_base_depth[:3, 3], view.camera_id)
-        corrected.append(moved(view, fit.T_new_old, fit.depth_factor))
-        fits[view.camera_id] = fit
-    return corrected, fits
+        is_seen = len(p) >= MIN_TABLE_POINTS
+        fit = fit_table(p, view.T_base_depth[:3, 3]) if is_seen else (np.eye(4), 1.0)
+        corrected.append(moved(view, *fit))
+    return corrected
 
 
 def _table_points(view: CameraView, task: Task) -> Float[np.ndarray, "num_points 3"]:
@@ -118,14 +84,15 @@ def _table_points(view: CameraView, task: Task) -> Float[np.ndarray, "num_points
 
 
 def fit_table(
-    p_base: Float[np.ndarray, "num_points 3"],
-    p_base_camera: Float[np.ndarray, "3"],
-    camera_id: str,
-) -> TableFit:
+    p_base: Float[np.ndarray, "num_points 3"], p_base_camera: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "4 4"], float]:
     """Find the correction that best lays table points on z = 0.
 
     Unknowns: relative depth error, camera height error, rotation about base x and y; least squares
     with Tukey weights and Gaussian priors. The rotation is about the camera.
+
+    Returns:
+        The camera's motion in the base frame, ``T_new_old``, and by what depth is multiplied.
     """
     d = p_base - p_base_camera
     # z after the correction: p_z - s d_z + h + (rotation x d)_z. On the table d_z is minus the
@@ -136,7 +103,6 @@ def fit_table(
     # Neighbouring pixels share their error: count the points as at most a few hundred.
     weight = np.ones(len(d)) * min(1.0, 500 / len(d)) / NOISE_SIGMA_M**2
     x = np.zeros(4)
-    spread = 0.0
     for _ in range(8):
         residual = p_base[:, 2] + A @ x
         centred = residual - np.median(residual)
@@ -144,24 +110,11 @@ def fit_table(
         robust = tukey_weights(centred, max(6.0 * spread, 1e-3)) * weight
         H, gradient = normal_equations(A, p_base[:, 2], robust)
         x = -np.linalg.solve(H + np.diag(1 / sigma**2), gradient)
-    slope = np.linalg.lstsq(
-        np.column_stack([p_base[:, :2] - p_base[:, :2].mean(axis=0), np.ones(len(d))]),
-        p_base[:, 2],
-        rcond=None,
-    )[0]
     T_new_old = np.eye(4)
     T_new_old[:3, :3] = se3.rotation_from_vector(np.array([x[2], x[3], 0.0]))
     lifted = p_base_camera + np.array([0.0, 0.0, x[1]])
     T_new_old[:3, 3] = lifted - T_new_old[:3, :3] @ p_base_camera
-    return TableFit(
-        camera_id=camera_id,
-        num_points=len(d),
-        offset_m=float(np.median(p_base[:, 2])),
-        tilt_rad=float(np.hypot(slope[0], slope[1])),
-        residual_m=spread,
-        depth_factor=float(1 - x[0]),
-        T_new_old=T_new_old,
-    )
+    return T_new_old, float(1 - x[0])
 
 
 MAX_FRAMES = 3
@@ -195,9 +148,9 @@ def localise_objects(
         seen. Never a guess.
     """
     views = fuse_stationary(frames, MAX_FRAMES, MAX_VIEWS, task)
-    views, tables = correct_for_table(views, task)
+    views = correct_for_table(views, task)
     objects = {
-        object_id: _localise_one(views, model, tables, (surfaces or {}).get(object_id))
+        object_id: _localise_one(views, model, (surfaces or {}).get(object_id))
         for object_id, model in task.objects.items()
         if model.soft is None or not views
     }
@@ -207,14 +160,13 @@ def localise_objects(
             for key, s in task.start.items()
         }
         expected_m = starts_m | dict(last_seen_m or {})
-        objects |= _localise_toys(views, task, tables, objects, expected_m)
+        objects |= _localise_toys(views, task, objects, expected_m)
     return {key: objects[key] for key in task.objects}
 
 
 def _localise_toys(
     views: Sequence[CameraView],
     task: Task,
-    tables: Mapping[str, TableFit],
     rigid: Mapping[str, LocalisedObject],
     expected_m: Mapping[str, Float[np.ndarray, "3"]],
 ) -> dict[str, LocalisedObject]:
@@ -232,21 +184,13 @@ def _localise_toys(
     for models in groups.values():
         fits = fit_toys(models, views, blocked, expected_m, min_explained=MIN_EXPLAINED)
         for model in models:
-            found[model.id] = _toy(model, fits[model.id], views, tables, len(models))
+            found[model.id] = _toy(model, fits[model.id], views)
     return found
 
 
-def _toy(
-    model: ObjectModel,
-    toy: SoftFit,
-    views: Sequence[CameraView],
-    tables: Mapping[str, TableFit],
-    equals: int,
-) -> LocalisedObject:
+def _toy(model: ObjectModel, toy: SoftFit, views: Sequence[CameraView]) -> LocalisedObject:
     stamp_ns = max(view.stamp_ns for view in views)
-    detail = _detail(views, toy.num_points, tables)
-    if equals > 1:
-        detail |= {"equal_objects": equals, "assignment_margin_m": toy.margin_m}
+    detail = _detail(views, toy.num_points)
     if toy.fit is None or toy.shape is None:
         return missing(model, stamp_ns, str(toy.reason), detail)
     found = found_by_fit(model, toy.fit, stamp_ns, REST_TOLERANCE_M, detail)
@@ -254,26 +198,20 @@ def _toy(
     return replace(
         found,
         reason="; ".join(reasons) or None,
-        detail={**found.detail, "soft_shape": toy.shape.to_record()},
+        detail={**found.detail, "soft_shape": toy.shape},
     )
 
 
-def _detail(
-    views: Sequence[CameraView], num_points: int, tables: Mapping[str, TableFit]
-) -> dict[str, Any]:
+def _detail(views: Sequence[CameraView], num_points: int) -> dict[str, Any]:
     return {
         "cameras": sorted({view.camera_id for view in views}),
         "num_frames": sum(view.num_frames for view in views),
         "num_points": num_points,
-        "table": {camera_id: fit.to_record() for camera_id, fit in tables.items()},
     }
 
 
 def _localise_one(
-    views: Sequence[CameraView],
-    model: ObjectModel,
-    tables: Mapping[str, TableFit],
-    scanned: MeshSurface | None,
+    views: Sequence[CameraView], model: ObjectModel, scanned: MeshSurface | None
 ) -> LocalisedObject:
     stamp_ns = max((view.stamp_ns for view in views), default=0)
     if not views:
@@ -282,7 +220,7 @@ def _localise_one(
     low_m = MIN_HEIGHT_M if is_box else LEAST_HEIGHT_M
     groups = object_points(views, model, low_m)
     seen = len(groups[0]) if groups else 0
-    detail = _detail(views, seen, tables)
+    detail = _detail(views, seen)
     if seen < MIN_POINTS:
         reason = (
             f"{seen} points have the colour of {model.id} above the table, "
@@ -296,12 +234,6 @@ def _localise_one(
     if model.shape == SCANNED:
         return _boxed_in(groups[0], model, stamp_ns, detail)
     fit = fit_shape(groups[0], views, model)
-    detail |= {
-        "outline_residual_m": fit.outline_residual_m,
-        "num_edges": fit.num_edges,
-        "other_points": sum(len(group) for group in groups[1:]),
-        "camera_shift_m": _by_view(views, fit.camera_shift_m),
-    }
     if fit.explained < MIN_EXPLAINED:
         reason = (
             f"only {fit.explained:.0%} of {seen} points fit the shape of {model.id}, "
@@ -351,10 +283,3 @@ def _localise_mesh(
         )
         return missing(model, stamp_ns, reason, detail)
     return found_by_fit(model, fit, stamp_ns, REST_TOLERANCE_M, detail)
-
-
-def _by_view(views: Sequence[CameraView], values: Sequence[float]) -> dict[str, list[float]]:
-    table: dict[str, list[float]] = {}
-    for view, value in zip(views, values, strict=True):
-        table.setdefault(view.camera_id, []).append(value)
-    return table

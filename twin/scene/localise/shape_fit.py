@@ -186,11 +186,6 @@ class ShapeFit:
     """Root mean square distance of the explained points to the surface."""
     explained: float
     """Share of points within the Tukey bound."""
-    outline_residual_m: float | None
-    """Root mean square distance of the explained edges, None without any."""
-    num_edges: int
-    camera_shift_m: tuple[float, ...]
-    """Per view: how far its own shift moves the object sideways."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -330,7 +325,7 @@ def _solve(
 def _summary(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> ShapeFit:
     system = _system(state, problem)
     near = np.abs(system.r) < TUKEY_M
-    on_points, on_edges = near[: system.num_points], near[system.num_points :]
+    on_points = near[: system.num_points]
     weak = 1 / np.array([0.05, 0.05, 0.05, 1.0]) ** 2
     H, _ = _pose_equations(state, system, near.astype(np.float64), problem, weak)
     covariance = np.zeros((6, 6))
@@ -339,18 +334,9 @@ def _summary(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> Sh
     covariance[2, 2] += CAMERA_SIGMA_M**2
     covariance[[3, 4], [3, 4]] = UPRIGHT_SIGMA_RAD**2
     points_r = system.r[: system.num_points][on_points]
-    edges_r = system.r[system.num_points :][on_edges]
-    shifts = state[_POSE:].reshape(-1, _PER_VIEW)[:, :2]
     return ShapeFit(
         T_base_object=pose_of(state[:_POSE]),
         covariance=covariance,
-        residual_m=_rms(points_r) or 0.0,
+        residual_m=float(np.sqrt(np.mean(points_r**2))) if len(points_r) else 0.0,
         explained=float(on_points.mean()),
-        outline_residual_m=_rms(edges_r),
-        num_edges=int(on_edges.sum()),
-        camera_shift_m=tuple(np.linalg.norm(shifts, axis=1).tolist()),
     )
-
-
-def _rms(r: Float[np.ndarray, " num_residuals"]) -> float | None:
-    return float(np.sqrt(np.mean(r**2))) if len(r) else None

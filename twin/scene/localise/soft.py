@@ -7,6 +7,7 @@ Equal toys are told apart by where each is expected: its start range, or where i
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -78,34 +79,16 @@ STANDS = 0.9
 """Cosine of the tilt up to which the underside of a toy is taken to be level."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SoftShape:
-    """Coarse shape: a box with its middle, axes and extents."""
-
-    centroid_m: Float[np.ndarray, "3"]
-    R_base_axes: Float[np.ndarray, "3 3"]
-    extents_m: Float[np.ndarray, "3"]
-    extents_sigma_m: Float[np.ndarray, "3"]
-
-    def to_record(self) -> dict[str, list[float] | list[list[float]]]:
-        """Return the entry ``soft_shape`` of a localisation record."""
-        return {
-            "centroid_m": self.centroid_m.tolist(),
-            "axes": self.R_base_axes.T.tolist(),
-            "extents_m": self.extents_m.tolist(),
-            "extents_sigma_m": self.extents_sigma_m.tolist(),
-        }
-
-
 def soft_shape(
     views: Sequence[CameraView],
     surface: MeshSurface,
     model: ObjectModel,
     fit: MeshFit,
-) -> SoftShape:
+) -> dict[str, Any]:
     """Extents along the axes of the fitted pose: those at rest, plus how far the seen ends moved.
 
-    All points near the fitted surface count, whatever their colour.
+    All points near the fitted surface count, whatever their colour. As the entry ``soft_shape`` of
+    a localisation record has it: a box with its middle, axes and extents.
     """
     T = fit.T_base_object
     T_object_base = se3.invert(T)
@@ -127,13 +110,12 @@ def soft_shape(
         ends[row] = sign * np.maximum(half + np.where(seen, reached - rest, 0.0), 0.1 * half)
     if T[2, 2] > STANDS and T[2, 3] + ends[1, 2] < 0:
         ends[1, 2] = -T[2, 3]  # it cannot reach below the table
-    sigma = np.hypot(0.005, fit.residual_m) * np.ones(3)
-    return SoftShape(
-        centroid_m=se3.apply(T, ends.mean(axis=0)[None])[0],
-        R_base_axes=T[:3, :3].copy(),
-        extents_m=ends[0] - ends[1],
-        extents_sigma_m=sigma,
-    )
+    return {
+        "centroid_m": se3.apply(T, ends.mean(axis=0)[None])[0].tolist(),
+        "axes": T[:3, :3].T.tolist(),
+        "extents_m": (ends[0] - ends[1]).tolist(),
+        "extents_sigma_m": [float(np.hypot(0.005, fit.residual_m))] * 3,
+    }
 
 
 DENSE_SAMPLES = 20_000
@@ -212,9 +194,8 @@ class SoftFit:
     reason: str | None
     num_points: int
     fit: MeshFit | None = None
-    shape: SoftShape | None = None
-    margin_m: float | None = None
-    """What exchanging it with an equal toy would cost; None without equal ones."""
+    shape: Mapping[str, Any] | None = None
+    """See ``soft_shape``."""
 
 
 def fit_toys(
@@ -255,13 +236,11 @@ def fit_toys(
             )
             continue
         index = good[taken[row]]
-        margin = margins.get(row)
         found[item.id] = SoftFit(
-            reason=_doubt(item, margin),
+            reason=_doubt(item, margins.get(row)),
             num_points=len(groups[index]),
             fit=fits[index],
             shape=soft_shape(views, surface, model, fits[index]),
-            margin_m=margin,
         )
     return found
 

@@ -19,7 +19,7 @@ from twin.scene.frames.camera_poses import (
     same_pose,
 )
 from twin.scene.frames.pairing import check_camera, paired_stamps_ns
-from twin.scene.frames.selection import rgbd_camera_ids, spread
+from twin.scene.frames.selection import rgbd_camera_ids, spread, with_true_depth
 from twin.scene.store.calibration import Calibration
 
 STATIONARY_WINDOW_NS = 40_000_000
@@ -126,13 +126,6 @@ def _between(
 def common_root(roots: Sequence[str], base_frame: str) -> str | None:
     """The frame in which objects are looked for: the robot's base where a camera is posed in it."""
     return base_frame if base_frame in roots else next(iter(roots), None)
-
-
-def with_true_depth(frame: RgbdFrame, poses: CameraPoses) -> RgbdFrame:
-    """A frame whose depth is what a calibration makes of what was measured."""
-    if poses.depth_scale == 1.0:
-        return frame
-    return replace(frame, depth_m=frame.depth_m * np.float32(poses.depth_scale))
 
 
 def is_stationary(

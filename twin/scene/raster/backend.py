@@ -7,7 +7,6 @@ the weighted mean, because gsplat does not say where half of the light is gone.
 """
 
 import importlib
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
@@ -61,15 +60,6 @@ def _torch() -> Any:
         raise MissingDependencyError(package="torch", extra="twin", purpose=purpose) from error
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Drawn:
-    """What the last image was made of, for further channels."""
-
-    leaves: dict[str, Any]
-    T_camera_base: Any
-    camera: Camera
-
-
 class CudaRasteriser:
     """Draws one camera after another on a GPU; the interface of ``rasteriser.Rasteriser``.
 
@@ -105,7 +95,8 @@ class CudaRasteriser:
             ) from error
         self._torch = torch
         self._device = torch.device(device)
-        self._drawn: _Drawn | None = None
+        self._drawn: tuple[dict[str, Any], Any, Camera] | None = None
+        """Arrays, pose and camera of the last image, for further channels."""
 
     def draw_planes(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
@@ -120,7 +111,7 @@ class CudaRasteriser:
         drawn, alpha, _ = self._rasterise(leaves, torch.cat(channels, dim=1), T_camera_base, camera)
         depth = self._depth_of_planes(drawn[0, ..., 3:], camera)
         image = torch.cat([drawn[0, ..., :3], depth, alpha[0]], dim=-1)
-        self._drawn = _Drawn(leaves=leaves, T_camera_base=T_camera_base, camera=camera)
+        self._drawn = leaves, T_camera_base, camera
         return self._numpy(image.permute(2, 0, 1))
 
     def view(
@@ -141,18 +132,17 @@ class CudaRasteriser:
         self, features: Float32[np.ndarray, "num_splats num_channels"]
     ) -> Float32[np.ndarray, "num_channels height width"]:
         """Draw any channels with the weights of the last ``draw_planes``: A F."""
-        size = (self._last().camera.height, self._last().camera.width)
-        blocks = [np.zeros((0, *size), dtype=np.float32)]
+        if self._drawn is None:
+            message = "nothing was drawn yet; call draw_planes first."
+            raise UsageError(message)
+        leaves, T_camera_base, camera = self._drawn
+        blocks = [np.zeros((0, camera.height, camera.width), dtype=np.float32)]
         for start in range(0, features.shape[1], CHANNEL_BLOCK):
             block = features[:, start : start + CHANNEL_BLOCK]
-            image = self._draw_channels(self._torch.tensor(block, device=self._device))
-            blocks.append(self._numpy(image))
+            channels = self._torch.tensor(block, device=self._device)
+            image, _, _ = self._rasterise(leaves, channels, T_camera_base, camera)
+            blocks.append(self._numpy(image[0].permute(2, 0, 1)))
         return np.concatenate(blocks)
-
-    def _draw_channels(self, channels: Any) -> Any:
-        drawn = self._last()
-        image, _, _ = self._rasterise(drawn.leaves, channels, drawn.T_camera_base, drawn.camera)
-        return image[0].permute(2, 0, 1)
 
     def _rasterise(
         self, leaves: dict[str, Any], colors: Any, T_camera_base: Any, camera: Camera
@@ -224,12 +214,6 @@ class CudaRasteriser:
         x, y, z = (ray / ray.norm(dim=1, keepdim=True).clamp(min=1e-12)).unbind(dim=1)
         basis = self._torch.stack(harmonic_terms(x, y, z), dim=1)
         return leaves["colors"] + (basis[:, :, None] * leaves["harmonics"]).sum(dim=1)
-
-    def _last(self) -> _Drawn:
-        if self._drawn is None:
-            message = "nothing was drawn yet; call draw_planes first."
-            raise UsageError(message)
-        return self._drawn
 
     def _numpy(self, values: Any) -> np.ndarray:
         return np.ascontiguousarray(values.cpu().numpy(), dtype=np.float32)

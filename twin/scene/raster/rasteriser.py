@@ -68,21 +68,6 @@ class RasterConfig:
     """What ``backend.open_rasteriser`` opens; ``Rasteriser`` itself is the CPU."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CloudGradient:
-    """Gradient of a scalar with respect to each array of a ``GaussianCloud``."""
-
-    means_m: Float32[np.ndarray, "num_splats 3"]
-    quats_wxyz: Float32[np.ndarray, "num_splats 4"]
-    scales_log: Float32[np.ndarray, "num_splats 3"]
-    opacities_logit: Float32[np.ndarray, " num_splats"]
-    colors: Float32[np.ndarray, "num_splats 3"]
-    harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"]
-    T_camera_base: Float[np.ndarray, "3 4"]
-    """With respect to the twelve entries of the upper part of that matrix, the camera centre of
-    the viewing directions being -R^T t of them."""
-
-
 def native_camera(
     camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float32[np.ndarray, "3 4"], tuple[int, int, float, float, float, float]]:
@@ -107,13 +92,16 @@ class StepReport:
     gain: Float[np.ndarray, "3"]
     """Gradient of the loss on the diagonal of the exposure."""
     T_camera_base: Float[np.ndarray, "3 4"]
-    """Gradient of the loss on the camera's pose, as in ``CloudGradient``."""
+    """Gradient of the loss on the entries of that matrix, the camera centre of the viewing
+    directions being -R^T t of them."""
     seconds: Mapping[str, float]
     """Wall time of each stage: draw, compare, pull, learn."""
     serial_s: float
     """How much of it one thread spent alone: by Amdahl's law it bounds what more threads gain."""
 
 
+L1_SHARE = 0.8
+"""Of the L1 term in the loss 3dgs."""
 OFTEN, RARELY = 32, 256
 """Steps from one with the slower number of threads to the next: rarely where it is far slower."""
 FAR_SLOWER = 1.3
@@ -165,12 +153,11 @@ class FitSession:
         *,
         loss: Literal["3dgs", "paper"] = "3dgs",
         depth_weight: float = 0.1,
-        l1_share: float = 0.8,
     ) -> None:
         """Copy the cloud; moments start at zero."""
         self.config = config or RasterConfig()
         self.steps = 0
-        self._loss = (loss == "3dgs", l1_share, depth_weight)
+        self._loss = (loss == "3dgs", L1_SHARE, depth_weight)
         self._native = load_native().FitSession(self.config.threads, self.config.isa)
         self._pace = ThreadPace(self.config.threads or os.cpu_count() or 1)
         self._cloud = _own_copy(cloud)
@@ -224,21 +211,6 @@ class FitSession:
             seconds=dict(zip(STAGES, seconds, strict=True)),
             serial_s=serial_s,
         )
-
-    def planes(self) -> Float32[np.ndarray, "5 height width"]:
-        """A copy of what the last step drew, before the exposure."""
-        drawn: np.ndarray = self._native.planes()
-        return drawn
-
-    def gradient(self, report: StepReport) -> CloudGradient:
-        """A copy of the last step's gradient; ``report`` is that step's."""
-        named = dict(zip(NAMES, self._native.gradients(), strict=True))
-        return CloudGradient(**named, T_camera_base=report.T_camera_base)
-
-    def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
-        """Say which Gaussians could touch the last image."""
-        mask: np.ndarray = self._native.visible()
-        return mask
 
     def rearrange(
         self, cloud: GaussianCloud, parents: Int64[np.ndarray, " num_splats"] | None = None
@@ -323,15 +295,6 @@ class Rasteriser:
             cloud.harmonics if cloud.num_harmonics else None,
         )
         return planes
-
-    def pull_back(
-        self,
-        planes: Float32[np.ndarray, "5 height width"],
-        plane_gradients: Float32[np.ndarray, "5 height width"],
-    ) -> CloudGradient:
-        """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud."""
-        *rows, pose = self._native.pull(planes, plane_gradients)
-        return CloudGradient(**dict(zip(NAMES, rows, strict=True)), T_camera_base=pose)
 
     def draw_features(
         self, features: Float32[np.ndarray, "num_splats num_channels"]

@@ -147,7 +147,6 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
         "stationary": choice.stationary,
         "poses_from": choice.poses.source,
         "poses_quality": dict(choice.poses.quality),
-        "poses_corrected": len(choice.corrections),
         "frames_without_pose": len(choice.poses.unposed_ns),
         "train_frames": len(choice.train_ns),
         "holdout_frames": len(choice.holdout_ns),

@@ -1,10 +1,12 @@
 """Divide points into things: connected voxels, cut along valleys and where colours differ."""
 
 import heapq
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.cluster.vq import kmeans2
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
@@ -29,9 +31,7 @@ class SurfacePoints:
 
     def take(self, index: np.ndarray) -> "SurfacePoints":
         """Select points by a mask or by ids."""
-        return SurfacePoints(
-            p_m=self.p_m[index], normals=self.normals[index], colors=self.colors[index]
-        )
+        return SurfacePoints(**{name: rows[index] for name, rows in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,8 +143,6 @@ def make_patches(
 
 MAX_COLOURS = 4
 """Colours to look for in one group."""
-LIGHTNESS_WEIGHT = 0.3
-"""Shading changes lightness, not the ratios of a and b to it."""
 COLOUR_NOISE = 5.0
 """Spread of one colour, in Lab units; groups tighter than this gain nothing by a cut."""
 MIN_COLOUR_GAP = 20.0
@@ -282,7 +280,7 @@ def split_by_colour(
     pieces of one colour. A piece much smaller than its neighbour is a marking (a beak, a label)
     and joins it, unless it lies in the neighbour's cavity.
     """
-    colour = without_shading(voxels.lab, LIGHTNESS_WEIGHT)
+    colour = without_shading(voxels.lab)
     classes = _colour_classes(colour)
     if classes.max(initial=0) == 0:
         return classes
@@ -322,16 +320,10 @@ def _k_means(values: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
         gap = np.min([np.square(values - c).sum(axis=1) for c in centres], axis=0)
         # Not the very farthest: a few mixed voxels at an edge should not seed a colour.
         centres.append(values[np.argsort(gap, kind="stable")[int(0.98 * (len(gap) - 1))]])
-    middle = np.array(centres)
-    classes = np.zeros(len(values), dtype=np.int64)
-    for _ in range(20):
-        classes = np.square(values[:, None] - middle[None]).sum(axis=2).argmin(axis=1)
-        filled = np.bincount(classes, minlength=num) > 0
-        moved = np.where(filled[:, None], means_of(values, classes, num), middle)
-        if np.allclose(moved, middle, atol=1e-3):
-            break
-        middle = moved
-    return classes, middle
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a class that nothing is nearest to keeps its centre
+        middle, classes = kmeans2(values, np.array(centres), iter=20, minit="matrix")
+    return classes.astype(np.int64), middle
 
 
 def _smallest_marking(

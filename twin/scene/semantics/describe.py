@@ -5,13 +5,13 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64, UInt16
+from jaxtyping import Bool, Float, UInt16
 from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from bridge.terminal import Advance
 from twin.naming.colours import colour_name
-from twin.naming.things import NAMED, Instance, MaskSet, SemanticScene
+from twin.naming.things import NAMED, Instance, Mask, SemanticScene
 from twin.naming.words import kind_of, label_of
 from twin.scene.frames.rgbd import NEAR_M
 from twin.scene.gaussians import GaussianCloud, moved_cloud
@@ -21,8 +21,6 @@ from twin.scene.semantics.masks import associate, observe
 from twin.scene.semantics.part_segmentation import find_parts
 from twin.scene.semantics.segment import (
     SOURCE,
-    SegmentConfig,
-    Thing,
     points_of,
     segment,
     solid_splats,
@@ -30,7 +28,6 @@ from twin.scene.semantics.segment import (
 from twin.scene.semantics.shape_descriptors import CONTAINER, measure_shape
 from twin.scene.semantics.support import (
     NoSupportError,
-    SupportConfig,
     SupportPlane,
     find_support,
     level_frame,
@@ -60,36 +57,20 @@ Item = TypeVar("Item")
 
 def scene_from_masks(
     cloud: GaussianCloud,
-    frames: Iterable[tuple[Viewpoint, MaskSet]],
+    frames: Iterable[tuple[Viewpoint, Sequence[Mask]]],
     rasteriser: Rasteriser,
+    source: str,
     advance: Advance = lambda done, note: None,
 ) -> SemanticScene:
     """Fuse the masks of a 2D segmenter into the Gaussians of a scene."""
-    observations, sources = [], []
-    for viewpoint, masks in _told(frames, 0, SHOWN, advance, "masks lifted"):
-        observations.append(observe(rasteriser, cloud, viewpoint, masks))
-        sources.append(masks.source)
-    source = ", ".join(dict.fromkeys(sources)) or "no masks"
-    tracks, labels = associate(observations, len(cloud))
+    observations = [
+        observe(rasteriser, cloud, viewpoint, masks)
+        for viewpoint, masks in _told(frames, 0, SHOWN, advance, "masks lifted")
+    ]
+    found, labels = associate(observations, len(cloud), source)
     plane = support_of(cloud)
-    instances = tuple(
-        describe(
-            cloud,
-            Instance(
-                id=number,
-                label=track.label,
-                mask=track.mask,
-                support=track.support,
-                seen=track.seen,
-                score=track.score,
-                source=source,
-            ),
-            plane,
-        )
-        for number, track in enumerate(
-            _told(tracks, SHOWN, 100, advance, "things measured"), start=1
-        )
-    )
+    told = _told(found, SHOWN, 100, advance, "things measured")
+    instances = tuple(describe(cloud, thing, plane) for thing in told)
     num_masks = sum(len(item.labels) for item in observations)
     remark = (
         f"{num_masks} masks in {len(observations)} frames gave no instance: each needs matching "
@@ -103,7 +84,6 @@ def scene_by_default(
     cloud: GaussianCloud,
     viewpoints: Iterable[Viewpoint],
     rasteriser: Rasteriser,
-    config: SegmentConfig | None = None,
     known: Mapping[str, Bool[np.ndarray, " num_splats"]] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
     fused: GaussianCloud | None = None,
@@ -111,26 +91,26 @@ def scene_by_default(
 ) -> SemanticScene:
     """Segment the scene with the default segmenter.
 
-    Support and seen count the viewpoints that show an instance; what fewer than two of them show
-    whole is left out. A scene without a level plane, or with nothing on it, gives only what is
-    known already, and a remark that says so. Where z of the scene's frame does not point up, the
-    work is done in a frame where it does, and a remark says that, too.
+    What fewer than two viewpoints show whole is left out. A scene without a level plane, or with
+    nothing on it, gives only what is known already, and a remark that says so. Where z of the
+    scene's frame does not point up, the work is done in a frame where it does, and a remark says
+    that, too.
 
     Args:
         known: Gaussians of the objects that a task names, by their ids. They come first, under
-            their names.
+            their names. In others that nobody measured no thing is looked for.
         surfaces_m: Points of the reconstructed surfaces of some of them, where they stand: parts
             are told apart on these, which are thinner than any coat of Gaussians.
         fused: The surface as it was measured, evenly sampled: things are looked for in it. None:
             in the scene's Gaussians, which a fit put where colours change.
     """
-    frames, surfaces_m = list(viewpoints), surfaces_m or {}
-    config = config or SegmentConfig()
-    ids = np.flatnonzero(solid_splats(cloud))
+    frames, surfaces_m, known = list(viewpoints), surfaces_m or {}, known or {}
+    is_measured = np.any([~cloud.completed, *known.values()], axis=0)
+    ids = np.flatnonzero(solid_splats(cloud) & is_measured)
     searched = cloud.take(ids) if fused is None else fused
     points = points_of(searched)
     Ts = [frame.T_base_camera for frame in frames]
-    T_level_base = level_frame(points.p_m, points.normals, Ts, config.support)
+    T_level_base = level_frame(points, Ts)
     is_level = np.array_equal(T_level_base, np.eye(4))
     if not is_level:
         cloud, searched = (moved_cloud(item, T_level_base) for item in (cloud, searched))
@@ -138,17 +118,15 @@ def scene_by_default(
         frames = [replace(f, T_base_camera=T_level_base @ f.T_base_camera) for f in frames]
         surfaces_m = {key: se3.apply(T_level_base, p) for key, p in surfaces_m.items()}
     labels = np.zeros(len(cloud), dtype=np.uint16)
-    things: tuple[Thing, ...] = ()
-    plane: SupportPlane | None = None
-    try:
-        found = segment(points, config)
-    except NoSupportError as error:
-        remark = str(error)
-    else:
-        labels[ids] = _nearest_label(found.labels, points.p_m, cloud.means_m[ids])
-        things, plane, remark = found.things, found.plane, found.remark
+    found = segment(points)
+    far_m, nearest = cKDTree(points.p_m).query(
+        cloud.means_m[ids], distance_upper_bound=NEAR_POINT_M
+    )
+    of_point = np.append(found.labels, 0)  # the query gives the number of points where none is near
+    labels[ids] = np.where(np.isfinite(far_m), of_point[nearest], 0)
+    things, remark = found.things, found.remark
     advance(FOUND, f"{len(things)} things found")
-    keys, others, labels = numbered(labels, known or {})
+    keys, others, labels = numbered(labels, known)
     named = [(key, "", 1.0, NAMED) for key in keys]
     named += [("", things[n - 1].label, things[n - 1].score, SOURCE) for n in others]
     looked = _told(frames, FOUND, SHOWN, advance, "frames looked at")
@@ -169,29 +147,16 @@ def scene_by_default(
             id=int(new_number[old]),
             label=label,
             mask=labels == new_number[old],
-            support=shown[old],
-            seen=shown[old],
             score=score,
             source=source,
         )
-        item = describe(cloud, item, plane, key, surfaces_m.get(key))
+        item = describe(cloud, item, found.plane, key, surfaces_m.get(key))
         T = se3.invert(T_level_base) @ item.T_base_instance
         instances.append(item if is_level else replace(item, T_base_instance=T))
     if not is_level:
         up = ", ".join(f"{value:.2f}" for value in T_level_base[2, :3])
         remark = " ".join(filter(None, [remark, f"z does not point up here, ({up}) does"]))
     return SemanticScene(instances=tuple(instances), labels=labels, source=SOURCE, remark=remark)
-
-
-def _nearest_label(
-    labels: Int64[np.ndarray, " num_points"],
-    p_m: Float[np.ndarray, "num_points 3"],
-    wanted_m: Float32[np.ndarray, "num_splats 3"],
-) -> UInt16[np.ndarray, " num_splats"]:
-    """What the nearest point belongs to; nothing where none is near."""
-    far_m, nearest = cKDTree(p_m).query(wanted_m, distance_upper_bound=NEAR_POINT_M)
-    known = np.append(labels, 0)  # the query gives the number of points where none is near
-    return np.asarray(np.where(np.isfinite(far_m), known[nearest], 0), dtype=np.uint16)
 
 
 def numbered(
@@ -268,9 +233,8 @@ def _within_edges(
 
 def support_of(cloud: GaussianCloud) -> SupportPlane | None:
     """The plane that things stand on, if there is one."""
-    points = points_of(cloud.take(solid_splats(cloud)))
     try:
-        return find_support(points.p_m, points.normals, SupportConfig())
+        return find_support(points_of(cloud.take(solid_splats(cloud))))
     except NoSupportError:
         return None
 

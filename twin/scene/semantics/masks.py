@@ -6,14 +6,15 @@ Whether two masks mean the same thing is decided on the Gaussians that both fram
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt16
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import squareform
 
-from twin.naming.things import MaskSet, SemanticsError
+from twin.naming.things import Instance, Mask
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.lift import Viewpoint, lifted
@@ -47,35 +48,13 @@ class Observation:
     scores: tuple[float, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Track:
-    """One thing that several frames agree on."""
-
-    label: str
-    score: float
-    support: int
-    """Frames with a mask of it."""
-    seen: int
-    """Frames that show enough of it."""
-    mask: Bool[np.ndarray, " num_splats"]
-
-
 def observe(
-    rasteriser: Rasteriser, cloud: GaussianCloud, viewpoint: Viewpoint, masks: MaskSet
+    rasteriser: Rasteriser, cloud: GaussianCloud, viewpoint: Viewpoint, masks: Sequence[Mask]
 ) -> Observation:
     """Carry the masks of one frame to the Gaussians."""
     camera = viewpoint.camera
-    for number, mask in enumerate(masks.masks):
-        if mask.image.shape != (camera.height, camera.width):
-            message = (
-                f"mask {number} ({mask.label!r}) of camera {masks.camera_id} at "
-                f"{masks.stamp_ns} ns is {mask.image.shape[1]} x {mask.image.shape[0]} pixels, "
-                f"the camera's image {camera.width} x {camera.height}. Give masks of the image's "
-                "own size."
-            )
-            raise SemanticsError(message)
     whole = np.ones((camera.height, camera.width), dtype=bool)
-    stack = np.stack([whole, *(mask.image for mask in masks.masks)]).astype(np.float32)
+    stack = np.stack([whole, *(mask.image for mask in masks)]).astype(np.float32)
     shown = lifted(rasteriser, cloud, viewpoint, stack)
     ids = np.flatnonzero(shown[:, 0] > MIN_WEIGHT)
     weight = shown[ids, 0]
@@ -83,14 +62,14 @@ def observe(
         splat_ids=ids,
         weight=weight,
         inside=as_float32(np.clip(shown[ids, 1:] / weight[:, None], 0.0, 1.0)),
-        labels=tuple(mask.label for mask in masks.masks),
-        scores=tuple(float(mask.score) for mask in masks.masks),
+        labels=tuple(mask.label for mask in masks),
+        scores=tuple(float(mask.score) for mask in masks),
     )
 
 
 def associate(
-    observations: Sequence[Observation], num_splats: int
-) -> tuple[tuple[Track, ...], UInt16[np.ndarray, " num_splats"]]:
+    observations: Sequence[Observation], num_splats: int, source: str = ""
+) -> tuple[tuple[Instance, ...], UInt16[np.ndarray, " num_splats"]]:
     """Find the things that the masks of many frames agree on, the largest first.
 
     Masks are clustered by the mean of their IoU. A Gaussian goes to the thing with the largest
@@ -111,20 +90,20 @@ def associate(
         of_thing = _share(observations, members, num_splats)
         support, seen = _counts(observations, members, of_thing > INSIDE)
         if support >= MIN_SUPPORT and support > MIN_HITS * seen:
-            kept.append((members, support, seen))
+            kept.append(members)
             share.append(of_thing)
     best = np.max(share, axis=0)
     owner = np.where(best > 1.0 - best, np.argmax(share, axis=0), 0)
-    tracks = [
-        _track(observations, members, support, seen, owner == number)
-        for number, (members, support, seen) in enumerate(kept, start=1)
+    things = [
+        Instance(id=0, mask=owner == number, source=source, **_named(observations, members))
+        for number, members in enumerate(kept, start=1)
         if int((owner == number).sum()) >= MIN_SPLATS
     ]
-    tracks.sort(key=lambda item: (-int(item.mask.sum()), item.label, int(item.mask.argmax())))
+    things.sort(key=lambda item: (-int(item.mask.sum()), item.label, int(item.mask.argmax())))
     labels = np.zeros(num_splats, dtype=np.uint16)
-    for number, track in enumerate(tracks, start=1):
-        labels[track.mask] = number
-    return tuple(tracks), labels
+    for number, thing in enumerate(things, start=1):
+        labels[thing.mask] = number
+    return tuple(replace(thing, id=n) for n, thing in enumerate(things, start=1)), labels
 
 
 def _clusters(
@@ -169,13 +148,9 @@ def _counts(
     return len(hit), len(hit | shown)
 
 
-def _track(
-    observations: Sequence[Observation],
-    members: Sequence[tuple[int, int]],
-    support: int,
-    seen: int,
-    mask: Bool[np.ndarray, " num_splats"],
-) -> Track:
+def _named(
+    observations: Sequence[Observation], members: Sequence[tuple[int, int]]
+) -> dict[str, Any]:
     """What most of its masks are called, and how sure they are."""
     names: dict[str, float] = defaultdict(float)
     scores = []
@@ -184,4 +159,4 @@ def _track(
         names[observations[frame].labels[column]] += score
         scores.append(score)
     label = max(sorted(names), key=lambda name: names[name])
-    return Track(label=label, score=float(np.mean(scores)), support=support, seen=seen, mask=mask)
+    return {"label": label, "score": float(np.mean(scores))}

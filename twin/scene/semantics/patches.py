@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from twin.naming.colours import without_shading
+from twin.naming.colours import LIGHTNESS_WEIGHT, without_shading
 from twin.scene.semantics.cluster import (
     SurfacePoints,
     Voxels,
@@ -23,6 +23,7 @@ from twin.scene.semantics.cluster import (
     neighbour_pairs,
     numbered,
 )
+from twin.scene.semantics.shape_descriptors import sides_m
 
 VOXEL_M = 0.008
 """Least size of the voxels: on finer ones noise of depth bends every surface."""
@@ -42,8 +43,6 @@ LOOSENESS = 6.0
 """Cost times voxels up to which small patches join (k of the paper)."""
 MIN_VOXELS = 25
 """Smaller patches join the neighbour with the cheapest border."""
-LIGHTNESS_WEIGHT = 0.3
-"""Shading changes lightness, not the ratios of a and b to it."""
 LEAST_BEND = -0.1
 """Mean (n_j - n_i) . d over a border from which two patches are one thing."""
 LEAST_CONTACT = 0.2
@@ -90,7 +89,7 @@ def cut_into_patches(
         ids = np.flatnonzero(joined == number)
         around = (links == number).sum(axis=1) == 1
         drawn = float(border.is_flat[around].mean()) if around.any() else 0.0
-        wide = _extents(voxels.p_m[ids])[1] >= MIN_WIDTH_M
+        wide = sides_m(voxels.p_m[ids])[1] >= MIN_WIDTH_M
         large = len(ids) * voxel_m**2 >= MIN_AREA_M2
         if large and wide and drawn <= MAX_DRAWN_SHARE:
             found += 1
@@ -102,7 +101,7 @@ def _smoothed(
     voxels: Voxels, voxel_m: float
 ) -> tuple[Float[np.ndarray, "num_voxels 3"], Float[np.ndarray, "num_voxels 3"]]:
     """Normals and colours averaged over neighbours that face the same way and look alike."""
-    normals, colour = voxels.normals, without_shading(voxels.lab, LIGHTNESS_WEIGHT)
+    normals, colour = voxels.normals, without_shading(voxels.lab)
     pairs, itself = neighbour_pairs(voxels.p_m, 2.6 * voxel_m), np.arange(len(voxels))
     a = np.concatenate([pairs[:, 0], pairs[:, 1], itself])
     b = np.concatenate([pairs[:, 1], pairs[:, 0], itself])
@@ -182,7 +181,7 @@ def _structure(
     patch: np.ndarray, num: int, colour: np.ndarray, p_m: np.ndarray
 ) -> Bool[np.ndarray, " num_patches"]:
     """Patches that are walls, or near one and of its colour."""
-    extents = np.array([_extents(p_m[patch == k])[:2] for k in range(num)]).reshape(num, 2)
+    extents = np.array([sides_m(p_m[patch == k])[:2] for k in range(num)]).reshape(num, 2)
     found = np.all(extents >= WALL_M, axis=1)
     trees = [cKDTree(p_m[patch == k]) for k in range(num)]
     is_dark = colour[:, 0] < LIGHTNESS_WEIGHT * DARK
@@ -219,16 +218,8 @@ def _joined_outwards(
         fits &= bend > LEAST_BEND
         for number in np.argsort(-bend, kind="stable"):
             a, b = keys[number]
-            if fits[number] and (_extents(p_m[(joined == a) | (joined == b)])[0] <= MAX_SIZE_M):
+            if fits[number] and (sides_m(p_m[(joined == a) | (joined == b)])[0] <= MAX_SIZE_M):
                 joined = np.where(joined == b, a, joined)
                 break
         else:
             return np.asarray(joined)
-
-
-def _extents(p_m: np.ndarray) -> np.ndarray:
-    """Extents along the principal axes without the outermost 2 %, largest first."""
-    away = p_m - p_m.mean(axis=0)
-    along = away @ np.linalg.eigh(away.T @ away)[1]
-    low, high = np.quantile(along, [0.02, 0.98], axis=0)
-    return np.asarray(np.sort(high - low)[::-1])

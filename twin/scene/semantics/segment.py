@@ -8,7 +8,7 @@ regions that stay when a threshold moves).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,7 +18,6 @@ from bridge.geometry import se3
 from twin.naming.colours import colour_name, lab_from_srgb, without_shading
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.semantics.cluster import (
-    LIGHTNESS_WEIGHT,
     SurfacePoints,
     Voxels,
     extents_m,
@@ -30,11 +29,10 @@ from twin.scene.semantics.cluster import (
     within_outline,
 )
 from twin.scene.semantics.height_tree import branches
-from twin.scene.semantics.patches import VOXEL_M, cut_into_patches
+from twin.scene.semantics.patches import REACH_VOXELS, VOXEL_M, cut_into_patches
 from twin.scene.semantics.shape_descriptors import measure_shape
 from twin.scene.semantics.support import (
     NoSupportError,
-    SupportConfig,
     SupportPlane,
     as_measured,
     find_support,
@@ -57,33 +55,30 @@ MAX_TAKEN = 0.3
 """Share of a thing that a stabler one may have."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SegmentConfig:
-    """What the default segmenter takes for a thing."""
+ROUGHNESS_FACTOR = 3.0
+"""Things are higher over the plane than so many times its roughness, as it was measured."""
+FINEST_VOXEL_M = 0.004
+"""Size of the voxels that hang together; grows with the spacing of the points."""
+MIN_VOXELS = 25
+"""Smaller groups are noise."""
+MIN_SIZE_M = 0.012
+"""Things have at least this extent in two directions."""
+PLANE_COLOUR_GAP = 12.0
+"""Lab distance up to which a colour is the plane's."""
+RELIEF_SCORE = 0.25
+"""What rises so little (``Thing.score``) and has the plane's own colour is the plane: noise of its
+depth, not a thing. So is a flat thing of exactly the plane's colour."""
 
-    support: SupportConfig = field(default_factory=SupportConfig)
-    """The plane that things stand on."""
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What is taken for a thing over one plane."""
+
     min_height_m: float = 0.007
-    """Above the plane."""
-    roughness_factor: float = 3.0
-    """And above so many times the roughness of the plane, as it was measured."""
     max_height_m: float = 0.6
     """Higher points belong to the surroundings."""
-    voxel_m: float = 0.004
-    """Finest size of the voxels that hang together; grows with the spacing of the points."""
-    reach_voxels: float = 1.8
-    """Voxels nearer than this hang together (the 26 neighbours)."""
-    min_voxels: int = 25
-    """Smaller groups are noise."""
-    min_size_m: float = 0.012
-    """Things have at least this extent in two directions."""
     max_size_m: float = 0.45
     """Larger groups are furniture, the robot, a wall."""
-    plane_colour_gap: float = 12.0
-    """Lab distance up to which a colour is the plane's."""
-    relief_score: float = 0.25
-    """What rises so little (``Thing.score``) and has the plane's own colour is the plane: noise of
-    its depth, not a thing. So is a flat thing of exactly the plane's colour."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,23 +105,18 @@ class Segmentation:
     """Why nothing was found; empty otherwise."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Look:
-    """What belongs together, seen with voxels of one size."""
-
-    labels: Int[np.ndarray, " num_points"]
-    """Index of the thing plus one, the largest first; 0 is the background."""
-    voxel_m: float
-    """Cells in which the shape of a thing is measured."""
+Look = tuple[Int[np.ndarray, " num_points"], float]
+"""What belongs together, seen with voxels of one size: index of each point's thing plus one, the
+largest first, 0 is the background; and the size of the cells in which their shape is measured."""
 
 
-def segment(points: SurfacePoints, config: SegmentConfig) -> Segmentation:
+def segment(points: SurfacePoints) -> Segmentation:
     """Find the things that most sizes of voxels find, the largest first."""
     ground: OverPlane | WithoutPlane
     try:
-        ground = OverPlane(points, find_support(points.p_m, points.normals, config.support), config)
+        ground = OverPlane(points, find_support(points))
     except NoSupportError:
-        ground = WithoutPlane(points, config)
+        ground = WithoutPlane(points)
     looks = [ground.look(scale) for scale in VOXEL_SCALES]
     kept = stable(looks)
     labels = np.zeros(len(points), dtype=np.int64)
@@ -134,7 +124,7 @@ def segment(points: SurfacePoints, config: SegmentConfig) -> Segmentation:
         labels[mask] = number
     things = tuple(ground.thing(mask, voxel_m) for mask, voxel_m in kept)
     remark = "" if things else ground.nothing
-    if not things and looks[0].labels.any():
+    if not things and looks[0][0].any():
         remark = f"of what stands out, no two of {len(looks)} sizes of voxels find the same"
     return Segmentation(labels=labels, things=things, plane=ground.plane, remark=remark)
 
@@ -142,16 +132,16 @@ def segment(points: SurfacePoints, config: SegmentConfig) -> Segmentation:
 def stable(looks: Sequence[Look]) -> list[tuple[Bool[np.ndarray, " num_points"], float]]:
     """What at least half the other looks find again, with the voxels it was found with."""
     found = []
-    for look in looks:
-        others = [other for other in looks if other is not look]
-        for number in range(1, int(look.labels.max(initial=0)) + 1):
-            mask = look.labels == number
-            best = np.array([_best_iou(mask, other.labels) for other in others])
+    for labels, voxel_m in looks:
+        others = [other for other, _ in looks if other is not labels]
+        for number in range(1, int(labels.max(initial=0)) + 1):
+            mask = labels == number
+            best = np.array([_best_iou(mask, other) for other in others])
             share = float((best >= SAME_IOU).mean())
             if share >= 0.5:
-                found.append((share + float(best.mean()), mask, look.voxel_m))
+                found.append((share + float(best.mean()), mask, voxel_m))
     kept: list[tuple[np.ndarray, float]] = []
-    taken = np.zeros(len(looks[0].labels), dtype=bool)
+    taken = np.zeros(len(looks[0][0]), dtype=bool)
     for _, mask, voxel_m in sorted(found, key=lambda item: -item[0]):
         if taken[mask].mean() <= MAX_TAKEN:
             kept.append((mask & ~taken, voxel_m))
@@ -168,33 +158,26 @@ def _best_iou(mask: np.ndarray, labels: np.ndarray) -> float:
 class OverPlane:
     """Points on a level plane, with all that does not depend on the size of voxels."""
 
-    def __init__(
-        self,
-        points: SurfacePoints,
-        plane: SupportPlane,
-        config: SegmentConfig,
-    ) -> None:
+    def __init__(self, points: SurfacePoints, plane: SupportPlane) -> None:
         """Measure heights, and choose what is free to be a thing."""
-        plane = as_measured(plane, points.p_m, points.normals, config.support)
-        roughness = roughness_m(points.p_m, points.normals, plane, config.support)
-        least = max(config.min_height_m, config.roughness_factor * roughness)
-        self._is_rough = least > config.min_height_m
+        plane, usual = as_measured(plane, points), Limits()
+        least = max(usual.min_height_m, ROUGHNESS_FACTOR * roughness_m(points, plane))
+        self._is_rough = least > usual.min_height_m
         large = FURNITURE if plane.area_m2 > FLOOR_M2 else 1.0
-        self._config = config = replace(
-            config,
+        self._limits = limits = Limits(
             min_height_m=least,
-            max_height_m=large * config.max_height_m,
-            max_size_m=large * config.max_size_m,
+            max_height_m=large * usual.max_height_m,
+            max_size_m=large * usual.max_size_m,
         )
         self._points, self.plane = points, plane
         self._height = height = plane.height_m(points.p_m)
         under = plane.under(points.p_m)
-        self._lab = without_shading(lab_from_srgb(points.colors), LIGHTNESS_WEIGHT)
-        free = under & (height < config.max_height_m)
-        raised = free & (height > config.min_height_m)
-        self._low = free & (np.abs(height) <= config.min_height_m)
+        self._lab = without_shading(lab_from_srgb(points.colors))
+        free = under & (height < limits.max_height_m)
+        raised = free & (height > limits.min_height_m)
+        self._low = free & (np.abs(height) <= limits.min_height_m)
         self._above = np.flatnonzero(raised)
-        self._voxel_m = max(config.voxel_m, 2.0 * _spacing(points.p_m[self._above]))
+        self._voxel_m = max(FINEST_VOXEL_M, 2.0 * _spacing(points.p_m[self._above]))
 
     @property
     def nothing(self) -> str:
@@ -207,19 +190,19 @@ class OverPlane:
 
     def look(self, scale: float) -> Look:
         """Group them, with voxels so many times as large as their spacing asks for."""
-        points, height, above, config = self._points, self._height, self._above, self._config
+        points, height, above, limits = self._points, self._height, self._above, self._limits
         voxel_m = scale * self._voxel_m
         labels = np.zeros(len(points), dtype=np.int64)
-        labels[above] = _things(points.take(above), height[above], voxel_m, config)
+        labels[above] = _things(points.take(above), height[above], voxel_m, limits)
         labels = _largest_first(labels)
-        _add_floors(labels, points.p_m, self._lab, self._low, config)
-        labels = _without_relief(labels, self._lab, self._low, height, config)
-        return Look(labels=labels, voxel_m=voxel_m)
+        _add_floors(labels, points.p_m, self._lab, self._low)
+        labels = _without_relief(labels, self._lab, self._low, height, limits)
+        return labels, voxel_m
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""
         mine, height = self._points.take(mask), self._height[mask]
-        return _thing(mine, height, voxel_m, self._config, self._is_rough)
+        return _thing(mine, height, voxel_m, self._limits, self._is_rough)
 
 
 class WithoutPlane:
@@ -227,28 +210,26 @@ class WithoutPlane:
 
     plane = None
 
-    def __init__(self, points: SurfacePoints, config: SegmentConfig) -> None:
+    def __init__(self, points: SurfacePoints) -> None:
         """Measure how far points lie apart."""
-        self._points, self._config = points, config
+        self._points = points
         self._spacing_m = _spacing(points.p_m)
 
     @property
     def nothing(self) -> str:
         """Why no thing was found, where none was."""
-        return no_support(self._points.p_m, self._points.normals, self._config.support)
+        return no_support(self._points)
 
     def look(self, scale: float) -> Look:
         """Cut them, with voxels so many times as large as their spacing asks for."""
         labels = cut_into_patches(self._points, self._spacing_m, scale)
-        if not labels.any():
-            raise NoSupportError(self.nothing)
-        return Look(labels=_largest_first(labels), voxel_m=VOXEL_M)
+        return _largest_first(labels), VOXEL_M
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""
         mine = self._points.take(mask)
         height = mine.p_m[:, 2] - float(np.quantile(mine.p_m[:, 2], 0.01))
-        return _thing(mine, height, voxel_m, self._config, rough=True)
+        return _thing(mine, height, voxel_m, Limits(), rough=True)
 
 
 def _spacing(p_m: np.ndarray) -> float:
@@ -261,43 +242,38 @@ def _spacing(p_m: np.ndarray) -> float:
 
 
 def _things(
-    points: SurfacePoints, height_m: np.ndarray, voxel_m: float, config: SegmentConfig
+    points: SurfacePoints, height_m: np.ndarray, voxel_m: float, limits: Limits
 ) -> np.ndarray:
     """Number the things among points above the plane from 1; 0 is none."""
-    if len(points) < config.min_voxels:
+    if len(points) < MIN_VOXELS:
         return np.zeros(len(points), dtype=np.int64)
     voxels = make_voxels(points, voxel_m)
     height = np.bincount(voxels.of_point, weights=height_m) / voxels.count
-    pairs = neighbour_pairs(voxels.p_m, config.reach_voxels * voxel_m)
+    pairs = neighbour_pairs(voxels.p_m, REACH_VOXELS * voxel_m)
     labels = np.zeros(len(voxels), dtype=np.int64)
     groups = branches(
         voxels.p_m,
         height,
         pairs,
         voxel_m=voxel_m,
-        max_size_m=config.max_size_m,
+        max_size_m=limits.max_size_m,
         min_voxels=MIN_FRAGMENT,
     )
     pieces: list[np.ndarray] = []
     for ids in groups:
-        pieces += _pieces(voxels, ids, height, pairs, voxel_m, config)
+        pieces += _pieces(voxels, ids, height, pairs, voxel_m)
     found = 0
     for piece in pieces:
         extent = extents_m(voxels.p_m[piece])
-        stands = np.quantile(height[piece], 0.03) < config.max_height_m / 3
-        if stands and len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
+        stands = np.quantile(height[piece], 0.03) < limits.max_height_m / 3
+        if stands and len(piece) >= MIN_VOXELS and extent[1] >= MIN_SIZE_M:
             found += 1
             labels[piece] = found
     return np.asarray(labels[voxels.of_point])
 
 
 def _pieces(
-    voxels: Voxels,
-    ids: np.ndarray,
-    height_m: np.ndarray,
-    pairs: np.ndarray,
-    voxel_m: float,
-    config: SegmentConfig,
+    voxels: Voxels, ids: np.ndarray, height_m: np.ndarray, pairs: np.ndarray, voxel_m: float
 ) -> list[np.ndarray]:
     """Cut one connected group by colour, and each piece of it along valleys."""
     pieces = []
@@ -336,7 +312,6 @@ def _add_floors(
     p_m: Float[np.ndarray, "num_points 3"],
     lab: Float[np.ndarray, "num_points 3"],
     low: Bool[np.ndarray, " num_points"],
-    config: SegmentConfig,
 ) -> None:
     """Give low points to the thing around them whose colour they have and the plane has not."""
     free = np.flatnonzero(low & (labels == 0))
@@ -346,7 +321,7 @@ def _add_floors(
     for number in range(1, int(labels.max(initial=0)) + 1):
         mine = labels == number
         to_thing = np.linalg.norm(lab[free] - np.median(lab[mine], axis=0), axis=1)
-        clear = (to_thing < config.plane_colour_gap) & (to_thing < 0.5 * to_plane)
+        clear = (to_thing < PLANE_COLOUR_GAP) & (to_thing < 0.5 * to_plane)
         clear[clear] = within_outline(p_m[free[clear]], p_m[mine])
         labels[free[clear]] = number
 
@@ -356,7 +331,7 @@ def _without_relief(
     lab: Float[np.ndarray, "num_points 3"],
     low: Bool[np.ndarray, " num_points"],
     height_m: np.ndarray,
-    config: SegmentConfig,
+    limits: Limits,
 ) -> Int[np.ndarray, " num_points"]:
     """Give back to the plane what hardly rises above it and looks like it."""
     plane = low & (labels == 0)
@@ -368,28 +343,24 @@ def _without_relief(
     for number in range(1, int(labels.max(initial=0)) + 1):
         mine = labels == number
         away = float(np.linalg.norm(np.median(lab[mine], axis=0) - middle))
-        is_flat = _firmness(height_m[mine], config) < config.relief_score
-        if not (is_flat and away < max(own, config.plane_colour_gap)):
+        is_flat = _firmness(height_m[mine], limits) < RELIEF_SCORE
+        if not (is_flat and away < max(own, PLANE_COLOUR_GAP)):
             kept[mine] = kept.max() + 1
     return kept
 
 
-def _firmness(height_m: np.ndarray, config: SegmentConfig) -> float:
+def _firmness(height_m: np.ndarray, limits: Limits) -> float:
     """Share of points that noise of the plane does not explain."""
-    return float((height_m > 2 * config.min_height_m).mean())
+    return float((height_m > 2 * limits.min_height_m).mean())
 
 
 def _thing(
-    points: SurfacePoints,
-    height_m: np.ndarray,
-    voxel_m: float,
-    config: SegmentConfig,
-    rough: bool,
+    points: SurfacePoints, height_m: np.ndarray, voxel_m: float, limits: Limits, rough: bool
 ) -> Thing:
     xyh = np.concatenate([points.p_m[:, :2], height_m[:, None]], axis=1)
     shape = measure_shape(xyh, voxel_m, rough=rough)
     color = np.median(points.colors, axis=0).astype(np.float64)
-    score = _firmness(height_m, config)
+    score = _firmness(height_m, limits)
     return Thing(label=f"{colour_name(color)} {shape.word}", score=score)
 
 

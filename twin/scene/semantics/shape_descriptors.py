@@ -8,11 +8,14 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from twin.naming.things import UNKNOWN_SHAPE
+from twin.scene.shape.known import rectangle_yaw_rad
 
 CONTAINER_RATIO = 1.8
 """Convex hull over filled volume; more, with a cavity that opens upwards, is a container."""
 CONTAINER = "open container"
 NUM_LEVELS = 48
+LEAST_DEPTH = 0.2
+"""Of a cavity, in heights of the thing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,10 +34,6 @@ class HeightMap:
         index = np.clip(index, 0, np.array(self.top_m.shape) - 1)
         return index[:, 0], index[:, 1]
 
-    def centre_m(self, mask: Bool[np.ndarray, "num_x num_y"]) -> Float[np.ndarray, "2"]:
-        """Mean place of the marked cells."""
-        return np.asarray((np.argwhere(mask).mean(axis=0) + 0.5) * self.cell_m + self.corner_m)
-
 
 @dataclass(frozen=True, kw_only=True)
 class HeightMapCavity:
@@ -45,7 +44,6 @@ class HeightMapCavity:
     rim_m: float
     """Height at which it would overflow."""
     floor_m: float
-    volume_m3: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +58,6 @@ class ShapeDescriptors:
     """Longer side, shorter side, height."""
     yaw_rad: float
     """Direction of the longer side."""
-    hull_ratio: float
-    """Volume of the convex hull over the volume filled from the plane to the highest points."""
     cavity: HeightMapCavity | None
 
 
@@ -84,16 +80,11 @@ def height_map(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> Heigh
     )
 
 
-def find_height_map_cavity(
-    heights: HeightMap, min_depth_fraction: float = 0.2
-) -> HeightMapCavity | None:
+def find_height_map_cavity(heights: HeightMap) -> HeightMapCavity | None:
     """Flood the height map; None when hardly any water would stand.
 
     Each level is closed by three cells first, so that a gap in a noisy rim does not drain it.
     The rim is the highest level that still holds half the area of the widest.
-
-    Args:
-        min_depth_fraction: A cavity is at least this deep, in heights of the thing.
     """
     height = float(heights.top_m.max())
     levels = np.linspace(0.0, height, NUM_LEVELS + 1)[1:]
@@ -111,12 +102,11 @@ def find_height_map_cavity(
     lowest = float(heights.top_m[pools[last]].min())
     pool = np.any([pools[k] for k in range(last + 1) if levels[k] >= (rim + lowest) / 2], axis=0)
     floor = float(np.quantile(heights.top_m[pool], 0.3))
-    deep = rim - floor > max(min_depth_fraction * height, 0.006)
+    deep = rim - floor > max(LEAST_DEPTH * height, 0.006)
     wide = pool.sum() > 0.15 * heights.footprint.sum()
     if not (deep and wide):
         return None
-    volume = float(np.maximum(rim - heights.top_m[pool], 0.0).sum()) * heights.cell_m**2
-    return HeightMapCavity(mask=pool, rim_m=rim, floor_m=floor, volume_m3=volume)
+    return HeightMapCavity(mask=pool, rim_m=rim, floor_m=floor)
 
 
 def measure_shape(
@@ -141,7 +131,6 @@ def measure_shape(
         centre_m=np.array([*centre_xy, top / 2]),
         size_m=size,
         yaw_rad=float(yaw),
-        hull_ratio=ratio,
         cavity=cavity,
     )
 
@@ -154,35 +143,16 @@ def _hull_volume(points: np.ndarray) -> float:
 
 
 def _rectangle(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Smallest rectangle around points: centre, sides (longer first), yaw, share that is hull.
-
-    One side of it lies along a side of the convex hull (Freeman and Shapira 1975).
-    """
-    try:
-        hull = ConvexHull(xy)
-    except (QhullError, ValueError):
-        low, high = xy.min(axis=0), xy.max(axis=0)
-        sides = np.maximum(high - low, 1e-6)
-        return (low + high) / 2, np.sort(sides)[::-1], float(np.pi / 2 * (sides[1] > sides[0])), 1.0
-    corners = xy[hull.vertices]
-    edges = np.roll(corners, -1, axis=0) - corners
-    yaws = np.arctan2(edges[:, 1], edges[:, 0])
-    along = np.stack([np.cos(yaws), np.sin(yaws)], axis=1)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    spans = []
-    for axis in (along, across):
-        shadow = corners @ axis.T
-        spans.append((shadow.min(axis=0), shadow.max(axis=0)))
-    areas = (spans[0][1] - spans[0][0]) * (spans[1][1] - spans[1][0])
-    best = int(np.argmin(areas))
-    middle = [(span[0][best] + span[1][best]) / 2 for span in spans]
-    sides = np.array([span[1][best] - span[0][best] for span in spans])
-    centre = middle[0] * along[best] + middle[1] * across[best]
-    yaw = float(yaws[best])
+    """Smallest rectangle around points: centre, sides (longer first), yaw, share that is hull."""
+    yaw = rectangle_yaw_rad(xy)
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s], [s, c]])
+    low, high = (xy @ R).min(axis=0), (xy @ R).max(axis=0)
+    sides = np.maximum(high - low, 1e-6)
+    fill = _hull_volume(xy) / float(np.prod(sides))
     if sides[1] > sides[0]:
         sides, yaw = sides[::-1], yaw + np.pi / 2
-    yaw = float((yaw + np.pi / 2) % np.pi - np.pi / 2)
-    return centre, sides, yaw, float(hull.volume / max(areas[best], 1e-12))
+    return R @ (low + high) / 2, sides, float((yaw + np.pi / 2) % np.pi - np.pi / 2), fill
 
 
 SLAB, BLOCK = 0.2, 0.4
@@ -219,10 +189,20 @@ def _word(
     return _bulk(xyh_m)
 
 
+def _along_principal(p_m: np.ndarray) -> np.ndarray:
+    away = p_m - p_m.mean(axis=0)
+    return np.asarray(away @ np.linalg.eigh(away.T @ away)[1])
+
+
+def sides_m(p_m: np.ndarray) -> np.ndarray:
+    """Extents along the principal axes without the outermost 2 %, largest first."""
+    low, high = np.quantile(_along_principal(p_m), [0.02, 0.98], axis=0)
+    return np.asarray(np.sort(high - low)[::-1])
+
+
 def _bulk(points: np.ndarray) -> str:
     """Of a shape that stands askew, or is half seen: thin, or filling its box, or neither."""
-    away = points - points.mean(axis=0)
-    along = away @ np.linalg.eigh(away.T @ away)[1]
+    along = _along_principal(points)
     low, high = np.quantile(along, [0.02, 0.98], axis=0)
     short, middle, long = np.sort(high - low)
     if short < SLAB * middle:

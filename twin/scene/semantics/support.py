@@ -18,35 +18,27 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from twin.naming.things import SemanticsError
+from twin.scene.semantics.cluster import SurfacePoints
 
 UP = np.array([0.0, 0.0, 1.0])
 """Against gravity in the root frame of a robot cell."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SupportConfig:
-    """What counts as the supporting plane."""
-
-    max_tilt_rad: float = 0.14
-    """From level: poses may be wrong by a few degrees, a ramp is no table."""
-    tolerance_m: float = 0.006
-    """Points this near belong to the plane."""
-    num_trials: int = 500
-    """Triples of points to try."""
-    max_points: int = 6000
-    """Points that vote; more are thinned out evenly."""
-    min_points: int = 100
-    """A plane with fewer points carries nothing."""
-    min_area_m2: float = 0.06
-    """Neither does a smaller one: it is the top of a thing."""
-    num_candidates: int = 3
-    """Planes among which the one that carries most is chosen (table and floor)."""
-    separation_m: float = 0.04
-    """Level planes nearer than this are one surface that is not quite flat."""
-    cell_m: float = 0.02
-    """Size of the cells that say where the plane extends."""
-    seed: int = 0
-    """Of the random triples."""
+MAX_TILT_RAD = 0.14
+"""From level: poses may be wrong by a few degrees, a ramp is no table."""
+TOLERANCE_M = 0.006
+"""Points this near belong to the plane."""
+NUM_TRIALS, MAX_POINTS = 500, 6000
+"""Triples of points to try, and points that vote; more are thinned out evenly."""
+MIN_POINTS, MIN_AREA_M2 = 100, 0.06
+"""A plane with fewer points carries nothing, and neither does a smaller one: it is the top of a
+thing."""
+NUM_CANDIDATES = 3
+"""Planes among which the one that carries most is chosen (table and floor)."""
+SEPARATION_M = 0.04
+"""Level planes nearer than this are one surface that is not quite flat."""
+CELL_M = 0.02
+"""Size of the cells that say where the plane extends."""
 
 
 class NoSupportError(SemanticsError):
@@ -82,14 +74,13 @@ class SupportPlane:
     """Where it extends, seen along z: cells with support and the holes between them."""
     corner_m: tuple[float, float]
     """Lower x and y of the first cell."""
-    cell_m: float
     bend: Bend | None = None
     """As measured, where that is far from flat."""
 
     @property
     def area_m2(self) -> float:
         """Of the footprint, seen along z."""
-        return float(self.footprint.sum()) * self.cell_m**2
+        return float(self.footprint.sum()) * CELL_M**2
 
     def height_m(self, p_m: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
         """Distance above the plane as it was measured; negative below [m]."""
@@ -98,40 +89,34 @@ class SupportPlane:
 
     def under(self, p_m: Float[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
         """Say which points lie above or below where the plane extends."""
-        cells = np.floor((p_m[:, :2] - self.corner_m) / self.cell_m).astype(np.int64)
+        cells = np.floor((p_m[:, :2] - self.corner_m) / CELL_M).astype(np.int64)
         inside = np.all((cells >= 0) & (cells < self.footprint.shape), axis=1)
         cells[~inside] = 0
         return np.asarray(inside & self.footprint[cells[:, 0], cells[:, 1]])
 
 
-def find_support(
-    p_m: Float[np.ndarray, "num_points 3"],
-    normals: Float[np.ndarray, "num_points 3"],
-    config: SupportConfig,
-) -> SupportPlane:
+def find_support(points: SurfacePoints) -> SupportPlane:
     """Find the level plane that carries most of what is near it.
 
     Fischler and Bolles 1981 on the points that face upwards, with the tilt bounded. Of the
     largest few planes the one with most points on it and just above it wins: a floor may be
     larger than the table, but less stands on the part of it that is seen.
     """
-    upright = _faces_up(normals, config)
-    left = p_m[upright]
+    left = points.p_m[_faces_up(points)]
     planes: list[tuple[int, SupportPlane]] = []
-    for _ in range(config.num_candidates):
-        found = _largest_plane(left, config)
-        if found is None:
+    for _ in range(NUM_CANDIDATES):
+        plane = _largest_plane(left)
+        if plane is None:
             break
-        plane = found
-        left = left[np.abs(plane.height_m(left)) > config.separation_m]
-        if plane.area_m2 < config.min_area_m2:
+        left = left[np.abs(plane.height_m(left)) > SEPARATION_M]
+        if plane.area_m2 < MIN_AREA_M2:
             continue
-        height = plane.height_m(p_m)
-        carried = (height > 2 * config.tolerance_m) & (height < 0.3)
-        carried[carried] = plane.under(p_m[carried])
+        height = plane.height_m(points.p_m)
+        carried = (height > 2 * TOLERANCE_M) & (height < 0.3)
+        carried[carried] = plane.under(points.p_m[carried])
         planes.append((plane.num_points + int(carried.sum()), plane))
     if not planes:
-        raise NoSupportError(no_support(p_m, normals, config))
+        raise NoSupportError(no_support(points))
     return max(planes, key=lambda item: item[0])[1]
 
 
@@ -147,31 +132,24 @@ WORTH = 0.75
 """A bend counts where it leaves less than this share of the roughness."""
 
 
-def as_measured(
-    plane: SupportPlane,
-    p_m: Float[np.ndarray, "num_points 3"],
-    normals: Float[np.ndarray, "num_points 3"],
-    config: SupportConfig,
-) -> SupportPlane:
+def as_measured(plane: SupportPlane, points: SurfacePoints) -> SupportPlane:
     """The plane with the bend that the cameras gave it; the same where it is flat."""
-    near = (np.abs(plane.height_m(p_m)) < BENT_M) & _faces_up(normals, config)
-    if int(near.sum()) < config.min_points:
+    near = (np.abs(plane.height_m(points.p_m)) < BENT_M) & _faces_up(points)
+    if int(near.sum()) < MIN_POINTS:
         return plane
-    p = p_m[near]
-    bent = replace(plane, bend=_fit_bend(p, plane.height_m(p), config.tolerance_m))
-    inside = np.abs(bent.height_m(p)) < config.tolerance_m
-    if int(inside.sum()) < config.min_points:
+    p = points.p_m[near]
+    bent = replace(plane, bend=_fit_bend(p, plane.height_m(p)))
+    inside = np.abs(bent.height_m(p)) < TOLERANCE_M
+    if int(inside.sum()) < MIN_POINTS:
         return plane
-    footprint, corner_m = _footprint(p[inside], config.cell_m)
+    footprint, corner_m = _footprint(p[inside])
     bent = replace(bent, footprint=footprint, corner_m=corner_m)
-    before, after = (roughness_m(p_m, normals, item, config) for item in (plane, bent))
+    before, after = (roughness_m(points, item) for item in (plane, bent))
     return bent if after < WORTH * before else plane
 
 
 def _fit_bend(
-    p_m: Float[np.ndarray, "num_points 3"],
-    height_m: Float[np.ndarray, " num_points"],
-    tolerance_m: float,
+    p_m: Float[np.ndarray, "num_points 3"], height_m: Float[np.ndarray, " num_points"]
 ) -> Bend:
     """Fit it to points near the plane, robustly: what stands on the plane is among them."""
     center_m = p_m[:, :2].mean(axis=0)
@@ -182,7 +160,7 @@ def _fit_bend(
     share = 1.0 / count[cell.reshape(-1)]
     x = np.zeros(A.shape[1])
     for _ in range(BEND_ROUNDS):
-        off = (height_m - A @ x) / (CUT_TOLERANCES * tolerance_m)
+        off = (height_m - A @ x) / (CUT_TOLERANCES * TOLERANCE_M)
         root = np.sqrt(share) * np.clip(1.0 - off**2, 0.0, None)
         x = np.linalg.lstsq(A * root[:, None], height_m * root, rcond=None)[0]
     return Bend(center_m=center_m, reach_m=reach_m, coefficients_m=x)
@@ -193,78 +171,76 @@ def _terms(xy: Float[np.ndarray, "num_points 2"]) -> Float[np.ndarray, "num_poin
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
-def no_support(p_m: np.ndarray, normals: np.ndarray, config: SupportConfig) -> str:
+def no_support(points: SurfacePoints) -> str:
     """What to tell somebody whose scene has no level plane, nor anything that stands out."""
-    upright = _faces_up(normals, config)
     return (
-        f"no level plane among {len(p_m)} points, {int(upright.sum())} of them facing up, and "
-        "nothing that stands out. The default segmenter needs a table in view, or things before a "
-        "wall."
+        f"no level plane among {len(points)} points, {int(_faces_up(points).sum())} of them facing "
+        "up, and nothing that stands out. The default segmenter needs a table in view, or things "
+        "before a wall."
     )
 
 
-def _faces_up(normals: np.ndarray, config: SupportConfig) -> Bool[np.ndarray, " num_points"]:
-    return np.asarray(normals @ UP > np.cos(3 * config.max_tilt_rad))
+def _faces_up(points: SurfacePoints) -> Bool[np.ndarray, " num_points"]:
+    return np.asarray(points.normals @ UP > np.cos(3 * MAX_TILT_RAD))
 
 
-def _largest_plane(p_m: np.ndarray, config: SupportConfig) -> SupportPlane | None:
-    if len(p_m) < config.min_points:
+def _largest_plane(p_m: np.ndarray) -> SupportPlane | None:
+    if len(p_m) < MIN_POINTS:
         return None
-    rng = np.random.default_rng(config.seed)
-    some = p_m[:: max(1, len(p_m) // config.max_points)]
-    triples = some[rng.integers(0, len(some), (config.num_trials, 3))]
+    rng = np.random.default_rng(0)
+    some = p_m[:: max(1, len(p_m) // MAX_POINTS)]
+    triples = some[rng.integers(0, len(some), (NUM_TRIALS, 3))]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     length = np.linalg.norm(normals, axis=1)
     normals /= np.maximum(length, 1e-12)[:, None]
     normals *= np.sign(normals[:, 2:] + 1e-12)
-    level = (length > 1e-9) & (normals @ UP > np.cos(config.max_tilt_rad))
+    level = (length > 1e-9) & (normals @ UP > np.cos(MAX_TILT_RAD))
     # The exactly level plane through one point is always among the trials.
     normals[~level] = UP
     offsets = (normals * triples[:, 0]).sum(axis=1)
-    votes = (np.abs(normals @ some.T - offsets[:, None]) < config.tolerance_m).sum(axis=1)
+    votes = (np.abs(normals @ some.T - offsets[:, None]) < TOLERANCE_M).sum(axis=1)
     best = int(np.argmax(votes))
     normal, offset = normals[best], float(offsets[best])
+    inside = np.abs(p_m @ normal - offset) < TOLERANCE_M
     for _ in range(3):
-        inside = np.abs(p_m @ normal - offset) < config.tolerance_m
-        if inside.sum() < config.min_points:
+        if inside.sum() < MIN_POINTS:
             return None
-        normal, offset = _refined(p_m[inside], config)
-    inside = np.abs(p_m @ normal - offset) < config.tolerance_m
-    if inside.sum() < config.min_points:
+        normal, offset = _refined(p_m[inside])
+        inside = np.abs(p_m @ normal - offset) < TOLERANCE_M
+    if inside.sum() < MIN_POINTS:
         return None
-    footprint, corner = _footprint(p_m[inside], config.cell_m)
+    footprint, corner = _footprint(p_m[inside])
     return SupportPlane(
         normal=normal,
         offset_m=offset,
         num_points=int(inside.sum()),
         footprint=footprint,
         corner_m=corner,
-        cell_m=config.cell_m,
     )
 
 
-def _refined(p_m: np.ndarray, config: SupportConfig) -> tuple[np.ndarray, float]:
+def _refined(p_m: np.ndarray) -> tuple[np.ndarray, float]:
     """Least squares for z over x and y, the tilt bounded."""
     centre = p_m.mean(axis=0)
     away = p_m - centre
     scatter = away[:, :2].T @ away[:, :2] + 1e-9 * len(p_m) * np.eye(2)
     slope = np.linalg.solve(scatter, away[:, :2].T @ away[:, 2])
     steepness = float(np.linalg.norm(slope))
-    slope *= min(1.0, np.tan(config.max_tilt_rad) / max(steepness, 1e-12))
+    slope *= min(1.0, np.tan(MAX_TILT_RAD) / max(steepness, 1e-12))
     normal = np.array([-slope[0], -slope[1], 1.0])
     normal /= np.linalg.norm(normal)
     return normal, float(normal @ centre)
 
 
-def _footprint(p_m: np.ndarray, cell_m: float) -> tuple[np.ndarray, tuple[float, float]]:
+def _footprint(p_m: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
     """Cells with points, small gaps closed, and the holes where things stand."""
-    cells = np.floor(p_m[:, :2] / cell_m).astype(np.int64)
+    cells = np.floor(p_m[:, :2] / CELL_M).astype(np.int64)
     low = cells.min(axis=0) - 3
     grid = np.zeros(cells.max(axis=0) - low + 4, dtype=bool)
     grid[tuple((cells - low).T)] = True
     closed = ndimage.binary_closing(grid, iterations=3)
     filled = np.asarray(ndimage.binary_fill_holes(closed | grid))
-    return filled, (float(low[0] * cell_m), float(low[1] * cell_m))
+    return filled, (float(low[0] * CELL_M), float(low[1] * CELL_M))
 
 
 MIN_SHARE_OF_BEST = 0.3
@@ -278,10 +254,7 @@ REFINEMENTS = 2
 
 
 def level_frame(
-    p_m: Float[np.ndarray, "num_points 3"],
-    normals: Float[np.ndarray, "num_points 3"],
-    Ts_base_camera: Sequence[Float[np.ndarray, "4 4"]],
-    config: SupportConfig,
+    points: SurfacePoints, Ts_base_camera: Sequence[Float[np.ndarray, "4 4"]]
 ) -> Float[np.ndarray, "4 4"]:
     """Turn the scene so that z points up: ``T_level_base``, exactly the identity where it does.
 
@@ -290,14 +263,13 @@ def level_frame(
     plane found along it says exactly where up is.
 
     Args:
-        normals: Unit vectors at the points, towards whoever saw them.
         Ts_base_camera: Where the cameras stood; none: z is up.
     """
-    if not len(Ts_base_camera) or len(p_m) < config.min_points:
+    if not len(Ts_base_camera) or len(points) < MIN_POINTS:
         return np.eye(4)
     camera_up = -np.mean([T[:3, 1] for T in Ts_base_camera], axis=0)
     camera_up /= max(float(np.linalg.norm(camera_up)), 1e-9)
-    some = normals[:: max(1, len(normals) // MAX_NORMALS)]
+    some = points.normals[:: max(1, len(points) // MAX_NORMALS)]
     directions = some[some @ camera_up > UPWARDS]
     directions = directions[:: max(1, len(directions) // MAX_DIRECTIONS)]
     if not len(directions):
@@ -310,8 +282,9 @@ def level_frame(
     up = _normalised(some[some @ up > limit].mean(axis=0))
     for _ in range(REFINEMENTS):
         T = _turned_up(up)
+        p_m, normals = (rows @ T[:3, :3].T for rows in (points.p_m, points.normals))
         try:
-            plane = find_support(p_m @ T[:3, :3].T, normals @ T[:3, :3].T, config)
+            plane = find_support(replace(points, p_m=p_m, normals=normals))
         except NoSupportError:
             break
         up = T[:3, :3].T @ plane.normal
@@ -331,18 +304,12 @@ def _turned_up(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def roughness_m(
-    p_m: Float[np.ndarray, "num_points 3"],
-    normals: Float[np.ndarray, "num_points 3"],
-    plane: SupportPlane,
-    config: SupportConfig,
-) -> float:
+def roughness_m(points: SurfacePoints, plane: SupportPlane) -> float:
     """Standard deviation of what belongs to the plane across it, by the median: noise and warp.
 
-    Args:
-        config: How near counts as the plane: five tolerances, upright points only.
+    Upright points within five tolerances count as the plane.
     """
-    height = plane.height_m(p_m)
-    near = (np.abs(height) < 5 * config.tolerance_m) & (normals @ UP > np.cos(FACING_RAD))
-    near[near] = plane.under(p_m[near])
+    height = plane.height_m(points.p_m)
+    near = (np.abs(height) < 5 * TOLERANCE_M) & (points.normals @ UP > np.cos(FACING_RAD))
+    near[near] = plane.under(points.p_m[near])
     return 1.4826 * float(np.median(np.abs(height[near]))) if near.any() else 0.0

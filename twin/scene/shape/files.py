@@ -42,10 +42,7 @@ def describe_shape(shape: ObjectShape) -> dict[str, Any]:
     return {
         "watertight": shape.is_watertight,
         "volume_m3": shape.volume_m3,
-        "completed_fraction": round(shape.completed_fraction, 4),
-        "completed": "share of the surface no view saw; closed by the plane it stands on, or solid",
         "voxel_m": shape.sdf.voxel_m,
         "truncation_m": shape.truncation_m,
         "num_views": shape.num_views,
-        "view_shift_m": shape.view_shift_m,
     }

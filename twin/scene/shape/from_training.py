@@ -22,7 +22,7 @@ from bridge.terminal import Advance
 from twin.errors import TwinError
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import spread
-from twin.scene.shape.carve import MaskedView, ShapeError
+from twin.scene.shape.carve import MaskedView
 from twin.scene.shape.known import pose_of, shape_mesh, surface_distances
 from twin.scene.shape.reconstruct import (
     ObjectShape,
@@ -68,8 +68,8 @@ def shapes_of(
         useful, support = [v for v in masked if v.mask.any()], support_z_m(models[key], T)
         make = reconstruct if T[2, 2] >= UPRIGHT_COSINE else partial(_leaning, T_base_object=T)
         try:
-            if is_known(models[key]):
-                found[key] = _task_shape(useful, models[key])
+            if is_known(models[key]) and useful:
+                found[key] = shape_of_mesh(*shape_mesh(models[key]), len(useful))
             else:
                 found[key] = make(useful, support, align_rounds=ALIGN_ROUNDS)
         except TwinError as error:
@@ -80,16 +80,6 @@ def shapes_of(
 def is_known(model: ObjectModel) -> bool:
     """Whether the task states the shape that an object has now."""
     return model.shape != SCANNED and model.soft is None
-
-
-def _task_shape(views: Sequence[MaskedView], model: ObjectModel) -> ObjectShape:
-    """The task's shape; what no view measured of it is marked."""
-    vertices, faces = shape_mesh(model)
-    if not views:
-        message = f"no view shows {model.id}: all masks are empty."
-        raise ShapeError(message)
-    shape = shape_of_mesh(vertices, faces, np.concatenate([view.points_m() for view in views]))
-    return replace(shape, num_views=len(views))
 
 
 def _leaning(
@@ -104,9 +94,7 @@ def _leaning(
     T_level_object = se3.invert(T_base_level) @ T_base_object
     level = reconstruct(moved_views(views, T_level_object), support, align_rounds=align_rounds)
     vertices = se3.apply(se3.invert(T_level_object), level.vertices_m)
-    points = np.concatenate([view.points_m() for view in views])
-    leant = shape_of_mesh(vertices, level.faces, points)
-    return replace(leant, num_views=level.num_views, view_shift_m=level.view_shift_m)
+    return shape_of_mesh(vertices, level.faces, level.num_views)
 
 
 def support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:

@@ -5,13 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
-from scipy import ndimage
+from jaxtyping import Float, Float32
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from twin.scene.shape.carve import (
-    Evidence,
     MaskedView,
     ShapeError,
     VoxelBox,
@@ -20,7 +18,7 @@ from twin.scene.shape.carve import (
     solid_of,
 )
 from twin.scene.shape.isosurface import isosurface
-from twin.scene.shape.mesh import Faces, Vertices, face_normals, is_watertight, volume_m3
+from twin.scene.shape.mesh import Faces, Vertices, is_watertight, volume_m3
 from twin.scene.shape.registration import laid_together
 from twin.scene.shape.sdf import SdfGrid, smoothed
 
@@ -56,16 +54,10 @@ class ObjectShape:
     faces: Faces
     """Counter-clockwise seen from outside."""
     sdf: SdfGrid
-    completed: Bool[np.ndarray, " num_faces"]
-    """Faces that no view saw: the underside on the plane, and whatever was hidden."""
-    completed_fraction: float
-    """Their share of the area."""
     is_watertight: bool
     volume_m3: float
     num_views: int
     truncation_m: float
-    view_shift_m: float = 0.0
-    """Root mean square of the shifts that laid the views together; 0 without rounds."""
 
 
 def reconstruct(
@@ -83,9 +75,16 @@ def reconstruct(
         ShapeError: When fewer than two views show the object, all from one side, or nothing
             is left after carving.
     """
-    useful = _useful(views)
-    useful, shift = laid_together(useful, support_z_m, align_rounds)
-    return replace(_carved(useful, support_z_m), view_shift_m=shift)
+    useful = laid_together(_useful(views), support_z_m, align_rounds)
+    low, high = _extent(useful, support_z_m)
+    box, truncation = voxel_box(low, high)
+    behind = max(min(2 * box.voxel_m, THIN_M), LEAST_BEHIND_VOXELS * box.voxel_m)
+    evidence = gather(box, useful, truncation, MIN_FREE_VIEWS, behind)
+    solid = solid_of(evidence, support_z_m, low - box.voxel_m, high + box.voxel_m)
+    distances = signed_distances(solid, evidence, truncation)
+    values = smoothed(distances, box.voxel_m, SMOOTHING_VOXELS)
+    grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
+    return _meshed(grid, len(useful), truncation)
 
 
 def _useful(views: Sequence[MaskedView]) -> list[MaskedView]:
@@ -116,18 +115,6 @@ def _useful(views: Sequence[MaskedView]) -> list[MaskedView]:
     return useful
 
 
-def _carved(views: Sequence[MaskedView], support_z_m: float | None) -> ObjectShape:
-    low, high = _extent(views, support_z_m)
-    box, truncation = voxel_box(low, high)
-    behind = max(min(2 * box.voxel_m, THIN_M), LEAST_BEHIND_VOXELS * box.voxel_m)
-    evidence = gather(box, views, truncation, MIN_FREE_VIEWS, behind)
-    solid = solid_of(evidence, support_z_m, low - box.voxel_m, high + box.voxel_m)
-    distances = signed_distances(solid, evidence, truncation)
-    values = smoothed(distances, box.voxel_m, SMOOTHING_VOXELS)
-    grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
-    return describe_solid(grid, evidence, len(views), truncation)
-
-
 def voxel_box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> tuple[VoxelBox, float]:
     """Voxels around an extent, and the truncation that goes with their size [m]."""
     voxel = max(MIN_VOXEL_M, float((high - low).max()) / VOXELS_ALONG)
@@ -138,43 +125,17 @@ def voxel_box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> tupl
     return VoxelBox(origin_m=origin, voxel_m=voxel, counts=(num_x, num_y, num_z)), truncation
 
 
-def describe_solid(
-    grid: SdfGrid,
-    evidence: Evidence,
-    num_views: int,
-    truncation_m: float,
-) -> ObjectShape:
-    """Mesh a solid and say what of it was seen."""
+def _meshed(grid: SdfGrid, num_views: int, truncation_m: float) -> ObjectShape:
     vertices, faces = isosurface(grid.values_m, grid.origin_m, grid.voxel_m)
-    completed = ~_observed(vertices, faces, evidence)
-    _, areas = face_normals(vertices, faces)
     return ObjectShape(
         vertices_m=vertices,
         faces=faces,
         sdf=grid,
-        completed=completed,
-        completed_fraction=float(areas[completed].sum() / areas.sum()),
         is_watertight=is_watertight(faces),
         volume_m3=volume_m3(vertices, faces),
         num_views=num_views,
         truncation_m=truncation_m,
     )
-
-
-def _observed(
-    vertices: Vertices, faces: Faces, evidence: Evidence
-) -> Bool[np.ndarray, " num_faces"]:
-    """Faces just outside of which some view saw the object's surface."""
-    box = evidence.box
-    normals, _ = face_normals(vertices, faces)
-    centre = vertices[faces].mean(axis=1)
-    seen = np.zeros(len(faces), dtype=bool)
-    for out in (0.6, 1.2):
-        place = centre + out * box.voxel_m * normals
-        index = np.rint((place - box.origin_m) / box.voxel_m).astype(np.int64)
-        index = np.clip(index, 0, np.array(box.counts) - 1)
-        seen |= evidence.weight[tuple(index.T)] > 0
-    return seen
 
 
 def _extent(
@@ -212,37 +173,21 @@ def moved_views(
     return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]
 
 
-MEASURED_VOXELS = 2.0
-"""Faces this near to a measured point were measured; the rest is somebody's guess."""
-
-
-def shape_of_mesh(
-    vertices_m: Vertices,
-    faces: Faces,
-    points_m: Float[np.ndarray, "num_points 3"],
-) -> ObjectShape:
+def shape_of_mesh(vertices_m: Vertices, faces: Faces, num_views: int = 1) -> ObjectShape:
     """Describe a mesh of closed pieces, which may overlap, like a reconstructed shape.
-
-    Faces that no measured point lies near are marked as completed.
 
     Args:
         vertices_m: In the frame that is wanted, z up.
-        points_m: What was measured on the object, in the same frame.
+        num_views: How many showed it.
     """
-    low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
-    box, truncation = voxel_box(low, high)
+    box, truncation = voxel_box(vertices_m.min(axis=0), vertices_m.max(axis=0))
     places = box.centres_m(np.arange(box.num_voxels))
     values = _signed_m(vertices_m, faces, places).reshape(box.counts)
-    solid = values < 0
-    if not solid.any():
+    if not (values < 0).any():
         message = f"{len(faces)} triangles enclose no voxel of {box.voxel_m * 1e3:.1f} mm."
         raise ShapeError(message)
     grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
-    weight = _near_points(points_m, box).astype(np.float32)
-    evidence = Evidence(
-        box=box, tsdf=np.zeros_like(weight), weight=weight, free=~solid, empty=~solid
-    )
-    return describe_solid(grid, evidence, 1, truncation)
+    return _meshed(grid, num_views, truncation)
 
 
 def _signed_m(
@@ -262,14 +207,3 @@ def _signed_m(
         away = scene.compute_signed_distance(tensor(places.astype(np.float32)))
         nearest = np.minimum(nearest, away.numpy())
     return nearest
-
-
-def _near_points(
-    points_m: Float[np.ndarray, "num_points 3"], box: VoxelBox
-) -> Bool[np.ndarray, "num_x num_y num_z"]:
-    """Voxels near a measured point."""
-    index = np.rint((points_m - box.origin_m) / box.voxel_m).astype(np.int64)
-    index = index[np.all((index >= 0) & (index < box.counts), axis=1)]
-    hit = np.zeros(box.counts, dtype=bool)
-    hit[tuple(index.T)] = True
-    return np.asarray(ndimage.distance_transform_edt(~hit) <= MEASURED_VOXELS)

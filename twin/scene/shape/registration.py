@@ -146,7 +146,7 @@ class _Placed:
 
 def laid_together(
     views: Sequence[MaskedView], support_z_m: float | None, rounds: int
-) -> tuple[list[MaskedView], float]:
+) -> list[MaskedView]:
     """Move each view so that its points lie on those of the others, and its plane on the plane.
 
     Robust point-to-plane steps for all views at once. Together is essential: views from around an
@@ -157,16 +157,13 @@ def laid_together(
     Compared with the mean of points that face the same way, not with a carved shape: where views
     disagree carving takes away more than it leaves. On average the object stays where the poses as
     given have it.
-
-    Returns:
-        The moved views, and how far they moved what they show, root mean square [m].
     """
     if rounds == 0:
-        return list(views), 0.0
+        return list(views)
     surfaces = [seen_surface(view, with_plane=support_z_m is not None) for view in views]
     seen = [se3.apply(s.T_base_camera, s.points) for s in surfaces if len(s.points)]
     if not seen:
-        return list(views), 0.0
+        return list(views)
     names, sensors = np.unique([view.sensor for view in views], return_inverse=True)
     state = _State(
         moves=np.zeros((len(views), OWN)),
@@ -186,9 +183,7 @@ def laid_together(
             break
     before, after = np.concatenate(seen), _placed(surfaces, state).p_base
     T_back = _back(before, after, on_plane=support_z_m is not None)
-    moved = [_moved(view, index, state, T_back) for index, view in enumerate(views)]
-    away = se3.apply(T_back, after) - before
-    return moved, float(np.sqrt(np.square(away).sum(axis=1).mean()))
+    return [_moved(view, index, state, T_back) for index, view in enumerate(views)]
 
 
 def _back(

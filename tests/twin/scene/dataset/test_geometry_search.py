@@ -1,4 +1,4 @@
-"""One wrong number of a camera's geometry is found, said, and corrected where that is asked for."""
+"""One wrong number of a camera's geometry is found and said."""
 
 import re
 from dataclasses import replace
@@ -10,11 +10,8 @@ import textured_room
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from twin.scene.dataset.geometry_search import (
-    Correction,
     WrongGeometryError,
     check_geometry,
-    corrected,
-    frame_ns_of,
     search_geometry,
 )
 from twin.scene.dataset.scan_check import CameraCheck, check_scan
@@ -114,38 +111,12 @@ def test_a_wrong_number_is_refused_and_the_way_out_is_named(choice: FrameChoice)
     wrong = camera(choice, 0.6)
     insist = FrameConfig(check_poses=False)
     report = check_scan([wrong], insist)
-    with pytest.raises(WrongGeometryError, match=r"depth reads .* x .*--correct-geometry") as told:
+    with pytest.raises(WrongGeometryError, match=r"depth reads .* x .*--depth-unit-m") as told:
         check_geometry([wrong], report, CONFIG)
     (factor,) = re.findall(r"depth reads (\d\.\d+) x", str(told.value))
     assert float(factor) == pytest.approx(0.6, rel=0.01)
-    insisted, choices = check_geometry([wrong], report, insist)
-    assert choices == [choice]
-    assert any("Correct it with --correct-geometry" in remark for remark in insisted.remarks())
-
-
-def test_the_number_is_corrected_on_request(choice: FrameChoice) -> None:
-    wrong = camera(choice, 1.2)
-    asked = FrameConfig(correct_geometry=True, check_poses=False)
-    told, (mended,) = check_geometry([wrong], check_scan([wrong], asked), asked)
-    assert mended.poses.depth_scale == pytest.approx(1 / 1.2, rel=0.02)
-    assert told.remarks()[-1].endswith("corrected")
-
-
-def test_a_delay_and_a_focal_length_are_corrected_in_the_frames_that_are_read(
-    choice: FrameChoice,
-) -> None:
-    stamps = sorted(choice.train_ns)[1:3]
-    step_ns = frame_ns_of(choice)
-    late = Correction(kind="delay", value=float(step_ns), frames=1.0, before=0.2, after=0.9)
-    first, second = load(choice, frozenset(stamps))
-    moved, _ = load(corrected(choice, late), frozenset(stamps))
-    assert second.stamp_ns - first.stamp_ns == step_ns  # the next frame's pose is the true one
-    np.testing.assert_allclose(moved.T_base_color, second.T_base_color, atol=1e-9)
-    np.testing.assert_allclose(moved.T_base_depth, second.T_base_depth, atol=1e-9)
-    longer = corrected(choice, replace(late, kind="focal", value=1.25))
-    frame, _ = load(longer, frozenset(stamps))
-    assert frame.depth_camera.fx == pytest.approx(1.25 * first.depth_camera.fx)
-    assert frame.color_camera.fy == pytest.approx(1.25 * first.color_camera.fy)
+    insisted = check_geometry([wrong], report, insist)
+    assert any("Import it again with another" in remark for remark in insisted.remarks())
 
 
 def test_nothing_is_found_in_a_noisy_scan_that_is_right() -> None:

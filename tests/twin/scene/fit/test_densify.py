@@ -52,20 +52,19 @@ def test_the_worst_are_split_and_the_budget_holds(room: Room) -> None:
     cloud = room[0]
     scores = even_scores(cloud)
     scores.error[[3, 50, 91]] = 5.0
-    done = densify(cloud, scores, max_splats=len(cloud) + 3, most=100)
-    assert done.num_split == 3
-    assert len(done.cloud) == len(cloud) + 3
-    parents, counts = np.unique(done.parents, return_counts=True)
+    grown, parents = densify(cloud, scores, max_splats=len(cloud) + 3, most=100)
+    assert len(grown) == len(cloud) + 3
+    parents, counts = np.unique(parents, return_counts=True)
     np.testing.assert_array_equal(parents, np.arange(len(cloud)))
     np.testing.assert_array_equal(parents[counts == 2], [3, 50, 91])
-    assert len(densify(cloud, scores, max_splats=len(cloud) + 3, most=2).cloud) == len(cloud) + 2
-    assert densify(cloud, scores, max_splats=10, most=100).num_split == 0
+    assert len(densify(cloud, scores, max_splats=len(cloud) + 3, most=2)[0]) == len(cloud) + 2
+    assert len(densify(cloud, scores, max_splats=10, most=100)[0]) == len(cloud)
 
 
 def test_two_halves_have_the_mean_and_the_covariance_of_the_whole(room: Room) -> None:
     cloud = room[0].take(np.array([11]))
     cloud = replace(cloud, scales_log=as_float32(np.log([[0.02, 0.05, 0.004]])))
-    halves = densify(cloud, even_scores(cloud), max_splats=2, most=1).cloud
+    halves = densify(cloud, even_scores(cloud), max_splats=2, most=1)[0]
 
     def covariances(of: GaussianCloud) -> np.ndarray:
         R = se3.rotation_from_quaternion(of.quats_wxyz.astype(np.float64))
@@ -88,19 +87,18 @@ def test_what_is_transparent_unseen_or_huge_goes(room: Room) -> None:
     scores.pixels[6] = 0.0
     scores.size_fraction[7] = 0.5
     faded = replace(cloud, opacities_logit=opacities)
-    done = densify(faded, scores, max_splats=len(cloud) - 3, most=10)
-    assert done.num_pruned == 3
-    assert not set(done.parents.tolist()) & {5, 6, 7}
-    assert len(done.cloud) == len(cloud) - 3
+    left, parents = densify(faded, scores, max_splats=len(cloud) - 3, most=10)
+    assert not set(parents.tolist()) & {5, 6, 7}
+    assert len(left) == len(parents) == len(cloud) - 3
 
 
 def test_nothing_is_lost_when_nothing_is_seen(room: Room) -> None:
     cloud = room[0]
     scores = replace(even_scores(cloud), pixels=np.zeros(len(cloud), dtype=np.float32))
-    assert len(densify(cloud, scores, max_splats=len(cloud), most=0).cloud) == len(cloud)
+    assert len(densify(cloud, scores, max_splats=len(cloud), most=0)[0]) == len(cloud)
 
 
 def test_what_no_image_can_resolve_is_not_split(room: Room) -> None:
     cloud = room[0]
     scores = replace(even_scores(cloud), size_px=np.full(len(cloud), 0.2, dtype=np.float32))
-    assert densify(cloud, scores, max_splats=10_000, most=100).num_split == 0
+    assert len(densify(cloud, scores, max_splats=10_000, most=100)[0]) == len(cloud)

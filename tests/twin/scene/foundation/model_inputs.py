@@ -4,14 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.scene.foundation.models import Sam3Config, Sam3Segmenter
-
-ALL_QUERIES = Sam3Config(min_score=0.0, min_pixels=0)
+from twin.scene.foundation.models import Sam3Segmenter
 
 
-def sam3(folder: Path, config: Sam3Config = ALL_QUERIES) -> Sam3Segmenter:
+def sam3(folder: Path, min_score: float = 0.0, min_pixels: int = 0) -> Sam3Segmenter:
     segmenter = Sam3Segmenter(folder, "cpu")
-    segmenter.config = config
+    segmenter.min_score, segmenter.min_pixels = min_score, min_pixels
     return segmenter
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from model_inputs import picture
 
-from bridge.errors import UsageError
 from twin.scene.foundation.models import ClipEmbedder, masked_crop
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
@@ -30,7 +29,6 @@ def test_clip_gives_unit_vectors_and_a_batch_is_as_good_as_one_by_one(
     np.testing.assert_allclose(np.linalg.norm(pieces, axis=1), 1.0, atol=1e-5)
     alone = embedder.embed_masked([picture()], masks[1:])
     np.testing.assert_allclose(alone[0], pieces[1], atol=1e-5)
-    assert embedder.encode([]).shape == embedder.embed_masked([], []).shape == (0, 16)
 
 
 def test_clip_sees_only_what_the_mask_shows(saved: Callable[[str], Path]) -> None:
@@ -44,12 +42,6 @@ def test_clip_sees_only_what_the_mask_shows(saved: Callable[[str], Path]) -> Non
     elsewhere = np.roll(mask, (10, -20), axis=(0, 1))
     moved = embedder.embed_masked([np.roll(inside, (10, -20), axis=(0, 1))], [elsewhere])
     np.testing.assert_allclose(moved[0], one[0], atol=1e-6)
-    with pytest.raises(UsageError, match="0 set does not cut anything out"):
-        embedder.embed_masked([inside], [np.zeros((60, 80), dtype=bool)])
-    with pytest.raises(UsageError, match="does not cut"):
-        embedder.embed_masked([inside], [np.ones((6, 8), dtype=bool)])
-    with pytest.raises(UsageError, match="1 images for 2 masks"):
-        embedder.embed_masked([inside], [mask, mask])
 
 
 def test_a_crop_is_square_with_its_mask_in_the_middle() -> None:

@@ -25,8 +25,6 @@ def thing(number: int, label: str, x_m: float) -> Instance:
         id=number,
         label=label,
         mask=np.arange(8) // 4 == number - 1,
-        support=2,
-        seen=2,
         score=0.9,
         source="test",
         color_srgb=(200, 20, 20),

@@ -8,7 +8,6 @@ import pytest
 from model_inputs import picture, sam3
 
 from bridge.errors import UsageError
-from twin.scene.foundation.models import Sam3Config
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
@@ -18,28 +17,26 @@ def test_sam3_gives_masks_of_the_image_s_size_with_scores_from_0_to_1(
     saved: Callable[[str], Path],
 ) -> None:
     segmenter = sam3(saved("sam3"))
-    found = segmenter.segment(picture(), ["red cube", "duck"], camera_id="wrist", stamp_ns=7)
-    assert (found.camera_id, found.stamp_ns, found.source) == ("wrist", 7, "SAM 3")
-    assert len(found.masks) == 20  # ten queries each
-    for mask in found.masks:
+    found = segmenter.segment(picture(), ["red cube", "duck"])
+    assert len(found) == 20  # ten queries each
+    for mask in found:
         assert mask.image.shape == (60, 80)
         assert mask.image.dtype == np.bool_
         assert 0.0 <= mask.score <= 1.0
     for label in ("red cube", "duck"):
-        scores = [mask.score for mask in found.masks if mask.label == label]
+        scores = [mask.score for mask in found if mask.label == label]
         assert scores == sorted(scores, reverse=True)
-    assert any(mask.image.any() and not mask.image.all() for mask in found.masks)
+    assert any(mask.image.any() and not mask.image.all() for mask in found)
 
 
 def test_sam3_drops_what_is_unlikely_or_small(saved: Callable[[str], Path]) -> None:
     everything = sam3(saved("sam3"))
-    where = {"camera_id": "c", "stamp_ns": 0}
-    masks = everything.segment(picture(), ["duck"], **where).masks
+    masks = everything.segment(picture(), ["duck"])
     cut, least = masks[4].score, sorted(int(mask.image.sum()) for mask in masks)[5]
-    likely = sam3(saved("sam3"), Sam3Config(min_score=cut, min_pixels=0))
-    assert len(likely.segment(picture(), ["duck"], **where).masks) == 5
-    large = sam3(saved("sam3"), Sam3Config(min_score=0.0, min_pixels=least))
-    kept = large.segment(picture(), ["duck"], **where).masks
+    likely = sam3(saved("sam3"), min_score=cut)
+    assert len(likely.segment(picture(), ["duck"])) == 5
+    large = sam3(saved("sam3"), min_pixels=least)
+    kept = large.segment(picture(), ["duck"])
     assert 0 < len(kept) < 10
     assert min(int(mask.image.sum()) for mask in kept) >= least
 
@@ -59,7 +56,7 @@ def test_sam3_refuses_prompts_it_cannot_read_whole(
 ) -> None:
     segmenter = sam3(saved("sam3"))
     with pytest.raises(UsageError, match=said):
-        segmenter.segment(picture(), prompts, camera_id="c", stamp_ns=0)
+        segmenter.segment(picture(), prompts)
 
 
 def test_sam3_is_read_in_the_form_it_is_published_in(
@@ -80,10 +77,9 @@ def test_sam3_is_read_in_the_form_it_is_published_in(
     named = {f"detector_model.{name}": values for name, values in tensors.items()}
     named |= {"tracker_model.a": torch.zeros(3), "tracker_neck.b": torch.zeros(2)}
     save_file(named, tmp_path / "model.safetensors", metadata={"format": "pt"})
-    where = {"camera_id": "c", "stamp_ns": 0}
     plain, video = (
-        sam3(folder).segment(picture(), ["duck"], **where) for folder in (saved("sam3"), tmp_path)
+        sam3(folder).segment(picture(), ["duck"]) for folder in (saved("sam3"), tmp_path)
     )
-    for one, other in zip(plain.masks, video.masks, strict=True):
+    for one, other in zip(plain, video, strict=True):
         assert one.score == other.score
         np.testing.assert_array_equal(one.image, other.image)

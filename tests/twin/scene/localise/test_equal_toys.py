@@ -19,8 +19,6 @@ def test_equal_toys_are_told_apart_by_where_they_start(stage: Callable[..., Any]
         distance_mm, angle_deg = off(found[name].T_base_object, T)
         assert distance_mm < 2.5
         assert angle_deg < 4.0
-        assert found[name].detail["equal_objects"] == 3
-        assert found[name].detail["assignment_margin_m"] > 0.02
 
 
 @pytest.mark.slow

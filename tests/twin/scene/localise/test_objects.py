@@ -63,9 +63,6 @@ def test_the_table_takes_out_a_wrong_camera_height_and_tilt(
     T_error[:3, :3] = se3.rotation_from_quaternion(np.array([1.0, 0.003, -0.003, 0.0]))
     T_error[2, 3] = 0.006
     cube = localise_objects(shoot(stage(POSES), [SIDE], T_error=T_error), task)["cube"]
-    table = cube.detail["table"]["side"]
-    assert abs(table["offset_m"]) > 0.002  # seen before the correction
-    assert table["residual_m"] < 0.003
     assert cube.found
     assert abs(cube.detail["lift_m"]) < 0.001  # without the table it would float or sink
 

@@ -11,7 +11,7 @@ import open3d
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.naming.things import Mask, MaskSet
+from twin.naming.things import Mask
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
@@ -58,19 +58,13 @@ class World:
     held_out: list[Shot]
     cloud: GaussianCloud
 
-    def masks(self, shot: Shot) -> MaskSet:
+    def masks(self, shot: Shot) -> list[Mask]:
         """The true masks of a frame."""
-        found = [
+        return [
             Mask(image=shot.instance == number, label=name)
             for number, name in self.names.items()
             if (shot.instance == number).any()
         ]
-        return MaskSet(
-            camera_id=shot.frame.camera_id,
-            stamp_ns=shot.frame.stamp_ns,
-            masks=tuple(found),
-            source="truth",
-        )
 
     @cached_property
     def _nearest(self) -> np.ndarray:

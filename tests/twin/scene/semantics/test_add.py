@@ -10,7 +10,6 @@ from table_scene import World, make_world, table
 from bridge.geometry import se3
 from twin.naming import scene_file
 from twin.naming.phrases import Asker
-from twin.naming.things import Mask, MaskSet
 from twin.scene.foundation.stage import find_things
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -114,19 +113,6 @@ def test_an_empty_scene_is_a_remark_too(tabletop: World, tmp_path: Path) -> None
     nothing = tabletop.cloud.take(np.zeros(0, dtype=int))
     record = written(tmp_path, nothing, nothing, tabletop)
     assert "no level plane among 0 points" in str(record["remark"])
-
-
-def test_masks_that_do_not_fit_are_a_remark(tabletop: World, tmp_path: Path) -> None:
-    masks = MaskSet(
-        camera_id="scan",
-        stamp_ns=0,
-        masks=[Mask(image=np.ones((5, 5), dtype=bool), label="cup")],
-        source="made model",
-    )
-    record = added(tmp_path, tabletop, masks=[(tabletop.train[0].viewpoint, masks)])
-    assert record["instances"] == []
-    assert record["source"] == "made model"
-    assert "5 x 5 pixels" in str(record["remark"])
 
 
 def test_vectors_lie_beside_the_labels_and_fit_this_scene_only(

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from twin.scene.semantics.masks import Observation, Track, associate
+from twin.naming.things import Instance
+from twin.scene.semantics.masks import Observation, associate
 
 NUM_SPLATS = 400
 THINGS = {"cube": range(100), "duck": range(150, 230), "box": range(260, 400)}
@@ -34,14 +35,14 @@ def frames(count: int = 8, seed: int = 0) -> list[Observation]:
     return [observation(rng, [str(n) for n in rng.permutation(list(THINGS))]) for _ in range(count)]
 
 
-def run(observations: list[Observation]) -> tuple[Track, ...]:
+def run(observations: list[Observation]) -> tuple[Instance, ...]:
     tracks, labels = associate(observations, NUM_SPLATS)
     for number, track in enumerate(tracks, start=1):
         np.testing.assert_array_equal(labels == number, track.mask)
     return tracks
 
 
-def by_label(tracks: tuple[Track, ...]) -> dict[str, np.ndarray]:
+def by_label(tracks: tuple[Instance, ...]) -> dict[str, np.ndarray]:
     return {track.label: track.mask for track in tracks}
 
 
@@ -57,27 +58,7 @@ def test_the_order_of_frames_does_not_matter() -> None:
     first, second = run(frames()), run(frames()[::-1])
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one.mask, other.mask)
-        assert (one.label, one.support) == (other.label, other.support)
-
-
-def test_dropping_a_frame_lowers_support_by_one() -> None:
-    whole, less = run(frames()), run(frames()[:-1])
-    for before, after in zip(whole, less, strict=True):
-        assert (after.support, after.seen) == (before.support - 1, before.seen - 1)
-
-
-def test_a_dropped_mask_lowers_support_but_not_seen() -> None:
-    items = frames()
-    column = items[2].labels.index("duck")
-    keep = [k for k in range(3) if k != column]
-    items[2] = replace(
-        items[2],
-        inside=items[2].inside[:, keep],
-        labels=tuple(items[2].labels[k] for k in keep),
-        scores=items[2].scores[:2],
-    )
-    track = next(t for t in run(items) if t.label == "duck")
-    assert (track.support, track.seen) == (7, 8)
+        assert one.label == other.label
 
 
 def test_dropped_masks_do_not_eat_the_edge() -> None:

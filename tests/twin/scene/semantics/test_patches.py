@@ -5,7 +5,7 @@ import pytest
 
 from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.patches import cut_into_patches
-from twin.scene.semantics.segment import SegmentConfig, segment
+from twin.scene.semantics.segment import segment
 
 WOOD, RED, BLUE = (0.55, 0.42, 0.30), (0.8, 0.1, 0.1), (0.1, 0.25, 0.75)
 SPACING_M = 0.004
@@ -63,7 +63,7 @@ def test_a_box_against_a_wall_is_a_thing_and_a_poster_on_it_is_none() -> None:
     labels = cut_into_patches(points, SPACING_M)
     assert labels.max() == 1
     assert share(labels, is_parcel) > 0.85
-    found = segment(points, SegmentConfig())
+    found = segment(points)
     assert found.plane is None
     assert [thing.label.split()[0] for thing in found.things] == ["red"]
 

@@ -38,7 +38,6 @@ def test_an_open_box_has_its_cavity() -> None:
     assert measured.cavity is not None
     assert measured.cavity.rim_m == pytest.approx(0.05, abs=0.002)
     assert measured.cavity.floor_m == pytest.approx(0.006, abs=0.002)
-    assert measured.cavity.volume_m3 == pytest.approx(0.108**2 * 0.044, rel=0.12)
 
 
 def test_a_gap_of_one_cell_does_not_drain_the_cavity() -> None:
@@ -67,7 +66,6 @@ def test_boxes_are_told_by_their_proportions(word: str, size_m: tuple[float, flo
     measured = measure_shape(from_above(height), CELL_M)
     assert measured.word == word
     np.testing.assert_allclose(measured.size_m, size_m, atol=0.004)
-    assert 0.7 < measured.hull_ratio < 1.2
 
 
 def test_the_box_turns_with_the_thing() -> None:

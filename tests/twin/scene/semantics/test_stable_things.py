@@ -8,7 +8,7 @@ from table_scene import World, iou
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
-from twin.scene.semantics.segment import Look, SegmentConfig, points_of, segment, stable
+from twin.scene.semantics.segment import Look, points_of, segment, stable
 
 
 def looked(*found: list[range]) -> list[Look]:
@@ -18,7 +18,7 @@ def looked(*found: list[range]) -> list[Look]:
         labels = np.zeros(100, dtype=np.int64)
         for number, members in enumerate(things, start=1):
             labels[list(members)] = number
-        looks.append(Look(labels=labels, voxel_m=0.004))
+        looks.append((labels, 0.004))
     return looks
 
 
@@ -41,7 +41,7 @@ def test_looks_that_do_not_agree_give_nothing() -> None:
 
 
 def test_things_are_those_of_the_table_largest_first(tabletop: World) -> None:
-    found = segment(points_of(tabletop.cloud), SegmentConfig())
+    found = segment(points_of(tabletop.cloud))
     truth = tabletop.true_instances()
     sizes = [int((found.labels == k).sum()) for k in range(1, len(found.things) + 1)]
     assert sizes == sorted(sizes, reverse=True)

@@ -2,8 +2,13 @@ import numpy as np
 import pytest
 
 from twin.scene.semantics import support
+from twin.scene.semantics.cluster import SurfacePoints
 
 UP = np.array([0.0, 0.0, 1.0])
+
+
+def seen(p: np.ndarray, normals: np.ndarray) -> SurfacePoints:
+    return SurfacePoints(p_m=p, normals=normals, colors=np.zeros_like(p))
 
 
 def sheet(
@@ -19,7 +24,7 @@ def test_a_tilted_table_is_found_among_clutter() -> None:
     p = np.concatenate([sheet(rng, 0.1, 0.4, 4000, slope=0.05), clutter])
     normals = np.concatenate([np.tile(UP, (4000, 1)), rng.normal(size=(4000, 3))])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    plane = support.find_support(p, normals, support.SupportConfig())
+    plane = support.find_support(seen(p, normals))
     expected = np.array([-0.05, 0.0, 1.0]) / np.hypot(0.05, 1.0)
     assert np.degrees(np.arccos(plane.normal @ expected)) < 0.5
     assert plane.offset_m == pytest.approx(0.1 * expected[2], abs=0.002)
@@ -30,7 +35,7 @@ def test_the_table_wins_over_a_floor_on_which_nothing_stands() -> None:
     things = rng.uniform([-0.2, -0.2, 0.0], [0.2, 0.2, 0.12], (3000, 3))
     p = np.concatenate([sheet(rng, 0.0, 0.4, 4000), sheet(rng, -0.7, 0.9, 5000), things])
     normals = np.concatenate([np.tile(UP, (9000, 1)), np.tile([1.0, 0.0, 0.0], (3000, 1))])
-    plane = support.find_support(p, normals, support.SupportConfig())
+    plane = support.find_support(seen(p, normals))
     assert abs(plane.offset_m) < 0.003
 
 
@@ -38,14 +43,14 @@ def test_a_wall_is_no_support() -> None:
     rng = np.random.default_rng(2)
     p = sheet(rng, 0.0, 0.5, 3000)[:, [2, 1, 0]]
     with pytest.raises(support.NoSupportError, match="no level plane among 3000 points"):
-        support.find_support(p, np.tile([1.0, 0.0, 0.0], (3000, 1)), support.SupportConfig())
+        support.find_support(seen(p, np.tile([1.0, 0.0, 0.0], (3000, 1))))
 
 
 def test_the_footprint_covers_holes_and_ends_at_the_edge() -> None:
     rng = np.random.default_rng(3)
     p = sheet(rng, 0.0, 0.3, 20000)
     p = p[np.linalg.norm(p[:, :2], axis=1) > 0.05]
-    plane = support.find_support(p, np.tile(UP, (len(p), 1)), support.SupportConfig())
+    plane = support.find_support(seen(p, np.tile(UP, (len(p), 1))))
     probes = np.array([[0.0, 0.0, 0.1], [0.25, 0.25, 0.0], [0.4, 0.0, 0.1], [5.0, 0.0, 0.0]])
     assert plane.under(probes).tolist() == [True, True, False, False]
 
@@ -55,8 +60,8 @@ def test_the_answer_moves_with_the_scene() -> None:
     p = sheet(rng, 0.0, 0.3, 3000)
     normals = np.tile(UP, (3000, 1))
     shift = np.array([1.0, -2.0, 0.35])
-    first = support.find_support(p, normals, support.SupportConfig())
-    second = support.find_support(p + shift, normals, support.SupportConfig())
+    first = support.find_support(seen(p, normals))
+    second = support.find_support(seen(p + shift, normals))
     np.testing.assert_allclose(second.height_m(p + shift), first.height_m(p), atol=1e-6)
 
 
@@ -65,7 +70,7 @@ def test_a_rough_table_does_not_stand_on_its_own_underside() -> None:
     below = sheet(rng, 0.0, 0.4, 9000)
     below[:, 2] -= np.abs(rng.normal(0.0, 0.012, 9000))  # what a fit pushes into the wood
     p = np.concatenate([sheet(rng, 0.0, 0.4, 9000), below])
-    plane = support.find_support(p, np.tile(UP, (len(p), 1)), support.SupportConfig())
+    plane = support.find_support(seen(p, np.tile(UP, (len(p), 1))))
     assert abs(plane.offset_m) < 0.003
 
 
@@ -79,8 +84,8 @@ def test_a_table_that_was_measured_as_a_bowl_is_followed_and_what_stands_on_it_i
     book = np.all(np.abs(p[:, :2] - 0.25) < 0.1, axis=1)
     p[:, 2] += bowl(p[:, :2], 0.012) + 0.015 * book
     normals = np.tile(UP, (len(p), 1))
-    flat = support.find_support(p, normals, support.SupportConfig())
-    plane = support.as_measured(flat, p, normals, support.SupportConfig())
+    flat = support.find_support(seen(p, normals))
+    plane = support.as_measured(flat, seen(p, normals))
     height = plane.height_m(p)
     assert np.abs(height[~book]).max() < 0.006
     np.testing.assert_allclose(np.median(height[book]), 0.015, atol=0.002)
@@ -93,8 +98,8 @@ def test_a_flat_table_keeps_its_plane_to_the_bit() -> None:
     rng = np.random.default_rng(7)
     p = sheet(rng, 0.0, 0.5, 9000)
     normals = np.tile(UP, (len(p), 1))
-    plane = support.find_support(p, normals, support.SupportConfig())
-    assert support.as_measured(plane, p, normals, support.SupportConfig()) is plane
+    plane = support.find_support(seen(p, normals))
+    assert support.as_measured(plane, seen(p, normals)) is plane
 
 
 def turned(angle_rad: float) -> np.ndarray:
@@ -124,7 +129,7 @@ def test_up_is_found_in_a_frame_that_is_not_level(angle_rad: float) -> None:
     p, normals, Ts = room(np.random.default_rng(6))
     R = turned(angle_rad)[:3, :3]
     moved = [turned(angle_rad) @ T for T in Ts]
-    T_level = support.level_frame(p @ R.T, normals @ R.T, moved, support.SupportConfig())
+    T_level = support.level_frame(seen(p @ R.T, normals @ R.T), moved)
     np.testing.assert_allclose(T_level[:3, :3] @ R @ UP, UP, atol=0.01)
     np.testing.assert_allclose(T_level[:3, :3] @ T_level[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(T_level[:3, :3]) == pytest.approx(1.0)
@@ -132,19 +137,17 @@ def test_up_is_found_in_a_frame_that_is_not_level(angle_rad: float) -> None:
 
 def test_a_level_frame_stays_as_it_is() -> None:
     p, normals, Ts = room(np.random.default_rng(7))
-    assert np.array_equal(support.level_frame(p, normals, Ts, support.SupportConfig()), np.eye(4))
-    assert np.array_equal(support.level_frame(p, normals, [], support.SupportConfig()), np.eye(4))
+    assert np.array_equal(support.level_frame(seen(p, normals), Ts), np.eye(4))
+    assert np.array_equal(support.level_frame(seen(p, normals), []), np.eye(4))
 
 
 def test_the_top_of_a_thing_and_a_ceiling_are_no_support() -> None:
     rng = np.random.default_rng(8)
     small = sheet(rng, 0.0, 0.1, 3000)
     with pytest.raises(support.NoSupportError):
-        support.find_support(small, np.tile(UP, (3000, 1)), support.SupportConfig())
+        support.find_support(seen(small, np.tile(UP, (3000, 1))))
     with pytest.raises(support.NoSupportError):
-        support.find_support(
-            sheet(rng, 1.0, 0.5, 3000), np.tile(-UP, (3000, 1)), support.SupportConfig()
-        )
+        support.find_support(seen(sheet(rng, 1.0, 0.5, 3000), np.tile(-UP, (3000, 1))))
 
 
 def test_roughness_is_the_noise_of_the_plane() -> None:
@@ -152,7 +155,5 @@ def test_roughness_is_the_noise_of_the_plane() -> None:
     p = sheet(rng, 0.0, 0.4, 9000)
     p[:, 2] += rng.normal(0, 0.004, len(p))
     normals = np.tile(UP, (len(p), 1))
-    plane = support.find_support(p, normals, support.SupportConfig())
-    assert support.roughness_m(p, normals, plane, support.SupportConfig()) == pytest.approx(
-        0.0041, rel=0.1
-    )
+    plane = support.find_support(seen(p, normals))
+    assert support.roughness_m(seen(p, normals), plane) == pytest.approx(0.0041, rel=0.1)

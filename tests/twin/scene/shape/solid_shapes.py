@@ -18,8 +18,6 @@ def shape_of(solid: np.ndarray, voxel_m: float) -> ObjectShape:
         vertices_m=vertices,
         faces=faces,
         sdf=SdfGrid(values_m=values, origin_m=origin_m, voxel_m=voxel_m),
-        completed=np.zeros(len(faces), dtype=bool),
-        completed_fraction=0.0,
         is_watertight=is_watertight(faces),
         volume_m3=volume_m3(vertices, faces),
         num_views=1,

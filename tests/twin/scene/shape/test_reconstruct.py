@@ -64,14 +64,8 @@ def test_a_cube_is_closed_and_has_its_size(cube: ObjectShape) -> None:
     assert cube.volume_m3 == pytest.approx(0.04**3, rel=0.06)
 
 
-def test_the_unseen_underside_is_closed_by_the_plane_and_marked(cube: ObjectShape) -> None:
+def test_the_unseen_underside_is_closed_by_the_plane(cube: ObjectShape) -> None:
     assert cube.vertices_m[:, 2].min() == pytest.approx(0.0, abs=1e-3)
-    centres = cube.vertices_m[cube.faces].mean(axis=1)
-    bottom = (centres[:, 2] < 5e-4) & (np.abs(centres[:, :2]).max(axis=1) < 0.014)
-    top = centres[:, 2] > 0.038
-    assert cube.completed[bottom].mean() > 0.95
-    assert cube.completed[top].mean() < 0.02
-    assert 1 / 10 < cube.completed_fraction < 1 / 4
 
 
 def test_an_open_box_stays_open(box: ObjectShape) -> None:
@@ -92,8 +86,6 @@ def test_views_that_are_shifted_against_each_other_are_laid_together() -> None:
         shifted.append(replace(view, T_base_camera=T))
     plain = quick(shifted)
     aligned = quick(shifted, align_rounds=6)
-    assert plain.view_shift_m == 0.0
-    assert aligned.view_shift_m > 0.001
     error = [abs(s.volume_m3 / 0.04**3 - 1) for s in (plain, aligned)]
     assert error[1] < max(error[0], 0.05)
 
@@ -113,7 +105,6 @@ def test_views_that_all_stand_too_far_out_do_not_thin_a_wall() -> None:
     mended = reconstruct(outward, 0.0, align_rounds=6)
     assert thin.volume_m3 < 0.85 * solid
     assert mended.volume_m3 == pytest.approx(solid, rel=0.08)
-    assert 0.0007 < mended.view_shift_m < 0.002  # an offset of the depth explains part of it
 
 
 def test_an_opening_nobody_looked_into_stays_solid() -> None:
