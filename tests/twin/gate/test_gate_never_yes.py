@@ -247,11 +247,8 @@ def test_a_gate_that_is_being_stopped_says_so(twin: TwinProcess) -> None:
 
 def test_a_no_is_a_no_whatever_happens_meanwhile() -> None:
     no = Factor(value=False, cause="inside", detail="beside the box")
-    verdict = judged(
-        ChangingPerception(running=[None, "plan_0"]),
-        verdict=Verdict(**{**vars(accepted()), "terminal": no}),
-    )
-    assert verdict.accepted is False
+    perception = ChangingPerception(running=[None, "plan_0"])
+    assert judged(perception, verdict=replace(accepted(), terminal=no)).accepted is False
 
 
 def test_without_a_newer_picture_nobody_looks_again() -> None:
