@@ -287,9 +287,12 @@ def ask(cell: Any, payload: bytes, family: str = "", number: int = 0) -> tuple[s
             way = rng.normal(size=3)
             far_m = basis["objects"][name]["margin_m"] + float(rng.uniform(0.001, 0.2))
             moved[name] = way / np.linalg.norm(way) * far_m
-        else:
+        elif rng.random() < 0.5:  # else of another scene
             verdict = replace(verdict, basis=None)
-        why = why_stale(verdict, plan, now_ns, joints, moved)
+        twin = {name: basis[name] for name in ("scene_hash", "calibration_id")}
+        if family == "yes_forged" and verdict.basis is not None:
+            twin[str(rng.choice(list(twin)))] = "another"
+        why = why_stale(verdict, plan, now_ns, joints, moved, twin)
         return ("no", f"stale: {why[:40]}") if why else ("yes", "")
     if verdict.accepted is True:
         return "yes", ""
