@@ -17,6 +17,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,7 +28,7 @@ from typing import Any
 
 import numpy as np
 from measure import ROOT, Target, report_targets
-from plan_mutations import FAMILIES, HEAVY_KG, HONEST, OUTSIDE, mutated
+from plan_mutations import CAUSES, FAMILIES, HEAVY_KG, HONEST, OUTSIDE, mutated
 from plan_oracle import Cell, Oracle
 
 CELL, FIRST = "standin", "cube_into_box"
@@ -47,6 +48,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--endpoint", default=ENDPOINT, help="on this machine alone")
     parser.add_argument("--max-s", type=float, default=1e9, help="stop asking after so long")
+    parser.add_argument("--again", action="store_true", help="ask the oracle again about each yes")
     parser.add_argument("--folder", type=Path, default=ROOT / "runs" / "attack_gate")
     return parser.parse_args()
 
@@ -133,6 +135,7 @@ def prepare(folder: Path, task_name: str) -> Stage:
             Ts_base_object=poses,
             start=dict(zip(ARM_JOINTS, start.tolist(), strict=True)),
             robot=ROBOT_NAME,
+            file=robot_file(),
             max_width_m=MAX_WIDTH_M,
         )
     )
@@ -140,6 +143,14 @@ def prepare(folder: Path, task_name: str) -> Stage:
     for plan in bases:
         plan["task_sha256"] = hashes_of(run.tasks_dir, task_name)[task_name]
     return Stage(run.path, task_name, messages, oracle, bases, hashes_of(run.tasks_dir, task_name))
+
+
+def robot_file() -> dict[str, Any]:
+    """The robot file as it is on disk."""
+    from bridge.data_files import dataset_file
+    from bridge.robots.default import ROBOT_NAME
+
+    return tomllib.loads(dataset_file("robots", ROBOT_NAME).read_text())
 
 
 def hashes_of(folder: Path, task_name: str) -> dict[str, str]:
@@ -276,9 +287,12 @@ def ask(cell: Any, payload: bytes, family: str = "", number: int = 0) -> tuple[s
             way = rng.normal(size=3)
             far_m = basis["objects"][name]["margin_m"] + float(rng.uniform(0.001, 0.2))
             moved[name] = way / np.linalg.norm(way) * far_m
-        else:
+        elif rng.random() < 0.5:  # else of another scene
             verdict = replace(verdict, basis=None)
-        why = why_stale(verdict, plan, now_ns, joints, moved)
+        twin = {name: basis[name] for name in ("scene_hash", "calibration_id")}
+        if family == "yes_forged" and verdict.basis is not None:
+            twin[str(rng.choice(list(twin)))] = "another"
+        why = why_stale(verdict, plan, now_ns, joints, moved, twin)
         return ("no", f"stale: {why[:40]}") if why else ("yes", "")
     if verdict.accepted is True:
         return "yes", ""
@@ -287,11 +301,12 @@ def ask(cell: Any, payload: bytes, family: str = "", number: int = 0) -> tuple[s
     return "null", str(verdict.reason)[:160]
 
 
-def unsafe(oracle: Oracle, family: str, payload: bytes) -> str:
-    """What the oracle says of a plan; two meanings of one text, and a yes misused, are unsafe."""
+def asked_of(oracle: Oracle, family: str, payload: bytes) -> dict[str, Any]:
+    """What the oracle says of a plan that got a yes; a yes misused, or to two meanings, is bad."""
     if family in OUTSIDE or family.startswith("says_twice"):
-        return family
-    return oracle.unsafe(json.loads(payload))
+        return {"unsafe": family}
+    plan = json.loads(payload)
+    return {"unsafe": oracle.unsafe(plan), "share": oracle.least_acceleration(plan)}
 
 
 def main() -> None:
@@ -303,6 +318,9 @@ def main() -> None:
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.is_file() else []
     known = {row["number"] for row in rows}
     stage, solve = prepare(options.folder, options.task), Kinematics()
+    for row in (row for row in rows if options.again and row["answer"] == "yes"):
+        family, payload = payload_of(options.seed, row["number"], stage.bases, solve, stage.hashes)
+        row.update(asked_of(stage.oracle, family, payload))
     oracle_turn, writing = threading.Lock(), threading.Lock()
     ends = time.monotonic() + options.max_s
 
@@ -314,8 +332,10 @@ def main() -> None:
         answer, cause = ask(cell, payload, family, number)
         row = {"number": number, "family": family, "answer": answer, "cause": cause}
         row["seconds"] = round(time.monotonic() - before, 3)
-        with oracle_turn:
-            row["unsafe"] = unsafe(stage.oracle, family, payload)
+        row["unsafe"] = ""
+        if answer == "yes":
+            with oracle_turn:
+                row.update(asked_of(stage.oracle, family, payload))
         with writing, kept.open("a") as file:
             file.write(json.dumps(row) + "\n")
             rows.append(row)
@@ -335,6 +355,13 @@ def main() -> None:
     summarise(rows, options, cpu_s, len(rows) - len(known))
 
 
+def names_its_cause(row: dict[str, Any]) -> bool:
+    """Whether a refusal says what its family has wrong, or of a mixed one anything."""
+    wanted = [words for start, words in CAUSES.items() if row["family"].startswith(start)]
+    said = row["cause"].strip(": None")
+    return any(word in said for word in wanted[0]) if wanted else bool(said)
+
+
 def summarise(
     rows: Sequence[dict[str, Any]], options: argparse.Namespace, cpu_s: float, asked: int
 ) -> None:
@@ -348,19 +375,18 @@ def summarise(
                 key: sum(row["answer"] == key for row in own)
                 for key in ("yes", "no", "null", "refused")
             },
-            "unsafe": sum(bool(row["unsafe"]) for row in own),
             "unsafe_yes": sum(bool(row["unsafe"]) and row["answer"] == "yes" for row in own),
             "causes": dict(
                 Counter(row["cause"] for row in own if row["answer"] == "no").most_common(8)
             ),
         }
     bad = [row for row in rows if row["answer"] == "yes" and row["unsafe"]]
-    nameless = [row for row in rows if row["answer"] != "yes" and not row["cause"].strip(": None")]
+    other = [row for row in rows if row["answer"] != "yes" and not names_its_cause(row)]
     fine = [row for row in rows if row["family"] in HONEST]
     accepted = sum(row["answer"] == "yes" for row in fine) / max(1, len(fine))
     targets = [
         Target(what="yes for an unsafe plan", measured=len(bad), limit=0),
-        Target(what="answers without a cause", measured=len(nameless), limit=0),
+        Target(what="refusals without their cause", measured=len(other), limit=0),
         Target(what="plans asked", measured=len(rows), limit=NUM_PLANS[options.task],
                at_most=False),
         Target(what="families", measured=len({row["family"] for row in rows}), limit=40,
@@ -368,7 +394,9 @@ def summarise(
         Target(what="share of valid plans accepted", measured=accepted, limit=0.98,
                at_most=False),
     ]  # fmt: skip
-    details = {"seed": options.seed, "families": families, "unsafe_yes": bad}
+    details = {"seed": options.seed, "families": families, "unsafe_yes": bad, "no_cause": other}
+    shares = [row["share"] for row in rows if row.get("share")]
+    details["most_acceleration_of_a_yes"] = max(shares, default=None)
     if asked:
         details["cpu_s_per_plan"] = round(cpu_s / asked, 3)
         details["asked_in_last_run"] = asked

@@ -1,4 +1,4 @@
-"""The rasteriser's speed: against a scalar numba reference, against torch, and with two threads."""
+"""The rasteriser's speed: against torch, with two threads, and for a frame of a sequence."""
 
 import statistics
 import sys
@@ -24,9 +24,9 @@ from twin.scene.sequence import Artist, Frame
 
 VGA = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 SMALL = Camera(width=160, height=120, fx=160.0, fy=160.0, cx=80.0, cy=60.0)
-COUNTS = (50_000, 200_000)
+COUNT = 50_000
 SMALL_COUNT = 2_000
-NUMBA_FACTOR, TORCH_FACTOR, THREADS_FACTOR = 8.0, 100.0, 1.8
+TORCH_FACTOR, THREADS_FACTOR = 100.0, 1.8
 FRAME_MS = 200.0
 """CPU time that a frame of a whole episode may take."""
 LINKS = (
@@ -67,50 +67,6 @@ def native(cloud: GaussianCloud, camera: Camera, rasteriser: Rasteriser) -> tupl
     planes = rasteriser.draw_planes(cloud, camera, np.eye(4))
     gradients = rasteriser._native.pull(planes, np.ones_like(planes))
     return planes, gradients[NAMES.index("colors")]
-
-
-def against_numba(counts: tuple[int, ...], repeats: int) -> list[Target]:
-    import splat_numba
-
-    wide = "v3" if "v3" in available_isas() else "auto"
-    targets = []
-    for count in counts:
-        cloud = surface_cloud(VGA, count)
-        ellipses = splat_numba.project(cloud, VGA)
-        upstream = np.ones((5, VGA.height, VGA.width), dtype=np.float32)
-        planes, gradient = splat_numba.draw_and_pull(ellipses, VGA, upstream)
-        rasteriser = Rasteriser(RasterConfig(threads=1, isa=wide))
-        own_planes, own_colors = native(cloud, VGA, rasteriser)
-        # Speeds are only compared of two that draw the same.
-        difference = float(np.quantile(np.abs(planes - own_planes), 0.999))
-        scale = float(np.abs(own_colors).max())
-        wrong = float(np.abs(gradient[:, 6:9] - own_colors[ellipses.index]).max()) / scale
-        if difference > 2e-3 or wrong > 2e-2:
-            message = f"the reference draws something else: {difference:g}, gradients {wrong:g}"
-            raise RuntimeError(message)
-        reference = statistics.median(
-            cpu_seconds(
-                lambda e=ellipses, g=upstream: splat_numba.draw_and_pull(e, VGA, g),
-                repeats=max(2, repeats // 4),
-            )
-        )
-        for isa in dict.fromkeys([wide, *available_isas()]):
-            one = Rasteriser(RasterConfig(threads=1, isa=isa))
-            own = statistics.median(
-                cpu_seconds(lambda c=cloud, r=one: native(c, VGA, r), repeats=repeats)
-            )
-            limit = NUMBA_FACTOR if isa == wide else 0.0
-            targets.append(
-                Target(
-                    what=f"{count // 1000}k Gaussians, {isa}, faster than numba",
-                    measured=reference / own,
-                    limit=limit,
-                    unit="x",
-                    at_most=False,
-                    reference=f"numba {reference * 1e3:.0f} ms, native {own * 1e3:.1f} ms",
-                )
-            )
-    return targets
 
 
 def against_torch(repeats: int) -> Target:
@@ -221,11 +177,8 @@ def main() -> None:
     """Measure; ``quick`` as the first argument takes fewer repeats."""
     quick = "quick" in sys.argv[1:]
     repeats = 5 if quick else 15
-    targets = against_numba(COUNTS[:1] if quick else COUNTS, repeats)
-    target, stages = with_threads(COUNTS[0], repeats)
-    targets.append(target)
-    targets.append(against_torch(repeats))
-    targets.append(of_a_sequence(repeats))
+    target, stages = with_threads(COUNT, repeats)
+    targets = [target, against_torch(repeats), of_a_sequence(repeats)]
     note = "640 x 480 unless said, forward and backward, CPU time of one thread unless said wall"
     report_targets("splat_rasteriser", targets, note=note, stages_s=stages)
 

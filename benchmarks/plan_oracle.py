@@ -25,12 +25,15 @@ Matrix = np.ndarray
 STEP_RAD = 0.02
 """Between two postures that are looked at no joint turns by more."""
 START_RAD, START_M = 0.05, 0.010
-TOOL_SPEED_M_S, ACCELERATION_RAD_S2 = 1.0, 15.0
 SLACK = 1.1
-"""A plan beyond a limit by less may be called either."""
-SPLINE = 1.9
-"""A spline through the corner of two straight lines asks for 1.73 times what a parabola does."""
-PAYLOAD_KG, LATE_S = 5.0, 0.005
+BAND = 1.05
+"""A plan that is beyond a limit of acceleration, power or momentum by less may be called either."""
+AHEAD_S = 0.04
+"""A controller that goes straight smooths over so much before and after (UR's servoj: 0.03 s and
+more); the longer, the softer."""
+BEFORE = {"elbow_speed_m_s": 0.05, "tool_speed_m_s": 0.05, "momentum_kg_m_s": 3.0, "power_W": 10.0}
+"""So much before its limits an arm may stop: the accuracies of UR's manual."""
+LATE_S = 0.005
 DEEP_M = 0.007
 """Bodies that may touch lie no deeper in each other (the gate: 5 mm)."""
 PRE_GRASP_M = 0.005
@@ -163,6 +166,8 @@ class Cell:
     start: Mapping[str, float]
     """Where each joint of the arm is [rad]."""
     robot: str
+    file: Mapping[str, Any]
+    """The robot file: limits, payload, safety settings."""
     max_width_m: float
 
 
@@ -172,6 +177,7 @@ class Oracle:
     def __init__(self, cell: Cell) -> None:
         """Place what stands still."""
         self._cell = cell
+        self._limit_rad_s2 = np.array(cell.file["acceleration_rad_s2"])
         self._arm = Arm(cell.urdf, cell.resolve)
         self._stages = {str(stage["id"]): stage for stage in cell.task.stages}
         self._walls = [("table", _box((4.0, 4.0, 0.4), _at(0.0, 0.0, -0.2)), np.zeros(3), 1e9)]
@@ -195,8 +201,9 @@ class Oracle:
                 or self._numbers(plan)
                 or self._contacts(plan)
                 or self._start(plan)
-                or self._load(plan)
+                or self._too_heavy(plan)
                 or self._speeds(plan)
+                or self._loads(plan)
                 or self._skims(plan)
                 or self._shapes(plan)
             )
@@ -294,9 +301,10 @@ class Oracle:
                 if not low - 0.01 <= value <= high + 0.01:
                     return "joint_limit"
         fastest = np.array([self._arm.limits[name][2] for name in names])
+        most_m_s = self._cell.file["tool_speed_m_s"]
         for a, b in pairwise(plan["tau"]):
             away = np.linalg.norm(np.array(b["p_m"]) - np.array(a["p_m"]))
-            if away / ((b["t_ns"] - a["t_ns"]) * 1e-9) > TOOL_SPEED_M_S * SLACK:
+            if away / ((b["t_ns"] - a["t_ns"]) * 1e-9) > most_m_s * SLACK:
                 return "tool_speed"
         tools = [self._tool(q) for _, q, _, _ in rows]
         speeds = []
@@ -304,9 +312,6 @@ class Oracle:
             speeds.append((q1 - q0) / ((t1 - t0) * 1e-9))
             if np.any(np.abs(speeds[-1]) > fastest * SLACK):
                 return "joint_speed"
-        for (a, b), (p0, p1) in zip(pairwise(rows), pairwise(tools), strict=True):
-            if np.linalg.norm(p1 - p0) / ((b[0] - a[0]) * 1e-9) > TOOL_SPEED_M_S * SLACK:
-                return "tool_speed"
         poses = {w["t_ns"]: np.array(w["p_m"]) for w in plan["tau"]}
         for (t, _, _, _), p in zip(rows, tools, strict=True):
             if np.linalg.norm(poses[t] - p) > 0.002:
@@ -316,41 +321,77 @@ class Oracle:
     def _acceleration(
         self, plan: Mapping[str, Any], rows: Sequence[tuple[int, np.ndarray, float, int]]
     ) -> str:
-        """What a spline through the waypoints asks for at a controller's rate, and at the ends."""
-        if len(rows) < 3:
+        """Whether any controller, and one that goes straight, can keep the limit."""
+        if len(rows) < 3 or len(rows) < len(plan["tau"]):
             return ""
-        t = np.array([row[0] for row in rows]) * 1e-9
-        q = np.stack([row[1] for row in rows])
-        whole = len(rows) == len(plan["tau"])  # else nobody knows how it goes on
-        curve = CubicSpline(t, q, bc_type="clamped" if whole else "not-a-knot")
-        if np.abs(curve(np.arange(t[0], t[-1], 0.002), 2)).max() > ACCELERATION_RAD_S2 * SPLINE:
+        if self.least_acceleration(plan) > BAND:
             return "joint_acceleration"
-        ends = [(q[1] - q[0]) / (t[1] - t[0]), (q[-1] - q[-2]) / (t[-1] - t[-2])]
-        most = ACCELERATION_RAD_S2 * SLACK * 0.08
-        return "sudden_end" if whole and np.abs(ends).max() > most else ""
+        t = np.array([row[0] for row in rows]) * 1e-9
+        speeds = np.diff(np.stack([row[1] for row in rows]), axis=0) / np.diff(t)[:, None]
+        speeds = np.pad(speeds, ((1, 1), (0, 0)))  # at rest before and after
+        ends = np.sort(np.concatenate([t - AHEAD_S, t + AHEAD_S]))
+        middles = (ends[1:] + ends[:-1]) / 2  # between two ends nothing changes
+        first, last = (np.searchsorted(t, middles + by) for by in (-AHEAD_S, AHEAD_S))
+        straight = np.abs(speeds[last] - speeds[first]).max(axis=0) / (2 * AHEAD_S)
+        return "straight_acceleration" if np.any(straight > self._limit_rad_s2 * BAND) else ""
 
-    def _load(self, plan: Mapping[str, Any]) -> str:
-        """Mass in the hand against what the arm may carry, and pinocchio's torques with it."""
+    def least_acceleration(self, plan: Mapping[str, Any]) -> float:
+        """Share of the limit without which nothing passes the waypoints in time, rest to rest.
+
+        With accelerations of at most A, a joint that goes d in h has speeds within A h / 2 of d / h
+        at the start; the slower it starts, the faster it may end, by accelerating after braking.
+        """
+        rows = self._postures(plan)
+        if len(rows) < len(plan["tau"]):  # nobody knows how it goes on
+            return 0.0
+        shares = np.append(BAND, np.geomspace(0.125, 128.0, 101))[:, None]
+        most = shares * self._limit_rad_s2
+        low, high, fits = np.zeros_like(most), np.zeros_like(most), np.ones_like(most, dtype=bool)
+        for (t0, q0, _, _), (t1, q1, _, _) in pairwise(rows):
+            h, d = (t1 - t0) * 1e-9, q1 - q0
+            low, high = (
+                np.maximum(low, d / h - most * h / 2),
+                np.minimum(high, d / h + most * h / 2),
+            )
+            fits &= low <= high + 1e-6
+            gained = np.sqrt(np.maximum(0.0, 2 * h * h + 4 * (d - low * h) / most))
+            lost = np.sqrt(np.maximum(0.0, 2 * h * h - 4 * (d - high * h) / most))
+            low, high = high + most * (h - lost), low + most * (gained - h)
+        fits &= (low <= 1e-6) & (high >= -1e-6)
+        found = shares[fits.all(axis=1)]
+        return float(found.min()) if len(found) else math.inf
+
+    def _held_kg(self, plan: Mapping[str, Any]) -> float:
         name = str(plan.get("task", ""))
-        if not name.startswith("heavy_") or not any(w["g"] for w in plan["tau"]):
+        if name.startswith("heavy_"):
+            return float(name.removeprefix("heavy_").replace("_", "."))
+        return max(self._cell.task.objects[n].mass_kg for n in self._cell.task.manipulated)
+
+    def _too_heavy(self, plan: Mapping[str, Any]) -> str:
+        heavy = self._held_kg(plan) > self._cell.file["payload_kg"]
+        return "payload" if heavy and any(w["g"] for w in plan["tau"]) else ""
+
+    def _loads(self, plan: Mapping[str, Any]) -> str:
+        """Torque and power along a spline by pinocchio; speeds and momentum by differences."""
+        rows, file = self._postures(plan), self._cell.file
+        if len(rows) < 3 or len(rows) < len(plan["tau"]):
             return ""
-        mass_kg = float(name.removeprefix("heavy_").replace("_", "."))
-        if mass_kg > PAYLOAD_KG:
-            return "payload"
-        model = pin.buildModelFromXML(
-            re.sub(r"<mesh [^>]*>", '<box size="1 1 1"/>', self._cell.urdf)
-        )
-        tool = model.frames[model.getFrameId("tcp")]
-        model.appendBodyToJoint(
-            tool.parentJoint, pin.Inertia.FromSphere(mass_kg, 0.02), tool.placement
-        )
-        ids = [model.joints[model.getJointId(n)].idx_v for n in self._cell.start]
-        q, data = pin.neutral(model), model.createData()
-        for _, joints, _, _ in self._postures(plan):
-            q[ids] = joints
-            torques = np.abs(pin.computeGeneralizedGravity(model, data, q)[ids])
-            if np.any(torques > model.effortLimit[ids] * SLACK):
+        arm = _Masses(self._cell.urdf, list(self._cell.start), self._held_kg(plan))
+        t = np.array([row[0] for row in rows]) * 1e-9
+        curve = CubicSpline(t, np.stack([row[1] for row in rows]), bc_type="clamped")
+        grips = np.array([row[3] for row in rows])
+        for at in np.arange(t[0], t[-1], 0.01).tolist():
+            held = bool(grips[np.searchsorted(t, at, "right") - 1])
+            torques = arm.torques(curve(at), curve(at, 1), curve(at, 2), held)
+            if np.any(np.abs(torques) > arm.efforts * SLACK):
                 return "torque"
+            if np.maximum(torques * curve(at, 1), 0).sum() > (file["power_W"] - 10) * BAND * SLACK:
+                return "power"
+        for (t0, q0, _, g), (t1, q1, _, _) in pairwise(rows):
+            found = arm.differences(q0, q1, (t1 - t0) * 1e-9, bool(g))
+            for name, value in found.items():
+                if value > (file[name] - BEFORE[name]) * BAND:
+                    return name
         return ""
 
     def _skims(self, plan: Mapping[str, Any]) -> str:
@@ -474,6 +515,54 @@ class Oracle:
                 if away < one.radius_m + other.radius_m and _depth_m(one.shape, other.shape):
                     return "self_collision"
         return ""
+
+
+class _Masses:
+    """The arm's masses by pinocchio, with a ball in the hand or without."""
+
+    def __init__(self, urdf: str, joints: Sequence[str], held_kg: float) -> None:
+        """Read the URDF; its shapes do not matter."""
+        bare = pin.buildModelFromXML(re.sub(r"<mesh [^>]*>", '<box size="1 1 1"/>', urdf))
+        loaded, tool = bare.copy(), bare.frames[bare.getFrameId("tcp")]
+        ball = pin.Inertia.FromSphere(held_kg, 0.02)
+        loaded.appendBodyToJoint(tool.parentJoint, ball, tool.placement)
+        self._models = (bare, bare.createData()), (loaded, loaded.createData())
+        self._ids = [bare.joints[bare.getJointId(name)].idx_v for name in joints]
+        self._elbow = bare.getJointId(joints[2])
+        self.efforts = bare.effortLimit[self._ids]
+
+    def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, held: bool) -> np.ndarray:
+        """Of the arm's joints [Nm]."""
+        model, data = self._models[held]
+        full = [np.zeros(model.nv) for _ in range(3)]
+        for row, values in zip(full, (q, v, a), strict=True):
+            row[self._ids] = values
+        return np.array(pin.rnea(model, data, *full)[self._ids])
+
+    def differences(self, q0: np.ndarray, q1: np.ndarray, h: float, held: bool) -> dict[str, float]:
+        """Momentum and speeds from where masses are a little later, at both ends of a line."""
+        model, data = self._models[held]
+        found = []
+        for start in (0.0, 0.999):
+            places = []
+            for share in (start, start + 0.001):
+                q = np.zeros(model.nv)
+                q[self._ids] = q0 + share * (q1 - q0)
+                mass_m = model_mass(model) * pin.centerOfMass(model, data, q)
+                pin.updateFramePlacements(model, data)
+                tool = data.oMf[model.getFrameId("tcp")].translation
+                places.append(
+                    (tool.copy(), data.oMi[self._elbow].translation.copy(), mass_m.copy())
+                )
+            steps = [np.linalg.norm(b - a) / (0.001 * h) for a, b in zip(*places, strict=True)]
+            found.append(steps)
+        names = ("tool_speed_m_s", "elbow_speed_m_s", "momentum_kg_m_s")
+        return dict(zip(names, np.max(found, axis=0).tolist(), strict=True))
+
+
+def model_mass(model: Any) -> float:
+    """Of all that moves [kg]; what is fixed to the base does not."""
+    return float(sum(inertia.mass for inertia in list(model.inertias)[1:]))
 
 
 def _slerp(first: Sequence[float], last: Sequence[float], share: float) -> Matrix:

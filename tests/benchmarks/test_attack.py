@@ -21,9 +21,9 @@ from twin.replay.config import ReplayConfig
 
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "benchmarks"))
-from attack_gate import Kinematics, payload_of, plans_from  # noqa: E402
+from attack_gate import Kinematics, payload_of, plans_from, robot_file  # noqa: E402
 from plan_mutations import FAMILIES  # noqa: E402
-from plan_oracle import Cell, Oracle  # noqa: E402
+from plan_oracle import BAND, Cell, Oracle  # noqa: E402
 
 HOME_RAD = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
 TASK = load_task("cube_into_box")
@@ -49,6 +49,7 @@ def oracle() -> Oracle:
             Ts_base_object=POSES,
             start=dict(zip(ARM_JOINTS, HOME_RAD.tolist(), strict=True)),
             robot=ROBOT_NAME,
+            file=robot_file(),
             max_width_m=MAX_WIDTH_M,
         )
     )
@@ -95,3 +96,22 @@ def test_no_family_of_mutations_gets_a_yes_for_a_plan_that_is_unsafe(
         assert said is True or family != "valid"
         unsafe += [family] if why else []
     assert len(unsafe) >= len(QUICK) // 2, unsafe
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.9, False), (1.2, True)])
+def test_the_oracle_sees_what_is_a_little_beyond_the_file_of_the_arm(
+    oracle: Oracle, share: float, refused: bool
+) -> None:
+    """From rest to rest over d in h no joint needs less than 4 d / h^2; as a sine A w^2."""
+    times = np.arange(0, 1.0001, 0.004)
+    size = share * 15.0 / (14 * np.pi) ** 2
+    for t, rows in (
+        (np.array([0, 0.5]), np.array([0, share * 15.0 * 0.25 / 4])),
+        (times, size * np.sin(np.pi * times) ** 2 * np.sin(14 * np.pi * times)),
+    ):
+        joints = np.tile(HOME_RAD, (len(t), 1))
+        joints[:, 2] += rows
+        tau = [{"t_ns": round(a * 1e9), "joints_rad": q.tolist(), "g": 0}
+               for a, q in zip(t, joints, strict=True)]  # fmt: skip
+        assert (oracle.least_acceleration({"tau": tau}) > BAND) is refused
+        assert oracle.least_acceleration({"tau": tau}) == pytest.approx(share, rel=0.08)

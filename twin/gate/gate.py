@@ -230,8 +230,11 @@ class Gate:
         localise: Localise,
         replay: Replay,
         now_ns: Callable[[], int],
+        judged_in: Callable[[], Mapping[str, str | None]] = dict,
     ) -> None:
-        """Put together what sees, what finds objects and what replays."""
+        """Put together what sees, finds objects and replays; ``judged_in``: the run's hashes."""
+        self.judged_in = judged_in
+        self._cameras_of = judged_in().get("calibration_id")
         self._tasks = tasks
         self._config = config
         self._perception = perception
@@ -382,14 +385,21 @@ class Gate:
         verdict = self._replay(plan, task, found, urdf, start_rad, ends_s)
         if verdict.accepted is not True:
             return verdict
+        if verdict.calibration_id != self._cameras_of:
+            raise UndecidedError(
+                "the run has been calibrated since the gate started, and it sees by cameras where "
+                "they were then. Start it again"
+            )
         verdict = self._likely(verdict)
         if verdict.accepted is True:
             self._look_again(task, found, frames, ends_s)
             self._feel_again(start_rad, robot_of(urdf))
-            verdict = replace(verdict, basis=self._basis(start_rad, found))
+            verdict = replace(verdict, basis=self._basis(verdict, start_rad, found))
         return verdict
 
-    def _basis(self, start_rad: Joints, found: Mapping[str, Any]) -> dict[str, Any]:
+    def _basis(
+        self, verdict: Verdict, start_rad: Joints, found: Mapping[str, Any]
+    ) -> dict[str, Any]:
         """What a yes holds for, but for the plan."""
         objects = {
             name: {
@@ -403,6 +413,8 @@ class Gate:
             "objects": objects,
             "judged_ns": self._perception.newest_ns(),
             "valid_s": self._config.valid_s,
+            "scene_hash": verdict.scene_hash,
+            "calibration_id": verdict.calibration_id,
         }
 
     def _check(self, plan: Plan) -> str:

@@ -4,7 +4,7 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,7 @@ def make_gate(
     perception: Perception,
     now_ns: Callable[[], int],  # the clock on which messages arrive
     twin: TwinProcess,
+    judged_in: Callable[[], Mapping[str, str | None]] = dict,  # hashes of the run as it is now
 ) -> Gate:
     """Put the real localisation and replay behind the gate."""
     return Gate(
@@ -56,6 +57,7 @@ def make_gate(
         localise=twin.localise,
         replay=twin.replay,
         now_ns=now_ns,
+        judged_in=judged_in,
     )
 
 
@@ -65,12 +67,14 @@ def serve_gate(
     """Answer on ``<cell>/gate/verdict`` and publish every verdict on ``/<cell>/verdict``.
 
     A published verdict carries the time of the newest thing seen, on the cell's own clock, so
-    that it lies before the execution it allows.
+    that it lies before the execution it allows. Asked without a plan it says in what it judges.
     """
     publisher = session.publisher(cell_topic(config.cell, VERDICT), schema.VERDICT)
     publishing = threading.Lock()
 
     def answer(payload: bytes) -> bytes:
+        if not payload:
+            return json.dumps(gate.judged_in()).encode()
         started = time.monotonic()
         verdict = gate.judge(payload)
         data = verdict.to_json()
@@ -159,7 +163,10 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     """Judge plans until SIGINT or SIGTERM; both end with exit code 0."""
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
     from twin.gate.live import LiveView  # noqa: PLC0415
+    from twin.robot.collision import hulls_of  # noqa: PLC0415
+    from twin.robot.model import load_robot  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
+    from twin.scene.store.folder import scene_hash_of  # noqa: PLC0415
 
     if not CELL_NAME.match(config.cell):
         message = f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'."
@@ -172,7 +179,16 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     if tasks.only is not None:
         config.replay.refuse_soft(tasks.only.task().soft_objects)
     urdf = read_robot(config.robot).description() if config.robot else None
+    blind = hulls_of(load_robot(urdf)).blind() if urdf else None
+    if blind is not None:
+        raise GateError(f"no motion of {config.robot} could be accepted: {blind}")
     perception = LiveView(config.cell, read_calibration(run), urdf)
+
+    def judged_in() -> dict[str, str | None]:
+        known = read_calibration(run)
+        calibration_id = None if known is None else known.calibration_id
+        return {"scene_hash": scene_hash_of(run), "calibration_id": calibration_id}
+
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with (
         stop_signals() as stopped,
@@ -181,7 +197,7 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     ):
         claim_gate(session, config.cell)
         watch_cell(session, config.cell, perception.take)
-        gate = make_gate(tasks, config, perception, session.now_ns, twin)
+        gate = make_gate(tasks, config, perception, session.now_ns, twin, judged_in)
         serve_gate(session, gate, perception, config, output)
         serve_localisation(session, gate, perception, config, output)
         output.say(

@@ -151,12 +151,11 @@ def _scene_of(question: Question, run: RunFolder) -> tuple[ReplayScene, tuple[st
 def _steps_of(question: Question, config: ReplayConfig) -> int:
     """Simulated steps of the nominal replay; no more than a verdict may take."""
     from twin.replay.dynamics import num_steps  # noqa: PLC0415
-    from twin.replay.path import MAX_DURATION_S  # noqa: PLC0415
+    from twin.replay.path import check_usable  # noqa: PLC0415
+    from twin.robot.model import load_robot  # noqa: PLC0415
 
-    tau = question.plan.tau
-    # Of a plan with impossible times the replay says what is wrong.
-    end_ns = min(max(tau[-1].t_ns if tau else 0, 0), round(MAX_DURATION_S * 1e9))
-    steps = max(1, num_steps(end_ns, config))
+    check_usable(question.plan, load_robot(question.urdf))  # before its impossible times are steps
+    steps = max(1, num_steps(question.plan.tau[-1].t_ns, config))
     if steps > question.max_steps:
         raise UndecidedError(
             f"its replay takes {steps} simulated steps, and a verdict at most "

@@ -147,7 +147,7 @@ def _too_heavy(robot: RobotModel, held: Sequence[Load]) -> list[Failure]:
             cause=Cause.PAYLOAD,
             bodies=(item.name,),
             detail=f"{item.name} weighs {item.mass_kg:g} kg, {item.mass_kg - most_kg:.2f} kg more "
-            f"than the {most_kg:g} kg that {robot.name} may carry",
+            f"than the {most_kg:g} kg of {robot.name}, and is held at {item.start_ns * 1e-9:.2f} s",
         )
         for item in held
         if most_kg is not None and not item.mass_kg <= most_kg

@@ -4,10 +4,11 @@ Whoever moves the robot asks the gate itself: what a planner says of its plan co
 """
 
 import hashlib
+import json
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -39,16 +40,8 @@ ARM_OF = {WITHOUT: "without", WITH: "with"}
 """What a condition means outside a study."""
 
 
-@runtime_checkable
-class Planner(Protocol):
-    """Who plans: built into the cell, or somebody on the wire."""
-
-    def ask(self, request: PlanRequest) -> PlanAnswer:
-        """Answer one request."""
-
-
 class BuiltInPlanner:
-    """The cell's own scripted planner behind the protocol that every planner has."""
+    """The cell's own scripted planner, asked as one on the wire is."""
 
     def __init__(self, cell: StandinCell, grounding: str) -> None:
         """Plan for a cell; ``grounding`` says in words where the poses are from."""
@@ -132,7 +125,7 @@ class Decider:
             raise UsageError(message)
         noise = cell.file.noise_for(cell.task.name)
         self.sees_by_gate = not built_in or noise.perception == "gate"
-        self._planner: Planner = (
+        self._planner: BuiltInPlanner | WirePlanner = (
             BuiltInPlanner(cell, GROUNDING_GATE if self.sees_by_gate else GROUNDING)
             if built_in
             else WirePlanner(session, config.cell, config.planner_timeout_s)
@@ -203,8 +196,16 @@ class Decider:
         joints = cell.world.joints_rad + cell.world.slack_rad + cell.hidden.joint_offset_rad
         places = cell.world.Ts_base_object()
         moved = {name: T[:3, 3] - self._stood[name] for name, T in places.items()}
-        why = why_stale(verdict, plan.to_json(), cell.now_ns, joints, moved)
+        why = why_stale(verdict, plan.to_json(), cell.now_ns, joints, moved, self._judged_in())
         return decision if not why else self._unverified(plan, f"the gate's yes is void: {why}")
+
+    def _judged_in(self) -> dict[str, Any]:
+        """In which scene and calibration the gate judges now; nothing where it is silent."""
+        key, limit_s = cell_topic(self._config.cell, GATE)[1:], self._config.gate_timeout_s
+        try:
+            return dict(json.loads(self._session.query(key, b"", timeout_s=limit_s)))
+        except (BridgeError, ValueError, TypeError):
+            return {}
 
     def _request(self, info: EpisodeInfo, start_seed: int, sight: GateSight | None) -> PlanRequest:
         cell = self._cell
@@ -264,9 +265,8 @@ class Decider:
     def _ask_gate(self, plan: Plan) -> tuple[Verdict | None, str]:
         """Return the verdict, None when there is none, and why it is not a yes."""
         key = cell_topic(self._config.cell, GATE)[1:]
-        self._stood = {
-            name: T[:3, 3].copy() for name, T in self._cell.world.Ts_base_object().items()
-        }
+        places = self._cell.world.Ts_base_object()
+        self._stood = {name: T[:3, 3].copy() for name, T in places.items()}
         self._cell.streams.joints_again()  # a planner may have thought for seconds
         limit_s, asked_s = self._config.gate_timeout_s, time.monotonic()
         try:
@@ -278,7 +278,7 @@ class Decider:
             return None, f"the wall-clock limit of {limit_s:g} s (--gate-timeout-s) struck first"
         if verdict.plan_id != plan.id:
             return None, f"the gate judged {verdict.plan_id!r} instead of {plan.id!r}"
-        return verdict, _reason(verdict)
+        return verdict, verdict.reason or "the verdict is undecided"
 
 
 MOVED_RAD = 0.05
@@ -290,6 +290,7 @@ def why_stale(
     now_ns: int,
     joints_rad: np.ndarray,
     moved_m: Mapping[str, np.ndarray],
+    twin: Mapping[str, Any],
 ) -> str:
     """Say why a yes does not allow to execute a plan from here and now; "" when it does.
 
@@ -297,6 +298,7 @@ def why_stale(
         plan: The bytes that will be executed.
         now_ns: On the cell's clock.
         moved_m: How far objects have been moved since, as far as anybody knows.
+        twin: In which scene and calibration the gate judges now.
     """
     basis = verdict.basis
     if verdict.accepted is not True or basis is None:
@@ -306,13 +308,20 @@ def why_stale(
     age_s = (now_ns - basis["judged_ns"]) * 1e-9
     if not 0 <= age_s <= basis["valid_s"]:
         return f"it is {age_s:.1f} s old, and holds for {basis['valid_s']:g} s"
-    off_rad = np.abs(np.asarray(joints_rad) - basis["joints_rad"]).max()
-    if not off_rad <= MOVED_RAD:
-        return f"a joint is {off_rad:.3f} rad from where it was, and {MOVED_RAD:g} rad are allowed"
+    for name in ("scene_hash", "calibration_id"):
+        then, now = basis.get(name), twin.get(name, "nothing")
+        if then != now:
+            return f"its {name} was {then or 'none'}, and the gate has {now or 'none'} now"
+    off_rad = np.abs(np.asarray(joints_rad) - basis["joints_rad"])
+    joint = int(np.argmax(off_rad))
+    if not off_rad[joint] <= MOVED_RAD:
+        told = f"{ARM_JOINTS[joint]} is {off_rad[joint]:.3f} rad from where it was"
+        return f"{told}, and {MOVED_RAD:g} rad are allowed"
     for name, seen in basis["objects"].items():
         off_m = np.linalg.norm(moved_m.get(name, np.zeros(3)))
         if not off_m <= seen["margin_m"]:
-            return f"{name} is {off_m * 1e3:.0f} mm from where it was judged"
+            told = f"{name} is {off_m * 1e3:.0f} mm from where it was judged"
+            return f"{told}, and {seen['margin_m'] * 1e3:.0f} mm are allowed"
     return ""
 
 
@@ -338,12 +347,3 @@ def _stamped(plan: Plan, info: EpisodeInfo, round_: int, parent: Plan | None) ->
         study_arm=info.study_arm,
         start_id=info.start_id or "",
     )
-
-
-def _reason(verdict: Verdict) -> str:
-    name = verdict.first_failing
-    if name is None:
-        return verdict.reason or "the verdict is undecided"
-    factor = verdict.factors()[name]
-    parts = [name, factor.cause or "", factor.detail or ""]
-    return " ".join(part for part in parts if part)

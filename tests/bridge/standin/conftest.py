@@ -47,6 +47,8 @@ class FakeSession:
         return FakePublisher(self, topic, type_name)
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+        if not payload and self.gate is not None:
+            return b'{"scene_hash": null, "calibration_id": null}'
         request = json.loads(payload)
         if key.startswith("rec/main/ctl/"):
             verb = key.rsplit("/", 1)[-1]

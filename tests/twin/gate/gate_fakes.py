@@ -6,11 +6,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from verdicts import verdict_of
 
 from bridge.robots.default import ARM_JOINTS
 from bridge.task.find import chosen_task_file
 from bridge.task.plan import Plan, Stage, Waypoint
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Verdict
 from twin.gate.config import GateConfig
 from twin.gate.gate import Gate, JudgedTasks
 
@@ -73,17 +74,7 @@ def found(**missing: str) -> dict[str, Any]:
 
 
 def accept(plan: Plan, *_: Any) -> Verdict:
-    yes = Factor(value=True)
-    return Verdict(
-        plan_id=plan.id,
-        trajectory="planned",
-        mode="dynamic",
-        ik=yes,
-        clearance=yes,
-        terminal=yes,
-        engine="fake 1",
-        seed=0,
-    )
+    return verdict_of(plan.id, engine="fake 1")
 
 
 def gate_with(
@@ -92,6 +83,7 @@ def gate_with(
     replay: Callable[..., Verdict] = accept,
     now_ns: Callable[[], int] = lambda: 0,
     tasks: JudgedTasks = JUDGED,
+    judged_in: Callable[[], dict[str, str | None]] = dict,
     **settings: Any,
 ) -> Gate:
     config = GateConfig(**{"deadline_s": 5.0, "frame_wait_s": 0.0, **settings})
@@ -102,6 +94,7 @@ def gate_with(
         localise=localise,
         replay=replay,
         now_ns=now_ns,
+        judged_in=judged_in,
     )
 
 

@@ -27,9 +27,7 @@ from bridge.task.task_file import Task, load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate import gate as gate_module
-from twin.gate.config import GateConfig
 from twin.gate.gate import (
-    Gate,
     JudgedTasks,
     PlanTooLargeError,
     no_verdict,
@@ -68,82 +66,44 @@ def test_a_task_with_soft_objects_is_replayed_like_any_other() -> None:
         name: SimpleNamespace(found=True, reason=None, T_base_object=np.eye(4))
         for name in file.task().objects
     }
-    gate = Gate(
-        tasks=JudgedTasks(only=file),
-        config=GateConfig(deadline_s=5.0, frame_wait_s=0.0),
-        perception=FakePerception(),
-        localise=lambda *_: there,
-        replay=accept,
-        now_ns=lambda: 0,
-    )
+    gate = gate_with(tasks=JudgedTasks(only=file), localise=lambda *_: there)
     assert gate.judge(replace(PLAN, task="sloth_into_basket").to_json()).accepted is True
+
+
+def sees(**seen: Any) -> dict[str, Any]:
+    return {"perception": FakePerception(**seen)}
+
+
+LATE_NS = 2_000_000_000
+TOO_OLD = "s old, and only those of the last 1 s say where"
 
 
 @pytest.mark.parametrize(
     ("settings", "plan", "reason"),
     [
-        (
-            {"perception": FakePerception(seen=[])},
-            PLAN,
-            "no usable frames within 0 s: side: silent for 9.0 s",
-        ),
-        ({"perception": FakePerception(description=None)}, PLAN, "no robot description"),
-        (
-            {"perception": FakePerception(arm=None)},
-            PLAN,
-            "no joint states have arrived on /standin/joint_states",
-        ),
-        (
-            {"perception": FakePerception(arm=arm(names=("panda_joint1", "panda_joint2")))},
-            PLAN,
-            "of another robot: they name panda_joint1, panda_joint2, and lack shoulder_pan_joint",
-        ),
-        (
-            {"perception": FakePerception(arm=arm(stamp_ns=42 - 1_100_000_000))},
-            PLAN,
-            "are 1.1 s old, and only those of the last 1 s say where",
-        ),
-        (
-            {"perception": FakePerception(heard=2_000_000_000), "now_ns": lambda: 2_000_000_000},
-            PLAN,
-            "are 2.0 s old, and only those of the last 1 s say where",
-        ),
-        (
-            {
-                "perception": FakePerception(
-                    arm=arm(position_rad=np.array([0.0, np.inf, 0, 0, 0, 0]))
-                )
-            },
-            PLAN,
-            "hold no numbers for every joint",
-        ),
-        (
-            {"perception": FakePerception(arm=arm(position_rad=np.zeros(0)))},
-            PLAN,
-            "hold no numbers for every joint",
-        ),
-        ({"perception": FakePerception(running="plan_0")}, PLAN, "plan_0 is being executed"),
-        (
-            {"localise": lambda *_: found(cube="0 points")},
-            PLAN,
-            "not every object was found: cube (0 points)",
-        ),
+        (sees(seen=[]), PLAN, "no usable frames within 0 s: side: silent for 9.0 s"),
+        (sees(description=None), PLAN, "no robot description"),
+        (sees(arm=None), PLAN, "no joint states have arrived on /standin/joint_states"),
+        (sees(arm=arm(names=("panda_joint1", "panda_joint2"))), PLAN, "of another robot: they name "
+         "panda_joint1, panda_joint2, and lack shoulder_pan_joint"),
+        (sees(arm=arm(stamp_ns=42 - 1_100_000_000)), PLAN, f"are 1.1 {TOO_OLD}"),
+        ({**sees(heard=LATE_NS), "now_ns": lambda: LATE_NS}, PLAN, f"are 2.0 {TOO_OLD}"),
+        (sees(arm=arm(position_rad=np.array([0.0, np.inf, 0, 0, 0, 0]))), PLAN, "hold no numbers "
+         "for every joint"),
+        (sees(arm=arm(position_rad=np.zeros(0))), PLAN, "hold no numbers for every joint"),
+        (sees(running="plan_0"), PLAN, "plan_0 is being executed"),
+        ({"localise": lambda *_: found(cube="0 points")}, PLAN, "not every object was found: cube "
+         "(0 points)"),
         ({"replay": raising(TwinError("no waypoints"))}, PLAN, "no waypoints"),
         ({}, replace(PLAN, frame="world"), "is given in frame 'world'"),
-        (
-            {"perception": FakePerception(description='<robot name="panda"/>')},
-            replace(PLAN, robot="panda"),
-            "is given in frame 'base_link'; only 'panda_link0'",
-        ),
-        (
-            {"perception": FakePerception(description=DAMAGED)},
-            PLAN,
-            "carries a record that is not a robot: Object missing required field `name`",
-        ),
+        (sees(description='<robot name="panda"/>'), replace(PLAN, robot="panda"), "is given in "
+         "frame 'base_link'; only 'panda_link0'"),
+        (sees(description=DAMAGED), PLAN, "carries a record that is not a robot: Object missing "
+         "required field `name`"),
         ({}, replace(PLAN, robot="panda"), "for robot 'panda'; the cell's robot is 'ur5"),
         ({}, replace(PLAN, task="fold_towel"), "task 'fold_towel' is asked for; this gate judges"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_decided_is_null_with_a_reason(
     settings: dict[str, Any], plan: Plan, reason: str
 ) -> None:

@@ -110,53 +110,30 @@ def test_a_yes_needs_the_cell_to_be_as_it_was_judged() -> None:
     assert judged(ChangingPerception(looks=list(LOOKS))).accepted is True
 
 
+LOST = {**seen(pose()), "cube": SimpleNamespace(found=False, reason="0 points")}
+BENT = at([0.0, 0.0, 0.06, 0.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize(
-    ("perception", "found", "reason"),
+    ("changes", "after", "reason"),
     [
-        (
-            ChangingPerception(looks=list(LOOKS)),
-            [seen(pose()), seen(pose(0.53))],
-            "moved while the plan was being judged: cube by 30 mm and 0 degrees",
-        ),
-        (
-            ChangingPerception(looks=list(LOOKS)),
-            [seen(pose()), seen(pose(yaw_rad=0.6))],
-            "cube by 0 mm and 34 degrees",
-        ),
-        (
-            ChangingPerception(running=[None, "plan_0"]),
-            None,
-            "plan_0 was started while the plan was",
-        ),
-        (
-            ChangingPerception(postures=[HOME, at([0.0, 0.0, 0.06, 0.0, 0.0, 0.0])]),
-            None,
-            "the arm moved while the plan was being judged: elbow_joint by 0.060 rad",
-        ),
-        (
-            ChangingPerception(postures=[HOME, at([np.nan] * 6)]),
-            None,
-            "/standin/joint_states hold no numbers for every joint",
-        ),
-        (
-            ChangingPerception(looks=[[frame(1)], []]),
-            None,
-            "lost from sight while the plan was judged",
-        ),
-        (
-            ChangingPerception(looks=list(LOOKS)),
-            [
-                seen(pose()),
-                {**seen(pose()), "cube": SimpleNamespace(found=False, reason="0 points")},
-            ],
-            "not every object was found: cube (0 points)",
-        ),
+        ({"looks": LOOKS}, seen(pose(0.53)), "moved while the plan was being judged: cube by 30 mm "
+         "and 0 degrees"),
+        ({"looks": LOOKS}, seen(pose(yaw_rad=0.6)), "cube by 0 mm and 34 degrees"),
+        ({"looks": LOOKS}, LOST, "not every object was found: cube (0 points)"),
+        ({"looks": [[frame(1)], []]}, None, "lost from sight while the plan was judged"),
+        ({"running": [None, "plan_0"]}, None, "plan_0 was started while the plan was"),
+        ({"postures": [HOME, BENT]}, None, "the arm moved while the plan was being judged: "
+         "elbow_joint by 0.060 rad"),
+        ({"postures": [HOME, at([np.nan] * 6)]}, None, "/standin/joint_states hold no numbers for "
+         "every joint"),
     ],
-)
+)  # fmt: skip
 def test_what_changes_while_a_plan_is_judged_takes_the_yes_away(
-    perception: ChangingPerception, found: list[dict[str, Any]] | None, reason: str
+    changes: dict[str, list[Any]], after: dict[str, Any] | None, reason: str
 ) -> None:
-    verdict = judged(perception, found)
+    perception = ChangingPerception(**{name: list(values) for name, values in changes.items()})
+    verdict = judged(perception, [seen(pose()), after] if after else None)
     assert verdict.accepted is None
     assert reason in str(verdict.reason)
 
@@ -270,11 +247,8 @@ def test_a_gate_that_is_being_stopped_says_so(twin: TwinProcess) -> None:
 
 def test_a_no_is_a_no_whatever_happens_meanwhile() -> None:
     no = Factor(value=False, cause="inside", detail="beside the box")
-    verdict = judged(
-        ChangingPerception(running=[None, "plan_0"]),
-        verdict=Verdict(**{**vars(accepted()), "terminal": no}),
-    )
-    assert verdict.accepted is False
+    perception = ChangingPerception(running=[None, "plan_0"])
+    assert judged(perception, verdict=replace(accepted(), terminal=no)).accepted is False
 
 
 def test_without_a_newer_picture_nobody_looks_again() -> None:

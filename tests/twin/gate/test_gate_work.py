@@ -16,7 +16,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT, ROBOT_NAME
 from bridge.robots.robot import read_robot
-from bridge.task.plan import Plan
+from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.gate.gate import UndecidedError
@@ -24,8 +24,16 @@ from twin.gate.twin_process import Question, answer
 from twin.replay import audit as auditor
 from twin.replay import verdict as verdict_module
 from twin.replay.config import ReplayConfig
+from twin.replay.path import UnusablePlanError
 from twin.replay.scene import ReplayScene
 from twin.scene.store.calibration import write_physics
+
+STANDS = Waypoint(t_ns=0, p_m=(0.4, 0.0, 0.3), q_wxyz=(0.0, 1.0, 0.0, 0.0), g=0)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "run")
 
 
 class SeenError(Exception):
@@ -52,7 +60,7 @@ def question_of(run: RunFolder, **changes: Any) -> Question:
     lying = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([0.5, -0.1, 0.03]))
     plan = Plan(
         id="p", planner="", policy="", condition="without_replanning", robot=ROBOT_NAME,
-        frame="base_link", instruction="", stages=(), tau=(),
+        frame="base_link", instruction="", stages=(), tau=(STANDS,),
     )  # fmt: skip
     question = Question(
         run_path=run.path,
@@ -88,14 +96,13 @@ def accepting(monkeypatch: pytest.MonkeyPatch) -> list[ReplayConfig]:
 
 
 NOMINAL_STEPS = 60 + 240
-"""A plan without waypoints settles for 0.25 s before and 1 s after, at 240 Hz."""
+"""A plan that stands settles for 0.25 s before and 1 s after, at 240 Hz."""
 
 
 @pytest.mark.parametrize(("more_steps", "count"), [(0, 0), (299, 0), (300, 1), (1500, 5)])
 def test_as_many_samples_are_run_as_fit_into_the_steps_on_any_machine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more_steps: int, count: int
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, more_steps: int, count: int
 ) -> None:
-    run = RunFolder.create(tmp_path / "run")
     question = question_of(
         run, config=ReplayConfig(samples=5), max_steps=NOMINAL_STEPS + more_steps
     )
@@ -109,7 +116,7 @@ def test_as_many_samples_are_run_as_fit_into_the_steps_on_any_machine(
 
 
 def test_a_gate_asks_both_engines_within_the_same_steps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
 
@@ -122,7 +129,6 @@ def test_a_gate_asks_both_engines_within_the_same_steps(
     monkeypatch.setattr(verdict_module, "replay_plan", replay_plan)
     monkeypatch.setattr(auditor, "audit", lambda *_, **__: YES)
     config = ReplayConfig(engine="both")
-    run = RunFolder.create(tmp_path / "run")
     question = question_of(run, config=config, max_steps=2 * NOMINAL_STEPS)
     question = replace(question, task=load_task("cube_into_box"))
     said = answer(question)
@@ -134,27 +140,29 @@ def test_a_gate_asks_both_engines_within_the_same_steps(
 
 
 def test_a_plan_that_alone_needs_too_many_steps_gets_no_verdict(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = accepting(monkeypatch)
-    run = RunFolder.create(tmp_path / "run")
     with pytest.raises(UndecidedError, match="300 simulated steps, and a verdict at most 299"):
         answer(question_of(run, max_steps=NOMINAL_STEPS - 1))
     assert not asked
+    late = replace(STANDS, t_ns=1_700_000_000_000_000_000)
+    question = question_of(run)
+    with pytest.raises(UnusablePlanError, match="from the start of the trajectory, not from 1970"):
+        answer(replace(question, plan=replace(question.plan, tau=(late,))))
 
 
 def test_a_gate_without_a_calibration_presses_as_the_task_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene, config = asked(RunFolder.create(tmp_path / "run"), monkeypatch)
+    scene, config = asked(run, monkeypatch)
     assert config.physics.grip_force_N == 9.0
     assert scene.Ts_base_object["sloth"][:3, 3] == pytest.approx([0.5, -0.1, 0.03])
 
 
 def test_a_gate_presses_as_the_calibration_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = RunFolder.create(tmp_path / "run")
     force = {"grip_force_N": {"value": 11.0, "low": 10.0, "high": 12.0, "sigma_log": 0.05}}
     write_physics(run, {"promoted": True, "identified": force, "id": "x"})
     scene, config = asked(run, monkeypatch)
@@ -163,10 +171,9 @@ def test_a_gate_presses_as_the_calibration_says(
 
 
 def test_a_yes_that_knows_less_than_a_scene_could_tell_says_what_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A rebuilt scene without distances and without the toy: the task file stands in for both."""
-    run = RunFolder.create(tmp_path / "run")
     run.scene_dir.mkdir(exist_ok=True)
     record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
               "sources": [], "views": []}  # fmt: skip
@@ -183,9 +190,8 @@ def test_a_yes_that_knows_less_than_a_scene_could_tell_says_what_is_missing(
 
 @pytest.mark.parametrize("now", ["abc", None])
 def test_a_plan_of_a_scene_that_was_rebuilt_since_gets_no_verdict(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, now: str | None
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, now: str | None
 ) -> None:
-    run = RunFolder.create(tmp_path / "run")
     if now is not None:
         run.scene_dir.mkdir(exist_ok=True)
         record = {"schema_version": 1, "key": "k", "scene_hash": now, "background": {},
@@ -203,9 +209,8 @@ def test_a_plan_of_a_scene_that_was_rebuilt_since_gets_no_verdict(
 
 
 def test_a_scene_that_another_robot_recorded_gives_no_verdict(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = RunFolder.create(tmp_path / "run")
     other = read_robot("ur10_parallel_gripper")
     write_scene_of(run, other)
     asked = accepting(monkeypatch)
@@ -215,14 +220,13 @@ def test_a_scene_that_another_robot_recorded_gives_no_verdict(
         answer(question)
     assert not asked
     assert answer(replace(question, any_robot=True)).accepted is True
-    same = replace(question, plan=replace(question.plan, robot=other.name))
-    assert answer(same).accepted is True
+    plan = replace(question.plan, robot=other.name)
+    assert answer(replace(question, plan=plan, urdf=other.description())).accepted is True
 
 
 def test_a_yes_that_the_audit_does_not_confirm_is_null_with_both_numbers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = RunFolder.create(tmp_path / "run")
     accepting(monkeypatch)
     assert answer(question_of(run)).checks["audit"] == YES
     detail = "forearm_link is 3.0 mm from box at 1.20 s by python-fcl, the clearance said 8.0 mm"
