@@ -117,11 +117,8 @@ def service_of_topic(topic: str) -> Service:
     """Say how a topic should travel when the network is behind; ``wire.qos`` has the presets."""
     if topic.endswith((COLOR_IMAGE, DEPTH_IMAGE, POINTS)) or TACTILE in topic:
         return "camera"
-    control = (
-        *(JOINT_STATES, JOINT_TARGETS, GRIPPER_STATE, SPEED_SCALING, TCP_POSE, WRENCH, TF),
-        *(IMU, ODOMETRY),
-    )
-    return "control" if topic.endswith(control) else "reliable"
+    control = (JOINT_STATES, JOINT_TARGETS, GRIPPER_STATE, SPEED_SCALING, TCP_POSE, WRENCH, TF)
+    return "control" if topic.endswith((*control, IMU, ODOMETRY)) else "reliable"
 
 
 def is_truth(topic: str) -> bool:

@@ -215,6 +215,5 @@ def _samples(path: JointPath) -> tuple[Times, Rows, Rows, Rows]:
     before = rises[np.clip(np.searchsorted(path.times_ns, times_ns, "left") - 1, 0, last)]
     faster = np.linalg.norm(before, axis=1) > np.linalg.norm(after, axis=1)
     accelerations = np.zeros_like(joints)
-    knots = np.searchsorted(times_ns, path.times_ns)
-    accelerations[knots] = _at_corners(path, rises)
+    accelerations[np.searchsorted(times_ns, path.times_ns)] = _at_corners(path, rises)
     return times_s, joints, np.where(faster[:, None], before, after), accelerations
