@@ -422,6 +422,7 @@ def _beside(cases: Sequence["_Case"], plan: Plan) -> dict[int, tuple[str, ...]]:
     """Compare progress and time to success over all tasks; these share another alpha."""
     asked: list[tuple[_Case, Measure, Course]] = []
     for case in cases:
+        anywhere = replace(case.tries[0].row, start_positions_m={})  # they are paired already
         for measure in MEASURES:
             if not all(map(measure.is_recorded, case.sides)):
                 continue
@@ -429,8 +430,7 @@ def _beside(cases: Sequence["_Case"], plan: Plan) -> dict[int, tuple[str, ...]]:
             pairs = measure.pairs((t.is_second, t.row) for t in case.tries)
             for number, (first, second, won) in enumerate(pairs):
                 for row, is_second, better in ((first, False, won < 0), (second, True, won > 0)):
-                    alone = replace(row, start_positions_m={})
-                    tries.append(Try(row.task, str(number), is_second, better, True, alone))
+                    tries.append(Try(row.task, str(number), is_second, better, True, anywhere))
             asked.append((case, measure, Course.of(tries, plan)))
     found: dict[int, tuple[str, ...]] = {}
     readings = with_holm(asked, plan, lambda share, each: each[2].read(share))
