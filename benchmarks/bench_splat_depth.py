@@ -21,7 +21,7 @@ from measure import ROOT, Target, print_targets, report_targets
 
 from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
-from twin.scene.dataset.masks import find_moving
+from twin.scene.dataset.masks import find_moving, without_ego
 from twin.scene.dataset.training_set import limits_of, read_training_set
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FitResult, fit
@@ -65,7 +65,7 @@ def of_a_recording(source: Path, folder: Path, config: FrameConfig) -> Frames:
             surface = FrameSurface(frame, limits_of(whole))
             view, points = training_view(surface), surface.points()
             if mask is not None:
-                view, points = mask.mask_in(view), mask.drop_from(points, view)
+                points, view = without_ego(points, view, mask)
             held_out.append(find_moving([points], training.reference_views).mask_in(view))
     return Frames(points=training.points, views=training.views, held_out=held_out)
 

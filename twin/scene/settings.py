@@ -20,29 +20,13 @@ DEFAULT_BUDGET_S = 60.0
 """Wall time of a fit when neither a time nor a number of images is given."""
 
 
-def parse_duration_s(text: str) -> float:
-    """Read ``60s``, ``2min``, ``1h`` or plain seconds."""
-    match = _DURATION.match(text)
-    if match is None:
-        message = f"{text!r} is not a duration. Write 60s, 2min, 1h or plain seconds."
-        raise UsageError(message)
-    return float(match[1]) * _SECONDS[match[2]]
-
-
 def convert_duration(_type: Any, tokens: Sequence[Any]) -> float:
-    """Let a command-line option take a duration."""
-    try:
-        return parse_duration_s(tokens[0].value)
-    except UsageError as error:
-        raise ValueError(str(error)) from error
-
-
-def _refuse_below(least: int, **options: int) -> None:
-    """Refuse settings that nothing can be made with."""
-    for name, value in options.items():
-        if value < least:
-            message = f"--{name.replace('_', '-')} {value} is too small: at least {least}."
-            raise UsageError(message)
+    """Let a command-line option take ``60s``, ``2min``, ``1h`` or plain seconds."""
+    match = _DURATION.match(tokens[0].value)
+    if match is None:
+        message = f"{tokens[0].value!r} is not a duration. Write 60s, 2min, 1h or plain seconds."
+        raise ValueError(message)
+    return float(match[1]) * _SECONDS[match[2]]
 
 
 @Parameter(name="*", group="Frames")
@@ -73,10 +57,9 @@ class FrameConfig:
 
     def __post_init__(self) -> None:
         """Refuse to hold out every frame, or to learn from none."""
-        _refuse_below(2, holdout_every=self.holdout_every)
-        _refuse_below(0, train_every=self.train_every, holdout_offset=self.first_holdout)
-        _refuse_below(1, max_train_frames=self.max_train_frames)
-        _refuse_below(1, max_holdout_frames=self.max_holdout_frames)
+        least = {"holdout_every": 2, "train_every": 0, "holdout_offset": 0}
+        least |= {"max_train_frames": 1, "max_holdout_frames": 1}
+        refuse_outside(self, {name: (value, math.inf) for name, value in least.items()})
         refuse_outside(self, {"max_depth_m": (0.1, 1000.0)})
         if self.first_holdout >= self.holdout_every:
             message = (
@@ -109,11 +92,8 @@ class InitialiseConfig:
 
     def __post_init__(self) -> None:
         """Refuse an empty budget and a growth of everything."""
-        _refuse_below(1, max_splats=self.max_splats)
+        refuse_outside(self, {"max_splats": (1, math.inf), "growth": (0.0, 0.99)})
         refuse_outside(self, {"completion": (0.0, 1.0), "flying_fraction": (1e-3, 10.0)})
-        if not 0 <= self.growth < 1:
-            message = f"--growth {self.growth:g} is no share: 0 up to, not including, 1."
-            raise UsageError(message)
 
 
 @Parameter(name="*", group="Fit")
@@ -135,7 +115,7 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         """Refuse a fit that never ends, or never begins."""
-        _refuse_below(0, iterations=self.iterations, seed=self.seed, threads=self.threads)
+        refuse_outside(self, dict.fromkeys(("iterations", "seed", "threads"), (0, math.inf)))
         if self.budget_s is not None and not 0 < self.budget_s <= MOST_S:
             message = f"--budget {self.budget_s:g} s is no time to fit in; give more than 0."
             raise UsageError(message)
@@ -169,7 +149,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Refuse to look at nothing."""
-        _refuse_below(1, model_frames=self.model_frames)
+        refuse_outside(self, {"model_frames": (1, math.inf)})
 
     @property
     def any_named(self) -> bool:

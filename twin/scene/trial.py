@@ -5,6 +5,7 @@ shape, coloured by frames from before the first motion: what is compared later m
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -136,17 +137,12 @@ def _recorded_tracks(
         records, about = streams.localisations(localised), localised.derived
     except GstError as error:
         tracks = ObjectTracks(notes=(f"objects are drawn where they were scanned: {error}",))
-        return tracks, _moved_cameras(run, episode)
+        with suppress(GstError):  # without a camera that could say it
+            return tracks, moved_cameras(run, episode)
+        return tracks, {}
     found = {} if about is None else about.settings.get(MOVED, {})
     moved = {key: MovedCamera.from_record(value) for key, value in found.items()}
     return localised_tracks(episode, records, task, postures), moved
-
-
-def _moved_cameras(run: RunFolder, episode: Episode) -> dict[str, MovedCamera]:
-    try:
-        return moved_cameras(run, episode)
-    except GstError:  # no camera that could say it
-        return {}
 
 
 def trial_parts(

@@ -26,7 +26,6 @@ def localised(**lost: str) -> dict[str, LocalisedObject]:
         if name in lost
         else LocalisedObject(
             object_id=name,
-            found=True,
             T_base_object=np.eye(4),
             covariance=None,
             confidence=1.0,

@@ -80,17 +80,9 @@ APART_M = 0.12
 PER_PLANE = 8
 
 
-@dataclass(frozen=True, kw_only=True)
-class Hypothesis:
-    """A rough guess of the robot's pose."""
-
-    T_base_source: Float[np.ndarray, "4 4"]
-    score: float
-
-
 def search(
     views: Sequence[RobotView], robot: RobotModel, planes: Sequence[LevelPlane]
-) -> list[Hypothesis]:
+) -> list[Float[np.ndarray, "4 4"]]:
     """Try 60 yaws and a grid of places on each plane; return distinct ones, best first.
 
     The base frame's z = 0 is taken to lie in the plane; refinement corrects that by some
@@ -98,30 +90,24 @@ def search(
     """
     used = list(views[:: max(1, -(-len(views) // MAX_VIEWS))])
     samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(used)]
-    found = [item for plane in planes for item in _on_plane(used, samples, plane)]
-    return sorted(found, key=lambda item: -item.score)
-
-
-def _on_plane(
-    views: Sequence[RobotView], samples: Sequence[np.ndarray], plane: LevelPlane
-) -> list[Hypothesis]:
-    places = _grid(plane)
     yaws = np.arange(NUM_YAWS) * 2 * np.pi / NUM_YAWS
-    scores = _scores(views, samples, plane, yaws, places, CAP_M)
-    return [
-        _polished(views, samples, plane, yaw, place)
-        for yaw, place in _distinct(scores, yaws, places)
-    ]
+    found = []
+    for plane in planes:
+        places = _grid(plane)
+        scores = _scores(used, samples, plane, yaws, places, CAP_M)
+        for yaw, place in _distinct(scores, yaws, places):
+            found.append(_polished(used, samples, plane, yaw, place))
+    return [T for _, T in sorted(found, key=lambda item: -item[0])]
 
 
 def search_near(
     views: Sequence[RobotView], robot: RobotModel, T_base_source: Float[np.ndarray, "4 4"]
-) -> Hypothesis:
+) -> Float[np.ndarray, "4 4"]:
     """Try yaws within 6 degrees and places within 7 cm of a pose whose tilt is about right."""
     samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(views)]
     nowhere = np.zeros(2)
     plane = LevelPlane(T_level_source=T_base_source, low_m=nowhere, high_m=nowhere, share=0.0)
-    return _polished(views, samples, plane, 0.0, np.zeros(3))
+    return _polished(views, samples, plane, 0.0, np.zeros(3))[1]
 
 
 def _polished(
@@ -130,8 +116,8 @@ def _polished(
     plane: LevelPlane,
     yaw: float,
     place: Float[np.ndarray, "3"],
-) -> Hypothesis:
-    """The best of finer steps around a yaw and a place."""
+) -> tuple[float, Float[np.ndarray, "4 4"]]:
+    """The best of finer steps around a yaw and a place: its score, and ``T_base_source``."""
     near_yaws = yaw + np.linspace(-1.0, 1.0, NUM_NEAR) * 2 * np.pi / NUM_YAWS
     step = np.linspace(-STEP_M, STEP_M, NUM_NEAR)
     near = np.stack([*np.meshgrid(step, step), np.zeros((NUM_NEAR,) * 2)], axis=-1)
@@ -141,8 +127,7 @@ def _polished(
     T_level_base = np.eye(4)
     T_level_base[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, near_yaws[i]]))
     T_level_base[:3, 3] = around[k]
-    T_base_source = se3.invert(T_level_base) @ plane.T_level_source
-    return Hypothesis(T_base_source=T_base_source, score=float(finer[i, k]))
+    return float(finer[i, k]), se3.invert(T_level_base) @ plane.T_level_source
 
 
 def _scores(
@@ -291,7 +276,7 @@ def align_robot(
         starts = _starts(views, robot)
     else:  # nearest points alone get stuck beside the start: the best of what lies around it, too
         around = search_near(views, robot, start)
-        starts = [ScenePose(T_base_source=T) for T in (start, around.T_base_source)]
+        starts = [ScenePose(T_base_source=T) for T in (start, around)]
     coarse = [_refined(views, surfaces, pose, fine=False, seed=seed) for pose in starts]
     best, others = _ranked(coarse)
     finals = [
@@ -323,7 +308,7 @@ def _starts(views: Sequence[RobotView], robot: RobotModel) -> list[ScenePose]:
             hint="Turn the camera so that it sees the table around the robot.",
         )
     found = search(views, robot, planes)
-    return [ScenePose(T_base_source=item.T_base_source) for item in found[:MAX_COARSE]]
+    return [ScenePose(T_base_source=T) for T in found[:MAX_COARSE]]
 
 
 def _refined(

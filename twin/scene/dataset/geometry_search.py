@@ -114,7 +114,11 @@ def search_geometry(
     if pose_at is not None and frame_ns > 0:
         ends_ns = images[0].stamp_ns, images[-1].stamp_ns
         moved = _Delayed(pairs=pairs, pose_at=pose_at, ends_ns=ends_ns)
-        found.append(_latest(moved.agreement, recorded, frame_ns))
+        steps = np.arange(-MOST_LATE_FRAMES, MOST_LATE_FRAMES + 1).astype(np.float64)
+        at, after = _climbed(steps, lambda frames: moved.agreement(frames * frame_ns))
+        found.append(
+            Correction(kind="delay", value=at * frame_ns, frames=at, before=recorded, after=after)
+        )
     best = max(found, key=lambda item: item.after)
     off = abs(best.frames) if best.kind == "delay" else abs(np.log(best.value))
     is_clear = best.after >= recorded + LEAST_GAIN and best.after >= LEAST_AGREEMENT
@@ -208,12 +212,6 @@ def _best(kind: str, score: Callable[[float], float], recorded: float) -> Correc
     return Correction(kind=kind, value=float(np.exp(at)), frames=0.0, before=recorded, after=after)
 
 
-def _latest(score: Callable[[float], float], recorded: float, frame_ns: int) -> Correction:
-    steps = np.arange(-MOST_LATE_FRAMES, MOST_LATE_FRAMES + 1).astype(np.float64)
-    at, after = _climbed(steps, lambda frames: score(frames * frame_ns))
-    return Correction(kind="delay", value=at * frame_ns, frames=at, before=recorded, after=after)
-
-
 def _smoothed(found: Correction, pairs: Sequence[_Pair]) -> Correction:
     """A factor at the top of a cubic through its peak, not at the highest of the peak's noise.
 
@@ -300,7 +298,9 @@ def check_geometry(
         if choice.stationary or poses is None or poses.better is not None:
             continue
         images = sorted(camera.images, key=lambda image: image.stamp_ns)
-        found = search_geometry(images, camera_pose_at(choice), frame_ns_of(choice))
+        stamps = sorted(paired_stamps_ns(choice.episode, choice.camera_id))
+        frame_ns = int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0
+        found = search_geometry(images, camera_pose_at(choice), frame_ns)
         if found is None:
             continue
         message = f"{camera.name}: {found.describe()}. {MENDED[found.kind]}"
@@ -314,9 +314,3 @@ def camera_pose_at(choice: FrameChoice) -> PoseAt:
     """Where a choice's poses put its depth camera at any instant."""
     frame_id = streams.camera_info(choice.episode, choice.camera_id, "depth").frame_id
     return lambda stamp_ns: choice.poses.tree.T_root_frame(frame_id, stamp_ns)
-
-
-def frame_ns_of(choice: FrameChoice) -> int:
-    """Time from one image of a camera to the next: the median; 0 with fewer than two."""
-    stamps = sorted(paired_stamps_ns(choice.episode, choice.camera_id))
-    return int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0

@@ -49,39 +49,26 @@ INDEX_BITS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class MovingRegion:
-    """A place where something came, went or passed."""
-
-    center_m: tuple[float, float, float]
-    size_m: tuple[float, float, float]
-    """Along the axes of the root frame, to a voxel."""
-
-    def describe(self) -> str:
-        """Its size and where it is."""
-        size = " x ".join(f"{100 * side:.0f}" for side in self.size_m)
-        return f"{size} cm around ({', '.join(f'{side:.2f}' for side in self.center_m)}) m"
-
-
-@dataclass(frozen=True, kw_only=True)
 class MovingVoxels:
     """Where something was that is not part of the static scene."""
 
     keys: Int64[np.ndarray, " num_voxels"]
 
-    def regions(self) -> list[MovingRegion]:
-        """Connected groups of these voxels, the largest first."""
+    def largest_place(self) -> str:
+        """Size and middle of the largest connected group of these voxels; empty for noise."""
         cells = _cells(self.keys)
         if not len(cells):
-            return []
+            return ""
         pairs = cKDTree(cells).query_pairs(1.8, output_type="ndarray")  # corners touch, too
         links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
         _, labels = connected_components(links, directed=False)
         sizes = np.bincount(labels)
-        largest = np.argsort(-sizes, kind="stable")
-        return [
-            _region(cells[labels == label])
-            for label in largest[sizes[largest] >= MIN_REGION_VOXELS]
-        ]
+        if sizes.max() < MIN_REGION_VOXELS:
+            return ""
+        mine = cells[labels == sizes.argmax()] * VOXEL_M
+        low, high = mine.min(axis=0), mine.max(axis=0) + VOXEL_M
+        size = " x ".join(f"{100 * side:.0f}" for side in high - low)
+        return f"{size} cm around ({', '.join(f'{side:.2f}' for side in (low + high) / 2)}) m"
 
     def contains(self, p_m: Float32[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
         """Say which points (root frame, metres) belong to something that moved."""
@@ -208,13 +195,6 @@ def _cells(keys: np.ndarray) -> np.ndarray:
     return np.asarray(packed - (1 << (INDEX_BITS - 1)))
 
 
-def _region(cells: np.ndarray) -> MovingRegion:
-    low, high = cells.min(axis=0) * VOXEL_M, (cells.max(axis=0) + 1) * VOXEL_M
-    x, y, z = ((low + high) / 2).round(3).tolist()
-    width, depth, height = (high - low).round(3).tolist()
-    return MovingRegion(center_m=(x, y, z), size_m=(width, depth, height))
-
-
 MIN_VIEWS, MAX_VIEWS = 6, 24
 """Views from different places that can tell, and how many are asked."""
 APART_M, APART_RAD = 0.02, 0.03
@@ -246,31 +226,20 @@ EGO_GROW_PX = 3
 """Masks grow by this much at half size: what is so near is out of focus and shadows its edge."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class EgoMask:
-    """The pixels of one camera that show what moves with it."""
-
-    half: Bool[np.ndarray, "height width"]
-
-    @property
-    def share(self) -> float:
-        """Of the image."""
-        return float(self.half.mean())
-
-    def drop_from(self, points: PointSet, view: TrainingView) -> PointSet:
-        """Return a frame's points without those that lie in these pixels."""
-        p_camera = se3.apply(se3.invert(view.T_base_color), points.p_m.astype(np.float64))
-        row, column, inside = pixels_of(view.half.camera, p_camera)
-        inside[inside] = self.half[row[inside], column[inside]]
-        return points.take(~inside)
-
-    def mask_in(self, view: TrainingView) -> TrainingView:
-        """Return a view with these pixels passed over."""
-        return view.without(self.half)
+def without_ego(
+    points: PointSet, view: TrainingView, mask: Bool[np.ndarray, "half_height half_width"]
+) -> tuple[PointSet, TrainingView]:
+    """A frame's points without those in an ego mask, and its view with these pixels passed over."""
+    p_camera = se3.apply(se3.invert(view.T_base_color), points.p_m.astype(np.float64))
+    row, column, inside = pixels_of(view.half.camera, p_camera)
+    inside[inside] = mask[row[inside], column[inside]]
+    return points.take(~inside), view.without(mask)
 
 
-def find_ego_mask(views: Sequence[TrainingView]) -> EgoMask | None:
+def find_ego_mask(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height width"] | None:
     """Find what moves with a camera in the views it took; None when nothing can be said to.
+
+    Pixels of the half-size image.
 
     Args:
         views: Of one camera; the robot need not be masked in them.
@@ -288,7 +257,7 @@ def find_ego_mask(views: Sequence[TrainingView]) -> EgoMask | None:
     if not MIN_SHARE <= mask.mean() <= MAX_SHARE:
         return None
     mask = mask | _more_of_it(mask, np.stack([view.half.depth_m for view in chosen]))
-    return EgoMask(half=mask) if mask.mean() <= MAX_SHARE else None
+    return mask if mask.mean() <= MAX_SHARE else None
 
 
 def _from_other_places(views: Sequence[TrainingView]) -> list[TrainingView]:

@@ -7,7 +7,7 @@ camera measured is carried into them instead.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 from typing import Any, NamedTuple
 
@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.errors import TwinError
-from twin.scene.dataset.masks import MovingRegion
 from twin.scene.frames.downscaled import DownscaledDepth, Meeting, meet
+from twin.scene.frames.pairing import name_of
 from twin.scene.frames.rgbd import NEAR_M
 from twin.scene.frames.selection import FrameChoice, spread
 from twin.scene.settings import FrameConfig
@@ -137,6 +137,13 @@ class PoseReport:
         return ""
 
 
+def judged(plain: PoseReport, recorded: Score, better: Convention, agreement: float) -> PoseReport:
+    """The report on poses as recorded, with another reading where that is clearly better."""
+    if agreement < GOOD or agreement < (plain.agreement or 0.0) + CLEARLY_BETTER:
+        return plain
+    return replace(plain, agreement=recorded.agreement, better=better, better_agreement=agreement)
+
+
 def score_of(met: Sequence[Meeting]) -> Score:
     """Agreement and overlap of all that was compared, at least one; it counts by its overlap."""
     total = sum(item.overlap for item in met)
@@ -162,11 +169,6 @@ def best_of(
         agreement, overlap = score(convention)
         scored.append((convention, agreement if overlap >= SOLID_OVERLAP else 0.0))
     return max(scored, key=lambda item: item[1])
-
-
-def is_clearly_better(agreement: float, recorded: PoseReport) -> bool:
-    """Whether poses fit with this agreement, and clearly better than as they were recorded."""
-    return agreement >= GOOD and agreement >= (recorded.agreement or 0.0) + CLEARLY_BETTER
 
 
 MAX_PAIRS = 10
@@ -196,27 +198,11 @@ def check_poses(images: Sequence[DownscaledDepth]) -> PoseReport:
     recorded = _score(pairs, Convention())
     plain = plain_report(len(pairs), recorded)
     better, score = _best(pairs)
-    if not is_clearly_better(score, plain):
-        return plain
     if better.depth_scale > 1.0:
         turned_only = _score(pairs, replace(better, depth_scale=1e9)).agreement
         if score < turned_only + SHIFT_MATTERS:
             return plain
-    return replace(plain, agreement=recorded.agreement, better=better, better_agreement=score)
-
-
-def stationary_agreement(images: Sequence[DownscaledDepth]) -> float | None:
-    """Share of the depth that stays the same in the images of a camera said to stand still.
-
-    The median over all pairs: a robot that passes by once does not count. None when no two images
-    measured the same place.
-    """
-    found = []
-    for first, second in combinations(images, 2):
-        met = meet(first, second, se3.invert(second.T_base_depth) @ first.T_base_depth)
-        if met.overlap >= MIN_OVERLAP:
-            found.append(met.agreement)
-    return float(np.median(found)) if found else None
+    return judged(plain, recorded, better, score)
 
 
 def _best(pairs: list[tuple[DownscaledDepth, DownscaledDepth]]) -> tuple[Convention, float]:
@@ -286,9 +272,7 @@ def check_between(own: Sequence[DownscaledDepth], others: Sequence[DownscaledDep
     better, score = best_of(
         OTHER_POSES, lambda reading: _seen_alike(first, chosen, reading.read(T_base_first))
     )
-    if not is_clearly_better(score, plain):
-        return plain
-    return replace(plain, agreement=recorded.agreement, better=better, better_agreement=score)
+    return judged(plain, recorded, better, score)
 
 
 def _seen_alike(
@@ -302,8 +286,6 @@ FEW_FRAMES = 5
 """With fewer training frames of all cameras together, much was seen once or never."""
 SPARSE = 0.02
 """With a smaller share of trusted pixels a camera contributes next to nothing."""
-MOST_REGIONS = 10
-"""That ``scene.json`` names."""
 MUCH_MOVED = 0.3
 """More of the surface than this is rarely only a robot's arm."""
 
@@ -324,7 +306,7 @@ class CameraCheck:
     @property
     def name(self) -> str:
         """The camera, as messages begin with it."""
-        return f"camera {self.choice.camera_id} of episode {self.choice.episode.info.id}"
+        return name_of(self.choice.episode, self.choice.camera_id)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,8 +319,8 @@ class ScanReport:
     """What is wrong, one remark each."""
     moving_fraction: float = 0.0
     """Share of the measured surface that moved."""
-    moving_regions: Sequence[MovingRegion] = ()
-    """Where that was, the largest place first; single voxels are left out."""
+    moving_place: str = ""
+    """Where most of that was; empty where only single voxels did."""
     ego_mask_shares: Mapping[str, float] = field(default_factory=dict)
     """By camera without joints: share of its image that moves with it."""
 
@@ -355,13 +337,11 @@ class ScanReport:
                 f"{100 * self.moving_fraction:.0f} % of the measured surface moved during the scan "
                 "and was left out; scan while nothing but the camera moves, or check the poses"
             )
-        elif self.moving_regions:
-            places = len(self.moving_regions)
+        elif self.moving_place:
             found.append(
                 f"{100 * self.moving_fraction:.2g} % of the measured surface moved during the "
-                "scan, or was measured where other frames find nothing, and was left out, in "
-                f"{places} place{'s' if places > 1 else ''}; the largest is "
-                f"{self.moving_regions[0].describe()}"
+                "scan, or was measured where other frames find nothing, and was left out: most of "
+                f"it {self.moving_place}"
             )
         return found
 
@@ -370,10 +350,6 @@ class ScanReport:
         return {
             "remarks": self.remarks(),
             "moving_fraction": self.moving_fraction,
-            "moving_regions": [asdict(region) for region in self.moving_regions[:MOST_REGIONS]],
-            "carried_fraction": {
-                name: round(share, 4) for name, share in self.ego_mask_shares.items()
-            },
             "pose_agreement": {
                 name: None if report.agreement is None else round(report.agreement, 4)
                 for name, report in self.poses.items()
@@ -450,11 +426,17 @@ def _pose_reports(usable: Sequence[CameraCheck]) -> dict[str, PoseReport]:
 
 
 def _moved_cameras(usable: Sequence[CameraCheck], *, refuse: bool) -> list[str]:
-    """Say which cameras moved although their poses do not."""
+    """Say which cameras moved although their poses do not.
+
+    By the median over all pairs of images: a robot that passes by once does not count.
+    """
     found = []
     for camera in usable:
-        agreement = stationary_agreement(camera.images) if camera.choice.stationary else None
-        if agreement is None or agreement >= STATIONARY_AGREEMENT:
+        pairs = combinations(camera.images, 2) if camera.choice.stationary else ()
+        all_met = [meet(a, b, se3.invert(b.T_base_depth) @ a.T_base_depth) for a, b in pairs]
+        same = [met.agreement for met in all_met if met.overlap >= MIN_OVERLAP]
+        agreement = float(np.median(same)) if same else 1.0
+        if agreement >= STATIONARY_AGREEMENT:
             continue
         about = (
             f"{camera.name} stands still by its poses, but only {100 * agreement:.0f} % of its "

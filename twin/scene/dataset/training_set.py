@@ -4,18 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Bool
 
 from bridge.episode.reader import Episode
 from bridge.terminal import Output
 from twin.scene.dataset.colour_check import check_colour
 from twin.scene.dataset.geometry_search import camera_pose_at, check_geometry
 from twin.scene.dataset.masks import (
-    EgoMask,
-    MovingVoxels,
     ReferenceView,
     choose_reference_views,
     find_ego_mask,
     find_moving,
+    without_ego,
 )
 from twin.scene.dataset.scan_check import CameraCheck, ScanReport, check_scan
 from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
@@ -43,8 +43,7 @@ class TrainingSet:
     bare_views: list[TrainingView]
     choice_of_view: list[int]
     """Index of each view's choice."""
-    moving: MovingVoxels
-    ego_masks: dict[int, EgoMask]
+    ego_masks: dict[int, Bool[np.ndarray, "height width"]]
     """By index of the choice: what moves with a camera whose robot is not known by joints."""
     reference_views: list[ReferenceView]
     report: ScanReport
@@ -95,7 +94,7 @@ def read_training_set(
     stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
     look_closer(robot, choices, limits_of(config), stride)
     ego_masks = _set_ego_pixels_aside(choices, read, robot)
-    shares = {read.cameras[index].name: item.share for index, item in ego_masks.items()}
+    shares = {read.cameras[index].name: float(mask.mean()) for index, mask in ego_masks.items()}
     points, views, choice_of_view = read.points, read.views, read.choice_of_view
     paths = [choice.episode.path for choice in choices]
     scans = [paths.index(paths[index]) for index in choice_of_view]
@@ -115,7 +114,7 @@ def read_training_set(
     report = replace(
         report,
         moving_fraction=round(gone, 4),
-        moving_regions=moving.regions(),
+        moving_place=moving.largest_place(),
         ego_mask_shares=shares,
     )
     for remark in report.remarks():
@@ -127,7 +126,6 @@ def read_training_set(
         bare_points=bare_points,
         bare_views=bare_views,
         choice_of_view=choice_of_view,
-        moving=moving,
         ego_masks=ego_masks,
         reference_views=reference_views,
         report=report,
@@ -174,9 +172,9 @@ def _colour_remarks(read: _Read) -> list[str]:
 
 def _set_ego_pixels_aside(
     choices: Sequence[FrameChoice], read: _Read, robot: FoundRobot
-) -> dict[int, EgoMask]:
+) -> dict[int, Bool[np.ndarray, "height width"]]:
     """Take out of points and views what moves with a camera, where no joints tell the robot."""
-    found: dict[int, EgoMask] = {}
+    found: dict[int, np.ndarray] = {}
     for index, choice in enumerate(choices):
         if choice.stationary or robot.frames.knows(choice.episode):
             continue
@@ -186,8 +184,8 @@ def _set_ego_pixels_aside(
             continue
         found[index] = mask
         for place in mine:
-            read.points[place] = mask.drop_from(read.points[place], read.views[place])
-            read.views[place] = mask.mask_in(read.views[place])
+            seen, shown = read.points[place], read.views[place]
+            read.points[place], read.views[place] = without_ego(seen, shown, mask)
     return found
 
 

@@ -64,15 +64,6 @@ class ImageObservation:
         return np.tensordot(E[:, :3], drawn, axes=1) + E[:, 3, None, None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Appearance:
-    """The outcome of one closed-form solution."""
-
-    cloud: GaussianCloud
-    steps: int
-    """Conjugate gradient steps done; 0: the cloud is as it was."""
-
-
 def solve_appearance(
     cloud: GaussianCloud,
     observations: Sequence[ImageObservation],
@@ -80,7 +71,7 @@ def solve_appearance(
     *,
     steps: int,
     allowance: Allowance = UNLIMITED,
-) -> Appearance:
+) -> tuple[GaussianCloud, int]:
     """Minimise sum |E A (c + sum_k Y_k h_k) - I|^2 + ridge |x - x_start|^2 over colours x = (c, h).
 
     Conjugate gradients with a diagonal preconditioner, the three channels side by side. The
@@ -91,20 +82,23 @@ def solve_appearance(
         steps: Conjugate gradient steps, at most; more than six follow the noise.
         allowance: Fewer steps are made, or none, when so many do not fit; what is begun and does
             not end in time is dropped.
+
+    Returns:
+        The cloud, and the conjugate gradient steps done; 0: it is as it was.
     """
     model = _ImageModel(cloud, observations, rasteriser, allowance)
     start = np.concatenate([cloud.colors[:, None], cloud.harmonics], axis=1)
     affordable = model.affordable_passes(start) - 1  # one pass sets the equations up
     equations = None if affordable < min(steps, LEAST_STEPS) else model.right_side(start)
     if equations is None:
-        return Appearance(cloud=cloud, steps=0)
+        return cloud, 0
     right, diagonal = equations
     change, done = conjugate_gradients(
         model.normal, right, diagonal, steps=int(min(steps, affordable))
     )
     solved = start + change
-    painted = replace(cloud, colors=as_float32(solved[:, 0]), harmonics=as_float32(solved[:, 1:]))
-    return Appearance(cloud=painted, steps=done)
+    harmonics = as_float32(solved[:, 1:])
+    return replace(cloud, colors=as_float32(solved[:, 0]), harmonics=harmonics), done
 
 
 def conjugate_gradients(

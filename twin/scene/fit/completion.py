@@ -88,18 +88,10 @@ def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _
             ~is_known, return_distances=False, return_indices=True
         )
         beside = drawn.depth_m[rows, columns]
-    mask = without_specks(empty, LEAST_PX) & (beside > 0)
-    return _Hole(view=view, mask=mask, drawn_m=drawn.depth_m, beside_m=beside)
-
-
-def without_specks(
-    mask: Bool[np.ndarray, "height width"], least_px: int
-) -> Bool[np.ndarray, "height width"]:
-    """The patches of a mask that have at least so many pixels."""
-    labels, number = ndimage.label(mask)
+    labels, number = ndimage.label(empty)
     sizes = np.bincount(labels.ravel(), minlength=number + 1)
-    sizes[0] = 0
-    return np.asarray((sizes >= least_px)[labels])
+    mask = empty & (sizes >= LEAST_PX)[labels] & (beside > 0)
+    return _Hole(view=view, mask=mask, drawn_m=drawn.depth_m, beside_m=beside)
 
 
 def _closed(

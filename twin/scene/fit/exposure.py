@@ -43,13 +43,6 @@ def solve_exposures(
             break
         planes = rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
         exposures[index] = gain_exposure(gain_between(planes[:3], item.target))
-    return _without_mean(exposures)
-
-
-def _without_mean(
-    exposures: Float[np.ndarray, "num_views 3 4"],
-) -> Float[np.ndarray, "num_views 3 4"]:
-    """The same differences between images, with a mean that changes nothing."""
     gains = np.ascontiguousarray(np.diagonal(exposures, axis1=1, axis2=2))
     return gain_exposure(gains / gains.mean(axis=0))
 

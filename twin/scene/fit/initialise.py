@@ -104,16 +104,16 @@ class _Voxels:
         means, normals = as_float32(self.means), as_float32(unit)
         for _ in range(SETTLE_ROUNDS):
             seen = list(_measured_offsets(means, normals, views))
-            scatter = np.concatenate([np.abs(item.offset_m) / item.depth_m for item in seen])
+            scatter = np.concatenate([np.abs(off_m) / depth_m for _, off_m, depth_m, _ in seen])
             if len(scatter) == 0:
                 break
             limit = SETTLE_SIGMA * 1.4826 * np.median(scatter)
             total, weights = (np.zeros(len(means), np.float32) for _ in range(2))
-            for item in seen:
-                weight = item.cosine / np.square(item.depth_m)
-                weight *= np.abs(item.offset_m) <= limit * item.depth_m
-                total[item.voxel] += weight * item.offset_m
-                weights[item.voxel] += weight
+            for voxel, off_m, depth_m, cosine in seen:
+                weight = cosine / np.square(depth_m)
+                weight *= np.abs(off_m) <= limit * depth_m
+                total[voxel] += weight * off_m
+                weights[voxel] += weight
             means += (total / np.where(weights > 0, weights, 1.0))[:, None] * normals
         return replace(self, means=means.astype(np.float64))
 
@@ -139,24 +139,18 @@ class _Voxels:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Offsets:
-    """How far from some voxels one view measured their surface."""
-
-    voxel: np.ndarray
-    offset_m: Float32[np.ndarray, " num_pairs"]
-    """Along the normal, to the plane through the measured point."""
-    depth_m: Float32[np.ndarray, " num_pairs"]
-    cosine: Float32[np.ndarray, " num_pairs"]
-    """Between the ray and the normal."""
-
-
 def _measured_offsets(
     means: Float32[np.ndarray, "num_voxels 3"],
     normals: Float32[np.ndarray, "num_voxels 3"],
     views: Sequence[TrainingView],
-) -> Iterator[_Offsets]:
-    """Look each voxel up in each depth image; what another surface hides is left out."""
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Look each voxel up in each depth image; what another surface hides is left out.
+
+    Yields:
+        Of each view the voxels whose surface it measured; how far away it did [m], along their
+        normals to the plane through the measured point; that depth [m]; and the cosine between
+        ray and normal.
+    """
     for view in views:
         camera, T = view.full.camera, as_float32(se3.invert(view.T_base_color))
         p = means @ T[:3, :3].T + T[:3, 3]
@@ -171,9 +165,7 @@ def _measured_offsets(
         offset = np.einsum("ni,ni->n", n, depth[:, None] * ray - p)
         same = (depth > 0) & (cosine > LEAST_COSINE)
         same &= np.abs(depth - p[:, 2]) < OTHER_SURFACE * p[:, 2]
-        yield _Offsets(
-            voxel=voxel[same], offset_m=offset[same], depth_m=depth[same], cosine=cosine[same]
-        )
+        yield voxel[same], offset[same], depth[same], cosine[same]
 
 
 def _no_surface(num_points: int) -> str:

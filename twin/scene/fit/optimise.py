@@ -119,16 +119,6 @@ class FitState:
     """Mean squared errors of the last images."""
 
 
-def first_state(session: FitSession, num_views: int) -> FitState:
-    """Before the first image."""
-    return FitState(
-        session=session,
-        size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
-        exposures=np.tile(SAME_EXPOSURE, (num_views, 1, 1)),
-        surface=SurfacePrior.of(session.cloud),
-    )
-
-
 COARSE = 0.6
 """Share of the budget spent at half resolution."""
 APPEARANCE_STEPS = 4
@@ -225,17 +215,17 @@ class Events:
     def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         self._solve_exposures(state, coarse, allowance)
         cloud = state.session.cloud
-        solved = solve_appearance(
+        solved, steps = solve_appearance(
             cloud,
             self._observations(state, coarse),
             self._rasteriser,
             steps=APPEARANCE_STEPS,
             allowance=allowance,
         )
-        keep_colors_in_range(solved.cloud)
-        state.colour_steps += solved.steps
-        cloud.colors[:] = solved.cloud.colors
-        cloud.harmonics[:] = solved.cloud.harmonics
+        keep_colors_in_range(solved)
+        state.colour_steps += steps
+        cloud.colors[:] = solved.colors
+        cloud.harmonics[:] = solved.harmonics
 
     def _densify(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         cloud = state.session.cloud
@@ -335,8 +325,13 @@ def fit(
     events = Events(views, max_splats or len(cloud), learner.rasteriser)
     raster = learner.rasteriser.config
     session = FitSession(with_harmonics(cloud), raster, depth_weight=DEPTH_WEIGHT)
-    state = first_state(session, len(views))
-    state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
+    state = FitState(
+        session=session,
+        size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
+        exposures=np.tile(SAME_EXPOSURE, (len(views), 1, 1)),
+        surface=SurfacePrior.of(session.cloud),
+        seconds=min(spent_s, SPENT_AT_MOST * config.limit_s),
+    )
     cpu_start = time.process_time()
     for at in _steps(config, state, clock):
         events.keep(state, at)

@@ -22,7 +22,13 @@ from bridge.terminal import Output
 from twin.scene.frames.odometry import CameraPath, follow_camera
 from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamps_ns
 from twin.scene.settings import FrameConfig
-from twin.scene.store.calibration import Calibration, MountedCamera, calibrated_tree, without_joints
+from twin.scene.store.calibration import (
+    Calibration,
+    MountedCamera,
+    calibrated_tree,
+    edge,
+    without_joints,
+)
 
 
 def same_pose(
@@ -55,16 +61,6 @@ def unknown_mask(
             unknown |= ~np.isfinite(tree.Ts_root_frame(frame, stamps_ns)).all(axis=(1, 2))
         unknown |= _far_from_any(tree, frame, stamps_ns)
     return unknown
-
-
-def least_gap_s(
-    tree: TransformTree, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
-) -> float | None:
-    """Least time between an instant and a published pose [s]; None without either."""
-    posed_ns = tree.stamps_ns(frame)
-    if len(posed_ns) == 0 or len(stamps_ns) == 0:
-        return None
-    return float(np.min(_gaps_ns(posed_ns, stamps_ns))) * 1e-9
 
 
 def _far_from_any(
@@ -283,7 +279,7 @@ def poses_shifted(
         T_new_old = T_posed @ T_posed_true @ se3.invert(T_posed)
         for frame in {color, depth}:
             T = T_new_old @ tree.T_root_frame(frame, stamp)
-            edges.append(_edge(tree.root_of(color), frame, T, stamp))
+            edges.append(edge(tree.root_of(color), frame, T, stamp))
     return replace(poses, tree=TransformTree(edges))
 
 
@@ -318,8 +314,9 @@ def _say_unposed(
             "not finite"
         )
         return
-    gap_s = least_gap_s(poses.tree, _frame_ids(episode, camera_id)[0], stamps_ns)
-    least = f", {gap_s:.1f} s away at least" if gap_s and poses.source == "tf" else ""
+    posed_ns, least = poses.tree.stamps_ns(_frame_ids(episode, camera_id)[0]), ""
+    if len(posed_ns) and poses.source == "tf":
+        least = f", {1e-9 * float(np.min(_gaps_ns(posed_ns, stamps_ns))):.1f} s away at least"
     message = (
         f"no image of {name_of(episode, camera_id)} was taken while {clock} said where it "
         f"is{least}: clocks that differ, or recordings of different times. Record images and "
@@ -341,14 +338,14 @@ def places_camera(tree: TransformTree, episode: Episode, camera_id: str) -> bool
 def _bare_tree(tree: TransformTree, episode: Episode, camera_id: str) -> TransformTree:
     """The camera's own frames, its depth camera in the origin."""
     color, depth = _frame_ids(episode, camera_id)
-    edges = [_edge(_root_name(episode, camera_id), depth, np.eye(4), 0)]
+    edges = [edge(_root_name(episode, camera_id), depth, np.eye(4), 0)]
     if color != depth:
         T_depth_color = np.eye(4)
         known = set(tree.frames())
         if {color, depth} <= known and tree.root_of(color) == tree.root_of(depth):
             at = episode.start_ns
             T_depth_color = se3.invert(tree.T_root_frame(depth, at)) @ tree.T_root_frame(color, at)
-        edges.append(_edge(depth, color, T_depth_color, 0))
+        edges.append(edge(depth, color, T_depth_color, 0))
     return TransformTree(edges)
 
 
@@ -357,11 +354,11 @@ def _tree_of(
 ) -> TransformTree:
     color, depth = _frame_ids(episode, camera_id)
     edges = [
-        _edge(_root_name(episode, camera_id), depth, T_first_depth, stamp_ns)
+        edge(_root_name(episode, camera_id), depth, T_first_depth, stamp_ns)
         for stamp_ns, T_first_depth in path.Ts_first_depth.items()
     ]
     if color != depth:
-        edges.append(_edge(depth, color, bare.T_root_frame(color, 0), 0))
+        edges.append(edge(depth, color, bare.T_root_frame(color, 0), 0))
     return TransformTree(edges)
 
 
@@ -374,10 +371,6 @@ def _frame_ids(episode: Episode, camera_id: str) -> tuple[str, str]:
         streams.camera_info(episode, camera_id, stream).frame_id for stream in ("color", "depth")
     )
     return color, depth
-
-
-def _edge(parent: str, child: str, T: np.ndarray, stamp_ns: int) -> FrameTransform:
-    return FrameTransform(stamp_ns=stamp_ns, parent=parent, child=child, T_parent_child=T)
 
 
 def _describe(path: CameraPath, num_lost: int) -> str:

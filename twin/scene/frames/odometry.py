@@ -255,35 +255,24 @@ def follow_camera(
         raise LostError(message)
     loops = _find_loops(follower.keys, aligner)
     Ts_first_key = _solve(follower.keys, loops, aligner)
-    moved = [
-        float(np.linalg.norm(T[:3, 3] - key.T_first_key[:3, 3]))
-        for T, key in zip(Ts_first_key, follower.keys, strict=True)
-    ]
     return CameraPath(
         Ts_first_depth={
             stamp_ns: Ts_first_key[index] @ T_key_frame
             for stamp_ns, (index, T_key_frame) in sorted(follower.places.items())
         },
         quality={
-            "frames": total,
-            "placed": len(follower.places),
             "keyframes": len(follower.keys),
             "loop_closures": len(loops),
-            "largest_correction_m": round(max(moved), 4),
             "agreement": round(_agreement(follower.keys, Ts_first_key), 4),
         },
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Loop:
-    source: int
-    target: int
-    step: Step
+def _find_loops(keys: list[Keyframe], aligner: Aligner) -> list[tuple[int, int, Step]]:
+    """Tie keyframes that see the same place, but do not follow each other; nearest first.
 
-
-def _find_loops(keys: list[Keyframe], aligner: Aligner) -> list[_Loop]:
-    """Tie keyframes that see the same place, but do not follow each other; nearest first."""
+    Each with its source, its target and how the source lies to the target.
+    """
     near = []
     for target in range(len(keys)):
         for source in range(target + 2, len(keys)):
@@ -297,12 +286,12 @@ def _find_loops(keys: list[Keyframe], aligner: Aligner) -> list[_Loop]:
     for _, source, target, guess in near[:MAX_LOOPS]:
         step = aligner.lay(keys[source].look, keys[target].look, guess)
         if step is not None:
-            loops.append(_Loop(source=source, target=target, step=step))
+            loops.append((source, target, step))
     return loops
 
 
 def _solve(
-    keys: list[Keyframe], loops: list[_Loop], aligner: Aligner
+    keys: list[Keyframe], loops: list[tuple[int, int, Step]], aligner: Aligner
 ) -> list[Float[np.ndarray, "4 4"]]:
     """Spread what the loops say over the path; the first keyframe stays."""
     if not loops:
@@ -313,8 +302,8 @@ def _solve(
     for index, key in enumerate(keys):
         if key.from_previous is not None:
             graph.edges.append(_edge(tools, index, index - 1, key.from_previous, uncertain=False))
-    for loop in loops:
-        graph.edges.append(_edge(tools, loop.source, loop.target, loop.step, uncertain=True))
+    for source, target, step in loops:
+        graph.edges.append(_edge(tools, source, target, step, uncertain=True))
     tools.global_optimization(
         graph,
         tools.GlobalOptimizationLevenbergMarquardt(),

@@ -264,13 +264,9 @@ def find_sources(run: RunFolder) -> Sources:
 
 def rgbd_camera_ids(episode: Episode) -> list[str]:
     """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
-    return cameras_with(episode, (COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO))
-
-
-def cameras_with(episode: Episode, others: Sequence[str]) -> list[str]:
-    """Cameras that have colour and some other topics; never those of stand-in truth."""
     topics = {topic for topic in episode.topics() if not is_truth(topic)}
     stems = {topic.removesuffix(COLOR_IMAGE) for topic in topics if topic.endswith(COLOR_IMAGE)}
+    others = (COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
     return sorted(
         stem.split("/")[-1] for stem in stems if all(stem + ending in topics for ending in others)
     )

@@ -134,14 +134,13 @@ def write_localised(
     task: Task,
     *,
     scene_hash: str | None = None,
-    force: bool = False,
 ) -> Path:
     """Write ``derived/<episode>.localised.<scene>.mcap`` and return its path.
 
     Holds one gst localisation record per object for the start and after every execution, and a
     PoseStamped per object that was found. Objects whose shape only a scan knows are laid out by the
     meshes of the run's scene, and calibrated cameras are where the run's calibration says. A file
-    made from the same bytes with the same settings is kept unless ``force``.
+    made from the same bytes with the same settings is kept.
 
     Args:
         scene_hash: The scene the poses are meant for; its first twelve digits name the file.
@@ -160,7 +159,7 @@ def write_localised(
         | ({"meshes": scanned.hashes} if scanned.hashes else {})
         | _mounts(calibration, rgbd_camera_ids(episode)),
     )
-    if path.exists() and not force and _made_from(path, derived):
+    if path.exists() and _made_from(path, derived):
         return path
     base_frame = streams.recorded_robot(episode).base_frame
     moved = moved_cameras(run, episode)

@@ -33,6 +33,7 @@ from twin.scene.localise.shape_fit import (
     POINT_SIGMA_M,
     SHARED_ERROR,
     TUKEY_M,
+    ShapeFit,
 )
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.known import pose_of
@@ -202,15 +203,9 @@ the covariance then covers both."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeshFit:
+class MeshFit(ShapeFit):
     """A mesh laid onto points."""
 
-    T_base_object: Float[np.ndarray, "4 4"]
-    covariance: Float[np.ndarray, "6 6"]
-    """Of (x, y, z, rotation about x, y, z), base frame [m^2, m rad, rad^2]."""
-    residual_m: float
-    explained: float
-    """Share of points within the Tukey bound."""
     seen_through: float
     """Share of the mesh's facing surface that cameras saw through."""
     score: float
@@ -319,21 +314,13 @@ def _residuals(
         far = lengths(gap)
         r = np.where(far > 2 * np.abs(r) + TUKEY_M, far, r)
         rows.append(r)
-        jacobians.append(_derivatives(p - moved[:3, 3], n @ T[:3, :3].T))
+        normal = n @ T[:3, :3].T
+        turning = np.cross(p - moved[:3, 3], normal)
+        jacobians.append(-np.concatenate([normal, turning, normal[:, :2]], axis=1))
         ids.append(np.full(len(r), view_id))
     if not rows:
         return np.zeros(0), np.zeros((0, _POSE + _PER_VIEW)), np.zeros(0, dtype=np.int64)
     return np.concatenate(rows), np.concatenate(jacobians), np.concatenate(ids)
-
-
-def _derivatives(
-    arm_m: Float[np.ndarray, "num_points 3"], normal: Float[np.ndarray, "num_points 3"]
-) -> Float[np.ndarray, "num_points 8"]:
-    """Of the distances along the normals, by the pose and by the own view's shift."""
-    x, y, z = arm_m.T
-    a, b, c = normal.T
-    columns = [a, b, c, y * c - z * b, z * a - x * c, x * b - y * a, a, b]
-    return np.asarray(-np.stack(columns, axis=1))
 
 
 def _pose_equations(

@@ -38,7 +38,7 @@ from twin.scene.localise.result import (
     found_by_fit,
     missing,
 )
-from twin.scene.localise.shape_fit import UPRIGHT_SIGMA_RAD, fit_shape
+from twin.scene.localise.shape_fit import MIN_EXPLAINED, UPRIGHT_SIGMA_RAD, fit_shape
 from twin.scene.localise.soft import LEAST_HEIGHT_M, SoftFit, fit_toys
 from twin.scene.shape.known import yaw_period_rad
 
@@ -121,10 +121,6 @@ MAX_FRAMES = 3
 """Frames of one camera pose that are averaged."""
 MAX_VIEWS = 8
 """Poses of one camera that are used, for example of a wrist camera during a scan."""
-MIN_EXPLAINED = 0.6
-"""Share of an object's points that its shape must explain."""
-REST_TOLERANCE_M = 0.006
-"""Nearer than this to standing on the table counts as standing on it."""
 
 
 def localise_objects(
@@ -182,7 +178,7 @@ def _localise_toys(
     }
     found = {}
     for models in groups.values():
-        fits = fit_toys(models, views, blocked, expected_m, min_explained=MIN_EXPLAINED)
+        fits = fit_toys(models, views, blocked, expected_m)
         for model in models:
             found[model.id] = _toy(model, fits[model.id], views)
     return found
@@ -193,7 +189,7 @@ def _toy(model: ObjectModel, toy: SoftFit, views: Sequence[CameraView]) -> Local
     detail = _detail(views, toy.num_points)
     if toy.fit is None or toy.shape is None:
         return missing(model, stamp_ns, str(toy.reason), detail)
-    found = found_by_fit(model, toy.fit, stamp_ns, REST_TOLERANCE_M, detail)
+    found = found_by_fit(model, toy.fit, stamp_ns, detail)
     reasons = [text for text in (found.reason, toy.reason) if text]
     return replace(
         found,
@@ -232,7 +228,14 @@ def _localise_one(
     if scanned is not None:
         return _localise_mesh(groups[0], views, model, scanned, stamp_ns, detail)
     if model.shape == SCANNED:
-        return _boxed_in(groups[0], model, stamp_ns, detail)
+        boxed = found_by_box(model, groups[0].p_base, stamp_ns, detail)  # no scan has shown it yet
+        if boxed.confidence >= MIN_EXPLAINED:
+            return boxed
+        reason = (
+            f"only {boxed.confidence:.0%} of {seen} points fit into the box of {model.id}, "
+            f"{MIN_EXPLAINED:.0%} are needed"
+        )
+        return missing(model, stamp_ns, reason, detail)
     fit = fit_shape(groups[0], views, model)
     if fit.explained < MIN_EXPLAINED:
         reason = (
@@ -240,24 +243,7 @@ def _localise_one(
             f"{MIN_EXPLAINED:.0%} are needed"
         )
         return missing(model, stamp_ns, reason, detail)
-    return found_by_fit(model, fit, stamp_ns, REST_TOLERANCE_M, detail)
-
-
-def _boxed_in(
-    group: Cluster,
-    model: ObjectModel,
-    stamp_ns: int,
-    detail: dict[str, Any],
-) -> LocalisedObject:
-    """A rough place for what no scan has shown yet."""
-    boxed = found_by_box(model, group.p_base, stamp_ns, detail)
-    if boxed.confidence >= MIN_EXPLAINED:
-        return boxed
-    reason = (
-        f"only {boxed.confidence:.0%} of {len(group)} points fit into the box of {model.id}, "
-        f"{MIN_EXPLAINED:.0%} are needed"
-    )
-    return missing(model, stamp_ns, reason, detail)
+    return found_by_fit(model, fit, stamp_ns, detail)
 
 
 def _localise_mesh(
@@ -282,4 +268,4 @@ def _localise_mesh(
             f"{MIN_EXPLAINED:.0%} are needed"
         )
         return missing(model, stamp_ns, reason, detail)
-    return found_by_fit(model, fit, stamp_ns, REST_TOLERANCE_M, detail)
+    return found_by_fit(model, fit, stamp_ns, detail)

@@ -25,6 +25,8 @@ MESH_METHOD = "colour_mesh_icp"
 BOX_METHOD = "colour_box"
 BOXED_M = 0.01
 """A point of a thing that is only boxed in lies this near to the box."""
+REST_TOLERANCE_M = 0.006
+"""Nearer than this to standing on the table counts as standing on it."""
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
 
@@ -34,9 +36,9 @@ class LocalisedObject:
     """One object's pose, or the reason why there is none."""
 
     object_id: str
-    found: bool
-    T_base_object: Float[np.ndarray, "4 4"] | None
-    covariance: Float[np.ndarray, "6 6"] | None
+    T_base_object: Float[np.ndarray, "4 4"] | None = None
+    """None: it was not found."""
+    covariance: Float[np.ndarray, "6 6"] | None = None
     """Of (x, y, z, rotation about x, y, z), base frame [m^2, m rad, rad^2]."""
     confidence: float
     """0 to 1: the share of points and outline that the fitted shape explains."""
@@ -46,6 +48,11 @@ class LocalisedObject:
     symmetry: str = "none"
     detail: Mapping[str, Any] = field(default_factory=dict)
     """Numbers behind the pose: points, residuals, what the table said of the cameras."""
+
+    @property
+    def found(self) -> bool:
+        """Whether its pose is known."""
+        return self.T_base_object is not None
 
     def to_record(self) -> dict[str, Any]:
         """Return the gst localisation v1 record, checked against its schema."""
@@ -71,32 +78,22 @@ def missing(
     model: ObjectModel, stamp_ns: int, reason: str, detail: Mapping[str, Any]
 ) -> LocalisedObject:
     """Say why an object was not found."""
+    method = METHOD if model.mesh is None else MESH_METHOD
+    return _of(model, stamp_ns, detail, confidence=0.0, method=method, reason=reason)
+
+
+def _of(
+    model: ObjectModel, stamp_ns: int, detail: Mapping[str, Any], **found: Any
+) -> LocalisedObject:
     return LocalisedObject(
-        object_id=model.id,
-        found=False,
-        T_base_object=None,
-        covariance=None,
-        confidence=0.0,
-        method=METHOD if model.mesh is None else MESH_METHOD,
-        reason=reason,
-        stamp_ns=stamp_ns,
-        symmetry=model.symmetry,
-        detail=detail,
+        object_id=model.id, symmetry=model.symmetry, stamp_ns=stamp_ns, detail=detail, **found
     )
 
 
 def found_by_fit(
-    model: ObjectModel,
-    fit: MeshFit | ShapeFit,
-    stamp_ns: int,
-    rest_tolerance_m: float,
-    detail: dict[str, Any],
+    model: ObjectModel, fit: ShapeFit, stamp_ns: int, detail: dict[str, Any]
 ) -> LocalisedObject:
-    """Turn a fitted mesh or shape into a result; what nearly stands on the table stands on it.
-
-    Args:
-        rest_tolerance_m: Height over or under its rest that still counts as standing.
-    """
+    """Turn a fitted mesh or shape into a result; what nearly stands on the table stands on it."""
     T = fit.T_base_object.copy()
     lift_m = float(T[2, 3]) - model.rest_height_m
     detail |= {"residual_m": fit.residual_m, "lift_m": lift_m}
@@ -108,7 +105,7 @@ def found_by_fit(
     if model.soft is None and is_upright:
         T = reduce_by_symmetry(T, model)
     reason = None
-    if is_upright and abs(lift_m) <= rest_tolerance_m:
+    if is_upright and abs(lift_m) <= REST_TOLERANCE_M:
         T[2, 3] = model.rest_height_m
     else:
         tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1, 1)))
@@ -116,18 +113,8 @@ def found_by_fit(
             f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table, "
             f"tilted by {tilt:.0f} degrees"
         )
-    return LocalisedObject(
-        object_id=model.id,
-        found=True,
-        T_base_object=T,
-        covariance=fit.covariance,
-        confidence=confidence,
-        method=method,
-        reason=reason,
-        stamp_ns=stamp_ns,
-        symmetry=model.symmetry,
-        detail=detail,
-    )
+    sure = {"covariance": fit.covariance, "confidence": confidence}
+    return _of(model, stamp_ns, detail, T_base_object=T, method=method, reason=reason, **sure)
 
 
 def found_by_box(
@@ -153,18 +140,9 @@ def found_by_box(
     away, _ = surface_distances(points, model, T)
     half = np.array([*(high - low) / 2, model.size_m[2] / 2])
     spread = np.concatenate([half / 4, np.array([0.02, 0.02, 0.3])])
-    return LocalisedObject(
-        object_id=model.id,
-        found=True,
-        T_base_object=T,
-        covariance=np.diag(np.square(spread)),
-        confidence=float((away < BOXED_M).mean()),
-        method=BOX_METHOD,
-        reason=f"the shape of {model.id} is not known yet: only boxed in",
-        stamp_ns=stamp_ns,
-        symmetry=model.symmetry,
-        detail=detail,
-    )
+    sure = {"covariance": np.diag(np.square(spread)), "confidence": float((away < BOXED_M).mean())}
+    reason = f"the shape of {model.id} is not known yet: only boxed in"
+    return _of(model, stamp_ns, detail, T_base_object=T, method=BOX_METHOD, reason=reason, **sure)
 
 
 def reduce_by_symmetry(

@@ -164,6 +164,8 @@ OUTLINE_WINDOW_M = 0.012
 TUKEY_M = 0.008
 """Residuals beyond this have no say."""
 ITERATIONS = 12
+MIN_EXPLAINED = 0.6
+"""Share of an object's points that its shape must explain."""
 SHARED_ERROR = 9.0
 """Neighbouring pixels share their error: this many count as one."""
 CAMERA_SIGMA_M = 0.002
@@ -182,6 +184,7 @@ class ShapeFit:
 
     T_base_object: Float[np.ndarray, "4 4"]
     covariance: Float[np.ndarray, "6 6"]
+    """Of (x, y, z, rotation about x, y, z), base frame [m^2, m rad, rad^2]."""
     residual_m: float
     """Root mean square distance of the explained points to the surface."""
     explained: float

@@ -37,6 +37,7 @@ from twin.scene.localise.points import (
     likeness,
     voxel_mean,
 )
+from twin.scene.localise.shape_fit import MIN_EXPLAINED
 from twin.scene.shape.known import surface_distances
 
 LEAST_HEIGHT_M = 0.006
@@ -139,7 +140,7 @@ def candidates(
         alike = p[:, 2] > LEAST_HEIGHT_M
         alike[alike] = likeness(view.color_linear[alike], model.color_srgb) >= (MIN_LIKENESS)
         p = voxel_mean(p[alike], VOXEL_M)
-        parts.append(p[~_on_others(p, blocked, CLEAR_M)])
+        parts.append(p[~_on_others(p, blocked)])
     ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     everything = np.concatenate(parts) if parts else np.zeros((0, 3))
     single = []
@@ -156,16 +157,15 @@ def candidates(
 def _on_others(
     p: Float[np.ndarray, "num_points 3"],
     blocked: Mapping[ObjectModel, Float[np.ndarray, "4 4"]],
-    clear_m: float,
 ) -> Bool[np.ndarray, " num_points"]:
     mask = np.zeros(len(p), dtype=bool)
     for model, T in blocked.items():
         if model.mesh is None:
             distance, _ = surface_distances(p, model, T)
-            mask |= np.abs(distance) < clear_m
+            mask |= np.abs(distance) < CLEAR_M
         elif len(p):
             surface = se3.apply(T, known_surface(model, DENSE_SAMPLES).p_m)
-            distance, _ = cKDTree(surface).query(p, distance_upper_bound=clear_m)
+            distance, _ = cKDTree(surface).query(p, distance_upper_bound=CLEAR_M)
             mask |= np.isfinite(distance)
     return mask
 
@@ -203,8 +203,6 @@ def fit_toys(
     views: Sequence[CameraView],
     blocked: Mapping[ObjectModel, Float[np.ndarray, "4 4"]],
     expected_m: Mapping[str, Float[np.ndarray, "3"]],
-    *,
-    min_explained: float,
 ) -> dict[str, SoftFit]:
     """Find toys that all look the same.
 
@@ -219,7 +217,7 @@ def fit_toys(
     good = [
         index
         for index, item in enumerate(fits)
-        if item.explained >= min_explained
+        if item.explained >= MIN_EXPLAINED
         and item.seen_through <= MAX_SEEN_THROUGH
         and agreeing(item.T_base_object, surface, views, SEE_THROUGH_M) >= MIN_AGREEING
     ]

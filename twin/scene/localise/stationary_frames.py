@@ -1,7 +1,7 @@
 """Frames taken while their camera stood still, posed in the robot's base."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Int
@@ -53,7 +53,7 @@ def stationary_frames(
     """
     tree = base_tree(episode)
     failed: list[GstError] = []
-    usable: dict[str, _Stationary] = {}
+    usable: dict[str, tuple[CameraPoses, str, np.ndarray]] = {}
     camera_ids = rgbd_camera_ids(episode)
     for camera_id in camera_ids:
         known = (poses or {}).get(camera_id) or CameraPoses(tree=tree, source="tf")
@@ -67,26 +67,15 @@ def stationary_frames(
     if failed and not usable:
         raise failed[0]
     base_frame = streams.recorded_robot(episode).base_frame
-    root = common_root([item.root for item in usable.values()], base_frame)
+    root = common_root([own_root for _, own_root, _ in usable.values()], base_frame)
     frames: list[RgbdFrame] = []
-    for camera_id, item in usable.items():
-        if item.root != root:
+    for camera_id, (posed, own_root, stamps) in usable.items():
+        if own_root != root:
             continue
-        stamps = np.array(item.stamps_ns, dtype=np.int64)
         chosen = spread(stamps, max_per_camera) if evenly else stamps[-max_per_camera:]
-        found = streams.rgbd_frames(episode, camera_id, item.poses.tree, set(chosen.tolist()))
-        frames.extend(with_true_depth(frame, item.poses) for frame in found)
+        found = streams.rgbd_frames(episode, camera_id, posed.tree, set(chosen.tolist()))
+        frames.extend(with_true_depth(frame, posed) for frame in found)
     return frames
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Stationary:
-    """When one camera stood still, and where."""
-
-    poses: CameraPoses
-    root: str
-    """Frame that the poses are in."""
-    stamps_ns: list[int]
 
 
 def _stationary(
@@ -95,32 +84,22 @@ def _stationary(
     poses: CameraPoses,
     after_ns: int | None,
     before_ns: int | None,
-) -> _Stationary:
+) -> tuple[CameraPoses, str, Int[np.ndarray, " num_frames"]]:
+    """Poses of a camera, the frame they are in, and when it stood still in an interval."""
     check_camera(episode, camera_id)
     frame_id = streams.camera_info(episode, camera_id, "color").frame_id
     check_connected(poses.tree, episode, camera_id)
-    stamps = _between(paired_stamps_ns(episode, camera_id), after_ns, before_ns)
-    return _Stationary(
-        poses=poses,
-        root=poses.tree.root_of(frame_id),
-        stamps_ns=[
-            stamp
-            for stamp in stamps
-            if stamp not in poses.unposed_ns
-            and is_stationary(poses.tree, frame_id, stamp, before_ns)
-        ],
-    )
-
-
-def _between(
-    stamps_ns: Int[np.ndarray, " num_frames"], after_ns: int | None, before_ns: int | None
-) -> list[int]:
-    wanted = np.ones(len(stamps_ns), dtype=bool)
+    stamps = paired_stamps_ns(episode, camera_id)
     if after_ns is not None:
-        wanted &= stamps_ns > after_ns
+        stamps = stamps[stamps > after_ns]
     if before_ns is not None:
-        wanted &= stamps_ns < before_ns
-    return [int(stamp) for stamp in stamps_ns[wanted]]
+        stamps = stamps[stamps < before_ns]
+    stationary = [
+        stamp
+        for stamp in stamps.tolist()
+        if stamp not in poses.unposed_ns and is_stationary(poses.tree, frame_id, stamp, before_ns)
+    ]
+    return poses, poses.tree.root_of(frame_id), np.array(stationary, dtype=np.int64)
 
 
 def common_root(roots: Sequence[str], base_frame: str) -> str | None:

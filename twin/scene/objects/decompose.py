@@ -27,11 +27,11 @@ from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
+from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.fit.lighting import EVEN, Lighting
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import (
     GaussianCloud,
-    as_float32,
     concatenate,
     moved_cloud,
     read_ply,
@@ -49,13 +49,14 @@ from twin.scene.shape.sdf import SdfGrid
 from twin.scene.store.folder import UnreadableSceneError
 from twin.scene.store.library import objects_folder
 
-SPACING_M = 0.004
+SPACING_M, WIDER = 0.004, 1.4
+"""Of Gaussians that fill holes, and how much wider than that they are."""
 GROWN_M = 0.018
 """How far beyond the footprint holes are looked for: what is left out reaches to the halo."""
 TABLE_M = 0.008
 """Gaussians this near z = 0 are table."""
 NEIGHBOURS = 12
-OPACITY_LOGIT = 3.0
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def fill_footprint(
@@ -82,23 +83,16 @@ def fill_footprint(
     weight = 1.0 / distance[holes] ** 2
     weight /= weight.sum(axis=1, keepdims=True)
     around = table[ids[holes]]
-    count = int(holes.sum())
-    scales = np.log([0.75 * SPACING_M, 0.75 * SPACING_M, 0.1 * SPACING_M])
     z = (weight * means[around, 2]).sum(axis=1)
     colors = (weight[..., None] * background.colors[around]).sum(axis=1)
-    return GaussianCloud(
-        means_m=as_float32(np.column_stack([xy[holes], z])),
-        quats_wxyz=as_float32(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))),
-        scales_log=as_float32(np.tile(scales, (count, 1))),
-        opacities_logit=as_float32(np.full(count, OPACITY_LOGIT)),
-        colors=as_float32(colors),
-    ).as_completed()
+    sizes = np.full(len(z), WIDER * SPACING_M)
+    up = np.tile(UP, (len(z), 1))
+    return flat_gaussians(np.column_stack([xy[holes], z]), up, colors, sizes).as_completed()
 
 
 UNDER_M = 0.008
 """Background this far below an object is covered by it."""
 TRANSPARENT_LOGIT = -30.0
-UP = np.array([0.0, 0.0, 1.0])
 OBJECT_VERSION = 4
 
 
@@ -180,17 +174,11 @@ class LibraryObject:
         return [MESH], {"shape_source": TASK_SHAPE, "shape_remark": self.shape}
 
     def _record(self) -> dict[str, Any]:
-        model, cloud = self.model, self.splats.cloud
+        cloud = self.splats.cloud
         return {
             "schema_version": OBJECT_VERSION,
-            "id": model.id,
+            "id": self.model.id,
             "scanned_in": self.episode_id,
-            "shape": model.shape,
-            "size_m": list(model.size_m),
-            "wall_m": model.wall_m,
-            "color_srgb": list(model.color_srgb),
-            "symmetry": model.symmetry,
-            "fixed": model.fixed,
             "frame": "all files of this folder are in the object frame",
             "num_splats": len(cloud),
             "num_completed": int(cloud.completed.sum()),
@@ -340,10 +328,9 @@ def read_objects(
 
 def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     try:
-        pose = json.loads(path.read_text())["T_base_object"]
+        return read_pose(json.loads(path.read_text())["T_base_object"], path)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UnreadableSceneError(path=path, found=f"no pose ({error!r})") from error
-    return read_pose(pose, path)
 
 
 def read_pose(pose: Any, path: Path) -> Float[np.ndarray, "4 4"]:

@@ -3,8 +3,9 @@
 import math
 import resource
 import sys
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from typing import Any
 
 from bridge.episode import provenance, streams
@@ -13,28 +14,32 @@ from twin.scene.fit.optimise import FitResult
 from twin.scene.frames.camera_poses import SAYS
 from twin.scene.frames.selection import FrameChoice, Sources, root_frame
 from twin.scene.rebuild.views import MOST_DB
-from twin.scene.settings import FrameConfig, RebuildConfig
+from twin.scene.settings import RebuildConfig
 from twin.scene.store.folder import BACKGROUND, SCENE_VERSION
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cost:
-    """What a rebuild took so far."""
+class Clock:
+    """What a rebuild took so far, stage by stage."""
 
-    seconds: float
-    """Wall time."""
-    cpu_seconds: float
-    """Of all threads."""
-    stages_s: Mapping[str, float] = field(default_factory=dict)
-    """Wall time of each stage."""
+    def __init__(self) -> None:
+        """Begin."""
+        self._wall = self._lap = time.monotonic()
+        self._cpu = time.process_time()
+        self._stages_s: dict[str, float] = {}
+
+    def end(self, stage: str) -> None:
+        """A stage is over; the next one begins."""
+        now = time.monotonic()
+        self._stages_s[stage] = round(now - self._lap, 2)
+        self._lap = now
 
     def to_record(self) -> dict[str, Any]:
-        """What ``scene.json`` says."""
+        """What ``scene.json`` says: wall and CPU time, memory, wall time of each stage."""
         return {
-            "seconds": round(self.seconds, 2),
-            "cpu_seconds": round(self.cpu_seconds, 2),
+            "seconds": round(time.monotonic() - self._wall, 2),
+            "cpu_seconds": round(time.process_time() - self._cpu, 2),
             "peak_memory_mb": round(peak_memory_mb()),
-            "stages_s": {name: round(seconds, 2) for name, seconds in self.stages_s.items()},
+            "stages_s": dict(self._stages_s),
         }
 
 
@@ -56,7 +61,7 @@ def make_record(
     views: Mapping[str, Any],
     num_background: int,
     num_completed: int,
-    cost: Cost,
+    cost: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Put together the content of ``scene.json``."""
     settings = asdict(config)
@@ -96,46 +101,30 @@ def make_record(
             else round(min(fitted.train_psnr_db, MOST_DB), 3),
         },
         "views": dict(views),
-        "cost": cost.to_record(),
-        "seconds": round(cost.seconds, 2),
+        "cost": dict(cost),
+        "seconds": cost["seconds"],
         "software": provenance.software(),
     }
 
 
 def protocol_of(
-    choices: Sequence[FrameChoice], fitted: FitResult, config: RebuildConfig, cost: Cost
+    choices: Sequence[FrameChoice], fitted: FitResult, config: RebuildConfig
 ) -> dict[str, Any]:
     """How the scene was made, as far as whoever rates its views must know."""
     frames = config.frames
+    training = "of the others the stillest and sharpest of each stretch of the camera's path"
+    if frames.train_every:
+        training = f"frame 0 and every {frames.train_every}th after it, but no held-out one"
     return {
-        "holdout": holdout_text(frames),
-        "training": training_text(frames),
+        "holdout": f"frame {frames.first_holdout} and every {frames.holdout_every}th after it of "
+        f"each camera, at most {frames.max_holdout_frames} in all",
+        "training": training,
         "train_frames": sum(len(choice.train_ns) for choice in choices),
         "cameras_from": sorted({SAYS[choice.poses.source] for choice in choices}),
         "num_splats": len(fitted.cloud),
         "fit_iterations": fitted.iterations,
         "underfitted": fitted.underfitted,
-        "fit_seconds": round(fitted.seconds, 2),
-        "fit_cpu_seconds": round(fitted.cpu_seconds, 2),
-        "rebuild_seconds": round(cost.seconds, 2),
-        "rebuild_cpu_seconds": round(cost.cpu_seconds, 2),
-        "peak_memory_mb": round(peak_memory_mb()),
     }
-
-
-def holdout_text(frames: FrameConfig) -> str:
-    """Which frames were held out, in words."""
-    return (
-        f"frame {frames.first_holdout} and every {frames.holdout_every}th after it of each camera, "
-        f"at most {frames.max_holdout_frames} in all"
-    )
-
-
-def training_text(frames: FrameConfig) -> str:
-    """Which frames were trained on, in words."""
-    if frames.train_every:
-        return f"frame 0 and every {frames.train_every}th after it, but no held-out one"
-    return "of the others the stillest and sharpest of each stretch of the camera's path"
 
 
 def camera_record(choice: FrameChoice) -> dict[str, Any]:

@@ -5,8 +5,9 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,14 @@ from twin.scene.dataset.training_set import (
 from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FitResult, fit
-from twin.scene.frames.selection import FrameChoice, Sources, choose_frames, find_sources
-from twin.scene.gaussians import GaussianCloud, concatenate, write_ply
+from twin.scene.frames.selection import Sources, choose_frames, find_sources
+from twin.scene.gaussians import concatenate, write_ply
 from twin.scene.objects.decompose import Decomposition, decompose
 from twin.scene.objects.placement import find_placements, scanned_tasks
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
-from twin.scene.rebuild.record import Cost, make_record, protocol_of
+from twin.scene.rebuild.record import Clock, make_record, protocol_of
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
-from twin.scene.robot.extraction import DrivenRobot, LitLinks, write_robot
+from twin.scene.robot.extraction import LitLinks, write_robot
 from twin.scene.settings import DEFAULT_BUDGET_S, RebuildConfig
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import (
@@ -47,28 +48,6 @@ METHOD_VERSION = 27
 """Counts changes of method that make older scenes out of date."""
 SEARCHED_SPLATS = 80_000
 """Points of the fused surface in which things are looked for, at most."""
-
-
-class _Clock:
-    """What the rebuild took so far, stage by stage."""
-
-    def __init__(self) -> None:
-        self._wall = self._lap = time.monotonic()
-        self._cpu = time.process_time()
-        self._stages: dict[str, float] = {}
-
-    def end(self, stage: str) -> None:
-        """A stage is over; the next one begins."""
-        now = time.monotonic()
-        self._stages[stage] = now - self._lap
-        self._lap = now
-
-    def cost(self) -> Cost:
-        return Cost(
-            seconds=time.monotonic() - self._wall,
-            cpu_seconds=time.process_time() - self._cpu,
-            stages_s=dict(self._stages),
-        )
 
 
 def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, Any]:
@@ -89,7 +68,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     if done is not None:
         output.say("the scene is up to date (same episodes, same settings); --force redoes it")
         return done
-    clock = _Clock()
+    clock = Clock()
     chosen = choose_frames(sources, config.frames, output, calibration)
     placements = find_placements(sources, chosen.choices, output)
     clock.end("find_objects")
@@ -109,7 +88,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     clock.end("decompose")
     backdrop = backdrop_of(fitted.cloud, training.bare_views, Rasteriser(raster))
-    views = _hold_out(run, training, fitted, backdrop, decomposed, links, config, clock, output)
+    views = _hold_out(run, training, fitted, backdrop, decomposed, links, config, output)
     clock.end("held_out_views")
     extras = _write_parts(run, sources, training, decomposed, links, config, output)
     clock.end("objects_and_semantics")
@@ -124,7 +103,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         views=views,
         num_background=len(decomposed.background),
         num_completed=int(decomposed.background.completed.sum()),
-        cost=clock.cost(),
+        cost=clock.to_record(),
     )
     record |= extras | {"backdrop": backdrop.write(run.scene_dir)}
     write_record(run, record)
@@ -154,10 +133,12 @@ def _hold_out(
     decomposed: Decomposition,
     links: LitLinks,
     config: RebuildConfig,
-    clock: _Clock,
     output: Output,
 ) -> dict[str, Any]:
-    """Render what was held out, and say how well it came out."""
+    """Render what was held out, and say how well it came out; our views of earlier scenes go.
+
+    Views that another program drew stay: they are compared with ours.
+    """
     choices = training.choices
     job = ViewsJob(
         scene_hash=background_hash(run),
@@ -165,8 +146,8 @@ def _hold_out(
         reference_views=training.reference_views,
         limits=limits_of(config),
         raster=RasterConfig(threads=config.fit.threads),
-        protocol=protocol_of(choices, fitted, config, clock.cost()),
-        robot=DrivenRobot(frames=training.robot.frames, links=links),
+        protocol=protocol_of(choices, fitted, config),
+        robot=partial(training.robot.frames.joined, links),
         ego_masks={
             (choices[index].episode.path, choices[index].camera_id): mask
             for index, mask in training.ego_masks.items()
@@ -176,7 +157,11 @@ def _hold_out(
     total = sum(len(choice.holdout_ns) for choice in choices)
     with output.progress("render held-out views", total) as advance:
         numbers = write_views(run, choices, job, advance)
-    return summarise_views(numbers, _remove_stale_views(run, choices, job.scene_hash))
+    present = {views_path(run, c.episode, job.scene_hash).name for c in choices if c.holdout_ns}
+    for path in run.derived("*.views.*"):
+        if path.name not in present and _is_ours(path):
+            path.unlink()
+    return summarise_views(numbers, sorted(present))
 
 
 def _write_parts(
@@ -195,29 +180,20 @@ def _write_parts(
     )
     if not config.models.any_named and not has_leaf("perception"):
         return written
+    # Not what was fitted: Gaussians gather where colours change, and every fit puts them elsewhere.
+    finer = replace(config.initialise, max_splats=SEARCHED_SPLATS, growth=0.0)
     named: dict[str, Any] = load_leaf("perception", "name_things")(
         run.scene_dir,
         decomposed,
         training.views,
         config.fit.threads,
         output,
-        fused=_evenly_fused(training, config),
+        fused=None if config.models.segmenter else fuse(training.points, finer, training.views),
         models=config.models,
         choices=training.choices,
         task=scanned_tasks(sources).task,
     )
     return written | named
-
-
-def _evenly_fused(training: TrainingSet, config: RebuildConfig) -> GaussianCloud | None:
-    """The measured surface in which things are looked for; None: nobody looks for them in it.
-
-    Not what was fitted: Gaussians gather where colours change, and every fit puts them elsewhere.
-    """
-    if config.models.segmenter:
-        return None
-    finer = replace(config.initialise, max_splats=SEARCHED_SPLATS, growth=0.0)
-    return fuse(training.points, finer, training.views)
 
 
 def _key(
@@ -273,20 +249,6 @@ def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
     needed += [run.scene_dir / static] if static else []
     whole = all(path.is_file() for path in needed)
     return record if whole and background_hash(run) == record["scene_hash"] else None
-
-
-def _remove_stale_views(
-    run: RunFolder, choices: Sequence[FrameChoice], scene_hash: str
-) -> list[str]:
-    """Remove our views of earlier scenes, which are no longer stored; return the present ones.
-
-    Views that another program drew stay: they are compared with ours.
-    """
-    present = {views_path(run, c.episode, scene_hash).name for c in choices if c.holdout_ns}
-    for path in run.derived("*.views.*"):
-        if path.name not in present and _is_ours(path):
-            path.unlink()
-    return sorted(present)
 
 
 def _is_ours(path: Path) -> bool:

@@ -7,13 +7,13 @@ Topics, all with the stamp of the recorded frame and the frame id of its colour 
 inside) where there is something to mask, and ``.../color/info``.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage
@@ -28,12 +28,12 @@ from bridge.media.color import encode_png
 from bridge.media.image_quality import as_float, psnr_db
 from bridge.terminal import Advance
 from twin.scene.backdrop import Backdrop
-from twin.scene.dataset.masks import EgoMask, ReferenceView, find_moving
+from twin.scene.dataset.masks import ReferenceView, find_moving, without_ego
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, load
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.objects.decompose import Decomposition
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
-from twin.scene.robot.extraction import DrivenRobot
 
 VIEWS_NOTE = (
     "held out from initialisation, poses, exposure, fit and objects; mean of the images' values, "
@@ -55,8 +55,6 @@ class ViewNumbers:
     """The camera does not move, so training frames show the same view."""
     psnr_db: float
     """Over the whole image, as recorded; at most 100."""
-    coverage_fraction: float
-    """Mean alpha of the rendered image."""
 
 
 def rate_view(frame: RgbdFrame, view: View, choice: FrameChoice) -> ViewNumbers:
@@ -71,7 +69,6 @@ def rate_view(frame: RgbdFrame, view: View, choice: FrameChoice) -> ViewNumbers:
         stamp_ns=frame.stamp_ns,
         stationary_camera=choice.stationary,
         psnr_db=min(found_db, MOST_DB),
-        coverage_fraction=float(view.alpha.mean()),
     )
 
 
@@ -109,33 +106,12 @@ class ViewsJob:
     raster: RasterConfig
     protocol: Mapping[str, Any]
     """How the scene was made: kept with the images, for whoever rates them."""
-    robot: DrivenRobot | None = None
-    """Drawn where it stood at each frame; the cloud holds only what is static."""
-    ego_masks: Mapping[tuple[Path, str], EgoMask] = field(default_factory=dict)
+    robot: Callable[[GaussianCloud, Episode, int], GaussianCloud] | None = None
+    """Puts it where it stood at each frame; the cloud holds only what is static."""
+    ego_masks: Mapping[tuple[Path, str], Bool[np.ndarray, "_ _"]] = field(default_factory=dict)
     """By episode and camera: what moves with the camera and is not part of the scene."""
     backdrop: Backdrop | None = None
     """Stands behind everything; None: black."""
-
-    def settings(self) -> dict[str, Any]:
-        """What the derived episode records about how its views were made."""
-        return {
-            **self.protocol,
-            "resolution": "native colour camera",
-            "masks": "as separate topics; none applied",
-            "alpha_cut": self.raster.alpha_cut,
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class HeldOutViews:
-    """One held-out frame with everything that is said about it."""
-
-    choice: FrameChoice
-    frame: RgbdFrame
-    recorded: TrainingView
-    """The frame with what moved masked; nothing is trained on it."""
-    view: View
-    masks: Mapping[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
 
 
 def write_views(
@@ -159,28 +135,30 @@ def write_views(
                     source_sha256=episode.sha256(),
                     scene_hash=job.scene_hash,
                     engine=ENGINE,
-                    settings=job.settings(),
+                    settings=dict(job.protocol),
                 ),
             )
             for choice in own:
-                for item in _rendered(choice, rasteriser, job, paths.index(path)):
-                    _write_view(writer, item)
-                    numbers.append(rate_view(item.frame, item.view, choice))
+                for number in _rendered(choice, rasteriser, job, paths.index(path), writer):
+                    numbers.append(number)
                     advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
     return numbers
 
 
 def _rendered(
-    choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob, scan: int
-) -> Iterator[HeldOutViews]:
-    """Draw the held-out frames of one camera; objects of other scans did not move in this one."""
+    choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob, scan: int, writer: EpisodeWriter
+) -> Iterator[ViewNumbers]:
+    """Draw and write the held-out frames of one camera, and rate each.
+
+    Objects of other scans did not move in this one.
+    """
     references = [each for each in job.reference_views if each.scan == scan]
     scene, num_background = job.scenes.as_seen_in(choice.episode), len(job.scenes.background)
     for frame in load(choice, choice.holdout_ns):
         camera, T = frame.color_camera, frame.T_base_color
         cloud = scene
         if job.robot is not None:
-            cloud = job.robot.joined(cloud, choice.episode, frame.stamp_ns)
+            cloud = job.robot(cloud, choice.episode, frame.stamp_ns)
         ego_mask = job.ego_masks.get((choice.episode.path, choice.camera_id))
         recorded = _recorded(frame, job.limits, references, ego_mask)
         view = rasteriser.view(cloud, camera, T)
@@ -191,38 +169,32 @@ def _rendered(
             white = np.zeros((len(cloud), 1), dtype=np.float32)
             white[num_background : len(scene)] = 1.0
             masks["objects"] = rasteriser.draw_features(white)[0] > OBJECT_SHARE
-        yield HeldOutViews(
-            choice=choice,
-            frame=frame,
-            recorded=recorded,
-            view=view,
-            masks=masks,
-        )
+        _write_view(writer, choice, frame, recorded.full.depth_m, view, masks)
+        yield rate_view(frame, view, choice)
 
 
 def _recorded(
     frame: RgbdFrame,
     limits: DepthLimits,
     references: Sequence[ReferenceView],
-    ego_mask: EgoMask | None,
+    ego_mask: Bool[np.ndarray, "_ _"] | None,
 ) -> TrainingView:
     """A held-out frame without what training frames look through or moves with the camera."""
     surface = FrameSurface(frame, limits)
     view, points = training_view(surface), surface.points()
     if ego_mask is not None:
-        view, points = ego_mask.mask_in(view), ego_mask.drop_from(points, view)
+        points, view = without_ego(points, view, ego_mask)
     return find_moving([points], references).mask_in(view)
 
 
-def one_camera(frame: RgbdFrame) -> bool:
-    """Say whether colour and depth have the same pixels."""
-    return frame.color_camera == frame.depth_camera and bool(
-        np.allclose(frame.T_base_color, frame.T_base_depth, atol=1e-6)
-    )
-
-
-def _write_view(writer: EpisodeWriter, item: HeldOutViews) -> None:
-    choice, frame = item.choice, item.frame
+def _write_view(
+    writer: EpisodeWriter,
+    choice: FrameChoice,
+    frame: RgbdFrame,
+    depth_in_color_m: Float32[np.ndarray, "height width"],
+    view: View,
+    masks: Mapping[str, Bool[np.ndarray, "height width"]],
+) -> None:
     cell = choice.episode.info.cell or "cell"
     topic = camera_topic(f"{cell}/views", frame.camera_id)
     frame_id = streams.camera_info(choice.episode, frame.camera_id).frame_id
@@ -247,12 +219,13 @@ def _write_view(writer: EpisodeWriter, item: HeldOutViews) -> None:
     info = CameraInfo(stamp_ns=stamp, frame_id=frame_id, camera=frame.color_camera)
     put("color/info", info.to_cdr(), schema.CAMERA_INFO)
     png("recorded/image", frame.image_u8)
-    png("rendered/image", item.view.image_u8())
-    depth("rendered/depth", item.view.depth_m)
-    if one_camera(frame):
+    png("rendered/image", view.image_u8())
+    depth("rendered/depth", view.depth_m)
+    same = np.allclose(frame.T_base_color, frame.T_base_depth, atol=1e-6)
+    if same and frame.color_camera == frame.depth_camera:
         depth("recorded/depth", np.nan_to_num(frame.depth_m, posinf=0.0))
     else:
-        depth("recorded/depth_in_color", item.recorded.full.depth_m)
-    for name, mask in item.masks.items():
+        depth("recorded/depth_in_color", depth_in_color_m)
+    for name, mask in masks.items():
         if not mask.all():
             png(f"mask/{name}", np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255)

@@ -201,11 +201,7 @@ class RobotFrames:
         return shapes
 
     def joined(
-        self,
-        cloud: GaussianCloud,
-        links: LitLinks,
-        episode: Episode,
-        stamp_ns: int,
+        self, links: LitLinks, cloud: GaussianCloud, episode: Episode, stamp_ns: int
     ) -> GaussianCloud:
         """Put the robot into a scene as it stood at an instant of an episode."""
         tracked = self._tracked.get(str(episode.path))
@@ -252,18 +248,6 @@ class FoundRobot:
     remark: str
     alignment: Alignment | None = None
     """Where the scene's root is not the robot's base: how the two were laid onto each other."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DrivenRobot:
-    """Links that stand where the joints of an episode put them."""
-
-    frames: RobotFrames
-    links: LitLinks = field(default_factory=LitLinks)
-
-    def joined(self, cloud: GaussianCloud, episode: Episode, stamp_ns: int) -> GaussianCloud:
-        """The scene with the robot in it as it stood at an instant."""
-        return self.frames.joined(cloud, self.links, episode, stamp_ns)
 
 
 def find_robot(choices: Sequence[FrameChoice], output: Output) -> FoundRobot:

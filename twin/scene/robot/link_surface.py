@@ -119,19 +119,13 @@ def on_surface(
         np.concatenate([getattr(item, name) for item in sets])
         for name in ("p_m", "normals", "colors")
     )
-    if not _fits(p, seen_m, spacing_m):
+    away_m, _ = cKDTree(p).query(seen_m)
+    if np.median(away_m) > FITS_M + spacing_m / 2:
         return None
     p = within_edges(p, normals, shapes, spacing_m)
     colors = _colors(p, normals, seen_m, seen_normals, seen_colors)
     sizes = np.full(len(p), WIDER * spacing_m)
     return flat_gaussians(p, normals, colors, sizes)
-
-
-def _fits(
-    p: Float[np.ndarray, "num_points 3"], seen_m: Float[np.ndarray, "num_seen 3"], spacing_m: float
-) -> bool:
-    away_m, _ = cKDTree(p).query(seen_m)
-    return bool(np.median(away_m) <= FITS_M + spacing_m / 2)
 
 
 def _colors(

@@ -37,19 +37,6 @@ class MaskedView:
     sensor: str = ""
     """Which camera it is: views of one camera share the errors of its depth."""
 
-    def __post_init__(self) -> None:
-        """Refuse images that do not belong together."""
-        size = (self.camera.height, self.camera.width)
-        if self.depth_m.shape != size or self.mask.shape != size:
-            message = (
-                f"a camera of {size[1]} x {size[0]} pixels came with depth of shape "
-                f"{self.depth_m.shape} and a mask of shape {self.mask.shape}; give all one size."
-            )
-            raise ShapeError(message)
-        if not np.isfinite(self.T_base_camera).all():
-            message = "a view's camera pose is not finite; leave that view out."
-            raise ShapeError(message)
-
     def known_depth_m(self) -> Float32[np.ndarray, "height width"]:
         """Depth with 0 wherever it was not measured [m]."""
         depth = self.depth_m.astype(np.float32)
@@ -200,8 +187,6 @@ class Evidence:
     """Mean distance in truncations, positive in front of the object's surface; 0 where unseen."""
     weight: Float32[np.ndarray, "num_x num_y num_z"]
     """How many views saw the object's surface near a voxel; 0 is "nobody"."""
-    free: Bool[np.ndarray, "num_x num_y num_z"]
-    """Looked through in at least two views."""
     empty: Bool[np.ndarray, "num_x num_y num_z"]
     """Not the object: free, at or before something else, or in front of its surface."""
 
@@ -246,7 +231,6 @@ def gather(
         box=box,
         tsdf=tsdf.reshape(box.counts),
         weight=weight.reshape(box.counts),
-        free=is_free.reshape(box.counts),
         empty=empty.reshape(box.counts),
     )
 

@@ -274,8 +274,8 @@ def write_static(
     except TwinError as error:
         return {"file": None, "remark": str(error), "rim_height_m": heights_m}
     static.save(path)
-    about = {"file": STATIC_FILE, "sha256": provenance.hash_file(path), **static.to_record()}
-    return {**about, "rim_height_m": heights_m}
+    sha256 = provenance.hash_file(path)
+    return {"file": STATIC_FILE, "sha256": sha256, "rim_height_m": heights_m}
 
 
 def from_outside_m(
@@ -293,17 +293,8 @@ def from_outside_m(
     else:
         distance, _ = surface_distances(points, model, T_base_object)
     if model.wall_m > 0:
-        distance = np.minimum(distance, _from_cavity_m(points, model, T_base_object))
+        half = np.array(model.inner_m) / 2
+        p = se3.apply(se3.invert(T_base_object), points) - [0.0, 0.0, model.wall_m + half[2]]
+        from_cavity = np.linalg.norm(np.maximum(np.abs(p) - half, 0.0), axis=1)
+        distance = np.minimum(distance, from_cavity)
     return np.asarray(distance)
-
-
-def _from_cavity_m(
-    points: Float[np.ndarray, "num_points 3"],
-    model: ObjectModel,
-    T_base_object: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, " num_points"]:
-    """Distance to a container's cavity, 0 in it."""
-    half = np.array(model.inner_m) / 2
-    centre = np.array([0.0, 0.0, model.wall_m + half[2]])
-    p = se3.apply(se3.invert(T_base_object), points) - centre
-    return np.asarray(np.linalg.norm(np.maximum(np.abs(p) - half, 0.0), axis=1))

@@ -34,22 +34,21 @@ class SdfGrid:
         sqrt(d(b)^2 + e^2): b is the projection onto a box that contains the solid, so the angle
         at b is at least a right one. When the solid may go on, only d(b) - e is certain.
         """
-        value, _, beyond = self._interpolate(points_m.reshape(-1, 3))
-        e = np.linalg.norm(beyond, axis=1)
+        place = (points_m.reshape(-1, 3) - self.origin_m) / self.voxel_m
+        held = np.clip(place, 0.0, np.array(self.values_m.shape) - 1.0)
+        value = ndimage.map_coordinates(self.values_m, held.T, output=np.float64, order=1)
+        e = np.linalg.norm(place - held, axis=1) * self.voxel_m
         far = np.hypot(np.maximum(value, 0.0), e) if self.closed else value - e
-        return np.where(e > 0, far, value).reshape(points_m.shape[:-1])
+        return np.asarray(np.where(e > 0, far, value).reshape(points_m.shape[:-1]))
 
     def gradient(self, points_m: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Derivative of ``distance`` by the point; about a unit vector away from the surface."""
-        value, slope, beyond = self._interpolate(points_m.reshape(-1, 3))
-        e = np.linalg.norm(beyond, axis=1, keepdims=True)
-        slope = np.where(beyond == 0.0, slope, 0.0)
-        if self.closed:
-            ahead = np.maximum(value, 0.0)[:, None]
-            far = (ahead * slope + beyond) / np.maximum(np.hypot(ahead, e), 1e-12)
-        else:
-            far = slope - beyond / np.maximum(e, 1e-12)
-        return np.where(e > 0, far, slope).reshape(points_m.shape)
+        """Derivative of ``distance`` by the point; about a unit vector away from the surface.
+
+        Central differences over a thousandth of a voxel.
+        """
+        step = 1e-3 * self.voxel_m * np.eye(3)
+        ahead, behind = (self.distance(points_m[..., None, :] + s * step) for s in (1, -1))
+        return np.asarray((ahead - behind) / (2e-3 * self.voxel_m))
 
     def save(self, path: Path) -> None:
         """Write an npz file."""
@@ -77,40 +76,6 @@ class SdfGrid:
         if not (np.isfinite(values).all() and np.isfinite(origin).all() and voxel > 0):
             raise UnreadableArraysError(path=path, found="a distance or a position is not finite")
         return SdfGrid(values_m=values, origin_m=origin, voxel_m=float(voxel), closed=bool(closed))
-
-    def _interpolate(
-        self, points: Float[np.ndarray, "num_points 3"]
-    ) -> tuple[
-        Float[np.ndarray, " num_points"],
-        Float[np.ndarray, "num_points 3"],
-        Float[np.ndarray, "num_points 3"],
-    ]:
-        """Value and derivative at the nearest point of the grid, and the way from it [m]."""
-        counts = np.array(self.values_m.shape)
-        last = (counts - 1).astype(np.float64)
-        place = (points - self.origin_m) / self.voxel_m
-        held = np.clip(place, 0.0, last)
-        first = np.minimum(held.astype(np.int64), counts - 2)
-        t = held - first
-        flat = (first[:, 0] * counts[1] + first[:, 1]) * counts[2] + first[:, 2]
-        step = (counts[1] * counts[2], counts[2], 1)
-        rows = self.values_m.ravel()
-        c = [
-            rows[flat + i * step[0] + j * step[1] + k * step[2]].astype(np.float64)
-            for i in (0, 1)
-            for j in (0, 1)
-            for k in (0, 1)
-        ]
-        tx, ty, tz = t.T
-        along_z = [c[n] + (c[n + 1] - c[n]) * tz for n in (0, 2, 4, 6)]
-        low, high = (along_z[n] + (along_z[n + 1] - along_z[n]) * ty for n in (0, 2))
-        value = low + (high - low) * tx
-        slope_y = (along_z[1] - along_z[0]) * (1 - tx) + (along_z[3] - along_z[2]) * tx
-        lean = [c[n + 1] - c[n] for n in (0, 2, 4, 6)]
-        lean_low, lean_high = (lean[n] + (lean[n + 1] - lean[n]) * ty for n in (0, 2))
-        slope_z = lean_low + (lean_high - lean_low) * tx
-        slope = np.stack([high - low, slope_y, slope_z], axis=1) / self.voxel_m
-        return value, slope, (place - held) * self.voxel_m
 
 
 def distances_of_solid(

@@ -9,7 +9,6 @@ the unseen for solid; the observed one takes it for free. Beyond the grid nothin
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -85,21 +84,6 @@ class StaticSdf:
             truncation_m=float(found["truncation_m"]),
             table_z_m=None if np.isnan(table) else table,
         )
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what ``scene.json`` says of it."""
-        shares = np.bincount(self.state.ravel(), minlength=3) / self.state.size
-        return {
-            "voxel_m": self.conservative.voxel_m,
-            "size": list(self.state.shape),
-            "origin_m": self.conservative.origin_m.tolist(),
-            "truncation_m": self.truncation_m,
-            "table_z_m": self.table_z_m,
-            "free": round(float(shares[FREE]), 4),
-            "surface": round(float(shares[SURFACE]), 4),
-            "unseen": round(float(shares[UNSEEN]), 4),
-            "note": "values_m: unseen is solid; observed_m: unseen is free; beyond: unknown",
-        }
 
 
 def static_sdf(

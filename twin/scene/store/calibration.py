@@ -205,9 +205,9 @@ def mounted_tree(
     edges = []
     for stamp, T_base_link in zip(stamps_ns, _links(mount, stamps_ns, track), strict=True):
         T_base_color = T_base_link @ mount.T_link_camera @ T_camera_color
-        edges.append(_edge(base, color, T_base_color, int(stamp)))
+        edges.append(edge(base, color, T_base_color, int(stamp)))
         if color != depth:
-            edges.append(_edge(base, depth, T_base_color @ T_color_depth, int(stamp)))
+            edges.append(edge(base, depth, T_base_color @ T_color_depth, int(stamp)))
     return TransformTree(edges)
 
 
@@ -244,5 +244,6 @@ def unknown_postures(
     )
 
 
-def _edge(parent: str, child: str, T: np.ndarray, stamp_ns: int) -> FrameTransform:
+def edge(parent: str, child: str, T: np.ndarray, stamp_ns: int) -> FrameTransform:
+    """A transform at an instant."""
     return FrameTransform(stamp_ns=stamp_ns, parent=parent, child=child, T_parent_child=T)

@@ -88,7 +88,7 @@ def dense_solution(
 def test_the_solution_is_that_of_a_dense_least_squares(room: Room, num_harmonics: int) -> None:
     cloud, observations = room
     start = gaussians.with_harmonics(cloud, num_harmonics)
-    solved = appearance.solve_appearance(start, observations, rasteriser(), steps=250).cloud
+    solved = appearance.solve_appearance(start, observations, rasteriser(), steps=250)[0]
     found = np.concatenate([solved.colors[:, None], solved.harmonics], axis=1)
     expected = dense_solution(start, observations)
     np.testing.assert_allclose(found.transpose(1, 0, 2), expected, atol=3e-3)
@@ -102,7 +102,7 @@ def test_what_a_mask_hides_does_not_matter(room: Room) -> None:
         planes[:, ~item.target.static_mask] = 255
         spoilt.append(replace(item, target=replace(item.target, planes_u8=planes)))
     clean, other = (
-        appearance.solve_appearance(cloud, items, rasteriser(), steps=3).cloud
+        appearance.solve_appearance(cloud, items, rasteriser(), steps=3)[0]
         for items in (observations, spoilt)
     )
     np.testing.assert_array_equal(clean.colors, other.colors)
@@ -117,7 +117,7 @@ def test_a_gaussian_that_no_pixel_shows_keeps_its_colour(room: Room) -> None:
     means = cloud.means_m.copy()
     means[7] = (0.0, -30.0, 0.0)
     moved = replace(cloud, means_m=means)
-    solved = appearance.solve_appearance(moved, observations, rasteriser(), steps=3).cloud
+    solved = appearance.solve_appearance(moved, observations, rasteriser(), steps=3)[0]
     np.testing.assert_array_equal(solved.colors[7], cloud.colors[7])
     assert not np.array_equal(solved.colors[8], cloud.colors[8])
 

@@ -99,8 +99,8 @@ def test_a_fixed_protocol_learns_from_every_fifth_and_holds_out_the_one_two_afte
     ("settings", "found"),
     [
         ({"holdout_offset": 8}, "beyond the first"),
-        ({"holdout_offset": -1}, "too small"),
-        ({"train_every": -1}, "too small"),
+        ({"holdout_offset": -1}, "at least 0"),
+        ({"train_every": -1}, "at least 0"),
     ],
 )
 def test_protocols_that_make_no_sense_are_refused(settings: dict[str, int], found: str) -> None:

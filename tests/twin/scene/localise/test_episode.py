@@ -118,5 +118,5 @@ def test_a_derived_episode_is_kept_until_its_settings_change(episode: Episode, t
     first = path.stat().st_mtime_ns
     assert write_localised(run, episode, task).stat().st_mtime_ns == first
     content = path.read_bytes()
-    assert write_localised(run, episode, task, force=True).stat().st_mtime_ns > first
-    assert path.read_bytes() == content  # same input, same bytes
+    path.unlink()
+    assert write_localised(run, episode, task).read_bytes() == content  # same input, same bytes

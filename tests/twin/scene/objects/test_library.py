@@ -114,7 +114,7 @@ def views() -> dict[str, list[TrainingView]]:
 
 def localised(key: str, T: np.ndarray) -> LocalisedObject:
     return LocalisedObject(
-        object_id=key, found=True, T_base_object=T, covariance=None, confidence=1.0,
+        object_id=key, T_base_object=T, covariance=None, confidence=1.0,
         method="given", reason=None, stamp_ns=1,
     )  # fmt: skip
 

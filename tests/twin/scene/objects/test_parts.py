@@ -41,7 +41,7 @@ def written(tmp_path: Path) -> tuple[RunFolder, dict, GaussianCloud, np.ndarray]
     T = se3.transform_from(np.array([0.97, 0, 0, 0.24]), np.array([0.5, -0.1, 0.02]))
     cloud, task = cube_on_table(T), load_task("cube_into_box")
     found = LocalisedObject(
-        object_id="cube", found=True, T_base_object=T, covariance=None, confidence=1.0,
+        object_id="cube", T_base_object=T, covariance=None, confidence=1.0,
         method="given", reason="", stamp_ns=1,
     )  # fmt: skip
     cube = LibraryObject(

@@ -74,7 +74,7 @@ def library_object(key: str, shape: ObjectShape | str) -> LibraryObject:
 
 def localised(key: str) -> LocalisedObject:
     return LocalisedObject(
-        object_id=key, found=True, T_base_object=POSES[key], covariance=None, confidence=1.0,
+        object_id=key, T_base_object=POSES[key], covariance=None, confidence=1.0,
         method="given", reason=None, stamp_ns=1,
     )  # fmt: skip
 

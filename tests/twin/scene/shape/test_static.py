@@ -75,9 +75,7 @@ def test_the_static_scene_is_read_back_and_described(static: StaticSdf, tmp_path
     np.testing.assert_array_equal(again.observed.values_m, static.observed.values_m)
     assert again.table_z_m == 0.0
     assert not SdfGrid.load(path).closed
-    about = static.to_record()
-    assert about["free"] + about["surface"] + about["unseen"] == pytest.approx(1.0, abs=1e-3)
-    assert about["truncation_m"] == pytest.approx(3 * about["voxel_m"])
+    assert static.truncation_m == pytest.approx(3 * static.conservative.voxel_m)
 
 
 def test_an_observed_distance_that_is_not_finite_is_refused(
