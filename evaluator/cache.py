@@ -61,13 +61,7 @@ def code_version() -> bytes:
     return digest.digest()
 
 
-def _to_plain(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(type(value).__name__)
-
-
-packed = msgspec.msgpack.Encoder(enc_hook=_to_plain).encode
+packed = msgspec.msgpack.Encoder(enc_hook=np.generic.item).encode
 """As msgpack; numbers of NumPy become plain ones."""
 _rows_of = msgspec.msgpack.Decoder(Rows).decode
 
@@ -88,8 +82,7 @@ def read_rows(path: Path) -> Rows:
     data = path.read_bytes()
     head, body = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
     if head != _digest(body):
-        message = f"{path.name} is damaged, or another version of this program wrote it"
-        raise ValueError(message)
+        raise ValueError(f"{path.name} is damaged, or another version of this program wrote it")
     return _rows_of(body)
 
 

@@ -84,8 +84,8 @@ def evaluate(
             from evaluator.report.review import index_run
 
             index_run(RunFolder(*sources), comparison, results, began_ns)
-        record = results.to_record() if output.json else {}  # of a large run it takes a second
-        output.result(record, summary_text(results, written))
+        # Of a large run the record takes a second.
+        output.result(results.to_record() if output.json else {}, summary_text(results, written))
         failed = missed(thresholds, results)
         for item in published.failed if published else ():
             where = "" if item.row is None else f"row {item.row}: "
@@ -124,8 +124,7 @@ def _compare(
     has_others = source.is_dir() and not is_run(source) and any(source.iterdir())
     if len(sources) > 1 or source.is_file() or has_others:
         if images != IMAGES:
-            message = "images go with one run folder, or with --reference and no table."
-            raise UsageError(message)
+            raise UsageError("images go with one run folder, or with --reference and no table.")
         beside = source.with_name(f"{source.stem}_results") if source.name else Path("results")
         return compare_several(sources, options=tables, output=output), beside
     run = RunFolder.open(source)

@@ -7,11 +7,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def without_collecting() -> Iterator[None]:
-    """Let only reference counts free memory, as long as the block lasts.
+    """Let only reference counts free memory, as long as the block lasts, which must end.
 
-    An evaluation makes frozen records by the million and drops them all at its end. Looking for
-    cycles among them took a fifth of its time. For blocks that end: what follows a session does
-    not use it.
+    An evaluation makes frozen records by the million; looking for cycles took a fifth of its time.
     """
     was_on = gc.isenabled()
     gc.disable()

@@ -16,8 +16,9 @@ def slug(text: str) -> str:
     Letters beyond ASCII are written as their code points, so that names in any script stay apart.
     Blanks and signs become ``_``, so that names may still share one: ``refuse_alike``.
     """
-    plain = text if text.isascii() else "".join(c if c.isascii() else _code(c) for c in text)
-    return re.sub(r"[^A-Za-z0-9_+-]+", "_", plain) or "-"
+    if not text.isascii():
+        text = "".join(c if c.isascii() else f"+{ord(c):04x}" for c in text)
+    return re.sub(r"[^A-Za-z0-9_+-]+", "_", text) or "-"
 
 
 PLURALS = {"pair of runs": "pairs of runs", "policy": "policies"}
@@ -26,10 +27,6 @@ PLURALS = {"pair of runs": "pairs of runs", "policy": "policies"}
 def noun(name: str, count: int) -> str:
     """Write what was counted, in the plural but for one."""
     return name if count == 1 else PLURALS.get(name, f"{name}s")
-
-
-def _code(letter: str) -> str:
-    return f"+{ord(letter):04x}"
 
 
 @dataclass(frozen=True, kw_only=True)

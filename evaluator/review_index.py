@@ -344,8 +344,7 @@ class ReviewIndex:
             UnusableIndexError: When it is not there, damaged, or of another version.
         """
         try:
-            data = source if isinstance(source, bytes) else source.read_bytes()
-            content = _decode(data)
+            content = _decode(source if isinstance(source, bytes) else source.read_bytes())
         except (OSError, ValueError) as error:
             raise UnusableIndexError(str(error)) from error
         if (content.version, content.software) != (VERSION, software()["version"]):

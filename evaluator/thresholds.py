@@ -43,18 +43,17 @@ def _parse(part: str) -> Threshold:
     except ValueError as error:
         message = f"--fail-under {part!r} is not a number; write 0.8, r=0.8 or ID=0.8."
         raise UsageError(message) from error
+    wrong = ""
     if not math.isfinite(limit):
-        message = f"--fail-under {part!r} is no limit that anything can reach or miss."
-        raise UsageError(message)
-    if name == "agreement" and not 0 <= limit <= 1:
-        message = f"--fail-under {limit} is not a fraction from 0 to 1, for example 0.8."
-        raise UsageError(message)
-    if "." not in name and name not in SHORT:
-        message = f"--fail-under knows no {name!r}; there are: {', '.join(SHORT)}, and every id."
-        raise UsageError(message)
-    if name in SHORT and name != "psnr" and abs(limit) > 1:
-        message = f"--fail-under {part!r} can never be reached: {name} is at most 1."
-        raise UsageError(message)
+        wrong = f"{part!r} is no limit that anything can reach or miss"
+    elif name == "agreement" and not 0 <= limit <= 1:
+        wrong = f"{limit} is not a fraction from 0 to 1, for example 0.8"
+    elif "." not in name and name not in SHORT:
+        wrong = f"knows no {name!r}; there are: {', '.join(SHORT)}, and every id"
+    elif name in SHORT and name != "psnr" and abs(limit) > 1:
+        wrong = f"{part!r} can never be reached: {name} is at most 1"
+    if wrong:
+        raise UsageError(f"--fail-under {wrong}.")
     return Threshold(name=name, id=SHORT.get(name, name), limit=limit)
 
 
@@ -72,6 +71,6 @@ def missed(thresholds: Sequence[Threshold], results: Results) -> list[str]:
             continue
         else:
             shown = f"{measurement.value:.4g}"
-        name = "Agreement of sim and outcome" if threshold.name == "agreement" else threshold.name
+        name = "Agreement of twin and outcome" if threshold.name == "agreement" else threshold.name
         found.append(f"{name} is {shown}; the threshold is {threshold.limit:g}.")
     return found

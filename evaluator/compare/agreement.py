@@ -6,22 +6,12 @@ from fractions import Fraction
 from functools import partial
 from typing import Any
 
+from evaluator import measurements
 from evaluator.cache import SummaryCache
 from evaluator.compare.measure import grouped, measured, percent
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.success import of_group
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import (
-    BIAS,
-    BLIND_GROUP,
-    BLIND_SHARE,
-    MAE,
-    MMRV_RECORDED,
-    PEARSON_R,
-    PEARSON_R_OF_CONDITION,
-    SPEARMAN,
-    Defined,
-)
 from evaluator.result import Interval, Measurement
 from evaluator.statistics import agreement
 from evaluator.statistics.agreement import counted_groups
@@ -118,18 +108,20 @@ def group_agreement(
         reason_without_interval="it is of these groups; r and the bias have intervals over others",
     )
     return [
-        _over_others(PEARSON_R.of(what=what), usable, model, "r"),
+        _over_others(measurements.PEARSON_R.of(what=what), usable, model, "r"),
         *_by_condition(usable, cache),
-        make(SPEARMAN.of(what=what), lambda: agreement.spearman(recorded, sim)),
-        _over_others(BIAS.of(what=what), usable, model, "bias"),
-        make(MAE.of(what=what), lambda: 100 * agreement.mean_absolute_error(**both)),
-        make(MMRV_RECORDED.of(what=what), lambda: agreement.mmrv(**both, gap="recorded")),
+        make(measurements.SPEARMAN.of(what=what), lambda: agreement.spearman(recorded, sim)),
+        _over_others(measurements.BIAS.of(what=what), usable, model, "bias"),
+        make(measurements.MAE.of(what=what), lambda: 100 * agreement.mean_absolute_error(**both)),
+        make(
+            measurements.MMRV_RECORDED.of(what=what), lambda: agreement.mmrv(**both, gap="recorded")
+        ),
         *_blind(usable, model),
     ]
 
 
 def _over_others(
-    defined: Defined, groups: Sequence[RateGroup], model: Fitted | str, statistic: str
+    defined: measurements.Defined, groups: Sequence[RateGroup], model: Fitted | str, statistic: str
 ) -> Measurement:
     recorded, sim = sides(groups)
     interval = None if isinstance(model, str) else getattr(model, statistic)
@@ -153,7 +145,9 @@ def _by_condition(groups: Sequence[RateGroup], cache: SummaryCache) -> list[Meas
     conditions = grouped(groups, lambda group: group.condition)
     found = []
     for name, mine in conditions.items() if len(conditions) > 1 else ():
-        defined = PEARSON_R_OF_CONDITION.of(what=f"over groups {name} only", condition=name)
+        defined = measurements.PEARSON_R_OF_CONDITION.of(
+            what=f"over groups {name} only", condition=name
+        )
         found.append(_over_others(defined, mine, _fitted(mine, cache), "r"))
     return found
 
@@ -162,10 +156,12 @@ def _blind(groups: Sequence[RateGroup], model: Fitted | str) -> list[Measurement
     """In how many groups of this kind the twin is blind, and which of these probably are."""
     if isinstance(model, str):
         return []
-    share = measured(BLIND_SHARE.of(), lambda: model.blind_share, n=len(groups), counted="group")
+    share = measured(
+        measurements.BLIND_SHARE.of(), lambda: model.blind_share, n=len(groups), counted="group"
+    )
     likely = [
         measured(
-            of_group(BLIND_GROUP, (group.task, group.condition, group.policy)),
+            of_group(measurements.BLIND_GROUP, (group.task, group.condition, group.policy)),
             partial(float, chance),
             n=(group.recorded.n or 0) + (group.sim.n or 0),
             counted="trial",

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from evaluator.compare.agreement import usable_groups
 from evaluator.compare.measure import ends, grouped
 from evaluator.compare.rows import RateGroup, TrialRow
-from evaluator.result import Cell, Interval, Table
+from evaluator.result import Cell, Table
 from evaluator.statistics.differences import points_of
 from evaluator.statistics.sequential import Stratum
 
@@ -20,20 +20,22 @@ def conclusions_table(
 
     The bias is of pairs, else of both sides' own trials, over a task's groups.
     """
-    usable = usable_groups(groups)
-    tasks = grouped(usable, lambda group: group.task)
+    tasks = grouped(usable_groups(groups), lambda group: group.task)
     if not tasks or len(tasks) > MOST_TASKS:
         return ()
     lines = [_line(task, members, rows) for task, members in tasks.items()]
     note = (
-        "Bias: sim minus recorded, mean of the task's groups. A yes: trials in which sim said "
-        "success, and those that then succeeded; beside it what succeeded whatever sim said."
+        "Bias: twin minus recorded, mean of the task's groups. A yes: trials in which it said "
+        "success, and those that then succeeded; beside it what succeeded whatever it said."
     )
     return (Table.of(lines, id="conclusions", title="What it means, task by task", note=note),)
 
 
 def _line(task: str, members: Sequence[RateGroup], rows: Sequence[TrialRow]) -> dict[str, Cell]:
-    bias, interval = _bias(members)
+    bias = 100 * sum(float(group.gap or 0) for group in members) / len(members)
+    known, interval = [each for each in map(_counted, members) if each is not None], None
+    if len(known) == len(members):
+        bias, interval = points_of(known)
     judged = [r for r in rows if r.task == task and None not in (r.sim_planned, r.recorded)]
     accepted = [row for row in judged if row.sim_planned]
     return {
@@ -47,12 +49,6 @@ def _line(task: str, members: Sequence[RateGroup], rows: Sequence[TrialRow]) -> 
         "succeeded": sum(bool(r.recorded) for r in judged) if accepted else None,
         "trials": len(judged) if accepted else None,
     }
-
-
-def _bias(members: Sequence[RateGroup]) -> tuple[float, Interval | None]:
-    value = 100 * sum(float(group.gap or 0) for group in members) / len(members)
-    known = [each for each in map(_counted, members) if each is not None]
-    return (value, None) if len(known) < len(members) else points_of(known)
 
 
 def _counted(group: RateGroup) -> Stratum | None:

@@ -224,6 +224,7 @@ def _runs(
         info, topics_of = episode.info, object_pose_topics(episode)
         objects = {name: pose_track(episode, topic) for name, topic in topics_of.items()}
         moving = {name: each for name, each in objects.items() if len(each) > 1}
+        named = () if derived is None else derived.settings.get(FITTED_TO)
         runs.append(
             Run(
                 episode=episode.path.stem if derived and derived.source_episode else info.id,
@@ -231,16 +232,10 @@ def _runs(
                 engine=engine,
                 bodies={TOOL_BODY: track} | moving,
                 replayed_from=None if derived is None else derived.source_episode or None,
-                fitted_to=_fitted_to(derived),
+                fitted_to=frozenset(map(str, named if isinstance(named, list | tuple) else ())),
             )
         )
     return runs, left_out
-
-
-def _fitted_to(derived: Derived | None) -> frozenset[str]:
-    """Recorded runs from which something was identified that a replay uses."""
-    named = () if derived is None else derived.settings.get(FITTED_TO, ())
-    return frozenset(map(str, named)) if isinstance(named, list | tuple) else frozenset()
 
 
 def _newest(files: Sequence[DerivedFile]) -> list[DerivedFile]:
@@ -249,8 +244,7 @@ def _newest(files: Sequence[DerivedFile]) -> list[DerivedFile]:
     for file in sorted(files, key=lambda file: file.path.stat().st_mtime_ns):
         derived = file.derived
         if file.info.kind == "imported" and derived.kind == "replay" and derived.plan_id is None:
-            source = derived.source_episode or file.name
-            newest[_side_name(derived), source] = file
+            newest[_side_name(derived), derived.source_episode or file.name] = file
     return sorted(newest.values(), key=lambda file: file.name)
 
 

@@ -102,8 +102,7 @@ class _Group:
         if figure is not None and figure.n is not None:
             values |= {"k": str(figure.k), "n": str(figure.n), "rate_percent": figure.number}
         elif figure is not None:
-            unit = "rate_percent" if figure.percent else self.unit or "rate"
-            values[unit] = figure.number
+            values["rate_percent" if figure.percent else self.unit or "rate"] = figure.number
         return SourceRow(path=sheet.path, row=int(row), values=values)
 
 

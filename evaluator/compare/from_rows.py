@@ -49,8 +49,7 @@ def compare_rows(
     has_twin = source == "run" or any(
         each is not None for r in rows for each in (r.sim_planned, r.sim_executed, r.verdict)
     )
-    answers = compare_policies(rows, protocol, void_causes)
-    compared = comparison_part(answers, protocol)
+    compared = comparison_part(compare_policies(rows, protocol, void_causes), protocol)
     stages, stage_tables, other_stages = stage_results(rows)
     measurements = (
         *rates,

@@ -31,9 +31,7 @@ def known_to(rows: Sequence[TrialRow], answer_of: Answer) -> list[TrialRow]:
 
 def confusion_of(rows: Sequence[TrialRow], answer_of: Answer) -> Confusion:
     """Count what was said against what was labelled, over trials where both are known."""
-    return Confusion.of(
-        (bool(answer_of(row)), bool(row.recorded)) for row in known_to(rows, answer_of)
-    )
+    return Confusion.of((bool(answer_of(r)), bool(r.recorded)) for r in known_to(rows, answer_of))
 
 
 def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:

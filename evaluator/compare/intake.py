@@ -70,8 +70,9 @@ def _with_outcome(
 ) -> table_text.TableOptions:
     """Map the one column that is called an outcome, and one of progress and of time, by content."""
     found = [options.map] if options.map else []
+    ended, answer = table_text.ENDED, table_text.answer_of
     for ours, names, is_ours in (
-        ("recorded", table_text.OUTCOME_LIKE, _is_answer),
+        ("recorded", table_text.OUTCOME_LIKE, lambda t: t in ended or answer(t) is not None),
         ("progress", table_text.MEASURED["progress"], is_share),
         ("time_s", table_text.MEASURED["time_s"], is_number),
     ):
@@ -83,10 +84,6 @@ def _with_outcome(
         if all(text in table_text.UNKNOWN or is_ours(text) for text in texts):
             found.append(f"{ours}={named[0]}")
     return replace(options, map=",".join(found))
-
-
-def _is_answer(text: str) -> bool:
-    return text in table_text.ENDED or table_text.answer_of(text) is not None
 
 
 def ranges(rates: Sequence[RateRecord]) -> str:

@@ -17,16 +17,7 @@ from jaxtyping import Float
 from bridge.clock import NS_PER_S
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
-from evaluator.compare.measure import (
-    Part,
-    average,
-    degrees,
-    grouped,
-    mean_of,
-    measured,
-    millimetres,
-    milliseconds,
-)
+from evaluator.compare import measure
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.trajectory import find_lag_s, pose_errors, position_errors
 from evaluator.motion_measurements import MOTIONS
@@ -152,12 +143,12 @@ Groups = Mapping[str, Sequence[MotionSummary]]
 
 
 COLUMNS = (
-    ("lag (ms)", milliseconds, "lag_s"),
-    ("path (mm)", millimetres, "path_mean_m"),
-    ("path, largest (mm)", millimetres, "path_max_m"),
-    ("at equal times (mm)", millimetres, "position_mean_m"),
-    ("end point (mm)", millimetres, "end_point_m"),
-    ("mean angle (deg)", degrees, "rotation_mean_rad"),
+    ("lag (ms)", measure.milliseconds, "lag_s"),
+    ("path (mm)", measure.millimetres, "path_mean_m"),
+    ("path, largest (mm)", measure.millimetres, "path_max_m"),
+    ("at equal times (mm)", measure.millimetres, "position_mean_m"),
+    ("end point (mm)", measure.millimetres, "end_point_m"),
+    ("mean angle (deg)", measure.degrees, "rotation_mean_rad"),
 )
 """Columns of means, their units, and the fields of ``MotionErrors``."""
 
@@ -166,7 +157,7 @@ def group_table(groups: Groups) -> Table:
     """Means of each task and condition."""
     rows: list[dict[str, Cell]] = []
     for name, motions in groups.items():
-        of_group = grouped(motions, attrgetter("task", "condition"))
+        of_group = measure.grouped(motions, attrgetter("task", "condition"))
         rows += [
             {
                 "task": task,
@@ -174,7 +165,7 @@ def group_table(groups: Groups) -> Table:
                 "against": name,
                 "trials": len(members),
                 **{
-                    column: shown(average(members, attrgetter(field)))
+                    column: shown(measure.average(members, attrgetter(field)))
                     for column, shown, field in COLUMNS
                 },
             }
@@ -199,14 +190,14 @@ MEANING = {
 SHARED = "not computed: trials share one calibration"
 
 
-def motion_results(motions: Sequence[MotionSummary]) -> Part:
+def motion_results(motions: Sequence[MotionSummary]) -> measure.Part:
     """Measure recorded against replayed motions, mean over trials, and their errors over time."""
     if not motions:
         reason = "no trial has both a recorded tool pose and a dynamic replay's"
-        return Part(missing=(f"motion errors: no data ({reason})",))
+        return measure.Part(missing=(f"motion errors: no data ({reason})",))
     groups = {name: [m for m in motions if m.against == name] for name in MEANING}
     found = [m for name, members in groups.items() for m in _measure(name, members)]
-    return Part(measurements=tuple(found), tables=(group_table(groups),))
+    return measure.Part(measurements=tuple(found), tables=(group_table(groups),))
 
 
 def _measure(name: str, motions: Sequence[MotionSummary]) -> list[Measurement]:
@@ -217,9 +208,9 @@ def _measure(name: str, motions: Sequence[MotionSummary]) -> list[Measurement]:
         known = [motion for motion in motions if getattr(motion, field) is not None]
         values = list(map(attrgetter(field), known))
         measurements.append(
-            measured(
+            measure.measured(
                 quantity.of(against=name, meaning=MEANING[name], how=how),
-                partial(mean_of, values, "motion error", why),
+                partial(measure.mean_of, values, "motion error", why),
                 n=len(known),
                 counted="trial",
                 reason_without_interval=SHARED,

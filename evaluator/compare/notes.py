@@ -8,23 +8,27 @@ from typing import Any
 from evaluator.compare.agreement import sides, usable_groups
 from evaluator.compare.measure import grouped
 from evaluator.compare.rows import RateGroup
+from evaluator.compare.success import of_group
 from evaluator.compare.trial import Trial
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import BLIND_GROUP
 from evaluator.result import Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 from evaluator.statistics.agreement import within_and_between
 
 Note = tuple[str, str]
 """About what, and the sentence."""
+BLIND_HERE = "blind: the twin's rate says nothing of the recorded one here"
 
 
 def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> list[Note]:
     """Collect what follows from the groups and the numbers alone."""
     by_id = {measurement.id: measurement for measurement in measurements}
     blind = [
-        (name, f"the twin is probably blind here ({m.value:.2f}): {m.definition}")
-        for name, m in by_id.items()
-        if name.startswith("agreement.blind.") and m.value is not None
+        (group.label, f"{BLIND_HERE} (probability {m.value:.2f})")
+        for group in groups
+        if (m := by_id.get(of_group(BLIND_GROUP, (group.task, group.condition, group.policy)).id))
+        if m.value is not None
     ]
     return [*_opposed(groups, by_id), *_units(groups), *blind]
 

@@ -142,8 +142,7 @@ def tries_of(made: Sequence[TrialRow], question: Question) -> list[Try]:
 
 def void_starts(rows: Sequence[TrialRow], void_causes: Sequence[str]) -> list[Exclusion]:
     """Name the trials that enter no comparison, and why: void ones, in a study with their start."""
-    causes = tuple(void_causes)
-    void = [r for r in rows if r.recorded is None and r.why_unknown.startswith(causes)]
+    void = [r for r in rows if r.recorded is None and r.why_unknown.startswith(tuple(void_causes))]
     reasons = {row.episode: f"void: {row.why_unknown}" for row in void}
     starts = {(row.task, row.start_id): row for row in void}
     for row in rows:
@@ -545,8 +544,7 @@ def _measured(answer: Answer) -> Measurement:
         for side in (question.second, question.first)
     )
     parts = {"second": second, "first": first, "words": answer.sentence}
-    quantity = COMPARED_IN_TASK if answer.task else COMPARED
-    defined = quantity.of(**parts, task=answer.task)
+    defined = (COMPARED_IN_TASK if answer.task else COMPARED).of(**parts, task=answer.task)
 
     def compute() -> tuple[float, Interval | None]:
         if not evidence.pairs:

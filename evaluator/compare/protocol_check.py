@@ -115,16 +115,13 @@ def _of_trials(
             if count != planned:
                 kind = "too few trials" if count < planned else "more trials"
                 yield kind, f"{task}, {policy}, {arm}", planned, count
-    other = Counter(
-        ("other task", row.task)
-        if row.task not in starts
-        else (
-            "other policy or arm",
-            f"{row.policy or 'no policy'}, {row.study_arm or row.condition or 'no arm'}",
-        )
-        for row in rows
-        if row.task not in starts or (row.policy, row.study_arm) not in arms
-    )
+    other: Counter[tuple[str, str]] = Counter()
+    for row in rows:
+        who = f"{row.policy or 'no policy'}, {row.study_arm or row.condition or 'no arm'}"
+        if row.task not in starts:
+            other["other task", row.task] += 1
+        elif (row.policy, row.study_arm) not in arms:
+            other["other policy or arm", who] += 1
     for (kind, where), count in sorted(other.items()):
         yield kind, where, "none", f"{count} trials"
 

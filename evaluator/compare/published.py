@@ -102,7 +102,10 @@ def check_published(path: Path, options: TableOptions = AS_SAVED) -> PublishedCh
         findings += [] if finding is None else [finding]
     comparison = compare_records(records, path.stem)
     groups = usable_groups(comparison.groups)
-    halves = {_key_of(record): record.half for record in records}
+    halves: Halves = {
+        (r.task, r.condition, r.policy, "sim" if r.side == "sim" else "recorded"): r.half
+        for r in records
+    }
     findings += [_judge(claim, groups, claims, halves) for claim in claims]
     findings += _not_printed(groups, claims)
     about = [(f.what, f.note) for f in findings if f.note]
@@ -161,11 +164,6 @@ Halves = Mapping[tuple[str, ...], Fraction]
 """How far each rate may lie from the printed one, by task, condition, policy and side."""
 
 
-def _key_of(record: trials_rates.RateRecord) -> tuple[str, ...]:
-    side = "sim" if record.side == "sim" else "recorded"
-    return record.task, record.condition, record.policy, side
-
-
 def _judge(
     claim: _Claim, groups: Sequence[RateGroup], claims: Sequence[_Claim], halves: Halves
 ) -> Finding:
@@ -185,16 +183,14 @@ def _judge(
         verdict, note = AS_PRINTED, ""
     else:
         low, high = _reach(claim, groups, halves)
-        between = f", or from {low:.4g} to {high:.4g} as its rates are rounded"
-        reach = between if high > low else ""
+        reach = f", or from {low:.4g} to {high:.4g} as its rates are rounded" if high > low else ""
         verdict, note = DIFFERS, f"printed {printed}, the rows give {shown}{reach}"
         if low - float(claim.half) <= float(claim.value) <= high + float(claim.half):
             verdict, note = WITHIN, f"the rows give {shown}{reach}"
             claims = ()
         else:
             verdict, note = _fits_otherwise(claim, groups, shown) or (verdict, note)
-        from_rounded = _from_rounded(claim, claims)
-        if from_rounded is not None and _fits(from_rounded, claim):
+        if (rounded := _from_rounded(claim, claims)) is not None and _fits(rounded, claim):
             verdict = ROUNDED
             note = f"{printed} comes from the rounded averages; unrounded it is {shown}"
     return Finding(claim.row.row, what, printed, value, verdict, note)
@@ -220,8 +216,7 @@ def _fits(value: float, claim: _Claim) -> bool:
 
 def _value(statistic: str, side: str, condition: str, groups: Sequence[RateGroup]) -> float:
     """Recompute one statistic from the groups, over one condition or all."""
-    chosen = [group for group in groups if condition in ("", group.condition)]
-    recorded, sim = sides(chosen)
+    recorded, sim = sides([group for group in groups if condition in ("", group.condition)])
     if statistic == "average_percent":
         return 100 * mean_rate(sim if side == "sim" else recorded)
     if statistic in ("gain_pp", "gain_relative_percent"):
@@ -232,10 +227,8 @@ def _value(statistic: str, side: str, condition: str, groups: Sequence[RateGroup
         return pearson(recorded, sim)
     if statistic == "spearman_rho":
         return spearman(recorded, sim)
-    if statistic == "mmrv_sim_gap":
-        return mmrv(recorded=recorded, sim=sim, gap="sim")
-    if statistic == "mmrv":
-        return mmrv(recorded=recorded, sim=sim)
+    if statistic in ("mmrv", "mmrv_sim_gap"):
+        return mmrv(recorded=recorded, sim=sim, gap="recorded" if statistic == "mmrv" else "sim")
     gap = bias(recorded=recorded, sim=sim)  # refuses where there is no group
     gaps = [float(b - a) for a, b in zip(recorded, sim, strict=True)]
     if statistic == "mae_pp":

@@ -106,15 +106,11 @@ def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
     ]
     if not lines:
         return ()
-    table = Table(
-        id="failures",
-        title="What failed first",
-        columns=("side", "clause or stage", "cause", "trials"),
-        rows=tuple(lines),
-        note="In the twin: the first clause of the acceptance indicator that is false. "
-        "Recorded: the first stage labelled a failure.",
-    )
-    return (table,)
+    note = "In the twin: the first clause of the acceptance indicator that is false. "
+    note += "Recorded: the first stage labelled a failure."
+    columns = ("side", "clause or stage", "cause", "trials")
+    title = "What failed first"
+    return (Table(id="failures", title=title, columns=columns, rows=tuple(lines), note=note),)
 
 
 def first_failed_stage(row: TrialRow) -> str:

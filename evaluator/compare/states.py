@@ -138,17 +138,14 @@ def _settled(replay: Episode, wanted: Mapping[str, Any]) -> dict[str, Pose]:
                 last[message.topic] = message
         if len(last) == len(named):
             break
-    return {name: _pose_in(last.get(topics.get(name, ""))) for name in wanted}
-
-
-def _pose_in(message: RawMessage | None) -> Pose:
-    if message is None:
-        return "the replay holds no poses of it"
-    try:
-        T = PoseSample.from_cdr(message.data).T_frame_body
-    except BridgeError as error:
-        return str(error)
-    return T if np.isfinite(T).all() else "its replayed pose is not a number"
+    found: dict[str, Pose] = dict.fromkeys(wanted, "the replay holds no poses of it")
+    for name in (name for name in wanted if topics.get(name) in last):
+        try:
+            T = PoseSample.from_cdr(last[topics[name]].data).T_frame_body
+            found[name] = T if np.isfinite(T).all() else "its replayed pose is not a number"
+        except BridgeError as error:
+            found[name] = str(error)
+    return found
 
 
 def _difference(first: Pose, second: Pose, task: Task | None, name: str) -> dict[str, Any]:

@@ -123,9 +123,7 @@ def rate_groups(rows: Sequence[TrialRow], rates: Sequence[Measurement]) -> tuple
         real, twin = (recorded, sim) if own else (recorded_common, sim_common)
         groups.append(
             RateGroup(
-                task=key[0],
-                condition=key[1],
-                policy=key[2],
+                **dict(zip(("task", "condition", "policy"), key, strict=True)),
                 unit="trial",
                 recorded=recorded,
                 sim=sim,
@@ -151,8 +149,7 @@ def trial_table(
     both: Sequence[TrialRow], answers: Sequence[bool | None]
 ) -> tuple[int, int, int, int]:
     """Count trials in which both succeed, only sim, only recorded, neither."""
-    pairs = zip(both, answers, strict=True)
-    table = Counter((bool(yes), bool(row.recorded)) for row, yes in pairs)
+    table = Counter((bool(yes), bool(row.recorded)) for row, yes in zip(both, answers, strict=True))
     return table[True, True], table[True, False], table[False, True], table[False, False]
 
 

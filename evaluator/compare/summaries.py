@@ -79,12 +79,6 @@ def recorded_task(episode: Episode) -> Task | None:
         return None
 
 
-def _files_of(trial: Trial, plan_id: str) -> _Files:
-    made = {"recorded": trial.file, **trial.replays, "localised": trial.localised}
-    paths = {name: file.path for name, file in made.items() if file is not None}
-    return _Files(episode=trial.row.episode, plan_id=plan_id, paths=paths)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Part:
     kind: type[Any]
@@ -130,7 +124,10 @@ def sum_up(
         kept = {part.kind: cache.find(part.kind, part.key(hashes)) for part in PARTS}
         parts = tuple(part for part in PARTS if kept[part.kind] is None)
         if parts:
-            unknown.append((trial, (_files_of(trial, trial.row.plan_id), parts)))
+            made_of = {"recorded": trial.file, **trial.replays, "localised": trial.localised}
+            paths = {name: file.path for name, file in made_of.items() if file is not None}
+            files = _Files(episode=trial.row.episode, plan_id=trial.row.plan_id, paths=paths)
+            unknown.append((trial, (files, parts)))
         for kind, known in kept.items():
             found[kind] += known or ()
     left_out: list[Exclusion] = []

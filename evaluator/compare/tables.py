@@ -11,11 +11,10 @@ EXECUTED = "executed in twin"
 """The twin's side of a group in which nobody published a plan."""
 EXECUTED_NOTE = "executed in twin: the recorded joints, replayed dynamically; there was no plan."
 SIM_NOTE = (
-    "sim: planned-in-twin, dynamic, of the plan actually sent, replayed from the start localised "
-    "again in the recording. With replanning the twin selected the accepted plans, so their sim is "
-    "optimistic by that selection: the replay has the gate's engine and nominal physics and draws "
-    "nothing new. "
-    "A trial in which no plan was sent has an outcome and no sim."
+    "twin: the plan actually sent, replayed with physics from the start localised again in the "
+    "recording. With replanning the twin selected the accepted plans, so its rate is optimistic by "
+    "that selection: the replay has the gate's engine and nominal physics and draws nothing new. "
+    "A trial in which no plan was sent is recorded only."
 )
 UNPAIRED_NOTE = "Each side counts its own trials; none was made on both."
 METHOD_NAMES = {
@@ -41,8 +40,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
     twin = not source_note or any(group.shown_sim.value is not None for group in groups)
     paired = any(group.trial_table is not None for group in groups)
     one_sided = any(group.sim.n for group in groups) and not paired
-    without_plans = all(group.executed is not None for group in groups)
-    note = EXECUTED_NOTE if without_plans else SIM_NOTE
+    note = EXECUTED_NOTE if all(group.executed is not None for group in groups) else SIM_NOTE
     parts = [source_note or (UNPAIRED_NOTE if one_sided else note), _brackets(groups)]
     if paired:
         parts.append("The difference is over trials where both sides are known.")
@@ -89,7 +87,7 @@ def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
             )
             for row in rows
         ),
-        note="sim executed is diagnosis only. Empty: unknown, undecided or not there; the "
+        note="twin executed is diagnosis only. Empty: unknown, undecided or not there; the "
         "exclusions say which.",
     )
 

@@ -118,15 +118,9 @@ def _row(
     return TrialRow(
         episode=info.id,
         file=file.file_name,
-        task=info.task,
         condition=treatment_of(info.condition, info.study_arm),
-        study_arm=info.study_arm,
         why_unknown=(detail or UNLABELLED) if result in (None, "unknown") else "",
-        policy=info.policy,
-        checkpoint=info.checkpoint,
-        start_id=info.start_id,
-        cell=info.cell,
-        stand_in=info.stand_in,
+        **{name: getattr(info, name) for name in _OF_INFO},
         recorded=_ANSWERS.get(result),
         unit="trial" if outcome is None else outcome.unit,
         k=outcome.k if outcome is not None and counted else None,
@@ -141,10 +135,7 @@ def _row(
         sim_executed=found["executed"].accepted,
         verdict=None if verdict is None else verdict.accepted,
         p_success=next((p for p in probabilities if p is not None), None),
-        first_failing=None if failing is None else failing.first_failing,
-        failing_detail=None if failing is None else failing.failing_detail,
-        failing_cause=None if failing is None else failing.failing_cause,
-        failing_bodies=() if failing is None else failing.failing_bodies,
+        **{} if failing is None else {name: getattr(failing, name) for name in _OF_FAILURE},
         failing_stage=_stage_at(facts, None if failing is None else failing.failing_t_ns),
         stages=_stages(outcome),
         planned_replay=replays["planned"].file_name if "planned" in replays else None,
@@ -155,6 +146,9 @@ def _row(
     )
 
 
+_OF_INFO = ("task", "study_arm", "policy", "checkpoint", "start_id", "cell", "stand_in")
+_OF_FAILURE = ("first_failing", "failing_detail", "failing_cause", "failing_bodies")
+"""Fields of a row that what it is made from calls by the same name."""
 _ANSWERS: dict[str | None, bool] = {"success": True, "failure": False}
 
 

@@ -207,8 +207,7 @@ def order_list(protocol: Protocol) -> bytes:
     for trial in protocol.order():
         code = protocol.code_of(trial.policy, trial.arm)
         treatment = (code, "") if code else (trial.policy, CONDITION_OF_ARM[trial.arm])
-        name = f"trial_{trial.number:04d}"
-        writer.writerow([name, trial.task, trial.start_id, *treatment, ""])
+        writer.writerow([f"trial_{trial.number:04d}", trial.task, trial.start_id, *treatment, ""])
     return text.getvalue().encode()
 
 

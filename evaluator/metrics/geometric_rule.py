@@ -63,7 +63,8 @@ def judge_by_geometry(
     Ts_base_tcp = se3.transform_from(plan.quaternions_wxyz(), plan.positions_m())
     before = Ts_base_tcp[0]
     for waypoint, T_base_tcp in zip(plan.tau, Ts_base_tcp, strict=True):
-        pushed = _pushed(plan, waypoint.t_ns)
+        at = (s.push for s in plan.stages if s.t_start_ns <= waypoint.t_ns <= s.t_end_ns)
+        pushed = next(filter(None, at), "")
         if held is not None:
             poses[held[0]] = T_base_tcp @ held[1]
         if pushed in poses and waypoint.g:
@@ -75,8 +76,7 @@ def judge_by_geometry(
         elif waypoint.g and not closed:
             name = _nearest(poses, task, T_base_tcp)
             T_tcp_object = se3.invert(T_base_tcp) @ poses[name]
-            problem = _grasp_problem(task.objects[name], T_tcp_object, open_m)
-            if problem:
+            if problem := _grasp_problem(task.objects[name], T_tcp_object, open_m):
                 return RuleAnswer(value=False, detail=f"grasp of {name}: {problem}")
             held = (name, _centred(task.objects[name], T_tcp_object))
         elif closed and not waypoint.g and held is not None:
@@ -86,12 +86,6 @@ def judge_by_geometry(
         if not closed:
             open_m = waypoint.width_m
     return _final_answer(task, poses)
-
-
-def _pushed(plan: Plan, t_ns: int) -> str:
-    """The object that the stage at a time pushes; empty where it pushes none."""
-    stages = (stage for stage in plan.stages if stage.t_start_ns <= t_ns <= stage.t_end_ns)
-    return next((stage.push for stage in stages if stage.push), "")
 
 
 def _carried_along(

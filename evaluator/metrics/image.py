@@ -198,13 +198,6 @@ SWAP_LEAST_DB = 15.0
 class SwappedColourError(EvaluatorError):
     """Red and blue of one of two images have changed places."""
 
-    def __init__(self, *, as_it_is_db: float, swapped_db: float) -> None:
-        """Remember both numbers."""
-        super().__init__(
-            f"red and blue look swapped (PSNR {as_it_is_db:.1f} dB as it is, {swapped_db:.1f} dB "
-            "with the channels reversed). Write it as RGB; OpenCV writes and reads BGR."
-        )
-
 
 def refuse_swapped(
     recorded: Float[np.ndarray, "height width 3"],
@@ -217,8 +210,11 @@ def refuse_swapped(
     limit = as_it_is * 10.0 ** (-SWAP_MARGIN_DB / 10.0)
     if as_it_is > 0 and swapped <= min(limit, 10.0 ** (-SWAP_LEAST_DB / 10.0)):
         # An exact likeness has no PSNR; 100 dB is far below what 8 bits can tell.
-        decibel = [-10.0 * math.log10(max(error, 1e-10)) for error in (as_it_is, swapped)]
-        raise SwappedColourError(as_it_is_db=decibel[0], swapped_db=decibel[1])
+        now, then = (-10.0 * math.log10(max(error, 1e-10)) for error in (as_it_is, swapped))
+        raise SwappedColourError(
+            f"red and blue look swapped (PSNR {now:.1f} dB as it is, {then:.1f} dB with the "
+            "channels reversed). Write it as RGB; OpenCV writes and reads BGR."
+        )
 
 
 DEPTH_PROTOCOL = (

@@ -35,8 +35,7 @@ class ImageOptions:
     def refuse_unused(self) -> None:
         """Refuse a reference or a split without any renders: nothing would be compared with it."""
         if not self.renders and (self.reference or self.split != UNSTATED):
-            message = "--reference and --split belong to --renders METHOD=FOLDER."
-            raise UsageError(message)
+            raise UsageError("--reference and --split belong to --renders METHOD=FOLDER.")
 
     def methods(self) -> dict[str, Path]:
         """Return the folders of renders by method; a folder alone is named after itself."""

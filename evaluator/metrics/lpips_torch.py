@@ -97,8 +97,7 @@ def _loaded(path: Path) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         # Its message tells how to load pickles after all, which runs their code.
-        message = "it holds more than tensors, or is no torch file"
-        raise ValueError(message) from error
+        raise ValueError("it holds more than tensors, or is no torch file") from error
 
 
 def read_heads() -> tuple[list[Float[Tensor, "_channels 1 1"]], str]:

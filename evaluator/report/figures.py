@@ -11,6 +11,7 @@ from html import escape
 from bridge.media import palette
 from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.compare.success import WITH
+from evaluator.report.views import shown_word
 from evaluator.result import Measurement
 
 NAMES = {"soft": "quiet", "line": "edge", "sim": "twin-planned"}
@@ -48,8 +49,7 @@ class Drawing:
     def svg(self) -> str:
         """A file of its own, in the colours of print."""
         style = '<style>text{font:12px "DejaVu Sans",Arial,sans-serif}</style>'
-        attributes = 'xmlns="http://www.w3.org/2000/svg"'
-        return self._written(attributes, style, LIGHT)
+        return self._written('xmlns="http://www.w3.org/2000/svg"', style, LIGHT)
 
     @property
     def inline(self) -> str:
@@ -72,7 +72,7 @@ class Drawing:
 
 def drawings_of(comparison: Comparison) -> list[Drawing]:
     """Return the figures that have data, in the order of the report."""
-    groups, word = comparison.groups, comparison.recorded_word
+    groups, word = comparison.groups, shown_word(comparison.recorded_word)
     return [each for each in (success(groups, word), scatter(groups, word)) if each is not None]
 
 
@@ -84,10 +84,14 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | None:
     shown = known[:MOST]
     bottom = 40 + 52 * len(shown)
     has_twin = any(group.shown_sim.value is not None for group in known)
-    marks = [*_axis(12, 340, bottom, 30), *(_key(word) if has_twin else ())]
+    marks = [*_axis(12, 340, bottom, 30)]
+    if has_twin:
+        marks += ('<circle cx="17" cy="16" r="5" fill="{sim}"/>', _text(28, 20, "twin", "ink"))
+        marks.append('<rect x="78" y="11" width="10" height="10" fill="{rec}"/>')
+        marks.append(_text(94, 20, word, "ink"))
     for index, group in enumerate(shown):
         y = 50 + 52 * index
-        marks.append(_text(12, y, _words(group.task, group.condition, group.policy), "ink"))
+        marks.append(_text(12, y, group.label, "ink"))
         marks += _rate(group.shown_sim, y + 14, "sim") if has_twin else ()
         marks += _rate(group.recorded, y + 30, "rec")
     more = len(known) - len(shown)
@@ -96,7 +100,7 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | None:
     return Drawing(
         id="success",
         title=f"Success rates in the twin and {word}" if has_twin else f"Success rates, {word}",
-        caption=f"{f'Circle: {side}-in-twin; square' if has_twin else 'Square'}: as labelled. Bars "
+        caption=f"{f'Circle: {side}-in-twin; square' if has_twin else 'Square'}: {word}. Bars "
         f"are 95 % intervals; the counts stand at the right.{rest}",
         alt=_alt("Rates", word, [(g.label, g.shown_sim, g.recorded) for g in known]),
         height=bottom + 42,
@@ -162,11 +166,6 @@ def _axis(left: int, side: int, y: int, top: int, name: str = "success rate (%)"
     yield _text(left + side / 2, y + 34, name, "ink", "middle")
 
 
-def _key(word: str) -> Iterable[str]:
-    yield '<circle cx="17" cy="16" r="5" fill="{sim}"/>' + _text(28, 20, "twin", "ink")
-    yield '<rect x="78" y="11" width="10" height="10" fill="{rec}"/>' + _text(94, 20, word, "ink")
-
-
 def _rate(rate: Measurement, y: Px, name: str) -> Iterable[str]:
     if rate.value is None:
         yield _text(12, y + 4, "undefined", "soft")
@@ -193,10 +192,6 @@ def _text(x: Px, y: Px, text: str, name: str, anchor: str = "start") -> str:
         f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{{{name}}}">'
         f"{escape(text)}</text>"
     )
-
-
-def _words(*parts: str) -> str:
-    return ", ".join(part.replace("_", " ") for part in parts if part)
 
 
 def _counted(rate: Measurement) -> str:

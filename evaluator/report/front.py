@@ -1,10 +1,12 @@
 """The first two pages: what an evaluation means, in one line per task, before any table."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from evaluator.compare.agreement import says_nothing
 from evaluator.compare.conclusions import direction
+from evaluator.compare.notes import BLIND_HERE
 from evaluator.compare.policies import ALL_TASKS
 from evaluator.quantity import noun
 from evaluator.report.sections import HEADLINES
@@ -23,10 +25,14 @@ LONGEST = 150
 LONGEST_NOTE = 260
 CLOSE_PP = 10.0
 """A bias smaller than this does not change what one does with a rate [percentage points]."""
+FOLLOWS_R = 0.5
+"""Where r is surely below this, the twin's rates tell less than a quarter of what differs."""
 SIMPSON = "Simpson's paradox"
 """What the report begins with, where a note says it."""
 SAYS_NOTHING = "says nothing"
 """Said of r by a note, which the first page does not say twice."""
+TAKE = "take "
+"""How a step begins after which no trial is needed."""
 FIGURES = ("scatter", "success")
 """The picture beside the sentences: the first that was drawn."""
 Row = Mapping[str, Cell]
@@ -39,7 +45,9 @@ class Front:
     sentences: Sequence[str]
     """Over all tasks."""
     next_step: str
-    """What to run next; empty where nothing would settle more."""
+    """What to do next; empty where nothing would settle more."""
+    command: str
+    """What to type once it is done; empty where nothing is to be tried."""
     tasks: Sequence[tuple[str, str]]
     """Task and sentence."""
     more_tasks: int
@@ -53,25 +61,26 @@ def front(results: Results) -> Front:
     """Write the first page of some results."""
     rows = rows_of(results, "conclusions")
     about = [(str(row["about"]), str(row["note"])) for row in rows_of(results, "notes")]
-    missing = [text for text in results.missing if not text.startswith("figures without data")]
     opposed = [text for _, text in about if SIMPSON in text]
     told = _summary(results, len(rows))
     about = [
         (name, text)
         for name, text in about
-        if text not in opposed and not (SAYS_NOTHING in text and SAYS_NOTHING in " ".join(told))
+        if text not in opposed and BLIND_HERE not in text
+        if not (SAYS_NOTHING in text and SAYS_NOTHING in " ".join(told))
     ]
     return Front(
-        sentences=[*_compared(results), *(f"{t}." for t in opposed), *told],
-        next_step=next_trials(results),
+        sentences=[*_trust(results), *_compared(results), *(f"{t}." for t in opposed), *told],
+        next_step=(step := next_trials(results)),
+        command=_again(results) if step and not step.startswith(TAKE) else "",
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[
             (HEADLINES.get(name, name.replace("_", " ")), _short(text, LONGEST_NOTE))
             for name, text in about[:2]
         ],
-        missing=[_short(text) for text in missing[:SHOWN_MISSING]],
-        more_missing=max(0, len(missing) - SHOWN_MISSING),
+        missing=[_short(text) for text in results.missing[:SHOWN_MISSING]],
+        more_missing=max(0, len(results.missing) - SHOWN_MISSING),
     )
 
 
@@ -96,8 +105,10 @@ def _compared(results: Results) -> list[str]:
         return [alike]
     regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
     if regret is not None and regret.value is not None:
-        ends = _ends(regret, ".0f")
-        found.append(f"Taking what sim ranks first costs {_points(regret.value)}{ends}.")
+        lost = f"{_points(regret.value)} of success against the best one{_ends(regret, '.0f')}"
+        found.append(
+            f"If you take the {regret.counted} that the twin ranks first, you lose {lost}."
+        )
     return found
 
 
@@ -115,10 +126,9 @@ def _standing(results: Results) -> tuple[list[str], list[str]]:
         listed = ", ".join(str(row["candidate"]) for row in best[:SHOWN_TASKS])
         more = " ..." if len(best) > SHOWN_TASKS else ""
         return [f"{len(best)} of {len(rows)} candidates may be best: {listed}{more}."], beaten
-    counts = " ".join(f"with {row['k']} of {row['n']}" for row in best)
-    name = best[0]["candidate"]
-    words = f"{name} is best of {len(rows)} candidates, {counts}: every other one is shown to be "
-    return [f"{words}worse than another; stop here."], beaten
+    words = " ".join(f"{row['candidate']} ({row['k']} of {row['n']})" for row in best)
+    words += f" is the best of {len(rows)} candidates: each of the others lost a comparison"
+    return [f"{words}; stop here."], beaten
 
 
 def rows_of(results: Results, table_id: str) -> list[Row]:
@@ -154,32 +164,94 @@ def answer(row: Row) -> str:
 
 
 def next_trials(results: Results) -> str:
-    """Name the comparison that the fewest trials are likely to decide; empty where none is open.
+    """Say what to try, take or record next, and how much of it; empty where nothing is open.
 
-    Candidates that are shown to be worse than another are left out. Where all trials ended alike
-    it is what would tell candidates apart.
+    It is what the fewest trials are likely to decide between candidates that may still be best.
+    Where all trials ended alike it is what would tell candidates apart.
     """
     if step := _all_alike(results)[1]:
         return step
     _, beaten = _standing(results)
-    wanted = [
-        (more, _pair(str(row.get("first", "one")), str(row.get("second", "another"))))
+    asked = [
+        (row, (str(row.get("first", "one")), str(row.get("second", "another"))))
         for row in rows_of(results, "comparisons")
-        if row["task"] == ALL_TASKS and row["decided"] == "no"
-        if not {row.get("first"), row.get("second")} & {*beaten}
+    ]
+    of_all = [(row, pair) for row, pair in asked if row["task"] == ALL_TASKS]
+    wanted = [
+        (more, pair)
+        for row, pair in of_all
+        if row["decided"] == "no" and not {*pair} & {*beaten}
         if isinstance(more := row["more trials of each"], int) and more > 0
     ]
     if not wanted:
-        return ""
+        return _settled([row for row, _ in of_all], rows_of(results, "standing"))
     more, pair = min(wanted)
-    return f"{more} more {noun('trial', more)} of each would likely decide {pair}."
+    tasks = sum(each == pair for _, each in asked) - 1
+    split = f" (in total: {-(-more // tasks)} on each of {tasks} tasks)" if tasks > 1 else ""
+    parts = [both for both in zip(*(n.split(", ") for n in pair), strict=False) if len({*both}) > 1]
+    differ = " and ".join(map(", ".join, zip(*parts, strict=True)))  # without what they share
+    words = f"try {differ} {more} more {noun('time', more)} each{split}"
+    return f"{words}; that would likely decide between them."
 
 
-def _pair(first: str, second: str) -> str:
-    """Name two candidates by what they do not share."""
-    parts = [*zip(first.split(", "), second.split(", "), strict=False)]
-    differ = [pair for pair in parts if pair[0] != pair[1]]
-    return " against ".join(map(", ".join, zip(*differ, strict=True)))
+def _settled(compared: Sequence[Row], standing: Sequence[Row]) -> str:
+    """Say what to take where one candidate is better than all others."""
+    best = [str(row["candidate"]) for row in standing if row["may be best"] == "yes"]
+    if len(compared) == 1 and compared[0]["decided"] != "no":
+        best = [str(compared[0]["second" if compared[0]["decided"] == "better" else "first"])]
+    return f"{TAKE}{best[0]}; no more trials are needed to choose." if len(best) == 1 else ""
+
+
+def _again(results: Results) -> str:
+    """Return what to type once further trials are recorded, or stand in the table."""
+    name = shlex.quote(results.run)
+    if results.source == "run":
+        return f"robot-gst replay {name} && robot-gst evaluate {name}"
+    return f"robot-gst evaluate {shlex.join(results.provenance.get('files', ())) or name}"
+
+
+def _trust(results: Results) -> list[str]:
+    """Say whether the twin's rates may stand for recorded ones: yes, no, or can't tell yet.
+
+    Yes only where it surely follows, is surely close in each task and seems blind in no group.
+    """
+    by_id = {m.id: m for m in results.measurements}
+    r, bias = by_id.get("agreement.pearson_r"), by_id.get("agreement.bias_pp")
+    if r is None or bias is None or not bias.n:
+        return []
+    against, unknown = [], []
+    if blind := _blind_groups(results):
+        words = f"in {len(blind)} of {bias.n} groups it is probably blind"
+        against.append(f"{words}: its rate there says nothing of the recorded one")
+    low, high = (0.0, 1.0) if r.interval is None else (r.interval.low, r.interval.high)
+    if r.interval is None or r.value is None:
+        why = str(r.reason_if_undefined or r.reason_without_interval).replace(";", ",")
+        unknown.append(f"whether its rates follow the recorded ones is not known: {why}")
+    elif high < FOLLOWS_R:
+        against.append(f"its rates hardly follow the recorded ones (r at most {high:.2f})")
+    elif low <= 0:
+        unknown.append(f"its rates may or may not follow the recorded ones (r in{_ends(r, '.2f')})")
+    found = [answer(row) for row in rows_of(results, "conclusions")]
+    off, open_, many = found.count("not for this"), found.count("not yet"), len(found)
+    if (ends := bias.interval) and answer({"low": ends.low, "high": ends.high}) == "not for this":
+        against.append(f"over all groups it is {direction(ends.low, ends.high)}")
+    if off:
+        words = f"in {off} of {many} {noun('task', many)} its rate is too high or too low"
+        (against if 2 * off > many else unknown).append(words)
+    if open_ or not many:
+        where = f"in {open_} of {many} tasks " if many > 1 else ""
+        unknown.append(f"{where}its rate may be more than {CLOSE_PP:.0f} points off")
+    yes = f"in each of these tasks its rate is within {CLOSE_PP:.0f} points of the recorded one, "
+    yes += f"it follows from group to group (r at least {low:.2f}), and no group looks blind"
+    told = "no" if against else "can't tell yet" if unknown else "yes"
+    why = "; ".join(against or unknown or [yes])
+    then = " Use the recorded rates." if against else ""
+    return [f"Trust the twin's success rates: {told}. {why[0].upper()}{why[1:]}.{then}"]
+
+
+def _blind_groups(results: Results) -> list[str]:
+    notes = rows_of(results, "notes")
+    return [str(row["about"]) for row in notes if BLIND_HERE in str(row["note"])]
 
 
 def _bias_words(row: Row) -> str:
@@ -209,31 +281,37 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
     side = agreeing_side(by_id)
     rate = by_id.get(f"agreement.{side}.rate")
     if rate is not None and rate.k is not None and rate.n:
-        who = "Sim" if side == "sim_planned" else "Without plans, what was executed in the twin"
-        parts.append(f"{who} and outcome agree in {rate.k} of {rate.n} trials.")
+        who = "Twin" if side == "sim_planned" else "Without plans, what was executed in the twin"
+        trials = f"{rate.n} {noun('trial', rate.n)}"
+        parts.append(f"{who} and recorded outcome agree in {rate.k} of {trials}.")
     bias = by_id.get("agreement.bias_pp")
     one_line = num_tasks == 1 and bias is not None and bias.interval is None  # says it already
     if bias is not None and bias.value is not None and (bias.n or 0) > 1 and not one_line:
         word = "above" if bias.value > 0 else "below"
-        ends = _ends(bias)
         size = f"{_points(bias.value)} {word}" if round(bias.value) else "level with"
-        parts.append(f"Over {bias.n} groups the twin lies {size} the recorded rates{ends}.")
+        rows = rows_of(results, "success")
+        kinds = [k for k in ("policy", "condition") if any(row[k] for row in rows)]
+        each = f" (each {' and '.join(f'one {k}' for k in kinds)} on one task)" if kinds else ""
+        words = f"Over {bias.n} groups{each} the twin's rates lie {size} the recorded ones"
+        parts.append(f"{words}{_ends(bias)}.")
     r = by_id.get("agreement.pearson_r")
     blind = by_id.get("agreement.blind_share")
     if r is not None and r.value is not None:
+        size = f"r = {r.value:.2f}"
         parts.append(
-            f"r = {r.value:.2f}{_ends(r, '.2f')} {SAYS_NOTHING}: its interval is too wide."
+            f"Their correlation, {size}{_ends(r, '.2f')}, {SAYS_NOTHING}: its interval is too wide."
             if says_nothing(r)
-            else f"Its rates follow them with r = {r.value:.2f}{_ends(r, '.2f')}."
+            else f"Their correlation is {size}{_ends(r, '.2f')}."
             if not r.is_beyond
-            else f"Measured r = {r.value:.2f}; without the noise of counting r lies"
-            f" in{_ends(r, '.2f')}."
+            else f"Measured {size}; without the noise of counting r lies in{_ends(r, '.2f')}."
         )
-    named = sum(name.startswith("agreement.blind.") for name in by_id)
+    named = _blind_groups(results)
     if blind is not None and blind.interval is not None and (named or blind.interval.low > 0.01):
         low, high = (round(100 * end) for end in (blind.interval.low, blind.interval.high))
-        which = f", probably in {named} of these, which the notes name" if named else ""
-        parts.append(f"It is blind in {low} to {high} % of such groups{which}.")
+        more = "; ..." if len(named) > SHOWN_TASKS else ""
+        listed = f"Probably blind: {'; '.join(named[:SHOWN_TASKS])}{more}. " if named else ""
+        words = f"Of all groups of this kind {low} to {high} % are blind: there the twin's rate "
+        parts.append(f"{listed}{words}says nothing of the recorded one.")
     return parts
 
 
@@ -245,10 +323,11 @@ def _all_alike(results: Results) -> tuple[str, str]:
         return "", ""
     word, task = ("Nothing", "an easier") if k == 0 else ("Everything", "a harder")
     ends = wilson(k, n)
-    reach = f"{100 * ends.low:.0f} to {100 * ends.high:.0f} %"
-    told = f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies in {reach}."
+    told = f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies between "
+    told += f"{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
     few = f"record more trials; {n} {'say' if n > 1 else 'says'} next to nothing."
-    return told, few if n < SAYS_LITTLE else f"try {task} task: this one ranks no candidate."
+    alike = f"try {task} task: where all trials end alike, no candidate is better."
+    return told, few if n < SAYS_LITTLE else alike
 
 
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:

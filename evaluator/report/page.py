@@ -83,6 +83,13 @@ def page(results: Results, figures: Sequence[Drawing] = (), *, everything: bool 
     names += [("left-out", "Left out, and missing")]
     names += [("numbers", "Every number")] if everything else []
     names += [("provenance", "Where it came from")]
+    names_of_twin = ("rate.sim", "agreement.", "views.", "image.", "motion.")
+    known = (each.id for each in results.measurements if each.value is not None)
+    has_twin = any(name.startswith(names_of_twin) for name in known)
+    question = "How far to trust the twin" if has_twin else "What succeeded, and how surely"
+    software = results.provenance.get("software") or {}
+    commit = f", commit {software['git_commit'][:12]}" if software.get("git_commit") else ""
+    told = f"{software.get('name', 'robot-gst')} {software.get('version', '')}{commit}"
     excluded = Table(
         id="exclusions",
         title="What was left out",
@@ -94,8 +101,9 @@ def page(results: Results, figures: Sequence[Drawing] = (), *, everything: bool 
         .get_template("report.html")
         .render(
             results=results,
-            title=f"{results.run}: {_question(results).lower()}",
-            question=_question(results),
+            title=f"{results.run}: {question.lower()}",
+            question=question,
+            has_twin=has_twin,
             shared_mark=Markup(NO_SHARED),
             source=SOURCES.get(results.source, results.source),
             banner=wording.stand_in_sentence(results),
@@ -108,20 +116,13 @@ def page(results: Results, figures: Sequence[Drawing] = (), *, everything: bool 
             parts=parts,
             trials=trials,
             excluded=excluded,
-            software=_made_by(results.provenance.get("software") or {}),
+            software=told if software else "",
             provenance=json.dumps(dict(_short(results.provenance)), indent=1),
             everything=everything,
             next_table=count(1).__next__,
             next_figure=count(1).__next__,
         )
     )
-
-
-def _question(results: Results) -> str:
-    """What the page answers; a study without a twin asks for no trust in one."""
-    names = ("rate.sim", "agreement.", "views.", "image.", "motion.")
-    has_twin = any(m.value is not None and m.id.startswith(names) for m in results.measurements)
-    return "How far to trust the twin" if has_twin else "What succeeded, and how surely"
 
 
 def name_shared(report: Path) -> None:
@@ -153,19 +154,12 @@ def _part(section: Section, results: Results, figures: Sequence[Drawing]) -> Par
     return Part(section=section, numbers=numbers, figures=drawn, tables=tables)
 
 
-def _made_by(software: Mapping[str, Any]) -> str:
-    commit = str(software.get("git_commit") or "")[:12]
-    told = f"{software.get('name', 'robot-gst')} {software.get('version', '')}" if software else ""
-    return f"{told}, commit {commit}" if commit else told
-
-
 def _short(provenance: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Cut long lists of files; results.json holds them whole."""
     for name, value in provenance.items():
         if isinstance(value, Mapping) and len(value) > SHOWN_ENTRIES:
             kept = dict(list(value.items())[:SHOWN_ENTRIES])
-            rest = f"{len(value) - SHOWN_ENTRIES:,} more in results.json"
-            yield name, kept | {"...": rest}
+            yield name, kept | {"...": f"{len(value) - SHOWN_ENTRIES:,} more in results.json"}
         else:
             yield name, value
 
@@ -207,8 +201,9 @@ def breakable(text: str) -> Markup:
 
 
 def minus(text: str) -> str:
-    """Write a minus as long as a plus is wide, and keep a percent sign with its number."""
-    return re.sub(r"(?<![\w.])-(?=[\d.])", "−", text).replace(" %", "\N{NO-BREAK SPACE}%")
+    """Write a minus as long as a plus is wide; keep together percent and number, and intervals."""
+    text = re.sub(r"(?<![\w.])-(?=[\d.])", "−", text)
+    return re.sub(r" %|\[\S+ \S+\]", lambda found: found[0].replace(" ", "\xa0"), text)
 
 
 def thousands(count: int) -> str:

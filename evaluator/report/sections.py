@@ -8,20 +8,20 @@ from fnmatch import fnmatchcase
 from evaluator.result import Measurement, Results, Table
 
 HEADLINES: dict[str, str] = {
-    "agreement.sim_planned.rate": "Sim and outcome agree",
-    "agreement.sim_planned.phi": "phi of sim and outcome",
-    "agreement.sim_planned.ppv": "Success when sim says success (PPV)",
-    "agreement.sim_planned.npv": "Failure when sim says failure (NPV)",
-    "baseline.sim_planned.base_rate": "Success whatever sim says (base rate)",
+    "agreement.sim_planned.rate": "Twin and recorded outcome agree",
+    "agreement.sim_planned.phi": "phi of twin and recorded outcome",
+    "agreement.sim_planned.ppv": "Success when the twin says success (PPV)",
+    "agreement.sim_planned.npv": "Failure when the twin says failure (NPV)",
+    "baseline.sim_planned.base_rate": "Success whatever the twin says (base rate)",
     "baseline.sim_planned.geometric_rule.rate": "Geometric rule and outcome agree",
-    "baseline.sim_planned.geometric_rule.twin_gain_pp": "Sim more often right than that rule",
+    "baseline.sim_planned.geometric_rule.twin_gain_pp": "Twin more often right than that rule",
     "agreement.verdict.ppv": "Success when the gate accepted (PPV)",
     "agreement.pearson_r": "Pearson r over groups",
     "agreement.pearson_r.without_replanning": "Pearson r without replanning",
     "agreement.pearson_r.with_replanning": "Pearson r with replanning",
-    "agreement.bias_pp": "Bias of sim",
+    "agreement.bias_pp": "Bias of the twin",
     "agreement.mmrv_recorded_gap": "MMRV (gap of recorded rates)",
-    "decision.regret_pp": "Loss of taking what sim ranks first",
+    "decision.regret_pp": "Loss of taking what the twin ranks first",
     "motion.planned.path_mean_m": "Tool path: recorded to planned replay, lag taken out",
     "motion.planned.lag_s": "Tool lag: recorded behind planned replay",
     "motion.executed.path_mean_m": "Tool path: recorded to executed replay, lag taken out",
@@ -38,8 +38,8 @@ HEADLINES: dict[str, str] = {
 NAMES: dict[str, str] = HEADLINES | {
     "protocol.departures": "Departures from the protocol",
     "agreement.spearman_rho": "Spearman's rank correlation",
-    "agreement.mae_pp": "Mean absolute error of sim",
-    "agreement.blind_share": "Share of groups in which sim says nothing",
+    "agreement.mae_pp": "Mean absolute error of the twin",
+    "agreement.blind_share": "Share of groups in which the twin is blind",
     "decision.wrong_pairs": "Pairs of candidates in the wrong order",
     "decision.wrong_pairs_pp": "Recorded difference of those pairs, mean",
     "agreement.verdict.rate": "Verdict and outcome agree",
@@ -76,10 +76,10 @@ published | The printed figures, recomputed |  | published
 protocol | The study against its protocol | protocol.* | protocol_departures
     What was fixed before the first trial, what it found, and every departure from it.
 success | Success rates |  | success notes | success
-    How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the plan
-    actually sent, replayed with physics.
+    How often a task succeeded in the twin and as recorded. Twin: the plan actually sent,
+    replayed with physics.
 agreement | Agreement over groups | agreement.[!sv]* agreement.spearman_rho decision.* |  | scatter
-    Whether the twin's rates move with the labelled ones, and how far off they are. A high r
+    Whether the twin's rates move with the recorded ones, and how far off they are. A high r
     does not show that the right decision follows, nor that there is no bias.
 comparisons | Which is better |  | comparisons standing
     Policies, and each without and with replanning, as recorded.
@@ -175,5 +175,4 @@ def _place(table_id: str) -> int | None:
 
 def decides(table_id: str) -> str:
     """Say what a table decides; empty where it only informs."""
-    place = _place(table_id)
-    return "" if place is None else list(TABLES.values())[place]
+    return next((text for name, text in TABLES.items() if fnmatchcase(table_id, name)), "")

@@ -4,6 +4,7 @@ Tables hold numbers, one to a column, in ``results.json``, CSV and Parquet. What
 drawn on the page and set in LaTeX is a view of them, made here row by row.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -52,7 +53,22 @@ def view(table: Table) -> View:
     build = _VIEWS.get(table.id, _folded)
     shown = build([dict(zip(table.columns, row, strict=True)) for row in table.rows])
     rows = tuple(tuple(row.values()) for row in shown)
-    return View(**(vars(table) | {"columns": tuple(shown[0]), "rows": rows}))
+    return View(**(vars(table) | {"columns": tuple(map(shown_word, shown[0])), "rows": rows}))
+
+
+def shown_word(name: str) -> str:
+    """Write a column's name, or a side's, in the two words that a page has for the two sides."""
+    return _SIDE.sub(lambda found: SIDES[found[0]], name)
+
+
+SIDES = {
+    "sim": "twin",
+    "real": "recorded",
+    "stand-in": "recorded (stand-in)",
+    "pp": "points",
+}
+"""Words of tables as they are stored, and of those that are read."""
+_SIDE = re.compile(rf"\b({'|'.join(SIDES)})\b")
 
 
 def used_columns(table: View) -> list[int]:

@@ -21,7 +21,6 @@ SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
 }
 """Factor, unit and digits in which a reader thinks."""
 PLAIN = (1.0, "", ".3f")
-SHARES = ("rate.",)
 UNSIGNED = ("agreement.mae_pp", "decision.regret_pp", "decision.wrong_pairs_pp")
 """Sizes in percentage points that are never below 0: a plus would look like a direction."""
 HUGE = 1e7
@@ -47,7 +46,7 @@ def _figure(value: float, unit: str) -> str:
 def is_share(measurement: Measurement) -> bool:
     """Say whether the value is a share of something, which people read in percent."""
     counted = measurement.k is not None and measurement.n is not None
-    return measurement.unit == "1" and (counted or measurement.id.startswith(SHARES))
+    return measurement.unit == "1" and (counted or measurement.id.startswith("rate."))
 
 
 def value_text(measurement: Measurement) -> str:
@@ -113,8 +112,8 @@ def headlines(results: Results) -> list[tuple[str, str, Measurement]]:
     if agreeing_side(by_id) == "sim_executed":
         listed = {
             name.replace("sim_planned", "sim_executed"): label.replace(
-                "Sim", "Executed in twin"
-            ).replace("sim says", "that says")
+                "Twin ", "Executed in twin "
+            ).replace("the twin says", "that says")
             for name, label in HEADLINES.items()
             if not name.startswith("motion.planned.")
         }

@@ -1,7 +1,7 @@
 """Put one comparison on disk: results.json, tables, figures, report.html, trials.csv, Parquet."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,7 +57,10 @@ def write_report(
         parquet, no_parquet = _write_parquet(folder, trials, results)
         text = page(results, drawn, everything=everything)
         figures = {folder / "figures" / f"{each.id}.svg": each.svg.encode() for each in drawn}
-        files = [*_write({folder / "report.html": text.encode()} | figures | tables)]
+        files = {folder / "report.html": text.encode()} | figures | tables
+        for place, data in files.items():
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_bytes(data)
         name_shared(folder / "report.html")
         for one in set(old) - {*files, *extra, *parquet}:
             one.unlink(missing_ok=True)
@@ -71,13 +74,6 @@ def write_report(
         files=(*files, *extra, *parquet),
         not_written="; ".join(filter(None, (no_parquet, no_latex))) or None,
     )
-
-
-def _write(contents: Mapping[Path, bytes]) -> list[Path]:
-    for place, data in contents.items():
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes(data)
-    return list(contents)
 
 
 def _table_files(

@@ -47,8 +47,7 @@ def read_tracks(episode: Episode, plan_id: str) -> Tracks:
     A stream that is not there, or is broken, is None.
     """
     poses = [t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE)]
-    events = episode.topics_of_type(schema.EVENT)
-    of_tool, of_events = episode.payloads(poses[:1], events)
+    of_tool, of_events = episode.payloads(poses[:1], episode.topics_of_type(schema.EVENT))
     known = (data for data in of_events if b"execution_" in data)
     records = [parse_record(data, name="event", package="bridge.episode") for data in known]
     if plan_id == NO_PLAN:

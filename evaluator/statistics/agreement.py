@@ -35,8 +35,7 @@ def exact(
         UndefinedStatisticError: Below ``at_least`` groups.
     """
     if len(recorded) != len(sim):
-        message = f"{len(recorded)} recorded rates but {len(sim)} of the twin"
-        raise ValueError(message)
+        raise ValueError(f"{len(recorded)} recorded rates but {len(sim)} of the twin")
     if len(recorded) < at_least:
         reason = f"{counted_groups(len(recorded))}; it needs at least {at_least}"
         if not recorded and at_least < MIN_GROUPS:

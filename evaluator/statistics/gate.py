@@ -60,8 +60,7 @@ def phi(confusion: Confusion) -> float:
     if constant:
         reason = f"the {' and '.join(constant)} side is the same in all {confusion.n} pairs"
         raise UndefinedStatisticError(statistic="phi", reason=reason)
-    margins = math.sqrt((tp + fp) * (tp + fn) * (tn + fp) * (tn + fn))
-    return (tp * tn - fp * fn) / margins
+    return (tp * tn - fp * fn) / math.sqrt((tp + fp) * (tp + fn) * (tn + fp) * (tn + fn))
 
 
 def kappa(confusion: Confusion) -> float:

@@ -84,8 +84,7 @@ class Stratum:
         if self.pairs:
             b, c, n = self.improved, self.worsened, self.pairs
             linear = (2 * n - b + c) * d - b - c
-            root = math.sqrt(max(0.0, linear**2 + 8 * n * c * d * (1 - d)))
-            worse = (root - linear) / (4 * n)
+            worse = (math.sqrt(max(0.0, linear**2 + 8 * n * c * d * (1 - d))) - linear) / (4 * n)
             found += n * max(0.0, 2 * worse + d * (1 - d))
         if self.others:
             (k, n), (j, m) = self.first, self.second
@@ -269,8 +268,7 @@ def equal(kind: Kind, rate: Number) -> tuple[Number, Number, Number]:
 
 def chances(first: float, second: float, correlation: float = 0.0) -> Chances:
     """Return the chances of a pair from both rates and the correlation of a start's outcomes."""
-    spread = math.sqrt(first * (1 - first) * second * (1 - second))
-    both = first * second + correlation * spread
+    both = first * second + correlation * math.sqrt(first * (1 - first) * second * (1 - second))
     both = min(max(both, 0.0, first + second - 1), first, second)
     return second - both, first - both, both
 

@@ -21,6 +21,5 @@ def test_where_the_twin_ties_only_the_better_cell_is_violated() -> None:
     """Recorded 0, 0.1 and 1, all alike in the twin: gaps of 0, 0.1 and 1 to what is worse."""
     recorded, sim = [0.0, 0.1, 1.0], [0.5, 0.5, 0.5]
     assert mmrv(recorded=recorded, sim=sim) == pytest.approx((0.0 + 0.1 + 1.0) / 3)
-    order = np.array([2, 0, 1])
-    shuffled = [recorded[index] for index in order]
+    shuffled = [recorded[index] for index in np.array([2, 0, 1])]
     assert mmrv(recorded=shuffled, sim=sim) == pytest.approx(1.1 / 3)

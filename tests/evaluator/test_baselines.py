@@ -75,8 +75,7 @@ def test_the_paired_difference_counts_the_trials_only_one_got_right() -> None:
 def test_always_yes_is_right_as_often_as_trials_succeed() -> None:
     rows = study()
     succeeded = sum(row.recorded for row in rows)
-    found = by_id(baseline_results(rows))
-    base = found["baseline.sim_planned.base_rate"]
+    base = by_id(baseline_results(rows))["baseline.sim_planned.base_rate"]
     assert (base.k, base.n) == (succeeded, 60)
 
 
@@ -99,8 +98,7 @@ def test_without_answers_of_the_twin_nothing_is_compared() -> None:
 
 def test_the_rule_enters_the_row_of_its_trial_only() -> None:
     rows = [trial(0, True, True, None), trial(1, True, True, None)]
-    said = [RuleSummary(episode="trial_0001", value=False)]
-    plain, judged = with_rule(rows, said)
+    plain, judged = with_rule(rows, [RuleSummary(episode="trial_0001", value=False)])
     assert plain == rows[0]
     assert judged.baselines == ((GEOMETRIC_RULE, False),)
     unknown = [RuleSummary(episode="trial_0001", value=None)]

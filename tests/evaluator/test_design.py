@@ -38,8 +38,7 @@ def filled(run: Path, change: Callable[[list[Line]], object] = lambda lines: Non
     for line in lines:
         seed = int(line["start_id"].rpartition("/")[2])
         arm = arms.get(line["policy"]) or ("with" if line["condition"] == "with_replanning" else "")
-        good = seed % 5 < (4 if arm == "with" else 2)
-        line["recorded"] = "success" if good else "failure"
+        line["recorded"] = "success" if seed % 5 < (4 if arm == "with" else 2) else "failure"
     change(lines)
     path = trials_path(RunFolder.open(run))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -118,8 +117,7 @@ def test_an_edited_protocol_and_another_interval_are_departures(
 ) -> None:
     lock(tmp_path, replace(made, protocol=replace(made.protocol, interval="jeffreys")))
     path = tmp_path / FILE_NAME
-    record = json.loads(path.read_bytes())
-    path.write_text(json.dumps({**record, "alpha": 0.2}))
+    path.write_text(json.dumps({**json.loads(path.read_bytes()), "alpha": 0.2}))
     assert {"protocol", "analysis"} <= departures(filled(tmp_path))
 
 
@@ -140,8 +138,7 @@ def test_the_list_of_a_blinded_operator_names_no_arm(tmp_path: Path, made: Desig
     text = (tmp_path / ORDER_FILE).read_text()
     assert "act" not in text
     assert "replanning" not in text
-    open_one = replace(made, protocol=replace(made.protocol, codes={}))
-    lock(tmp_path / "open", open_one)
+    lock(tmp_path / "open", replace(made, protocol=replace(made.protocol, codes={})))
     assert "act,with_replanning" in (tmp_path / "open" / ORDER_FILE).read_text()
 
 

@@ -52,8 +52,7 @@ def test_the_gate_is_judged_where_it_was_not_obeyed(
     lines = [line(i, True, True, verdict="accepted") for i in range(6)]
     lines += [line(10 + i, False, False, verdict="refused") for i in range(4)]
     lines += [line(20 + i, True, False, verdict="refused") for i in range(2)]
-    comparison = trials(write_table, lines)
-    results = comparison.results()
+    results = trials(write_table, lines).results()
     assert results.get("agreement.verdict_unheeded.phi").value == pytest.approx(0.7071, abs=1e-4)
 
 

@@ -44,8 +44,7 @@ def plan(
     steps = [(grasp, 0), (grasp, 1), (release, 1), (release, 0)]
     tau = []
     for t_s, (p_m, g) in enumerate(steps):
-        T = moved @ pose(p_m, R=DOWN)
-        q, p = se3.split(T)
+        q, p = se3.split(moved @ pose(p_m, R=DOWN))
         tau.append(
             Waypoint(
                 t_ns=t_s * 1_000_000_000,

@@ -47,8 +47,7 @@ def tracks(
     first_ns: int = START_NS,
 ) -> Tracks:
     stamps = first_ns + STEP_NS * np.arange(NUM, dtype=np.int64)
-    t_s = (stamps - first_ns) * 1e-9
-    p = path_m(t_s - late_s) + np.array(shift_m)
+    p = path_m((stamps - first_ns) * 1e-9 - late_s) + np.array(shift_m)
     q = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_quat(scalar_first=True)
     return Tracks(
         tool=PoseTrajectory(stamps, p, np.tile(q, (NUM, 1))),
@@ -224,8 +223,7 @@ def summaries(*mean_m: float) -> list[MotionSummary]:
 
 
 def test_numbers_are_means_over_trials() -> None:
-    part = motion_results(summaries(0.01, 0.02, 0.06))
-    by_id = {m.id: m for m in part.measurements}
+    by_id = {m.id: m for m in motion_results(summaries(0.01, 0.02, 0.06)).measurements}
     mean = by_id["motion.planned.position_mean_m"]
     assert (mean.value, mean.n, mean.counted) == (pytest.approx(0.03), 3, "trial")
     assert "share one calibration" in str(mean.reason_without_interval)

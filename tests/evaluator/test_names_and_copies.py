@@ -93,8 +93,7 @@ def test_an_impossible_count_costs_its_own_trial_and_is_named(maker: Any) -> Non
     for name, k in (("t1", 4), ("t2", 5)):
         maker.trial(name, start_id=name)
         label_episode(maker.run, name, Outcome(result="success", unit="object", k=k, n=5))
-    odd = Outcome(result="success", unit="object", k=7, n=5)
-    maker.trial("t3", start_id="t3", outcome=odd)
+    maker.trial("t3", start_id="t3", outcome=Outcome(result="success", unit="object", k=7, n=5))
     comparison = compare_run(maker.run)
     rate = comparison.results().get(
         "rate.recorded_object.cube_into_box.without_replanning.scripted"

@@ -144,8 +144,7 @@ def test_pairs_grow_as_they_are_counted() -> None:
         for n in range(60)
     ]
     answers = compare_policies(rows)
-    tries = tries_of(made_trials(rows, ()), answers[0].question)
-    course = Course.of(tries, Plan(pairs=4))
+    course = Course.of(tries_of(made_trials(rows, ()), answers[0].question), Plan(pairs=4))
     assert course.all_.pairs == answers[0].reading.evidence.pairs
     places = [place for place in islice(Plan(pairs=4).places(), 12) if place <= course.all_.pairs]
     assert list(course.at) == places
@@ -272,12 +271,13 @@ def test_rates_are_compared_in_each_task_and_intervals_say_what_was_decided(
         interval = answer.reading.interval
         assert interval is not None
         assert (interval.low > 0 or interval.high < 0) == bool(answer.reading.better)
-    assert front(four_policies.results()).next_step == ""  # p3 is best; no other is worth a trial
+    first = front(four_policies.results())  # no other is worth a trial
+    assert (first.next_step, first.command) == ("take p3; no more trials are needed to choose.", "")
 
 
 def test_the_first_page_begins_with_who_may_be_best(four_policies: Comparison) -> None:
     summary = " ".join(front(four_policies.results()).sentences)
-    assert summary.startswith("p3 is best of 4 candidates, with 57 of 60: every other one")
+    assert "p3 (57 of 60) is the best of 4 candidates: each of the others lost" in summary
     assert "undecided" not in summary.lower()  # between p1 and p2, which nobody would take
 
 
@@ -287,7 +287,7 @@ def test_a_study_where_all_trials_end_alike_says_so_first(k: int, words: str) ->
     found = compare_rows(rows, run="r", source="trials", stand_in=None)
     summary = " ".join(front(found.results()).sentences)
     assert summary.startswith(words)
-    assert "costs" not in summary
+    assert "you lose" not in summary
 
 
 def test_a_study_without_a_twin_says_nothing_of_a_twin() -> None:

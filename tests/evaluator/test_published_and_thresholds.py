@@ -165,7 +165,7 @@ def test_every_short_name_is_an_id_of_some_results(six_trials: Any) -> None:
     for name, identifier in SHORT.items():
         assert identifier in ids or identifier.startswith("views."), name
     (text,) = missed(parse_thresholds("0.9"), compare_run(six_trials.run).results())
-    assert text == "Agreement of sim and outcome is 0.8333; the threshold is 0.9."
+    assert text == "Agreement of twin and outcome is 0.8333; the threshold is 0.9."
 
 
 def test_evaluate_without_anything_is_wrong_use() -> None:
@@ -207,8 +207,7 @@ def test_a_published_table_that_says_a_cell_twice_or_a_side_wrongly_is_refused(
 def test_a_rate_that_several_counts_give_accuses_nobody(
     write_table: Callable[[str], Path],
 ) -> None:
-    path = write_table(f"{HEAD}a,c,sim,trial,150,67,,\na,c,real,trial,10,46,,\n")
-    check = check_published(path)
+    check = check_published(write_table(f"{HEAD}a,c,sim,trial,150,67,,\na,c,real,trial,10,46,,\n"))
     found = {finding.row: finding for finding in check.findings}
     assert found[2].verdict == "ambiguous"
     assert "2 counts of 150 round to 0.67" in found[2].note
@@ -288,8 +287,7 @@ def test_counts_leave_nothing_to_rounding(write_table: Callable[[str], Path]) ->
     lines = ["task,side,n,rate_percent,statistic,printed"]
     for index, (real, sim) in enumerate([(3, 5), (6, 6), (9, 7), (2, 4)]):
         lines += [f"t{index},real,10,{10 * real},,", f"t{index},sim,10,{10 * sim},,"]
-    path = write_table("\n".join([*lines, ",,,,mae_pp,12.6"]) + "\n")
-    (finding,) = check_published(path).failed
+    (finding,) = check_published(write_table("\n".join([*lines, ",,,,mae_pp,12.6"]) + "\n")).failed
     assert (finding.verdict, finding.recomputed) == ("differs", pytest.approx(15.0))
     assert "rounded" not in finding.note
 

@@ -76,8 +76,7 @@ def test_power_is_that_of_simulated_studies() -> None:
 
 
 def test_interim_looks_are_dearer_and_extensions_cost_their_share() -> None:
-    plan = Plan(pairs=20, locked=True)
-    looks = list(islice(plan.looks("shared"), 8))
+    looks = list(islice(Plan(pairs=20, locked=True).looks("shared"), 8))
     assert [look.pairs for look in looks] == [5, 10, 15, 20, 30, 40, 60, 80]
     limits = [look.limit for look in looks]
     assert limits[:4] == sorted(limits[:4], reverse=True)

@@ -101,8 +101,7 @@ def kept(folder: Path, rows: dict[str, tuple[Everything, ...]]) -> list[Any]:
     with SummaryCache(folder) as cache:
         for key, found in rows.items():
             cache.keep(Everything, key, found)
-    again = SummaryCache(folder)
-    return [again.find(Everything, key) for key in rows]
+    return [SummaryCache(folder).find(Everything, key) for key in rows]
 
 
 @given(

@@ -480,8 +480,7 @@ def test_every_rate_of_up_to_forty_trials_is_counted_at_full_precision(tmp_path:
 
 
 def test_what_was_understood_stands_in_one_line(tmp_path: Path) -> None:
-    text = "policy,trials,real,sim,gap\nACT,10,1,3,2\nDP,10,9,10,1\n"
-    said = take(write(tmp_path, text)).summary
+    said = take(write(tmp_path, "policy,trials,real,sim,gap\nACT,10,1,3,2\nDP,10,9,10,1\n")).summary
     assert "\n" not in said
     for part in ("2 groups", "real 10 to 90 %", "sim 30 to 100 %", "n from 'trials'", "'gap'"):
         assert part in said

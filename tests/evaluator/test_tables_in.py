@@ -56,8 +56,7 @@ def test_trials_survive_writing_and_reading(
 
 def test_a_run_exported_as_trials_gives_the_same_numbers(six_trials: Any, tmp_path: Path) -> None:
     comparison = compare_run(six_trials.run)
-    path = write_trials(tmp_path / "out.csv", map(record_from_row, comparison.rows))
-    again = compare_csv(path)
+    again = compare_csv(write_trials(tmp_path / "out.csv", map(record_from_row, comparison.rows)))
     for name in (
         "agreement.sim_planned.rate",
         "agreement.sim_planned.phi",

@@ -61,8 +61,7 @@ def test_kappa_of_two_raters(write_table: Callable[[str], Path]) -> None:
     ]
     reviews.append(Review(trial_id="elsewhere", rater="Ann", result="success"))
     found = with_reviews(comparison, reviews)
-    tables = {table.id: table for table in found.tables}
-    line = cells(tables["raters"])
+    line = cells({table.id: table for table in found.tables}["raters"])
     a = np.array([i % 2 for i in range(20)])
     b = np.array([(i % 2) != (i < 4) for i in range(20)])
     chance = a.mean() * b.mean() + (1 - a.mean()) * (1 - b.mean())

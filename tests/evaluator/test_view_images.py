@@ -142,8 +142,7 @@ def test_other_methods_stand_beside_the_twin_on_the_views_of_a_run(
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / f"wrist_{STAMP}.png").write_bytes(png(other))
     options = ImageOptions(renders=(f"other={tmp_path / 'other'}",))
-    comparison = compare_run(maker.run, images=options)
-    results = comparison.results()
+    results = compare_run(maker.run, images=options).results()
     results.to_record()
     found = {m: results.get(f"image.{m}.psnr_db") for m in ("twin", "other")}
     assert found["twin"].value == results.get("views.all.psnr_db").value

@@ -25,8 +25,7 @@ def moved(maker: Any, name: str, result: str) -> None:
         writer.describe(info, outcome=outcome)
         for number, angle in enumerate(turn.tolist()):
             stamp_ns = 10**18 + number * STEP_NS
-            sample = at_positions(stamp_ns, ("a",), np.array([angle]))
-            data = sample.to_cdr()
+            data = at_positions(stamp_ns, ("a",), np.array([angle])).to_cdr()
             writer.write(
                 "/c/joint_states", data, type_name=schema.JOINT_STATE, log_time_ns=stamp_ns
             )
@@ -46,7 +45,7 @@ def test_agreement_is_that_of_what_was_executed_and_says_so(maker: Any) -> None:
     assert "planned: 3 of 3 trials had no plan" in comparison.missing
     assert not [e for e in comparison.exclusions if "planned" in e.reason]
     named = {label: m.id for label, _, m in headlines(results)}
-    assert named["Executed in twin and outcome agree"] == "agreement.sim_executed.rate"
+    assert named["Executed in twin and recorded outcome agree"] == "agreement.sim_executed.rate"
     assert not any("sim_planned" in name for name in named.values())
     row = comparison.rows[0]
     assert (row.plan_id, row.num_plans, row.num_plans_sent) == (NO_PLAN, 0, 0)

@@ -130,8 +130,7 @@ _NOTE = (
 def compare_folders(options: ImageOptions) -> Comparison:
     """Compare folders of renders with a folder of recorded images, without any run."""
     if options.reference is None or not options.renders:
-        message = "images alone need --reference FOLDER and --renders METHOD=FOLDER."
-        raise UsageError(message)
+        raise UsageError("images alone need --reference FOLDER and --renders METHOD=FOLDER.")
     net = image_scores.open_net(options.lpips_vgg)
     part = compare_renders(options, (), {}, net=net)
     return Comparison(

@@ -82,8 +82,7 @@ def test_each_method_has_its_means_over_the_same_views(folders: Path) -> None:
 def test_the_headline_is_laid_out_as_the_paper_s_with_the_protocol_in_each_row(
     folders: Path,
 ) -> None:
-    tables = {table.id: table for table in compared(folders).tables}
-    table = tables["image_methods"]
+    table = {table.id: table for table in compared(folders).tables}["image_methods"]
     assert table.columns == ("method", "PSNR (dB)", "SSIM", "LPIPS (vgg)", "views", "protocol")
     assert [row[0] for row in table.rows] == ["good", "poor"]
     assert {row[3] for row in table.rows} == {"not computed"}

@@ -186,8 +186,7 @@ def test_a_run_without_trials_still_gets_a_report(
 def test_writing_twice_replaces_the_first(six_trials: Any) -> None:
     comparison = compare_run(six_trials.run)
     folder = six_trials.run.results_dir
-    first = write_report(comparison, folder)
-    before = {path: path.read_bytes() for path in first.files}
+    before = {path: path.read_bytes() for path in write_report(comparison, folder).files}
     second = write_report(compare_run(six_trials.run), folder)
     assert {path: path.read_bytes() for path in second.files} == before
 

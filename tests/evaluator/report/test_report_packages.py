@@ -94,8 +94,7 @@ def test_without_pyarrow_the_report_is_written_and_says_so(
 ) -> None:
     take_away(monkeypatch, "pyarrow", "evaluator.report.parquet")
     comparison = compare_run(six_trials.run)
-    written = write_report(comparison, six_trials.run.results_dir)
-    text = summary_text(comparison.results(), written)
+    text = summary_text(comparison.results(), write_report(comparison, six_trials.run.results_dir))
     assert "not written: pyarrow is not installed" in text
     assert (six_trials.run.results_dir / "trials.csv").is_file()
     assert not list(six_trials.run.results_dir.glob("*.parquet"))

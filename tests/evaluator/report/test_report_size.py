@@ -46,8 +46,7 @@ def many(count: int) -> Comparison:
 @pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 def test_a_report_about_thousands_of_trials_stays_small_and_complete(tmp_path: Path) -> None:
-    comparison = many(3000)
-    written = write_report(comparison, tmp_path)
+    written = write_report(many(3000), tmp_path)
     text = written.report.read_text()
     assert len(text.encode()) < MAX_BYTES
     assert (

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,13 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     ]
     table = Table(id="comparisons", title="t", columns=columns, rows=tuple(rows))
     results = Results(run="r", source="trials", stand_in=None, tables=(table,))
-    assert next_trials(results) == "1 more trial of each would likely decide C against B."
+    words = "try C and B 1 more time each; that would likely decide between them."
+    assert next_trials(results) == words
+    in_tasks = replace(
+        table, rows=(rows[0], *(compared(t, "A", "no", 9) for t in ("pour", "stir")))
+    )
+    of_tasks = next_trials(replace(results, tables=(in_tasks,)))
+    assert of_tasks.startswith("try A and B 40 more times each (in total: 20 on each of 2 tasks);")
     decided = replace(table, rows=tuple(rows[2:]))
     assert next_trials(replace(results, tables=(decided,))) == ""
     beaten = Table(
@@ -135,21 +142,38 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
         columns=("candidate", "k", "n", "may be best"),
         rows=(("C", 1, 9, "no"), ("A", 8, 9, "yes"), ("B", 8, 9, "yes")),
     )
-    assert "A against B" in next_trials(replace(results, tables=(table, beaten)))
+    assert "try A and B" in next_trials(replace(results, tables=(table, beaten)))
     pair = [compared(ALL_TASKS, "A, without replanning", "no", 9)]
     pair[0] = (*pair[0][:3], "A, with replanning", *pair[0][4:])
-    words = "9 more trials of each would likely decide without replanning against with replanning."
-    assert next_trials(replace(results, tables=(replace(table, rows=tuple(pair)),))) == words
+    next_step = next_trials(replace(results, tables=(replace(table, rows=tuple(pair)),)))
+    assert next_step.startswith("try without replanning and with replanning 9 more times each;")
 
 
 def shown(tmp_path: Path, text: str) -> tuple[str, str]:
     """The first page and the terminal of a table."""
     path = tmp_path / "table.csv"
     path.write_text(text)
-    comparison = compare_csv(path)
-    written = write_report(comparison, tmp_path / "out")
+    written = write_report(compare_csv(path), tmp_path / "out")
     first = front(written.content)
     return " ".join([*first.sentences, *first.missing]), summary_text(written.content, written)
+
+
+def trusted(tmp_path: Path, sim: tuple[int, ...], n: int) -> str:
+    """What the first page says of a twin in ten tasks, of which tenths succeed on the robot."""
+    cells = product(range(10), range(2), range(n))
+    rows = [f"t{t},p{p},{int(i % 10 < t)},{int(i % 10 < sim[t])}" for t, p, i in cells]
+    return shown(tmp_path, "\n".join(["task,policy,recorded,sim_planned", *rows]))[0]
+
+
+def test_a_twin_is_trusted_only_where_the_numbers_say_so(tmp_path: Path) -> None:
+    head = "Trust the twin's success rates: "
+    right, off = tuple(range(10)), (4, 5, 6, 7, 8, 9, 10, 10, 9, 9)
+    assert trusted(tmp_path, right, 100).startswith(f"{head}yes. In each of these tasks")
+    assert trusted(tmp_path, right, 4).startswith(f"{head}can't tell yet. ")
+    assert trusted(tmp_path, off, 100).startswith(f"{head}no. ")
+    assert trusted(tmp_path, right[::-1], 100).startswith(f"{head}no. ")
+    blind = trusted(tmp_path, (9, *right[1:]), 100)  # in one task it says success throughout
+    assert blind.startswith(f"{head}no. In 2 of 20 groups it is probably blind")
 
 
 def test_rates_without_n_ask_for_it_and_claim_no_interval(tmp_path: Path) -> None:
