@@ -81,7 +81,7 @@ class Logs:
         counts = np.stack(study, axis=-1)
         kinds, places = np.unique(counts.reshape(-1, 4), axis=0, return_inverse=True)
         self.places = places.reshape(counts.shape[:2])
-        there = gap_model._drawn()
+        there = gap_model.drawn()
         share = there.share[:, None].astype(np.float32)
         self.found = np.empty((len(kinds), len(share)), dtype=np.float32)
         for start in range(0, len(kinds), 200):

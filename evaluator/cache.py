@@ -110,12 +110,7 @@ class SummaryCache:
         say: Say = lambda text: None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Use a folder, which need not exist.
-
-        Args:
-            folder: None keeps nothing.
-            monotonic: The clock of periodic saving [s].
-        """
+        """Use a folder, which need not exist; None keeps nothing. ``monotonic``: its clock [s]."""
         self._folder = folder
         self._say_once: Say | None = say
         self._monotonic = monotonic
@@ -125,10 +120,9 @@ class SummaryCache:
     def kept_or_made(
         self, kind: type[Summary], key: str, make: Callable[[], tuple[Summary, ...]]
     ) -> tuple[Summary, ...]:
-        """Return what is kept under a key, or make and keep it; what ``make`` raises passes.
+        """Return what is kept under a key, which names its inputs, or make and keep it.
 
-        Args:
-            key: Names what they are made from, so that a changed file has another key.
+        A changed file has another key; what ``make`` raises passes.
         """
         found = self.find(kind, key)
         if found is None:

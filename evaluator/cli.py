@@ -101,10 +101,8 @@ def _images_alone(images: ImageOptions) -> "tuple[Comparison, Path]":
     from evaluator.compare.images.methods import compare_folders
 
     if not images.renders:
-        raise UsageError(
-            "evaluate needs a run folder or a table, --check-published TABLE, or --reference "
-            "FOLDER with --renders METHOD=FOLDER."
-        )
+        message = "evaluate needs a run folder or a table, --check-published TABLE, or --reference "
+        raise UsageError(message + "FOLDER with --renders METHOD=FOLDER.")
     comparison = compare_folders(images)
     return comparison, Path(f"{comparison.run}_results")
 

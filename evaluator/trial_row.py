@@ -110,9 +110,7 @@ class TrialRow:
     @property
     def agrees(self) -> bool | None:
         """Whether the twin and the outcome agree; None when one of them is unknown."""
-        if self.twin is None or self.recorded is None:
-            return None
-        return self.twin == self.recorded
+        return None if self.twin is None or self.recorded is None else self.twin == self.recorded
 
     @property
     def recorded_word(self) -> str:

@@ -170,8 +170,7 @@ def assign_trial(
 ) -> Path:
     """Note that an episode is a trial of a task, beside the run."""
     path, name = _finished(run, episode_id), task_of_run(run, task)
-    info = Episode.open(path).info
-    return assign(run, path, info, task=name, start_id=start_id, policy=policy)
+    return assign(run, path, Episode.open(path).info, task=name, start_id=start_id, policy=policy)
 
 
 def task_of_run(run: RunFolder, task: str) -> str:

@@ -177,6 +177,5 @@ def _instant_ns(name: str, text: str | None) -> int | None:
 
 def _holds(entry: Entry, words: str) -> bool:
     """Whether all words are there, in any order and case."""
-    texts = (getattr(entry, name) for name in _SEARCHED)
-    folded = "\n".join(map(str, texts)).casefold()
+    folded = "\n".join(map(str, (getattr(entry, name) for name in _SEARCHED))).casefold()
     return all(word in folded for word in words.casefold().split())

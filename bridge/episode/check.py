@@ -310,8 +310,7 @@ def _paused_spans(episode: Episode) -> list[tuple[int, int]]:
     except BridgeError:  # the walk finds what is wrong
         return []
     said = [each for each in said if each[1] in ("paused", "resumed")]
-    ends = [*(stamp_ns for stamp_ns, _ in said[1:]), episode.end_ns]
-    pairs = zip(said, ends, strict=False)
+    pairs = zip(said, [*(stamp_ns for stamp_ns, _ in said[1:]), episode.end_ns], strict=False)
     return [(start_ns, end_ns) for (start_ns, kind), end_ns in pairs if kind == "paused"]
 
 

@@ -193,8 +193,7 @@ class FileCheck:
             with self.path.open("rb") as stream:
                 self.library = read_header(stream).library
                 footer, footer_at = read_footer(stream)
-                data_end = footer.summary_start or footer_at
-                yield from self._walk_data(stream, data_end)
+                yield from self._walk_data(stream, footer.summary_start or footer_at)
                 summary = read_summary(stream, footer, footer_at)
                 for text in summary_faults(stream, self.seen, summary, footer, footer_at):
                     self._fault(text)

@@ -89,8 +89,7 @@ class Decoder:
         elif type_name == schema.DROPS:
             self._add_losses(parse_record(data, name="drops", package="bridge.episode"))
         elif type_name == schema.EVENT:
-            event = parse_record(data, name="event", package="bridge.episode")
-            self.findings += of_event(event)
+            self.findings += of_event(parse_record(data, name="event", package="bridge.episode"))
         elif type_name in _DECODERS:
             _DECODERS[type_name](data)
         elif type_name in DEFINITIONS:

@@ -96,8 +96,7 @@ class ClockLine:
 
     def offset_at(self, at_ns: int) -> float:
         """Source minus recorder at a time of the recorder's clock [ns]."""
-        middle_ns = (self.start_ns + self.end_ns) // 2
-        return self.offset_ns + (self.drift or 0.0) * (at_ns - middle_ns)
+        return self.offset_ns + (self.drift or 0.0) * (at_ns - (self.start_ns + self.end_ns) // 2)
 
 
 def fit_line(readings: Sequence[Reading]) -> ClockLine:

@@ -216,8 +216,7 @@ class Presence:
     @property
     def is_regular(self) -> bool:
         """Whether it has shown a rate, so that an end of it is remarkable."""
-        span_ns = self.last_ns - self.first_ns
-        return self.messages >= REGULAR_MESSAGES and span_ns >= REGULAR_SPAN_NS
+        return self.messages >= REGULAR_MESSAGES and self.last_ns - self.first_ns >= REGULAR_SPAN_NS
 
 
 def _silence_ns(start_ns: int, end_ns: int, pauses: Spans) -> int:

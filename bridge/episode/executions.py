@@ -114,8 +114,7 @@ def is_without_plan(episode: Episode) -> bool:
     info = episode.info
     if info.kind != "trial" or not info.task:
         return False
-    topics = episode.topics()
-    return not any(topics[name].count for name in episode.topics_of_type(schema.PLAN))
+    return not any(episode.topics()[name].count for name in episode.topics_of_type(schema.PLAN))
 
 
 def _tracks(episode: Episode) -> Sequence[JointTrack]:

@@ -136,8 +136,7 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
         tally.take(found)
     if tally.losses or tally.reached_end != data.end:
         return None
-    output = _publish(path) if path.name.endswith(PART) else path
-    return tally.report(path, output, finished=True)
+    return tally.report(path, _publish(path) if path.name.endswith(PART) else path, finished=True)
 
 
 def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:

@@ -143,7 +143,7 @@ class RunFolder:
 
     def episodes(self) -> list[Path]:
         """Recorded episodes, in name order; of a split one, its first part."""
-        return [self.episodes_dir / name for name in self.episode_parts()]
+        return [*map(self.episodes_dir.joinpath, self.episode_parts())]
 
     def episode_parts(self) -> dict[str, list[str]]:
         """File names of each recorded episode, by the first of them, in name order."""
@@ -166,5 +166,5 @@ class RunFolder:
 
     def derived(self, pattern: str = "*") -> list[Path]:
         """Derived episode files, in name order."""
-        names = file_names(self.derived_dir)
-        return [self.derived_dir / name for name in names if fnmatchcase(name, pattern + SUFFIX)]
+        names = (n for n in file_names(self.derived_dir) if fnmatchcase(n, pattern + SUFFIX))
+        return [*map(self.derived_dir.joinpath, names)]

@@ -247,8 +247,7 @@ _TIMES = struct.Struct("<QQ")
 
 def has_wrong_times(found: Chunk) -> bool:
     """Whether a chunk's head states other times than its messages; no CRC covers them."""
-    said = _TIMES.unpack_from(found.raw, mcap.RECORD_HEAD.size)
-    return said != found.contents.time_range()
+    return _TIMES.unpack_from(found.raw, mcap.RECORD_HEAD.size) != found.contents.time_range()
 
 
 def verbatim(found: Chunk) -> EncodedChunk:

@@ -311,8 +311,7 @@ def pose_track_of(payloads: Sequence[bytes]) -> PoseTrajectory | None:
     else:
         stamps_ns, Ts = alike
     order = np.argsort(stamps_ns, kind="stable")
-    is_last = np.append(np.diff(stamps_ns[order]) != 0, True)
-    order = order[is_last]
+    order = order[np.append(np.diff(stamps_ns[order]) != 0, True)]
     q, p = se3.split(Ts[order])
     return PoseTrajectory(stamps_ns[order], p, q)
 

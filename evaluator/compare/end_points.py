@@ -91,11 +91,10 @@ def moved_bodies(real: Sequence[Run]) -> list[str]:
 def _compared(
     real: Sequence[Run], simulated: Sequence[Run], body: str
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Compare one body run by run; recorded runs without a counterpart are left out.
+    """Compare one body with those recorded runs that have a counterpart.
 
-    Returns:
-        Distances by recorded run and name in ``BODY_DISTANCES``, over several simulated runs the
-        mean; and runs to which something was fitted, which say nothing about others.
+    Found are distances by run and name in ``BODY_DISTANCES``, over several simulated runs the mean;
+    and runs to which something was fitted, which say nothing about others.
     """
     found: dict[str, dict[str, float]] = {}
     fitted = []

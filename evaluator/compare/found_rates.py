@@ -10,6 +10,7 @@ from fractions import Fraction
 
 from bridge.exchange.table_text import SourceRow
 from evaluator.compare.found_sheet import Sheet, Value, key_of
+from evaluator.compare.measure import grouped
 from evaluator.compare.table_words import Column, Figure
 
 SMALL = 50
@@ -109,10 +110,8 @@ class _Group:
 def _settle_numbers(sheet: Sheet, groups: Sequence[_Group]) -> None:
     """Settle what plain numbers are, all columns of a like name alike."""
     certain = any(g.figure is not None and g.figure.percent for g in groups)
-    kinds: dict[str, list[_Group]] = {}
-    for group in groups:
-        if group.is_open and group.column is not None:
-            kinds.setdefault(group.column.figure, []).append(group)
+    open_ = (group for group in groups if group.is_open and group.column is not None)
+    kinds = grouped(open_, lambda group: group.column.figure if group.column else "")
     for figure, members in kinds.items():
         if figure == "percent":
             _settle_percent(sheet, members)
@@ -143,10 +142,7 @@ def holds_fractions(numbers: Sequence[float]) -> bool:
 
 def _settle_beside_signs(sheet: Sheet, groups: Sequence[_Group]) -> None:
     """Plain numbers beside cells with a percent sign."""
-    by_column: dict[int, list[_Group]] = {}
-    for group in groups:
-        by_column.setdefault(group.column.place if group.column else -1, []).append(group)
-    for members in by_column.values():
+    for members in grouped(groups, lambda each: each.column.place if each.column else -1).values():
         if len(members) == len(sheet.lines):  # a column without any sign
             _settle_pool(sheet, members, counts=True)
             continue
@@ -187,9 +183,7 @@ def _settle_pool(sheet: Sheet, groups: Sequence[_Group], *, counts: bool) -> Non
 
 def _settle_by_side(sheet: Sheet, groups: Sequence[_Group], *, counts: bool) -> None:
     """Shares of 1 on one side, percent on the other; in one side it is a slip."""
-    sides: dict[str, list[_Group]] = {}
-    for group in groups:
-        sides.setdefault(group.key[3], []).append(group)
+    sides = grouped(groups, lambda group: group.key[3])
     for members in sides.values():
         numbers = _numbers(members)
         if any(0 < v < 1 for v in numbers) and any(v > 1 for v in numbers):

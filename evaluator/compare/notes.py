@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
+from evaluator.cache import packed
 from evaluator.compare.agreement import sides, usable_groups
 from evaluator.compare.measure import grouped
 from evaluator.compare.rows import RateGroup
@@ -132,13 +133,13 @@ def _scene(scene_hash: str | None) -> str:
 
 def _settings(used: Sequence[DerivedFile]) -> str:
     """Name the first setting in which replays that count differ."""
-    # Nearly always all are equal, and many files share one record: it is laid flat once.
-    records: dict[int, dict[str, Any]] = {}
-    for file in used:
-        records.setdefault(id(file.derived.settings), dict(_leaves(_made_with(file))))
-    made = [found for file in used if (found := records[id(file.derived.settings)])]
-    for name in dict.fromkeys(chain.from_iterable(records.values())):
-        values = Counter(str(settings.get(name)) for settings in made)
+    # Nearly always all are equal, and equal ones are laid flat once.
+    kinds = grouped(used, lambda file: packed(file.derived.settings)).values()
+    made = [(found, len(k)) for k in kinds if (found := dict(_leaves(_made_with(k[0]))))]
+    for name in dict.fromkeys(chain.from_iterable(found for found, _ in made)):
+        values: Counter[str] = Counter()
+        for found, count in made:
+            values[str(found.get(name))] += count
         if len(values) > 1:
             shown = ", ".join(f"{value} in {count}" for value, count in values.most_common())
             return (

@@ -292,9 +292,7 @@ def _from_rounded(claim: _Claim, claims: Sequence[_Claim]) -> float | None:
     if not {WITHOUT, WITH} <= averages.keys() or not averages[WITHOUT]:
         return None
     before, after = averages[WITHOUT], averages[WITH]
-    if claim.statistic == "gain_pp":
-        return after - before
-    return 100 * relative_gain(before, after)
+    return after - before if claim.statistic == "gain_pp" else 100 * relative_gain(before, after)
 
 
 def _not_printed(groups: Sequence[RateGroup], claims: Sequence[_Claim]) -> list[Finding]:

@@ -31,12 +31,11 @@ def with_reviews(comparison: Comparison, reviews: Sequence[Review]) -> Compariso
     if strange := sorted({r.trial_id for r in reviews} - rows.keys()):
         shown = ", ".join(strange[:3])
         missing = (*missing, f"reviews: {len(strange)} of trials that are not there ({shown})")
-    agreement = [_agreement(a, b, raters) for a, b in combinations(raters, 2)]
-    agreement = [line for line in agreement if line["trials"]]
-    if not agreement:
+    lines = [x for a, b in combinations(raters, 2) if (x := _agreement(a, b, raters))["trials"]]
+    if not lines:
         return replace(comparison, missing=(*missing, "raters: no trial has two known labels"))
     table = Table.of(
-        agreement,
+        lines,
         id="raters",
         title="Agreement of raters",
         note="Kappa: Cohen's (1960), agreement beyond chance; 1 is full agreement. Brackets: 95 % "

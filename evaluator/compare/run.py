@@ -195,7 +195,7 @@ def compare_read(
             task_hashes=_task_hashes(read.contents),
         )
         for read in reads
-        if len(reads) == 1
+        if len(reads) == 1 and read.protocol is not None
     )
     parts = (motion_results(summaries.motions), state_results(summaries.states), *of_protocol)
     return _with_parts(base, parts)

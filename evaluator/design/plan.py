@@ -43,10 +43,8 @@ class Expected:
     def words(self) -> str:
         """What is expected in words."""
         first, second = (f"{100 * rate:.0f} %" for rate in self.rates)
-        return (
-            f"expected rates: {first} and {second}; correlation of both outcomes of a start "
-            f"{self.correlation:g}"
-        )
+        told = f"expected rates: {first} and {second}; correlation of both outcomes of a start "
+        return f"{told}{self.correlation:g}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,10 +173,7 @@ def _shows(pairs: int, wanted: Wanted, expected: Expected) -> list[str]:
 
 
 def lock(run_path: Path, made: Design) -> Protocol:
-    """Write protocol and order into a run; a protocol that is there is never overwritten.
-
-    Returns:
-        The protocol as written, with its hash.
+    """Write protocol, returned with its hash, and order into a run; never overwrite one.
 
     Raises:
         UsageError: When the run has a protocol or trials already.

@@ -46,12 +46,9 @@ class RuleAnswer:
 def judge_by_geometry(
     plan: Plan, task: Task, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]
 ) -> RuleAnswer:
-    """Say whether a plan succeeds as far as geometry alone can tell.
+    """Say whether a plan with its whole trajectory succeeds as far as geometry alone can tell.
 
-    Args:
-        plan: With its whole trajectory, in the robot's base frame.
-        Ts_base_object: Where the objects were localised before the execution; what is missing
-            leaves the answer open.
+    ``Ts_base_object``: where objects were localised before; a missing one leaves the answer open.
     """
     missing = [n for n in (*task.manipulated, *task.containers) if n not in Ts_base_object]
     if missing:

@@ -101,10 +101,9 @@ def _loaded(path: Path) -> Any:
 
 
 def read_heads() -> tuple[list[Float[Tensor, "_channels 1 1"]], str]:
-    """Read the linear heads out of an installed wheel, without importing it.
+    """Read weights of each channel of each stage out of an installed wheel, and say of which.
 
-    Returns:
-        One weight for each channel of each stage, and where they came from, in words.
+    The wheel is not imported.
     """
     package, file = HEADS
     spec = find_spec(package)

@@ -1,6 +1,7 @@
 """How far apart two poses of one object are in rotation, modulo its symmetry."""
 
 from functools import cache
+from itertools import permutations, product
 
 import numpy as np
 from jaxtyping import Float
@@ -35,9 +36,11 @@ def turns_alike(model: ObjectModel) -> Float[np.ndarray, "num_turns 3 3"]:
 @cache
 def _box_turns() -> Float[np.ndarray, "24 3 3"]:
     """Every rotation that lays the axes onto each other, none first: the group of the cube."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  # takes half a second to load
-
-    turns = Rotation.create_group("O").as_matrix().round()
+    signs = [np.diag(each) for each in product((1.0, -1.0), repeat=3)]
+    turns = np.array(
+        [sign @ np.eye(3)[[*axes]] for axes in permutations(range(3)) for sign in signs]
+    )
+    turns = turns[np.linalg.det(turns) > 0]  # the others are mirrored
     return np.asarray(turns[np.argsort(-turns.trace(axis1=1, axis2=2), kind="stable")])
 
 

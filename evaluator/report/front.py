@@ -283,8 +283,8 @@ def _trust(results: Results) -> list[str]:
     yes += f"it follows from group to group (r at least {low:.2f}), and no group looks blind"
     told = "no" if against else "can't tell yet" if unknown else "yes"
     why = "; ".join(against or unknown or [yes])
-    then = " Use the recorded rates." if against else ""
-    return [f"Trust the twin's success rates: {told}. {why[0].upper()}{why[1:]}.{then}"]
+    why = f"{why[0].upper()}{why[1:]}.{' Use the recorded rates.' if against else ''}"
+    return [f"Trust the twin's success rates: {told}. {why}"]
 
 
 def _blind_groups(results: Results) -> list[str]:
@@ -386,6 +386,4 @@ def _number(cell: Cell) -> float | None:
 
 
 def _short(text: str, longest: int = LONGEST) -> str:
-    if len(text) <= longest:
-        return text
-    return text[:longest].rsplit(" ", 1)[0].rstrip(",;:") + " ..."
+    return text if len(text) <= longest else text[:longest].rsplit(" ", 1)[0].rstrip(",;:") + " ..."

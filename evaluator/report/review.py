@@ -82,10 +82,12 @@ def index_run(run: RunFolder, comparison: Comparison, results: Results, began_ns
     read = _Read(
         began_ns=began_ns, rows=comparison.rows, motions=comparison.motions, derived=derived
     )
-    _write(run, read, results, None)
+    _write(run, read, results, None, is_new=True)
 
 
-def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str | None) -> bytes:
+def _write(
+    run: RunFolder, read: _Read, results: Results | None, none: str | None, *, is_new: bool = False
+) -> bytes:
     state = review_index.state_of(run)
     planned = [motion for motion in read.motions if motion.against == "planned"]
     off = {motion.episode: (motion.path_max_m, motion.lag_s) for motion in planned}
@@ -102,8 +104,8 @@ def _write(run: RunFolder, read: _Read, results: Results | None, why_none: str |
         "as_of_ns": read.began_ns,
         "changed_meanwhile": state.newest_ns >= read.began_ns,
         "comparison_reason": read.reason,
-        "outdated": None if results is None or read.reason else _outdated(run, read.rows),
-        "results_reason": why_none,
+        "outdated": None if is_new or not results or read.reason else _outdated(run, read.rows),
+        "results_reason": none,
         "stand_in": stand_in_of(row.stand_in for row in read.rows)
         if results is None or results.stand_in is None
         else results.stand_in,
@@ -196,10 +198,9 @@ def _files(run: RunFolder, read: _Read, trials: set[str]) -> Iterator[review_ind
         if path.name not in trials:
             yield _file(run, path)
     for path in run.derived():
-        if f"{run.derived_dir.name}/{path.name}" not in read.derived:
-            found = _file(run, path)
-            if found.error:
-                yield found
+        was_read = f"{run.derived_dir.name}/{path.name}" in read.derived
+        if not was_read and (found := _file(run, path)).error:
+            yield found
     for path in run.unfinished():
         reason = "not finished: still being recorded, or its recorder was stopped"
         yield review_index.IndexedFile(name=str(path.relative_to(run.path)), error=reason)

@@ -30,10 +30,8 @@ def as_text(table: Table, *, width: int | None = None) -> str:
     """Draw the table for a terminal, without the columns that are empty throughout.
 
     Lines break between words only. Columns that hold one value throughout are named once where the
-    table is too wide, and rows become lists of their cells where it still is.
-
-    Args:
-        width: Characters in a line; None asks the terminal.
+    table is too wide, and rows become lists of their cells where it still is. Without ``width``
+    the terminal says how many characters fit a line.
     """
     width = width or shutil.get_terminal_size(fallback=(80, 24)).columns
     shown = view(table)

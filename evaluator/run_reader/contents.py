@@ -96,11 +96,7 @@ class FileHash:
 def _take_inventory(
     run: RunFolder, cache: SummaryCache, output: Output
 ) -> tuple[list[RunFile], list[RunFile], list[Exclusion]]:
-    """Look at every file of a run, and hash those that are new or have changed.
-
-    Returns:
-        Recorded files, derived ones, and what cannot be read at all.
-    """
+    """Hash what is new or has changed: recorded files, derived ones, and what cannot be read."""
     now_ns = time.time_ns()
     groups = [(run.episodes_dir, parts) for parts in run.episode_parts().values()]
     groups += [(run.derived_dir, [path.name]) for path in run.derived()]
@@ -225,11 +221,7 @@ def _read(
     spread: Callable[..., Iterator[Facts | Exclusion]],
     output: Output,
 ) -> tuple[dict[str, Facts], list[Exclusion]]:
-    """Return what files say of themselves, by name, and those that cannot be read.
-
-    Args:
-        files: By what their facts are kept under.
-    """
+    """Return what files, by what their facts are kept under, say, by name; and the unreadable."""
     kept = {file.name: cache.find(kind, key) for key, file in files.items()}
     facts = {name: found[0] for name, found in kept.items() if found}
     unknown = {key: file for key, file in files.items() if file.name not in facts}

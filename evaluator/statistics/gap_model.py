@@ -3,20 +3,20 @@
 A population of groups is two curves of log-odds and a copula between them, and a share of groups in
 which the twin is blind: there it says something that has nothing to do with what is recorded. Some
 thousand populations are drawn once from the prior, each laid out as chances of pairs of rates; what
-was counted weighs them. So one product of two matrices gives the posterior, and equal counts give
-equal numbers. Where fewer than ``FEW`` populations would count, the weights are flattened until so
-many do: intervals are wider then, never narrower than the drawn populations can tell; the weights
+was counted weighs them. A run keeps them among its caches: they take longer to draw than to read.
+So one product of two matrices gives the posterior, and equal counts give equal numbers. Where fewer
+than ``FEW`` populations would count, the weights are flattened until so many do: intervals are
+wider then, never narrower than the drawn populations can tell; the weights
 as they are tell which group is blind. Groups that share tasks or policies count as fewer, by how
 much their rates have in common.
 """
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-from scipy.special import betainc, expit, ndtr, ndtri
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
@@ -25,6 +25,8 @@ from evaluator.statistics.intervals import LEVEL
 METHOD = "populations"
 MIN_GROUPS = 3
 NODES = 16_384
+PARTS = [slice(at, at + 256) for at in range(0, NODES, 256)]
+"""Populations that are drawn together: so many stay in a processor's cache."""
 FEW = 60.0
 CELLS = 21
 EDGES = np.concatenate([[-np.inf], np.linspace(-4.6, 4.6, CELLS - 1), [np.inf]])
@@ -68,7 +70,7 @@ Side = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Populations:
+class Populations:
     """Populations drawn from the prior."""
 
     seeing: Float32[np.ndarray, "nodes cells"]
@@ -87,11 +89,27 @@ class _Populations:
         """How r, bias and share are sorted."""
         return {n: np.argsort(getattr(self, n), kind="stable") for n in ("r", "bias", "share")}
 
+    def to_bytes(self) -> dict[str, bytes]:
+        """Return the bytes of each part."""
+        return {name: getattr(self, name).tobytes() for name in _STORED}
+
+    @staticmethod
+    def of_bytes(parts: Mapping[str, bytes]) -> "Populations":
+        """Return what was stored, number for number."""
+        found = {name: np.frombuffer(parts[name], kind) for name, kind in _STORED.items()}
+        cells = {name: found[name].reshape(-1, CELLS * CELLS) for name in ("seeing", "blind")}
+        return Populations(**found | cells)
+
+
+_STORED: dict[str, type[np.generic]] = dict.fromkeys(("seeing", "blind"), np.float32)
+_STORED |= {"may_be_blind": np.int64} | dict.fromkeys(("share", "r", "bias"), np.float64)
+
 
 @lru_cache(maxsize=1)
-def _drawn(nodes: int = NODES) -> _Populations:
+def drawn() -> Populations:
+    """Draw populations from the prior; always the same."""
     rng = np.random.default_rng(0)
-    z, u = rng.standard_normal((nodes, 8)), rng.random((nodes, 5))
+    z, u = rng.standard_normal((NODES, 8)), rng.random((NODES, 5))
     recorded_at = 1.6 * z[:, 0]
     size = np.maximum(np.abs(2 * z[:, 2]), 0.02)
     sim_size = np.maximum(size * np.exp(0.5 * z[:, 3]), 0.02)
@@ -100,24 +118,32 @@ def _drawn(nodes: int = NODES) -> _Populations:
     bends = np.where(u[:, 3:] < 0.6, 0.0, u[:, 3:] * 0.95).T
     recorded: Side = (recorded_at, size, bends[0])
     sim: Side = (recorded_at + 1.2 * z[:, 1], sim_size, bends[1])
-    blind: Side = (2 * z[:, 4], np.maximum(np.abs(z[:, 5]), 0.05), np.zeros(nodes))
+    blind: Side = (2 * z[:, 4], np.maximum(np.abs(z[:, 5]), 0.05), np.zeros(NODES))
     (x, middle_x), (y, middle_y), (of_blind, _) = (_masses(*s) for s in (recorded, sim, blind))
-    near = np.clip(rho, -0.97, 0.97)[:, None, None]
-    a, b = middle_x[:, :, None], middle_y[:, None, :]
-    seeing = np.exp(-(near**2 * (a * a + b * b) - 2 * near * a * b) / (2 * (1 - near**2)))
-    seeing *= x[:, :, None] * y[:, None, :]
-    seeing /= seeing.sum(axis=(1, 2), keepdims=True)
-    rows = np.flatnonzero(share)
-    pairs = seeing[rows].sum(axis=2)[:, :, None] * of_blind[rows, None, :]
+    seeing, pairs = np.empty((NODES, CELLS, CELLS), np.float32), []
+    for part in PARTS:
+        near = np.clip(rho[part], -0.97, 0.97)[:, None, None]
+        a, b = middle_x[part, :, None], middle_y[part, None, :]
+        mine = np.exp(-(near**2 * (a * a + b * b) - 2 * near * a * b) / (2 * (1 - near**2)))
+        mine *= x[part, :, None] * y[part, None, :]
+        mine /= mine.sum(axis=(1, 2), keepdims=True)
+        seeing[part], rows = mine, np.flatnonzero(share[part])
+        of_all = mine[rows].sum(axis=2)[:, :, None] * of_blind[part][rows, None, :]
+        pairs.append(of_all.reshape(len(rows), -1).astype(np.float32))
     r, bias = _moments(recorded, sim, blind, rho, share)
-    return _Populations(
-        seeing=seeing.reshape(nodes, -1).astype(np.float32),
-        may_be_blind=rows,
-        blind=pairs.reshape(len(rows), -1).astype(np.float32),
+    return Populations(
+        seeing=seeing.reshape(NODES, -1),
+        may_be_blind=np.flatnonzero(share),
+        blind=np.concatenate(pairs),
         share=share,
         r=r,
         bias=bias,
     )
+
+
+def _rate(log_odds: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
 def _bent(z: np.ndarray, bend: np.ndarray) -> np.ndarray:
@@ -131,6 +157,8 @@ def _bent(z: np.ndarray, bend: np.ndarray) -> np.ndarray:
 
 def _masses(at: np.ndarray, size: np.ndarray, bend: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Chance of each cell of log-odds, and the normal number in its middle."""
+    from scipy.special import ndtr, ndtri  # noqa: PLC0415  # takes half a second to load
+
     z = np.linspace(-6, 6, 241)
     found = (EDGES[None, 1:-1] - at[:, None]) / size[:, None]
     rows = np.flatnonzero(bend)
@@ -149,15 +177,17 @@ def _moments(
     w /= w.sum()
     z = QUADRATURE[None, :]
     at, size, bend = recorded
-    x = expit(at[:, None] + size[:, None] * _bent(z, bend))
+    x = _rate(at[:, None] + size[:, None] * _bent(z, bend))
     at, size, bend = sim
-    other = rho[:, None, None] * z[:, :, None] + np.sqrt(1 - rho**2)[:, None, None] * z[:, None, :]
-    y = expit(at[:, None, None] + size[:, None, None] * _bent(other, bend))
-    given = y @ w
-    of_blind = expit(blind[0][:, None] + blind[1][:, None] * z)
+    apart, given, square_y = np.sqrt(1 - rho**2), *np.empty((2, *x.shape))
+    for part in PARTS:
+        near, far, middle, wide = (v[part, None, None] for v in (rho, apart, at, size))
+        y = _rate(middle + wide * _bent(near * z[:, :, None] + far * z[:, None, :], bend[part]))
+        given[part], square_y[part] = y @ w, y**2 @ w
+    of_blind = _rate(blind[0][:, None] + blind[1][:, None] * z)
     mean_x, square_x = x @ w, x**2 @ w
     mean_y = (1 - share) * (given @ w) + share * (of_blind @ w)
-    square_y = (1 - share) * ((y**2 @ w) @ w) + share * (of_blind**2 @ w)
+    square_y = (1 - share) * (square_y @ w) + share * (of_blind**2 @ w)
     both = (1 - share) * ((x * given) @ w) + share * mean_x * (of_blind @ w)
     spread = (square_x - mean_x**2) * (square_y - mean_y**2)
     r = (both - mean_x * mean_y) / np.sqrt(np.maximum(spread, 1e-14))
@@ -169,6 +199,8 @@ class GapModel:
     """What some groups say of the population that they are from."""
 
     groups: tuple[GroupCounts, ...]
+    populations: Populations = field(default_factory=drawn, repr=False)
+    """What is weighed."""
     weights: Float64[np.ndarray, " nodes"] = field(init=False, repr=False)
     blind_groups: Float64[np.ndarray, " groups"] = field(init=False, repr=False)
     """Probability of each group that the twin is blind in it."""
@@ -197,11 +229,6 @@ class GapModel:
         # Flat weights would see scatter in place of groups that lie apart from the others.
         sharp = _flattened(logs, few=1.0)
         object.__setattr__(self, "blind_groups", sharp @ (share * blind / chance))
-
-    @property
-    def populations(self) -> _Populations:
-        """The populations that are weighed."""
-        return _drawn()
 
     @cached_property
     def design_effect(self) -> float:
@@ -241,7 +268,7 @@ class GapModel:
 
 
 def chances_in(
-    there: _Populations, tables: Sequence[np.ndarray]
+    there: Populations, tables: Sequence[np.ndarray]
 ) -> tuple[Float32[np.ndarray, "nodes groups"], Float32[np.ndarray, "nodes groups"]]:
     """Return the chance of each group's counts where the twin sees, and where it is blind."""
     chances = np.stack([table.ravel() for table in tables], axis=1).astype(np.float32)
@@ -283,7 +310,7 @@ def _likelihood(group: GroupCounts, odds: float) -> Float64[np.ndarray, "rates r
     found = np.outer(_binomial(*group.recorded), _binomial(*group.sim))
     if not sum(group.pairs):
         return found
-    p, q = expit(CENTRES)[:, None], expit(CENTRES)[None, :]
+    p, q = _rate(CENTRES)[:, None], _rate(CENTRES)[None, :]
     both = _both(p, q, float(np.exp(odds)))
     scale = min(1.0, MOST / sum(group.pairs))
     logs = np.zeros_like(found)
@@ -296,9 +323,11 @@ def _binomial(k: int, n: int) -> Float64[np.ndarray, " rates"]:
     """Mean chance of a count over the rates of each cell, 1 without trials."""
     if not n:
         return np.ones(CELLS)
+    from scipy.special import betainc  # noqa: PLC0415  # takes half a second to load
+
     scale = min(1.0, MOST / n)
     a, b = scale * k + 1, scale * (n - k) + 1
-    rates = expit(EDGES)
+    rates = _rate(EDGES)
     return np.asarray(np.diff(betainc(a, b, rates)) / np.diff(rates))
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import integrate, stats
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.gap_model import CENTRES, GapModel, GroupCounts, _drawn, _likelihood
+from evaluator.statistics.gap_model import CENTRES, GapModel, GroupCounts, _likelihood, drawn
 
 N = 30
 
@@ -73,7 +73,7 @@ def test_the_chance_of_a_count_is_its_mean_over_a_cell() -> None:
 
 def test_r_and_bias_of_a_population_are_those_of_its_own_draws() -> None:
     """By drawing cells from what was laid out: coarser, and by other code."""
-    there = _drawn()
+    there = drawn()
     rates = 1 / (1 + np.exp(-CENTRES))
     rng = np.random.default_rng(3)
     checked = 0

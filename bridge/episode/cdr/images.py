@@ -110,8 +110,7 @@ def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
     if header.encoding not in COLOR_LAYOUTS:
         return None
     layout, channels = COLOR_LAYOUTS[header.encoding]
-    rows = pixel_rows(header)
-    image_u8 = rows.reshape(header.height, header.width, channels)
+    image_u8 = pixel_rows(header).reshape(header.height, header.width, channels)
     try:
         jpeg = encode_jpeg(image_u8, quality, layout=layout, subsampling=SUBSAMPLING)
     except ValueError as error:

@@ -77,8 +77,7 @@ def _summary_start(file: RecordFile) -> int | None:
     start, _, crc = mcap.FOOTER_FIELDS.unpack_from(footer, mcap.RECORD_HEAD.size)
     if not len(mcap.MAGIC) <= start <= file.size - _FOOTER_BYTES:
         return None
-    is_right = crc == file.crc(start, file.size - start - len(mcap.MAGIC) - 4)
-    return int(start) if is_right else None
+    return int(start) if crc == file.crc(start, file.size - start - len(mcap.MAGIC) - 4) else None
 
 
 def summary_definitions(file: RecordFile) -> list[bytes]:

@@ -336,8 +336,7 @@ class DataSection:
     def seal(self) -> None:
         """Write the end of the data, the summary and the footer."""
         data_end = mcap_format.data_end(self.file.crc)
-        summary = self.summary.encode(self.file.offset + len(data_end))
-        self.file.append([data_end, summary])
+        self.file.append([data_end, self.summary.encode(self.file.offset + len(data_end))])
 
 
 def index_records(index: dict[int, list[int]], start: int) -> tuple[bytes, dict[int, int]]:

@@ -300,8 +300,7 @@ def read_header(stream: ByteStream) -> records.Header:
     """Read magic and first record; raises BrokenRecordError."""
     if stream.read(len(MAGIC)) != MAGIC:
         raise BrokenRecordError("it does not begin as an MCAP file does")
-    size = stream.seek(0, 2)
-    place = next(walk(stream, len(MAGIC), size), None)
+    place = next(walk(stream, len(MAGIC), stream.seek(0, 2)), None)
     record = parse(place.opcode, read_body(stream, place)) if place else None
     if not isinstance(record, records.Header):
         raise BrokenRecordError("its first record is no header")

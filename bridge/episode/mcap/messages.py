@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int64, UInt16, UInt64
 from mcap import records
 
 from bridge.episode.mcap.file import McapFile, damaged
-from bridge.episode.mcap.format import CHUNK, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.format import CHUNK, MESSAGE, MESSAGE_FIELDS, MESSAGE_HEAD, RECORD_HEAD
 from bridge.episode.mcap.walk import (
     DAMAGE,
     BrokenRecordError,
@@ -62,14 +62,18 @@ def _refuse_strays(
 
 def message_table(data: bytes) -> MessageTable:
     """List the messages in a chunk."""
-    times_ns, channel_ids = array("Q"), array("H")
-    starts = array("q")
-    for opcode, at, _ in records_in(data):
-        if opcode == MESSAGE:
-            _, _, channel_id, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(data, at)
-            times_ns.append(log_time_ns)
-            channel_ids.append(channel_id)
-            starts.append(at)
+    times_ns, channel_ids, starts = array("Q"), array("H"), array("q")
+    at, end, unpack = 0, len(data), MESSAGE_HEAD.unpack_from
+    while at < end:  # nearly all are whole messages, for which this is one step each
+        if data[at] == MESSAGE and end - at >= MESSAGE_HEAD.size:
+            _, length, channel_id, _, log_time_ns, _ = unpack(data, at)
+            if length >= MESSAGE_FIELDS and at + RECORD_HEAD.size + length <= end:
+                times_ns.append(log_time_ns)
+                channel_ids.append(channel_id)
+                starts.append(at)
+                at += RECORD_HEAD.size + length
+                continue
+        at += RECORD_HEAD.size + next(records_in(data, at))[2]
     return MessageTable(
         np.array(times_ns, dtype=np.uint64),
         np.array(channel_ids, dtype=np.uint16),
@@ -359,8 +363,7 @@ class _Held:
     def load(self, source: _Source) -> None:
         """Read a chunk, after those needed last made room for it."""
         while self._sources and self._bytes + source.size > MEMORY_BYTES:
-            last = max(self._sources, key=lambda held: held.next_ns)
-            self.forget(last)
+            self.forget(max(self._sources, key=lambda held: held.next_ns))
         source.load()
         self._sources.add(source)
         self._bytes += source.size

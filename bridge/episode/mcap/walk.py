@@ -264,8 +264,7 @@ def parse_chunk(body: bytes) -> ChunkHead:
     if length > len(body) - at:
         message = f"a chunk claims {length} bytes of data, {len(body) - at} are there"
         raise BrokenRecordError(message)
-    data = memoryview(body)[at : at + length]
-    return ChunkHead(start_ns, end_ns, size, crc, compression, data)
+    return ChunkHead(start_ns, end_ns, size, crc, compression, memoryview(body)[at : at + length])
 
 
 def unpack_chunk(chunk: ChunkHead, *, whose: str = "a chunk") -> bytes:
@@ -320,9 +319,9 @@ def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
     return MessageHead(log_ns, where, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
 
 
-def records_in(data: Buffer) -> Iterator[tuple[int, int, int]]:
+def records_in(data: Buffer, at: int = 0) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, offset and body length of each record in a chunk's unpacked data."""
-    at, end = 0, len(data)
+    end = len(data)
     head_bytes, unpack = RECORD_HEAD.size, RECORD_HEAD.unpack_from
     while at < end:
         if end - at < head_bytes:

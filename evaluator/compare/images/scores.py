@@ -215,9 +215,7 @@ def measure_images(
 ) -> list[Measurement]:
     """Measure the mean of every metric that each variant can have; no number without its protocol.
 
-    Args:
-        quantities: By the metric, and whether the images were compared as they are stored.
-        protocol: What all numbers about these images have in common.
+    ``quantities``: by the metric, and whether the images were compared as they are stored.
     """
     variants = {variant: None for score in scores for variant in score} or {RAW: None}
     found = []

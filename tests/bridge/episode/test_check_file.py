@@ -124,8 +124,7 @@ def test_a_number_that_is_off_by_one_is_found(
 @pytest.mark.parametrize("opcode", [mcap_format.DATA_END, mcap_format.FOOTER])
 def test_a_wrong_crc_of_data_or_summary_is_found(tmp_path: Path, opcode: int) -> None:
     data = bytearray(whole_file())
-    place = find(bytes(data), opcode, in_summary=opcode == mcap_format.FOOTER)
-    data[place.end - 1] ^= 1
+    data[find(bytes(data), opcode, in_summary=opcode == mcap_format.FOOTER).end - 1] ^= 1
     faults = check(tmp_path / "x.mcap", bytes(data))
     assert "another CRC than it declares" in faults[0]
 

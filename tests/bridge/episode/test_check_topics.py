@@ -105,8 +105,7 @@ def test_losses_the_ledger_lists_are_declared(tmp_path: Path) -> None:
 def test_losses_the_ledger_does_not_list_are_named(tmp_path: Path) -> None:
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, [0, 1, 5])
-        record = drops(JOINTS, gaps=1)
-        writer.write_json(DROPS, record, type_name=schema.DROPS, log_time_ns=2000)
+        writer.write_json(DROPS, drops(JOINTS, gaps=1), type_name=schema.DROPS, log_time_ns=2000)
 
     report = check(tmp_path, fill)
     assert (report.exit_code, report.summary) == (3, "drops not logged")
@@ -186,8 +185,7 @@ def foreign(path: Path, topic: str, name: str, data: bytes) -> Path:
 
 
 def test_our_contract_is_not_asked_of_other_programs(tmp_path: Path) -> None:
-    path = foreign(tmp_path / "x.mcap", JOINTS, schema.JOINT_STATE, b"no CDR")
-    report = check_episode(path)
+    report = check_episode(foreign(tmp_path / "x.mcap", JOINTS, schema.JOINT_STATE, b"no CDR"))
     assert (report.exit_code, report.summary, report.faults) == (3, "unreadable", [])
     assert report.topics[JOINTS].undecodable == 2
     assert report.findings[0].text.startswith("2 of 2 messages cannot be read: not a valid")
@@ -198,8 +196,7 @@ def test_the_command_prints_everything_as_json(
 ) -> None:
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, [0, 2])
-        record = drops(JOINTS, gaps=1)
-        writer.write_json(DROPS, record, type_name=schema.DROPS, log_time_ns=2000)
+        writer.write_json(DROPS, drops(JOINTS, gaps=1), type_name=schema.DROPS, log_time_ns=2000)
 
     check(tmp_path, fill)
     part = tmp_path / "e2.mcap.part"

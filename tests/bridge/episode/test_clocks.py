@@ -118,8 +118,7 @@ def test_stamps_alone_show_a_jump_but_no_stall_and_no_playback() -> None:
 
 
 def _joints(stamp_ns: int) -> bytes:
-    sample = at_positions(stamp_ns, ("a",), np.ones(1))
-    return sample.to_cdr()
+    return at_positions(stamp_ns, ("a",), np.ones(1)).to_cdr()
 
 
 def _write(path: Path, host: Host, *, seconds: int = 30, jump_at: int | None = None) -> None:

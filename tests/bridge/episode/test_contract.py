@@ -42,8 +42,7 @@ def seen(*stamps_s: float, pauses: tuple[tuple[int, int], ...] = ()) -> Presence
 
 
 def steady(start_s: float, end_s: float, rate_hz: float = 100.0) -> list[float]:
-    count = round((end_s - start_s) * rate_hz)
-    return [start_s + number / rate_hz for number in range(count + 1)]
+    return [start_s + number / rate_hz for number in range(round((end_s - start_s) * rate_hz) + 1)]
 
 
 def broken(
@@ -52,8 +51,7 @@ def broken(
 ) -> list[str]:  # fmt: skip
     span = Span(NS_PER_S, NS_PER_S + round(end_s * NS_PER_S), pauses)
     presences = {} if presence is None else {JOINTS: presence}
-    reports = judge(presences, Contract(topics={JOINTS: rule}), span, {JOINTS: lost})
-    return told(reports, presences)
+    return told(judge(presences, Contract(topics={JOINTS: rule}), span, {JOINTS: lost}), presences)
 
 
 def told(
@@ -112,10 +110,8 @@ def test_a_silence_is_told_exactly_when_one_is_longer_than_allowed(
     presence = Presence()
     for stamp in stamps:
         presence.see(stamp, ())
-    edges = [NS_PER_S, *stamps, 21 * NS_PER_S]
-    longest_ns = max(b - a for a, b in itertools.pairwise(edges))
-    rule = TopicRule(silence_s=limit_s)
-    found = broken(presence, rule, end_s=20.0)
+    longest_ns = max(b - a for a, b in itertools.pairwise([NS_PER_S, *stamps, 21 * NS_PER_S]))
+    found = broken(presence, TopicRule(silence_s=limit_s), end_s=20.0)
     assert bool(found) == (longest_ns / NS_PER_S > limit_s)
 
 

@@ -47,8 +47,7 @@ def test_first_and_last_motion_are_found_within_50_ms(
     start: int, length: int, by_rad: float, sign: int, joint: int, seed: int
 ) -> None:
     clean = moved_once(start, length, sign * by_rad, joint=joint)
-    noisy = clean + np.random.default_rng(seed).normal(0, 5e-5, clean.shape)
-    found = motion_ns(track_of(noisy))
+    found = motion_ns(track_of(clean + np.random.default_rng(seed).normal(0, 5e-5, clean.shape)))
     assert found is not None
     # The oracle looks at speeds of the motion without noise: above 0.01 rad/s it moves.
     moving = np.flatnonzero(np.abs(np.diff(clean[:, joint])) / (PERIOD_NS * 1e-9) > 0.01)
@@ -89,8 +88,7 @@ def write(
     with EpisodeWriter(path) as writer:
         writer.describe(info)
         for stamp_ns, row in zip(track.stamps_ns.tolist(), track.position, strict=True):
-            sample = at_positions(stamp_ns, track.names, row)
-            data = sample.to_cdr()
+            data = at_positions(stamp_ns, track.names, row).to_cdr()
             writer.write(
                 "/c/joint_states", data, type_name=schema.JOINT_STATE, log_time_ns=stamp_ns
             )

@@ -104,8 +104,7 @@ def test_foxgloves_unfinished_tail_chunk_is_understood(tmp_path: Path) -> None:
 
 
 def test_attachments_and_metadata_come_along_and_the_loss_is_declared(whole: Path) -> None:
-    part = cut(whole, whole.stat().st_size * 3 // 4)
-    report = recover(part)
+    report = recover(cut(whole, whole.stat().st_size * 3 // 4))
     assert report.output is not None
     with report.output.open("rb") as stream:
         (attachment,) = make_reader(stream).iter_attachments()
@@ -122,8 +121,7 @@ def test_attachments_and_metadata_come_along_and_the_loss_is_declared(whole: Pat
 
 
 def test_a_finished_part_is_only_renamed(tmp_path: Path) -> None:
-    whole = write_ours(tmp_path / "w.mcap", MESSAGES)
-    data = whole.read_bytes()
+    data = write_ours(tmp_path / "w.mcap", MESSAGES).read_bytes()
     part = tmp_path / "f.mcap.part"
     part.write_bytes(data)
     report = recover(part)
@@ -146,8 +144,7 @@ def test_a_taken_name_is_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_another_writers_broken_file_stays_as_it_is(tmp_path: Path) -> None:
-    whole = write_official(tmp_path / "w.mcap", MESSAGES)
-    broken = cut(whole, 4000, "b.mcap")
+    broken = cut(write_official(tmp_path / "w.mcap", MESSAGES), 4000, "b.mcap")
     before = broken.read_bytes()
     report = recover(broken)
     assert report.output == tmp_path / "b_recovered.mcap"

@@ -167,8 +167,7 @@ def test_what_recover_writes_passes_the_check_whatever_the_damage(
 
 
 def test_a_message_that_calls_itself_an_index_is_not_lost_unsaid(tmp_path: Path) -> None:
-    whole = write_official(tmp_path / "w.mcap", MESSAGES, chunked=False)
-    data = bytearray(whole.read_bytes())
+    data = bytearray(write_official(tmp_path / "w.mcap", MESSAGES, chunked=False).read_bytes())
     at = data.index(MESSAGES[20].data) - MESSAGE_HEAD.size
     assert data[at] == MESSAGE
     data[at] = MESSAGE_INDEX

@@ -15,8 +15,7 @@ STAMPS = np.array([0, 1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789])
     "names", [("a",), ("shoulder", "elbow_joint", "wrist"), ("gripper_width",)]
 )
 def test_joint_states_are_the_same_bytes(names: tuple[str, ...]) -> None:
-    rng = np.random.default_rng(0)
-    position = rng.normal(size=(len(STAMPS), len(names)))
+    position = np.random.default_rng(0).normal(size=(len(STAMPS), len(names)))
     position[0] = 0.0
     position[1] = np.inf
     for stamp, row, data in zip(

@@ -55,8 +55,7 @@ def in_layout(rgb: np.ndarray, encoding: str) -> np.ndarray:
 
 def test_a_header_says_where_the_pixels_are() -> None:
     depth = np.arange(12, dtype=np.uint16).reshape(3, 4)
-    data = image(depth, "16UC1")
-    header = image_header(data)
+    header = image_header(image(depth, "16UC1"))
     assert (header.stamp_ns, header.frame_id) == (STAMP_NS, "camera")
     assert (header.height, header.width, header.encoding, header.step) == (3, 4, "16UC1", 8)
     assert header.pixels == depth.tobytes()
@@ -79,8 +78,7 @@ def test_a_big_endian_message_is_read() -> None:
 @pytest.mark.parametrize("padding", [0, 1, 64])
 def test_every_colour_encoding_becomes_the_same_jpeg_colours(encoding: str, padding: int) -> None:
     rgb = smooth_rgb()
-    data = padded(in_layout(rgb, encoding), encoding, padding)
-    jpeg = image_to_jpeg(data, 95)
+    jpeg = image_to_jpeg(padded(in_layout(rgb, encoding), encoding, padding), 95)
     assert jpeg is not None
     color = CompressedColor.from_cdr(jpeg)
     assert (color.stamp_ns, color.frame_id, color.format) == (STAMP_NS, "camera", "jpeg")

@@ -224,8 +224,7 @@ def test_what_is_not_localised_or_not_a_number_stays_open(spec: dict[str, Any]) 
     }
     named = predicate.bodies_of(spec)
     for name in named:
-        missing = {key: T for key, T in Ts.items() if key != name}
-        answer = found(spec, **missing)
+        answer = found(spec, **{key: T for key, T in Ts.items() if key != name})
         assert answer.value is None
         assert name in answer.detail
         assert found(spec, **{**Ts, name: np.full((4, 4), np.nan)}).value is None

@@ -71,8 +71,7 @@ def test_the_shape_of_a_rigid_object_holds() -> None:
 
 def test_ducks_are_counted_one_by_one() -> None:
     task = load_task("five_ducks_into_basket")
-    findings = evaluate_success(task, rollout(task, outside="duck_2"))
-    done = objects_done(findings, task.manipulated)
+    done = objects_done(evaluate_success(task, rollout(task, outside="duck_2")), task.manipulated)
     assert done == {f"duck_{k}": k != 2 for k in range(1, 6)}
 
 

@@ -47,8 +47,7 @@ def test_every_edge_belongs_to_two_triangles_in_opposite_directions(name: str) -
 def test_a_basket_that_many_grids_cut_badly_is_closed_on_another() -> None:
     """A drawn laboratory had it: the first five shifts of the grid give no closed surface."""
     scale = (0.9273804612549033, 1.0194105348968454, 1.1153609232615622)
-    nominal_m = (0.22, 0.17, 0.1)
-    x_m, y_m, z_m = (size * part for size, part in zip(nominal_m, scale, strict=True))
+    x_m, y_m, z_m = (size * part for size, part in zip((0.22, 0.17, 0.1), scale, strict=True))
     assert is_closed(basket_mesh((x_m, y_m, z_m), WALL_M).triangles)
 
 
