@@ -358,7 +358,7 @@ def main() -> None:
 def names_its_cause(row: dict[str, Any]) -> bool:
     """Whether a refusal says what its family has wrong, or of a mixed one anything."""
     wanted = [words for start, words in CAUSES.items() if row["family"].startswith(start)]
-    said = row["cause"].strip(": None")
+    said = row["cause"].removesuffix("None").strip(": ")
     return any(word in said for word in wanted[0]) if wanted else bool(said)
 
 

@@ -329,10 +329,9 @@ class Oracle:
         t = np.array([row[0] for row in rows]) * 1e-9
         speeds = np.diff(np.stack([row[1] for row in rows]), axis=0) / np.diff(t)[:, None]
         speeds = np.pad(speeds, ((1, 1), (0, 0)))  # at rest before and after
-        ends = np.sort(np.concatenate([t - AHEAD_S, t + AHEAD_S]))
-        middles = (ends[1:] + ends[:-1]) / 2  # between two ends nothing changes
-        first, last = (np.searchsorted(t, middles + by) for by in (-AHEAD_S, AHEAD_S))
-        straight = np.abs(speeds[last] - speeds[first]).max(axis=0) / (2 * AHEAD_S)
+        gaps = np.diff(t, prepend=-np.inf, append=np.inf) >= 2 * AHEAD_S
+        corners = np.abs(np.diff(speeds, axis=0))[gaps[:-1] & gaps[1:]]  # of others two are one
+        straight = corners.max(axis=0, initial=0.0) / (2 * AHEAD_S)
         return "straight_acceleration" if np.any(straight > self._limit_rad_s2 * BAND) else ""
 
     def least_acceleration(self, plan: Mapping[str, Any]) -> float:
