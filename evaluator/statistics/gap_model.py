@@ -179,9 +179,9 @@ def _moments(
     at, size, bend = recorded
     x = _rate(at[:, None] + size[:, None] * _bent(z, bend))
     at, size, bend = sim
-    apart, given, square_y = np.sqrt(1 - rho**2), *np.empty((2, *x.shape))
+    other, given, square_y = np.sqrt(1 - rho**2), *np.empty((2, *x.shape))
     for part in PARTS:
-        near, far, middle, wide = (v[part, None, None] for v in (rho, apart, at, size))
+        near, far, middle, wide = (v[part, None, None] for v in (rho, other, at, size))
         y = _rate(middle + wide * _bent(near * z[:, :, None] + far * z[:, None, :], bend[part]))
         given[part], square_y[part] = y @ w, y**2 @ w
     of_blind = _rate(blind[0][:, None] + blind[1][:, None] * z)
