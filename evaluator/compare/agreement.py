@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 from evaluator import measurements
 from evaluator.cache import SummaryCache
@@ -13,11 +13,8 @@ from evaluator.compare.rows import RateGroup
 from evaluator.compare.success import of_group
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval, Measurement
-from evaluator.statistics import agreement
+from evaluator.statistics import agreement, gap_model
 from evaluator.statistics.agreement import counted_groups
-
-if TYPE_CHECKING:
-    from evaluator.statistics.gap_model import Populations
 
 MODEL_FROM = 4
 """Groups from which r and the bias have an interval."""
@@ -71,33 +68,13 @@ class Fitted:
     blind_groups: tuple[float, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class DrawnPopulations:
-    """What the model weighs: the same for all runs, and longer to draw than to read."""
-
-    parts: dict[str, bytes]
-
-
-@lru_cache(maxsize=1)
-def _populations(cache: SummaryCache) -> "Populations":
-    from evaluator.statistics.gap_model import NODES, Populations, drawn  # noqa: PLC0415
-
-    def draw() -> tuple[DrawnPopulations]:
-        return (DrawnPopulations(parts=drawn().to_bytes()),)
-
-    return Populations.of_bytes(cache.kept_or_made(DrawnPopulations, f"{NODES}", draw)[0].parts)
-
-
 def _fitted(groups: Sequence[RateGroup], cache: SummaryCache) -> Fitted | str:
     """Return the model of some groups with both rates, or why there is none."""
     if len(groups) < MODEL_FROM:
         return f"{counted_groups(len(groups))}; it needs {MODEL_FROM}"
 
     def fit() -> tuple[Fitted]:
-        from evaluator.statistics.gap_model import GapModel, GroupCounts  # noqa: PLC0415
-
-        counted = tuple(GroupCounts(**each) for each in counts)
-        model = GapModel(groups=counted, populations=_populations(cache))
+        model = gap_model.GapModel(groups=tuple(gap_model.GroupCounts(**each) for each in counts))
         blind = tuple(map(float, model.blind_groups))
         share = model.blind_share
         return (Fitted(r=model.r, bias=model.bias, blind_share=share, blind_groups=blind),)

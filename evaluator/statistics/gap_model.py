@@ -3,15 +3,14 @@
 A population of groups is two curves of log-odds and a copula between them, and a share of groups in
 which the twin is blind: there it says something that has nothing to do with what is recorded. Some
 thousand populations are drawn once from the prior, each laid out as chances of pairs of rates; what
-was counted weighs them. A run keeps them among its caches: they take longer to draw than to read.
-So one product of two matrices gives the posterior, and equal counts give equal numbers. Where fewer
-than ``FEW`` populations would count, the weights are flattened until so many do: intervals are
-wider then, never narrower than the drawn populations can tell; the weights
+was counted weighs them. So one product of two matrices gives the posterior, and equal counts give
+equal numbers. Where fewer than ``FEW`` populations would count, the weights are flattened until so
+many do: intervals are wider then, never narrower than the drawn populations can tell; the weights
 as they are tell which group is blind. Groups that share tasks or policies count as fewer, by how
 much their rates have in common.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
@@ -88,21 +87,6 @@ class Populations:
     def orders(self) -> dict[str, np.ndarray]:
         """How r, bias and share are sorted."""
         return {n: np.argsort(getattr(self, n), kind="stable") for n in ("r", "bias", "share")}
-
-    def to_bytes(self) -> dict[str, bytes]:
-        """Return the bytes of each part."""
-        return {name: getattr(self, name).tobytes() for name in _STORED}
-
-    @staticmethod
-    def of_bytes(parts: Mapping[str, bytes]) -> "Populations":
-        """Return what was stored, number for number."""
-        found = {name: np.frombuffer(parts[name], kind) for name, kind in _STORED.items()}
-        cells = {name: found[name].reshape(-1, CELLS * CELLS) for name in ("seeing", "blind")}
-        return Populations(**found | cells)
-
-
-_STORED: dict[str, type[np.generic]] = dict.fromkeys(("seeing", "blind"), np.float32)
-_STORED |= {"may_be_blind": np.int64} | dict.fromkeys(("share", "r", "bias"), np.float64)
 
 
 @lru_cache(maxsize=1)
@@ -199,8 +183,6 @@ class GapModel:
     """What some groups say of the population that they are from."""
 
     groups: tuple[GroupCounts, ...]
-    populations: Populations = field(default_factory=drawn, repr=False)
-    """What is weighed."""
     weights: Float64[np.ndarray, " nodes"] = field(init=False, repr=False)
     blind_groups: Float64[np.ndarray, " groups"] = field(init=False, repr=False)
     """Probability of each group that the twin is blind in it."""
@@ -229,6 +211,11 @@ class GapModel:
         # Flat weights would see scatter in place of groups that lie apart from the others.
         sharp = _flattened(logs, few=1.0)
         object.__setattr__(self, "blind_groups", sharp @ (share * blind / chance))
+
+    @property
+    def populations(self) -> Populations:
+        """The populations that are weighed."""
+        return drawn()
 
     @cached_property
     def design_effect(self) -> float:
