@@ -330,8 +330,7 @@ Item = TypeVar("Item", TrialRow, IndexedFile)
 
 
 def _spelt(item: Item) -> Item:
-    texts: dict[str, Any] = {n: printable(v) for n, v in vars(item).items() if isinstance(v, str)}
-    return replace(item, **texts)
+    return replace(item, **{n: printable(v) for n, v in vars(item).items() if isinstance(v, str)})
 
 
 class ReviewIndex:

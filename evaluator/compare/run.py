@@ -203,8 +203,7 @@ def compare_read(
 
 def _with_parts(base: Comparison, parts: Sequence[Part]) -> Comparison:
     more = vars(joined(parts)).items()
-    both: dict[str, Any] = {name: (*getattr(base, name), *items) for name, items in more}
-    return replace(base, **both)
+    return replace(base, **{name: (*getattr(base, name), *items) for name, items in more})
 
 
 def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:

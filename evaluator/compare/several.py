@@ -142,8 +142,7 @@ def _trials(gathered: _Gathered) -> Comparison:
     else:
         stand_in = stand_in_of(row.stand_in for row in rows)
         base = compare_rows(rows, run=gathered.name, source="trials", stand_in=stand_in)
-    base = replace(base, exclusions=(*unknown_sides(rows), *base.exclusions))
-    return _from(base, gathered)
+    return _from(replace(base, exclusions=(*unknown_sides(rows), *base.exclusions)), gathered)
 
 
 def _rates(gathered: _Gathered) -> Comparison:

@@ -17,8 +17,6 @@ from evaluator.statistics.intervals import wilson
 SHOWN_TASKS = 8
 """Tasks with a line; the table holds the others."""
 SHOWN_MISSING = 6
-NAMED_TASKS = 4
-"""More are counted where a step says on which to try."""
 SAYS_LITTLE = 10
 """Fewer trials that all end alike say little of anything."""
 SHOWN_ANSWERS = 3
@@ -127,9 +125,7 @@ def _by_task(results: Results) -> list[str]:
     if not split:
         return []
     (one, here), (other, there) = split[0].items()
-    words = f"Which is better depends on the task: {one} on {here}, {other} on {there}"
-    more = f"; {len(split) - 1} more {noun('pair', len(split) - 1)} too" if split[1:] else ""
-    return [f"{words}{more}."]
+    return [f"Which is better depends on the task: {one} on {here}, {other} on {there}."]
 
 
 def _standing(results: Results) -> tuple[list[str], list[str]]:
@@ -142,16 +138,15 @@ def _standing(results: Results) -> tuple[list[str], list[str]]:
     beaten = [str(row["candidate"]) for row in rows if row["may be best"] == "no"]
     if not beaten:
         return [], []
+    if not best:
+        return [f"Each of {len(rows)} candidates lost to another: none is the best."], []
     if len(best) > 1:
         listed = ", ".join(str(row["candidate"]) for row in best[:SHOWN_TASKS])
         more = " ..." if len(best) > SHOWN_TASKS else ""
         return [f"{len(best)} of {len(rows)} candidates may be best: {listed}{more}."], beaten
     words = " ".join(f"{row['candidate']} ({row['k']} of {row['n']})" for row in best)
-    over_all = all(
-        f", {best[0]['candidate']}, " in f", {row['beaten by']}, "
-        for row in rows
-        if row["may be best"] == "no"
-    )
+    name = f", {best[0]['candidate']}, "
+    over_all = all(name in f", {row['beaten by']}, " for row in rows if row not in best)
     why = "it is better than each of the others" if over_all else "only it lost no comparison"
     return [f"{words} is the best of {len(rows)} candidates: {why}; stop here."], beaten
 
@@ -217,7 +212,7 @@ def next_trials(results: Results) -> str:
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
     one = -(-more // max(1, len(tasks)))
     first, second = (n if n.startswith("with") else f"of {n}" for n in _apart(pair))
-    where = f": {', '.join(tasks)}" if len(tasks) <= NAMED_TASKS else ""
+    where = f": {', '.join(tasks)}" if len(tasks) <= SHOWN_TASKS else ""
     split = f" on each of {len(tasks)} tasks{where}" if len(tasks) > 1 else ""
     words = f"make {one} more {noun('trial', one)} {first} and {one} {second}{split}"
     then = "that would likely decide between them"
@@ -336,10 +331,11 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
     blind = by_id.get("agreement.blind_share")
     if r is not None and r.value is not None:
         size = f"r = {r.value:.2f}"
+        none = ", and may be none" if r.interval is not None and r.interval.low <= 0 else ""
         parts.append(
             f"Their correlation, {size}{_ends(r, '.2f')}, {SAYS_NOTHING}: its interval is too wide."
             if says_nothing(r)
-            else f"Their correlation is {size}{_ends(r, '.2f')}{_may_be_none(r)}."
+            else f"Their correlation is {size}{_ends(r, '.2f')}{none}."
             if not r.is_beyond
             else f"Measured {size}; without the noise of counting r lies in{_ends(r, '.2f')}."
         )
@@ -367,10 +363,6 @@ def _all_alike(results: Results) -> tuple[str, str]:
     few += f"{'say' if n > 1 else 'says'} next to nothing."
     alike = f"try {task} task: where all trials end alike, no candidate is better."
     return told, few if n < SAYS_LITTLE else alike
-
-
-def _may_be_none(r: Measurement) -> str:
-    return ", and may be none" if r.interval is not None and r.interval.low <= 0 else ""
 
 
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:

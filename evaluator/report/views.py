@@ -61,12 +61,7 @@ def shown_word(name: str) -> str:
     return _SIDE.sub(lambda found: SIDES[found[0]], name)
 
 
-SIDES = {
-    "sim": "twin",
-    "real": "recorded",
-    "stand-in": "recorded (stand-in)",
-    "pp": "points",
-}
+SIDES = {"sim": "twin", "real": "recorded", "stand-in": "recorded (stand-in)", "pp": "points"}
 """Words of tables as they are stored, and of those that are read."""
 _SIDE = re.compile(rf"\b({'|'.join(SIDES)})\b")
 

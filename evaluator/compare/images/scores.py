@@ -256,5 +256,4 @@ def _lacking(metric: ImageMetric, scores: Sequence[ImageScore]) -> str:
     without = sum(metric.id in score.reasons for score in scores)
     if not 0 < without < len(scores):
         return ""
-    reason = _first_reason(metric, scores)
-    return f"not in the mean: {without} of {len(scores)} images ({reason})"
+    return f"not in the mean: {without} of {len(scores)} images ({_first_reason(metric, scores)})"

@@ -151,6 +151,9 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
         rows=(("C", 1, 9, "no"), ("A", 8, 9, "yes"), ("B", 8, 9, "yes")),
     )
     assert "of A and 40 of B" in next_trials(replace(results, tables=(table, beaten)))
+    round_ = replace(beaten, rows=tuple((name, 5, 9, "no") for name in "ABC"))
+    told = " ".join(front(replace(results, tables=(round_,))).sentences)
+    assert told == "Each of 3 candidates lost to another: none is the best."
     pair = [compared(ALL_TASKS, "A, without replanning", "no", 9)]
     pair[0] = (*pair[0][:3], "A, with replanning", *pair[0][4:])
     next_step = next_trials(replace(results, tables=(replace(table, rows=tuple(pair)),)))
