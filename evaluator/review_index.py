@@ -330,7 +330,8 @@ Item = TypeVar("Item", TrialRow, IndexedFile)
 
 
 def _spelt(item: Item) -> Item:
-    return replace(item, **{n: printable(v) for n, v in vars(item).items() if isinstance(v, str)})
+    texts: dict[str, Any] = {n: printable(v) for n, v in vars(item).items() if isinstance(v, str)}
+    return replace(item, **texts)
 
 
 class ReviewIndex:

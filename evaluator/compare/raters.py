@@ -78,5 +78,4 @@ def _kappas(pairs: Bool[np.ndarray, "trials 2"]) -> Float64[np.ndarray, " draws"
     p, q = a.mean(axis=1), b.mean(axis=1)
     chance = p * q + (1 - p) * (1 - q)
     kept = chance < 1
-    agreed = (a == b).mean(axis=1)
-    return np.asarray((agreed[kept] - chance[kept]) / (1 - chance[kept]))
+    return np.asarray(((a == b).mean(axis=1)[kept] - chance[kept]) / (1 - chance[kept]))

@@ -203,7 +203,8 @@ def compare_read(
 
 def _with_parts(base: Comparison, parts: Sequence[Part]) -> Comparison:
     more = vars(joined(parts)).items()
-    return replace(base, **{name: (*getattr(base, name), *items) for name, items in more})
+    both: dict[str, Any] = {name: (*getattr(base, name), *items) for name, items in more}
+    return replace(base, **both)
 
 
 def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:

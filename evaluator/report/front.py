@@ -31,6 +31,7 @@ SIMPSON = "Simpson's paradox"
 """What the report begins with, where a note says it."""
 SAYS_NOTHING = "says nothing"
 """Said of r by a note, which the first page does not say twice."""
+SIDES = ("first", "second")
 TAKE = "take "
 """How a step begins after which no trial is needed."""
 FIGURES = ("scatter", "success")
@@ -88,7 +89,6 @@ def _compared(results: Results) -> list[str]:
     """Say which candidate is better, of the questions over all tasks, and what the twin's cost."""
     rows = rows_of(results, "comparisons")
     sentences = [str(row["answer"]) for row in rows if row["task"] == ALL_TASKS]
-    heads = ("undecided", "no difference")  # others begin with a name, which keeps its letters
     split = _by_task(results)
     standing, beaten = _standing(results)
     if standing:  # it says who is worse; what is open between those who may be best is left
@@ -99,33 +99,35 @@ def _compared(results: Results) -> list[str]:
             and not any(f": {name} " in text or f", {name} " in text for name in beaten)
         ]
     found = standing + [
-        f"{text[0].upper()}{text[1:]}." if text.startswith(heads) else f"{text}."
+        f"{text[0].upper()}{text[1:]}." if text.startswith(("undec", "no ")) else f"{text}."
         for text in sentences[: SHOWN_ANSWERS - len(standing) - 2 * len(split)]
     ]
     if alike := _all_alike(results)[0]:
         return [alike]
-    regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
-    if regret is not None and regret.value is not None:
-        found.append(
-            f"Had you taken the {regret.counted} that the twin ranks first, you would have lost "
-            f"{_points(regret.value)} of recorded success{_ends(regret, '.0f')}."
-        )
+    for regret in results.measurements:
+        if regret.id != "decision.regret_pp" or regret.value is None:
+            continue
+        name = regret.definition.partition("ranks first (")[2].partition(")")[0]
+        lost = f"{_points(regret.value)} of recorded success{_ends(regret, '.0f')}"
+        found.append(f"The twin ranks {name} first; to take that costs {lost} against the best.")
     return [*split, *found]
 
 
 def _by_task(results: Results) -> list[str]:
-    """Say where one candidate is better on one task, and worse on another."""
-    won: dict[tuple[str, str], dict[str, str]] = {}
-    for row in rows_of(results, "comparisons"):
-        first, second = str(row.get("first")), str(row.get("second"))
-        if row["task"] != ALL_TASKS and row["decided"] != "no":
-            better = second if row["decided"] == "better" else first
-            won.setdefault((first, second), {}).setdefault(better, str(row["task"]))
-    split = [found for found in won.values() if len(found) > 1]
-    if not split:
+    """Say who was not beaten on a task, where of two one is better here and the other there."""
+    rows = [row for row in rows_of(results, "comparisons") if row["task"] != ALL_TASKS]
+    decided = [row for row in rows if row["decided"] != "no"]
+    won = {(row.get("first"), row.get("second"), row["decided"]) for row in decided}
+    if not any({(*pair, "better"), (*pair, "worse")} <= won for *pair, _ in won):
         return []
-    (one, here), (other, there) = split[0].items()
-    return [f"Which is better depends on the task: {one} on {here}, {other} on {there}."]
+    listed = []
+    for task in dict.fromkeys(row["task"] for row in rows):
+        here = [row for row in decided if row["task"] == task]
+        lost = [row["first" if row["decided"] == "better" else "second"] for row in here]
+        names = dict.fromkeys(r[side] for r in rows if r["task"] == task for side in SIDES)
+        left = " or ".join(str(name) for name in names if name not in lost)
+        listed += [f"{left or 'none'} on {task}"] if lost else []
+    return [f"Which is better depends on the task. Not beaten: {'; '.join(listed)}."]
 
 
 def _standing(results: Results) -> tuple[list[str], list[str]]:
@@ -207,24 +209,27 @@ def next_trials(results: Results) -> str:
     if settled or not (wanted or _by_task(results)):
         return settled
     if _by_task(results):
-        return f"{TAKE}for each task the candidate that is better there; none is on all tasks."
+        return f"{TAKE}for each task one that was not beaten there; none is best on all tasks."
     more, pair = min(wanted)
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
     one = -(-more // max(1, len(tasks)))
-    first, second = (n if n.startswith("with") else f"of {n}" for n in _apart(pair))
+    (first, second), shared = _differing(pair)
+    sides = [n if n.startswith("with") else f"of {n}" for n in (first, second)]
     where = f": {', '.join(tasks)}" if len(tasks) <= SHOWN_TASKS else ""
     split = f" on each of {len(tasks)} tasks{where}" if len(tasks) > 1 else ""
-    words = f"make {one} more {noun('trial', one)} {first} and {one} {second}{split}"
-    then = "that would likely decide between them"
-    if len(wanted) > 1:
-        then += f", all that is open after up to {max(wanted)[0]} of each"
-    return f"{words}; {then}."
+    split += f" ({shared})" if shared else ""
+    words = f"make {one} more {noun('trial', one)} {sides[0]} and {one} {sides[1]}{split}"
+    then = ["that would likely decide between them"]
+    for many, others in sorted(wanted)[1:SHOWN_ANSWERS]:
+        then.append(f"{' against '.join(_differing(others)[0])} would take {many} of each")
+    return f"{words}; {', '.join(then)}."
 
 
-def _apart(pair: tuple[str, str]) -> list[str]:
-    """Name two candidates without what they have in common."""
-    parts = [both for both in zip(*(n.split(", ") for n in pair), strict=False) if len({*both}) > 1]
-    return [", ".join(each) for each in zip(*parts, strict=True)]
+def _differing(pair: tuple[str, str]) -> tuple[list[str], str]:
+    """Name two candidates without what they have in common, and that."""
+    parts = list(zip(*(name.split(", ") for name in pair), strict=False))
+    unlike = zip(*(both for both in parts if len({*both}) > 1), strict=True)
+    return list(map(", ".join, unlike)), ", ".join(a for a, b in parts if a == b)
 
 
 def _settled(compared: Sequence[Row], standing: Sequence[Row]) -> str:
@@ -315,8 +320,8 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
     rate = by_id.get(f"agreement.{side}.rate")
     if rate is not None and rate.k is not None and rate.n:
         who = "Twin" if side == "sim_planned" else "Without plans, what was executed in the twin"
-        trials = f"{rate.n} {noun('trial', rate.n)}"
-        parts.append(f"{who} and recorded outcome agree in {rate.k} of {trials}.")
+        of = f"{rate.k} of {rate.n} {noun('trial', rate.n)}"
+        parts.append(f"{who} and recorded outcome agree in {of}.")
     bias = by_id.get("agreement.bias_pp")
     one_line = num_tasks == 1 and bias is not None and bias.interval is None  # says it already
     if bias is not None and bias.value is not None and (bias.n or 0) > 1 and not one_line:
@@ -328,7 +333,6 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
         words = f"Over {bias.n} groups{each} the twin's rates lie {size} the recorded ones"
         parts.append(f"{words}{_ends(bias)}.")
     r = by_id.get("agreement.pearson_r")
-    blind = by_id.get("agreement.blind_share")
     if r is not None and r.value is not None:
         size = f"r = {r.value:.2f}"
         none = ", and may be none" if r.interval is not None and r.interval.low <= 0 else ""
@@ -339,13 +343,9 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
             if not r.is_beyond
             else f"Measured {size}; without the noise of counting r lies in{_ends(r, '.2f')}."
         )
-    named = _blind_groups(results)
-    if blind is not None and blind.interval is not None and (named or blind.interval.low > 0.01):
-        low, high = (round(100 * end) for end in (blind.interval.low, blind.interval.high))
+    if named := _blind_groups(results):
         more = "; ..." if len(named) > SHOWN_TASKS else ""
-        listed = f"Probably blind: {'; '.join(named[:SHOWN_TASKS])}{more}. " if named else ""
-        words = f"Of all groups of this kind {low} to {high} % are blind: there the twin's rate "
-        parts.append(f"{listed}{words}says nothing of the recorded one.")
+        parts.append(f"Probably blind: {'; '.join(named[:SHOWN_TASKS])}{more}.")
     return parts
 
 
@@ -359,9 +359,8 @@ def _all_alike(results: Results) -> tuple[str, str]:
     ends = wilson(k, n)
     told = f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies between "
     told += f"{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
-    few = f"record at least {SAYS_LITTLE} trials of each candidate on each task; {n} "
-    few += f"{'say' if n > 1 else 'says'} next to nothing."
-    alike = f"try {task} task: where all trials end alike, no candidate is better."
+    few = f"record {SAYS_LITTLE} trials or more of each candidate, in 4 groups to judge the twin."
+    alike = f"check the scoring, then try {task} task: where all trials end alike, none is better."
     return told, few if n < SAYS_LITTLE else alike
 
 

@@ -73,4 +73,4 @@ def test_a_new_task_goes_from_its_file_to_the_report(
     rows = [row for row in json.loads(said[3])["rows"] if row["mode"] == "dynamic"]
     assert {row["trajectory"] for row in rows} == {"planned", "executed"}
     assert all(row["error"] is None and row["accepted"] is not None for row in rows)
-    assert "stand-in: 1/1" in said[4]
+    assert "recorded (stand-in): 1/1" in said[4]

@@ -127,21 +127,20 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     ]
     table = Table(id="comparisons", title="t", columns=columns, rows=tuple(rows))
     results = Results(run="r", source="trials", stand_in=None, tables=(table,))
-    words = "make 1 more trial of C and 1 of B; that would likely decide between them, all that is"
-    assert next_trials(results) == f"{words} open after up to 40 of each."
+    words = "make 1 more trial of C and 1 of B; that would likely decide between them, A against B"
+    assert next_trials(results) == f"{words} would take 40 of each."
     in_tasks = replace(
         table, rows=(rows[0], *(compared(t, "A", "no", 9) for t in ("pour", "stir")))
     )
     of_tasks = next_trials(replace(results, tables=(in_tasks,)))
-    assert of_tasks.startswith(
-        "make 20 more trials of A and 20 of B on each of 2 tasks: pour, stir;"
+    assert of_tasks.startswith("make 20 more trials of A and 20 of B on each of 2 tasks: pour")
+    opposed = replace(table, rows=(compared("x", "A", "better", 0), compared("y", "A", "worse", 0)))
+    assert "for each task one that was not beaten" in next_trials(
+        replace(results, tables=(opposed,))
     )
-    opposed = replace(
-        in_tasks,
-        rows=tuple(compared(*w, 0) for w in zip("xy", "AA", ("better", "worse"), strict=True)),
+    assert "Not beaten: B on x; A on y." in " ".join(
+        front(replace(results, tables=(opposed,))).sentences
     )
-    assert "for each task the candidate" in next_trials(replace(results, tables=(opposed,)))
-    assert "B on x, A on y." in " ".join(front(replace(results, tables=(opposed,))).sentences)
     decided = replace(table, rows=tuple(rows[2:]))
     assert next_trials(replace(results, tables=(decided,))) == ""
     beaten = Table(
@@ -157,7 +156,7 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     pair = [compared(ALL_TASKS, "A, without replanning", "no", 9)]
     pair[0] = (*pair[0][:3], "A, with replanning", *pair[0][4:])
     next_step = next_trials(replace(results, tables=(replace(table, rows=tuple(pair)),)))
-    assert next_step.startswith("make 9 more trials without replanning and 9 with replanning;")
+    assert next_step.startswith("make 9 more trials without replanning and 9 with replanning (A);")
 
 
 def shown(tmp_path: Path, text: str) -> tuple[str, str]:

@@ -26,7 +26,7 @@ def sloth() -> ObjectModel:
 def rebuilt(sloth: ObjectModel) -> dict[str, np.ndarray]:
     """What rebuilding a scene writes of a sloth that was seen from all sides."""
     mesh = toy_mesh("sloth", sloth.size_m)
-    found = lattice(shape_of_mesh(mesh.vertices_m, mesh.triangles, mesh.vertices_m))
+    found = lattice(shape_of_mesh(mesh.vertices_m, mesh.triangles))
     return {
         "nodes_m": found.nodes_m,
         "tets": found.tets,

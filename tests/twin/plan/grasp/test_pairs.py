@@ -23,7 +23,7 @@ def box(error_m: float = 0.0) -> Shape:
 def scanned_duck() -> Shape:
     """As views have it: rough, by voxels of 1.5 mm."""
     toy = toy_mesh("duck", (0.07, 0.05, 0.06))
-    found = shape_of_mesh(toy.vertices_m, toy.triangles, toy.vertices_m)
+    found = shape_of_mesh(toy.vertices_m, toy.triangles)
     vertices_m = found.vertices_m + np.random.default_rng(0).normal(0, 3e-4, found.vertices_m.shape)
     return Shape(vertices_m=vertices_m, triangles=found.faces, source="test", error_m=0.0015)
 
