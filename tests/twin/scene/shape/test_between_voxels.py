@@ -22,9 +22,7 @@ def wall(low: float, high: float, *, stretch: float = 1.0) -> tuple[np.ndarray, 
     seen = np.abs(measured) < TRUNCATION
     seen = seen & (np.arange(COUNTS[1]) > 1)[:, None] & (np.arange(COUNTS[1]) < 18)[:, None]
     tsdf = np.where(seen, measured / TRUNCATION, 0.0).astype(np.float32)
-    return solid, Evidence(
-        box=BOX, tsdf=tsdf, weight=seen.astype(np.float32), free=~solid, empty=~solid
-    )
+    return solid, Evidence(box=BOX, tsdf=tsdf, weight=seen.astype(np.float32), empty=~solid)
 
 
 @pytest.mark.parametrize("stretch", [1.0, 1.8])
@@ -41,7 +39,7 @@ def test_a_thin_wall_is_as_thick_as_measured(low: float, high: float, stretch: f
 def test_where_nobody_measured_faces_between_voxels_are_the_surface() -> None:
     solid, evidence = wall(8.2, 11.3)
     nothing = np.zeros_like(evidence.tsdf)
-    blind = Evidence(box=BOX, tsdf=nothing, weight=nothing, free=~solid, empty=~solid)
+    blind = Evidence(box=BOX, tsdf=nothing, weight=nothing, empty=~solid)
     np.testing.assert_allclose(
         signed_distances(solid, blind, TRUNCATION), distances_of_solid(solid, VOXEL), atol=1e-7
     )
