@@ -219,7 +219,7 @@ def test_the_object_folders_are_vouched_for_by_hashes_and_old_ones_go(
     record = parts.write(run, every, lambda episode: views[episode.path.stem])
     assert sorted(record["objects"]) == ["block", "box", "cube"]
     assert not old.exists()
-    for key, about in record["objects"].items():
+    for about in record["objects"].values():
         folder = run.scene_dir / about["folder"]
         assert {path.name for path in folder.iterdir()} == set(about["files"])
         for name, sha256 in about["files"].items():
