@@ -13,7 +13,7 @@ from evaluator.compare.rows import RateGroup
 from evaluator.compare.success import of_group
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval, Measurement
-from evaluator.statistics import agreement, gap_model
+from evaluator.statistics import agreement
 from evaluator.statistics.agreement import counted_groups
 
 MODEL_FROM = 4
@@ -74,6 +74,8 @@ def _fitted(groups: Sequence[RateGroup], cache: SummaryCache) -> Fitted | str:
         return f"{counted_groups(len(groups))}; it needs {MODEL_FROM}"
 
     def fit() -> tuple[Fitted]:
+        from evaluator.statistics import gap_model  # noqa: PLC0415  # scipy takes a moment
+
         model = gap_model.GapModel(groups=tuple(gap_model.GroupCounts(**each) for each in counts))
         blind = tuple(map(float, model.blind_groups))
         share = model.blind_share

@@ -16,6 +16,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
+from scipy.special import betainc, expit, ndtr, ndtri
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
@@ -125,11 +126,6 @@ def drawn() -> Populations:
     )
 
 
-def _rate(log_odds: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        return np.asarray(1 / (1 + np.exp(-log_odds)))
-
-
 def _bent(z: np.ndarray, bend: np.ndarray) -> np.ndarray:
     """A straight line, or by ``bend`` two levels with little between them: one row a population."""
     found = np.array(np.broadcast_to(z, (len(bend), *z.shape[1:])))
@@ -141,8 +137,6 @@ def _bent(z: np.ndarray, bend: np.ndarray) -> np.ndarray:
 
 def _masses(at: np.ndarray, size: np.ndarray, bend: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Chance of each cell of log-odds, and the normal number in its middle."""
-    from scipy.special import ndtr, ndtri  # noqa: PLC0415  # takes half a second to load
-
     z = np.linspace(-6, 6, 241)
     found = (EDGES[None, 1:-1] - at[:, None]) / size[:, None]
     rows = np.flatnonzero(bend)
@@ -161,14 +155,14 @@ def _moments(
     w /= w.sum()
     z = QUADRATURE[None, :]
     at, size, bend = recorded
-    x = _rate(at[:, None] + size[:, None] * _bent(z, bend))
+    x = expit(at[:, None] + size[:, None] * _bent(z, bend))
     at, size, bend = sim
     other, given, square_y = np.sqrt(1 - rho**2), *np.empty((2, *x.shape))
     for part in PARTS:
         near, far, middle, wide = (v[part, None, None] for v in (rho, other, at, size))
-        y = _rate(middle + wide * _bent(near * z[:, :, None] + far * z[:, None, :], bend[part]))
+        y = expit(middle + wide * _bent(near * z[:, :, None] + far * z[:, None, :], bend[part]))
         given[part], square_y[part] = y @ w, y**2 @ w
-    of_blind = _rate(blind[0][:, None] + blind[1][:, None] * z)
+    of_blind = expit(blind[0][:, None] + blind[1][:, None] * z)
     mean_x, square_x = x @ w, x**2 @ w
     mean_y = (1 - share) * (given @ w) + share * (of_blind @ w)
     square_y = (1 - share) * (square_y @ w) + share * (of_blind**2 @ w)
@@ -297,7 +291,7 @@ def _likelihood(group: GroupCounts, odds: float) -> Float64[np.ndarray, "rates r
     found = np.outer(_binomial(*group.recorded), _binomial(*group.sim))
     if not sum(group.pairs):
         return found
-    p, q = _rate(CENTRES)[:, None], _rate(CENTRES)[None, :]
+    p, q = expit(CENTRES)[:, None], expit(CENTRES)[None, :]
     both = _both(p, q, float(np.exp(odds)))
     scale = min(1.0, MOST / sum(group.pairs))
     logs = np.zeros_like(found)
@@ -310,11 +304,9 @@ def _binomial(k: int, n: int) -> Float64[np.ndarray, " rates"]:
     """Mean chance of a count over the rates of each cell, 1 without trials."""
     if not n:
         return np.ones(CELLS)
-    from scipy.special import betainc  # noqa: PLC0415  # takes half a second to load
-
     scale = min(1.0, MOST / n)
     a, b = scale * k + 1, scale * (n - k) + 1
-    rates = _rate(EDGES)
+    rates = expit(EDGES)
     return np.asarray(np.diff(betainc(a, b, rates)) / np.diff(rates))
 
 
