@@ -114,7 +114,8 @@ def is_without_plan(episode: Episode) -> bool:
     info = episode.info
     if info.kind != "trial" or not info.task:
         return False
-    return not any(episode.topics()[name].count for name in episode.topics_of_type(schema.PLAN))
+    topics = episode.topics()
+    return not any(topics[name].count for name in episode.topics_of_type(schema.PLAN))
 
 
 def _tracks(episode: Episode) -> Sequence[JointTrack]:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from bridge.exchange.trials_rates import RateRecord
 from evaluator.compare.agreement import group_agreement, usable_groups
@@ -81,7 +80,10 @@ def _rate_groups(records: Sequence[RateRecord]) -> tuple[tuple[RateGroup, ...], 
         real, sim = found["recorded"], found["sim"]
         groups.append(
             RateGroup(
-                **dict[str, Any](zip(("task", "condition", "policy", "unit"), key, strict=True)),
+                task=key[0],
+                condition=key[1],
+                policy=key[2],
+                unit=key[3],
                 recorded=_rate(real, "recorded", key),
                 sim=_rate(sim, "sim_planned", key),
                 recorded_rate=None if real is None else real.rate,

@@ -35,7 +35,7 @@ def turns_alike(model: ObjectModel) -> Float[np.ndarray, "num_turns 3 3"]:
 
 @cache
 def _box_turns() -> Float[np.ndarray, "24 3 3"]:
-    """Every rotation that lays the axes onto each other, none first: the group of the cube."""
+    """Rotations that lay the axes onto each other, none first; SciPy loads half a second."""
     signs = [np.diag(each) for each in product((1.0, -1.0), repeat=3)]
     turns = np.array(
         [sign @ np.eye(3)[[*axes]] for axes in permutations(range(3)) for sign in signs]

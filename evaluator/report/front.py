@@ -89,6 +89,7 @@ def _compared(results: Results) -> list[str]:
     """Say which candidate is better, of the questions over all tasks, and what the twin's cost."""
     rows = rows_of(results, "comparisons")
     sentences = [str(row["answer"]) for row in rows if row["task"] == ALL_TASKS]
+    heads = ("undecided", "no difference")  # others begin with a name, which keeps its letters
     split = _by_task(results)
     standing, beaten = _standing(results)
     if standing:  # it says who is worse; what is open between those who may be best is left
@@ -99,15 +100,14 @@ def _compared(results: Results) -> list[str]:
             and not any(f": {name} " in text or f", {name} " in text for name in beaten)
         ]
     found = standing + [
-        f"{text[0].upper()}{text[1:]}." if text.startswith(("undec", "no ")) else f"{text}."
+        f"{text[0].upper()}{text[1:]}." if text.startswith(heads) else f"{text}."
         for text in sentences[: SHOWN_ANSWERS - len(standing) - 2 * len(split)]
     ]
     if alike := _all_alike(results)[0]:
         return [alike]
-    for regret in results.measurements:
-        if regret.id != "decision.regret_pp" or regret.value is None:
-            continue
-        name = regret.definition.partition("ranks first (")[2].partition(")")[0]
+    regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
+    if regret is not None and regret.value is not None:
+        name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
         lost = f"{_points(regret.value)} of recorded success{_ends(regret, '.0f')}"
         found.append(f"The twin ranks {name} first; to take that costs {lost} against the best.")
     return [*split, *found]
@@ -206,10 +206,12 @@ def next_trials(results: Results) -> str:
         if isinstance(more := row["more trials of each"], int) and more > 0
     ]
     settled = "" if wanted else _settled([row for row, _ in of_all], rows_of(results, "standing"))
-    if settled or not (wanted or _by_task(results)):
+    if settled:
         return settled
     if _by_task(results):
         return f"{TAKE}for each task one that was not beaten there; none is best on all tasks."
+    if not wanted:
+        return ""
     more, pair = min(wanted)
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
     one = -(-more // max(1, len(tasks)))

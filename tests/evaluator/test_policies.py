@@ -27,7 +27,7 @@ from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import rate_groups, side_rates
 from evaluator.report.front import front
-from evaluator.result import Measurement
+from evaluator.result import Measurement, Results
 from evaluator.statistics.sequential import Plan
 
 
@@ -190,6 +190,9 @@ def test_regret_is_what_taking_the_twins_first_costs() -> None:
     assert right["decision.regret_pp"].value == 0
     assert right["decision.wrong_pairs_pp"].value is None
     assert measurements({"A": (9, 9)}) == {}
+    named = tuple(measurements({"A (v2)": (9, 9), "B": (6, 7)}).values())
+    told = front(Results(run="r", source="trials", stand_in=None, measurements=named)).sentences
+    assert "The twin ranks A (v2) first; to take that costs 0 points" in " ".join(told)
 
 
 def test_rates_with_n_are_compared_without_their_trials() -> None:

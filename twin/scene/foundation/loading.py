@@ -18,6 +18,7 @@ from jaxtyping import UInt8
 from bridge.episode import provenance
 from bridge.errors import MissingDependencyError, UsageError
 
+MAX_JSON_BYTES = 64_000_000
 MAX_PROMPT_CHARACTERS = 200
 SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 _PICKLED = (".bin", ".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".h5", ".msgpack")
@@ -104,9 +105,11 @@ def weight_files(folder: Path, kind: WeightsKind) -> list[Path]:
 def _json(path: Path, kind: WeightsKind) -> dict[str, Any]:
     if not path.is_file():
         raise kind.refuse(path.parent, f"there is no {path.name}")
+    if path.stat().st_size > MAX_JSON_BYTES:
+        raise kind.refuse(path.parent, f"{path.name} is too large")
     try:
         content = json.loads(path.read_bytes())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise kind.refuse(path.parent, f"{path.name} is not JSON") from error
     if not isinstance(content, dict):
         raise kind.refuse(path.parent, f"{path.name} is not an object")
