@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 from measure import ROOT, Target, report_targets
-from plan_mutations import CAUSES, FAMILIES, HEAVY_KG, HONEST, OUTSIDE, mutated
+from plan_mutations import FAMILIES, HEAVY_KG, HONEST, OUTSIDE, mutated
 from plan_oracle import Cell, Oracle
 
 CELL, FIRST = "standin", "cube_into_box"
@@ -353,6 +353,27 @@ def main() -> None:
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     summarise(rows, options, cpu_s, len(rows) - len(known))
+
+
+_MOTION = ("joint_acceleration", "_speed", "joint_jump", "motor_power", "joint_torque", "momentum",
+           "stop_time", "clearance", "joint_limit")  # fmt: skip
+CAUSES = {
+    "heavy": ("over_payload",),
+    "very_heavy": ("over_payload",),
+    "says_twice": ("is there twice",),
+    "since_1970": ("not from 1970",),
+    "waits": ("before it moves", "begins at"),
+    "many_waypoints": ("waypoints is not read",),
+    "text_for_numbers": ("is invalid at tau/",),
+    "not_a_number": ("is not a number in JSON",),
+    "other_task": ("no task named",),
+    "skims": ("too_close", "joint_acceleration"),
+    "yes_": ("stale: ",),
+    **dict.fromkeys(
+        ("chatter", "velocity_step", "blip", "sudden_end", "jumps_in", "faster"), _MOTION
+    ),
+}
+"""By how a family's name begins: what a refusal of its plans says, among these; else anything."""
 
 
 def names_its_cause(row: dict[str, Any]) -> bool:

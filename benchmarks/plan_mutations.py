@@ -538,25 +538,6 @@ OLD = tuple(FAMILIES)[1:19]
 """Of these two may come together; none is bytes but the one left out."""
 OLD = tuple(name for name in OLD if name != "not_a_number")
 HONEST = ("valid", "slower", "denser")
-_MOTION = ("joint_acceleration", "_speed", "joint_jump", "motor_power", "joint_torque", "momentum",
-           "stop_time", "clearance", "joint_limit")  # fmt: skip
-CAUSES = {
-    "heavy": ("over_payload",),
-    "very_heavy": ("over_payload",),
-    "says_twice": ("is there twice",),
-    "since_1970": ("not from 1970",),
-    "waits": ("before it moves", "begins at"),
-    "many_waypoints": ("waypoints is not read",),
-    "text_for_numbers": ("is invalid at tau/",),
-    "not_a_number": ("is not a number in JSON",),
-    "other_task": ("no task named",),
-    "skims": ("too_close", "joint_acceleration"),
-    "yes_": ("stale: ",),
-    **dict.fromkeys(
-        ("chatter", "velocity_step", "blip", "sudden_end", "jumps_in", "faster"), _MOTION
-    ),
-}
-"""By how a family's name begins: what a refusal of its plans says, among these; else anything."""
 OUTSIDE = tuple(name for name in FAMILIES if name.startswith("yes_"))
 
 
