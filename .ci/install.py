@@ -7,6 +7,7 @@
     .venv/bin/python .ci/install.py test no-torch  # the rest without torch and what needs it
 """
 
+import ast
 import os
 import re
 import shutil
@@ -14,17 +15,13 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from threading import Event, Thread
-from typing import TextIO
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = Path(sys.prefix)
 SITE = next(Path(path) for path in sys.path if path.endswith("site-packages"))
-LOG = VENV / "install.log"
 TEMPORARY = VENV / "tmp"
 """Wheels wait here until all are there; a /tmp in memory is too small for them."""
 
@@ -32,10 +29,31 @@ TOOLS = TEMPORARY / "tools"
 """What compiles the extension modules and is not in .venv, removed afterwards: always the same
 place, so that a second build goes on where the first ended."""
 
+CACHE = TEMPORARY / "cache"
+"""Beside .venv, so that uv links a package instead of copying it."""
+UV = ("pip", "install", "--no-config", "--python", sys.executable, "--cache-dir", str(CACHE))
 BUILD_TOOLS = ("scikit-build-core>=1.0", "nanobind>=2.4", "cmake", "ninja")
-SELDOM_IMPORTED = "/tests/|/transformers/models/"
+FROM_PIP = {
+    "index-url": "UV_DEFAULT_INDEX",
+    "extra-index-url": "UV_INDEX",
+    "find-links": "UV_FIND_LINKS",
+    "constraint": "UV_CONSTRAINT",
+    "trusted-host": "UV_INSECURE_HOST",
+    "cert": "SSL_CERT_FILE",
+    "proxy": "ALL_PROXY",
+    "timeout": "UV_HTTP_TIMEOUT",
+    "default-timeout": "UV_HTTP_TIMEOUT",
+}
+"""What pip was told, by the name that uv knows it by."""
+WITHOUT_EFFECT = {"disable-pip-version-check", "no-cache-dir", "progress-bar", "root-user-action"}
+"""Settings of pip that change nothing of what is installed."""
+SELDOM_IMPORTED = (
+    "/tests/|/transformers/models/|/torch/(_inductor|testing)/|/ray/(rllib|data|serve|tune|train|llm)/"
+    "|/sympy/physics/|/(plotly|dash|OpenGL|IPython|networkx|fontTools|Cython|mypyc?|statsmodels|seaborn"
+    "|pybullet_envs|pybullet_examples|setuptools|pip|wcwidth|prompt_toolkit|imageio|pygments)/"
+)
+"""Compiled where it is imported: half of all lines."""
 BYTECODE = ("-W", "ignore", "-m", "compileall", "-qq", "-j", "0", "-x", SELDOM_IMPORTED)
-"""Compiles all packages but what is compiled when it is imported, a quarter of all lines."""
 UNUSED = (
     "cmeel.prefix/include",
     "open3d/open3d_tf_ops.so",
@@ -89,7 +107,7 @@ def main() -> int:
         return 1
     TEMPORARY.mkdir(exist_ok=True)
     try:
-        return install(stage, download)
+        return install(stage, much=download > 0)
     finally:
         shutil.rmtree(TEMPORARY, ignore_errors=True)
 
@@ -179,30 +197,52 @@ def requirements(extras: str) -> list[str]:
     return sorted(found)
 
 
-def install(stage: str, megabytes: int) -> int:
-    """Run pip and show how far it is."""
-    pip = [sys.executable, "-m", "pip", "install", "--no-compile", "--progress-bar", "off"]
-    pip += ["--disable-pip-version-check", "-c", "constraints.txt"]
-    steps = [[*pip, *requirements(EXTRAS[stage])]]
-    if stage == "demo":
-        if tools := [tool for tool in BUILD_TOOLS if not is_installed(tool.split(">")[0])]:
-            steps.append([*pip, "--target", str(TOOLS), *tools])
-        steps.append([*pip, "--no-build-isolation", "--no-deps", "-e", "."])
-    progress = Progress(megabytes)
+def install(stage: str, *, much: bool) -> int:
+    """Run uv, several times as fast where much is missing, and pip where uv fails."""
+    pip = [sys.executable, "-m", "pip", "install", "--no-compile", "--disable-pip-version-check"]
+    pip += ["-c", "constraints.txt"]
+    beside = [*pip, "--quiet", "--target"]
+    wanted, settings = requirements(EXTRAS[stage]), settings_of_pip() if much else None
+    uv = [str(TEMPORARY / "uv" / "bin" / "uv"), *UV, *wanted]
     started = time.monotonic()
-    with LOG.open("w", encoding="utf-8") as log, progress.shown():
-        failed = any(run(step, progress, log) for step in steps)
-        if stage != "demo" and not failed:
-            progress.enter("compiling to bytecode")
-            # On all cores; a few files of the packages are templates and do not compile.
-            run([sys.executable, *BYTECODE, str(SITE)], progress, log)
-    if failed:
-        tail = LOG.read_text(encoding="utf-8").splitlines()[-25:]
-        sys.stderr.write("\n".join([*tail, f"pip failed; all it said is in {LOG}.", ""]))
+    fetched = settings is not None and run([*beside, str(TEMPORARY / "uv"), "uv"])
+    fetched = fetched and run(uv, settings)
+    done = fetched or run([*pip, *wanted])
+    if stage == "demo" and done:
+        say("Compiling the extension modules, a minute or two")
+        tools = [tool for tool in BUILD_TOOLS if not is_installed(tool.split(">")[0])]
+        places = [str(TOOLS / "bin"), str(VENV / "bin"), os.environ["PATH"]]
+        paths = {"PYTHONPATH": str(TOOLS), "PATH": os.pathsep.join(places)}
+        own = [*pip, "--quiet", "--no-build-isolation", "--no-deps", "-e", "."]
+        done = (not tools or run([*beside, str(TOOLS), *tools])) and run(own, paths)
+    elif done:
+        say("Compiling packages to bytecode, a minute or two")
+        # On all cores; a few files of the packages are templates and do not compile.
+        run([sys.executable, *BYTECODE, str(SITE)])
+    if not done:
+        sys.stderr.write("Not all could be installed; the reason stands above.\n")
         return 1
     remove_unused()
-    say(f"Installed in {time.monotonic() - started:.0f} s; what pip said is in {LOG}")
+    say(f"Installed in {time.monotonic() - started:.0f} s")
     return 0
+
+
+def settings_of_pip() -> dict[str, str] | None:
+    """Say for uv where pip was told to look; None if pip was told what uv is not asked for."""
+    told = [sys.executable, "-m", "pip", "config", "list"]
+    lines = subprocess.run(told, capture_output=True, text=True, check=False).stdout.splitlines()
+    found = {"UV_CONSTRAINT": "constraints.txt", "UV_INDEX_STRATEGY": "unsafe-best-match"}
+    for key, _, value in (line.partition("=") for line in lines):
+        scope, _, name = key.rpartition(".")
+        if scope not in {"global", "install", ":env:"} or name in WITHOUT_EFFECT:
+            continue
+        if name not in FROM_PIP:
+            return None
+        places = ast.literal_eval(value).split()
+        if name == "constraint":
+            places.insert(0, found["UV_CONSTRAINT"])
+        found[FROM_PIP[name]] = " ".join(places)
+    return found
 
 
 def remove_unused() -> None:
@@ -215,105 +255,10 @@ def remove_unused() -> None:
             place.unlink(missing_ok=True)
 
 
-def run(command: list[str], progress: "Progress", log: TextIO) -> int:
-    """Run one step, keep all it says, and learn from it what it is doing."""
-    environment = {**os.environ, "TMPDIR": str(TEMPORARY), "PYTHONUNBUFFERED": "1"}
-    if "--no-build-isolation" in command:
-        environment["PYTHONPATH"] = str(TOOLS)
-        places = [str(TOOLS / "bin"), str(VENV / "bin"), os.environ["PATH"]]
-        environment["PATH"] = os.pathsep.join(places)
-    with subprocess.Popen(
-        command,
-        cwd=ROOT,
-        env=environment,
-        text=True,
-        errors="replace",
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    ) as pip:
-        for line in pip.stdout or ():
-            log.write(line)
-            progress.read(line)
-    return pip.returncode
-
-
-class Progress:
-    """One line that says what pip does: rewritten on a terminal, printed now and then elsewhere."""
-
-    def __init__(self, megabytes: int) -> None:
-        """Begin at nothing, of about so many megabytes."""
-        self.megabytes = megabytes
-        self.enter("asking for packages")
-        self._wanted = self._before = 0
-        self._on_terminal = sys.stdout.isatty()
-
-    def enter(self, phase: str) -> None:
-        """Go on to the next thing to do."""
-        self.phase, self._since = phase, time.monotonic()
-
-    def read(self, line: str) -> None:
-        """Take one line of pip."""
-        words = line.split()
-        if line.startswith("Collecting "):
-            self.enter(f"fetching {re.split('[<>=!~;@ ([]', words[1])[0]}")
-        elif words[:1] == ["Downloading"]:
-            self.enter(f"fetching {Path(words[1]).name.split('-')[0]} {' '.join(words[2:])}")
-        elif words[:1] in (["Building"], ["Preparing"]) and words[-1] == "started":
-            self.enter(f"{words[0].lower()} {line.split(' for ')[-1].split()[0]}")
-        elif line.startswith("Installing collected packages:"):
-            self._wanted, self._before = line.count(",") + 1, finished()
-            self.enter("installing")
-
-    def line(self) -> str:
-        """What is going on now."""
-        if self.phase.startswith("fetching"):
-            return f"{self.phase}; {size(TEMPORARY) / 1e6:.0f} of about {self.megabytes} MB"
-        if self.phase == "installing":
-            return f"installing {finished() - self._before} of {self._wanted} packages"
-        return f"{self.phase}, {time.monotonic() - self._since:.0f} s"
-
-    @contextmanager
-    def shown(self) -> Iterator[None]:
-        """Show it until the block ends."""
-        over = Event()
-        thread = Thread(target=self._show, args=(over,), daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            over.set()
-            thread.join()
-
-    def _show(self, over: Event) -> None:
-        last = ""
-        while not over.wait(0.5 if self._on_terminal else 10.0):
-            line = self.line()
-            if self._on_terminal:
-                width = shutil.get_terminal_size().columns - 1
-                sys.stdout.write("\r" + line[:width].ljust(width))
-                sys.stdout.flush()
-            elif line != last:
-                say(f"  {line}")
-            last = line
-        if self._on_terminal:
-            sys.stdout.write("\r" + " " * (shutil.get_terminal_size().columns - 1) + "\r")
-
-
-def finished() -> int:
-    """How many packages lie in .venv as a whole: their record is written last."""
-    return sum(1 for _ in SITE.glob("*.dist-info/RECORD"))
-
-
-def size(folder: Path) -> int:
-    """Bytes below a folder that others are writing in."""
-    total = 0
-    for place, _, names in os.walk(folder):
-        for name in names:
-            try:
-                total += (Path(place) / name).lstat().st_size
-            except OSError:
-                continue
-    return total
+def run(command: list[str], more: Mapping[str, str] = {}) -> bool:
+    """Run one step, which says itself how far it is; whether it went well."""
+    environment = {**os.environ, "TMPDIR": str(TEMPORARY), **more}
+    return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode == 0
 
 
 def say(line: str) -> None:
