@@ -184,7 +184,7 @@ def plots_of_joints(
             name=f"to twin, {trajectory}",
             style=REPLAY_STYLES.get(trajectory, "twin-executed"),
             t_s=clock.all_seconds(each.stamps_ns),
-            values=MRAD * each.over_time_rad(),
+            values=MRAD * np.sqrt((each.error_rad**2).mean(axis=1)),
         )
         for trajectory, each in errors.items()
     ]

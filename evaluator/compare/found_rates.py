@@ -126,18 +126,13 @@ def _numbers(groups: Sequence[_Group]) -> list[float]:
 
 
 def _settle_percent(sheet: Sheet, groups: Sequence[_Group]) -> None:
-    small = holds_fractions(_numbers(groups))
+    others = [number for number in _numbers(groups) if number]
+    small = bool(others) and max(others) <= 1
     names = dict.fromkeys(repr(group.column.name) for group in groups if group.column)
     if small:
         sheet.found.doubts.append(f"{', '.join(names)} says percent, and is read as shares of 1")
     for group in groups:
         group.unit = "rate" if small else "rate_percent"
-
-
-def holds_fractions(numbers: Sequence[float]) -> bool:
-    """Whether numbers under a name that says percent look like shares of 1."""
-    others = [number for number in numbers if number]
-    return bool(others) and all(number <= 1 for number in others)
 
 
 def _settle_beside_signs(sheet: Sheet, groups: Sequence[_Group]) -> None:

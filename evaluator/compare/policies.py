@@ -359,7 +359,7 @@ class Answer:
             return f"no difference of more than 10 points: {found}; stop here"
         more = self.reading.more
         rest = (
-            f"likely to be decided after {more} more {noun('trial', more)} of each"
+            f"if that stays, {more} more {noun('trial', more)} of each are likely to decide it"
             if more is not None
             else "no number of trials worth running is likely to decide it"
         )

@@ -223,12 +223,9 @@ def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:
 
 
 def _task_hashes(contents: RunContents) -> dict[str, frozenset[str]]:
-    found: dict[str, set[str]] = {}
-    for each in contents.recorded:
-        info = each.facts.info
-        if info.kind == "trial" and info.task_sha256:
-            found.setdefault(info.task, set()).add(info.task_sha256)
-    return {task: frozenset(hashes) for task, hashes in found.items()}
+    infos = [each.facts.info for each in contents.recorded]
+    found = {(i.task, i.task_sha256) for i in infos if i.kind == "trial" and i.task_sha256}
+    return {task: frozenset(h for name, h in found if name == task) for task, _ in found}
 
 
 def _imported_motions(contents: RunContents) -> Part:

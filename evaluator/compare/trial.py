@@ -115,6 +115,8 @@ def _row(
     counted = outcome is not None and outcome.unit != "trial" and not _impossible_count(outcome)
     probabilities = [s.p_success for s in (planned.verdict, verdict) if s is not None]
     places = () if localised is None else localised.facts.places
+    fails_ns = None if failing is None else failing.failing_t_ns
+    begun = [e.id for e in facts.plan_stages if fails_ns is not None and fails_ns >= e.t_start_ns]
     return TrialRow(
         episode=info.id,
         file=file.file_name,
@@ -136,7 +138,7 @@ def _row(
         verdict=None if verdict is None else verdict.accepted,
         p_success=next((p for p in probabilities if p is not None), None),
         **{} if failing is None else {name: getattr(failing, name) for name in _OF_FAILURE},
-        failing_stage=_stage_at(facts, None if failing is None else failing.failing_t_ns),
+        failing_stage=next(reversed(begun), ""),
         stages=_stages(outcome),
         planned_replay=replays["planned"].file_name if "planned" in replays else None,
         divergence=replays["executed"].facts.divergence if "executed" in replays else "",
@@ -150,12 +152,6 @@ _OF_INFO = ("task", "study_arm", "policy", "checkpoint", "start_id", "cell", "st
 _OF_FAILURE = ("first_failing", "failing_detail", "failing_cause", "failing_bodies")
 """Fields of a row that what it is made from calls by the same name."""
 _ANSWERS: dict[str | None, bool] = {"success": True, "failure": False}
-
-
-def _stage_at(facts: RecordedFacts, t_ns: int | None) -> str:
-    """Name the stage of the plan that an instant is in; what is after the last is in the last."""
-    begun = [e.id for e in facts.plan_stages if t_ns is not None and t_ns >= e.t_start_ns]
-    return next(reversed(begun), "")
 
 
 def _stages(outcome: Outcome | None) -> tuple[tuple[str, bool | None], ...]:

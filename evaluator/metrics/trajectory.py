@@ -66,10 +66,6 @@ class JointErrors:
     error_rad: Float[np.ndarray, "num_samples num_joints"]
     """Recorded minus replayed, modulo a whole turn: -pi to pi."""
 
-    def over_time_rad(self) -> Float[np.ndarray, " num_samples"]:
-        """Root mean square over the joints at each instant."""
-        return np.asarray(np.sqrt((self.error_rad**2).mean(axis=1)))
-
 
 def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
     """Compare at the recorded stamps inside the time both cover; the replay is interpolated.

@@ -4,6 +4,7 @@ Text stays text, and the same numbers give the same bytes. A file has the colour
 gives the names of colours its own values.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -125,14 +126,10 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
         f'<line x1="{left}" y1="{top + side}" x2="{left + side}" y2="{top}" stroke="{{soft}}" '
         'stroke-dasharray="4 3"/>',
     ]
-    taken: dict[tuple[float, float], int] = {}
-    for group in drawn:
+    places = [tuple(rate.value or 0.0 for rate in group.pair) for group in drawn]
+    for group, at in zip(drawn, places, strict=True):
         sim, real = group.pair
-        at = (sim.value or 0.0, real.value or 0.0)
-        nudge = 0.026 * taken.get(at, 0)  # towards the middle, so that none leaves the picture
-        inwards = [nudge if value < 0.5 else -nudge for value in at]
-        taken[at] = taken.get(at, 0) + 1
-        x, y = left + side * (at[0] + inwards[0]), top + side * (1 - at[1] - inwards[1])
+        x, y = left + side * at[0], top + side * (1 - at[1])
         if sim.interval is not None:
             ends = [left + side * end for end in (sim.interval.low, sim.interval.high)]
             marks.append(_line(ends[0], y, ends[1], y))
@@ -144,6 +141,10 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{fill}" stroke="{{sim}}" '
             f'stroke-width="2"><title>{escape(group.label)}</title></circle>'
         )
+    for at, together in Counter(places).items():
+        if together > 1:
+            x, y = left + side * at[0] + 8, top + side * (1 - at[1]) - 8
+            marks.append(_text(x, y, f"{together} groups", "ink"))
     with_too = any(group.condition == WITH for group in drawn)
     filled = " Hollow: without replanning; solid: with." if with_too else ""
     return Drawing(
@@ -151,7 +152,7 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
         title=f"Success in the twin against {word} success",
         caption="One mark per group (task, condition, policy), over the trials where both sides "
         "are known; bars are 95 % intervals of both rates. Below the dashed line the twin is "
-        f"optimistic. Marks that coincide are set apart.{filled}",
+        f"optimistic.{filled}",
         alt=_alt("Scatter", word, [(group.label, *group.pair) for group in drawn]),
         height=top + side + 48,
         marks=tuple(marks),

@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import shorten
 
 from evaluator.compare.agreement import says_nothing
 from evaluator.compare.conclusions import direction
@@ -16,22 +17,21 @@ from evaluator.statistics.intervals import wilson
 
 SHOWN_TASKS = 8
 """Tasks with a line; the table holds the others."""
-SHOWN_MISSING = 6
 SAYS_LITTLE = 10
 """Fewer trials that all end alike say little of anything."""
 SHOWN_ANSWERS = 3
-LONGEST = 150
-"""Characters of one reason; the whole stands further down."""
-LONGEST_NOTE = 260
+LONGEST = 260
+"""Characters of a note; the whole stands further down."""
 CLOSE_PP = 10.0
 """A bias smaller than this does not change what one does with a rate [percentage points]."""
+GROUPS_FOR_R = 4
+"""Fewer say nothing of whether the twin's rates follow."""
 FOLLOWS_R = 0.5
 """Where r is surely below this, the twin's rates tell less than a quarter of what differs."""
 SIMPSON = "Simpson's paradox"
 """What the report begins with, where a note says it."""
 SAYS_NOTHING = "says nothing"
 """Said of r by a note, which the first page does not say twice."""
-SIDES = ("first", "second")
 TAKE = "take "
 """How a step begins after which no trial is needed."""
 FIGURES = ("scatter", "success")
@@ -54,8 +54,6 @@ class Front:
     more_tasks: int
     notes: Sequence[tuple[str, str]]
     """What must be known before a number is used."""
-    missing: Sequence[str]
-    more_missing: int
 
 
 def front(results: Results) -> Front:
@@ -77,11 +75,12 @@ def front(results: Results) -> Front:
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[
-            (HEADLINES.get(name, name.replace("_", " ")), _short(text, LONGEST_NOTE))
+            (
+                HEADLINES.get(name, name.replace("_", " ")),
+                shorten(text, LONGEST, placeholder=" ..."),
+            )
             for name, text in about[:2]
         ],
-        missing=[_short(text) for text in results.missing[:SHOWN_MISSING]],
-        more_missing=max(0, len(results.missing) - SHOWN_MISSING),
     )
 
 
@@ -100,16 +99,17 @@ def _compared(results: Results) -> list[str]:
             and not any(f": {name} " in text or f", {name} " in text for name in beaten)
         ]
     found = standing + [
-        f"{text[0].upper()}{text[1:]}." if text.startswith(heads) else f"{text}."
-        for text in sentences[: SHOWN_ANSWERS - len(standing) - 2 * len(split)]
+        f"{text[0].upper() if text.startswith(heads) else text[0]}{text[1:]}."
+        for text in sentences[: SHOWN_ANSWERS - len(standing) - SHOWN_ANSWERS * len(split)]
     ]
     if alike := _all_alike(results)[0]:
         return [alike]
     regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
     if regret is not None and regret.value is not None:
         name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
-        lost = f"{_points(regret.value)} of recorded success{_ends(regret, '.0f')}"
-        found.append(f"The twin ranks {name} first; to take that costs {lost} against the best.")
+        taken = "one of them by chance" if " or " in name else "that"
+        words = f"The twin ranks {name} first; who takes {taken} is {_points(regret.value)}"
+        found.append(f"{words}{_ends(regret, '.0f')} below the best recorded rate over all tasks.")
     return [*split, *found]
 
 
@@ -124,9 +124,11 @@ def _by_task(results: Results) -> list[str]:
     for task in dict.fromkeys(row["task"] for row in rows):
         here = [row for row in decided if row["task"] == task]
         lost = [row["first" if row["decided"] == "better" else "second"] for row in here]
-        names = dict.fromkeys(r[side] for r in rows if r["task"] == task for side in SIDES)
+        names = dict.fromkeys(
+            r[side] for r in rows if r["task"] == task for side in ("first", "second")
+        )
         left = " or ".join(str(name) for name in names if name not in lost)
-        listed += [f"{left or 'none'} on {task}"] if lost else []
+        listed.append(f"{(left or 'none') if lost else 'any'} on {task}")
     return [f"Which is better depends on the task. Not beaten: {'; '.join(listed)}."]
 
 
@@ -146,11 +148,10 @@ def _standing(results: Results) -> tuple[list[str], list[str]]:
         listed = ", ".join(str(row["candidate"]) for row in best[:SHOWN_TASKS])
         more = " ..." if len(best) > SHOWN_TASKS else ""
         return [f"{len(best)} of {len(rows)} candidates may be best: {listed}{more}."], beaten
-    words = " ".join(f"{row['candidate']} ({row['k']} of {row['n']})" for row in best)
-    name = f", {best[0]['candidate']}, "
-    over_all = all(name in f", {row['beaten by']}, " for row in rows if row not in best)
+    name, of = best[0]["candidate"], f"({best[0]['k']} of {best[0]['n']})"
+    over_all = all(f", {name}, " in f", {row['beaten by']}, " for row in rows if row not in best)
     why = "it is better than each of the others" if over_all else "only it lost no comparison"
-    return [f"{words} is the best of {len(rows)} candidates: {why}; stop here."], beaten
+    return [f"{name} {of} is the best of {len(rows)} candidates: {why}."], beaten
 
 
 def rows_of(results: Results, table_id: str) -> list[Row]:
@@ -218,13 +219,19 @@ def next_trials(results: Results) -> str:
     (first, second), shared = _differing(pair)
     sides = [n if n.startswith("with") else f"of {n}" for n in (first, second)]
     where = f": {', '.join(tasks)}" if len(tasks) <= SHOWN_TASKS else ""
-    split = f" on each of {len(tasks)} tasks{where}" if len(tasks) > 1 else ""
-    split += f" ({shared})" if shared else ""
-    words = f"make {one} more {noun('trial', one)} {sides[0]} and {one} {sides[1]}{split}"
-    then = ["that would likely decide between them"]
+    in_all = f" ({2 * one * len(tasks)} trials in all)" if len(tasks) > 1 else ""
+    split = f" on each of {len(tasks)} tasks{where}{in_all}" if len(tasks) > 1 else ""
+    alone = f"{shared}, " if shared else ""
+    words = f"{alone}make {one} more {noun('trial', one)} {sides[0]} and {one} {sides[1]}{split}"
+    then = ["that would likely tell these two apart"]
     for many, others in sorted(wanted)[1:SHOWN_ANSWERS]:
-        then.append(f"{' against '.join(_differing(others)[0])} would take {many} of each")
-    return f"{words}; {', '.join(then)}."
+        each = (
+            f"{-(-many // len(tasks))} of each on each task"
+            if len(tasks) > 1
+            else f"{many} of each"
+        )
+        then.append(f"{' and '.join(_differing(others)[0])} would take {each}")
+    return f"{words}; {'; '.join(then)}."
 
 
 def _differing(pair: tuple[str, str]) -> tuple[list[str], str]:
@@ -260,23 +267,34 @@ def _trust(results: Results) -> list[str]:
     if r is None or bias is None or not bias.n:
         return []
     against, unknown = [], []
-    if blind := _blind_groups(results):
-        words = f"in {len(blind)} of {bias.n} groups it is probably blind"
-        against.append(f"{words}: its rate there says nothing of the recorded one")
+    if results.stand_in:
+        unknown.append("what was recorded is a simulation itself")
+    notes = rows_of(results, "notes")
+    if blind := [str(row["about"]) for row in notes if BLIND_HERE in str(row["note"])]:
+        named = [*blind[:SHOWN_TASKS], *["..."] * (len(blind) > SHOWN_TASKS)]
+        words = f"in {len(blind)} of {bias.n} groups its rate is far from the recorded one"
+        against.append(f"{words}, unlike in the others ({' / '.join(named)})")
     low, high = (0.0, 1.0) if r.interval is None else (r.interval.low, r.interval.high)
     if r.interval is None or r.value is None:
-        why = str(r.reason_if_undefined or r.reason_without_interval).replace(";", ",")
+        few = (
+            bias.n < GROUPS_FOR_R
+            and f"it takes {GROUPS_FOR_R} groups or more, and here is {bias.n}"
+        )
+        why = few or str(r.reason_if_undefined or r.reason_without_interval).replace(";", ",")
         unknown.append(f"whether its rates follow the recorded ones is not known: {why}")
     elif high < FOLLOWS_R:
         against.append(f"its rates hardly follow the recorded ones (r at most {high:.2f})")
     elif low <= 0:
         unknown.append(f"its rates may or may not follow the recorded ones (r in{_ends(r, '.2f')})")
-    found = [answer(row) for row in rows_of(results, "conclusions")]
+    rows = rows_of(results, "conclusions")
+    found = [answer(row) for row in rows]
     off, open_, many = found.count("not for this"), found.count("not yet"), len(found)
     if (ends := bias.interval) and answer({"low": ends.low, "high": ends.high}) == "not for this":
         against.append(f"over all groups it is {direction(ends.low, ends.high)}")
     if off:
-        words = f"in {off} of {many} {noun('task', many)} its rate is too high or too low"
+        biases = [_number(row["bias (pp)"]) or 0.0 for row in rows if answer(row) == "not for this"]
+        which = "too high" if min(biases) > 0 else "too low" if max(biases) < 0 else "wrong"
+        words = f"in {off} of {many} {noun('task', many)} its rate is {which}"
         (against if 2 * off > many else unknown).append(words)
     if open_ or not many:
         where = f"in {open_} of {many} tasks " if many > 1 else ""
@@ -287,11 +305,6 @@ def _trust(results: Results) -> list[str]:
     why = "; ".join(against or unknown or [yes])
     why = f"{why[0].upper()}{why[1:]}.{' Use the recorded rates.' if against else ''}"
     return [f"Trust the twin's success rates: {told}. {why}"]
-
-
-def _blind_groups(results: Results) -> list[str]:
-    notes = rows_of(results, "notes")
-    return [str(row["about"]) for row in notes if BLIND_HERE in str(row["note"])]
 
 
 def _bias_words(row: Row) -> str:
@@ -323,32 +336,37 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
     if rate is not None and rate.k is not None and rate.n:
         who = "Twin" if side == "sim_planned" else "Without plans, what was executed in the twin"
         of = f"{rate.k} of {rate.n} {noun('trial', rate.n)}"
-        parts.append(f"{who} and recorded outcome agree in {of}.")
+        parts.append(f"{who} and recorded outcome agree in {of}{_by_chance(results, rate.n)}.")
     bias = by_id.get("agreement.bias_pp")
-    one_line = num_tasks == 1 and bias is not None and bias.interval is None  # says it already
-    if bias is not None and bias.value is not None and (bias.n or 0) > 1 and not one_line:
-        word = "above" if bias.value > 0 else "below"
-        size = f"{_points(bias.value)} {word}" if round(bias.value) else "level with"
+    if bias and bias.value is not None and (bias.n or 0) > 1 and (num_tasks > 1 or bias.interval):
+        size = f"{_points(bias.value)} {'below' if bias.value < 0 else 'above'}"
         rows = rows_of(results, "success")
         kinds = [k for k in ("policy", "condition") if any(row[k] for row in rows)]
         each = f" (each {' and '.join(f'one {k}' for k in kinds)} on one task)" if kinds else ""
         words = f"Over {bias.n} groups{each} the twin's rates lie {size} the recorded ones"
-        parts.append(f"{words}{_ends(bias)}.")
+        parts.append(f"{words} on average{_ends(bias)}.")
     r = by_id.get("agreement.pearson_r")
     if r is not None and r.value is not None:
-        size = f"r = {r.value:.2f}"
-        none = ", and may be none" if r.interval is not None and r.interval.low <= 0 else ""
+        nothing = f", which {SAYS_NOTHING}: its interval is too wide" if says_nothing(r) else ""
         parts.append(
-            f"Their correlation, {size}{_ends(r, '.2f')}, {SAYS_NOTHING}: its interval is too wide."
-            if says_nothing(r)
-            else f"Their correlation is {size}{_ends(r, '.2f')}{none}."
-            if not r.is_beyond
-            else f"Measured {size}; without the noise of counting r lies in{_ends(r, '.2f')}."
+            f"Measured r = {r.value:.2f}; without the noise of counting r is in{_ends(r, '.2f')}."
+            if r.is_beyond
+            else f"Their correlation is r = {r.value:.2f}{_ends(r, '.2f')}{nothing}."
         )
-    if named := _blind_groups(results):
-        more = "; ..." if len(named) > SHOWN_TASKS else ""
-        parts.append(f"Probably blind: {'; '.join(named[:SHOWN_TASKS])}{more}.")
     return parts
+
+
+def _by_chance(results: Results, num_trials: int) -> str:
+    """Say in how many trials outcomes would agree that have the same rates and else nothing."""
+    rows = rows_of(results, "conclusions")
+    yes, succeeded, known = (
+        sum(n for row in rows if isinstance(n := row.get(name), int)) / num_trials
+        for name in ("yes", "succeeded", "trials")
+    )
+    if known != 1 or num_trials < SAYS_LITTLE:  # or older results, which miss some
+        return ""
+    by_chance = num_trials * (yes * succeeded + (1 - yes) * (1 - succeeded))
+    return f"; by chance they would in {by_chance:.0f}"
 
 
 def _all_alike(results: Results) -> tuple[str, str]:
@@ -359,10 +377,14 @@ def _all_alike(results: Results) -> tuple[str, str]:
         return "", ""
     word, task = ("Nothing", "an easier") if k == 0 else ("Everything", "a harder")
     ends = wilson(k, n)
-    told = f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}, so the rate lies between "
+    told = (
+        f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}; over all, the rate is between "
+    )
     told += f"{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
-    few = f"record {SAYS_LITTLE} trials or more of each candidate, in 4 groups to judge the twin."
-    alike = f"check the scoring, then try {task} task: where all trials end alike, none is better."
+    each = f"record {SAYS_LITTLE} trials or more of each candidate"
+    few = f"{each}, in {GROUPS_FOR_R} groups or more to judge the twin."
+    why = "where all trials end alike, none can be shown to be better"
+    alike = f"check how success is scored, then {each} on {task} task: {why}."
     return told, few if n < SAYS_LITTLE else alike
 
 
@@ -376,7 +398,3 @@ def _ends(measurement: Measurement, digits: str = "+.0f") -> str:
 def _number(cell: Cell) -> float | None:
     is_number = isinstance(cell, int | float) and not isinstance(cell, bool)
     return float(cell) if is_number and cell is not None else None
-
-
-def _short(text: str, longest: int = LONGEST) -> str:
-    return text if len(text) <= longest else text[:longest].rsplit(" ", 1)[0].rstrip(",;:") + " ..."

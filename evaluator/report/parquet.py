@@ -16,7 +16,7 @@ from pyarrow.json import ParseOptions, ReadOptions, read_json
 
 from bridge.exchange.trials_csv import TrialRecord
 from bridge.whole_file import part_of
-from evaluator.result import Cell, Measurement, Table
+from evaluator.result import Measurement, Table
 
 ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 """Column types in which unknown is null, never "", 0, NaN or False."""
@@ -56,14 +56,12 @@ def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
 def write_table(path: Path, table: Table) -> Path:
     """Write one row per row of a table, each column with the type of what it holds."""
     rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
-    types = {name: _type_of([row[name] for row in rows]) for name in table.columns}
+    types: dict[str, type] = {}
+    for name in table.columns:
+        kinds = {type(row[name]) for row in rows if row[name] is not None}
+        found = next((kind for kind in (bool, int, float) if kinds == {kind}), str)
+        types[name] = float if kinds == {int, float} else found
     return _write(path, rows, types)
-
-
-def _type_of(values: Sequence[Cell]) -> type:
-    kinds = {type(value) for value in values if value is not None}
-    found = next((kind for kind in (bool, int, float) if kinds == {kind}), str)
-    return float if kinds == {int, float} else found
 
 
 def _write(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, type]) -> Path:

@@ -51,8 +51,7 @@ def varying(
     x, y = exact(statistic, recorded, sim, at_least=MIN_GROUPS)
     for name, side in (("recorded", x), ("twin", y)):
         if len(set(side)) == 1:
-            value = f"{float(side[0]):g} in all {len(side)} groups"
-            reason = f"the {name} side is constant ({value})"
+            reason = f"the {name} rate is {float(side[0]):g} in all {len(side)} groups"
             raise UndefinedStatisticError(statistic=statistic, reason=reason)
     return x, y
 

@@ -78,7 +78,7 @@ def test_r_does_not_care_about_order_or_scale(
 def test_r_of_two_points_and_of_a_constant_side_is_refused() -> None:
     with pytest.raises(UndefinedStatisticError, match="2 groups; it needs at least 3"):
         agreement.pearson([0.1, 0.2], [0.3, 0.4])
-    with pytest.raises(UndefinedStatisticError, match=r"twin side is constant \(1 in all 3"):
+    with pytest.raises(UndefinedStatisticError, match="twin rate is 1 in all 3"):
         agreement.pearson([0.1, 0.2, 0.3], [1, 1, 1])
 
 
@@ -98,7 +98,7 @@ def test_rates_on_a_line_correlate_exactly(counts: list[int], slope: Fraction) -
     recorded = [Fraction(k, 13) for k in counts]
     sim = [slope * rate + Fraction(1, 3) for rate in recorded]
     if slope == 0:
-        with pytest.raises(UndefinedStatisticError, match="twin side is constant"):
+        with pytest.raises(UndefinedStatisticError, match=r"twin rate is .* in all"):
             agreement.pearson(recorded, sim)
         return
     r = agreement.pearson(recorded, sim)

@@ -127,7 +127,7 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     ]
     table = Table(id="comparisons", title="t", columns=columns, rows=tuple(rows))
     results = Results(run="r", source="trials", stand_in=None, tables=(table,))
-    words = "make 1 more trial of C and 1 of B; that would likely decide between them, A against B"
+    words = "make 1 more trial of C and 1 of B; that would likely tell these two apart; A and B"
     assert next_trials(results) == f"{words} would take 40 of each."
     in_tasks = replace(
         table, rows=(rows[0], *(compared(t, "A", "no", 9) for t in ("pour", "stir")))
@@ -156,7 +156,7 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     pair = [compared(ALL_TASKS, "A, without replanning", "no", 9)]
     pair[0] = (*pair[0][:3], "A, with replanning", *pair[0][4:])
     next_step = next_trials(replace(results, tables=(replace(table, rows=tuple(pair)),)))
-    assert next_step.startswith("make 9 more trials without replanning and 9 with replanning (A);")
+    assert next_step.startswith("A, make 9 more trials without replanning and 9 with replanning;")
 
 
 def shown(tmp_path: Path, text: str) -> tuple[str, str]:
@@ -164,8 +164,8 @@ def shown(tmp_path: Path, text: str) -> tuple[str, str]:
     path = tmp_path / "table.csv"
     path.write_text(text)
     written = write_report(compare_csv(path), tmp_path / "out")
-    first = front(written.content)
-    return " ".join([*first.sentences, *first.missing]), summary_text(written.content, written)
+    told = [*front(written.content).sentences, *written.content.missing]
+    return " ".join(told), summary_text(written.content, written)
 
 
 def trusted(tmp_path: Path, sim: tuple[int, ...], n: int) -> str:
@@ -183,7 +183,7 @@ def test_a_twin_is_trusted_only_where_the_numbers_say_so(tmp_path: Path) -> None
     assert trusted(tmp_path, off, 100).startswith(f"{head}no. ")
     assert trusted(tmp_path, right[::-1], 100).startswith(f"{head}no. ")
     blind = trusted(tmp_path, (9, *right[1:]), 100)  # in one task it says success throughout
-    assert blind.startswith(f"{head}no. In 2 of 20 groups it is probably blind")
+    assert blind.startswith(f"{head}no. In 2 of 20 groups its rate is far from")
 
 
 def test_rates_without_n_ask_for_it_and_claim_no_interval(tmp_path: Path) -> None:
