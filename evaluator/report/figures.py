@@ -144,7 +144,7 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
     for at, together in Counter(places).items():
         if together > 1:
             x, y = left + side * at[0] + 8, top + side * (1 - at[1]) - 8
-            marks.append(_text(x, y, f"{together} groups", "ink"))
+            marks.append(_text(x, y, f"\u00d7{together}", "ink"))
     with_too = any(group.condition == WITH for group in drawn)
     filled = " Hollow: without replanning; solid: with." if with_too else ""
     return Drawing(
@@ -152,7 +152,7 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
         title=f"Success in the twin against {word} success",
         caption="One mark per group (task, condition, policy), over the trials where both sides "
         "are known; bars are 95 % intervals of both rates. Below the dashed line the twin is "
-        f"optimistic.{filled}",
+        f"optimistic. \u00d72: two alike.{filled}",
         alt=_alt("Scatter", word, [(group.label, *group.pair) for group in drawn]),
         height=top + side + 48,
         marks=tuple(marks),
