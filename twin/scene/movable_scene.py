@@ -30,6 +30,19 @@ DASH_PX = 4
 
 
 @dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One instant as it is to be drawn."""
+
+    stamp_ns: int
+    T_base_camera: Float[np.ndarray, "4 4"]
+    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]
+    posture: Posture | None
+    """None: no robot is drawn."""
+    urdf: str
+    """Of the robot."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Drawn:
     """One state as it was drawn."""
 
@@ -92,6 +105,13 @@ class MovableScene:
     """What stands behind everything; None: black."""
     not_scanned: frozenset[str] = frozenset()
     """Objects that no scan saw: drawn from the task's shape."""
+
+    def drawn_as(
+        self, rasteriser: Rasteriser | CudaRasteriser, camera: Camera, frame: Frame
+    ) -> Drawn:
+        """Draw the scene as it is at one instant."""
+        cloud = self.at(frame.Ts_base_object, frame.posture, frame.urdf)
+        return self.draw(rasteriser, cloud, camera, frame.T_base_camera)
 
     def draw(
         self,
