@@ -177,10 +177,7 @@ class MovableScene:
 
     def robot_at(self, posture: Posture, urdf: str) -> GaussianCloud:
         """The robot's part of that cloud; there must be links."""
-        robot = posed(
-            self.links, posture.joints_rad, urdf, width_m=posture.width_m, lighting=self.lighting
-        )
-        return moved_cloud(robot, self.T_root_base)
+        return moved_cloud(posed(self.links, posture, urdf, self.lighting), self.T_root_base)
 
 
 def read_movable_scene(

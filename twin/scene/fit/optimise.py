@@ -111,7 +111,6 @@ class FitState:
     """Of the Gaussians from ``MEAN_FROM`` on."""
     seconds: float = 0.0
     """Time spent so far."""
-    coarse_steps: int = 0
     events_done: int = 0
     """How much of the schedule of colour solutions and splits is behind."""
     colour_steps: int = 0
@@ -158,13 +157,8 @@ class Progress:
         return Allowance(clock=self.clock, until_s=min(now_s + share * budget_s, self.end_s))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Event:
-    """One entry of the schedule."""
-
-    at: float
-    share: float
-    act: Callable[[FitState, bool, Allowance], None]
+Act = Callable[[FitState, bool, Allowance], None]
+"""What is done at one time of the schedule."""
 
 
 class Events:
@@ -177,24 +171,23 @@ class Events:
         self._rasteriser = rasteriser
 
     @cached_property
-    def _schedule(self) -> list[Event]:
+    def _schedule(self) -> list[tuple[float, float, Act]]:
+        """When, in which share of the budget at most, and what."""
         planned = (
             (SPLIT_AT, SPLIT_SHARE, self._densify),
             (EXPOSURES_AT, EXPOSURES_SHARE, self._solve_exposures),
             (SOLVE_AT, SOLVE_SHARE, self._solve_colours),
         )
-        events = [Event(at=at, share=share, act=act) for ats, share, act in planned for at in ats]
-        return sorted(events, key=lambda event: event.at)
+        events = [(at, share, act) for ats, share, act in planned for at in ats]
+        return sorted(events, key=lambda event: event[0])
 
     def keep(self, state: FitState, at: Progress) -> None:
         """Do what is due; what is already behind is not done again."""
         coarse = at.fraction < COARSE
-        while (
-            state.events_done < len(self._schedule)
-            and self._schedule[state.events_done].at <= at.fraction
-        ):
-            due = self._schedule[state.events_done]
-            due.act(state, coarse, at.allowance(due.share))
+        for due, share, act in self._schedule[state.events_done :]:
+            if due > at.fraction:
+                break
+            act(state, coarse, at.allowance(share))
             state.events_done += 1
 
     def _observations(self, state: FitState, coarse: bool) -> list[ImageObservation]:
@@ -230,7 +223,7 @@ class Events:
     def _densify(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         cloud = state.session.cloud
         scores = score(cloud, self._observations(state, coarse), self._rasteriser, allowance)
-        left = sum(event.act == self._densify for event in self._schedule[state.events_done :])
+        left = sum(act == self._densify for _, _, act in self._schedule[state.events_done :])
         left_over = max(self._max_splats - len(cloud), 0)
         most = -(-left_over // left)
         cloud, parents = densify(cloud, scores, max_splats=self._max_splats, most=most)
@@ -281,11 +274,8 @@ class FitResult:
     iterations: int
     iterations_asked: int | None
     """None: as many as the time allowed."""
-    coarse_iterations: int
     seconds: float
     """Wall time, initialisation included."""
-    cpu_seconds: float
-    """Of this process."""
     train_psnr_db: float | None
     """Over the static pixels of the last images seen, at the size they were fitted at; None when
     there were none."""
@@ -332,7 +322,6 @@ def fit(
         surface=SurfacePrior.of(session.cloud),
         seconds=min(spent_s, SPENT_AT_MOST * config.limit_s),
     )
-    cpu_start = time.process_time()
     for at in _steps(config, state, clock):
         events.keep(state, at)
         learner.step(state, at)
@@ -343,9 +332,7 @@ def fit(
         cloud=state.session.cloud,
         iterations=state.session.steps,
         iterations_asked=config.iterations or None,
-        coarse_iterations=state.coarse_steps,
         seconds=state.seconds,
-        cpu_seconds=time.process_time() - cpu_start,
         train_psnr_db=_recent_psnr_db(state, len(views)),
         exposures=state.exposures,
         colour_steps=state.colour_steps,
@@ -391,7 +378,6 @@ class _Learner:
         epoch, place = divmod(state.session.steps, len(self._views))
         index = int(order_of_views(self._config.seed, epoch, len(self._views))[place])
         coarse = at.fraction < COARSE
-        state.coarse_steps += coarse
         view = self._views[index]
         decay = DECAY**at.fraction
         rates = {name: rate * decay for name, rate in RATES.items()}

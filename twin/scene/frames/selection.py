@@ -24,11 +24,9 @@ from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.errors import TwinError
 from twin.scene.frames.camera_poses import (
-    STATIONARY_M,
-    STATIONARY_RAD,
     CameraPoses,
     find_poses,
-    same_pose,
+    never_moves,
 )
 from twin.scene.frames.pairing import (
     UnusableCameraError,
@@ -179,8 +177,7 @@ def _shortlist(members: np.ndarray, smear_px: np.ndarray) -> Sequence[int]:
 
 def _around(values: np.ndarray) -> np.ndarray:
     """Median of each value and its two neighbours to each side."""
-    padded = np.pad(values, 2, mode="edge")
-    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
+    return np.asarray(ndimage.median_filter(values, 5, mode="nearest"))
 
 
 STATIONARY_TRAIN_FRAMES = 4
@@ -363,7 +360,11 @@ def _choose(
         episode, camera_id, stamps, frozenset(held.tolist()), config, output, calibration
     )
     unposed = np.array(sorted(poses.unposed_ns), dtype=np.int64)
-    stationary = _is_stationary(episode, camera_id, poses, np.setdiff1d(stamps, unposed))
+    posed, frame_id = (
+        np.setdiff1d(stamps, unposed),
+        streams.camera_info(episode, camera_id).frame_id,
+    )
+    stationary = len(posed) > 1 and never_moves(poses.tree, frame_id, posed)
     train_count, holdout_count = config.max_train_frames, config.max_holdout_frames
     if stationary:
         train_count = min(train_count, STATIONARY_TRAIN_FRAMES)
@@ -417,17 +418,6 @@ def spread(values: np.ndarray, count: int) -> np.ndarray:
     if len(values) <= count:
         return values
     return np.asarray(values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))])
-
-
-def _is_stationary(
-    episode: Episode, camera_id: str, poses: CameraPoses, stamps: Int[np.ndarray, " num_frames"]
-) -> bool:
-    frame_id = streams.camera_info(episode, camera_id).frame_id
-    Ts = poses.tree.Ts_root_frame(frame_id, spread(stamps, 40))
-    stationary = all(
-        same_pose(Ts[0], T, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD) for T in Ts
-    )
-    return stationary and len(stamps) > 1
 
 
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:

@@ -4,7 +4,7 @@ Diffuse shading scales linear light by one factor, so the share of each channel 
 property of the surface alone. The likeness of a pixel is 1 on the object's colour, 0 on grey.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -217,19 +217,25 @@ class Cluster:
 
 
 def object_points(
-    views: Sequence[CameraView], model: ObjectModel, min_height_m: float = MIN_HEIGHT_M
+    views: Sequence[CameraView],
+    model: ObjectModel,
+    min_height_m: float = MIN_HEIGHT_M,
+    is_other: Callable[[np.ndarray], np.ndarray] = lambda p: np.zeros(len(p), dtype=bool),
 ) -> list[Cluster]:
-    """Clusters of voxel-averaged points of an object's colour, largest first."""
-    parts = []
+    """Clusters of voxel-averaged points of an object's colour, largest first.
+
+    Args:
+        is_other: Which points belong to something else, whatever their colour.
+    """
+    parts = [np.zeros((0, 3))]
     for view in views:
         p = view.p_base
         wanted = p[:, 2] > min_height_m
         p, color = p[wanted], view.color_linear[wanted]
         alike = likeness(color, model.color_srgb) >= MIN_LIKENESS
-        parts.append(voxel_mean(p[alike], VOXEL_M))
-    if not parts:
-        return []
-    view_ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        mean = voxel_mean(p[alike], VOXEL_M)
+        parts.append(mean[~is_other(mean)])
+    view_ids = np.repeat(np.arange(len(views)), [len(part) for part in parts[1:]])
     return clusters(np.concatenate(parts), view_ids, CLUSTER_GAP_M)
 
 

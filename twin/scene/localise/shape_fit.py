@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners
 from bridge.task.task_file import ObjectModel
 from twin.scene.frames.downscaled import pixels_of
 from twin.scene.least_squares import normal_equations, tukey_weights
@@ -44,10 +45,9 @@ class Outline:
 
 def corners(model: ObjectModel) -> Float[np.ndarray, "8 3"]:
     """Outer corners in the object frame [m]."""
-    half = np.array(model.size_m) / 2
-    centre = np.array([0.0, 0.0, 0.0 if model.origin_at_centre else half[2]])
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    return centre + signs * half
+    size = np.array(model.size_m)
+    lift_m = 0.0 if model.origin_at_centre else size[2] / 2
+    return box_corners(size) + np.array([0.0, 0.0, lift_m])
 
 
 def find_outlines(

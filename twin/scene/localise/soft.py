@@ -7,6 +7,7 @@ Equal toys are told apart by where each is expected: its start range, or where i
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,14 +28,11 @@ from twin.scene.localise.mesh_fit import (
     known_surface,
 )
 from twin.scene.localise.points import (
-    CLUSTER_GAP_M,
-    MIN_LIKENESS,
     MIN_POINTS,
     VOXEL_M,
     CameraView,
     Cluster,
-    clusters,
-    likeness,
+    object_points,
     voxel_mean,
 )
 from twin.scene.localise.shape_fit import MIN_EXPLAINED
@@ -134,17 +132,9 @@ def candidates(
     Args:
         blocked: Rigid objects with their poses; their points do not count.
     """
-    parts = []
-    for view in views:
-        p = view.p_base
-        alike = p[:, 2] > LEAST_HEIGHT_M
-        alike[alike] = likeness(view.color_linear[alike], model.color_srgb) >= (MIN_LIKENESS)
-        p = voxel_mean(p[alike], VOXEL_M)
-        parts.append(p[~_on_others(p, blocked)])
-    ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    everything = np.concatenate(parts) if parts else np.zeros((0, 3))
     single = []
-    for group in clusters(everything, ids, CLUSTER_GAP_M):
+    is_other = partial(_on_others, blocked=blocked)
+    for group in object_points(views, model, LEAST_HEIGHT_M, is_other):
         if len(group) < MIN_POINTS:
             continue
         for piece in _cut(group, model, count):

@@ -73,7 +73,6 @@ def make_record(
         "key": key,
         "scene_hash": scene_hash,
         "frame": root_frame(training.choices[0]),
-        "units": {"length": "m", "colour": "sRGB", "quaternion": "wxyz"},
         "remark": sources.remark,
         "stand_in": any(episode.info.stand_in for episode in sources.episodes),
         "sources": [
@@ -92,9 +91,7 @@ def make_record(
             "iterations": fitted.iterations,
             "iterations_asked": fitted.iterations_asked,
             "underfitted": fitted.underfitted,
-            "coarse_iterations": fitted.coarse_iterations,
             "seconds": round(fitted.seconds, 2),
-            "cpu_seconds": round(fitted.cpu_seconds, 2),
             "colour_steps": fitted.colour_steps,
             "train_psnr_db": None
             if fitted.train_psnr_db is None

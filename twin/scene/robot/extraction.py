@@ -4,7 +4,7 @@ Where its joints are known, pixels that show the robot are masked and its points
 What it hid in one frame is filled by the frames in which it stood elsewhere; nothing is invented.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,20 +19,21 @@ from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.terminal import Output
-from twin.robot.model import RobotModel, load_robot
+from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack, distinct_postures, posture_track
 from twin.robot.surface import PosedSurface, link_poses, link_surfaces
 from twin.scene.align.align import Alignment, align_robot
 from twin.scene.align.view import RobotView
 from twin.scene.fit.initialise import NoSurfaceError, fuse
 from twin.scene.fit.lighting import EVEN, Lighting
-from twin.scene.fit.on_mesh import Triangles, surface_area_m2
+from twin.scene.fit.on_mesh import surface_area_m2
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
 from twin.scene.robot.link_surface import SeenLink, link_lighting, on_surface, own_colors
 from twin.scene.robot.splats import posed, surface_links, write_links
 from twin.scene.settings import InitialiseConfig
+from twin.scene.shape.mesh import Mesh
 
 IN_FRONT_M = 0.03
 """A measurement this much nearer than the robot shows something in front of it."""
@@ -46,12 +47,6 @@ FEWEST = 400
 """Gaussians that a link has at least: a finger of few would be all edge."""
 UNUSED = 0.25
 """Share of a link's Gaussians that fusing leaves unused; nothing splits them later."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Tracked:
-    robot: RobotModel
-    track: PostureTrack
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,24 +73,23 @@ class RobotFrames:
             T_base_root: Where the frames' root lies in the robot's base; None: it is the base.
         """
         self.T_base_root = np.eye(4) if T_base_root is None else T_base_root
-        self._tracked: dict[str, _Tracked] = {}
+        self._tracks: dict[str, PostureTrack] = {}
         remarks = []
         for episode in episodes:
             try:
                 track = posture_track(episode)
-                robot = load_robot(track.urdf)
-                link_surfaces(robot)
+                link_surfaces(load_robot(track.urdf))
             except GstError as error:
                 remarks.append(f"{episode.info.id}: {error}")
                 continue
-            self._tracked[str(episode.path)] = _Tracked(robot=robot, track=track)
+            self._tracks[str(episode.path)] = track
         self.remark = "; ".join(remarks)
         """Why the robot is not told apart in some episodes; empty when it is in all."""
         self._seen: dict[str, list[SeenLink]] = {}
 
     def knows(self, episode: Episode) -> bool:
         """Say whether joints tell where the robot is in the frames of an episode."""
-        return str(episode.path) in self._tracked
+        return str(episode.path) in self._tracks
 
     def take_out(
         self, episode: Episode, frame: RgbdFrame, points: PointSet, view: TrainingView
@@ -112,41 +106,44 @@ class RobotFrames:
         shown = robot_mask(surface, view.half.camera, T_base_color, view.half.depth_m)
         return points.take(owner < 0), view.without(shown)
 
-    def collect(self, episode: Episode, stamp_ns: int, points: PointSet) -> None:
-        """Keep the robot's points of a frame that the background does not need."""
-        surface = self._surface(episode, stamp_ns)
-        if surface is not None:
-            self._keep(episode, stamp_ns, surface, points)
+    def look_closer(self, choice: FrameChoice, limits: DepthLimits, stride: int) -> None:
+        """Collect its surface from frames that a camera standing still has to spare.
 
-    def stationary_postures(
-        self, episode: Episode, stamps_ns: Iterable[int]
-    ) -> dict[int, Float[np.ndarray, " num_joints"]]:
-        """Joints at those of some instants at which the robot of an episode stood still [rad]."""
-        tracked = self._tracked.get(str(episode.path))
-        if tracked is None:
-            return {}
-        track = tracked.track
-        return {t: track.at(t).joints_rad for t in sorted(stamps_ns) if track.is_stationary(t)}
+        A few of its frames are enough for the background. The robot shows another side in each
+        posture, so up to two dozen postures far from each other are read for its links.
+        """
+        track, episode = self._tracks.get(str(choice.episode.path)), choice.episode
+        if track is None or not choice.stationary:
+            return
+        stamps = np.array([t for t in sorted(choice.spare_ns) if track.is_stationary(t)])
+        joints = np.array([track.at(t).joints_rad for t in stamps.tolist()])
+        wanted = stamps[distinct_postures(joints, MAX_POSTURES)] if len(stamps) else stamps
+        for frame in load(choice, frozenset(wanted.tolist())):
+            surface = self._surface(episode, frame.stamp_ns)
+            if surface is not None:
+                points = FrameSurface(frame, limits).points(stride)
+                self._keep(episode, frame.stamp_ns, surface, points)
 
     def _surface(self, episode: Episode, stamp_ns: int) -> PosedSurface | None:
-        tracked = self._tracked.get(str(episode.path))
-        if tracked is None or not tracked.track.covers(stamp_ns):
+        track = self._tracks.get(str(episode.path))
+        if track is None or not track.covers(stamp_ns):
             return None
-        return PosedSurface(tracked.robot, tracked.track.at(stamp_ns))
+        return PosedSurface(load_robot(track.urdf), track.at(stamp_ns))
 
     def _keep(
         self, episode: Episode, stamp_ns: int, surface: PosedSurface, points: PointSet
     ) -> Int64[np.ndarray, " num_points"]:
         """Keep the robot's points if it stood still; return which shape owns each point, or -1."""
-        tracked, T = self._tracked[str(episode.path)], self.T_base_root
+        track, T = self._tracks[str(episode.path)], self.T_base_root
+        robot = load_robot(track.urdf)
         owner = surface_links(
-            tracked.robot,
+            robot,
             surface,
             se3.apply(T, points.p_m.astype(np.float64)),
             points.normals.astype(np.float64) @ T[:3, :3].T,
         )
-        if tracked.track.is_stationary(stamp_ns):
-            poses = link_poses(tracked.robot, tracked.track.at(stamp_ns))
+        if track.is_stationary(stamp_ns):
+            poses = link_poses(robot, track.at(stamp_ns))
             for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
                 mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
                 T_link_root, own = se3.invert(poses[link]) @ T, points.take(mine)
@@ -190,13 +187,13 @@ class RobotFrames:
                 continue
         return LitLinks(clouds=clouds, lighting=lighting)
 
-    def _shapes(self) -> dict[str, list[Triangles]]:
+    def _shapes(self) -> dict[str, list[Mesh]]:
         """Shapes of the links by name, where all episodes have one description."""
-        robots = {tracked.robot for tracked in self._tracked.values()}
-        if len(robots) != 1:
+        urdfs = {track.urdf for track in self._tracks.values()}
+        if len(urdfs) != 1:
             return {}
-        shapes: dict[str, list[Triangles]] = {}
-        for item in link_surfaces(next(iter(robots))):
+        shapes: dict[str, list[Mesh]] = {}
+        for item in link_surfaces(load_robot(urdfs.pop())):
             shapes.setdefault(item.link, []).append((item.vertices_m, item.triangles))
         return shapes
 
@@ -204,17 +201,10 @@ class RobotFrames:
         self, links: LitLinks, cloud: GaussianCloud, episode: Episode, stamp_ns: int
     ) -> GaussianCloud:
         """Put the robot into a scene as it stood at an instant of an episode."""
-        tracked = self._tracked.get(str(episode.path))
-        if tracked is None or not links.clouds or not tracked.track.covers(stamp_ns):
+        track = self._tracks.get(str(episode.path))
+        if track is None or not links.clouds or not track.covers(stamp_ns):
             return cloud
-        posture = tracked.track.at(stamp_ns)
-        robot = posed(
-            links.clouds,
-            posture.joints_rad,
-            tracked.track.urdf,
-            width_m=posture.width_m,
-            lighting=links.lighting,
-        )
+        robot = posed(links.clouds, track.at(stamp_ns), track.urdf, links.lighting)
         return concatenate([cloud, moved_cloud(robot, se3.invert(self.T_base_root))])
 
 
@@ -272,25 +262,6 @@ def find_robot(choices: Sequence[FrameChoice], output: Output) -> FoundRobot:
     )
     frames = RobotFrames(episodes, alignment.T_base_source)
     return FoundRobot(frames=frames, remark=frames.remark, alignment=alignment)
-
-
-def look_closer(
-    found: FoundRobot, choices: Sequence[FrameChoice], limits: DepthLimits, stride: int
-) -> None:
-    """Collect the robot's surface from frames that cameras standing still have to spare.
-
-    A few of their frames are enough for the background. The robot shows another side in each
-    posture, so up to two dozen postures far from each other are read for its links.
-    """
-    for choice in choices:
-        postures = found.frames.stationary_postures(choice.episode, choice.spare_ns)
-        if not choice.stationary or not postures:
-            continue
-        stamps, joints = np.array(list(postures)), np.array(list(postures.values()))
-        wanted = frozenset(stamps[distinct_postures(joints, MAX_POSTURES)].tolist())
-        for frame in load(choice, wanted):
-            points = FrameSurface(frame, limits).points(stride)
-            found.frames.collect(choice.episode, frame.stamp_ns, points)
 
 
 def _aligned(choices: Sequence[FrameChoice]) -> Alignment:

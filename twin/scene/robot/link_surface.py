@@ -15,9 +15,10 @@ from scipy.spatial import cKDTree
 
 from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.fit.lighting import EVEN, Lighting, Patches, fit_lighting
-from twin.scene.fit.on_mesh import WIDER, Triangles, even_points, within_edges
+from twin.scene.fit.on_mesh import WIDER, even_points, within_edges
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.shape.mesh import Mesh
 
 FITS_M = 0.006
 """Half of the measured points lie nearer to a shape that is the link's."""
@@ -45,7 +46,7 @@ class SeenLink:
 
 
 def link_lighting(
-    shapes: Mapping[str, Sequence[Triangles]], seen: Mapping[str, Sequence[SeenLink]]
+    shapes: Mapping[str, Sequence[Mesh]], seen: Mapping[str, Sequence[SeenLink]]
 ) -> Lighting:
     """The light on a robot, from links that were seen turned in several ways."""
     patches: list[Patches] = []
@@ -76,7 +77,7 @@ def link_lighting(
 
 
 def own_colors(
-    shapes: Sequence[Triangles], seen: Sequence[SeenLink], lighting: Lighting
+    shapes: Sequence[Mesh], seen: Sequence[SeenLink], lighting: Lighting
 ) -> list[PointSet]:
     """What was measured of a link with its own colours, as in even light.
 
@@ -111,7 +112,7 @@ def _pieces(
 
 
 def on_surface(
-    shapes: Sequence[Triangles], sets: Sequence[PointSet], spacing_m: float
+    shapes: Sequence[Mesh], sets: Sequence[PointSet], spacing_m: float
 ) -> GaussianCloud | None:
     """Gaussians on a link's shapes, in its frame; None where these do not fit what was measured."""
     p, normals = even_points(shapes, spacing_m)
