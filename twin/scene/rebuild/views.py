@@ -7,8 +7,8 @@ Topics, all with the stamp of the recorded frame and the frame id of its colour 
 inside) where there is something to mask, and ``.../color/info``.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,14 @@ from bridge.media.image_quality import as_float, psnr_db
 from bridge.terminal import Advance
 from twin.scene.backdrop import Backdrop
 from twin.scene.dataset.masks import ReferenceView, find_moving, without_ego
+from twin.scene.dataset.training_set import TrainingSet, limits_of
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, load
-from twin.scene.gaussians import GaussianCloud
 from twin.scene.objects.decompose import Decomposition
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
+from twin.scene.robot.extraction import LitLinks
+from twin.scene.settings import RebuildConfig
+from twin.scene.store.folder import background_hash
 
 VIEWS_NOTE = (
     "held out from initialisation, poses, exposure, fit and objects; mean of the images' values, "
@@ -98,34 +101,26 @@ def views_path(run: RunFolder, episode: Episode, scene_hash: str) -> Path:
 class ViewsJob:
     """What to render held-out frames of, and what to say about it."""
 
-    scene_hash: str
+    training: TrainingSet
     scenes: Decomposition
     """Draws each episode with its own objects."""
-    reference_views: Sequence[ReferenceView]
-    limits: DepthLimits
-    raster: RasterConfig
+    links: LitLinks
+    backdrop: Backdrop
+    config: RebuildConfig
     protocol: Mapping[str, Any]
     """How the scene was made: kept with the images, for whoever rates them."""
-    robot: Callable[[GaussianCloud, Episode, int], GaussianCloud] | None = None
-    """Puts it where it stood at each frame; the cloud holds only what is static."""
-    ego_masks: Mapping[tuple[Path, str], Bool[np.ndarray, "_ _"]] = field(default_factory=dict)
-    """By episode and camera: what moves with the camera and is not part of the scene."""
-    backdrop: Backdrop | None = None
-    """Stands behind everything; None: black."""
 
 
-def write_views(
-    run: RunFolder, choices: Sequence[FrameChoice], job: ViewsJob, advance: Advance
-) -> list[ViewNumbers]:
+def write_views(run: RunFolder, job: ViewsJob, advance: Advance) -> list[ViewNumbers]:
     """Render every held-out frame; one derived episode per recorded one, replaced if present."""
-    rasteriser = Rasteriser(job.raster)
+    rasteriser = Rasteriser(RasterConfig(threads=job.config.fit.threads))
     numbers: list[ViewNumbers] = []
+    choices, scene_hash = job.training.choices, background_hash(run)
     paths = [choice.episode.path for choice in choices]
     episodes = {choice.episode.path: choice.episode for choice in choices if choice.holdout_ns}
     for path, episode in episodes.items():
-        target = views_path(run, episode, job.scene_hash)
+        target = views_path(run, episode, scene_hash)
         target.unlink(missing_ok=True)
-        own = [choice for choice in choices if choice.episode.path == path]
         with EpisodeWriter(target) as writer:
             writer.describe(
                 replace(episode.info, id=target.stem),
@@ -133,37 +128,34 @@ def write_views(
                     kind="views",
                     source_episode=episode.info.id,
                     source_sha256=episode.sha256(),
-                    scene_hash=job.scene_hash,
+                    scene_hash=scene_hash,
                     engine=ENGINE,
                     settings=dict(job.protocol),
                 ),
             )
-            for choice in own:
-                for number in _rendered(choice, rasteriser, job, paths.index(path), writer):
+            for index in (k for k, own in enumerate(paths) if own == path):
+                for number in _rendered(index, rasteriser, job, paths.index(path), writer):
                     numbers.append(number)
                     advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
     return numbers
 
 
 def _rendered(
-    choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob, scan: int, writer: EpisodeWriter
+    index: int, rasteriser: Rasteriser, job: ViewsJob, scan: int, writer: EpisodeWriter
 ) -> Iterator[ViewNumbers]:
     """Draw and write the held-out frames of one camera, and rate each.
 
     Objects of other scans did not move in this one.
     """
-    references = [each for each in job.reference_views if each.scan == scan]
+    training, choice = job.training, job.training.choices[index]
+    references = [each for each in training.reference_views if each.scan == scan]
     scene, num_background = job.scenes.as_seen_in(choice.episode), len(job.scenes.background)
     for frame in load(choice, choice.holdout_ns):
         camera, T = frame.color_camera, frame.T_base_color
-        cloud = scene
-        if job.robot is not None:
-            cloud = job.robot(cloud, choice.episode, frame.stamp_ns)
-        ego_mask = job.ego_masks.get((choice.episode.path, choice.camera_id))
-        recorded = _recorded(frame, job.limits, references, ego_mask)
-        view = rasteriser.view(cloud, camera, T)
-        if job.backdrop is not None:
-            view = job.backdrop.behind(view, camera, T)
+        cloud = training.robot.frames.joined(job.links, scene, choice.episode, frame.stamp_ns)
+        ego_mask = training.ego_masks.get(index)
+        recorded = _recorded(frame, limits_of(job.config), references, ego_mask)
+        view = job.backdrop.behind(rasteriser.view(cloud, camera, T), camera, T)
         masks = {"static": recorded.full.static_mask}
         if len(scene) > num_background:
             white = np.zeros((len(cloud), 1), dtype=np.float32)
