@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8, UInt16
+from jaxtyping import Float, Int, UInt8
 
 from bridge.episode import streams
 from bridge.episode.cdr.messages import CompressedColor, RawColor, color_from_message
@@ -21,6 +21,7 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
+from bridge.media.depth import from_metres
 from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface
@@ -139,7 +140,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
                 image = comparison.add(before.image_u8(), drawn, frame, camera)
             planes = {"": image}
             if config.depth:
-                planes |= {"_depth": depth_image(drawn.depth_m), "_seen": drawn.seen_u8()}
+                planes |= {"_depth": from_metres(drawn.depth_m), "_seen": drawn.seen_u8()}
             files = write(frame.stamp_ns - frames[0].stamp_ns, planes)
             coverage.append(float(drawn.alpha.mean()))
     return {
@@ -273,12 +274,6 @@ class _Comparison:
         difference = np.abs(recorded_u8.astype(np.int16) - drawn.image_u8.astype(np.int16))
         sides = [recorded_u8, drawn.marked_u8(), difference.astype(np.uint8)]
         return np.concatenate(sides, axis=1)
-
-
-def depth_image(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarray, "_ _"]:
-    """Whole millimetres; what is farther away than they can say is as far as they can."""
-    largest = np.iinfo(np.uint16).max
-    return np.clip(np.rint(depth_m * 1e3), 0, largest).astype(np.uint16)
 
 
 Write = Callable[[int, Mapping[str, np.ndarray]], list[str]]

@@ -21,30 +21,24 @@ GAIN_PRIOR = 1e-3
 """Pull of a gain towards 1, as a mean squared brightness: decides only black images."""
 
 
-def gain_exposure(gain: Float[np.ndarray, "*images 3"]) -> Float[np.ndarray, "*images 3 4"]:
-    """Factors for the channels as exposures."""
-    return np.asarray(gain[..., None] * np.eye(3, 4))
-
-
-def solve_exposures(
+def solve_gains(
     cloud: GaussianCloud,
     observations: Sequence[ImageObservation],
     rasteriser: Rasteriser,
     allowance: Allowance = UNLIMITED,
-) -> Float[np.ndarray, "num_views 3 4"]:
+) -> Float[np.ndarray, "num_views 3"]:
     """How each image's colours come from the drawn ones; on average they do not change.
 
     Least squares over static pixels that are not saturated. Images that there is no time for keep
-    the exposures they have.
+    the gains they have.
     """
-    exposures = np.array([item.exposure for item in observations], dtype=np.float64)
+    gains = np.array([item.gain for item in observations], dtype=np.float64)
     for index, item in enumerate(observations):
         if allowance.is_over():
             break
         planes = rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
-        exposures[index] = gain_exposure(gain_between(planes[:3], item.target))
-    gains = np.ascontiguousarray(np.diagonal(exposures, axis1=1, axis2=2))
-    return gain_exposure(gains / gains.mean(axis=0))
+        gains[index] = gain_between(planes[:3], item.target)
+    return np.asarray(gains / gains.mean(axis=0))
 
 
 def gain_between(

@@ -24,7 +24,7 @@ from bridge.geometry import se3
 from bridge.terminal import Advance
 from twin.scene.fit.appearance import Allowance, ImageObservation, solve_appearance
 from twin.scene.fit.densify import densify, score
-from twin.scene.fit.exposure import solve_exposures
+from twin.scene.fit.exposure import solve_gains
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32, with_harmonics
 from twin.scene.raster.rasteriser import (
@@ -104,7 +104,7 @@ class FitState:
     """The cloud, the moments of Adam and the number of images seen."""
     size_m: float
     """Median size of the first Gaussians; positions move in units of it."""
-    exposures: Float[np.ndarray, "num_views 3 4"]
+    gains: Float[np.ndarray, "num_views 3"]
     surface: SurfacePrior
     """Where the Gaussians began."""
     last: RunningSum = field(default_factory=RunningSum)
@@ -195,7 +195,7 @@ class Events:
             ImageObservation(
                 target=view.half if coarse else view.full,
                 T_base_camera=view.T_base_color,
-                exposure=state.exposures[index],
+                gain=state.gains[index],
             )
             for index, view in enumerate(self._views)
         ]
@@ -203,7 +203,7 @@ class Events:
     def _solve_exposures(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         seen = self._observations(state, coarse)
         cloud = state.session.cloud
-        state.exposures = solve_exposures(cloud, seen, self._rasteriser, allowance)
+        state.gains = solve_gains(cloud, seen, self._rasteriser, allowance)
 
     def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         self._solve_exposures(state, coarse, allowance)
@@ -279,9 +279,9 @@ class FitResult:
     train_psnr_db: float | None
     """Over the static pixels of the last images seen, at the size they were fitted at; None when
     there were none."""
-    exposures: Float[np.ndarray, "num_views 3 4"]
-    """How the colours (red, green, blue, 1) of the scene came out in each training image; on
-    average they did not change."""
+    gains: Float[np.ndarray, "num_views 3"]
+    """How the colours of the scene came out in each training image; on average they did not
+    change."""
     colour_steps: int
     """Conjugate gradient steps that solved colours; 0 when there was no time for them."""
 
@@ -318,7 +318,7 @@ def fit(
     state = FitState(
         session=session,
         size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
-        exposures=np.tile(SAME_EXPOSURE, (len(views), 1, 1)),
+        gains=np.ones((len(views), 3)),
         surface=SurfacePrior.of(session.cloud),
         seconds=min(spent_s, SPENT_AT_MOST * config.limit_s),
     )
@@ -334,7 +334,7 @@ def fit(
         iterations_asked=config.iterations or None,
         seconds=state.seconds,
         train_psnr_db=_recent_psnr_db(state, len(views)),
-        exposures=state.exposures,
+        gains=state.gains,
         colour_steps=state.colour_steps,
     )
 
@@ -382,8 +382,9 @@ class _Learner:
         decay = DECAY**at.fraction
         rates = {name: rate * decay for name, rate in RATES.items()}
         rates["means_m"] *= state.size_m
+        exposure = state.gains[index][:, None] * SAME_EXPOSURE
         report = state.session.step(
-            view.half if coarse else view.full, view.T_base_color, rates, state.exposures[index]
+            view.half if coarse else view.full, view.T_base_color, rates, exposure
         )
         keep_colors_in_range(state.session.cloud)
         if state.session.steps % HOLD_EVERY == 0:

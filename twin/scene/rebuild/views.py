@@ -25,6 +25,7 @@ from bridge.episode.topics import camera_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UndefinedStatisticError
 from bridge.media.color import encode_png
+from bridge.media.depth import from_metres
 from bridge.media.image_quality import as_float, psnr_db
 from bridge.terminal import Advance
 from twin.scene.backdrop import Backdrop
@@ -204,8 +205,7 @@ def _write_view(
         put(tail, color.to_cdr(), schema.COMPRESSED_IMAGE)
 
     def depth(tail: str, depth_m: np.ndarray) -> None:
-        millimetres = np.clip(np.rint(depth_m * 1e3), 0, 65535).astype(np.uint16)
-        image = DepthImage(stamp_ns=stamp, frame_id=frame_id, depth_mm=millimetres)
+        image = DepthImage(stamp_ns=stamp, frame_id=frame_id, depth_mm=from_metres(depth_m))
         put(tail, image.to_cdr(), schema.IMAGE)
 
     info = CameraInfo(stamp_ns=stamp, frame_id=frame_id, camera=frame.color_camera)
@@ -215,7 +215,7 @@ def _write_view(
     depth("rendered/depth", view.depth_m)
     same = np.allclose(frame.T_base_color, frame.T_base_depth, atol=1e-6)
     if same and frame.color_camera == frame.depth_camera:
-        depth("recorded/depth", np.nan_to_num(frame.depth_m, posinf=0.0))
+        depth("recorded/depth", frame.depth_m)
     else:
         depth("recorded/depth_in_color", depth_in_color_m)
     for name, mask in masks.items():

@@ -111,6 +111,17 @@ def surface_distances(
     return np.stack(distances)[nearest, rows], gradient
 
 
+def outside_m(
+    points: Float[np.ndarray, "num_points 3"],
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, " num_points"]:
+    """Signed distance to a rigid object's known shape, mesh or panels; of a soft one to its box."""
+    if model.mesh is None or model.soft is not None:
+        return surface_distances(points, model, T_base_object)[0]
+    return object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points))
+
+
 def shape_mesh(
     model: ObjectModel,
 ) -> tuple[Float[np.ndarray, "num_vertices 3"], Int[np.ndarray, "num_faces 3"]]:
