@@ -9,7 +9,6 @@ camera measured is carried into them instead.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -304,7 +303,7 @@ class CameraCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanReport:
-    """What is to be said about a scan; ``scene.json`` keeps it."""
+    """What is to be said about a scan; ``scene.json`` keeps the remarks."""
 
     poses: Mapping[str, PoseReport]
     """By camera; one that stands still is compared with those that move, where there are any."""
@@ -337,17 +336,6 @@ class ScanReport:
                 f"it {self.moving_place}"
             )
         return found
-
-    def to_record(self) -> dict[str, Any]:
-        """What ``scene.json`` says."""
-        return {
-            "remarks": self.remarks(),
-            "moving_fraction": self.moving_fraction,
-            "pose_agreement": {
-                name: None if report.agreement is None else round(report.agreement, 4)
-                for name, report in self.poses.items()
-            },
-        }
 
 
 def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanReport:

@@ -67,7 +67,6 @@ def make_record(
     settings = asdict(config)
     settings.pop("force")
     settings["fit"]["budget_s"] = None if math.isinf(config.fit.limit_s) else config.fit.limit_s
-    scan = training.report.to_record()
     return {
         "schema_version": SCENE_VERSION,
         "key": key,
@@ -79,7 +78,7 @@ def make_record(
             {"id": e.info.id, "kind": e.info.kind, "sha256": e.sha256()} for e in sources.episodes
         ],
         "cameras": [camera_record(choice) for choice in training.choices],
-        "scan": scan | {"remarks": [*left_out, *scan["remarks"]]},
+        "scan": {"remarks": [*left_out, *training.report.remarks()]},
         "settings": settings,
         "background": {
             "file": BACKGROUND,
@@ -92,7 +91,6 @@ def make_record(
             "iterations_asked": fitted.iterations_asked,
             "underfitted": fitted.underfitted,
             "seconds": round(fitted.seconds, 2),
-            "colour_steps": fitted.colour_steps,
             "train_psnr_db": None
             if fitted.train_psnr_db is None
             else round(min(fitted.train_psnr_db, MOST_DB), 3),
@@ -132,8 +130,6 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
         "id": choice.camera_id,
         "stationary": choice.stationary,
         "poses_from": choice.poses.source,
-        "poses_quality": dict(choice.poses.quality),
-        "frames_without_pose": len(choice.poses.unposed_ns),
         "train_frames": len(choice.train_ns),
         "holdout_frames": len(choice.holdout_ns),
         "color": asdict(camera),

@@ -29,11 +29,6 @@ def write_shape(
         else:
             inside.save(folder / SOFT)
             names.append(SOFT)
-            about["lattice"] = {
-                "num_nodes": len(inside.nodes_m),
-                "num_tets": len(inside.tets),
-                "spacing_m": inside.spacing_m,
-            }
     return names, about
 
 

@@ -43,8 +43,9 @@ def camera(choice: FrameChoice, *, count: int = 8, depth_times: float = 1.0) -> 
 def test_a_good_scan_gives_no_remark(choice: FrameChoice) -> None:
     report = check_scan([camera(choice)], CONFIG)
     assert report.remarks() == []
-    (agreement,) = report.to_record()["pose_agreement"].values()
-    assert agreement > 0.9
+    (poses,) = report.poses.values()
+    assert poses.agreement is not None
+    assert poses.agreement > 0.9
 
 
 @pytest.mark.parametrize(
