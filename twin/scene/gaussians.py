@@ -200,7 +200,11 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
         axis=1,
     ).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
-    header += [f"property float {name}" for name in _columns_of(cloud)]
+    after_color = COLUMNS.index("f_dc_2") + 1
+    rest = REST_COLUMNS[: 3 * cloud.num_harmonics]
+    marks = (COMPLETED_COLUMN,) if cloud.completed.any() else ()
+    names = (*COLUMNS[:after_color], *rest, *COLUMNS[after_color:], *marks)
+    header += [f"property float {name}" for name in names]
     write_whole(path, "\n".join([*header, "end_header", ""]).encode() + table.tobytes())
 
 
@@ -238,13 +242,6 @@ def read_ply(path: Path) -> GaussianCloud:
         if COMPLETED_COLUMN in names
         else np.zeros(count, dtype=bool),
     )
-
-
-def _columns_of(cloud: GaussianCloud) -> tuple[str, ...]:
-    after_color = COLUMNS.index("f_dc_2") + 1
-    rest = REST_COLUMNS[: 3 * cloud.num_harmonics]
-    marks = (COMPLETED_COLUMN,) if cloud.completed.any() else ()
-    return (*COLUMNS[:after_color], *rest, *COLUMNS[after_color:], *marks)
 
 
 def _harmonics(names: list[str], table: np.ndarray) -> np.ndarray:

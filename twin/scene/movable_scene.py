@@ -55,10 +55,6 @@ class Drawn:
     not_scanned: Mapping[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
     """By object that no scan saw: the pixels that show it."""
 
-    def seen_u8(self) -> UInt8[np.ndarray, "height width"]:
-        """The mask as an image, white where seen."""
-        return np.where(self.seen_mask, np.uint8(255), np.uint8(0))
-
     def marked_u8(self) -> UInt8[np.ndarray, "height width 3"]:
         """The image for people: what was not scanned has a dashed outline and is named."""
         image = self.image_u8

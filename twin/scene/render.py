@@ -140,7 +140,10 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
                 image = comparison.add(before.image_u8(), drawn, frame, camera)
             planes = {"": image}
             if config.depth:
-                planes |= {"_depth": from_metres(drawn.depth_m), "_seen": drawn.seen_u8()}
+                planes |= {
+                    "_depth": from_metres(drawn.depth_m),
+                    "_seen": drawn.seen_mask * np.uint8(255),
+                }
             files = write(frame.stamp_ns - frames[0].stamp_ns, planes)
             coverage.append(float(drawn.alpha.mean()))
     return {

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from twin.scene.frames.camera_poses import same_pose
 from twin.scene.frames.downscaled import pixels_of
-from twin.scene.frames.rgbd import PointSet, Target, TrainingView
+from twin.scene.frames.rgbd import PointSet, TrainingView
 from twin.scene.frames.selection import spread
 
 VOXEL_M = 0.02
@@ -248,7 +248,8 @@ def find_ego_mask(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height wid
     chosen = _from_other_places(views)
     if len(chosen) < MIN_VIEWS:
         return None
-    images = np.stack([_blurred(view.half) for view in chosen])
+    planes = np.stack([view.half.planes_u8 for view in chosen]).astype(np.float32)
+    images = ndimage.gaussian_filter(planes, (0.0, 0.0, BLUR_PX, BLUR_PX))
     stays = _edges_that_stay(images)
     if stays.mean() < MIN_SHARE / 10:
         return None
@@ -272,11 +273,6 @@ def _from_other_places(views: Sequence[TrainingView]) -> list[TrainingView]:
         ):
             kept.append(view)
     return [kept[index] for index in spread(np.arange(len(kept)), MAX_VIEWS)]
-
-
-def _blurred(target: Target) -> Float32[np.ndarray, "3 height width"]:
-    planes = target.planes_u8.astype(np.float32)
-    return np.asarray(ndimage.gaussian_filter(planes, (0.0, BLUR_PX, BLUR_PX)), dtype=np.float32)
 
 
 def _edges_that_stay(

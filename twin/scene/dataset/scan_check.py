@@ -210,16 +210,16 @@ def _best(pairs: list[tuple[DownscaledDepth, DownscaledDepth]]) -> tuple[Convent
 
 
 def _score(pairs: list[tuple[DownscaledDepth, DownscaledDepth]], convention: Convention) -> Meeting:
-    return mean_of([_met(first, second, convention) for first, second in pairs])
-
-
-def _met(first: DownscaledDepth, second: DownscaledDepth, convention: Convention) -> Meeting:
-    T_second_first = se3.invert(convention.read(second.T_base_depth)) @ convention.read(
-        first.T_base_depth
-    )
-    if convention.depth_scale != 1.0:  # the same as moving by the inverse, up to the tolerance
+    met = []
+    for first, second in pairs:
+        T_base_first, T_base_second = (
+            convention.read(image.T_base_depth) for image in (first, second)
+        )
+        T_second_first = se3.invert(T_base_second) @ T_base_first
+        # Depth times a scale is the same as moving by the inverse, up to the tolerance.
         T_second_first[:3, 3] /= convention.depth_scale
-    return meet(first, second, T_second_first)
+        met.append(meet(first, second, T_second_first))
+    return mean_of(met)
 
 
 def _informative(

@@ -90,7 +90,12 @@ def densify(
     Returns:
         The rearranged cloud, and which Gaussian of the one before each comes from.
     """
-    kept = _kept_mask(cloud, scores)
+    kept: Bool[np.ndarray, " num_splats"] = cloud.opacities() > TRANSPARENT
+    if scores.complete:
+        kept &= scores.pixels > UNSEEN_PIXELS
+    kept &= scores.size_fraction < HUGE_FRACTION
+    if not kept.any():  # nothing is seen at all: images that are masked everywhere
+        kept[:] = True
     free = max(min(max_splats - int(kept.sum()), most), 0)
     wanting = np.flatnonzero(kept & (scores.size_px > FINEST_PX) & (scores.error > 0))
     worst = wanting[np.argsort(-scores.error[wanting], kind="stable")[:free]]
@@ -101,16 +106,6 @@ def densify(
     everything = concatenate([cloud.take(whole), *halves])
     order = morton_order(everything.means_m)
     return everything.take(order), ids[order]
-
-
-def _kept_mask(cloud: GaussianCloud, scores: Scores) -> Bool[np.ndarray, " num_splats"]:
-    kept: np.ndarray = cloud.opacities() > TRANSPARENT
-    if scores.complete:
-        kept &= scores.pixels > UNSEEN_PIXELS
-    kept &= scores.size_fraction < HUGE_FRACTION
-    if not kept.any():  # nothing is seen at all: images that are masked everywhere
-        kept[:] = True
-    return kept
 
 
 def _halves(cloud: GaussianCloud) -> list[GaussianCloud]:

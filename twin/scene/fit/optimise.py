@@ -240,11 +240,6 @@ def keep_colors_in_range(cloud: GaussianCloud) -> None:
     np.clip(cloud.colors, 0.0, 1.0, out=cloud.colors)
 
 
-def order_of_views(seed: int, epoch: int, num_views: int) -> np.ndarray:
-    """The order in which one pass shows the views; the same whenever it is asked for."""
-    return np.random.default_rng([seed, epoch]).permutation(num_views)
-
-
 RATES = {
     "means_m": 0.18,  # in units of the median Gaussian's size
     "quats_wxyz": 4e-3,
@@ -376,7 +371,8 @@ class _Learner:
     def step(self, state: FitState, at: Progress) -> None:
         """Draw one image and follow its gradient."""
         epoch, place = divmod(state.session.steps, len(self._views))
-        index = int(order_of_views(self._config.seed, epoch, len(self._views))[place])
+        order = np.random.default_rng([self._config.seed, epoch]).permutation(len(self._views))
+        index = int(order[place])
         coarse = at.fraction < COARSE
         view = self._views[index]
         decay = DECAY**at.fraction

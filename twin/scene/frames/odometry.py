@@ -181,7 +181,9 @@ class _Follower:
             before = np.eye(4) if self._last is None else self._last[1].T_target_source
             self._motion = se3.invert(before) @ step.T_target_source
             self._last = (look, step)
-            if self._is_far(step.T_target_source):
+            turn = float(se3.rotation_angle_rad(step.T_target_source[:3, :3]))
+            shift = float(np.linalg.norm(step.T_target_source[:3, 3]))
+            if turn > KEY_TURN_RAD or shift > KEY_SHIFT_M:
                 self._promote()
 
     def _begin(self, look: Look) -> None:
@@ -220,11 +222,6 @@ class _Follower:
         self.keys.append(Keyframe(look=look, T_first_key=T_first_key, from_previous=step))
         self.places[look.small.stamp_ns] = (len(self.keys) - 1, np.eye(4))
         self._last = None
-
-    def _is_far(self, T_key_frame: np.ndarray) -> bool:
-        turn = float(se3.rotation_angle_rad(T_key_frame[:3, :3]))
-        shift = float(np.linalg.norm(T_key_frame[:3, 3]))
-        return turn > KEY_TURN_RAD or shift > KEY_SHIFT_M
 
 
 def follow_camera(

@@ -94,7 +94,10 @@ def path_length_m(
     """How far the camera has come, turns included; grows a little even while it stands still."""
     if len(Ts_base_camera) < 2:
         return np.zeros(len(Ts_base_camera))
-    steps = _steps_m(Ts_base_camera[:-1], Ts_base_camera[1:])
+    before, after = Ts_base_camera[:-1], Ts_base_camera[1:]
+    turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    steps = shift + TURN_M_PER_RAD * turn
     return np.concatenate([[0.0], np.cumsum(steps + max(1e-6, 1e-3 * float(steps.mean())))])
 
 
@@ -146,12 +149,6 @@ def sharpness(image_u8: UInt8[np.ndarray, "height width 3"]) -> float:
     grey = grey.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
     laplacian = ndimage.laplace(grey)[1:-1, 1:-1]
     return float(laplacian.var()) if laplacian.size else 0.0
-
-
-def _steps_m(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
-    shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
-    return np.asarray(shift + TURN_M_PER_RAD * turn)
 
 
 def _stretches(path_m: np.ndarray, count: int) -> np.ndarray:

@@ -64,22 +64,18 @@ def correct_for_table(views: Sequence[CameraView], task: Task) -> list[CameraVie
     """
     corrected = []
     for view in views:
-        p = _table_points(view, task)
+        wanted = np.abs(view.p_base[:, 2]) < BAND_M
+        step = max(1, int(wanted.sum()) // MAX_TABLE_POINTS)
+        ids = everything = np.flatnonzero(wanted)[::step]
+        for model in task.objects.values():
+            like = likeness(view.color_linear[ids], model.color_srgb)
+            ids = ids[like < MIN_LIKENESS / 2]
+        # A table of the objects' own colour: most points of the band are table all the same.
+        p = view.p_base[ids if len(ids) >= MIN_TABLE_POINTS else everything]
         is_seen = len(p) >= MIN_TABLE_POINTS
         fit = fit_table(p, view.T_base_depth[:3, 3]) if is_seen else (np.eye(4), 1.0)
         corrected.append(moved(view, *fit))
     return corrected
-
-
-def _table_points(view: CameraView, task: Task) -> Float[np.ndarray, "num_points 3"]:
-    wanted = np.abs(view.p_base[:, 2]) < BAND_M
-    step = max(1, int(wanted.sum()) // MAX_TABLE_POINTS)
-    ids = everything = np.flatnonzero(wanted)[::step]
-    for model in task.objects.values():
-        like = likeness(view.color_linear[ids], model.color_srgb)
-        ids = ids[like < MIN_LIKENESS / 2]
-    # A table of the objects' own colour: most points of the band are table all the same.
-    return view.p_base[ids if len(ids) >= MIN_TABLE_POINTS else everything]
 
 
 def fit_table(

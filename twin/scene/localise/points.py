@@ -107,7 +107,16 @@ def fuse_stationary(
     groups: list[list[RgbdFrame]] = []
     for frame in sorted(frames, key=lambda item: -item.stamp_ns):
         for group in groups:
-            if _same_pose(group[0], frame):
+            if (
+                frame.camera_id == group[0].camera_id
+                and frame.depth_m.shape == group[0].depth_m.shape
+                and same_pose(
+                    group[0].T_base_depth,
+                    frame.T_base_depth,
+                    distance_m=SAME_POSE_M,
+                    angle_rad=SAME_POSE_RAD,
+                )
+            ):
                 group.append(frame)
                 break
         else:
@@ -117,17 +126,6 @@ def fuse_stationary(
         if sum(view.camera_id == group[0].camera_id for view in views) < max_views:
             views.append(_view(group[:max_frames], task))
     return sorted(views, key=lambda view: (view.camera_id, view.stamp_ns))
-
-
-def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
-    if a.camera_id != b.camera_id or a.depth_m.shape != b.depth_m.shape:
-        return False
-    return same_pose(
-        a.T_base_depth,
-        b.T_base_depth,
-        distance_m=SAME_POSE_M,
-        angle_rad=SAME_POSE_RAD,
-    )
 
 
 def _view(frames: Sequence[RgbdFrame], task: Task) -> CameraView:

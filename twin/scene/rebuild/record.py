@@ -139,10 +139,12 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
 def describe_scene(record: Mapping[str, Any]) -> str:
     """Say in a few lines what was rebuilt and how well."""
     fitted, cost = record["fit"], record["cost"]
+    asked = fitted.get("iterations_asked")  # not in scenes of older versions
+    of_asked = "" if asked is None else f" of {asked}"
     lines = [
         f"scene {record['scene_hash']}: {record['background']['num_splats']} Gaussians"
         + (" (stand-in)" if record["stand_in"] else ""),
-        f"fit: {_images_done(fitted)} in {fitted['seconds']:.1f} s"
+        f"fit: {fitted['iterations']}{of_asked} images in {fitted['seconds']:.1f} s"
         + (
             ""
             if fitted["train_psnr_db"] is None
@@ -163,26 +165,15 @@ def describe_scene(record: Mapping[str, Any]) -> str:
     ]
     if fitted.get("underfitted"):
         lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
-    lines.append(_view_line(record["views"]))
+    images = record["views"]["images"]
+    stationary = sum(bool(item["stationary_camera"]) for item in images)
+    which = f", {stationary} of cameras that stand still" if stationary else ""
+    lines.append(
+        f"held-out views ({len(images)}{which}): PSNR {record['views']['psnr_db']:.2f} dB"
+        if images
+        else "no frame could be held out: too few frames"
+    )
     lines += record["scan"]["remarks"]
     if record["remark"]:
         lines.append(record["remark"])
     return "\n".join(lines)
-
-
-def _images_done(fitted: Mapping[str, Any]) -> str:
-    asked = fitted.get("iterations_asked")  # not in scenes of older versions
-    return (
-        f"{fitted['iterations']} images"
-        if asked is None
-        else f"{fitted['iterations']} of {asked} images"
-    )
-
-
-def _view_line(views: Mapping[str, Any]) -> str:
-    images = views["images"]
-    if not images:
-        return "no frame could be held out: too few frames"
-    stationary = sum(bool(item["stationary_camera"]) for item in images)
-    which = f", {stationary} of cameras that stand still" if stationary else ""
-    return f"held-out views ({len(images)}{which}): PSNR {views['psnr_db']:.2f} dB"

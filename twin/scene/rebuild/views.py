@@ -8,7 +8,8 @@ inside) where there is something to mask, and ``.../color/info``.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,42 +49,14 @@ MOST_DB = 100.0
 """JSON has no word for identical images."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewNumbers:
-    """How one held-out view came out."""
-
-    episode: str
-    camera_id: str
-    stamp_ns: int
-    stationary_camera: bool
-    """The camera does not move, so training frames show the same view."""
-    psnr_db: float
-    """Over the whole image, as recorded; at most 100."""
-
-
-def rate_view(frame: RgbdFrame, view: View, choice: FrameChoice) -> ViewNumbers:
-    """Compare one rendered view with its recorded frame."""
-    try:
-        found_db = psnr_db(as_float(frame.image_u8), as_float(view.image_u8()))
-    except UndefinedStatisticError:
-        found_db = MOST_DB
-    return ViewNumbers(
-        episode=choice.episode.info.id,
-        camera_id=frame.camera_id,
-        stamp_ns=frame.stamp_ns,
-        stationary_camera=choice.stationary,
-        psnr_db=min(found_db, MOST_DB),
-    )
-
-
-def summarise_views(numbers: Sequence[ViewNumbers], files: Sequence[str]) -> dict[str, Any]:
+def summarise_views(numbers: Sequence[Mapping[str, Any]], files: Sequence[str]) -> dict[str, Any]:
     """Average the held-out views, as ``robot-gst evaluate`` does."""
-    each = [item.psnr_db for item in numbers]
+    each = [item["psnr_db"] for item in numbers]
     return {
         "files": list(files),
         "note": VIEWS_NOTE,
         "psnr_db": round(float(np.mean(each)), 4) if each else None,
-        "images": [asdict(item) for item in numbers],
+        "images": list(numbers),
     }
 
 
@@ -112,10 +85,14 @@ class ViewsJob:
     """How the scene was made: kept with the images, for whoever rates them."""
 
 
-def write_views(run: RunFolder, job: ViewsJob, advance: Advance) -> list[ViewNumbers]:
-    """Render every held-out frame; one derived episode per recorded one, replaced if present."""
+def write_views(run: RunFolder, job: ViewsJob, advance: Advance) -> list[dict[str, Any]]:
+    """Render every held-out frame; one derived episode per recorded one, replaced if present.
+
+    Returns:
+        How each came out: PSNR over the whole image, as recorded; at most 100 dB.
+    """
     rasteriser = Rasteriser(RasterConfig(threads=job.config.fit.threads))
-    numbers: list[ViewNumbers] = []
+    numbers: list[dict[str, Any]] = []
     choices, scene_hash = job.training.choices, background_hash(run)
     paths = [choice.episode.path for choice in choices]
     episodes = {choice.episode.path: choice.episode for choice in choices if choice.holdout_ns}
@@ -137,13 +114,13 @@ def write_views(run: RunFolder, job: ViewsJob, advance: Advance) -> list[ViewNum
             for index in (k for k, own in enumerate(paths) if own == path):
                 for number in _rendered(index, rasteriser, job, paths.index(path), writer):
                     numbers.append(number)
-                    advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
+                    advance(len(numbers), f"{numbers[-1]['psnr_db']:.1f} dB")
     return numbers
 
 
 def _rendered(
     index: int, rasteriser: Rasteriser, job: ViewsJob, scan: int, writer: EpisodeWriter
-) -> Iterator[ViewNumbers]:
+) -> Iterator[dict[str, Any]]:
     """Draw and write the held-out frames of one camera, and rate each.
 
     Objects of other scans did not move in this one.
@@ -163,7 +140,16 @@ def _rendered(
             white[num_background : len(scene)] = 1.0
             masks["objects"] = rasteriser.draw_features(white)[0] > OBJECT_SHARE
         _write_view(writer, choice, frame, recorded.full.depth_m, view, masks)
-        yield rate_view(frame, view, choice)
+        psnr = MOST_DB
+        with suppress(UndefinedStatisticError):  # the images are the same
+            psnr = psnr_db(as_float(frame.image_u8), as_float(view.image_u8()))
+        yield {
+            "episode": choice.episode.info.id,
+            "camera_id": frame.camera_id,
+            "stamp_ns": frame.stamp_ns,
+            "stationary_camera": choice.stationary,  # training frames show the same view
+            "psnr_db": min(psnr, MOST_DB),
+        }
 
 
 def _recorded(

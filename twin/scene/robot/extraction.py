@@ -271,7 +271,12 @@ def _aligned(choices: Sequence[FrameChoice]) -> Alignment:
     stamps = spread(np.array(sorted(choice.train_ns), dtype=np.int64), ALIGN_FRAMES)
     wanted = frozenset(stamp for stamp in stamps.tolist() if track.is_stationary(stamp))
     views = [
-        RobotView.from_frame(frame, track.at(frame.stamp_ns), frame.T_base_depth)
+        RobotView(
+            camera=frame.depth_camera,
+            depth_m=np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0),
+            T_source_camera=frame.T_base_depth,
+            posture=track.at(frame.stamp_ns),
+        )
         for frame in load(choice, wanted)
     ]
     return align_robot(views, load_robot(track.urdf))

@@ -212,13 +212,8 @@ class WithoutPlane:
 
     def __init__(self, points: SurfacePoints) -> None:
         """Measure how far points lie apart."""
-        self._points = points
-        self._spacing_m = _spacing(points.p_m)
-
-    @property
-    def nothing(self) -> str:
-        """Why no thing was found, where none was."""
-        return no_support(self._points)
+        self._points, self._spacing_m = points, _spacing(points.p_m)
+        self.nothing = no_support(points)
 
     def look(self, scale: float) -> Look:
         """Cut them, with voxels so many times as large as their spacing asks for."""
@@ -277,8 +272,8 @@ def _pieces(
 ) -> list[np.ndarray]:
     """Cut one connected group by colour, and each piece of it along valleys."""
     pieces = []
-    by_colour = _within(voxels, ids, pairs)
-    colours = split_by_colour(by_colour[0], height_m[ids], by_colour[1])
+    group, group_pairs = _within(voxels, ids, pairs)
+    colours = split_by_colour(group, height_m[ids], group_pairs)
     for colour in range(int(colours.max()) + 1):
         part = ids[colours == colour]
         own, own_pairs = _within(voxels, part, pairs)

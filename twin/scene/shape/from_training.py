@@ -25,7 +25,6 @@ from twin.scene.shape.carve import MaskedView
 from twin.scene.shape.known import outside_m, pose_of, shape_mesh
 from twin.scene.shape.reconstruct import (
     ObjectShape,
-    moved_views,
     reconstruct,
     shape_of_mesh,
 )
@@ -91,7 +90,8 @@ def _leaning(
     yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
     T_base_level = pose_of(np.array([*T_base_object[:3, 3], yaw]))
     T_level_object = se3.invert(T_base_level) @ T_base_object
-    level = reconstruct(moved_views(views, T_level_object), support, align_rounds=align_rounds)
+    moved = [replace(view, T_base_camera=T_level_object @ view.T_base_camera) for view in views]
+    level = reconstruct(moved, support, align_rounds=align_rounds)
     vertices = se3.apply(se3.invert(T_level_object), level.vertices_m)
     return shape_of_mesh(vertices, level.faces, level.num_views)
 

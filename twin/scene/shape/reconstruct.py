@@ -1,7 +1,7 @@
 """One closed metric shape of an object, from masked depth or a foreign mesh."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -165,13 +165,6 @@ def _extent(
             message = f"all measured points lie below the plane z = {support_z_m:.4f} m."
             raise ShapeError(message)
     return low, high
-
-
-def moved_views(
-    views: Sequence[MaskedView], T_new_base: Float[np.ndarray, "4 4"]
-) -> list[MaskedView]:
-    """The same views in another frame."""
-    return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]
 
 
 def shape_of_mesh(vertices_m: Vertices, faces: Faces, num_views: int = 1) -> ObjectShape:
