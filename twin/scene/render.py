@@ -4,13 +4,12 @@ One process draws all frames. The scene is read once; for each frame the links a
 moved rigidly, and background, objects and robot are drawn together.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from bridge.episode import streams
 from bridge.episode.cdr.messages import CompressedColor, RawColor, color_from_message
@@ -22,18 +21,19 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
 from bridge.media.depth import from_metres
+from bridge.media.image_quality import as_float
 from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface
 from twin.scene.frames.pairing import name_of
-from twin.scene.image_agreement import ImageAgreement, describe_agreement, part_masks
 from twin.scene.movable_scene import Drawn, Frame
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig
 from twin.scene.settings import RenderConfig
-from twin.scene.shape.mesh import Mesh
+from twin.scene.shape.mesh import Mesh, first_hit
 from twin.scene.standpoint import camera_of, camera_places, episode_of, sized_camera
 from twin.scene.store.folder import Scene, read_scene
+from twin.scene.store.library import NOT_SCANNED
 from twin.scene.trial import TrialInScene, open_trial
 
 CRF = 18
@@ -128,16 +128,17 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     stamps = _stamps(trial, camera_id, config)
     _, _, robot = posture_of(trial, int(stamps[0]), config)
     frames = _frames(run, scene, trial, camera_id, stamps, config)
-    comparison = _Comparison.start(run, trial) if config.compare and config.is_sequence else None
+    agreement = ImageAgreement() if config.compare and config.is_sequence else None
+    meshes = {} if agreement is None else trial.meshes(run)
     recorded = recorded_images(episode, camera_id)
     coverage = []
     with _writer(run, config, f"{episode.path.stem}.{camera_id}", stamps) as write:
         for frame in frames:
             drawn = trial.parts.drawn_as(rasteriser, camera, frame)
             image = drawn.marked_u8()
-            if comparison is not None:
+            if agreement is not None:
                 before = next(item for item in recorded if item.stamp_ns == frame.stamp_ns)
-                image = comparison.add(before.image_u8(), drawn, frame, camera)
+                image = _beside(agreement, before.image_u8(), drawn, frame, camera, meshes)
             planes = {"": image}
             if config.depth:
                 planes |= {
@@ -157,7 +158,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
         "notes": list(trial.notes),
         "not_scanned": sorted(trial.parts.not_scanned),
         "coverage_fraction": float(np.mean(coverage)),
-        **({} if comparison is None else {"agreement": comparison.agreement.record()}),
+        **({} if agreement is None else {"agreement": agreement.record()}),
     }
 
 
@@ -238,45 +239,74 @@ def recorded_images(episode: Episode, camera_id: str) -> Iterator[CompressedColo
         yield color_from_message(message.type_name, message.data)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Comparison:
-    """Recorded images beside drawn ones."""
+class ImageAgreement:
+    """Collects squared errors over many images: whole, where seen, and by part of the scene.
 
-    agreement: ImageAgreement
-    meshes: Mapping[str, Mesh]
-    not_scanned: frozenset[str]
+    Every PSNR is of the squared error over all pixels of its kind in all images, so that an image
+    in which a part is small counts little.
+    """
 
-    @staticmethod
-    def start(run: RunFolder, episode: TrialInScene) -> "_Comparison":
-        return _Comparison(
-            agreement=ImageAgreement(),
-            meshes=episode.meshes(run),
-            not_scanned=episode.parts.not_scanned,
-        )
+    def __init__(self) -> None:
+        """Nothing was compared yet."""
+        self._squared: dict[str, float] = {}
+        self._pixels: dict[str, int] = {}
+        self._images = 0
 
     def add(
         self,
         recorded_u8: UInt8[np.ndarray, "height width 3"],
-        drawn: Drawn,
-        frame: Frame,
-        camera: Camera,
-    ) -> UInt8[np.ndarray, "height three_widths 3"]:
-        """Measure one frame, and put recorded image, twin and difference side by side."""
-        robot = None
-        if frame.posture is not None:
-            robot = PosedSurface(load_robot(frame.urdf), frame.posture)
-        masks = part_masks(
-            camera,
-            frame.T_base_camera,
-            robot,
-            self.meshes,
-            frame.Ts_base_object,
-            self.not_scanned,
-        )
-        self.agreement.add(recorded_u8, drawn.image_u8, drawn.seen_mask, masks)
-        difference = np.abs(recorded_u8.astype(np.int16) - drawn.image_u8.astype(np.int16))
-        sides = [recorded_u8, drawn.marked_u8(), difference.astype(np.uint8)]
-        return np.concatenate(sides, axis=1)
+        drawn_u8: UInt8[np.ndarray, "height width 3"],
+        seen_mask: Bool[np.ndarray, "height width"],
+        parts: Mapping[str, Bool[np.ndarray, "height width"]],
+    ) -> None:
+        """Compare one more image."""
+        squared = np.square(as_float(recorded_u8) - as_float(drawn_u8)).mean(axis=-1)
+        whole = np.ones_like(seen_mask)
+        kinds = {"whole": whole, "seen": seen_mask, "unseen": ~seen_mask, **parts}
+        for kind, mask in kinds.items():
+            self._squared[kind] = self._squared.get(kind, 0.0) + float(squared[mask].sum())
+            self._pixels[kind] = self._pixels.get(kind, 0) + int(mask.sum())
+        self._images += 1
+
+    def record(self) -> dict[str, Any]:
+        """PSNR [dB], share of the pixels and share of the squared error of each kind.
+
+        A kind without pixels, or without any error, has no PSNR: None.
+        """
+        total, pixels = self._squared.get("whole", 0.0), self._pixels.get("whole", 0)
+        return {
+            "images": self._images,
+            **{
+                kind: {
+                    "psnr_db": -10.0 * float(np.log10(squared / self._pixels[kind]))
+                    if squared > 0 and self._pixels[kind]
+                    else None,
+                    "pixel_fraction": self._pixels[kind] / pixels,
+                    "error_fraction": squared / total if total > 0 else 0.0,
+                }
+                for kind, squared in self._squared.items()
+            },
+        }
+
+
+def _beside(
+    agreement: ImageAgreement,
+    recorded_u8: UInt8[np.ndarray, "height width 3"],
+    drawn: Drawn,
+    frame: Frame,
+    camera: Camera,
+    meshes: Mapping[str, Mesh],
+) -> UInt8[np.ndarray, "height three_widths 3"]:
+    """Measure one frame, and put recorded image, twin and difference side by side."""
+    robot = None
+    if frame.posture is not None:
+        robot = PosedSurface(load_robot(frame.urdf), frame.posture)
+    T, places = frame.T_base_camera, frame.Ts_base_object
+    masks = part_masks(camera, T, robot, meshes, places, drawn.not_scanned)
+    agreement.add(recorded_u8, drawn.image_u8, drawn.seen_mask, masks)
+    difference = np.abs(recorded_u8.astype(np.int16) - drawn.image_u8.astype(np.int16))
+    sides = [recorded_u8, drawn.marked_u8(), difference.astype(np.uint8)]
+    return np.concatenate(sides, axis=1)
 
 
 Write = Callable[[int, Mapping[str, np.ndarray]], list[str]]
@@ -339,4 +369,47 @@ def describe_drawn(drawn: Mapping[str, Any]) -> str:
     lines += [f"robot: {drawn['robot']}", *drawn["notes"]]
     if "agreement" in drawn:
         lines.append(describe_agreement(drawn["agreement"]))
+    return "\n".join(lines)
+
+
+def part_masks(
+    camera: Camera,
+    T_base_camera: Float[np.ndarray, "4 4"],
+    robot: PosedSurface | None,
+    meshes: Mapping[str, Mesh],
+    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
+    not_scanned: Collection[str] = (),
+) -> dict[str, Bool[np.ndarray, "height width"]]:
+    """Which pixels show robot, objects and background, by the first mesh along each ray.
+
+    Args:
+        robot: Its surface as it stands then; None: it is not known.
+        not_scanned: Objects that no scan saw: they are objects, and a kind of their own besides.
+    """
+    rays = camera.rays()
+    nothing = np.full(rays.shape[:2], np.inf, dtype=np.float32)
+    robot_m = nothing if robot is None else robot.depth_along(rays, T_base_camera)
+    objects_m, _ = first_hit(rays, T_base_camera, meshes, Ts_base_object)
+    is_robot = np.isfinite(robot_m) & (robot_m <= objects_m)
+    is_object = np.isfinite(objects_m) & ~is_robot
+    masks = {"robot": is_robot, "objects": is_object, "background": ~is_robot & ~is_object}
+    drawn_from_task = {name: mesh for name, mesh in meshes.items() if name in not_scanned}
+    if drawn_from_task:
+        own_m, _ = first_hit(rays, T_base_camera, drawn_from_task, Ts_base_object)
+        masks[NOT_SCANNED] = is_object & (own_m <= objects_m)
+    return masks
+
+
+def describe_agreement(record: Mapping[str, Any]) -> str:
+    """One line for each kind of pixel."""
+    lines = [f"compared with {record['images']} recorded images:"]
+    for kind, found in record.items():
+        if kind == "images":
+            continue
+        psnr = found["psnr_db"]
+        text = "undefined (no pixel, or no error)" if psnr is None else f"{psnr:.2f} dB"
+        lines.append(
+            f"  {kind:<11}{text}, {found['pixel_fraction']:.1%} of the pixels, "
+            f"{found['error_fraction']:.1%} of the squared error"
+        )
     return "\n".join(lines)

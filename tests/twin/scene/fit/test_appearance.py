@@ -7,7 +7,7 @@ from seen_colors import view_directions
 
 from twin.scene import gaussians
 from twin.scene.fit import appearance
-from twin.scene.fit.exposure import gain_between, solve_gains
+from twin.scene.fit.appearance import gain_between, solve_gains
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 from twin.scene.harmonics import harmonic_terms

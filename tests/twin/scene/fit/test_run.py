@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import textured_room
 
-from twin.scene.fit import densify, optimise
+from twin.scene.fit import optimise
 from twin.scene.fit.appearance import ImageObservation
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import fit
@@ -66,12 +66,13 @@ def test_errors_are_lifted_from_images_of_both_sizes_the_full_ones_last(
     room: tuple[GaussianCloud, list[TrainingView]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     widths: list[int] = []
+    score = optimise.score
 
     def noted(
         cloud: GaussianCloud, observations: list[ImageObservation], *rest: object
-    ) -> densify.Scores:
+    ) -> optimise.Scores:
         widths.append(observations[0].target.camera.width)
-        return densify.score(cloud, observations, *rest)
+        return score(cloud, observations, *rest)
 
     monkeypatch.setattr(optimise, "score", noted)
     fit(*room, FitConfig(iterations=20, threads=1), lambda *_: None)

@@ -5,7 +5,7 @@ import numpy as np
 from bridge.geometry.mesh import sample_triangles
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import as_float32
-from twin.scene.robot.link_surface import on_surface
+from twin.scene.robot.extraction import on_surface
 from twin.scene.shape.mesh import Mesh
 
 HALF_M = np.array([0.05, 0.04, 0.2])
