@@ -126,15 +126,11 @@ def morton_order(
     extent = float((means_m.max(axis=0) - low).max())
     cells = ((means_m - low) / max(extent, 1e-9) * 1023.0).astype(np.uint64)
     code = np.zeros(len(means_m), dtype=np.uint64)
-    for axis in range(3):
-        code |= _spread_bits(cells[:, axis]) << np.uint64(axis)
-    return np.argsort(code, kind="stable")
-
-
-def _spread_bits(values: np.ndarray) -> np.ndarray:
     for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
-        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
-    return values
+        cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
+    for axis in range(3):
+        code |= cells[:, axis] << np.uint64(axis)
+    return np.argsort(code, kind="stable")
 
 
 def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:

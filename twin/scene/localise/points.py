@@ -138,6 +138,10 @@ def _view(frames: Sequence[RgbdFrame], task: Task) -> CameraView:
     image = np.mean([linear_image(frame.image_u8) for frame in frames], axis=0)
     p_base = se3.apply(newest.T_base_depth, newest.depth_camera.unproject(depth)[depth > 0])
     p_base = p_base[_in_search_area(p_base, task)]
+    p_color = se3.apply(se3.invert(newest.T_base_color), p_base)
+    row, column, inside = pixels_of(newest.color_camera, p_color)
+    color_linear = np.zeros_like(p_base)
+    color_linear[inside] = image[row[inside], column[inside]]
     return CameraView(
         camera_id=newest.camera_id,
         stamp_ns=newest.stamp_ns,
@@ -149,21 +153,8 @@ def _view(frames: Sequence[RgbdFrame], task: Task) -> CameraView:
         T_base_color=newest.T_base_color,
         T_base_depth=newest.T_base_depth,
         p_base=p_base,
-        color_linear=_sample(image, newest.color_camera, newest.T_base_color, p_base),
+        color_linear=color_linear,
     )
-
-
-def _sample(
-    image: Float[np.ndarray, "height width 3"],
-    camera: Camera,
-    T_base_camera: Float[np.ndarray, "4 4"],
-    p_base: Float[np.ndarray, "num_points 3"],
-) -> Float[np.ndarray, "num_points 3"]:
-    """Nearest pixel's colour of each point; 0 outside the image."""
-    row, column, inside = pixels_of(camera, se3.apply(se3.invert(T_base_camera), p_base))
-    colors = np.zeros_like(p_base)
-    colors[inside] = image[row[inside], column[inside]]
-    return colors
 
 
 def moved(view: CameraView, T_new_old: Float[np.ndarray, "4 4"], depth_factor: float) -> CameraView:

@@ -256,19 +256,12 @@ def _costs(
     expected_m: Mapping[str, Float[np.ndarray, "3"]],
 ) -> Float[np.ndarray, "num_models num_candidates"]:
     """What it costs to say that a fit is a toy [m]."""
-    cost = [
-        [_displacement(expected_m.get(item.id), fit) + SCORE_M * fit.score for fit in fits]
-        for item in models
-    ]
-    return np.array(cost).reshape(len(models), len(fits))
-
-
-def _displacement(expected_m: Float[np.ndarray, "3"] | None, fit: MeshFit) -> float:
-    """Distance to where a toy is expected; beyond ``moved_m`` it hardly grows [m]."""
-    if expected_m is None:
-        return 0.0
-    distance = float(np.linalg.norm(fit.T_base_object[:3, 3] - expected_m))
-    return MOVED_M * (1.0 - float(np.exp(-distance / MOVED_M)))
+    cost = np.tile([SCORE_M * fit.score for fit in fits], (len(models), 1))
+    for row, item in enumerate(models):
+        for column, fit in enumerate(fits if item.id in expected_m else ()):
+            away_m = np.linalg.norm(fit.T_base_object[:3, 3] - expected_m[item.id])
+            cost[row, column] += MOVED_M * (1.0 - np.exp(-away_m / MOVED_M))  # hardly grows beyond
+    return cost
 
 
 def _margins(
