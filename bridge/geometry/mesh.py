@@ -11,12 +11,6 @@ def box_corners(size_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "8 3"]:
     return np.asarray(np.array(list(product((-0.5, 0.5), repeat=3))) * size_m)
 
 
-BOX_QUADS = np.array(
-    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-)
-"""Sides of a box by its ``box_corners``, counter-clockwise seen from outside."""
-
-
 def sample_triangles(
     areas: Float[np.ndarray, " num_triangles"],
     count: int,

@@ -15,7 +15,8 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float, Float32, Int, Int64
 
-from bridge.geometry.mesh import BOX_QUADS, box_corners, sample_triangles
+from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners, sample_triangles
 from twin.robot.collision import collision_geometry
 from twin.robot.model import RobotDescriptionError, RobotModel
 from twin.robot.posture import Posture
@@ -92,11 +93,9 @@ class PosedSurface:
     def __init__(self, robot: RobotModel, posture: Posture) -> None:
         """Pose all links."""
         poses = link_poses(robot, posture)
-        self.links: tuple[str, ...] = tuple(item.link for item in link_surfaces(robot))
-        meshes = []
-        for item in link_surfaces(robot):
-            T = poses[item.link]
-            meshes.append((item.vertices_m @ T[:3, :3].T + T[:3, 3], item.triangles))
+        surfaces = link_surfaces(robot)
+        self.links: tuple[str, ...] = tuple(item.link for item in surfaces)
+        meshes = [(se3.apply(poses[s.link], s.vertices_m), s.triangles) for s in surfaces]
         self._scene = ray_scene(meshes)
         self._boxes = [(vertices.min(axis=0), vertices.max(axis=0)) for vertices, _ in meshes]
 
@@ -163,8 +162,11 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
 
     shape = item.geometry
     if isinstance(shape, coal.Box):
-        triangles = np.concatenate([BOX_QUADS[:, [0, 1, 2]], BOX_QUADS[:, [0, 2, 3]]])
-        return box_corners(2 * np.array(shape.halfSide)), triangles
+        corners = box_corners(2 * np.array(shape.halfSide))
+        faces = np.array(
+            [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+        )
+        return corners, np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
     if isinstance(shape, coal.BVHModelBase) and Path(str(item.meshPath)).suffix in _NOT_READ:
         corners = [shape.tri_indices(index) for index in range(shape.num_tris)]
         triangles = [[item[0], item[1], item[2]] for item in corners]

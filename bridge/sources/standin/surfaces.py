@@ -16,7 +16,6 @@ from jaxtyping import Float, Int, UInt32
 from scipy.ndimage import gaussian_filter, zoom
 
 from bridge.geometry import se3
-from bridge.geometry.mesh import BOX_QUADS, box_corners
 from bridge.robots.default import FINGER_LINKS
 from bridge.sources.standin.cell_file import Clutter
 from bridge.sources.standin.clutter import CLUTTER
@@ -160,8 +159,12 @@ def box_surface(
     color: tuple[float, float, float],
 ) -> Surface:
     """A box with hard edges, of a body that moves or ("") of the laboratory."""
-    triangles = np.concatenate([BOX_QUADS[:, [0, 1, 2]], BOX_QUADS[:, [0, 2, 3]]])
-    return make_surface(body, box_corners(size_m) + centre_m, triangles, color)
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    faces = np.array(
+        [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    )
+    triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+    return make_surface(body, corners * size_m + centre_m, triangles, color)
 
 
 def make_surface(

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from bridge.geometry import se3
-from bridge.geometry.mesh import BOX_QUADS, box_corners
+from bridge.geometry.mesh import box_corners
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel
 
@@ -130,7 +130,9 @@ def shape_mesh(
         known = object_mesh(model)
         return known.vertices_m, known.triangles
     vertices, faces = [], []
-    triangles = BOX_QUADS[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+    # Counter-clockwise seen from outside.
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
     for index, (centre, extents) in enumerate(model.panels()):
         vertices.append(centre + box_corners(extents))
         faces.append(triangles + 8 * index)
