@@ -162,11 +162,11 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
 
     shape = item.geometry
     if isinstance(shape, coal.Box):
-        corners = box_corners(2 * np.array(shape.halfSide))
         faces = np.array(
             [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
         )
-        return corners, np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+        halves = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+        return box_corners(2 * np.array(shape.halfSide)), halves
     if isinstance(shape, coal.BVHModelBase) and Path(str(item.meshPath)).suffix in _NOT_READ:
         corners = [shape.tri_indices(index) for index in range(shape.num_tris)]
         triangles = [[item[0], item[1], item[2]] for item in corners]

@@ -131,7 +131,8 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     agreement = ImageAgreement() if config.compare and config.is_sequence else None
     meshes = {} if agreement is None else trial.meshes(run)
     recorded = recorded_images(episode, camera_id)
-    coverage = []
+    coverage: list[float] = []
+    files: list[str] = []
     with _writer(run, config, f"{episode.path.stem}.{camera_id}", stamps) as write:
         for frame in frames:
             drawn = trial.parts.drawn_as(rasteriser, camera, frame)

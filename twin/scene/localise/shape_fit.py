@@ -47,7 +47,7 @@ def corners(model: ObjectModel) -> Float[np.ndarray, "8 3"]:
     """Outer corners in the object frame [m]."""
     size = np.array(model.size_m)
     lift_m = 0.0 if model.origin_at_centre else size[2] / 2
-    return box_corners(size) + np.array([0.0, 0.0, lift_m])
+    return np.asarray(box_corners(size) + np.array([0.0, 0.0, lift_m]))
 
 
 def find_outlines(
