@@ -23,9 +23,9 @@ from serving import dashboard  # noqa: E402
 
 from bridge.episode import streams  # noqa: E402
 from bridge.episode.run_folder import RunFolder  # noqa: E402
+from twin.scene.movable_scene import Frame  # noqa: E402
 from twin.scene.raster.rasteriser import Rasteriser  # noqa: E402
-from twin.scene.render import episode_of, poses_in_scene, sized_camera  # noqa: E402
-from twin.scene.sequence import Artist, Frame  # noqa: E402
+from twin.scene.standpoint import episode_of, poses_in_scene, sized_camera  # noqa: E402
 from twin.scene.store.folder import read_scene  # noqa: E402
 from twin.scene.trial import open_trial  # noqa: E402
 
@@ -108,19 +108,15 @@ def rasterised(run: RunFolder, trial: str, t_s: float, width: int, height: int) 
     stamp_ns = (streams.first_stamp_ns(shown.recorded) or 0) + round(t_s * 1e9)
     tree = poses_in_scene(run, scene, shown.recorded, camera_id, np.array([stamp_ns]))
     postures = shown.postures
-    artist = Artist(
-        rasteriser=Rasteriser(),
-        parts=shown.parts,
-        urdf="" if shown.postures is None else shown.postures.urdf,
-        camera=sized_camera(info.camera, f"{width}x{height}"),
-    )
+    camera = sized_camera(info.camera, f"{width}x{height}")
     frame = Frame(
         stamp_ns=stamp_ns,
         T_base_camera=tree.T_root_frame(info.frame_id, stamp_ns),
         Ts_base_object=shown.tracks.at(stamp_ns, None),
         posture=None if postures is None else postures.at(stamp_ns),
+        urdf="" if postures is None else postures.urdf,
     )
-    return artist.draw(frame).image_u8
+    return shown.parts.drawn_as(Rasteriser(), camera, frame).image_u8
 
 
 def measured(run: RunFolder, trial: str, *, looks: bool) -> dict[str, Any]:

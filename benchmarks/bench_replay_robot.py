@@ -157,8 +157,7 @@ def static_of(vertices: np.ndarray, faces: np.ndarray) -> object:
     grid = SdfGrid(
         values_m=distances_of_solid(solid, VOXEL_M), origin_m=origin, voxel_m=VOXEL_M, closed=False
     )
-    return StaticSdf(conservative=grid, observed=grid, state=solid.astype(np.uint8),
-                     truncation_m=0.024, table_z_m=None)  # fmt: skip
+    return StaticSdf(conservative=grid, observed=grid)  # fmt: skip
 
 
 def clearance_rows(num_states: int) -> list[Target]:

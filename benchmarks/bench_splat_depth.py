@@ -121,6 +121,7 @@ def rows_of(name: str, frames: Frames) -> list[Target]:
     config = InitialiseConfig(max_splats=frames.max_splats)
     first = fuse(frames.points, config, frames.views)
     fused_s = time.process_time() - begun
+    begun = time.process_time()
     fitted: FitResult = fit(
         first,
         frames.views,
@@ -128,6 +129,7 @@ def rows_of(name: str, frames: Frames) -> list[Target]:
         lambda *_: None,
         max_splats=frames.max_splats,
     )
+    fitted_s = time.process_time() - begun
     rasteriser = Rasteriser(RasterConfig(threads=1))
     ways = {"TSDF": Tsdf(frames.views).depth_m}
     for label, cloud in (("fused", first), ("fitted", fitted.cloud)):
@@ -139,7 +141,7 @@ def rows_of(name: str, frames: Frames) -> list[Target]:
     share = "within_20mm" if name == "kitchen" else "within_5mm"
     psnr = mean_psnr_db(fitted.cloud, frames.held_out)
     about = f"{len(first)} then {len(fitted.cloud)} Gaussians, {psnr:.2f} dB"
-    cost = f"{fused_s:.1f} and {fitted.cpu_seconds:.1f} CPU seconds"
+    cost = f"{fused_s:.1f} and {fitted_s:.1f} CPU seconds"
     median_limit_m = CLEAN_MEDIAN_M if name == "tabletop" else tsdf.median_abs_m
     return [
         Target(what=f"{name}: depth, median error", measured=1e3 * ours.median_abs_m,

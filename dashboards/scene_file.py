@@ -32,7 +32,7 @@ from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
 from twin.scene.harmonics import NUM_FIRST
 from twin.scene.movable_scene import MovableScene
 from twin.scene.raster.backend import open_rasteriser
-from twin.scene.render import sized_camera
+from twin.scene.standpoint import sized_camera
 
 MAGIC, VERSION = b"GS3D", 1
 HEAD = 16

@@ -30,7 +30,7 @@ from twin.robot.posture import Posture, PostureTrack, posture_track
 from twin.scene.frames.camera_poses import base_tree, unknown_mask
 from twin.scene.movable_scene import MovableScene
 from twin.scene.object_tracks import ObjectTracks, localised_tracks
-from twin.scene.render import poses_in_scene
+from twin.scene.standpoint import poses_in_scene
 from twin.scene.store.folder import Scene, read_scene
 from twin.scene.trial import trial_parts
 

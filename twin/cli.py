@@ -105,12 +105,6 @@ def render(
     from twin.scene.render import describe_drawn
     from twin.scene.render import render as render_scene
 
-    if config.is_sequence:
-        from twin.scene.sequence import describe_sequence, render_sequence
-
-        sequence = render_sequence(RunFolder.open(run), config)
-        output.result(sequence, describe_sequence(sequence))
-        return 0
     drawn = render_scene(RunFolder.open(run), config)
     output.result(drawn, describe_drawn(drawn))
     return 0

@@ -18,8 +18,7 @@ from PIL import Image
 from side_by_side import write_rows
 
 from bridge.episode.run_folder import RunFolder
-from twin.scene.render import render
-from twin.scene.sequence import describe_sequence, render_sequence
+from twin.scene.render import describe_drawn, render
 from twin.scene.settings import RenderConfig
 
 INSTANTS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -33,7 +32,7 @@ def trial_frames(run: RunFolder, episode: str, camera: str) -> dict[int, np.ndar
     """Recorded, twin and difference beside each other, by milliseconds since the first frame."""
     with TemporaryDirectory() as scratch:
         config = RenderConfig(episode=episode, camera=camera, compare=True, out=Path(scratch) / "x")
-        print(describe_sequence(render_sequence(run, config)))
+        print(describe_drawn(render(run, config)))
         paths = sorted((Path(scratch) / "x").glob("*.png"))
         return {int(path.stem): np.asarray(Image.open(path)) for path in paths}
 

@@ -34,8 +34,8 @@ from twin.robot.posture import posture_track
 from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
 from twin.scene.movable_scene import read_movable_scene
 from twin.scene.raster.rasteriser import Rasteriser
-from twin.scene.render import sized_camera
 from twin.scene.skinning import bind, pose_cloud
+from twin.scene.standpoint import sized_camera
 from twin.scene.store.folder import read_scene
 
 ID = "trial_0001"

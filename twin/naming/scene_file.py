@@ -1,6 +1,5 @@
 """Semantics in the scene folder: ``semantics.npz`` beside the splats, a summary in the record."""
 
-import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,10 +11,9 @@ from jaxtyping import Float32, UInt8, UInt16
 from bridge.episode import provenance
 from bridge.errors import InvalidRecordError, PathNotFoundError
 from bridge.geometry import se3
-from bridge.whole_file import write_whole
 from twin.errors import UnreadableFileError
 from twin.naming.things import Instance, SemanticScene, SemanticsError
-from twin.npz import UnreadableArraysError, read_npz
+from twin.npz import UnreadableArraysError, read_npz, write_npz
 
 SEMANTICS_FILE = "semantics.npz"
 VECTORS_FILE = "features.npz"
@@ -46,15 +44,8 @@ def write_semantics(folder: Path, scene: SemanticScene, rows: Mapping[str, int])
         "rows": dict(rows),
         "instances": about,
     }
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        labels=scene.labels,
-        parts=_part_codes(scene),
-        about=np.frombuffer(json.dumps(table).encode(), dtype=np.uint8),
-    )
-    path = folder / SEMANTICS_FILE
-    write_whole(path, buffer.getvalue())
+    path, coded = folder / SEMANTICS_FILE, np.frombuffer(json.dumps(table).encode(), dtype=np.uint8)
+    write_npz(path, {"labels": scene.labels, "parts": _part_codes(scene), "about": coded})
     return {
         "file": SEMANTICS_FILE,
         "sha256": provenance.hash_file(path),
@@ -175,14 +166,12 @@ def write_vectors(
     Args:
         source: The model, and the beginning of its weights' SHA-256.
     """
-    buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        instance_ids=np.array([item.id for item in scene.instances], dtype=np.int32),
-        instance_embeddings=vectors,
-        source=np.frombuffer(source.encode(), dtype=np.uint8),
-    )
-    write_whole(folder / VECTORS_FILE, buffer.getvalue())
+    arrays = {
+        "instance_ids": np.array([item.id for item in scene.instances], dtype=np.int32),
+        "instance_embeddings": vectors,
+        "source": np.frombuffer(source.encode(), dtype=np.uint8),
+    }
+    write_npz(folder / VECTORS_FILE, arrays)
     return {"file": VECTORS_FILE, "source": source, "num_channels": vectors.shape[1]}
 
 

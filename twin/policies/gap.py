@@ -20,11 +20,12 @@ from twin.policies.mapping import Interpreter
 from twin.policies.policy import Policy
 from twin.policies.views import Pictures
 from twin.robot.posture import Posture
+from twin.scene.movable_scene import Frame
 from twin.scene.raster.backend import open_rasteriser
-from twin.scene.render import poses_in_scene
-from twin.scene.sequence import Artist, Frame, recorded_images
+from twin.scene.render import recorded_images
+from twin.scene.standpoint import poses_in_scene
 from twin.scene.store.folder import read_scene
-from twin.scene.trial import TrialInScene, open_trial
+from twin.scene.trial import open_trial
 
 INSTANTS = 12
 """So many states of a trial are looked at."""
@@ -93,7 +94,8 @@ def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[
     if not seen:
         return
     chosen = np.unique(np.linspace(0, len(seen) - 1, INSTANTS).round().astype(int))
-    artists = {name: _artist(trial, episode, name) for name in names}
+    cameras = {name: streams.camera_info(episode, name).camera for name in names}
+    rasteriser = open_rasteriser()
     stamps = np.array([seen[k] for k in chosen], dtype=np.int64)
     trees = {name: poses_in_scene(run, scene, episode, name, stamps) for name in names}
     for stamp_ns in stamps.tolist():
@@ -104,6 +106,7 @@ def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[
                 T_base_camera=tree.T_root_frame(_frame_id(episode, name), stamp_ns),
                 Ts_base_object=places,
                 posture=posture,
+                urdf=trial.postures.urdf,
             )
             for name, tree in trees.items()
         }
@@ -115,17 +118,11 @@ def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[
             posture=posture,
             recorded={name: pictures[name][k].image_u8() for name, k in near.items()},
             following={name: pictures[name][k + 1].image_u8() for name, k in near.items()},
-            rendered={name: artists[name].draw(frame).image_u8 for name, frame in frames.items()},
+            rendered={
+                name: trial.parts.drawn_as(rasteriser, cameras[name], frame).image_u8
+                for name, frame in frames.items()
+            },
         )
-
-
-def _artist(trial: TrialInScene, episode: Episode, camera_id: str) -> Artist:
-    return Artist(
-        rasteriser=open_rasteriser(),
-        parts=trial.parts,
-        urdf=trial.postures.urdf if trial.postures is not None else "",
-        camera=streams.camera_info(episode, camera_id).camera,
-    )
 
 
 def _frame_id(episode: Episode, camera_id: str) -> str:

@@ -21,7 +21,7 @@ from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
 from twin.scene.gaussians import GaussianCloud, concatenate
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.raster.rasteriser import View
-from twin.scene.render import sized_camera
+from twin.scene.standpoint import sized_camera
 from twin.scene.store.calibration import read_calibration
 
 Pictures = Mapping[str, UInt8[np.ndarray, "height width 3"]]

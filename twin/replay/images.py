@@ -29,8 +29,8 @@ from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.movable_scene import MovableScene
 from twin.scene.raster.backend import open_rasteriser
-from twin.scene.render import carried_camera
 from twin.scene.skinning import Binding, bind, pose_cloud
+from twin.scene.standpoint import carried_camera
 from twin.scene.store.calibration import read_calibration, without_joints
 from twin.scene.store.folder import read_scene
 from twin.scene.trial import trial_parts

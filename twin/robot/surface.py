@@ -4,9 +4,9 @@ Made of the description's collision shapes: every URDF has them, they are light,
 visual meshes they load without a reader of COLLADA files. Normals are those of the triangles.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float, Float32, Int, Int64
 
-from bridge.geometry.mesh import sample_triangles
+from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners, sample_triangles
 from twin.robot.collision import collision_geometry
 from twin.robot.model import RobotDescriptionError, RobotModel
 from twin.robot.posture import Posture
@@ -92,20 +93,11 @@ class PosedSurface:
     def __init__(self, robot: RobotModel, posture: Posture) -> None:
         """Pose all links."""
         poses = link_poses(robot, posture)
-        self.links: tuple[str, ...] = tuple(item.link for item in link_surfaces(robot))
-        import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
-
-        make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
-        self._scene = make()
-        boxes = []
-        for item in link_surfaces(robot):
-            T = poses[item.link]
-            vertices = item.vertices_m @ T[:3, :3].T + T[:3, 3]
-            boxes.append((vertices.min(axis=0), vertices.max(axis=0)))
-            self._scene.add_triangles(
-                _tensor(vertices.astype(np.float32)), _tensor(item.triangles.astype(np.uint32))
-            )
-        self._boxes = boxes
+        surfaces = link_surfaces(robot)
+        self.links: tuple[str, ...] = tuple(item.link for item in surfaces)
+        meshes = [(se3.apply(poses[s.link], s.vertices_m), s.triangles) for s in surfaces]
+        self._scene = ray_scene(meshes)
+        self._boxes = [(vertices.min(axis=0), vertices.max(axis=0)) for vertices, _ in meshes]
 
     def near_box(
         self, p_base: Float[np.ndarray, "num_points 3"], margin_m: float
@@ -125,7 +117,7 @@ class PosedSurface:
             none = np.zeros((0, 3))
             ids = np.zeros(0, dtype=np.int64)
             return Nearest(p_m=none, normals=none, distance_m=np.zeros(0), link_ids=ids)
-        found = self._scene.compute_closest_points(_tensor(p_base.astype(np.float32)))
+        found = self._scene.compute_closest_points(tensor(p_base.astype(np.float32)))
         p = found["points"].numpy().astype(np.float64)
         normals = found["primitive_normals"].numpy().astype(np.float64)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -145,7 +137,7 @@ class PosedSurface:
         turned = rays_camera @ T_base_camera[:3, :3].T
         origin = np.broadcast_to(T_base_camera[:3, 3], turned.shape)
         rays = np.concatenate([origin, turned], axis=-1).astype(np.float32)
-        return np.asarray(self._scene.cast_rays(_tensor(rays))["t_hit"].numpy())
+        return np.asarray(self._scene.cast_rays(tensor(rays))["t_hit"].numpy())
 
 
 def sample_surface(
@@ -170,11 +162,11 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
 
     shape = item.geometry
     if isinstance(shape, coal.Box):
-        corners = np.array(list(product((-1.0, 1.0), repeat=3))) * np.array(shape.halfSide)
         faces = np.array(
             [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
         )
-        return corners, np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+        halves = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+        return box_corners(2 * np.array(shape.halfSide)), halves
     if isinstance(shape, coal.BVHModelBase) and Path(str(item.meshPath)).suffix in _NOT_READ:
         corners = [shape.tri_indices(index) for index in range(shape.num_tris)]
         triangles = [[item[0], item[1], item[2]] for item in corners]
@@ -197,7 +189,21 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.asarray(mesh.triangles).astype(np.int64)
 
 
-def _tensor(array: np.ndarray) -> Any:
+def ray_scene(meshes: Iterable[tuple[np.ndarray, np.ndarray]]) -> Any:
+    """Open3D's scene of triangles, each mesh a geometry of its own: for rays and distances."""
+    import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
+
+    make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
+    scene = make()
+    for vertices_m, triangles in meshes:
+        scene.add_triangles(
+            tensor(vertices_m.astype(np.float32)), tensor(triangles.astype(np.uint32))
+        )
+    return scene
+
+
+def tensor(array: np.ndarray) -> Any:
+    """An array as Open3D takes it."""
     import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
 
     make: Any = open3d.core.Tensor  # its stubs leave out that an array alone is enough

@@ -141,22 +141,18 @@ def _spread(
     known = np.flatnonzero(weights > 0)
     if not len(known):
         return np.zeros_like(total)
-    cells = _cell_directions()
+    down = (np.arange(ROWS) + 0.5) / ROWS * np.pi
+    heading = ((np.arange(COLUMNS) + 0.5) / COLUMNS - 0.5) * 2 * np.pi
+    down, heading = np.meshgrid(down, heading, indexing="ij")
+    level = np.sin(down)
+    places = np.stack([level * np.cos(heading), level * np.sin(heading), np.cos(down)], axis=-1)
+    cells = places.reshape(-1, 3)
     cosines = np.clip(cells @ cells[known].T, -1.0, 1.0)
     nearness = 1 / (np.arccos(cosines) ** 2 + NEAR_RAD**2) ** 2
     # What many images saw says no more of its neighbours than what one saw.
     colors, trust = total[known] / weights[known, None], np.minimum(weights[known], 1.0)
     shares = nearness * trust
     return np.asarray(shares @ colors / shares.sum(axis=1, keepdims=True))
-
-
-def _cell_directions() -> Float[np.ndarray, "num_cells 3"]:
-    down = (np.arange(ROWS) + 0.5) / ROWS * np.pi
-    heading = ((np.arange(COLUMNS) + 0.5) / COLUMNS - 0.5) * 2 * np.pi
-    down, heading = np.meshgrid(down, heading, indexing="ij")
-    return np.stack(
-        [np.sin(down) * np.cos(heading), np.sin(down) * np.sin(heading), np.cos(down)], axis=-1
-    ).reshape(-1, 3)
 
 
 def read_backdrop(run: RunFolder, record: Mapping[str, Any]) -> Backdrop | None:

@@ -126,15 +126,11 @@ def morton_order(
     extent = float((means_m.max(axis=0) - low).max())
     cells = ((means_m - low) / max(extent, 1e-9) * 1023.0).astype(np.uint64)
     code = np.zeros(len(means_m), dtype=np.uint64)
-    for axis in range(3):
-        code |= _spread_bits(cells[:, axis]) << np.uint64(axis)
-    return np.argsort(code, kind="stable")
-
-
-def _spread_bits(values: np.ndarray) -> np.ndarray:
     for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
-        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
-    return values
+        cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
+    for axis in range(3):
+        code |= cells[:, axis] << np.uint64(axis)
+    return np.argsort(code, kind="stable")
 
 
 def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:
@@ -200,7 +196,11 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
         axis=1,
     ).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
-    header += [f"property float {name}" for name in _columns_of(cloud)]
+    after_color = COLUMNS.index("f_dc_2") + 1
+    rest = REST_COLUMNS[: 3 * cloud.num_harmonics]
+    marks = (COMPLETED_COLUMN,) if cloud.completed.any() else ()
+    names = (*COLUMNS[:after_color], *rest, *COLUMNS[after_color:], *marks)
+    header += [f"property float {name}" for name in names]
     write_whole(path, "\n".join([*header, "end_header", ""]).encode() + table.tobytes())
 
 
@@ -238,13 +238,6 @@ def read_ply(path: Path) -> GaussianCloud:
         if COMPLETED_COLUMN in names
         else np.zeros(count, dtype=bool),
     )
-
-
-def _columns_of(cloud: GaussianCloud) -> tuple[str, ...]:
-    after_color = COLUMNS.index("f_dc_2") + 1
-    rest = REST_COLUMNS[: 3 * cloud.num_harmonics]
-    marks = (COMPLETED_COLUMN,) if cloud.completed.any() else ()
-    return (*COLUMNS[:after_color], *rest, *COLUMNS[after_color:], *marks)
 
 
 def _harmonics(names: list[str], table: np.ndarray) -> np.ndarray:

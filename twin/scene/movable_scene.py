@@ -30,6 +30,19 @@ DASH_PX = 4
 
 
 @dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One instant as it is to be drawn."""
+
+    stamp_ns: int
+    T_base_camera: Float[np.ndarray, "4 4"]
+    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]
+    posture: Posture | None
+    """None: no robot is drawn."""
+    urdf: str
+    """Of the robot."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Drawn:
     """One state as it was drawn."""
 
@@ -41,10 +54,6 @@ class Drawn:
     """Pixels that show what was measured in the scan, and not what was completed."""
     not_scanned: Mapping[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
     """By object that no scan saw: the pixels that show it."""
-
-    def seen_u8(self) -> UInt8[np.ndarray, "height width"]:
-        """The mask as an image, white where seen."""
-        return np.where(self.seen_mask, np.uint8(255), np.uint8(0))
 
     def marked_u8(self) -> UInt8[np.ndarray, "height width 3"]:
         """The image for people: what was not scanned has a dashed outline and is named."""
@@ -92,6 +101,13 @@ class MovableScene:
     """What stands behind everything; None: black."""
     not_scanned: frozenset[str] = frozenset()
     """Objects that no scan saw: drawn from the task's shape."""
+
+    def drawn_as(
+        self, rasteriser: Rasteriser | CudaRasteriser, camera: Camera, frame: Frame
+    ) -> Drawn:
+        """Draw the scene as it is at one instant."""
+        cloud = self.at(frame.Ts_base_object, frame.posture, frame.urdf)
+        return self.draw(rasteriser, cloud, camera, frame.T_base_camera)
 
     def draw(
         self,
@@ -157,10 +173,7 @@ class MovableScene:
 
     def robot_at(self, posture: Posture, urdf: str) -> GaussianCloud:
         """The robot's part of that cloud; there must be links."""
-        robot = posed(
-            self.links, posture.joints_rad, urdf, width_m=posture.width_m, lighting=self.lighting
-        )
-        return moved_cloud(robot, self.T_root_base)
+        return moved_cloud(posed(self.links, posture, urdf, self.lighting), self.T_root_base)
 
 
 def read_movable_scene(

@@ -11,7 +11,6 @@ something else, and changes place when that is known.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -56,44 +55,34 @@ class Grip:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Rest:
-    """From here on the object stands in the base frame."""
+class _Span:
+    """From here on its pose changes evenly, or it stands."""
 
-    start_ns: int
-    T_base_object: Float[np.ndarray, "4 4"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Change:
-    """From here on its pose changes evenly, in the base frame or in that of the tool."""
-
-    power: ClassVar[int] = 1
     start_ns: int
     end_ns: int
     T_start: Float[np.ndarray, "4 4"]
     T_end: Float[np.ndarray, "4 4"]
+    """The same one: it stands."""
+    in_hand: bool = False
+    """Poses are ``T_tcp_object``, else ``T_base_object``."""
+    power: int = 1
+    """2: it falls ever faster."""
+
+    @property
+    def stands(self) -> bool:
+        """Whether it does not move in the base frame."""
+        return self.T_start is self.T_end
 
     def pose(self, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
         """Where it is then."""
+        if self.stands:
+            return self.T_end
         share = (stamp_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
         return _between(self.T_start, self.T_end, float(np.clip(share, 0.0, 1.0)) ** self.power)
 
 
-class _Push(_Change):
-    """The closing fingers push it; poses ``T_base_object``."""
-
-
-class _Fall(_Push):
-    """It was let go, and falls ever faster; poses ``T_base_object``."""
-
-    power = 2
-
-
-class _Carry(_Change):
-    """It moves with the tool; poses ``T_tcp_object``."""
-
-
-_Span = _Rest | _Push | _Carry
+def _rest(start_ns: int, T_base_object: Float[np.ndarray, "4 4"]) -> _Span:
+    return _Span(start_ns=start_ns, end_ns=start_ns, T_start=T_base_object, T_end=T_base_object)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,13 +113,12 @@ class ObjectTracks:
         for name, spans in self.spans.items():
             begun = [span for span in spans if span.start_ns <= stamp_ns]
             span = begun[-1] if begun else spans[0]
-            if isinstance(span, _Carry) and T_base_tcp is not None:
+            if span.in_hand and T_base_tcp is not None:
                 found[name] = T_base_tcp @ span.pose(stamp_ns)
-            elif isinstance(span, _Push):
-                found[name] = span.pose(stamp_ns)
+            elif span.in_hand:
+                found[name] = [item.T_end for item in begun if item.stands][-1]
             else:
-                rests = [item for item in begun or spans if isinstance(item, _Rest)]
-                found[name] = rests[-1].T_base_object
+                found[name] = span.pose(stamp_ns)
         return found
 
 
@@ -178,7 +166,7 @@ def carried_tracks(
             notes.append(f"{name} was not localised: not drawn")
             absent.add(name)
             continue
-        spans[name] = [_Rest(start_ns=0, T_base_object=next(iter(seen.values())))]
+        spans[name] = [_rest(0, next(iter(seen.values())))]
         for plan_id, (start_ns, end_ns) in sorted(executions_ns.items(), key=lambda i: i[1]):
             grips = (
                 grips_between(track, robot, start_ns, end_ns)
@@ -245,7 +233,7 @@ def _moved(
     end_ns: int,
 ) -> tuple[list[_Span], str]:
     """What one execution did to an object, and what had to be assumed."""
-    (T,) = [item.T_base_object for item in before[-1:] if isinstance(item, _Rest)]
+    T = before[-1].T_end
     grasps = _grasps(model, T, grips)
     added = [span for grasp in grasps[:-1] for span in _carried(grasp, grasp.T_base_put)]
     if grasps:
@@ -267,7 +255,7 @@ def _moved(
         else f"was moved by {away_m * 100:.0f} cm without being held: drawn there afterwards"
     )
     if not grasps:
-        return [_Rest(start_ns=end_ns, T_base_object=after)], note
+        return [_rest(end_ns, after)], note
     return [*added[:-2], *_fallen(grasps[-1].grip.end_ns, T, after)], note
 
 
@@ -319,13 +307,14 @@ def _carried(grasp: _Grasp, T_base_put: Float[np.ndarray, "4 4"]) -> list[_Span]
     grip, T_let_go = grasp.grip, T_base_put.copy()
     T_let_go[2, 3] = max(T_base_put[2, 3], grasp.T_base_put[2, 3])
     return [
-        _Push(
+        _Span(
             start_ns=grip.closing_ns,
             end_ns=grip.start_ns,
             T_start=grasp.T_base_lay,
             T_end=grip.T_base_tcp_start @ grasp.T_tcp_object,
         ),
-        _Carry(
+        _Span(
+            in_hand=True,
             start_ns=grip.start_ns,
             end_ns=grip.end_ns,
             T_start=grasp.T_tcp_object,
@@ -341,8 +330,8 @@ def _fallen(
     """From one place to another, as long as a free fall takes."""
     fall_m = max(float(T_start[2, 3] - T_end[2, 3]), 0.0)
     end_ns = start_ns + round(1e9 * float(np.sqrt(2 * fall_m / GRAVITY_M_S2)))
-    fall = _Fall(start_ns=start_ns, end_ns=end_ns, T_start=T_start, T_end=T_end)
-    return [fall, _Rest(start_ns=end_ns, T_base_object=T_end)]
+    fall = _Span(start_ns=start_ns, end_ns=end_ns, T_start=T_start, T_end=T_end, power=2)
+    return [fall, _rest(end_ns, T_end)]
 
 
 def _between_pads(

@@ -1,37 +1,45 @@
-"""Draw the rebuilt scene, also in another state than scanned: objects moved, the robot posed."""
+"""Draw the rebuilt scene: one image in any state of robot and objects, or a whole episode.
 
-from collections.abc import Mapping, Sequence
+One process draws all frames. The scene is read once; for each frame the links and objects are
+moved rigidly, and background, objects and robot are drawn together.
+"""
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt16
+from jaxtyping import Bool, Float, Int, UInt8
 
 from bridge.episode import streams
+from bridge.episode.cdr.messages import CompressedColor, RawColor, color_from_message
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import ROBOT_DESCRIPTION
-from bridge.episode.transforms import TransformTree
-from bridge.errors import BridgeError, GstError, UsageError
+from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
+from bridge.media.depth import from_metres
+from bridge.media.image_quality import as_float
 from twin.robot.model import RobotDescriptionError, load_robot
-from twin.robot.posture import Posture, posture_track
-from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
+from twin.robot.posture import Posture
+from twin.robot.surface import PosedSurface
 from twin.scene.frames.pairing import name_of
+from twin.scene.movable_scene import Drawn, Frame
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig
 from twin.scene.settings import RenderConfig
-from twin.scene.store.calibration import read_calibration
+from twin.scene.shape.mesh import Mesh, first_hit
+from twin.scene.standpoint import camera_of, camera_places, episode_of, sized_camera
 from twin.scene.store.folder import Scene, read_scene
+from twin.scene.store.library import NOT_SCANNED
 from twin.scene.trial import TrialInScene, open_trial
 
-PROBES = 9
-"""Instants of an episode at which a camera's place in the hand is looked at."""
-RIGID_M = 0.01
-"""A camera that stays this near to one place in the hand is mounted there."""
-MOVED_M = 0.02
-"""A hand that moved less says nothing about what it carries."""
+CRF = 18
+"""Quality of the video: hardly to be told from the frames."""
+OTHER_FILES = (".avi", ".gif", ".h264", ".jpeg", ".jpg", ".mkv", ".mov", ".webm")
+"""Files that somebody may ask for and that are not written."""
 
 
 def posture_of(
@@ -51,7 +59,7 @@ def posture_of(
     recorded = track.at(stamp_ns)
     width_m = recorded.width_m if config.width_m is None else config.width_m
     posture = Posture(joints_rad=recorded.joints_rad, width_m=width_m)
-    return posture, track.urdf, f"joints as {of} has them at that time"
+    return posture, track.urdf, trial.robot
 
 
 def _given_posture(
@@ -105,222 +113,304 @@ def _pose_from(text: str, listed: str) -> Float[np.ndarray, "4 4"]:
     return se3.transform_from(numbers[3:] / np.linalg.norm(numbers[3:]), numbers[:3])
 
 
-def carried_camera(
-    episode: Episode,
-    frame_id: str,
-    joints_rad: Float[np.ndarray, " num_joints"],
-    tree: TransformTree | None = None,
-) -> Float[np.ndarray, "4 4"] | None:
-    """Where a camera in the robot's hand would be in a posture, ``T_base_camera``.
-
-    Returns:
-        None when the camera is not seen to move with the hand.
-    """
-    try:
-        track = posture_track(episode)
-    except GstError:
-        return None
-    tree = base_tree(episode) if tree is None else tree
-    robot = load_robot(track.urdf)
-    # By the source's clock, which may have little to do with when messages arrived; and where the
-    # camera's pose was stated, because in a fast motion what lies between may be off by much.
-    posed_ns = np.array([t for t in tree.stamps_ns(frame_id).tolist() if track.covers(t)])
-    stamps = posed_ns[
-        np.linspace(0, len(posed_ns) - 1, min(PROBES, len(posed_ns))).round().astype(int)
-    ]
-    pairs = [
-        (robot.T_base_tcp(track.at(stamp).joints_rad), tree.T_root_frame(frame_id, stamp))
-        for stamp in stamps.tolist()
-        if track.covers(stamp)
-    ]
-    mounted = np.array([se3.invert(hand) @ camera for hand, camera in pairs]).reshape(-1, 4, 4)
-    hands = np.array([hand for hand, _ in pairs]).reshape(-1, 4, 4)
-    if len(pairs) == 0 or _spread(hands) < MOVED_M or _spread(mounted) > RIGID_M:
-        return None
-    return np.asarray(robot.T_base_tcp(joints_rad) @ mounted[len(mounted) // 2])
-
-
-def _spread(Ts: Float[np.ndarray, "num_poses 4 4"]) -> float:
-    return float(np.linalg.norm(np.ptp(Ts[:, :3, 3], axis=0)))
-
-
-def describe_drawn(drawn: Mapping[str, Any]) -> str:
-    """The files, and what a reader should know about what they show."""
-    return "\n".join([*drawn["files"], f"robot: {drawn['robot']}", *drawn["notes"]])
-
-
-UP = np.array([0.0, 0.0, 1.0])
-"""The root frame's z axis points up (table top at z = 0)."""
-
-
 def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
-    """Write one image of the scene, and return what was drawn."""
+    """Draw one image of the scene, or a whole episode, and return what was drawn.
+
+    A whole episode becomes a video, or one PNG a frame. Instants at which nobody recorded where
+    the camera was are left out.
+    """
+    _check(config)
     rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
     scene = read_scene(run)
-    episode = episode_of(run, scene, config.episode)
-    camera_id = camera_of(episode, config.camera)
-    first_ns = streams.first_stamp_ns(episode)
-    began_ns = episode.start_ns if first_ns is None else first_ns
-    stamp_ns = began_ns + round((config.at_s or 0.0) * 1e9)
-    trial = open_trial(run, scene, episode)
-    moved = object_places(config.object, list(trial.parts.objects))
-    posture, urdf, robot = posture_of(trial, stamp_ns, config)
-    camera, T_base_camera = _view_of(run, scene, episode, camera_id, stamp_ns, config)
-    if chosen_view(config) is None:
-        T_base_camera = trial.registered(camera_id, T_base_camera)
-    places = trial.places(stamp_ns) | moved
-    cloud = trial.parts.at(places, posture, urdf)
-    drawn = trial.parts.draw(rasteriser, cloud, camera, T_base_camera)
-    path = config.out or run.results_dir / "render.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(encode_png(drawn.marked_u8()))
-    written = [str(path)]
-    if config.depth:
-        for ending, image in (("depth", depth_image(drawn.depth_m)), ("seen", drawn.seen_u8())):
-            beside = path.with_name(f"{path.stem}_{ending}.png")
-            beside.write_bytes(encode_png(image))
-            written.append(str(beside))
+    trial = open_trial(run, scene, episode_of(run, scene, config.episode))
+    episode, camera_id = trial.recorded, camera_of(trial.recorded, config.camera)
+    camera = sized_camera(streams.camera_info(episode, camera_id).camera, config.size)
+    stamps = _stamps(trial, camera_id, config)
+    _, _, robot = posture_of(trial, int(stamps[0]), config)
+    frames = _frames(run, scene, trial, camera_id, stamps, config)
+    agreement = ImageAgreement() if config.compare and config.is_sequence else None
+    meshes = {} if agreement is None else trial.meshes(run)
+    recorded = recorded_images(episode, camera_id)
+    coverage: list[float] = []
+    files: list[str] = []
+    with _writer(run, config, f"{episode.path.stem}.{camera_id}", stamps) as write:
+        for frame in frames:
+            drawn = trial.parts.drawn_as(rasteriser, camera, frame)
+            image = drawn.marked_u8()
+            if agreement is not None:
+                before = next(item for item in recorded if item.stamp_ns == frame.stamp_ns)
+                image = _beside(agreement, before.image_u8(), drawn, frame, camera, meshes)
+            planes = {"": image}
+            if config.depth:
+                planes |= {
+                    "_depth": from_metres(drawn.depth_m),
+                    "_seen": drawn.seen_mask * np.uint8(255),
+                }
+            files = write(frame.stamp_ns - frames[0].stamp_ns, planes)
+            coverage.append(float(drawn.alpha.mean()))
     return {
-        "files": written,
+        "files": files,
         "scene_hash": scene.scene_hash,
         "episode": episode.info.id,
         "camera": camera_id,
         "robot": robot,
+        "frames": len(frames),
+        "frames_without_pose": len(stamps) - len(frames),
         "notes": list(trial.notes),
         "not_scanned": sorted(trial.parts.not_scanned),
-        "coverage_fraction": float(drawn.alpha.mean()),
+        "coverage_fraction": float(np.mean(coverage)),
+        **({} if agreement is None else {"agreement": agreement.record()}),
     }
 
 
-def depth_image(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarray, "_ _"]:
-    """Whole millimetres; what is farther away than they can say is as far as they can."""
-    largest = np.iinfo(np.uint16).max
-    return np.clip(np.rint(depth_m * 1e3), 0, largest).astype(np.uint16)
-
-
-def episode_of(run: RunFolder, scene: Scene, wanted: str) -> Episode:
-    """Open a recorded episode of a run by its id."""
-    name = wanted or scene.record["sources"][0]["id"]
-    episodes: dict[str, Episode] = {}
-    for path in run.episodes():
-        try:
-            episode = Episode.open(path)
-        except BridgeError:
-            if path.stem == name:
-                raise
-        else:
-            episodes[episode.info.id] = episode
-    if name not in episodes:
-        message = f"no episode {name!r} in {run.path}. There are: {', '.join(episodes) or 'none'}."
+def _check(config: RenderConfig) -> None:
+    if not config.is_sequence:
+        return
+    is_video = config.out is None or config.out.suffix.lower() == ".mp4"
+    if config.out is not None and config.out.suffix.lower() in OTHER_FILES:
+        message = f"--out {config.out}: a whole episode becomes an .mp4 file or a folder of frames."
         raise UsageError(message)
-    return episodes[name]
-
-
-def camera_of(episode: Episode, wanted: str) -> str:
-    """The camera of an episode that is wanted, or the first."""
-    ids = streams.camera_ids(episode)
-    if not ids or (wanted and wanted not in ids):
-        found = ", ".join(ids) or "none"
-        message = f"no camera {wanted!r} in episode {episode.info.id}. There are: {found}."
+    if is_video and config.depth:
+        message = "--depth goes into a folder of frames, not into a video: --out FOLDER."
         raise UsageError(message)
-    return wanted or ids[0]
+    if config.compare and (config.eye is not None or config.size):
+        message = "--compare needs the recorded camera and size: leave out --eye and --size."
+        raise UsageError(message)
 
 
-def _view_of(
+def _stamps(
+    trial: TrialInScene, camera_id: str, config: RenderConfig
+) -> Int[np.ndarray, " num_stamps"]:
+    """Instants to be drawn: of all images of a camera, or the one that is asked for."""
+    episode = trial.recorded
+    if not config.is_sequence:
+        first_ns = streams.first_stamp_ns(episode)
+        began_ns = episode.start_ns if first_ns is None else first_ns
+        return np.array([began_ns + round((config.at_s or 0.0) * 1e9)])
+    images = recorded_images(episode, camera_id)
+    recorded = np.array([message.stamp_ns for message in images], dtype=np.int64)
+    first_ns, last_ns = episode.start_ns, episode.end_ns
+    if trial.postures is not None:
+        first_ns, last_ns = (int(trial.postures.arm.stamps_ns[k]) for k in (0, -1))
+    stamps = recorded[(recorded >= first_ns) & (recorded <= last_ns)]
+    if not len(stamps):
+        message = f"camera {camera_id} recorded no image in episode {episode.info.id}."
+        raise UsageError(message)
+    return np.asarray(stamps)
+
+
+def _frames(
     run: RunFolder,
     scene: Scene,
-    episode: Episode,
+    trial: TrialInScene,
     camera_id: str,
-    stamp_ns: int,
+    stamps_ns: Int[np.ndarray, " num_stamps"],
     config: RenderConfig,
-) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
-    info = streams.camera_info(episode, camera_id)
-    camera = sized_camera(info.camera, config.size)
-    T_chosen = chosen_view(config)
-    if T_chosen is not None:
-        return camera, T_chosen
-    tree = poses_in_scene(run, scene, episode, camera_id, np.array([stamp_ns]))
-    root = tree.root_of(info.frame_id)
-    if config.joints is not None and root == streams.recorded_robot(episode).base_frame:
-        T_base_camera = carried_camera(episode, info.frame_id, np.array(config.joints), tree)
+) -> list[Frame]:
+    """The instants that can be drawn, in the order of time; at least one."""
+    moved = object_places(config.object, list(trial.parts.objects))
+    cameras = camera_places(run, scene, trial, camera_id, stamps_ns, config)
+    frames = []
+    for stamp_ns, T_base_camera in zip(stamps_ns.tolist(), cameras, strict=True):
         if T_base_camera is not None:
-            return camera, T_base_camera
-    if unknown_mask(tree, [info.frame_id], np.array([stamp_ns]))[0]:
-        at_s = config.at_s or 0.0
+            posture, urdf, _ = posture_of(trial, stamp_ns, config)
+            frames.append(
+                Frame(
+                    stamp_ns=stamp_ns,
+                    T_base_camera=T_base_camera,
+                    Ts_base_object=trial.places(stamp_ns) | moved,
+                    posture=posture,
+                    urdf=urdf,
+                )
+            )
+    if not frames:
+        when = "at any image" if config.is_sequence else f"at --at-s {config.at_s or 0.0:g}"
         message = (
-            f"nobody recorded where {name_of(episode, camera_id)} was at --at-s {at_s:g}: "
+            f"nobody recorded where {name_of(trial.recorded, camera_id)} was {when}: "
             "choose another time, or say where to stand with --eye and --target."
         )
         raise UsageError(message)
-    return camera, tree.T_root_frame(info.frame_id, stamp_ns)
+    return frames
 
 
-def chosen_view(config: RenderConfig) -> Float[np.ndarray, "4 4"] | None:
-    """Where ``--eye`` and ``--target`` put a camera; None without them."""
-    if config.eye is None and config.target is None:
-        return None
-    if config.eye is None or config.target is None:
-        message = "--eye and --target belong together: where to stand, and what to look at."
-        raise UsageError(message)
-    eye, target = np.array(config.eye), np.array(config.target)
-    if np.linalg.norm(np.cross(target - eye, UP)) < 1e-6:
-        message = "--eye is straight above or below --target; move it a little sideways."
-        raise UsageError(message)
-    return se3.look_at(eye, target, UP)
+def recorded_images(episode: Episode, camera_id: str) -> Iterator[CompressedColor | RawColor]:
+    """Colour images of a camera, in log order."""
+    topic = streams.find_camera_topic(episode, camera_id, "color/image")
+    for message in episode.messages([] if topic is None else [topic]):
+        yield color_from_message(message.type_name, message.data)
 
 
-def sized_camera(camera: Camera, size: str) -> Camera:
-    """The same view as an image of another size: all of it is seen, more only beside it."""
-    if not size:
-        return camera
-    words = size.lower().split("x")
-    if len(words) != 2 or not all(word.isdigit() and 16 <= int(word) <= 8192 for word in words):
-        message = f"--size {size!r} is no size: write WIDTHxHEIGHT, each 16 to 8192 pixels."
-        raise UsageError(message)
-    width, height = (int(word) for word in words)
-    factor = min(width / camera.width, height / camera.height)
-    return Camera(
-        width=width,
-        height=height,
-        fx=camera.fx * factor,
-        fy=camera.fy * factor,
-        cx=camera.cx * factor + (width - camera.width * factor) / 2,
-        cy=camera.cy * factor + (height - camera.height * factor) / 2,
-    )
+class ImageAgreement:
+    """Collects squared errors over many images: whole, where seen, and by part of the scene.
+
+    Every PSNR is of the squared error over all pixels of its kind in all images, so that an image
+    in which a part is small counts little.
+    """
+
+    def __init__(self) -> None:
+        """Nothing was compared yet."""
+        self._squared: dict[str, float] = {}
+        self._pixels: dict[str, int] = {}
+        self._images = 0
+
+    def add(
+        self,
+        recorded_u8: UInt8[np.ndarray, "height width 3"],
+        drawn_u8: UInt8[np.ndarray, "height width 3"],
+        seen_mask: Bool[np.ndarray, "height width"],
+        parts: Mapping[str, Bool[np.ndarray, "height width"]],
+    ) -> None:
+        """Compare one more image."""
+        squared = np.square(as_float(recorded_u8) - as_float(drawn_u8)).mean(axis=-1)
+        whole = np.ones_like(seen_mask)
+        kinds = {"whole": whole, "seen": seen_mask, "unseen": ~seen_mask, **parts}
+        for kind, mask in kinds.items():
+            self._squared[kind] = self._squared.get(kind, 0.0) + float(squared[mask].sum())
+            self._pixels[kind] = self._pixels.get(kind, 0) + int(mask.sum())
+        self._images += 1
+
+    def record(self) -> dict[str, Any]:
+        """PSNR [dB], share of the pixels and share of the squared error of each kind.
+
+        A kind without pixels, or without any error, has no PSNR: None.
+        """
+        total, pixels = self._squared.get("whole", 0.0), self._pixels.get("whole", 0)
+        return {
+            "images": self._images,
+            **{
+                kind: {
+                    "psnr_db": -10.0 * float(np.log10(squared / self._pixels[kind]))
+                    if squared > 0 and self._pixels[kind]
+                    else None,
+                    "pixel_fraction": self._pixels[kind] / pixels,
+                    "error_fraction": squared / total if total > 0 else 0.0,
+                }
+                for kind, squared in self._squared.items()
+            },
+        }
 
 
-def poses_in_scene(
-    run: RunFolder,
-    scene: Scene,
-    episode: Episode,
-    camera_id: str,
-    stamps_ns: Int[np.ndarray, " num_stamps"],
-) -> TransformTree:
-    """Poses of a camera in the scene's frame, from where the scene has its own."""
-    tree = _tree_of(run, scene, episode, camera_id, stamps_ns)
-    frame_id = streams.camera_info(episode, camera_id).frame_id
-    root = tree.root_of(frame_id) if frame_id in tree.frames() else None
-    if root != scene.record.get("frame", root) or root is None:
-        message = (
-            f"nothing says where {name_of(episode, camera_id)} was in the scene's frame "
-            f"{scene.record.get('frame')!r}: say where to stand with --eye and --target."
+def _beside(
+    agreement: ImageAgreement,
+    recorded_u8: UInt8[np.ndarray, "height width 3"],
+    drawn: Drawn,
+    frame: Frame,
+    camera: Camera,
+    meshes: Mapping[str, Mesh],
+) -> UInt8[np.ndarray, "height three_widths 3"]:
+    """Measure one frame, and put recorded image, twin and difference side by side."""
+    robot = None
+    if frame.posture is not None:
+        robot = PosedSurface(load_robot(frame.urdf), frame.posture)
+    T, places = frame.T_base_camera, frame.Ts_base_object
+    masks = part_masks(camera, T, robot, meshes, places, drawn.not_scanned)
+    agreement.add(recorded_u8, drawn.image_u8, drawn.seen_mask, masks)
+    difference = np.abs(recorded_u8.astype(np.int16) - drawn.image_u8.astype(np.int16))
+    sides = [recorded_u8, drawn.marked_u8(), difference.astype(np.uint8)]
+    return np.concatenate(sides, axis=1)
+
+
+Write = Callable[[int, Mapping[str, np.ndarray]], list[str]]
+"""Time since the first frame and its images in; out what lies there then."""
+
+
+@contextmanager
+def _writer(
+    run: RunFolder, config: RenderConfig, name: str, stamps_ns: Int[np.ndarray, " num_stamps"]
+) -> Iterator[Write]:
+    """Write one image, or frames to a video or under the milliseconds since the first one."""
+    name = f"{name}.mp4" if config.is_sequence else "render.png"
+    out = config.out or run.results_dir / name
+    if not config.is_sequence or out.suffix.lower() != ".mp4":
+        (out if config.is_sequence else out.parent).mkdir(parents=True, exist_ok=True)
+
+        def write_images(since_ns: int, planes: Mapping[str, np.ndarray]) -> list[str]:
+            written = []
+            for ending, pixels in planes.items():
+                path = out.with_name(f"{out.stem}{ending}.png") if ending else out
+                if config.is_sequence:
+                    path = out / f"{since_ns // 1_000_000:07d}{ending}.png"
+                path.write_bytes(encode_png(pixels))
+                written.append(str(path))
+            return [str(out)] if config.is_sequence else written
+
+        yield write_images
+        return
+    from bridge.media.video_writer import VideoWriter  # noqa: PLC0415  # the extra [video]
+
+    rate_hz = float(1e9 / np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 1.0
+    video: VideoWriter | None = None
+
+    def append(since_ns: int, planes: Mapping[str, np.ndarray]) -> list[str]:
+        nonlocal video
+        image = planes[""]
+        if video is None:
+            height, width = image.shape[:2]
+            fps = max(1, round(rate_hz))
+            video = VideoWriter(out, fps=fps, width=width, height=height, crf=CRF)
+        video.write(image, first=since_ns == 0)
+        return [str(out)]
+
+    try:
+        yield append
+    finally:
+        if video is not None:
+            video.close()
+
+
+def describe_drawn(drawn: Mapping[str, Any]) -> str:
+    """The files, how many frames they hold, and what a reader should know about them."""
+    lines = list(drawn["files"])
+    if drawn["frames"] > 1:
+        lines.append(f"{drawn['frames']} frames of {drawn['episode']}, {drawn['camera']}")
+    if drawn["frames_without_pose"]:
+        lines.append(
+            f"{drawn['frames_without_pose']} left out: nobody recorded where the camera was"
         )
-        raise UsageError(message)
-    return tree
+    lines += [f"robot: {drawn['robot']}", *drawn["notes"]]
+    if "agreement" in drawn:
+        lines.append(describe_agreement(drawn["agreement"]))
+    return "\n".join(lines)
 
 
-def _tree_of(
-    run: RunFolder,
-    scene: Scene,
-    episode: Episode,
-    camera_id: str,
-    stamps_ns: Int[np.ndarray, " num_stamps"],
-) -> TransformTree:
-    known = scene.record.get("cameras", [])
-    if not any((item["id"], item["poses_from"]) == (camera_id, "hand-eye") for item in known):
-        return base_tree(episode)
-    calibration = read_calibration(run)
-    place = None if calibration is None else calibration.cameras.get(camera_id)
-    if place is None:
-        return base_tree(episode)
-    return calibrated_tree_at(episode, camera_id, place, stamps_ns)
+def part_masks(
+    camera: Camera,
+    T_base_camera: Float[np.ndarray, "4 4"],
+    robot: PosedSurface | None,
+    meshes: Mapping[str, Mesh],
+    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
+    not_scanned: Collection[str] = (),
+) -> dict[str, Bool[np.ndarray, "height width"]]:
+    """Which pixels show robot, objects and background, by the first mesh along each ray.
+
+    Args:
+        robot: Its surface as it stands then; None: it is not known.
+        not_scanned: Objects that no scan saw: they are objects, and a kind of their own besides.
+    """
+    rays = camera.rays()
+    nothing = np.full(rays.shape[:2], np.inf, dtype=np.float32)
+    robot_m = nothing if robot is None else robot.depth_along(rays, T_base_camera)
+    objects_m, _ = first_hit(rays, T_base_camera, meshes, Ts_base_object)
+    is_robot = np.isfinite(robot_m) & (robot_m <= objects_m)
+    is_object = np.isfinite(objects_m) & ~is_robot
+    masks = {"robot": is_robot, "objects": is_object, "background": ~is_robot & ~is_object}
+    drawn_from_task = {name: mesh for name, mesh in meshes.items() if name in not_scanned}
+    if drawn_from_task:
+        own_m, _ = first_hit(rays, T_base_camera, drawn_from_task, Ts_base_object)
+        masks[NOT_SCANNED] = is_object & (own_m <= objects_m)
+    return masks
+
+
+def describe_agreement(record: Mapping[str, Any]) -> str:
+    """One line for each kind of pixel."""
+    lines = [f"compared with {record['images']} recorded images:"]
+    for kind, found in record.items():
+        if kind == "images":
+            continue
+        psnr = found["psnr_db"]
+        text = "undefined (no pixel, or no error)" if psnr is None else f"{psnr:.2f} dB"
+        lines.append(
+            f"  {kind:<11}{text}, {found['pixel_fraction']:.1%} of the pixels, "
+            f"{found['error_fraction']:.1%} of the squared error"
+        )
+    return "\n".join(lines)

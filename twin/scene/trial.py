@@ -60,8 +60,6 @@ class TrialInScene:
     """What nobody saw, and what was not scanned."""
     moved: Mapping[str, MovedCamera] = field(default_factory=dict)
     """Cameras that are elsewhere than their poses say, by id."""
-    unposed: list[int] = field(default_factory=list)
-    """Instants left out because nobody knows where the camera was."""
 
     def places(self, stamp_ns: int) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Where its objects are at an instant, ``T_base_object``; some in the hand."""

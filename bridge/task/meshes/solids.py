@@ -167,9 +167,9 @@ def mesh_of(
 def is_closed(triangles: Int[np.ndarray, "num_triangles 3"]) -> bool:
     """Say whether each edge belongs to two triangles, which run along it in opposite directions."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    base = int(triangles.max()) + 1
+    base = int(triangles.max(initial=0)) + 1
     there, back = edges[:, 0] * base + edges[:, 1], edges[:, 1] * base + edges[:, 0]
-    once = len(np.unique(there)) == len(there)
+    once = 0 < len(np.unique(there)) == len(there)
     return bool(once and np.array_equal(np.sort(there), np.sort(back)))
 
 

@@ -100,16 +100,6 @@ def search(
     return [T for _, T in sorted(found, key=lambda item: -item[0])]
 
 
-def search_near(
-    views: Sequence[RobotView], robot: RobotModel, T_base_source: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "4 4"]:
-    """Try yaws within 6 degrees and places within 7 cm of a pose whose tilt is about right."""
-    samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(views)]
-    nowhere = np.zeros(2)
-    plane = LevelPlane(T_level_source=T_base_source, low_m=nowhere, high_m=nowhere, share=0.0)
-    return _polished(views, samples, plane, 0.0, np.zeros(3))[1]
-
-
 def _polished(
     views: Sequence[RobotView],
     samples: Sequence[np.ndarray],
@@ -275,7 +265,12 @@ def align_robot(
     if start is None:
         starts = _starts(views, robot)
     else:  # nearest points alone get stuck beside the start: the best of what lies around it, too
-        around = search_near(views, robot, start)
+        samples = [
+            sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(views)
+        ]
+        nowhere = np.zeros(2)
+        plane = LevelPlane(T_level_source=start, low_m=nowhere, high_m=nowhere, share=0.0)
+        _, around = _polished(views, samples, plane, 0.0, np.zeros(3))
         starts = [ScenePose(T_base_source=T) for T in (start, around)]
     coarse = [_refined(views, surfaces, pose, fine=False, seed=seed) for pose in starts]
     best, others = _ranked(coarse)

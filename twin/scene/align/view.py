@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.robot.posture import Posture
@@ -24,18 +23,6 @@ class RobotView:
     T_source_camera: Float[np.ndarray, "4 4"]
     """Camera pose in the source frame: the scene's root, or the camera itself."""
     posture: Posture
-
-    @staticmethod
-    def from_frame(
-        frame: RgbdFrame, posture: Posture, T_source_camera: Float[np.ndarray, "4 4"]
-    ) -> "RobotView":
-        """Take the depth image of a frame."""
-        return RobotView(
-            camera=frame.depth_camera,
-            depth_m=np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0),
-            T_source_camera=T_source_camera,
-            posture=posture,
-        )
 
     @cached_property
     def cloud(self) -> "ViewCloud":

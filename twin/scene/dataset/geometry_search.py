@@ -8,6 +8,7 @@ almost anything.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -113,9 +114,9 @@ def search_geometry(
     ]
     if pose_at is not None and frame_ns > 0:
         ends_ns = images[0].stamp_ns, images[-1].stamp_ns
-        moved = _Delayed(pairs=pairs, pose_at=pose_at, ends_ns=ends_ns)
+        late = partial(_agreement_late, pairs, pose_at, ends_ns)
         steps = np.arange(-MOST_LATE_FRAMES, MOST_LATE_FRAMES + 1).astype(np.float64)
-        at, after = _climbed(steps, lambda frames: moved.agreement(frames * frame_ns))
+        at, after = _climbed(steps, lambda frames: late(frames * frame_ns))
         found.append(
             Correction(kind="delay", value=at * frame_ns, frames=at, before=recorded, after=after)
         )
@@ -134,10 +135,9 @@ class _Pair:
     first: DownscaledDepth
     second: DownscaledDepth
 
-    def agreement(
-        self, T_second_first: Float[np.ndarray, "4 4"], depth: float, focal: float
-    ) -> tuple[float, float]:
+    def agreement(self, depth: float, focal: float) -> tuple[float, float]:
         """Share of the overlap that agrees, and the overlap."""
+        T_second_first = se3.invert(self.second.T_base_depth) @ self.first.T_base_depth
         first = self.first.camera
         camera = replace(first, fx=first.fx * focal, fy=first.fy * focal)
         z = depth * self.first.depth_m.astype(np.float64)
@@ -152,58 +152,34 @@ class _Pair:
 
 
 def _agreement(pairs: Sequence[_Pair], depth: float = 1.0, focal: float = 1.0) -> float:
-    return _mean(
-        [
-            pair.agreement(
-                se3.invert(pair.second.T_base_depth) @ pair.first.T_base_depth, depth, focal
-            )
-            for pair in pairs
-        ]
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Delayed:
-    pairs: Sequence[_Pair]
-    pose_at: PoseAt
-    ends_ns: tuple[int, int]
-    """Of the recording."""
-
-    def agreement(self, late_ns: float) -> float:
-        """With poses that were stated this much too late.
-
-        Beyond the ends of a recording its camera stands still, which agrees with anything: pairs
-        that would come to lie there do not count.
-        """
-        kept = [pair for pair in self.pairs if self._within(pair, late_ns)]
-        if len(kept) < LEAST_LEFT * len(self.pairs):
-            return 0.0
-        return _mean(
-            [
-                pair.agreement(
-                    se3.invert(self._pose(pair.second, late_ns)) @ self._pose(pair.first, late_ns),
-                    1.0,
-                    1.0,
-                )
-                for pair in kept
-            ]
-        )
-
-    def _within(self, pair: _Pair, late_ns: float) -> bool:
-        start_ns, end_ns = self.ends_ns
-        moved_ns = (each.stamp_ns + late_ns for each in (pair.first, pair.second))
-        return all(start_ns <= t_ns <= end_ns for t_ns in moved_ns)
-
-    def _pose(self, image: DownscaledDepth, late_ns: float) -> Float[np.ndarray, "4 4"]:
-        return self.pose_at(image.stamp_ns + round(late_ns))
-
-
-def _mean(scores: Sequence[tuple[float, float]]) -> float:
     """Agreement over pairs by their overlap; 0 where views hardly meet."""
-    overlap = float(np.mean([each[1] for each in scores]))
-    if overlap < LEAST_OVERLAP:
+    shares, overlaps = np.array([pair.agreement(depth, focal) for pair in pairs]).T
+    if overlaps.mean() < LEAST_OVERLAP:
         return 0.0
-    return float(np.average([each[0] for each in scores], weights=[each[1] for each in scores]))
+    return float(np.average(shares, weights=overlaps))
+
+
+def _agreement_late(
+    pairs: Sequence[_Pair], pose_at: PoseAt, ends_ns: tuple[int, int], late_ns: float
+) -> float:
+    """The same with poses that were stated this much too late.
+
+    Beyond the ends of a recording its camera stands still, which agrees with anything: pairs that
+    would come to lie there do not count.
+    """
+
+    def moved(image: DownscaledDepth) -> DownscaledDepth:
+        return replace(image, T_base_depth=pose_at(image.stamp_ns + round(late_ns)))
+
+    kept = [
+        _Pair(first=moved(pair.first), second=moved(pair.second))
+        for pair in pairs
+        if all(
+            ends_ns[0] <= image.stamp_ns + late_ns <= ends_ns[1]
+            for image in (pair.first, pair.second)
+        )
+    ]
+    return _agreement(kept) if len(kept) >= LEAST_LEFT * len(pairs) else 0.0
 
 
 def _best(kind: str, score: Callable[[float], float], recorded: float) -> Correction:

@@ -14,6 +14,7 @@ held-out frame is looked at.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
@@ -25,7 +26,7 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from twin.scene.frames.camera_poses import same_pose
 from twin.scene.frames.downscaled import pixels_of
-from twin.scene.frames.rgbd import PointSet, Target, TrainingView
+from twin.scene.frames.rgbd import PointSet, TrainingView
 from twin.scene.frames.selection import spread
 
 VOXEL_M = 0.02
@@ -96,9 +97,15 @@ class ReferenceView:
     """What one training frame can say about other frames' points."""
 
     view: TrainingView
-    nearest_m: Float32[np.ndarray, "height width"]
     scan: int = 0
     """Frames of one scan are compared in the order of their time, those of several are not."""
+
+    @cached_property
+    def nearest_m(self) -> Float32[np.ndarray, "height width"]:
+        """Smallest measurement within a few pixels: beside an outline nothing counts as passed."""
+        depth_m = self.view.half.depth_m
+        nearest = np.where(depth_m > 0, depth_m, np.float32(np.inf))
+        return np.asarray(ndimage.minimum_filter(nearest, 2 * OUTLINE_PX + 1, mode="nearest"))
 
     def look_through(
         self, p_base: Float[np.ndarray, "num_points 3"]
@@ -127,7 +134,7 @@ def choose_reference_views(
     step = max(1, -(-len(views) // MAX_REFERENCE_VIEWS))
     of_scan = [0] * len(views) if scans is None else scans
     return [
-        ReferenceView(view=view, nearest_m=nearest_around(view.half.depth_m), scan=scan)
+        ReferenceView(view=view, scan=scan)
         for view, scan in zip(views[::step], of_scan[::step], strict=True)
     ]
 
@@ -174,12 +181,6 @@ class _Votes:
         left, came = self._last[1] < self._first[0], self._last[0] < self._first[1]
         both = (self.through >= MIN_THROUGH_IN_TURN) & (self.confirmed > 0)
         return np.asarray(both & (left | came))
-
-
-def nearest_around(depth_m: np.ndarray) -> np.ndarray:
-    """Smallest measurement within a few pixels: beside an outline nothing counts as passed."""
-    nearest = np.where(depth_m > 0, depth_m, np.float32(np.inf))
-    return np.asarray(ndimage.minimum_filter(nearest, 2 * OUTLINE_PX + 1, mode="nearest"))
 
 
 def _keys(p_m: np.ndarray) -> np.ndarray:
@@ -247,7 +248,8 @@ def find_ego_mask(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height wid
     chosen = _from_other_places(views)
     if len(chosen) < MIN_VIEWS:
         return None
-    images = np.stack([_blurred(view.half) for view in chosen])
+    planes = np.stack([view.half.planes_u8 for view in chosen]).astype(np.float32)
+    images = ndimage.gaussian_filter(planes, (0.0, 0.0, BLUR_PX, BLUR_PX))
     stays = _edges_that_stay(images)
     if stays.mean() < MIN_SHARE / 10:
         return None
@@ -271,11 +273,6 @@ def _from_other_places(views: Sequence[TrainingView]) -> list[TrainingView]:
         ):
             kept.append(view)
     return [kept[index] for index in spread(np.arange(len(kept)), MAX_VIEWS)]
-
-
-def _blurred(target: Target) -> Float32[np.ndarray, "3 height width"]:
-    planes = target.planes_u8.astype(np.float32)
-    return np.asarray(ndimage.gaussian_filter(planes, (0.0, BLUR_PX, BLUR_PX)), dtype=np.float32)
 
 
 def _edges_that_stay(
@@ -311,7 +308,7 @@ def _stands_in_scene(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height 
     confirmed, grid = np.zeros_like(through), np.zeros(through.shape, dtype=bool)
     grid[::EVIDENCE_STRIDE, ::EVIDENCE_STRIDE] = True
     asked = views[:: -(-len(views) // EVIDENCE_VIEWS)]
-    references = [ReferenceView(view=v, nearest_m=nearest_around(v.half.depth_m)) for v in asked]
+    references = [ReferenceView(view=view) for view in asked]
     for view in asked:
         known = (view.half.depth_m > 0) & grid
         p_camera = view.half.camera.unproject(view.half.depth_m)[known]

@@ -9,7 +9,6 @@ camera measured is carried into them instead.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
-from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -85,15 +84,6 @@ SOLID_OVERLAP = 0.2
 """Frames near in time overlap at least by this much if their poses are read rightly."""
 
 
-class Score(NamedTuple):
-    """How well depth fits under one reading of the poses."""
-
-    agreement: float
-    """Share of the overlapping depth that agrees."""
-    overlap: float
-    """Share of a frame's measurements that another frame sees too; mean over what was compared."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class PoseReport:
     """What the depth says about the poses of one camera."""
@@ -137,21 +127,23 @@ class PoseReport:
         return ""
 
 
-def judged(plain: PoseReport, recorded: Score, better: Convention, agreement: float) -> PoseReport:
+def judged(
+    plain: PoseReport, recorded: Meeting, better: Convention, agreement: float
+) -> PoseReport:
     """The report on poses as recorded, with another reading where that is clearly better."""
     if agreement < GOOD or agreement < (plain.agreement or 0.0) + CLEARLY_BETTER:
         return plain
     return replace(plain, agreement=recorded.agreement, better=better, better_agreement=agreement)
 
 
-def score_of(met: Sequence[Meeting]) -> Score:
+def mean_of(met: Sequence[Meeting]) -> Meeting:
     """Agreement and overlap of all that was compared, at least one; it counts by its overlap."""
     total = sum(item.overlap for item in met)
     agreed = sum(item.agreement * item.overlap for item in met)
-    return Score(agreement=agreed / total if total > 0 else 0.0, overlap=total / len(met))
+    return Meeting(agreement=agreed / total if total > 0 else 0.0, overlap=total / len(met))
 
 
-def plain_report(num_pairs: int, recorded: Score) -> PoseReport:
+def plain_report(num_pairs: int, recorded: Meeting) -> PoseReport:
     """Report on poses as they were recorded; no agreement where views hardly overlap."""
     return PoseReport(
         num_pairs=num_pairs,
@@ -161,13 +153,13 @@ def plain_report(num_pairs: int, recorded: Score) -> PoseReport:
 
 
 def best_of(
-    conventions: Iterable[Convention], score: Callable[[Convention], Score]
+    conventions: Iterable[Convention], score: Callable[[Convention], Meeting]
 ) -> tuple[Convention, float]:
     """The convention under which most depth agrees, and how much; 0 without solid overlap."""
     scored = []
     for convention in conventions:
-        agreement, overlap = score(convention)
-        scored.append((convention, agreement if overlap >= SOLID_OVERLAP else 0.0))
+        met = score(convention)
+        scored.append((convention, met.agreement if met.overlap >= SOLID_OVERLAP else 0.0))
     return max(scored, key=lambda item: item[1])
 
 
@@ -217,17 +209,17 @@ def _best(pairs: list[tuple[DownscaledDepth, DownscaledDepth]]) -> tuple[Convent
     return max(best, also, key=lambda item: item[1])
 
 
-def _score(pairs: list[tuple[DownscaledDepth, DownscaledDepth]], convention: Convention) -> Score:
-    return score_of([_met(first, second, convention) for first, second in pairs])
-
-
-def _met(first: DownscaledDepth, second: DownscaledDepth, convention: Convention) -> Meeting:
-    T_second_first = se3.invert(convention.read(second.T_base_depth)) @ convention.read(
-        first.T_base_depth
-    )
-    if convention.depth_scale != 1.0:  # the same as moving by the inverse, up to the tolerance
+def _score(pairs: list[tuple[DownscaledDepth, DownscaledDepth]], convention: Convention) -> Meeting:
+    met = []
+    for first, second in pairs:
+        T_base_first, T_base_second = (
+            convention.read(image.T_base_depth) for image in (first, second)
+        )
+        T_second_first = se3.invert(T_base_second) @ T_base_first
+        # Depth times a scale is the same as moving by the inverse, up to the tolerance.
         T_second_first[:3, 3] /= convention.depth_scale
-    return meet(first, second, T_second_first)
+        met.append(meet(first, second, T_second_first))
+    return mean_of(met)
 
 
 def _informative(
@@ -277,9 +269,9 @@ def check_between(own: Sequence[DownscaledDepth], others: Sequence[DownscaledDep
 
 def _seen_alike(
     own: DownscaledDepth, others: Sequence[DownscaledDepth], T_base_own: Float[np.ndarray, "4 4"]
-) -> Score:
+) -> Meeting:
     T_own_base = se3.invert(T_base_own)
-    return score_of([meet(other, own, T_own_base @ other.T_base_depth) for other in others])
+    return mean_of([meet(other, own, T_own_base @ other.T_base_depth) for other in others])
 
 
 FEW_FRAMES = 5
@@ -311,7 +303,7 @@ class CameraCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanReport:
-    """What is to be said about a scan; ``scene.json`` keeps it."""
+    """What is to be said about a scan; ``scene.json`` keeps the remarks."""
 
     poses: Mapping[str, PoseReport]
     """By camera; one that stands still is compared with those that move, where there are any."""
@@ -345,17 +337,6 @@ class ScanReport:
             )
         return found
 
-    def to_record(self) -> dict[str, Any]:
-        """What ``scene.json`` says."""
-        return {
-            "remarks": self.remarks(),
-            "moving_fraction": self.moving_fraction,
-            "pose_agreement": {
-                name: None if report.agreement is None else round(report.agreement, 4)
-                for name, report in self.poses.items()
-            },
-        }
-
 
 def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanReport:
     """Look for what makes a scan useless, or worth less than it seems.
@@ -381,7 +362,8 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
             raise PoseConventionError(message)
     found = [_no_depth(camera, config) for camera in blind] + moved
     found += [f"{name}: {report.remark()}" for name, report in poses.items() if report.remark()]
-    if any(_is_unexplained(camera, poses) for camera in usable):
+    moving = [poses[item.name] for item in usable if not item.choice.stationary]
+    if any(report.better is None and not report.fits for report in moving):
         found.append(
             "poses that are off by centimetres: --poses odometry follows the images instead"
         )
@@ -396,18 +378,6 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
             "longer"
         )
     return ScanReport(poses=poses, found=tuple(found))
-
-
-def _is_unexplained(camera: CameraCheck, poses: Mapping[str, PoseReport]) -> bool:
-    """Whether the poses of a moving camera fit its depth under no convention."""
-    report = poses.get(camera.name)
-    return (
-        not camera.choice.stationary
-        and report is not None
-        and report.agreement is not None
-        and report.better is None
-        and not report.fits
-    )
 
 
 def _pose_reports(usable: Sequence[CameraCheck]) -> dict[str, PoseReport]:

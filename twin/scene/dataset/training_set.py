@@ -22,7 +22,7 @@ from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, NoFramesError, load
 from twin.scene.objects.placement import NO_OBJECTS, Placements
-from twin.scene.robot.extraction import MAX_POSTURES, FoundRobot, find_robot, look_closer
+from twin.scene.robot.extraction import MAX_POSTURES, FoundRobot, find_robot
 from twin.scene.settings import RebuildConfig
 
 MAX_POINTS = 3_000_000
@@ -92,7 +92,8 @@ def read_training_set(
     report = check_geometry(read.cameras, report, config.frames)
     report = replace(report, found=(*report.found, *_colour_remarks(read)))
     stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
-    look_closer(robot, choices, limits_of(config), stride)
+    for choice in choices:
+        robot.frames.look_closer(choice, limits_of(config), stride)
     ego_masks = _set_ego_pixels_aside(choices, read, robot)
     shares = {read.cameras[index].name: float(mask.mean()) for index, mask in ego_masks.items()}
     points, views, choice_of_view = read.points, read.views, read.choice_of_view

@@ -53,15 +53,14 @@ class ImageObservation:
 
     target: Target
     T_base_camera: Float[np.ndarray, "4 4"]
-    exposure: Float[np.ndarray, "3 4"]
-    """Times the scene's (red, green, blue, 1) gives the recorded colour: a factor per channel."""
+    gain: Float[np.ndarray, "3"]
+    """Times the scene's colour gives the recorded one: a factor per channel."""
 
     def exposed(
         self, drawn: Float32[np.ndarray, "3 height width"]
     ) -> Float32[np.ndarray, "3 height width"]:
         """Drawn colours as this image would show them, not clipped."""
-        E = self.exposure.astype(np.float32)
-        return np.tensordot(E[:, :3], drawn, axes=1) + E[:, 3, None, None]
+        return drawn * self.gain.astype(np.float32)[:, None, None]
 
 
 def solve_appearance(
@@ -180,16 +179,14 @@ class _ImageModel:
         for item in self._observations:
             if self._allowance.is_over():
                 return None
-            M = item.exposure[:, :3]
             mask = item.target.static_mask
             basis = self._basis(item)
             planes = self._draw(start, item)
             missing = (item.target.image() - item.exposed(planes[:3])) * mask
-            pulled = np.tensordot(M.T.astype(np.float32), missing, axes=1)
-            maps = np.concatenate([pulled, (planes[4] * mask)[None]])
+            maps = np.concatenate([item.exposed(missing), (planes[4] * mask)[None]])
             lifted = self._rasteriser.lift(maps)
             right += basis[:, :, None] * lifted[:, None, :3]
-            squared = np.square(M).sum(axis=0).astype(np.float32) * lifted[:, 3:]
+            squared = np.square(item.gain).astype(np.float32) * lifted[:, 3:]
             diagonal += np.square(basis)[:, :, None] * squared[:, None, :]
         return right, diagonal
 
@@ -204,8 +201,8 @@ class _ImageModel:
 
     def _lifted(self, x: np.ndarray, item: ImageObservation) -> np.ndarray:
         """A change of colours carried into one image and back."""
-        M = item.exposure[:, :3]
-        drawn = np.tensordot((M.T @ M).astype(np.float32), self._draw(x, item)[:3], axes=1)
+        squared = np.square(item.gain).astype(np.float32)[:, None, None]
+        drawn = squared * self._draw(x, item)[:3]
         lifted = self._rasteriser.lift(drawn * item.target.static_mask)
         return np.asarray(self._basis(item)[:, :, None] * lifted[:, None, :])
 
@@ -221,3 +218,42 @@ class _ImageModel:
     def _draw(self, x: np.ndarray, item: ImageObservation) -> np.ndarray:
         cloud = replace(self._cloud, colors=as_float32(x[:, 0]), harmonics=as_float32(x[:, 1:]))
         return self._rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
+
+
+SATURATED = 250 / 255
+"""A channel brighter than this no longer follows the exposure."""
+GAIN_PRIOR = 1e-3
+"""Pull of a gain towards 1, as a mean squared brightness: decides only black images."""
+
+
+def solve_gains(
+    cloud: GaussianCloud,
+    observations: Sequence[ImageObservation],
+    rasteriser: Rasteriser,
+    allowance: Allowance = UNLIMITED,
+) -> Float[np.ndarray, "num_views 3"]:
+    """How each image's colours come from the drawn ones; on average they do not change.
+
+    All images twice as bright and all colours half as bright would look the same: the mean over the
+    images is held at no change. Least squares over static pixels that are not saturated. Images
+    that there is no time for keep the gains they have.
+    """
+    gains = np.array([item.gain for item in observations], dtype=np.float64)
+    for index, item in enumerate(observations):
+        if allowance.is_over():
+            break
+        planes = rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
+        gains[index] = gain_between(planes[:3], item.target)
+    return np.asarray(gains / gains.mean(axis=0))
+
+
+def gain_between(
+    drawn: Float32[np.ndarray, "3 height width"], target: Target
+) -> Float[np.ndarray, "3"]:
+    """The factor per channel that brings a drawn image closest to the recorded one."""
+    wanted = target.image()
+    usable = target.static_mask & (wanted < SATURATED).all(axis=0)
+    recorded, own = wanted[:, usable].astype(np.float64), drawn[:, usable].astype(np.float64)
+    prior = GAIN_PRIOR * max(int(usable.sum()), 1)
+    both = (recorded * own).sum(axis=1) + prior
+    return np.asarray(both / (np.square(own).sum(axis=1) + prior))

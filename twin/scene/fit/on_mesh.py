@@ -1,12 +1,13 @@
 """Gaussians set evenly on triangles: closed surfaces for links and objects."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry.mesh import sample_triangles
+from twin.robot.surface import ray_scene, tensor
+from twin.scene.shape.mesh import Mesh, face_normals
 
 PER_CELL = 12
 """Samples for each that is kept: nearly every cell of the surface then has one."""
@@ -16,17 +17,15 @@ FROM_EDGE = 0.95
 """How far from an edge Gaussians end, in their spacing: half of the light passes at the edge."""
 DIRECTIONS, ROUNDS = 8, 3
 """In which it is looked how far a Gaussian reaches beyond the surface, and how often."""
-Triangles = tuple[np.ndarray, np.ndarray]
-"""Vertices [m] and triangles, counter-clockwise seen from outside."""
 
 
-def surface_area_m2(meshes: Sequence[Triangles]) -> float:
+def surface_area_m2(meshes: Sequence[Mesh]) -> float:
     """Area of all triangles."""
-    return float(sum(_areas(*mesh).sum() for mesh in meshes))
+    return float(sum(face_normals(*mesh)[1].sum() for mesh in meshes))
 
 
 def even_points(
-    meshes: Sequence[Triangles], spacing_m: float
+    meshes: Sequence[Mesh], spacing_m: float
 ) -> tuple[Float[np.ndarray, "num_points 3"], Float[np.ndarray, "num_points 3"]]:
     """One point in each cell of the surface, with its outward normal; the same ones each time.
 
@@ -35,13 +34,12 @@ def even_points(
     rng = np.random.default_rng(0)
     points, normals = [], []
     for vertices_m, triangles in meshes:
-        areas = _areas(vertices_m, triangles)
+        unit, areas = face_normals(vertices_m, triangles)
         count = max(int(PER_CELL * areas.sum() / spacing_m**2), 1)
         chosen, u, v = sample_triangles(areas, count, rng)
         a, b, c = (vertices_m[triangles[chosen, k]] for k in range(3))
         points.append(a + u * (b - a) + v * (c - a))
-        normal = np.cross(b - a, c - a)
-        normals.append(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
+        normals.append(unit[chosen])
     p, n = np.concatenate(points), np.concatenate(normals)
     place = (p - p.min(axis=0)) / spacing_m
     cells = np.floor(place).astype(np.int64)
@@ -59,7 +57,7 @@ def even_points(
 def within_edges(
     p: Float[np.ndarray, "num_points 3"],
     normals: Float[np.ndarray, "num_points 3"],
-    meshes: Sequence[Triangles],
+    meshes: Sequence[Mesh],
     spacing_m: float,
 ) -> Float[np.ndarray, "num_points 3"]:
     """Points of a surface, moved inwards along it where their Gaussians would reach beyond an edge.
@@ -67,15 +65,7 @@ def within_edges(
     A flat Gaussian is round and knows nothing of edges: without this, boxes and fingers come out
     wider than they are, with a fringe.
     """
-    import open3d  # noqa: PLC0415  # loads 300 modules; who only fuses points needs none
-
-    make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
-    tensor: Any = open3d.core.Tensor
-    scene, reach_m = make(), FROM_EDGE * spacing_m
-    for vertices_m, triangles in meshes:
-        scene.add_triangles(
-            tensor(vertices_m.astype(np.float32)), tensor(triangles.astype(np.uint32))
-        )
+    scene, reach_m = ray_scene(meshes), FROM_EDGE * spacing_m
     aside = np.eye(3)[np.abs(normals).argmin(axis=1)]
     x = np.cross(aside, normals)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -89,8 +79,3 @@ def within_edges(
         farthest = beyond_m.argmax(axis=1)
         moved -= beyond_m[every, farthest, None] * around[every, farthest]
     return moved
-
-
-def _areas(vertices_m: np.ndarray, triangles: np.ndarray) -> Float[np.ndarray, " num_triangles"]:
-    a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
-    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)

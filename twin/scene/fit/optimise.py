@@ -13,20 +13,31 @@ surface that it began on.
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 
 from bridge.geometry import se3
 from bridge.terminal import Advance
-from twin.scene.fit.appearance import Allowance, ImageObservation, solve_appearance
-from twin.scene.fit.densify import densify, score
-from twin.scene.fit.exposure import solve_exposures
+from twin.scene.fit.appearance import (
+    UNLIMITED,
+    Allowance,
+    ImageObservation,
+    solve_appearance,
+    solve_gains,
+)
 from twin.scene.frames.rgbd import TrainingView
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32, with_harmonics
+from twin.scene.gaussians import (
+    GaussianCloud,
+    arrays,
+    as_float32,
+    concatenate,
+    morton_order,
+    with_harmonics,
+)
 from twin.scene.raster.rasteriser import (
     SAME_EXPOSURE,
     FitSession,
@@ -104,19 +115,131 @@ class FitState:
     """The cloud, the moments of Adam and the number of images seen."""
     size_m: float
     """Median size of the first Gaussians; positions move in units of it."""
-    exposures: Float[np.ndarray, "num_views 3 4"]
+    gains: Float[np.ndarray, "num_views 3"]
     surface: SurfacePrior
     """Where the Gaussians began."""
     last: RunningSum = field(default_factory=RunningSum)
     """Of the Gaussians from ``MEAN_FROM`` on."""
     seconds: float = 0.0
     """Time spent so far."""
-    coarse_steps: int = 0
     events_done: int = 0
     """How much of the schedule of colour solutions and splits is behind."""
     colour_steps: int = 0
     errors: list[float] = field(default_factory=list)
     """Mean squared errors of the last images."""
+
+
+MAX_SCORED_VIEWS = 20
+"""Views that errors are gathered from; more only cost time."""
+TRANSPARENT = 0.03
+"""Gaussians with less opacity go."""
+UNSEEN_PIXELS = 0.05
+"""Gaussians that make up less than this many pixels of all views together go."""
+HUGE_FRACTION = 0.15
+"""Gaussians whose deviation exceeds this share of an image's width go: fog before the camera."""
+FINEST_PX = 0.4
+"""Gaussians smaller than this in every view are not split: pixels cannot tell the halves."""
+SPLIT_SHRINK = 0.62
+"""Standard deviation of a half along the split, in that of the whole."""
+SPLIT_SHIFT = 0.78
+"""Distance of a half from the middle; with the shrink, s^2 + d^2 = 1: the variance stays."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """What the views say about each Gaussian."""
+
+    error: Float32[np.ndarray, " num_splats"]
+    """Sum over views and pixels of weight times colour error."""
+    pixels: Float32[np.ndarray, " num_splats"]
+    """Sum of weights: how many pixels it makes up in all views."""
+    size_fraction: Float32[np.ndarray, " num_splats"]
+    """Largest standard deviation in any image, in image widths."""
+    size_px: Float32[np.ndarray, " num_splats"]
+    """The same in pixels."""
+    complete: bool = True
+    """Whether all views that were chosen could be asked in time; else not seen says nothing."""
+
+
+def score(
+    cloud: GaussianCloud,
+    observations: Sequence[ImageObservation],
+    rasteriser: Rasteriser,
+    allowance: Allowance = UNLIMITED,
+) -> Scores:
+    """Draw the views, evenly chosen where there are many, and lift their errors.
+
+    A^T |error| is a sum over views that needs no extra passes and leaves nothing to chance
+    (error-based densification, Rota Bulo et al. 2024, Revising Densification). Views that there is
+    no time for are left out.
+    """
+    step = -(-len(observations) // MAX_SCORED_VIEWS)
+    error, pixels, size_px, fraction = (np.zeros(len(cloud), np.float32) for _ in range(4))
+    largest_m = np.exp(cloud.scales_log.max(axis=1))
+    complete = True
+    for item in observations[::step]:
+        if allowance.is_over():
+            complete = False
+            break
+        camera, mask = item.target.camera, item.target.static_mask
+        planes = rasteriser.draw_planes(cloud, camera, item.T_base_camera)
+        wrong = np.abs(item.exposed(planes[:3]) - item.target.image()).mean(axis=0) * mask
+        lifted = rasteriser.lift(np.stack([wrong, mask.astype(np.float32)]))
+        error += lifted[:, 0]
+        pixels += lifted[:, 1]
+        seen = rasteriser.visible_mask() & (lifted[:, 1] > 0)
+        depth_m = (cloud.means_m - item.T_base_camera[:3, 3]) @ item.T_base_camera[:3, 2]
+        px = np.where(seen, largest_m * camera.fx / np.maximum(depth_m, 0.05), 0.0)
+        np.maximum(size_px, px.astype(np.float32), out=size_px)
+        np.maximum(fraction, (px / camera.width).astype(np.float32), out=fraction)
+    return Scores(
+        error=error, pixels=pixels, size_px=size_px, size_fraction=fraction, complete=complete
+    )
+
+
+def densify(
+    cloud: GaussianCloud, scores: Scores, *, max_splats: int, most: int
+) -> tuple[GaussianCloud, Int64[np.ndarray, " num_splats"]]:
+    """Drop what shows nothing or hides everything, and split where the error is large.
+
+    Returns:
+        The rearranged cloud, and which Gaussian of the one before each comes from.
+    """
+    kept: Bool[np.ndarray, " num_splats"] = cloud.opacities() > TRANSPARENT
+    if scores.complete:
+        kept &= scores.pixels > UNSEEN_PIXELS
+    kept &= scores.size_fraction < HUGE_FRACTION
+    if not kept.any():  # nothing is seen at all: images that are masked everywhere
+        kept[:] = True
+    free = max(min(max_splats - int(kept.sum()), most), 0)
+    wanting = np.flatnonzero(kept & (scores.size_px > FINEST_PX) & (scores.error > 0))
+    worst = wanting[np.argsort(-scores.error[wanting], kind="stable")[:free]]
+    whole = kept.copy()
+    whole[worst] = False
+    ids = np.concatenate([np.flatnonzero(whole), worst, worst])
+    halves = _halves(cloud.take(worst))
+    everything = concatenate([cloud.take(whole), *halves])
+    order = morton_order(everything.means_m)
+    return everything.take(order), ids[order]
+
+
+def _halves(cloud: GaussianCloud) -> list[GaussianCloud]:
+    """Each Gaussian as two beside one another along its longest axis."""
+    axis = cloud.scales_log.argmax(axis=1)
+    row = np.arange(len(cloud))
+    R = se3.rotation_from_quaternion(cloud.quats_wxyz.astype(np.float64))
+    length_m = np.exp(cloud.scales_log[row, axis]).astype(np.float64)
+    shift_m = SPLIT_SHIFT * length_m[:, None] * R[row, :, axis]
+    scales_log = cloud.scales_log.copy()
+    scales_log[row, axis] += np.float32(np.log(SPLIT_SHRINK))
+    return [
+        replace(
+            cloud,
+            means_m=as_float32(cloud.means_m + sign * shift_m),
+            scales_log=scales_log.copy(),
+        )
+        for sign in (-1.0, 1.0)
+    ]
 
 
 COARSE = 0.6
@@ -158,13 +281,8 @@ class Progress:
         return Allowance(clock=self.clock, until_s=min(now_s + share * budget_s, self.end_s))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Event:
-    """One entry of the schedule."""
-
-    at: float
-    share: float
-    act: Callable[[FitState, bool, Allowance], None]
+Act = Callable[[FitState, bool, Allowance], None]
+"""What is done at one time of the schedule."""
 
 
 class Events:
@@ -177,24 +295,23 @@ class Events:
         self._rasteriser = rasteriser
 
     @cached_property
-    def _schedule(self) -> list[Event]:
+    def _schedule(self) -> list[tuple[float, float, Act]]:
+        """When, in which share of the budget at most, and what."""
         planned = (
             (SPLIT_AT, SPLIT_SHARE, self._densify),
             (EXPOSURES_AT, EXPOSURES_SHARE, self._solve_exposures),
             (SOLVE_AT, SOLVE_SHARE, self._solve_colours),
         )
-        events = [Event(at=at, share=share, act=act) for ats, share, act in planned for at in ats]
-        return sorted(events, key=lambda event: event.at)
+        events = [(at, share, act) for ats, share, act in planned for at in ats]
+        return sorted(events, key=lambda event: event[0])
 
     def keep(self, state: FitState, at: Progress) -> None:
         """Do what is due; what is already behind is not done again."""
         coarse = at.fraction < COARSE
-        while (
-            state.events_done < len(self._schedule)
-            and self._schedule[state.events_done].at <= at.fraction
-        ):
-            due = self._schedule[state.events_done]
-            due.act(state, coarse, at.allowance(due.share))
+        for due, share, act in self._schedule[state.events_done :]:
+            if due > at.fraction:
+                break
+            act(state, coarse, at.allowance(share))
             state.events_done += 1
 
     def _observations(self, state: FitState, coarse: bool) -> list[ImageObservation]:
@@ -202,7 +319,7 @@ class Events:
             ImageObservation(
                 target=view.half if coarse else view.full,
                 T_base_camera=view.T_base_color,
-                exposure=state.exposures[index],
+                gain=state.gains[index],
             )
             for index, view in enumerate(self._views)
         ]
@@ -210,7 +327,7 @@ class Events:
     def _solve_exposures(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         seen = self._observations(state, coarse)
         cloud = state.session.cloud
-        state.exposures = solve_exposures(cloud, seen, self._rasteriser, allowance)
+        state.gains = solve_gains(cloud, seen, self._rasteriser, allowance)
 
     def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         self._solve_exposures(state, coarse, allowance)
@@ -230,7 +347,7 @@ class Events:
     def _densify(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         cloud = state.session.cloud
         scores = score(cloud, self._observations(state, coarse), self._rasteriser, allowance)
-        left = sum(event.act == self._densify for event in self._schedule[state.events_done :])
+        left = sum(act == self._densify for _, _, act in self._schedule[state.events_done :])
         left_over = max(self._max_splats - len(cloud), 0)
         most = -(-left_over // left)
         cloud, parents = densify(cloud, scores, max_splats=self._max_splats, most=most)
@@ -245,11 +362,6 @@ def keep_colors_in_range(cloud: GaussianCloud) -> None:
     elsewhere. What depends on the direction may go beyond: it is small where few views show it.
     """
     np.clip(cloud.colors, 0.0, 1.0, out=cloud.colors)
-
-
-def order_of_views(seed: int, epoch: int, num_views: int) -> np.ndarray:
-    """The order in which one pass shows the views; the same whenever it is asked for."""
-    return np.random.default_rng([seed, epoch]).permutation(num_views)
 
 
 RATES = {
@@ -281,17 +393,14 @@ class FitResult:
     iterations: int
     iterations_asked: int | None
     """None: as many as the time allowed."""
-    coarse_iterations: int
     seconds: float
     """Wall time, initialisation included."""
-    cpu_seconds: float
-    """Of this process."""
     train_psnr_db: float | None
     """Over the static pixels of the last images seen, at the size they were fitted at; None when
     there were none."""
-    exposures: Float[np.ndarray, "num_views 3 4"]
-    """How the colours (red, green, blue, 1) of the scene came out in each training image; on
-    average they did not change."""
+    gains: Float[np.ndarray, "num_views 3"]
+    """How the colours of the scene came out in each training image; on average they did not
+    change."""
     colour_steps: int
     """Conjugate gradient steps that solved colours; 0 when there was no time for them."""
 
@@ -328,11 +437,10 @@ def fit(
     state = FitState(
         session=session,
         size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
-        exposures=np.tile(SAME_EXPOSURE, (len(views), 1, 1)),
+        gains=np.ones((len(views), 3)),
         surface=SurfacePrior.of(session.cloud),
         seconds=min(spent_s, SPENT_AT_MOST * config.limit_s),
     )
-    cpu_start = time.process_time()
     for at in _steps(config, state, clock):
         events.keep(state, at)
         learner.step(state, at)
@@ -343,11 +451,9 @@ def fit(
         cloud=state.session.cloud,
         iterations=state.session.steps,
         iterations_asked=config.iterations or None,
-        coarse_iterations=state.coarse_steps,
         seconds=state.seconds,
-        cpu_seconds=time.process_time() - cpu_start,
         train_psnr_db=_recent_psnr_db(state, len(views)),
-        exposures=state.exposures,
+        gains=state.gains,
         colour_steps=state.colour_steps,
     )
 
@@ -389,15 +495,16 @@ class _Learner:
     def step(self, state: FitState, at: Progress) -> None:
         """Draw one image and follow its gradient."""
         epoch, place = divmod(state.session.steps, len(self._views))
-        index = int(order_of_views(self._config.seed, epoch, len(self._views))[place])
+        order = np.random.default_rng([self._config.seed, epoch]).permutation(len(self._views))
+        index = int(order[place])
         coarse = at.fraction < COARSE
-        state.coarse_steps += coarse
         view = self._views[index]
         decay = DECAY**at.fraction
         rates = {name: rate * decay for name, rate in RATES.items()}
         rates["means_m"] *= state.size_m
+        exposure = state.gains[index][:, None] * SAME_EXPOSURE
         report = state.session.step(
-            view.half if coarse else view.full, view.T_base_color, rates, state.exposures[index]
+            view.half if coarse else view.full, view.T_base_color, rates, exposure
         )
         keep_colors_in_range(state.session.cloud)
         if state.session.steps % HOLD_EVERY == 0:

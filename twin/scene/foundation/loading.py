@@ -17,7 +17,9 @@ from jaxtyping import UInt8
 
 from bridge.episode import provenance
 from bridge.errors import MissingDependencyError, UsageError
+from twin.scene.raster.backend import import_torch
 
+PURPOSE = "a foundation model"
 MAX_JSON_BYTES = 64_000_000
 MAX_PROMPT_CHARACTERS = 200
 SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
@@ -151,25 +153,14 @@ def _package(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        purpose = "a foundation model"
-        raise MissingDependencyError(package=name, extra="foundation", purpose=purpose) from error
-
-
-def import_torch() -> Any:
-    """Import torch."""
-    try:
-        import torch  # noqa: PLC0415  # only the extra [twin] brings it
-    except ImportError as error:
-        purpose = "a foundation model"
-        raise MissingDependencyError(package="torch", extra="twin", purpose=purpose) from error
-    return torch
+        raise MissingDependencyError(package=name, extra="foundation", purpose=PURPOSE) from error
 
 
 def import_transformers() -> Any:
     """Import transformers, with its way to the network closed."""
     os.environ.setdefault("HF_HUB_OFFLINE", "1")  # read once, when the library is imported
     os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
-    import_torch()
+    import_torch(PURPOSE)
     _package("safetensors")
     transformers = _package("transformers")
     transformers.utils.logging.disable_progress_bar()
@@ -178,7 +169,7 @@ def import_transformers() -> Any:
 
 def device_of(wanted: str) -> Any:
     """Torch's device; ``auto`` is the first CUDA device, or the CPU where there is none."""
-    torch = import_torch()
+    torch = import_torch(PURPOSE)
     if wanted == "auto":
         wanted = "cuda" if torch.cuda.is_available() else "cpu"
     try:

@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float32, UInt8
 
 from bridge.errors import UsageError
 from twin.naming.things import Mask
-from twin.scene.foundation.loading import Network, WeightsKind, import_torch
+from twin.scene.foundation.loading import Network, WeightsKind
+from twin.scene.raster.backend import import_torch
 
 MAX_PROMPTS = 64
 MARGIN_FRACTION = 0.1

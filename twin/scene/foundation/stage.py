@@ -189,21 +189,21 @@ def write_scene_semantics(
     threads: int,
     output: Output,
     *,
-    fused: GaussianCloud | None = None,
-    models: ModelConfig | None = None,
-    choices: Sequence[FrameChoice] = (),
-    task: Task | None = None,
+    fused: GaussianCloud | None,
+    models: ModelConfig,
+    choices: Sequence[FrameChoice],
+    task: Task | None,
 ) -> dict[str, Any]:
     """Say what is what in a decomposed scene, and write it into the scene's folder.
 
     Args:
         fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
-        models: Large models to ask beside the default segmenter; None: none.
+        models: Large models to ask beside the default segmenter.
 
     Returns:
         What ``scene.json`` says about it.
     """
-    models, objects = models or ModelConfig(), decomposed.objects
+    objects = decomposed.objects
     placed = {key: moved_cloud(item.cloud, item.T_base_object) for key, item in objects.items()}
     rasteriser = Rasteriser(RasterConfig(threads=threads))
     num = len(decomposed.background) + sum(len(part) for part in placed.values())

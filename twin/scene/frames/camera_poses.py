@@ -6,9 +6,9 @@ clock than ``/tf`` all get the first pose, or all the last. Such instants are ma
 root of all frames is the robot's base, wherever ``/tf`` says where it is.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -175,8 +175,6 @@ class CameraPoses:
     """Images whose pose is not known."""
     depth_scale: float = 1.0
     """True depth divided by measured depth, where a calibration knows it."""
-    quality: Mapping[str, Any] = field(default_factory=dict)
-    """What the odometry says of itself."""
 
 
 def find_poses(
@@ -200,10 +198,10 @@ def find_poses(
         LostError: When the odometry cannot follow the camera.
     """
     mount = None if calibration is None else calibration.cameras.get(camera_id)
-    if config.poses == "auto" and calibration is not None and mount is not None:
+    if config.poses == "auto" and mount is not None:
         poses = calibrated_poses(episode, camera_id, mount, stamps_ns)
         _say_unposed(poses, episode, camera_id, stamps_ns, output)
-        return replace(poses, quality={"calibration_id": calibration.calibration_id})
+        return poses
     tree = base_tree(episode)
     if config.poses == "tf" or (config.poses == "auto" and places_camera(tree, episode, camera_id)):
         check_connected(tree, episode, camera_id)
@@ -227,7 +225,6 @@ def find_poses(
         tree=_tree_of(path, bare, episode, camera_id),
         source="odometry",
         unposed_ns=lost,
-        quality=path.quality,
     )
 
 

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import MissingDependencyError
 from bridge.geometry import se3
-from bridge.geometry.camera import Camera
 from bridge.terminal import Advance
 from twin.scene.frames.downscaled import DownscaledDepth, colors_in_depth, downscaled_depth, meet
 from twin.scene.frames.pairing import UnusableCameraError
@@ -98,10 +97,13 @@ class Aligner:
 
     def lay(self, source: Look, target: Look, T_guess: Float[np.ndarray, "4 4"]) -> Step | None:
         """Lay one frame onto another, from a guess; None when they then disagree."""
+        camera = source.small.camera
         success, T, information = self.open3d.pipelines.odometry.compute_rgbd_odometry(
             source.image,
             target.image,
-            self._pinhole(source.small.camera),
+            self.open3d.camera.PinholeCameraIntrinsic(
+                camera.width, camera.height, *camera.to_ros()
+            ),
             T_guess,
             self._term,
             self._option,
@@ -116,12 +118,6 @@ class Aligner:
             return None
         score = met.agreement * met.likeness
         return Step(T_target_source=T, information=np.array(information), score=score)
-
-    def _pinhole(self, camera: Camera) -> Any:
-        fx, fy, cx, cy = camera.to_ros()
-        return self.open3d.camera.PinholeCameraIntrinsic(
-            camera.width, camera.height, fx, fy, cx, cy
-        )
 
 
 SURE = 0.9
@@ -181,7 +177,9 @@ class _Follower:
             before = np.eye(4) if self._last is None else self._last[1].T_target_source
             self._motion = se3.invert(before) @ step.T_target_source
             self._last = (look, step)
-            if self._is_far(step.T_target_source):
+            turn = float(se3.rotation_angle_rad(step.T_target_source[:3, :3]))
+            shift = float(np.linalg.norm(step.T_target_source[:3, 3]))
+            if turn > KEY_TURN_RAD or shift > KEY_SHIFT_M:
                 self._promote()
 
     def _begin(self, look: Look) -> None:
@@ -220,11 +218,6 @@ class _Follower:
         self.keys.append(Keyframe(look=look, T_first_key=T_first_key, from_previous=step))
         self.places[look.small.stamp_ns] = (len(self.keys) - 1, np.eye(4))
         self._last = None
-
-    def _is_far(self, T_key_frame: np.ndarray) -> bool:
-        turn = float(se3.rotation_angle_rad(T_key_frame[:3, :3]))
-        shift = float(np.linalg.norm(T_key_frame[:3, 3]))
-        return turn > KEY_TURN_RAD or shift > KEY_SHIFT_M
 
 
 def follow_camera(

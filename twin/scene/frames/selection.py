@@ -24,11 +24,9 @@ from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.errors import TwinError
 from twin.scene.frames.camera_poses import (
-    STATIONARY_M,
-    STATIONARY_RAD,
     CameraPoses,
     find_poses,
-    same_pose,
+    never_moves,
 )
 from twin.scene.frames.pairing import (
     UnusableCameraError,
@@ -96,7 +94,10 @@ def path_length_m(
     """How far the camera has come, turns included; grows a little even while it stands still."""
     if len(Ts_base_camera) < 2:
         return np.zeros(len(Ts_base_camera))
-    steps = _steps_m(Ts_base_camera[:-1], Ts_base_camera[1:])
+    before, after = Ts_base_camera[:-1], Ts_base_camera[1:]
+    turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    steps = shift + TURN_M_PER_RAD * turn
     return np.concatenate([[0.0], np.cumsum(steps + max(1e-6, 1e-3 * float(steps.mean())))])
 
 
@@ -150,12 +151,6 @@ def sharpness(image_u8: UInt8[np.ndarray, "height width 3"]) -> float:
     return float(laplacian.var()) if laplacian.size else 0.0
 
 
-def _steps_m(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
-    shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
-    return np.asarray(shift + TURN_M_PER_RAD * turn)
-
-
 def _stretches(path_m: np.ndarray, count: int) -> np.ndarray:
     """Number the stretch of each frame, so that at most ``count`` stretches hold any."""
     total = max(float(path_m[-1]), 1e-12)
@@ -179,8 +174,7 @@ def _shortlist(members: np.ndarray, smear_px: np.ndarray) -> Sequence[int]:
 
 def _around(values: np.ndarray) -> np.ndarray:
     """Median of each value and its two neighbours to each side."""
-    padded = np.pad(values, 2, mode="edge")
-    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
+    return np.asarray(ndimage.median_filter(values, 5, mode="nearest"))
 
 
 STATIONARY_TRAIN_FRAMES = 4
@@ -363,7 +357,11 @@ def _choose(
         episode, camera_id, stamps, frozenset(held.tolist()), config, output, calibration
     )
     unposed = np.array(sorted(poses.unposed_ns), dtype=np.int64)
-    stationary = _is_stationary(episode, camera_id, poses, np.setdiff1d(stamps, unposed))
+    posed, frame_id = (
+        np.setdiff1d(stamps, unposed),
+        streams.camera_info(episode, camera_id).frame_id,
+    )
+    stationary = len(posed) > 1 and never_moves(poses.tree, frame_id, posed)
     train_count, holdout_count = config.max_train_frames, config.max_holdout_frames
     if stationary:
         train_count = min(train_count, STATIONARY_TRAIN_FRAMES)
@@ -417,17 +415,6 @@ def spread(values: np.ndarray, count: int) -> np.ndarray:
     if len(values) <= count:
         return values
     return np.asarray(values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))])
-
-
-def _is_stationary(
-    episode: Episode, camera_id: str, poses: CameraPoses, stamps: Int[np.ndarray, " num_frames"]
-) -> bool:
-    frame_id = streams.camera_info(episode, camera_id).frame_id
-    Ts = poses.tree.Ts_root_frame(frame_id, spread(stamps, 40))
-    stationary = all(
-        same_pose(Ts[0], T, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD) for T in Ts
-    )
-    return stationary and len(stamps) > 1
 
 
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:

@@ -75,14 +75,16 @@ def localise_episode(
     """
     if after_ns is None and before_ns is None:
         before_ns = first_execution_ns(episode)
-    if after_ns is None and before_ns is None:
-        frames = stationary_frames(
-            episode, MAX_VIEWS, evenly=True, held_out_ns=held_out_ns, poses=poses
-        )
-    else:
-        frames = stationary_frames(
-            episode, MAX_FRAMES, after_ns, before_ns, held_out_ns=held_out_ns, poses=poses
-        )
+    evenly = after_ns is None and before_ns is None
+    frames = stationary_frames(
+        episode,
+        MAX_VIEWS if evenly else MAX_FRAMES,
+        after_ns,
+        before_ns,
+        evenly=evenly,
+        held_out_ns=held_out_ns,
+        poses=poses,
+    )
     return localise_objects(frames, task, last_seen_m, surfaces)
 
 

@@ -37,7 +37,7 @@ from twin.scene.localise.shape_fit import (
 )
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.known import pose_of
-from twin.scene.shape.mesh import read_mesh
+from twin.scene.shape.mesh import face_normals, read_mesh
 from twin.scene.store.folder import UnreadableSceneError, read_record
 from twin.scene.store.library import Library
 
@@ -66,12 +66,10 @@ def mesh_surface(
         triangles: Counter-clockwise seen from outside.
     """
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    double_area = np.linalg.norm(cross, axis=1)
-    rng = np.random.default_rng(0)
-    chosen, u, v = sample_triangles(double_area, num_samples, rng, in_order=True)
+    normals, areas = face_normals(vertices_m, triangles)
+    chosen, u, v = sample_triangles(areas, num_samples, np.random.default_rng(0), in_order=True)
     p = a[chosen] * (1 - u - v) + b[chosen] * u + c[chosen] * v
-    return MeshSurface(p_m=p, normals=cross[chosen] / double_area[chosen, None])
+    return MeshSurface(p_m=p, normals=normals[chosen])
 
 
 @cache

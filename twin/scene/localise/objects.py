@@ -26,7 +26,6 @@ from twin.scene.localise.points import (
     MIN_LIKENESS,
     MIN_POINTS,
     CameraView,
-    Cluster,
     fuse_stationary,
     likeness,
     moved,
@@ -38,7 +37,7 @@ from twin.scene.localise.result import (
     found_by_fit,
     missing,
 )
-from twin.scene.localise.shape_fit import MIN_EXPLAINED, UPRIGHT_SIGMA_RAD, fit_shape
+from twin.scene.localise.shape_fit import MIN_EXPLAINED, UPRIGHT_SIGMA_RAD, ShapeFit, fit_shape
 from twin.scene.localise.soft import LEAST_HEIGHT_M, SoftFit, fit_toys
 from twin.scene.shape.known import yaw_period_rad
 
@@ -65,22 +64,18 @@ def correct_for_table(views: Sequence[CameraView], task: Task) -> list[CameraVie
     """
     corrected = []
     for view in views:
-        p = _table_points(view, task)
+        wanted = np.abs(view.p_base[:, 2]) < BAND_M
+        step = max(1, int(wanted.sum()) // MAX_TABLE_POINTS)
+        ids = everything = np.flatnonzero(wanted)[::step]
+        for model in task.objects.values():
+            like = likeness(view.color_linear[ids], model.color_srgb)
+            ids = ids[like < MIN_LIKENESS / 2]
+        # A table of the objects' own colour: most points of the band are table all the same.
+        p = view.p_base[ids if len(ids) >= MIN_TABLE_POINTS else everything]
         is_seen = len(p) >= MIN_TABLE_POINTS
         fit = fit_table(p, view.T_base_depth[:3, 3]) if is_seen else (np.eye(4), 1.0)
         corrected.append(moved(view, *fit))
     return corrected
-
-
-def _table_points(view: CameraView, task: Task) -> Float[np.ndarray, "num_points 3"]:
-    wanted = np.abs(view.p_base[:, 2]) < BAND_M
-    step = max(1, int(wanted.sum()) // MAX_TABLE_POINTS)
-    ids = everything = np.flatnonzero(wanted)[::step]
-    for model in task.objects.values():
-        like = likeness(view.color_linear[ids], model.color_srgb)
-        ids = ids[like < MIN_LIKENESS / 2]
-    # A table of the objects' own colour: most points of the band are table all the same.
-    return view.p_base[ids if len(ids) >= MIN_TABLE_POINTS else everything]
 
 
 def fit_table(
@@ -225,47 +220,33 @@ def _localise_one(
         return missing(model, stamp_ns, reason, detail)
     if model.mesh is not None:
         scanned = known_surface(model)
-    if scanned is not None:
-        return _localise_mesh(groups[0], views, model, scanned, stamp_ns, detail)
-    if model.shape == SCANNED:
-        boxed = found_by_box(model, groups[0].p_base, stamp_ns, detail)  # no scan has shown it yet
-        if boxed.confidence >= MIN_EXPLAINED:
-            return boxed
-        reason = (
-            f"only {boxed.confidence:.0%} of {seen} points fit into the box of {model.id}, "
-            f"{MIN_EXPLAINED:.0%} are needed"
+    if scanned is None and model.shape == SCANNED:  # no scan has shown it yet
+        boxed = found_by_box(model, groups[0].p_base, stamp_ns, detail)
+        reason = _misfit(model, boxed.confidence, seen, "into the box")
+        return missing(model, stamp_ns, reason, detail) if reason else boxed
+    fit: ShapeFit
+    if scanned is None:
+        fit, onto = fit_shape(groups[0], views, model), "the shape"
+    else:
+        onto = "the mesh"
+        fit = fit_mesh(
+            groups[0],
+            views,
+            scanned,
+            tilt_sigma_rad=UPRIGHT_SIGMA_RAD,
+            yaw_period_rad=yaw_period_rad(model),
         )
-        return missing(model, stamp_ns, reason, detail)
-    fit = fit_shape(groups[0], views, model)
-    if fit.explained < MIN_EXPLAINED:
-        reason = (
-            f"only {fit.explained:.0%} of {seen} points fit the shape of {model.id}, "
-            f"{MIN_EXPLAINED:.0%} are needed"
-        )
+    reason = _misfit(model, fit.explained, seen, onto)
+    if reason:
         return missing(model, stamp_ns, reason, detail)
     return found_by_fit(model, fit, stamp_ns, detail)
 
 
-def _localise_mesh(
-    group: Cluster,
-    views: Sequence[CameraView],
-    model: ObjectModel,
-    surface: MeshSurface,
-    stamp_ns: int,
-    detail: dict[str, Any],
-) -> LocalisedObject:
-    """Lay the mesh of a rigid object that stands onto its points."""
-    fit = fit_mesh(
-        group,
-        views,
-        surface,
-        tilt_sigma_rad=UPRIGHT_SIGMA_RAD,
-        yaw_period_rad=yaw_period_rad(model),
+def _misfit(model: ObjectModel, explained: float, num_points: int, onto: str) -> str:
+    """Why points are not the object's; empty when they are."""
+    if explained >= MIN_EXPLAINED:
+        return ""
+    return (
+        f"only {explained:.0%} of {num_points} points fit {onto} of {model.id}, "
+        f"{MIN_EXPLAINED:.0%} are needed"
     )
-    if fit.explained < MIN_EXPLAINED:
-        reason = (
-            f"only {fit.explained:.0%} of {len(group)} points fit the mesh of {model.id}, "
-            f"{MIN_EXPLAINED:.0%} are needed"
-        )
-        return missing(model, stamp_ns, reason, detail)
-    return found_by_fit(model, fit, stamp_ns, detail)

@@ -4,7 +4,7 @@ Diffuse shading scales linear light by one factor, so the share of each channel 
 property of the surface alone. The likeness of a pixel is 1 on the object's colour, 0 on grey.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,7 +107,16 @@ def fuse_stationary(
     groups: list[list[RgbdFrame]] = []
     for frame in sorted(frames, key=lambda item: -item.stamp_ns):
         for group in groups:
-            if _same_pose(group[0], frame):
+            if (
+                frame.camera_id == group[0].camera_id
+                and frame.depth_m.shape == group[0].depth_m.shape
+                and same_pose(
+                    group[0].T_base_depth,
+                    frame.T_base_depth,
+                    distance_m=SAME_POSE_M,
+                    angle_rad=SAME_POSE_RAD,
+                )
+            ):
                 group.append(frame)
                 break
         else:
@@ -117,17 +126,6 @@ def fuse_stationary(
         if sum(view.camera_id == group[0].camera_id for view in views) < max_views:
             views.append(_view(group[:max_frames], task))
     return sorted(views, key=lambda view: (view.camera_id, view.stamp_ns))
-
-
-def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
-    if a.camera_id != b.camera_id or a.depth_m.shape != b.depth_m.shape:
-        return False
-    return same_pose(
-        a.T_base_depth,
-        b.T_base_depth,
-        distance_m=SAME_POSE_M,
-        angle_rad=SAME_POSE_RAD,
-    )
 
 
 def _view(frames: Sequence[RgbdFrame], task: Task) -> CameraView:
@@ -140,6 +138,10 @@ def _view(frames: Sequence[RgbdFrame], task: Task) -> CameraView:
     image = np.mean([linear_image(frame.image_u8) for frame in frames], axis=0)
     p_base = se3.apply(newest.T_base_depth, newest.depth_camera.unproject(depth)[depth > 0])
     p_base = p_base[_in_search_area(p_base, task)]
+    p_color = se3.apply(se3.invert(newest.T_base_color), p_base)
+    row, column, inside = pixels_of(newest.color_camera, p_color)
+    color_linear = np.zeros_like(p_base)
+    color_linear[inside] = image[row[inside], column[inside]]
     return CameraView(
         camera_id=newest.camera_id,
         stamp_ns=newest.stamp_ns,
@@ -151,21 +153,8 @@ def _view(frames: Sequence[RgbdFrame], task: Task) -> CameraView:
         T_base_color=newest.T_base_color,
         T_base_depth=newest.T_base_depth,
         p_base=p_base,
-        color_linear=_sample(image, newest.color_camera, newest.T_base_color, p_base),
+        color_linear=color_linear,
     )
-
-
-def _sample(
-    image: Float[np.ndarray, "height width 3"],
-    camera: Camera,
-    T_base_camera: Float[np.ndarray, "4 4"],
-    p_base: Float[np.ndarray, "num_points 3"],
-) -> Float[np.ndarray, "num_points 3"]:
-    """Nearest pixel's colour of each point; 0 outside the image."""
-    row, column, inside = pixels_of(camera, se3.apply(se3.invert(T_base_camera), p_base))
-    colors = np.zeros_like(p_base)
-    colors[inside] = image[row[inside], column[inside]]
-    return colors
 
 
 def moved(view: CameraView, T_new_old: Float[np.ndarray, "4 4"], depth_factor: float) -> CameraView:
@@ -217,19 +206,25 @@ class Cluster:
 
 
 def object_points(
-    views: Sequence[CameraView], model: ObjectModel, min_height_m: float = MIN_HEIGHT_M
+    views: Sequence[CameraView],
+    model: ObjectModel,
+    min_height_m: float = MIN_HEIGHT_M,
+    is_other: Callable[[np.ndarray], np.ndarray] = lambda p: np.zeros(len(p), dtype=bool),
 ) -> list[Cluster]:
-    """Clusters of voxel-averaged points of an object's colour, largest first."""
-    parts = []
+    """Clusters of voxel-averaged points of an object's colour, largest first.
+
+    Args:
+        is_other: Which points belong to something else, whatever their colour.
+    """
+    parts = [np.zeros((0, 3))]
     for view in views:
         p = view.p_base
         wanted = p[:, 2] > min_height_m
         p, color = p[wanted], view.color_linear[wanted]
         alike = likeness(color, model.color_srgb) >= MIN_LIKENESS
-        parts.append(voxel_mean(p[alike], VOXEL_M))
-    if not parts:
-        return []
-    view_ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        mean = voxel_mean(p[alike], VOXEL_M)
+        parts.append(mean[~is_other(mean)])
+    view_ids = np.repeat(np.arange(len(views)), [len(part) for part in parts[1:]])
     return clusters(np.concatenate(parts), view_ids, CLUSTER_GAP_M)
 
 

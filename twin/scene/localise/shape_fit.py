@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners
 from bridge.task.task_file import ObjectModel
 from twin.scene.frames.downscaled import pixels_of
 from twin.scene.least_squares import normal_equations, tukey_weights
@@ -44,10 +45,9 @@ class Outline:
 
 def corners(model: ObjectModel) -> Float[np.ndarray, "8 3"]:
     """Outer corners in the object frame [m]."""
-    half = np.array(model.size_m) / 2
-    centre = np.array([0.0, 0.0, 0.0 if model.origin_at_centre else half[2]])
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    return centre + signs * half
+    size = np.array(model.size_m)
+    lift_m = 0.0 if model.origin_at_centre else size[2] / 2
+    return np.asarray(box_corners(size) + np.array([0.0, 0.0, lift_m]))
 
 
 def find_outlines(
@@ -68,10 +68,12 @@ def find_outlines(
             continue
         uv, z = view.color_camera.project(p_camera)
         px_m = float(z.mean()) / view.color_camera.fx
-        window = _window(uv, view.image_linear.shape, window_m / px_m)
-        if window is None:
+        margin_px, (height, width) = window_m / px_m, view.image_linear.shape[:2]
+        low = np.maximum(np.floor(uv.min(axis=0) - margin_px).astype(int), 0)
+        high = np.minimum(np.ceil(uv.max(axis=0) + margin_px).astype(int), (width, height))
+        if np.any(high - low < 3):
             continue
-        rows, columns = window
+        rows, columns = slice(low[1], high[1]), slice(low[0], high[0])
         score = likeness(view.image_linear[rows, columns], model.color_srgb)
         edge, outward = _crossings(np.minimum(score, 1.0))
         edge = edge + np.array([columns.start, rows.start])
@@ -87,16 +89,6 @@ def find_outlines(
                 )
             )
     return outlines
-
-
-def _window(
-    uv: Float[np.ndarray, "8 2"], shape: tuple[int, ...], margin_px: float
-) -> tuple[slice, slice] | None:
-    low = np.maximum(np.floor(uv.min(axis=0) - margin_px).astype(int), 0)
-    high = np.minimum(np.ceil(uv.max(axis=0) + margin_px).astype(int), (shape[1], shape[0]))
-    if np.any(high - low < 3):
-        return None
-    return slice(low[1], high[1]), slice(low[0], high[0])
 
 
 def _crossings(

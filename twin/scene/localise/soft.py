@@ -7,6 +7,7 @@ Equal toys are told apart by where each is expected: its start range, or where i
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,14 +28,11 @@ from twin.scene.localise.mesh_fit import (
     known_surface,
 )
 from twin.scene.localise.points import (
-    CLUSTER_GAP_M,
-    MIN_LIKENESS,
     MIN_POINTS,
     VOXEL_M,
     CameraView,
     Cluster,
-    clusters,
-    likeness,
+    object_points,
     voxel_mean,
 )
 from twin.scene.localise.shape_fit import MIN_EXPLAINED
@@ -134,17 +132,9 @@ def candidates(
     Args:
         blocked: Rigid objects with their poses; their points do not count.
     """
-    parts = []
-    for view in views:
-        p = view.p_base
-        alike = p[:, 2] > LEAST_HEIGHT_M
-        alike[alike] = likeness(view.color_linear[alike], model.color_srgb) >= (MIN_LIKENESS)
-        p = voxel_mean(p[alike], VOXEL_M)
-        parts.append(p[~_on_others(p, blocked)])
-    ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    everything = np.concatenate(parts) if parts else np.zeros((0, 3))
     single = []
-    for group in clusters(everything, ids, CLUSTER_GAP_M):
+    is_other = partial(_on_others, blocked=blocked)
+    for group in object_points(views, model, LEAST_HEIGHT_M, is_other):
         if len(group) < MIN_POINTS:
             continue
         for piece in _cut(group, model, count):
@@ -266,19 +256,12 @@ def _costs(
     expected_m: Mapping[str, Float[np.ndarray, "3"]],
 ) -> Float[np.ndarray, "num_models num_candidates"]:
     """What it costs to say that a fit is a toy [m]."""
-    cost = [
-        [_displacement(expected_m.get(item.id), fit) + SCORE_M * fit.score for fit in fits]
-        for item in models
-    ]
-    return np.array(cost).reshape(len(models), len(fits))
-
-
-def _displacement(expected_m: Float[np.ndarray, "3"] | None, fit: MeshFit) -> float:
-    """Distance to where a toy is expected; beyond ``moved_m`` it hardly grows [m]."""
-    if expected_m is None:
-        return 0.0
-    distance = float(np.linalg.norm(fit.T_base_object[:3, 3] - expected_m))
-    return MOVED_M * (1.0 - float(np.exp(-distance / MOVED_M)))
+    cost = np.tile([SCORE_M * fit.score for fit in fits], (len(models), 1))
+    for row, item in enumerate(models):
+        for column, fit in enumerate(fits if item.id in expected_m else ()):
+            away_m = np.linalg.norm(fit.T_base_object[:3, 3] - expected_m[item.id])
+            cost[row, column] += MOVED_M * (1.0 - np.exp(-away_m / MOVED_M))  # hardly grows beyond
+    return cost
 
 
 def _margins(

@@ -19,11 +19,11 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.fit.lighting import EVEN, Lighting
-from twin.scene.fit.on_mesh import WIDER, Triangles, even_points, surface_area_m2, within_edges
+from twin.scene.fit.on_mesh import WIDER, even_points, surface_area_m2, within_edges
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.shape.from_training import image_window
-from twin.scene.shape.mesh import first_hit
+from twin.scene.shape.mesh import Mesh, first_hit
 
 FOOTPRINTS = 1.6
 """Spacing of the Gaussians in pixels of the views that come nearest."""
@@ -48,7 +48,7 @@ SIDEWAYS = 0.2
 
 
 def closed_object(
-    mesh: Triangles,
+    mesh: Mesh,
     views: Sequence[TrainingView],
     T_base_object: Float[np.ndarray, "4 4"],
     lighting: Lighting = EVEN,
@@ -93,7 +93,7 @@ class _Look:
     """How surely a pixel shows this place: 1 away from outlines and edges."""
 
     @staticmethod
-    def of(view: TrainingView, mesh: Triangles, T_base_object: Float[np.ndarray, "4 4"]) -> "_Look":
+    def of(view: TrainingView, mesh: Mesh, T_base_object: Float[np.ndarray, "4 4"]) -> "_Look":
         target = view.full
         T_camera_object = se3.invert(view.T_base_color) @ T_base_object
         reach_m = float(np.linalg.norm(mesh[0], axis=1).max())
@@ -155,7 +155,7 @@ def _trust(
     return np.where(ndimage.binary_dilation(beside, around), NEAR_OUTLINE, trust)
 
 
-def _spacing_m(mesh: Triangles, looks: Sequence[_Look]) -> float:
+def _spacing_m(mesh: Mesh, looks: Sequence[_Look]) -> float:
     """As fine as the views that come nearest resolve, and not too many."""
     footprints = [float(np.median(look.expected_m[look.shown])) / look.camera.fx for look in looks]
     fine_m = FOOTPRINTS * float(np.quantile(footprints, NEAREST_SHARE))

@@ -5,7 +5,7 @@ alone, the first that shows it, so that scans of several tasks make one library:
 reconstructed from these views where they allow it, otherwise it is the known shape of the task
 file, and ``shape_source`` says so; its Gaussians are set on the mesh, all around it. Table under
 objects that no scan saw is filled with the distance-weighted mean of the table around: a guess
-that keeps renders free of black holes, counted separately in ``scene.json``.
+that keeps renders free of black holes.
 """
 
 import json
@@ -37,7 +37,6 @@ from twin.scene.gaussians import (
     read_ply,
     write_ply,
 )
-from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.closing import closed_object
 from twin.scene.objects.placement import Placements
 from twin.scene.shape.files import MESH, SDF, TASK_SHAPE, write_shape
@@ -137,7 +136,6 @@ class LibraryObject:
     splats: ObjectSplats
     shape: ObjectShape | str
     """Reconstructed, in the frame of the object, or why not: it has the task's shape then."""
-    localised: LocalisedObject
     episode_id: str
     """Whose views it was made from."""
 
@@ -183,7 +181,6 @@ class LibraryObject:
             "num_splats": len(cloud),
             "num_completed": int(cloud.completed.sum()),
             "T_base_object": se3.pose_record(self.splats.T_base_object),
-            "localisation": self.localised.to_record(),
         }
 
 
@@ -195,8 +192,6 @@ class Decomposition:
     """What ``background.ply`` holds: the table under the objects is filled in."""
     placements: Placements
     library: Mapping[str, LibraryObject] = field(default_factory=dict)
-    num_filled: int = 0
-    """Gaussians of the table that nobody saw."""
 
     def write(
         self,
@@ -211,12 +206,11 @@ class Decomposition:
             ObjectViews(views=views_of(item.episode), task=item.task, Ts_base_object=item.poses)
             for item in self.placements.by_episode.values()
         ]
-        about = {
+        return {
             "objects": {key: item.write(folder / key) for key, item in self.library.items()},
             "objects_remark": self.placements.remark,
             "sdf": write_static(run.scene_dir, views, scans),
         }
-        return about | ({"filled_splats": self.num_filled} if self.library else {})
 
     @property
     def objects(self) -> dict[str, ObjectSplats]:
@@ -257,7 +251,7 @@ def decompose(
     if placed:
         left &= ~np.logical_and.reduce([each.covers(cloud.means_m) for each in placed])
     cloud = cloud.take(left)
-    filling = [cloud.take(np.zeros(0, dtype=np.int64))]
+    filling: list[GaussianCloud] = []
     for placement in placed:
         views, poses = views_of(placement.episode), placement.poses
         models = placement.task.objects
@@ -271,19 +265,14 @@ def decompose(
                     model=models[key],
                     splats=splats,
                     shape=shapes[key],
-                    localised=placement.localised[key],
                     episode_id=placement.episode.info.id,
                 )
         for key, T in poses.items():
             filling.append(fill_footprint(concatenate([cloud, *filling]), models[key], T))
     if placements.remark:
         output.say(placements.remark)
-    filled = concatenate(filling)
     return Decomposition(
-        background=concatenate([cloud, filled]),
-        placements=placements,
-        library=library,
-        num_filled=len(filled),
+        background=concatenate([cloud, *filling]), placements=placements, library=library
     )
 
 

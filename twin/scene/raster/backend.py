@@ -49,14 +49,14 @@ class CudaMissingError(MissingDependencyError):
 
 def has_cuda() -> bool:
     """Whether the backend can run here; torch is only imported where gsplat is installed."""
-    return find_spec("gsplat") is not None and bool(_torch().cuda.is_available())
+    return find_spec("gsplat") is not None and bool(import_torch().cuda.is_available())
 
 
-def _torch() -> Any:
+def import_torch(purpose: str = "the backend cuda") -> Any:
+    """Import torch, which only the extra [twin] brings."""
     try:
         return importlib.import_module("torch")
     except ImportError as error:
-        purpose = "the backend cuda"
         raise MissingDependencyError(package="torch", extra="twin", purpose=purpose) from error
 
 
@@ -84,7 +84,7 @@ class CudaRasteriser:
                 f"{cuts[1]:g} were asked for. Use the backend cpu for other values."
             )
             raise UsageError(message)
-        torch = _torch()
+        torch = import_torch()
         if device == "cuda" and not torch.cuda.is_available():
             raise CudaMissingError(found=f"torch {torch.__version__} without a usable device")
         try:
@@ -109,8 +109,12 @@ class CudaRasteriser:
         centre = -T_camera_base[:3, :3].T @ T_camera_base[:3, 3]
         channels = [self._colors(leaves, centre), self._depth_planes(leaves, T_camera_base, camera)]
         drawn, alpha, _ = self._rasterise(leaves, torch.cat(channels, dim=1), T_camera_base, camera)
-        depth = self._depth_of_planes(drawn[0, ..., 3:], camera)
-        image = torch.cat([drawn[0, ..., :3], depth, alpha[0]], dim=-1)
+        # Weighted depth at each pixel, of what was drawn of the depth planes.
+        u = torch.arange(camera.width, device=drawn.device) + 0.5 - camera.width / 2
+        v = torch.arange(camera.height, device=drawn.device) + 0.5 - camera.height / 2
+        sums = drawn[0, ..., 3:]
+        depth = sums[..., 0] + u[None] * sums[..., 1] + v[:, None] * sums[..., 2]
+        image = torch.cat([drawn[0, ..., :3], depth[..., None], alpha[0]], dim=-1)
         self._drawn = leaves, T_camera_base, camera
         return self._numpy(image.permute(2, 0, 1))
 
@@ -188,14 +192,6 @@ class CudaRasteriser:
         u = camera.fx * x / z + camera.cx - camera.width / 2
         v = camera.fy * y / z + camera.cy - camera.height / 2
         return torch.stack([z - slope[:, 0] * u - slope[:, 1] * v, *slope.unbind(dim=1)], dim=1)
-
-    def _depth_of_planes(self, sums: Any, camera: Camera) -> Any:
-        """Sum of weighted depth at each pixel, from what was drawn of ``_depth_planes``."""
-        torch = self._torch
-        u = torch.arange(camera.width, device=sums.device) + 0.5 - camera.width / 2
-        v = torch.arange(camera.height, device=sums.device) + 0.5 - camera.height / 2
-        depth = sums[..., 0] + u[None] * sums[..., 1] + v[:, None] * sums[..., 2]
-        return depth[..., None]
 
     def _rotations(self, quats_wxyz: Any) -> Any:
         w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=1, keepdim=True)).unbind(dim=1)

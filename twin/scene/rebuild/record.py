@@ -67,20 +67,18 @@ def make_record(
     settings = asdict(config)
     settings.pop("force")
     settings["fit"]["budget_s"] = None if math.isinf(config.fit.limit_s) else config.fit.limit_s
-    scan = training.report.to_record()
     return {
         "schema_version": SCENE_VERSION,
         "key": key,
         "scene_hash": scene_hash,
         "frame": root_frame(training.choices[0]),
-        "units": {"length": "m", "colour": "sRGB", "quaternion": "wxyz"},
         "remark": sources.remark,
         "stand_in": any(episode.info.stand_in for episode in sources.episodes),
         "sources": [
             {"id": e.info.id, "kind": e.info.kind, "sha256": e.sha256()} for e in sources.episodes
         ],
         "cameras": [camera_record(choice) for choice in training.choices],
-        "scan": scan | {"remarks": [*left_out, *scan["remarks"]]},
+        "scan": {"remarks": [*left_out, *training.report.remarks()]},
         "settings": settings,
         "background": {
             "file": BACKGROUND,
@@ -92,10 +90,7 @@ def make_record(
             "iterations": fitted.iterations,
             "iterations_asked": fitted.iterations_asked,
             "underfitted": fitted.underfitted,
-            "coarse_iterations": fitted.coarse_iterations,
             "seconds": round(fitted.seconds, 2),
-            "cpu_seconds": round(fitted.cpu_seconds, 2),
-            "colour_steps": fitted.colour_steps,
             "train_psnr_db": None
             if fitted.train_psnr_db is None
             else round(min(fitted.train_psnr_db, MOST_DB), 3),
@@ -135,8 +130,6 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
         "id": choice.camera_id,
         "stationary": choice.stationary,
         "poses_from": choice.poses.source,
-        "poses_quality": dict(choice.poses.quality),
-        "frames_without_pose": len(choice.poses.unposed_ns),
         "train_frames": len(choice.train_ns),
         "holdout_frames": len(choice.holdout_ns),
         "color": asdict(camera),
@@ -146,10 +139,12 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
 def describe_scene(record: Mapping[str, Any]) -> str:
     """Say in a few lines what was rebuilt and how well."""
     fitted, cost = record["fit"], record["cost"]
+    asked = fitted.get("iterations_asked")  # not in scenes of older versions
+    of_asked = "" if asked is None else f" of {asked}"
     lines = [
         f"scene {record['scene_hash']}: {record['background']['num_splats']} Gaussians"
         + (" (stand-in)" if record["stand_in"] else ""),
-        f"fit: {_images_done(fitted)} in {fitted['seconds']:.1f} s"
+        f"fit: {fitted['iterations']}{of_asked} images in {fitted['seconds']:.1f} s"
         + (
             ""
             if fitted["train_psnr_db"] is None
@@ -170,26 +165,15 @@ def describe_scene(record: Mapping[str, Any]) -> str:
     ]
     if fitted.get("underfitted"):
         lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
-    lines.append(_view_line(record["views"]))
+    images = record["views"]["images"]
+    stationary = sum(bool(item["stationary_camera"]) for item in images)
+    which = f", {stationary} of cameras that stand still" if stationary else ""
+    lines.append(
+        f"held-out views ({len(images)}{which}): PSNR {record['views']['psnr_db']:.2f} dB"
+        if images
+        else "no frame could be held out: too few frames"
+    )
     lines += record["scan"]["remarks"]
     if record["remark"]:
         lines.append(record["remark"])
     return "\n".join(lines)
-
-
-def _images_done(fitted: Mapping[str, Any]) -> str:
-    asked = fitted.get("iterations_asked")  # not in scenes of older versions
-    return (
-        f"{fitted['iterations']} images"
-        if asked is None
-        else f"{fitted['iterations']} of {asked} images"
-    )
-
-
-def _view_line(views: Mapping[str, Any]) -> str:
-    images = views["images"]
-    if not images:
-        return "no frame could be held out: too few frames"
-    stationary = sum(bool(item["stationary_camera"]) for item in images)
-    which = f", {stationary} of cameras that stand still" if stationary else ""
-    return f"held-out views ({len(images)}{which}): PSNR {views['psnr_db']:.2f} dB"

@@ -7,7 +7,6 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from bridge.terminal import Output
 from twin.scene.backdrop import Backdrop, backdrop_of
 from twin.scene.dataset.training_set import (
     TrainingSet,
-    limits_of,
     read_training_set,
 )
 from twin.scene.fit.completion import complete_holes
@@ -141,23 +139,18 @@ def _hold_out(
     """
     choices = training.choices
     job = ViewsJob(
-        scene_hash=background_hash(run),
+        training=training,
         scenes=decomposed,
-        reference_views=training.reference_views,
-        limits=limits_of(config),
-        raster=RasterConfig(threads=config.fit.threads),
-        protocol=protocol_of(choices, fitted, config),
-        robot=partial(training.robot.frames.joined, links),
-        ego_masks={
-            (choices[index].episode.path, choices[index].camera_id): mask
-            for index, mask in training.ego_masks.items()
-        },
+        links=links,
         backdrop=backdrop,
+        config=config,
+        protocol=protocol_of(choices, fitted, config),
     )
     total = sum(len(choice.holdout_ns) for choice in choices)
     with output.progress("render held-out views", total) as advance:
-        numbers = write_views(run, choices, job, advance)
-    present = {views_path(run, c.episode, job.scene_hash).name for c in choices if c.holdout_ns}
+        numbers = write_views(run, job, advance)
+    scene_hash = background_hash(run)
+    present = {views_path(run, c.episode, scene_hash).name for c in choices if c.holdout_ns}
     for path in run.derived("*.views.*"):
         if path.name not in present and _is_ours(path):
             path.unlink()

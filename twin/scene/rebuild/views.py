@@ -7,8 +7,9 @@ Topics, all with the stamp of the recorded frame and the frame id of its colour 
 inside) where there is something to mask, and ``.../color/info``.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +26,19 @@ from bridge.episode.topics import camera_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UndefinedStatisticError
 from bridge.media.color import encode_png
+from bridge.media.depth import from_metres
 from bridge.media.image_quality import as_float, psnr_db
 from bridge.terminal import Advance
 from twin.scene.backdrop import Backdrop
 from twin.scene.dataset.masks import ReferenceView, find_moving, without_ego
+from twin.scene.dataset.training_set import TrainingSet, limits_of
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, load
-from twin.scene.gaussians import GaussianCloud
 from twin.scene.objects.decompose import Decomposition
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
+from twin.scene.robot.extraction import LitLinks
+from twin.scene.settings import RebuildConfig
+from twin.scene.store.folder import background_hash
 
 VIEWS_NOTE = (
     "held out from initialisation, poses, exposure, fit and objects; mean of the images' values, "
@@ -44,42 +49,14 @@ MOST_DB = 100.0
 """JSON has no word for identical images."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewNumbers:
-    """How one held-out view came out."""
-
-    episode: str
-    camera_id: str
-    stamp_ns: int
-    stationary_camera: bool
-    """The camera does not move, so training frames show the same view."""
-    psnr_db: float
-    """Over the whole image, as recorded; at most 100."""
-
-
-def rate_view(frame: RgbdFrame, view: View, choice: FrameChoice) -> ViewNumbers:
-    """Compare one rendered view with its recorded frame."""
-    try:
-        found_db = psnr_db(as_float(frame.image_u8), as_float(view.image_u8()))
-    except UndefinedStatisticError:
-        found_db = MOST_DB
-    return ViewNumbers(
-        episode=choice.episode.info.id,
-        camera_id=frame.camera_id,
-        stamp_ns=frame.stamp_ns,
-        stationary_camera=choice.stationary,
-        psnr_db=min(found_db, MOST_DB),
-    )
-
-
-def summarise_views(numbers: Sequence[ViewNumbers], files: Sequence[str]) -> dict[str, Any]:
+def summarise_views(numbers: Sequence[Mapping[str, Any]], files: Sequence[str]) -> dict[str, Any]:
     """Average the held-out views, as ``robot-gst evaluate`` does."""
-    each = [item.psnr_db for item in numbers]
+    each = [item["psnr_db"] for item in numbers]
     return {
         "files": list(files),
         "note": VIEWS_NOTE,
         "psnr_db": round(float(np.mean(each)), 4) if each else None,
-        "images": [asdict(item) for item in numbers],
+        "images": list(numbers),
     }
 
 
@@ -98,34 +75,30 @@ def views_path(run: RunFolder, episode: Episode, scene_hash: str) -> Path:
 class ViewsJob:
     """What to render held-out frames of, and what to say about it."""
 
-    scene_hash: str
+    training: TrainingSet
     scenes: Decomposition
     """Draws each episode with its own objects."""
-    reference_views: Sequence[ReferenceView]
-    limits: DepthLimits
-    raster: RasterConfig
+    links: LitLinks
+    backdrop: Backdrop
+    config: RebuildConfig
     protocol: Mapping[str, Any]
     """How the scene was made: kept with the images, for whoever rates them."""
-    robot: Callable[[GaussianCloud, Episode, int], GaussianCloud] | None = None
-    """Puts it where it stood at each frame; the cloud holds only what is static."""
-    ego_masks: Mapping[tuple[Path, str], Bool[np.ndarray, "_ _"]] = field(default_factory=dict)
-    """By episode and camera: what moves with the camera and is not part of the scene."""
-    backdrop: Backdrop | None = None
-    """Stands behind everything; None: black."""
 
 
-def write_views(
-    run: RunFolder, choices: Sequence[FrameChoice], job: ViewsJob, advance: Advance
-) -> list[ViewNumbers]:
-    """Render every held-out frame; one derived episode per recorded one, replaced if present."""
-    rasteriser = Rasteriser(job.raster)
-    numbers: list[ViewNumbers] = []
+def write_views(run: RunFolder, job: ViewsJob, advance: Advance) -> list[dict[str, Any]]:
+    """Render every held-out frame; one derived episode per recorded one, replaced if present.
+
+    Returns:
+        How each came out: PSNR over the whole image, as recorded; at most 100 dB.
+    """
+    rasteriser = Rasteriser(RasterConfig(threads=job.config.fit.threads))
+    numbers: list[dict[str, Any]] = []
+    choices, scene_hash = job.training.choices, background_hash(run)
     paths = [choice.episode.path for choice in choices]
     episodes = {choice.episode.path: choice.episode for choice in choices if choice.holdout_ns}
     for path, episode in episodes.items():
-        target = views_path(run, episode, job.scene_hash)
+        target = views_path(run, episode, scene_hash)
         target.unlink(missing_ok=True)
-        own = [choice for choice in choices if choice.episode.path == path]
         with EpisodeWriter(target) as writer:
             writer.describe(
                 replace(episode.info, id=target.stem),
@@ -133,44 +106,50 @@ def write_views(
                     kind="views",
                     source_episode=episode.info.id,
                     source_sha256=episode.sha256(),
-                    scene_hash=job.scene_hash,
+                    scene_hash=scene_hash,
                     engine=ENGINE,
                     settings=dict(job.protocol),
                 ),
             )
-            for choice in own:
-                for number in _rendered(choice, rasteriser, job, paths.index(path), writer):
+            for index in (k for k, own in enumerate(paths) if own == path):
+                for number in _rendered(index, rasteriser, job, paths.index(path), writer):
                     numbers.append(number)
-                    advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
+                    advance(len(numbers), f"{numbers[-1]['psnr_db']:.1f} dB")
     return numbers
 
 
 def _rendered(
-    choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob, scan: int, writer: EpisodeWriter
-) -> Iterator[ViewNumbers]:
+    index: int, rasteriser: Rasteriser, job: ViewsJob, scan: int, writer: EpisodeWriter
+) -> Iterator[dict[str, Any]]:
     """Draw and write the held-out frames of one camera, and rate each.
 
     Objects of other scans did not move in this one.
     """
-    references = [each for each in job.reference_views if each.scan == scan]
+    training, choice = job.training, job.training.choices[index]
+    references = [each for each in training.reference_views if each.scan == scan]
     scene, num_background = job.scenes.as_seen_in(choice.episode), len(job.scenes.background)
     for frame in load(choice, choice.holdout_ns):
         camera, T = frame.color_camera, frame.T_base_color
-        cloud = scene
-        if job.robot is not None:
-            cloud = job.robot(cloud, choice.episode, frame.stamp_ns)
-        ego_mask = job.ego_masks.get((choice.episode.path, choice.camera_id))
-        recorded = _recorded(frame, job.limits, references, ego_mask)
-        view = rasteriser.view(cloud, camera, T)
-        if job.backdrop is not None:
-            view = job.backdrop.behind(view, camera, T)
+        cloud = training.robot.frames.joined(job.links, scene, choice.episode, frame.stamp_ns)
+        ego_mask = training.ego_masks.get(index)
+        recorded = _recorded(frame, limits_of(job.config), references, ego_mask)
+        view = job.backdrop.behind(rasteriser.view(cloud, camera, T), camera, T)
         masks = {"static": recorded.full.static_mask}
         if len(scene) > num_background:
             white = np.zeros((len(cloud), 1), dtype=np.float32)
             white[num_background : len(scene)] = 1.0
             masks["objects"] = rasteriser.draw_features(white)[0] > OBJECT_SHARE
         _write_view(writer, choice, frame, recorded.full.depth_m, view, masks)
-        yield rate_view(frame, view, choice)
+        psnr = MOST_DB
+        with suppress(UndefinedStatisticError):  # the images are the same
+            psnr = psnr_db(as_float(frame.image_u8), as_float(view.image_u8()))
+        yield {
+            "episode": choice.episode.info.id,
+            "camera_id": frame.camera_id,
+            "stamp_ns": frame.stamp_ns,
+            "stationary_camera": choice.stationary,  # training frames show the same view
+            "psnr_db": min(psnr, MOST_DB),
+        }
 
 
 def _recorded(
@@ -212,8 +191,7 @@ def _write_view(
         put(tail, color.to_cdr(), schema.COMPRESSED_IMAGE)
 
     def depth(tail: str, depth_m: np.ndarray) -> None:
-        millimetres = np.clip(np.rint(depth_m * 1e3), 0, 65535).astype(np.uint16)
-        image = DepthImage(stamp_ns=stamp, frame_id=frame_id, depth_mm=millimetres)
+        image = DepthImage(stamp_ns=stamp, frame_id=frame_id, depth_mm=from_metres(depth_m))
         put(tail, image.to_cdr(), schema.IMAGE)
 
     info = CameraInfo(stamp_ns=stamp, frame_id=frame_id, camera=frame.color_camera)
@@ -223,7 +201,7 @@ def _write_view(
     depth("rendered/depth", view.depth_m)
     same = np.allclose(frame.T_base_color, frame.T_base_depth, atol=1e-6)
     if same and frame.color_camera == frame.depth_camera:
-        depth("recorded/depth", np.nan_to_num(frame.depth_m, posinf=0.0))
+        depth("recorded/depth", frame.depth_m)
     else:
         depth("recorded/depth_in_color", depth_in_color_m)
     for name, mask in masks.items():

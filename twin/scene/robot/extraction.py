@@ -4,13 +4,14 @@ Where its joints are known, pixels that show the robot are masked and its points
 What it hid in one frame is filled by the frames in which it stood elsewhere; nothing is invented.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int, Int64
 from scipy.ndimage import binary_dilation
+from scipy.spatial import cKDTree
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -19,20 +20,20 @@ from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.terminal import Output
-from twin.robot.model import RobotModel, load_robot
+from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack, distinct_postures, posture_track
 from twin.robot.surface import PosedSurface, link_poses, link_surfaces
 from twin.scene.align.align import Alignment, align_robot
 from twin.scene.align.view import RobotView
-from twin.scene.fit.initialise import NoSurfaceError, fuse
-from twin.scene.fit.lighting import EVEN, Lighting
-from twin.scene.fit.on_mesh import Triangles, surface_area_m2
+from twin.scene.fit.initialise import NoSurfaceError, flat_gaussians, fuse
+from twin.scene.fit.lighting import EVEN, Lighting, Patches, fit_lighting
+from twin.scene.fit.on_mesh import WIDER, even_points, surface_area_m2, within_edges
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
-from twin.scene.robot.link_surface import SeenLink, link_lighting, on_surface, own_colors
 from twin.scene.robot.splats import posed, surface_links, write_links
 from twin.scene.settings import InitialiseConfig
+from twin.scene.shape.mesh import Mesh
 
 IN_FRONT_M = 0.03
 """A measurement this much nearer than the robot shows something in front of it."""
@@ -49,12 +50,6 @@ UNUSED = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Tracked:
-    robot: RobotModel
-    track: PostureTrack
-
-
-@dataclass(frozen=True, kw_only=True)
 class LitLinks:
     """The robot's links as Gaussians."""
 
@@ -62,6 +57,138 @@ class LitLinks:
     """Each in its link's frame and its own colours."""
     lighting: Lighting = EVEN
     """Makes of them the colours that a camera sees."""
+
+
+FITS_M = 0.006
+"""Half of the measured points lie nearer to a shape that is the link's."""
+REACH_M = 0.03
+"""Colours of points farther away are not the surface's."""
+NEIGHBOURS = 16
+BLUR_M = 0.006
+PATCH_M, PATCH_NEIGHBOURS = 0.012, 4
+"""Pieces of a link's surface whose light is compared between postures, and how many are looked at
+to find the one that a point lies on."""
+FACES_ALIKE = 0.7
+"""Cosine between a measured normal and that of the surface it is of."""
+MOST_WEIGHT = 10
+"""More points on one piece count no more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenLink:
+    """What one frame measured of a link."""
+
+    points: PointSet
+    """In the link's frame."""
+    R_base_link: Float[np.ndarray, "3 3"]
+    """How the link was turned."""
+
+
+def link_lighting(
+    shapes: Mapping[str, Sequence[Mesh]], seen: Mapping[str, Sequence[SeenLink]]
+) -> Lighting:
+    """The light on a robot, from links that were seen turned in several ways."""
+    patches: list[Patches] = []
+    first = 0
+    for link, items in sorted(seen.items()):
+        if not shapes.get(link):
+            continue
+        p, normals = even_points(shapes[link], PATCH_M)
+        tree = cKDTree(p)
+        for item in items:
+            piece, is_on = _pieces(item.points, tree, normals)
+            ids, inverse = np.unique(piece[is_on], return_inverse=True)
+            count = np.maximum(np.bincount(inverse, minlength=len(ids)), 1)
+            colors = [
+                np.bincount(inverse, item.points.colors[is_on, k], len(ids)) / count
+                for k in range(3)
+            ]
+            patches.append(
+                Patches(
+                    ids=first + ids,
+                    colors=np.stack(colors, axis=1),
+                    normals=normals[ids] @ item.R_base_link.T,
+                    weights=np.minimum(count, MOST_WEIGHT).astype(np.float64),
+                )
+            )
+        first += len(p)
+    return fit_lighting(patches)
+
+
+def own_colors(
+    shapes: Sequence[Mesh], seen: Sequence[SeenLink], lighting: Lighting
+) -> list[PointSet]:
+    """What was measured of a link with its own colours, as in even light.
+
+    Args:
+        shapes: Of the link, in its frame: measured normals are noisy, theirs are not; may be none.
+    """
+    if lighting == EVEN:
+        return [item.points for item in seen]
+    p, normals = even_points(shapes, PATCH_M) if shapes else (np.zeros((1, 3)), np.zeros((1, 3)))
+    tree = cKDTree(p)
+    result = []
+    for item in seen:
+        piece, is_on = _pieces(item.points, tree, normals)
+        facing = np.where(is_on[:, None], normals[piece], item.points.normals)
+        light = lighting.brightness(facing @ item.R_base_link.T)
+        colors = as_float32(item.points.colors / light[:, None])
+        result.append(replace(item.points, colors=colors))
+    return result
+
+
+def _pieces(
+    points: PointSet, tree: cKDTree, normals: Float[np.ndarray, "num_pieces 3"]
+) -> tuple[Int[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
+    """The piece of surface each point lies on, and whether it does."""
+    count = min(PATCH_NEIGHBOURS, tree.n)
+    distance, ids = tree.query(points.p_m, k=count)
+    distance, ids = distance.reshape(-1, count), ids.reshape(-1, count)
+    alike = np.einsum("pkc,pc->pk", normals[ids], points.normals)
+    rows, best = np.arange(len(ids)), alike.argmax(axis=1)
+    is_on = (alike[rows, best] > FACES_ALIKE) & (distance[rows, best] < 2 * PATCH_M)
+    return ids[rows, best], is_on
+
+
+def on_surface(
+    shapes: Sequence[Mesh], sets: Sequence[PointSet], spacing_m: float
+) -> GaussianCloud | None:
+    """Gaussians on a link's shapes, in its frame; None where these do not fit what was measured.
+
+    Depth is noisy and postures are few: points fused over a link leave ragged edges and gaps. A
+    side that nobody saw takes the link's own middle colour.
+    """
+    p, normals = even_points(shapes, spacing_m)
+    seen_m, seen_normals, seen_colors = (
+        np.concatenate([getattr(item, name) for item in sets])
+        for name in ("p_m", "normals", "colors")
+    )
+    away_m, _ = cKDTree(p).query(seen_m)
+    if np.median(away_m) > FITS_M + spacing_m / 2:
+        return None
+    p = within_edges(p, normals, shapes, spacing_m)
+    colors = _colors(p, normals, seen_m, seen_normals, seen_colors)
+    sizes = np.full(len(p), WIDER * spacing_m)
+    return flat_gaussians(p, normals, colors, sizes)
+
+
+def _colors(
+    p: Float[np.ndarray, "num_points 3"],
+    normals: Float[np.ndarray, "num_points 3"],
+    seen_m: Float[np.ndarray, "num_seen 3"],
+    seen_normals: Float[np.ndarray, "num_seen 3"],
+    seen_colors: Float[np.ndarray, "num_seen 3"],
+) -> Float[np.ndarray, "num_points 3"]:
+    """Mean colour of the measured points around that face the same way."""
+    distance, ids = cKDTree(seen_m).query(p, k=min(NEIGHBOURS, len(seen_m)))
+    distance, ids = distance.reshape(len(p), -1), ids.reshape(len(p), -1)
+    alike = np.einsum("pkc,pc->pk", seen_normals[ids], normals).clip(0.0)
+    nearest = distance.min(axis=1, keepdims=True)
+    weight = alike * np.exp(-0.5 * ((distance - nearest) / BLUR_M) ** 2) * (distance < REACH_M)
+    total = weight.sum(axis=1, keepdims=True)
+    mean = np.einsum("pk,pkc->pc", weight, seen_colors[ids]) / np.maximum(total, 1e-9)
+    middle = np.median(seen_colors, axis=0)
+    return np.asarray(np.where(total > 0.05, mean, middle))
 
 
 class RobotFrames:
@@ -78,24 +205,23 @@ class RobotFrames:
             T_base_root: Where the frames' root lies in the robot's base; None: it is the base.
         """
         self.T_base_root = np.eye(4) if T_base_root is None else T_base_root
-        self._tracked: dict[str, _Tracked] = {}
+        self._tracks: dict[str, PostureTrack] = {}
         remarks = []
         for episode in episodes:
             try:
                 track = posture_track(episode)
-                robot = load_robot(track.urdf)
-                link_surfaces(robot)
+                link_surfaces(load_robot(track.urdf))
             except GstError as error:
                 remarks.append(f"{episode.info.id}: {error}")
                 continue
-            self._tracked[str(episode.path)] = _Tracked(robot=robot, track=track)
+            self._tracks[str(episode.path)] = track
         self.remark = "; ".join(remarks)
         """Why the robot is not told apart in some episodes; empty when it is in all."""
         self._seen: dict[str, list[SeenLink]] = {}
 
     def knows(self, episode: Episode) -> bool:
         """Say whether joints tell where the robot is in the frames of an episode."""
-        return str(episode.path) in self._tracked
+        return str(episode.path) in self._tracks
 
     def take_out(
         self, episode: Episode, frame: RgbdFrame, points: PointSet, view: TrainingView
@@ -112,41 +238,44 @@ class RobotFrames:
         shown = robot_mask(surface, view.half.camera, T_base_color, view.half.depth_m)
         return points.take(owner < 0), view.without(shown)
 
-    def collect(self, episode: Episode, stamp_ns: int, points: PointSet) -> None:
-        """Keep the robot's points of a frame that the background does not need."""
-        surface = self._surface(episode, stamp_ns)
-        if surface is not None:
-            self._keep(episode, stamp_ns, surface, points)
+    def look_closer(self, choice: FrameChoice, limits: DepthLimits, stride: int) -> None:
+        """Collect its surface from frames that a camera standing still has to spare.
 
-    def stationary_postures(
-        self, episode: Episode, stamps_ns: Iterable[int]
-    ) -> dict[int, Float[np.ndarray, " num_joints"]]:
-        """Joints at those of some instants at which the robot of an episode stood still [rad]."""
-        tracked = self._tracked.get(str(episode.path))
-        if tracked is None:
-            return {}
-        track = tracked.track
-        return {t: track.at(t).joints_rad for t in sorted(stamps_ns) if track.is_stationary(t)}
+        A few of its frames are enough for the background. The robot shows another side in each
+        posture, so up to two dozen postures far from each other are read for its links.
+        """
+        track, episode = self._tracks.get(str(choice.episode.path)), choice.episode
+        if track is None or not choice.stationary:
+            return
+        stamps = np.array([t for t in sorted(choice.spare_ns) if track.is_stationary(t)])
+        joints = np.array([track.at(t).joints_rad for t in stamps.tolist()])
+        wanted = stamps[distinct_postures(joints, MAX_POSTURES)] if len(stamps) else stamps
+        for frame in load(choice, frozenset(wanted.tolist())):
+            surface = self._surface(episode, frame.stamp_ns)
+            if surface is not None:
+                points = FrameSurface(frame, limits).points(stride)
+                self._keep(episode, frame.stamp_ns, surface, points)
 
     def _surface(self, episode: Episode, stamp_ns: int) -> PosedSurface | None:
-        tracked = self._tracked.get(str(episode.path))
-        if tracked is None or not tracked.track.covers(stamp_ns):
+        track = self._tracks.get(str(episode.path))
+        if track is None or not track.covers(stamp_ns):
             return None
-        return PosedSurface(tracked.robot, tracked.track.at(stamp_ns))
+        return PosedSurface(load_robot(track.urdf), track.at(stamp_ns))
 
     def _keep(
         self, episode: Episode, stamp_ns: int, surface: PosedSurface, points: PointSet
     ) -> Int64[np.ndarray, " num_points"]:
         """Keep the robot's points if it stood still; return which shape owns each point, or -1."""
-        tracked, T = self._tracked[str(episode.path)], self.T_base_root
+        track, T = self._tracks[str(episode.path)], self.T_base_root
+        robot = load_robot(track.urdf)
         owner = surface_links(
-            tracked.robot,
+            robot,
             surface,
             se3.apply(T, points.p_m.astype(np.float64)),
             points.normals.astype(np.float64) @ T[:3, :3].T,
         )
-        if tracked.track.is_stationary(stamp_ns):
-            poses = link_poses(tracked.robot, tracked.track.at(stamp_ns))
+        if track.is_stationary(stamp_ns):
+            poses = link_poses(robot, track.at(stamp_ns))
             for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
                 mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
                 T_link_root, own = se3.invert(poses[link]) @ T, points.take(mine)
@@ -190,13 +319,13 @@ class RobotFrames:
                 continue
         return LitLinks(clouds=clouds, lighting=lighting)
 
-    def _shapes(self) -> dict[str, list[Triangles]]:
+    def _shapes(self) -> dict[str, list[Mesh]]:
         """Shapes of the links by name, where all episodes have one description."""
-        robots = {tracked.robot for tracked in self._tracked.values()}
-        if len(robots) != 1:
+        urdfs = {track.urdf for track in self._tracks.values()}
+        if len(urdfs) != 1:
             return {}
-        shapes: dict[str, list[Triangles]] = {}
-        for item in link_surfaces(next(iter(robots))):
+        shapes: dict[str, list[Mesh]] = {}
+        for item in link_surfaces(load_robot(urdfs.pop())):
             shapes.setdefault(item.link, []).append((item.vertices_m, item.triangles))
         return shapes
 
@@ -204,17 +333,10 @@ class RobotFrames:
         self, links: LitLinks, cloud: GaussianCloud, episode: Episode, stamp_ns: int
     ) -> GaussianCloud:
         """Put the robot into a scene as it stood at an instant of an episode."""
-        tracked = self._tracked.get(str(episode.path))
-        if tracked is None or not links.clouds or not tracked.track.covers(stamp_ns):
+        track = self._tracks.get(str(episode.path))
+        if track is None or not links.clouds or not track.covers(stamp_ns):
             return cloud
-        posture = tracked.track.at(stamp_ns)
-        robot = posed(
-            links.clouds,
-            posture.joints_rad,
-            tracked.track.urdf,
-            width_m=posture.width_m,
-            lighting=links.lighting,
-        )
+        robot = posed(links.clouds, track.at(stamp_ns), track.urdf, links.lighting)
         return concatenate([cloud, moved_cloud(robot, se3.invert(self.T_base_root))])
 
 
@@ -274,25 +396,6 @@ def find_robot(choices: Sequence[FrameChoice], output: Output) -> FoundRobot:
     return FoundRobot(frames=frames, remark=frames.remark, alignment=alignment)
 
 
-def look_closer(
-    found: FoundRobot, choices: Sequence[FrameChoice], limits: DepthLimits, stride: int
-) -> None:
-    """Collect the robot's surface from frames that cameras standing still have to spare.
-
-    A few of their frames are enough for the background. The robot shows another side in each
-    posture, so up to two dozen postures far from each other are read for its links.
-    """
-    for choice in choices:
-        postures = found.frames.stationary_postures(choice.episode, choice.spare_ns)
-        if not choice.stationary or not postures:
-            continue
-        stamps, joints = np.array(list(postures)), np.array(list(postures.values()))
-        wanted = frozenset(stamps[distinct_postures(joints, MAX_POSTURES)].tolist())
-        for frame in load(choice, wanted):
-            points = FrameSurface(frame, limits).points(stride)
-            found.frames.collect(choice.episode, frame.stamp_ns, points)
-
-
 def _aligned(choices: Sequence[FrameChoice]) -> Alignment:
     """Align by the camera that has joints; errors say what is missing."""
     choice = choices[0]
@@ -300,7 +403,12 @@ def _aligned(choices: Sequence[FrameChoice]) -> Alignment:
     stamps = spread(np.array(sorted(choice.train_ns), dtype=np.int64), ALIGN_FRAMES)
     wanted = frozenset(stamp for stamp in stamps.tolist() if track.is_stationary(stamp))
     views = [
-        RobotView.from_frame(frame, track.at(frame.stamp_ns), frame.T_base_depth)
+        RobotView(
+            camera=frame.depth_camera,
+            depth_m=np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0),
+            T_source_camera=frame.T_base_depth,
+            posture=track.at(frame.stamp_ns),
+        )
         for frame in load(choice, wanted)
     ]
     return align_robot(views, load_robot(track.urdf))

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int64
 from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from twin.robot.model import RobotModel, load_robot
+from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface, fixed_links
 from twin.scene.fit.lighting import EVEN, Lighting
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud, read_ply, write_ply
@@ -26,12 +27,7 @@ ASIDE_M = 0.006
 
 
 def posed(
-    links: Mapping[str, GaussianCloud],
-    joints_rad: Float[np.ndarray, " num_joints"],
-    urdf: str,
-    *,
-    width_m: float = 0.0,
-    lighting: Lighting = EVEN,
+    links: Mapping[str, GaussianCloud], posture: Posture, urdf: str, lighting: Lighting = EVEN
 ) -> GaussianCloud:
     """Put the Gaussians of all links where forward kinematics puts the links.
 
@@ -40,7 +36,7 @@ def posed(
     """
     robot = load_robot(urdf)
     placed = [
-        moved_cloud(cloud, robot.T_base_link(link, joints_rad, width_m))
+        moved_cloud(cloud, robot.T_base_link(link, posture.joints_rad, posture.width_m))
         for link, cloud in links.items()
     ]
     return lighting.on(concatenate(placed))

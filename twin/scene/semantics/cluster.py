@@ -10,6 +10,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial.distance import pdist
 
 from twin.naming.colours import lab_from_srgb, without_shading
 from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map
@@ -239,11 +240,9 @@ def _first_dependent(
     for piece in np.argsort(counts, kind="stable"):
         if counts[piece] == 0:
             continue
-        links = pieces[pairs]
-        links = links[(links == piece).sum(axis=1) == 1]
-        if not len(links):
+        others, strength = _neighbours(pieces, pairs, int(piece))
+        if not len(others):
             continue
-        others, strength = np.unique(links[links != piece], return_counts=True)
         strongest = int(others[np.argmax(strength)])
         own = pieces == piece
         small = counts[piece] < MIN_VALLEY_FRACTION * len(pieces)
@@ -298,7 +297,7 @@ def _colour_classes(colour: np.ndarray) -> np.ndarray:
     best, best_cost = np.zeros(len(colour), dtype=np.int64), np.inf
     for num in range(1, MAX_COLOURS + 1):
         classes, centres = _k_means(colour, num)
-        if num > 1 and _closest(centres) < MIN_COLOUR_GAP:
+        if num > 1 and pdist(centres).min() < MIN_COLOUR_GAP:
             continue
         spread = np.square(colour - centres[classes]).sum(axis=1).mean() / 3
         variance = max(float(spread), COLOUR_NOISE**2)
@@ -306,11 +305,6 @@ def _colour_classes(colour: np.ndarray) -> np.ndarray:
         if cost < best_cost - 1e-9:
             best, best_cost = classes, float(cost)
     return best
-
-
-def _closest(centres: np.ndarray) -> float:
-    gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    return float(gaps[np.triu_indices(len(centres), 1)].min())
 
 
 def _k_means(values: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
@@ -334,7 +328,7 @@ def _smallest_marking(
     for piece in np.argsort(counts, kind="stable"):
         if counts[piece] == 0:
             continue
-        neighbours = _neighbours(pieces, pairs, int(piece))
+        neighbours, _ = _neighbours(pieces, pairs, int(piece))
         if not len(neighbours):
             continue
         own = colour[pieces == piece].mean(axis=0)
@@ -351,11 +345,11 @@ def _smallest_marking(
     return None
 
 
-def _neighbours(pieces: np.ndarray, pairs: np.ndarray, piece: int) -> np.ndarray:
-    a, b = pieces[pairs[:, 0]], pieces[pairs[:, 1]]
-    return np.unique(
-        np.concatenate([b[(a == piece) & (b != piece)], a[(b == piece) & (a != piece)]])
-    )
+def _neighbours(pieces: np.ndarray, pairs: np.ndarray, piece: int) -> tuple[np.ndarray, np.ndarray]:
+    """The pieces that one touches, and by how many pairs."""
+    links = pieces[pairs]
+    links = links[(links == piece).sum(axis=1) == 1]
+    return np.unique(links[links != piece], return_counts=True)
 
 
 SET_IN_SHARE = 0.5

@@ -1,6 +1,7 @@
 """From sets of Gaussians to instances: colour, box and parts."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TypeVar
 
@@ -16,16 +17,15 @@ from twin.naming.words import kind_of, label_of
 from twin.scene.frames.rgbd import NEAR_M
 from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.raster.rasteriser import Rasteriser
-from twin.scene.semantics.lift import Viewpoint, visible_weight
+from twin.scene.semantics.lift import Viewpoint, lifted
 from twin.scene.semantics.masks import associate, observe
-from twin.scene.semantics.part_segmentation import find_parts
 from twin.scene.semantics.segment import (
     SOURCE,
     points_of,
     segment,
     solid_splats,
 )
-from twin.scene.semantics.shape_descriptors import CONTAINER, measure_shape
+from twin.scene.semantics.shape_descriptors import CONTAINER, find_parts, measure_shape
 from twin.scene.semantics.support import (
     NoSupportError,
     SupportPlane,
@@ -68,7 +68,9 @@ def scene_from_masks(
         for viewpoint, masks in _told(frames, 0, SHOWN, advance, "masks lifted")
     ]
     found, labels = associate(observations, len(cloud), source)
-    plane = support_of(cloud)
+    plane: SupportPlane | None = None
+    with suppress(NoSupportError):
+        plane = find_support(points_of(cloud.take(solid_splats(cloud))))
     told = _told(found, SHOWN, 100, advance, "things measured")
     instances = tuple(describe(cloud, thing, plane) for thing in told)
     num_masks = sum(len(item.labels) for item in observations)
@@ -209,7 +211,9 @@ def _num_shown(
     shown, whole = np.zeros((2, num_things + 1), dtype=np.int64)
     size = np.maximum(np.bincount(labels, minlength=num_things + 1), 1)
     for viewpoint in viewpoints if num_things else ():
-        weight = visible_weight(rasteriser, cloud, viewpoint)
+        camera = viewpoint.camera
+        everywhere = np.ones((1, camera.height, camera.width), dtype=np.float32)
+        weight = lifted(rasteriser, cloud, viewpoint, everywhere)[:, 0]
         pixels = np.bincount(labels, weights=weight, minlength=num_things + 1)
         inside = _within_edges(cloud.means_m, viewpoint)
         share = np.bincount(labels, weights=inside, minlength=num_things + 1) / size
@@ -229,14 +233,6 @@ def _within_edges(
     edge = EDGE_SHARE * camera.width
     inside = np.all((uv > edge) & (uv < [camera.width - edge, camera.height - edge]), axis=1)
     return np.asarray(front & inside)
-
-
-def support_of(cloud: GaussianCloud) -> SupportPlane | None:
-    """The plane that things stand on, if there is one."""
-    try:
-        return find_support(points_of(cloud.take(solid_splats(cloud))))
-    except NoSupportError:
-        return None
 
 
 def describe(

@@ -34,14 +34,6 @@ def lifted(
     return rasteriser.lift(maps)
 
 
-def visible_weight(
-    rasteriser: Rasteriser, cloud: GaussianCloud, viewpoint: Viewpoint
-) -> Float32[np.ndarray, " num_splats"]:
-    """Pixels' worth of one camera's image that each Gaussian gives."""
-    ones = np.ones((1, viewpoint.camera.height, viewpoint.camera.width), dtype=np.float32)
-    return lifted(rasteriser, cloud, viewpoint, ones)[:, 0]
-
-
 def render_labels(
     rasteriser: Rasteriser,
     cloud: GaussianCloud,

@@ -20,6 +20,7 @@ from twin.scene.gaussians import GaussianCloud
 from twin.scene.semantics.cluster import (
     SurfacePoints,
     Voxels,
+    components,
     extents_m,
     make_voxels,
     neighbour_pairs,
@@ -28,7 +29,6 @@ from twin.scene.semantics.cluster import (
     split_by_valleys,
     within_outline,
 )
-from twin.scene.semantics.height_tree import branches
 from twin.scene.semantics.patches import REACH_VOXELS, VOXEL_M, cut_into_patches
 from twin.scene.semantics.shape_descriptors import measure_shape
 from twin.scene.semantics.support import (
@@ -212,13 +212,8 @@ class WithoutPlane:
 
     def __init__(self, points: SurfacePoints) -> None:
         """Measure how far points lie apart."""
-        self._points = points
-        self._spacing_m = _spacing(points.p_m)
-
-    @property
-    def nothing(self) -> str:
-        """Why no thing was found, where none was."""
-        return no_support(self._points)
+        self._points, self._spacing_m = points, _spacing(points.p_m)
+        self.nothing = no_support(points)
 
     def look(self, scale: float) -> Look:
         """Cut them, with voxels so many times as large as their spacing asks for."""
@@ -277,8 +272,8 @@ def _pieces(
 ) -> list[np.ndarray]:
     """Cut one connected group by colour, and each piece of it along valleys."""
     pieces = []
-    by_colour = _within(voxels, ids, pairs)
-    colours = split_by_colour(by_colour[0], height_m[ids], by_colour[1])
+    group, group_pairs = _within(voxels, ids, pairs)
+    colours = split_by_colour(group, height_m[ids], group_pairs)
     for colour in range(int(colours.max()) + 1):
         part = ids[colours == colour]
         own, own_pairs = _within(voxels, part, pairs)
@@ -362,6 +357,83 @@ def _thing(
     color = np.median(points.colors, axis=0).astype(np.float64)
     score = _firmness(height_m, limits)
     return Thing(label=f"{colour_name(color)} {shape.word}", score=score)
+
+
+LEVELS_M = (0.012, 0.018, 0.026, 0.036, 0.05, 0.07)
+"""Heights over the plane at which a group that is too large is looked at again."""
+BESIDE = 1.2
+"""Voxels this near to a branch, seen from above, lie below it."""
+BELOW = 2.0
+"""And no higher over its lowest voxel than so many voxels."""
+
+
+def branches(
+    p_m: Float[np.ndarray, "num_voxels 3"],
+    height_m: Float[np.ndarray, " num_voxels"],
+    pairs: Int[np.ndarray, "num_pairs 2"],
+    *,
+    voxel_m: float,
+    max_size_m: float,
+    min_voxels: int,
+) -> list[Int[np.ndarray, " num_members"]]:
+    """Groups of connected voxels that are small enough; what no level parts is left out.
+
+    Low down things hang together, as papers under mugs do. The groups are the branches of the tree
+    of components over rising levels, cut where they first are small enough (Jones 1999 on component
+    trees). What lies below a branch belongs to it.
+    """
+    groups: list[np.ndarray] = []
+    group = components(len(p_m), pairs)
+    large = np.flatnonzero(np.bincount(group, minlength=1) >= min_voxels)
+    todo: list[tuple[np.ndarray, tuple[float, ...]]]
+    todo = [(np.flatnonzero(group == number), LEVELS_M) for number in large]
+    while todo:
+        ids, levels = todo.pop(0)
+        if extents_m(p_m[ids])[0] <= max_size_m:
+            groups.append(ids)
+            continue
+        parts, left = _parted(ids, p_m, height_m, pairs, levels, max_size_m, min_voxels)
+        todo[:0] = [(part, left) for part in parts]
+    return _with_what_lies_below(groups, p_m, height_m, voxel_m)
+
+
+def _parted(
+    ids: np.ndarray,
+    p_m: np.ndarray,
+    height_m: np.ndarray,
+    pairs: np.ndarray,
+    levels_m: Sequence[float],
+    max_size_m: float,
+    min_voxels: int,
+) -> tuple[list[np.ndarray], tuple[float, ...]]:
+    """What is left of a group above the lowest level that parts it, and the levels above that."""
+    for place, level_m in enumerate(levels_m):
+        high = ids[height_m[ids] > level_m]
+        if len(high) < min_voxels:
+            break
+        group = components(len(high), pairs_among(high, pairs, len(p_m)))
+        parts = [high[group == n] for n in np.flatnonzero(np.bincount(group) >= min_voxels)]
+        if len(parts) > 1 or (parts and extents_m(p_m[parts[0]])[0] <= max_size_m):
+            return parts, tuple(levels_m[place + 1 :])
+    return [], ()
+
+
+def _with_what_lies_below(
+    groups: list[np.ndarray], p_m: np.ndarray, height_m: np.ndarray, voxel_m: float
+) -> list[np.ndarray]:
+    """Each group with the voxels below it that are nobody's; the first group comes first."""
+    owner = np.full(len(p_m), -1, dtype=np.int64)
+    for number, ids in enumerate(groups):
+        owner[ids] = number
+    for number, ids in enumerate(groups):
+        free = np.flatnonzero(owner < 0)
+        free = free[height_m[free] < height_m[ids].min() + BELOW * voxel_m]
+        if len(free):
+            beside, _ = cKDTree(p_m[ids, :2]).query(
+                p_m[free, :2], distance_upper_bound=BESIDE * voxel_m
+            )
+            owner[free[np.isfinite(beside)]] = number
+    return [np.flatnonzero(owner == number) for number in range(len(groups))]
 
 
 MIN_OPACITY = 0.3

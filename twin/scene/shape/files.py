@@ -20,7 +20,14 @@ def write_shape(
     """Write the geometry of one object, in the frame of its mesh."""
     write_whole(folder / MESH, mesh_ply(shape.vertices_m, shape.faces))
     shape.sdf.save(folder / SDF)
-    names, about = [MESH, SDF], describe_shape(shape)
+    names = [MESH, SDF]
+    about: dict[str, Any] = {
+        "watertight": shape.is_watertight,
+        "volume_m3": shape.volume_m3,
+        "voxel_m": shape.sdf.voxel_m,
+        "truncation_m": shape.truncation_m,
+        "num_views": shape.num_views,
+    }
     if soft:
         try:
             inside = lattice(shape)
@@ -29,20 +36,4 @@ def write_shape(
         else:
             inside.save(folder / SOFT)
             names.append(SOFT)
-            about["lattice"] = {
-                "num_nodes": len(inside.nodes_m),
-                "num_tets": len(inside.tets),
-                "spacing_m": inside.spacing_m,
-            }
     return names, about
-
-
-def describe_shape(shape: ObjectShape) -> dict[str, Any]:
-    """Return the numbers of a shape as ``object.json`` holds them."""
-    return {
-        "watertight": shape.is_watertight,
-        "volume_m3": shape.volume_m3,
-        "voxel_m": shape.sdf.voxel_m,
-        "truncation_m": shape.truncation_m,
-        "num_views": shape.num_views,
-    }

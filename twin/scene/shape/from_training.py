@@ -16,17 +16,15 @@ from jaxtyping import Bool, Float
 from bridge.episode import provenance
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import BASKET, SCANNED, ObjectModel, Task
 from bridge.terminal import Advance
 from twin.errors import TwinError
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import spread
 from twin.scene.shape.carve import MaskedView
-from twin.scene.shape.known import pose_of, shape_mesh, surface_distances
+from twin.scene.shape.known import outside_m, pose_of, shape_mesh
 from twin.scene.shape.reconstruct import (
     ObjectShape,
-    moved_views,
     reconstruct,
     shape_of_mesh,
 )
@@ -92,7 +90,8 @@ def _leaning(
     yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
     T_base_level = pose_of(np.array([*T_base_object[:3, 3], yaw]))
     T_level_object = se3.invert(T_base_level) @ T_base_object
-    level = reconstruct(moved_views(views, T_level_object), support, align_rounds=align_rounds)
+    moved = [replace(view, T_base_camera=T_level_object @ view.T_base_camera) for view in views]
+    level = reconstruct(moved, support, align_rounds=align_rounds)
     vertices = se3.apply(se3.invert(T_level_object), level.vertices_m)
     return shape_of_mesh(vertices, level.faces, level.num_views)
 
@@ -177,11 +176,8 @@ def _away(
     T_base_object: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, " num_points"]:
     """Distance to the known surface; where only the box around is known, 0 inside of it."""
-    if model.mesh is not None and model.soft is None:
-        return np.abs(object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points)))
-    distance, _ = surface_distances(points, model, T_base_object)
-    is_known = model.soft is None and model.shape != SCANNED
-    return np.asarray(np.abs(distance) if is_known else np.maximum(distance, 0.0))
+    distance = outside_m(points, model, T_base_object)
+    return np.asarray(np.abs(distance) if is_known(model) else np.maximum(distance, 0.0))
 
 
 WALL_BAND_M = (0.006, 0.008)
@@ -288,10 +284,7 @@ def from_outside_m(
     What cameras that are a little off see of a container's far wall lies in its cavity. Were it
     left in the scene, nothing could be put there once the container stands elsewhere.
     """
-    if model.mesh is not None and model.soft is None:
-        distance = object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points))
-    else:
-        distance, _ = surface_distances(points, model, T_base_object)
+    distance = outside_m(points, model, T_base_object)
     if model.wall_m > 0:
         half = np.array(model.inner_m) / 2
         p = se3.apply(se3.invert(T_base_object), points) - [0.0, 0.0, model.wall_m + half[2]]

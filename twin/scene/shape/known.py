@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel
 
@@ -110,6 +111,17 @@ def surface_distances(
     return np.stack(distances)[nearest, rows], gradient
 
 
+def outside_m(
+    points: Float[np.ndarray, "num_points 3"],
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, " num_points"]:
+    """Signed distance to a rigid object's known shape, mesh or panels; of a soft one to its box."""
+    if model.mesh is None or model.soft is not None:
+        return surface_distances(points, model, T_base_object)[0]
+    return object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points))
+
+
 def shape_mesh(
     model: ObjectModel,
 ) -> tuple[Float[np.ndarray, "num_vertices 3"], Int[np.ndarray, "num_faces 3"]]:
@@ -118,11 +130,10 @@ def shape_mesh(
         known = object_mesh(model)
         return known.vertices_m, known.triangles
     vertices, faces = [], []
-    corner = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     # Counter-clockwise seen from outside.
     quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
     for index, (centre, extents) in enumerate(model.panels()):
-        vertices.append(centre + corner * extents / 2)
+        vertices.append(centre + box_corners(extents))
         faces.append(triangles + 8 * index)
     return np.concatenate(vertices), np.concatenate(faces)

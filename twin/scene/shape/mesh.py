@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -10,6 +9,7 @@ from jaxtyping import Float, Float32, Int
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from twin.errors import UnreadableFileError
+from twin.robot.surface import ray_scene, tensor
 
 Vertices = Float[np.ndarray, "num_vertices 3"]
 Faces = Int[np.ndarray, "num_faces 3"]
@@ -29,22 +29,6 @@ class UnreadableMeshError(UnreadableFileError):
         "Expected a binary little-endian PLY with float x, y, z and triangles. "
         "Make it again: robot-gst rebuild RUN --force."
     )
-
-
-def is_watertight(faces: Faces) -> bool:
-    """Say whether a mesh is closed: every edge once in each direction, no face degenerate.
-
-    That is: each edge belongs to exactly two faces, and they are oriented alike.
-    """
-    if len(faces) == 0:
-        return False
-    start = faces.astype(np.int64).ravel()
-    end = np.roll(faces, -1, axis=1).astype(np.int64).ravel()
-    if np.any(start == end):
-        return False
-    base = int(faces.max()) + 1
-    there, back = np.sort(start * base + end), np.sort(end * base + start)
-    return bool(np.all(np.diff(there) > 0) and np.array_equal(there, back))
 
 
 def volume_m3(vertices_m: Vertices, faces: Faces) -> float:
@@ -117,16 +101,11 @@ def first_hit(
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
 ) -> tuple[Float32[np.ndarray, "height width"], Float32[np.ndarray, "height width 3"]]:
     """Where rays of a camera meet the first mesh: depth, infinite beside them, and normal."""
-    import open3d  # noqa: PLC0415  # loads 300 modules; who only reads meshes needs none
-
-    make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
-    tensor: Any = open3d.core.Tensor
-    scene = make()
-    for name, (vertices_m, triangles) in meshes.items():
-        if name in Ts_base_object and len(triangles):
-            T_camera_object = se3.invert(T_base_camera) @ Ts_base_object[name]
-            vertices = se3.apply(T_camera_object, vertices_m).astype(np.float32)
-            scene.add_triangles(tensor(vertices), tensor(triangles.astype(np.uint32)))
+    scene = ray_scene(
+        (se3.apply(se3.invert(T_base_camera) @ Ts_base_object[name], vertices_m), triangles)
+        for name, (vertices_m, triangles) in meshes.items()
+        if name in Ts_base_object and len(triangles)
+    )
     from_camera = np.concatenate([np.zeros_like(rays), rays], axis=-1).astype(np.float32)
     found = scene.cast_rays(tensor(from_camera))
     return found["t_hit"].numpy(), found["primitive_normals"].numpy()

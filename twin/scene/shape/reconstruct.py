@@ -1,14 +1,15 @@
 """One closed metric shape of an object, from masked depth or a foreign mesh."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from bridge.task.meshes.solids import is_closed
+from twin.robot.surface import ray_scene, tensor
 from twin.scene.shape.carve import (
     MaskedView,
     ShapeError,
@@ -18,7 +19,7 @@ from twin.scene.shape.carve import (
     solid_of,
 )
 from twin.scene.shape.isosurface import isosurface
-from twin.scene.shape.mesh import Faces, Vertices, is_watertight, volume_m3
+from twin.scene.shape.mesh import Faces, Vertices, volume_m3
 from twin.scene.shape.registration import laid_together
 from twin.scene.shape.sdf import SdfGrid, smoothed
 
@@ -131,7 +132,7 @@ def _meshed(grid: SdfGrid, num_views: int, truncation_m: float) -> ObjectShape:
         vertices_m=vertices,
         faces=faces,
         sdf=grid,
-        is_watertight=is_watertight(faces),
+        is_watertight=is_closed(faces),
         volume_m3=volume_m3(vertices, faces),
         num_views=num_views,
         truncation_m=truncation_m,
@@ -166,13 +167,6 @@ def _extent(
     return low, high
 
 
-def moved_views(
-    views: Sequence[MaskedView], T_new_base: Float[np.ndarray, "4 4"]
-) -> list[MaskedView]:
-    """The same views in another frame."""
-    return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]
-
-
 def shape_of_mesh(vertices_m: Vertices, faces: Faces, num_views: int = 1) -> ObjectShape:
     """Describe a mesh of closed pieces, which may overlap, like a reconstructed shape.
 
@@ -194,16 +188,11 @@ def _signed_m(
     vertices_m: Vertices, faces: Faces, places: Float[np.ndarray, "num_places 3"]
 ) -> Float32[np.ndarray, " num_places"]:
     """Distance of places to the union of closed pieces, negative inside of one."""
-    import open3d  # noqa: PLC0415  # loads 300 modules; who only reads shapes needs none
-
-    make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
-    tensor: Any = open3d.core.Tensor
     count, ends = len(vertices_m), np.concatenate([faces[:, :2], faces[:, 1:]]).T
     _, piece = connected_components(coo_array((np.ones(ends.shape[1]), ends), shape=(count, count)))
     nearest = np.full(len(places), np.inf, dtype=np.float32)
     for number in np.unique(piece[faces[:, 0]]):
-        scene, own = make(), faces[piece[faces[:, 0]] == number].astype(np.uint32)
-        scene.add_triangles(tensor(vertices_m.astype(np.float32)), tensor(own))
+        scene = ray_scene([(vertices_m, faces[piece[faces[:, 0]] == number])])
         away = scene.compute_signed_distance(tensor(places.astype(np.float32)))
         nearest = np.minimum(nearest, away.numpy())
     return nearest

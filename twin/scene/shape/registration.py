@@ -119,11 +119,6 @@ class _State:
         offset, scale = self.errors[self.sensors[view], 6:]
         return np.asarray(points * (1 + scale + offset / np.maximum(points[:, 2:], 1e-9)))
 
-    @property
-    def num_unknowns(self) -> int:
-        """Those of all views, then those of all sensors."""
-        return int(self.moves.size + self.errors.size)
-
     def columns(self, sensor: int) -> slice:
         """Where a sensor's unknowns are."""
         first = self.moves.size + SHARED * sensor
@@ -279,7 +274,7 @@ def _agreement(surfaces: Sequence[SeenSurface], state: _State) -> tuple[np.ndarr
     np.add.at(share, (line[:, None], owner[index]), -weight)
     share[line, owner[rows]] += 1.0
     lever = np.concatenate([slope, np.cross(p[rows] - state.pivot, slope)], axis=1)
-    J = np.zeros((len(rows), state.num_unknowns))
+    J = np.zeros((len(rows), state.moves.size + state.errors.size))
     J[:, : state.moves.size] = (share[:, :, None] * lever[:, None, :]).reshape(
         len(rows), state.moves.size
     )

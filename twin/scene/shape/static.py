@@ -7,11 +7,11 @@ the unseen for solid; the observed one takes it for free. Beyond the grid nothin
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from twin.npz import UnreadableArraysError, read_npz, write_npz
 from twin.scene.frames.rgbd import TrainingView
@@ -19,7 +19,8 @@ from twin.scene.frames.selection import spread
 from twin.scene.shape.carve import MaskedView, ShapeError, VoxelBox, gather
 from twin.scene.shape.sdf import MAX_VOXELS, SdfGrid, distances_of_solid
 
-FREE, SURFACE, UNSEEN = 0, 1, 2
+OBSERVED = "observed_m"
+"""Name of that grid's distances in the file."""
 MIN_POINTS = 100
 POINTS_PER_VIEW = 2000
 OBJECT_MARGIN_VOXELS = 1.5
@@ -46,44 +47,22 @@ class StaticSdf:
     """What nobody saw counts as solid."""
     observed: SdfGrid
     """What nobody saw counts as free."""
-    state: UInt8[np.ndarray, "num_x num_y num_z"]
-    """FREE, SURFACE or UNSEEN."""
-    truncation_m: float
-    table_z_m: float | None
-    """Everything below is solid; None when no table is known."""
 
     def save(self, path: Path) -> None:
         """Write an npz file; ``SdfGrid.load`` finds the conservative grid in it."""
-        table = np.nan if self.table_z_m is None else self.table_z_m
-        extra = {
-            "observed_m": self.observed.values_m,
-            "state": self.state,
-            "truncation_m": np.array(self.truncation_m),
-            "table_z_m": np.array(table),
-        }
-        write_npz(path, self.conservative.arrays() | extra)
+        write_npz(path, self.conservative.arrays() | {OBSERVED: self.observed.values_m})
 
     @staticmethod
     def load(path: Path) -> "StaticSdf":
         """Read what ``save`` wrote."""
         grid = SdfGrid.load(path)
-        names = ("observed_m", "state", "truncation_m", "table_z_m")
-        found = read_npz(path, names, MAX_VOXELS * 5 + 4096)
-        values, state = found["observed_m"], found["state"]
-        if not values.shape == state.shape == grid.values_m.shape or state.dtype != np.uint8:
+        values = read_npz(path, (OBSERVED,), MAX_VOXELS * 4 + 4096)[OBSERVED]
+        if values.shape != grid.values_m.shape:
             raise UnreadableArraysError(path=path, found="grids of different sizes")
         if not np.isfinite(values).all():
             raise UnreadableArraysError(path=path, found="a distance is not finite")
-        table = float(found["table_z_m"])
-        return StaticSdf(
-            conservative=grid,
-            observed=SdfGrid(
-                values_m=values, origin_m=grid.origin_m, voxel_m=grid.voxel_m, closed=False
-            ),
-            state=state,
-            truncation_m=float(found["truncation_m"]),
-            table_z_m=None if np.isnan(table) else table,
-        )
+        observed = replace(grid, values_m=values, closed=False)
+        return StaticSdf(conservative=grid, observed=observed)
 
 
 def static_sdf(
@@ -100,8 +79,7 @@ def static_sdf(
     """
     masked = [everything_in(views[k]) for k in spread(np.arange(len(views)), MAX_VIEWS)]
     box = _box(masked, table_z_m)
-    truncation = TRUNCATION_VOXELS * box.voxel_m
-    evidence = gather(box, masked, truncation, min_free_views=2)
+    evidence = gather(box, masked, TRUNCATION_VOXELS * box.voxel_m, min_free_views=2)
     free = evidence.empty.ravel()
     taken = np.flatnonzero(~free if objects else [])
     for first in range(0, len(taken), VOXELS_AT_ONCE):
@@ -114,15 +92,7 @@ def static_sdf(
     if table_z_m is not None:
         below = box.axis_m(2) < table_z_m
         free[:, :, below], surface[:, :, below] = False, True
-    surface &= ~free
-    state = np.where(free, FREE, np.where(surface, SURFACE, UNSEEN)).astype(np.uint8)
-    return StaticSdf(
-        conservative=_grid(box, state != FREE),
-        observed=_grid(box, state == SURFACE),
-        state=state,
-        truncation_m=truncation,
-        table_z_m=table_z_m,
-    )
+    return StaticSdf(conservative=_grid(box, ~free), observed=_grid(box, surface & ~free))
 
 
 def everything_in(view: TrainingView) -> MaskedView:

@@ -214,10 +214,7 @@ def test_a_rebuilt_scene_says_how_far_it_is() -> None:
     z = 0.02 * np.arange(40) - 0.2
     values = np.broadcast_to((z - 0.05).astype(np.float32), (60, 60, 40)).copy()
     grid = SdfGrid(values_m=values, origin_m=np.array([0.0, -0.6, -0.2]), voxel_m=0.02)
-    free = np.zeros(values.shape, dtype=np.uint8)
-    still = StaticSdf(
-        conservative=grid, observed=grid, state=free, truncation_m=0.1, table_z_m=None
-    )
+    still = StaticSdf(conservative=grid, observed=grid)
     problem = replace(blocks(), scene=replace(blocks().scene, static_sdf=still))
     record = {"kind": "clearance", "obj": "cube", "against": "scene", "min": 0.03}
     constraint = compile_constraint(record, problem)

@@ -173,8 +173,7 @@ def test_what_only_a_scenes_grid_shows_is_kept_away_from(pairs: Pairs) -> None:
         voxel_m=voxel_m, closed=False,
     )  # fmt: skip
     static = StaticSdf(
-        conservative=grid, observed=grid, state=solid.astype(np.uint8), truncation_m=0.03,
-        table_z_m=0.0,
+        conservative=grid, observed=grid,
     )  # fmt: skip
     problem = replace(pairs.problem, scene=replace(pairs.problem.scene, static_sdf=static))
     world = build_world(problem, width_m=WIDTH_M, eps_col_m=EPS_M)

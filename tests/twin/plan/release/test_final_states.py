@@ -137,10 +137,7 @@ def wall_behind(voxel_m: float) -> StaticSdf:
     grid = SdfGrid(
         values_m=distances_of_solid(solid, voxel_m), origin_m=origin, voxel_m=voxel_m, closed=False
     )
-    state = solid.astype(np.uint8)
-    return StaticSdf(
-        conservative=grid, observed=grid, state=state, truncation_m=0.03, table_z_m=None
-    )
+    return StaticSdf(conservative=grid, observed=grid)
 
 
 def test_the_static_grid_is_made_thicker_by_its_own_error() -> None:

@@ -51,9 +51,6 @@ def static_of(*boxes: Box, table_m: float | None = 0.0, left_m: float = 0.3) -> 
     return StaticSdf(
         conservative=grid,
         observed=grid,
-        state=solid.astype(np.uint8),
-        truncation_m=3 * VOXEL_M,
-        table_z_m=table_m,
     )
 
 

@@ -34,7 +34,7 @@ from twin.replay.images import RATE_HZ, render_replay
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.robot.model import load_robot
-from twin.scene.sequence import render_sequence
+from twin.scene.render import render
 from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import write_calibration
 
@@ -231,7 +231,7 @@ def test_a_trial_shows_the_recorded_arm_and_says_whom_nobody_found(
     scene = script.scene()
     write_scene(run, scene, "cube", block())
     write_recording(run, scene.urdf)
-    about = render_sequence(
+    about = render(
         run, RenderConfig(episode="trial_0001", camera="side", depth=True, out=tmp_path / "f")
     )
     assert about["frames"] == 3
@@ -259,7 +259,7 @@ def test_a_video_has_the_frames_and_what_does_not_go_together_is_refused(
     write_recording(run, scene.urdf)
     eye = {"eye": (1.2, -0.8, 0.9), "target": (0.45, 0.0, 0.2)}
     config = RenderConfig(episode="trial_0001", size="97x64", out=tmp_path / "a.mp4", **eye)
-    assert render_sequence(run, config)["frames"] == 3
+    assert render(run, config)["frames"] == 3
     frames = list(read_frames(tmp_path / "a.mp4", [0.0, 1.0, 2.0], 0.01))
     assert {frame.shape for frame in frames} == {(64, 97, 3)}
     assert np.abs(frames[0].astype(int) - frames[-1]).max() > 80
@@ -268,9 +268,9 @@ def test_a_video_has_the_frames_and_what_does_not_go_together_is_refused(
         ({"depth": True}, "--out FOLDER"),
         ({"size": "big"}, "write WIDTHxHEIGHT"),
         ({"compare": True}, "leave out --eye and --size"),
-        ({"object": ("cube=0,0,0",)}, "are for one image"),
+        ({"object": ("cup=0,0,0",)}, "the scene has no object 'cup'"),
         ({"episode": "trial_9"}, "no episode 'trial_9'.*trial_0001"),
         ({"eye": None}, "belong together"),
     ):
         with pytest.raises(UsageError, match=found):
-            render_sequence(run, replace(config, **wrong))
+            render(run, replace(config, **wrong))

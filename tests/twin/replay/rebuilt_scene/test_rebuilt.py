@@ -98,9 +98,6 @@ def write_distances(run: RunFolder, observed_m: float) -> None:
     StaticSdf(
         conservative=grid,
         observed=replace(grid, values_m=observed),
-        state=np.zeros(values.shape, dtype=np.uint8),
-        truncation_m=0.1,
-        table_z_m=None,
     ).save(run.scene_dir / "sdf.npz")
 
 

@@ -188,8 +188,7 @@ def test_what_has_no_name_in_the_scene_is_measured_by_its_surface(script: Simple
     values = (outside + np.minimum(inside.max(axis=0), 0.0)).astype(np.float32)
     grid = SdfGrid(values_m=values, origin_m=origin, voxel_m=voxel, closed=False)
     static = StaticSdf(
-        conservative=grid, observed=grid, state=np.zeros(values.shape, dtype=np.uint8),
-        truncation_m=0.03, table_z_m=0.0,
+        conservative=grid, observed=grid,
     )  # fmt: skip
     cluttered = replace(scene, static_sdf=static)
     joints = joints_over(scene, 0.7, -0.1 + 0.05 + 0.045, 0.12)

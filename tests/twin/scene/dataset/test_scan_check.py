@@ -1,5 +1,6 @@
 """Bad scans: one clear sentence each, and what can be kept is kept."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import textured_room
 from bridge.episode.cdr.messages import FrameTransform
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
+from bridge.terminal import Output
 from twin.scene.dataset.scan_check import (
     CameraCheck,
     MovedCameraError,
@@ -43,8 +45,9 @@ def camera(choice: FrameChoice, *, count: int = 8, depth_times: float = 1.0) -> 
 def test_a_good_scan_gives_no_remark(choice: FrameChoice) -> None:
     report = check_scan([camera(choice)], CONFIG)
     assert report.remarks() == []
-    (agreement,) = report.to_record()["pose_agreement"].values()
-    assert agreement > 0.9
+    (poses,) = report.poses.values()
+    assert poses.agreement is not None
+    assert poses.agreement > 0.9
 
 
 @pytest.mark.parametrize(
@@ -133,15 +136,17 @@ def spoilt_transforms(
 
 @pytest.mark.slow
 def test_a_camera_that_tf_knows_nothing_of_is_followed_by_its_images(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = RunFolder.create(tmp_path)
     for _ in spoilt_transforms(monkeypatch, None):
         textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=24)
-    (choice,) = choose_frames(find_sources(run), CONFIG).choices
+    (choice,) = choose_frames(find_sources(run), CONFIG, Output()).choices
     assert choice.poses.source == "odometry"
     assert root_frame(choice) == "odometry_scan_wrist"
-    assert choice.poses.quality["agreement"] > 0.8
+    agreed = re.search(r"(\d+) % of the depth agrees between them", capsys.readouterr().err)
+    assert agreed is not None
+    assert int(agreed[1]) > 80
     stamps = np.array([1_000_000_000 + 100_000_000 * k for k in range(24)])
     found = choice.poses.tree.Ts_root_frame("wrist_depth_optical", stamps)
     np.testing.assert_allclose(found[0], np.eye(4), atol=1e-6)

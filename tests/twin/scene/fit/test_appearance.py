@@ -7,7 +7,7 @@ from seen_colors import view_directions
 
 from twin.scene import gaussians
 from twin.scene.fit import appearance
-from twin.scene.fit.exposure import gain_between, gain_exposure, solve_exposures
+from twin.scene.fit.appearance import gain_between, solve_gains
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 from twin.scene.harmonics import harmonic_terms
@@ -35,7 +35,7 @@ def room() -> Room:
             appearance.ImageObservation(
                 target=replace(view.half, static_mask=mask),
                 T_base_camera=view.T_base_color,
-                exposure=gain_exposure(GAINS[index]),
+                gain=GAINS[index],
             )
         )
     return cloud, observations
@@ -75,8 +75,8 @@ def dense_solution(
             basis[:, 1:] = np.stack(harmonic_terms(*towards.T), axis=1)
         seen = item.target.static_mask.ravel()
         blocks = np.concatenate([A * basis[:, term] for term in range(terms)], axis=1)[seen]
-        M, offset = item.exposure[:, :3], item.exposure[:, 3]
-        missing = item.target.image().reshape(3, -1).T[seen] - offset
+        M = np.diag(item.gain)
+        missing = item.target.image().reshape(3, -1).T[seen]
         missing -= blocks @ origin.reshape(-1, 3) @ M.T
         normal += np.kron(blocks.T @ blocks, M.T @ M)
         right += blocks.T @ missing @ M
@@ -107,8 +107,8 @@ def test_what_a_mask_hides_does_not_matter(room: Room) -> None:
     )
     np.testing.assert_array_equal(clean.colors, other.colors)
     np.testing.assert_array_equal(
-        solve_exposures(cloud, observations, rasteriser()),
-        solve_exposures(cloud, spoilt, rasteriser()),
+        solve_gains(cloud, observations, rasteriser()),
+        solve_gains(cloud, spoilt, rasteriser()),
     )
 
 
@@ -131,10 +131,10 @@ def test_gains_are_found_up_to_their_mean(room: Room) -> None:
         planes = draw.draw_planes(cloud, item.target.camera, item.T_base_camera)[:3]
         recorded = np.rint(np.clip(planes * gain[:, None, None], 0, 1) * 255).astype(np.uint8)
         exposed.append(replace(item, target=replace(item.target, planes_u8=recorded)))
-    found = solve_exposures(cloud, exposed, draw)
-    expected = gain_exposure(true / true.mean(axis=0))
+    found = solve_gains(cloud, exposed, draw)
+    expected = true / true.mean(axis=0)
     np.testing.assert_allclose(found, expected, rtol=5e-3)
-    np.testing.assert_allclose(found.mean(axis=0), np.eye(3, 4), rtol=1e-12)
+    np.testing.assert_allclose(found.mean(axis=0), 1.0, rtol=1e-12)
 
 
 def test_a_saturated_pixel_says_nothing_about_the_gain(room: Room) -> None:

@@ -6,11 +6,11 @@ import textured_room
 
 from bridge.geometry import se3
 from twin.scene.fit.appearance import ImageObservation
-from twin.scene.fit.densify import Scores, densify, score
 from twin.scene.fit.initialise import fuse
+from twin.scene.fit.optimise import Scores, densify, score
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.raster.rasteriser import SAME_EXPOSURE, RasterConfig, Rasteriser
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 
 Room = tuple[GaussianCloud, list[ImageObservation]]
@@ -23,7 +23,7 @@ def room() -> Room:
     cloud = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=400))
     views = [training_view(surface) for surface in surfaces]
     return cloud, [
-        ImageObservation(target=view.full, T_base_camera=view.T_base_color, exposure=SAME_EXPOSURE)
+        ImageObservation(target=view.full, T_base_camera=view.T_base_color, gain=np.ones(3))
         for view in views
     ]
 

@@ -16,8 +16,8 @@ from bridge.geometry.camera import Camera
 from bridge.task.task_file import Task, load_task
 from twin.scene import trial
 from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
-from twin.scene.image_agreement import part_masks
 from twin.scene.raster.rasteriser import Rasteriser
+from twin.scene.render import part_masks
 from twin.scene.shape.known import pose_of, shape_mesh
 from twin.scene.store.folder import background_hash, read_scene, write_record
 from twin.scene.trial import trial_parts

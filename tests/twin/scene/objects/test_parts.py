@@ -10,7 +10,6 @@ from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
-from twin.scene.localise.result import LocalisedObject
 from twin.scene.movable_scene import MovableScene
 from twin.scene.objects.decompose import LibraryObject, ObjectSplats, read_objects
 from twin.scene.shape.sdf import SdfGrid
@@ -40,17 +39,12 @@ def cube_on_table(T_base_cube: np.ndarray) -> GaussianCloud:
 def written(tmp_path: Path) -> tuple[RunFolder, dict, GaussianCloud, np.ndarray]:
     T = se3.transform_from(np.array([0.97, 0, 0, 0.24]), np.array([0.5, -0.1, 0.02]))
     cloud, task = cube_on_table(T), load_task("cube_into_box")
-    found = LocalisedObject(
-        object_id="cube", T_base_object=T, covariance=None, confidence=1.0,
-        method="given", reason="", stamp_ns=1,
-    )  # fmt: skip
     cube = LibraryObject(
         model=task.objects["cube"],
         splats=ObjectSplats(
             cloud=moved_cloud(cloud.take(np.arange(600)), se3.invert(T)), T_base_object=T
         ),
         shape="seen too little",
-        localised=found,
         episode_id="scan_0001",
     )
     run = RunFolder.create(tmp_path / "run")

@@ -8,7 +8,7 @@ from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.fit.lighting import EVEN, Lighting, fit_lighting, read_lighting
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import as_float32
-from twin.scene.robot.link_surface import SeenLink, link_lighting, on_surface, own_colors
+from twin.scene.robot.extraction import SeenLink, link_lighting, on_surface, own_colors
 
 HALF_M = np.array([0.05, 0.04, 0.12])
 TRUE = Lighting(coefficients=(1.0, 0.1, -0.15, 0.35, 0.05, 0.0, 0.03, -0.04, 0.02))

@@ -3,16 +3,16 @@
 import numpy as np
 
 from bridge.geometry.mesh import sample_triangles
-from twin.scene.fit.on_mesh import Triangles
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import as_float32
-from twin.scene.robot.link_surface import on_surface
+from twin.scene.robot.extraction import on_surface
+from twin.scene.shape.mesh import Mesh
 
 HALF_M = np.array([0.05, 0.04, 0.2])
 RED, GREEN = np.array([0.8, 0.1, 0.1]), np.array([0.1, 0.7, 0.2])
 
 
-def box(half_m: np.ndarray = HALF_M) -> Triangles:
+def box(half_m: np.ndarray = HALF_M) -> Mesh:
     corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
@@ -51,7 +51,7 @@ def test_gaussians_lie_on_the_shape_densely_and_keep_the_colour_of_their_side() 
     assert gap_m.max() < 0.015  # no hole wider than a spacing and a half
 
 
-def _evenly(surface: Triangles, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _evenly(surface: Mesh, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     corners = surface[0][surface[1]]
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)

@@ -78,7 +78,7 @@ def rotations(cloud: GaussianCloud) -> np.ndarray:
 
 def test_posing_at_the_joints_of_binding_changes_nothing(skin: GaussianCloud) -> None:
     links = bind(skin)
-    again = posed(links, HOME, URDF, width_m=WIDTH_M)
+    again = posed(links, Posture(joints_rad=HOME, width_m=WIDTH_M), URDF)
     a, b = skin.take(in_order(skin)), again.take(in_order(again))
     assert len(a) == len(b)
     np.testing.assert_allclose(a.means_m, b.means_m, atol=2e-6)
@@ -91,8 +91,8 @@ def test_a_link_moves_exactly_as_forward_kinematics_says(skin: GaussianCloud) ->
     robot = load_robot(URDF)
     links = bind(skin)
     for link in ("forearm_link", "wrist_3_link", "gripper_left_finger"):
-        before = posed({link: links[link]}, HOME, URDF, width_m=WIDTH_M)
-        after = posed({link: links[link]}, AWAY, URDF, width_m=0.08)
+        before = posed({link: links[link]}, Posture(joints_rad=HOME, width_m=WIDTH_M), URDF)
+        after = posed({link: links[link]}, Posture(joints_rad=AWAY, width_m=0.08), URDF)
         T = robot.T_base_link(link, AWAY, 0.08) @ se3.invert(robot.T_base_link(link, HOME, WIDTH_M))
         expected = se3.apply(T, before.means_m.astype(np.float64))
         np.testing.assert_allclose(after.means_m, expected, atol=3e-6)
@@ -102,7 +102,7 @@ def test_a_link_moves_exactly_as_forward_kinematics_says(skin: GaussianCloud) ->
 
 def test_an_unknown_link_lists_those_that_exist(skin: GaussianCloud) -> None:
     with pytest.raises(RobotDescriptionError, match="forearm_link"):
-        posed({"tentacle": skin}, HOME, URDF)
+        posed({"tentacle": skin}, Posture(joints_rad=HOME), URDF)
 
 
 def test_links_survive_the_disk_and_stale_ones_go(skin: GaussianCloud, tmp_path: Path) -> None:
@@ -208,7 +208,7 @@ def test_links_are_collected_over_postures_in_their_own_frames(episode: Episode)
     assert {"upper_arm_link", "forearm_link"} <= set(links)
     robot = load_robot(URDF)
     third = HOME + 0.4 * (AWAY - HOME)
-    cloud = posed(links, third, URDF, width_m=WIDTH_M)
+    cloud = posed(links, Posture(joints_rad=third, width_m=WIDTH_M), URDF)
     surface = PosedSurface(robot, Posture(joints_rad=third, width_m=WIDTH_M))
     assert np.quantile(surface.nearest(cloud.means_m.astype(np.float64)).distance_m, 0.9) < 0.006
     assert np.median(cloud.colors[:, 0]) > 0.6

@@ -3,7 +3,7 @@
 import numpy as np
 
 from twin.scene.semantics.cluster import neighbour_pairs
-from twin.scene.semantics.height_tree import branches
+from twin.scene.semantics.segment import branches
 
 VOXEL_M = 0.01
 

@@ -3,7 +3,7 @@ import pytest
 import table_scene
 from table_scene import Piece, iou, make_world, table
 
-from twin.scene.semantics.part_segmentation import find_parts
+from twin.scene.semantics.shape_descriptors import find_parts
 
 
 def parts_of(pieces: list[Piece]) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -10,7 +10,7 @@ from bridge.robots.default import ROBOT
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface
-from twin.scene.image_agreement import ImageAgreement, describe_agreement, part_masks
+from twin.scene.render import ImageAgreement, describe_agreement, part_masks
 
 CAMERA = Camera(width=80, height=60, fx=70.0, fy=70.0, cx=40.0, cy=30.0)
 T_CAMERA = se3.look_at(np.array([1.5, -0.8, 0.7]), np.array([0.2, 0.0, 0.3]), np.eye(3)[2])

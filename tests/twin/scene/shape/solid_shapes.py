@@ -4,8 +4,9 @@ from functools import cache
 
 import numpy as np
 
+from bridge.task.meshes.solids import is_closed
 from twin.scene.shape.isosurface import isosurface
-from twin.scene.shape.mesh import is_watertight, volume_m3
+from twin.scene.shape.mesh import volume_m3
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
 
@@ -18,7 +19,7 @@ def shape_of(solid: np.ndarray, voxel_m: float) -> ObjectShape:
         vertices_m=vertices,
         faces=faces,
         sdf=SdfGrid(values_m=values, origin_m=origin_m, voxel_m=voxel_m),
-        is_watertight=is_watertight(faces),
+        is_watertight=is_closed(faces),
         volume_m3=volume_m3(vertices, faces),
         num_views=1,
         truncation_m=0.01,

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from skimage.measure import marching_cubes
 
 from bridge.errors import PathNotFoundError
+from bridge.task.meshes.solids import is_closed
 from twin.scene.shape import mesh
 from twin.scene.shape.isosurface import isosurface
 
@@ -28,7 +29,7 @@ def test_any_values_whatever_give_a_closed_surface(seed: int, share: float) -> N
     values = (rng.random((7, 6, 5)) - share).astype(np.float32)
     vertices, faces = isosurface(values, np.zeros(3), 1.0)
     if (values < 0).any():
-        assert mesh.is_watertight(faces)
+        assert is_closed(faces)
         assert mesh.volume_m3(vertices, faces) > 0
         assert vertices.min() > -1.0
 
@@ -41,7 +42,7 @@ def test_the_surface_lies_where_scikit_image_puts_it() -> None:
     step = axis[1] - axis[0]
     vertices, faces = isosurface(ring, np.full(3, -1.0), step)
     theirs, their_faces, _, _ = marching_cubes(ring, 0.0, spacing=(step,) * 3)
-    assert mesh.is_watertight(faces)
+    assert is_closed(faces)
     assert len(vertices) == len(theirs)
     ours = vertices[np.lexsort(vertices.round(5).T)]
     np.testing.assert_allclose(ours, (theirs - 1.0)[np.lexsort((theirs - 1.0).round(5).T)],
@@ -52,16 +53,16 @@ def test_the_surface_lies_where_scikit_image_puts_it() -> None:
 
 def test_an_open_mesh_a_flipped_face_and_no_mesh_are_not_watertight() -> None:
     _, faces = sphere(0.05, 0.01)
-    assert mesh.is_watertight(faces)
-    assert not mesh.is_watertight(faces[1:])
+    assert is_closed(faces)
+    assert not is_closed(faces[1:])
     flipped = faces.copy()
     flipped[0] = flipped[0][::-1]
-    assert not mesh.is_watertight(flipped)
-    assert not mesh.is_watertight(np.concatenate([faces, faces[:1]]))
-    assert not mesh.is_watertight(np.zeros((0, 3), dtype=np.int64))
+    assert not is_closed(flipped)
+    assert not is_closed(np.concatenate([faces, faces[:1]]))
+    assert not is_closed(np.zeros((0, 3), dtype=np.int64))
     degenerate = faces.copy()
     degenerate[0, 1] = degenerate[0, 0]
-    assert not mesh.is_watertight(degenerate)
+    assert not is_closed(degenerate)
 
 
 def test_a_written_mesh_is_read_back_and_open3d_reads_it_too(tmp_path: Path) -> None:
