@@ -66,6 +66,12 @@ def test_the_refused_plan_stays_beside_the_accepted_one(steered: tuple[RunFolder
     assert json.loads(done.path.read_bytes())["parent_id"] == refused.id
 
 
+def test_a_plan_is_named_by_its_start(steered: tuple[RunFolder, Planned]) -> None:
+    _, done = steered
+    name = "cube_into_box.trial_0001.nominal.0"
+    assert [each.candidate.plan.id for each in done.attempts] == [f"{name}.0", f"{name}.1"]
+
+
 def test_a_replay_holds_the_plan_its_verdict_and_the_moving_arm(
     steered: tuple[RunFolder, Planned],
 ) -> None:
