@@ -81,7 +81,7 @@ GONE: dict[str, str] = {
     "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
     "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",
-    "plan --send-images": "A model is told the objects in words; leave the flag out.",
+    "plan --send-images": "A model gets the marked picture of the start; leave the flag out.",
     "publish standin --probes": "Trials teach as much: robot-gst calibrate RUN --posterior.",
     "calibrate --pairs": "Record /CELL/cam/ID/target/pose, then robot-gst calibrate RUN --cameras.",
     "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
@@ -90,7 +90,7 @@ GONE: dict[str, str] = {
         (
             *(f"{command} --replay.{name}" for command in ("replay", "gate") for name in FIXED),
             "gate --max-audit-distances",
-            "plan --candidates",
+            *("plan --candidates", "plan --policy"),
             *(f"publish standin --{name}" for name in ("real-time", "execute-unverified")),
             *(f"publish standin --{name}" for name in ("scan-id", "first-probe", "gate-cell")),
             *(f"rebuild --{name}" for name in ("slab", "harmonics", "exposure", "densify", "loss")),

@@ -30,7 +30,7 @@ def plan(
 
     Args:
         run: Run folder; its episodes and its scene say which objects there are, and where.
-        task: The instruction in English, or the name or file of a task.
+        task: The instruction, in English where no model is given, or the name or file of a task.
         dry: Say what was understood and write nothing; without it plans go into the run's
             plans/ and their task into tasks/.
         live: Answer a cell's requests.
@@ -69,6 +69,8 @@ def plan(
     if dry:
         output.result({**begun.to_json(), "file": None}, "\n".join(begun.lines()))
         return 0
+    if begun.asked is not None and not words.yes:
+        _refuse_without_yes("\n".join(begun.lines()))
     judge = judge_of(folder.path, begun.start.problem.scene)
     planned = plan_once(folder, begun, judge, words)
     path = keep(folder, understood)
@@ -76,3 +78,19 @@ def plan(
     wrote = [] if path is None else [f"wrote {path}"]
     output.result(data, "\n".join([*planned.lines(), *wrote]))
     return 0 if planned.path is not None else 3
+
+
+def _refuse_without_yes(understood: str) -> None:
+    """Read back what a model understood, and go on only with a person's yes."""
+    import sys
+
+    from bridge.errors import UsageError
+    from bridge.terminal import printable
+
+    sys.stderr.write(f"{printable(understood)}\n")
+    if not sys.stdin.isatty():
+        message = "what the model understood needs a yes, and nobody is here to ask: add --yes."
+        raise UsageError(message)
+    if input("Is that meant? [y/N] ").strip().lower() not in ("y", "yes"):
+        message = "not meant, so nothing was planned. Say it in other words."
+        raise UsageError(message)

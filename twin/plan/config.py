@@ -7,7 +7,6 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
-from bridge.task.model_policy import MODEL_POLICY
 from bridge.wire.config import LOOPBACK
 
 
@@ -32,9 +31,6 @@ class LivePlanConfig:
 class PlanConfig:
     """How an instruction is planned."""
 
-    policy: str = "nominal"
-    """nominal, or model (nominal with what a model adds: --model). With --live each request names
-    its own."""
     rounds: int = 5
     """Candidates that the twin may judge; each is steered by what it said of the one before."""
     seed: int = 0
@@ -42,18 +38,17 @@ class PlanConfig:
     episode: str = ""
     """Whose start is planned from; none: the newest that shows all objects."""
     model: str = ""
-    """Address of an OpenAI-compatible server whose model may add constraints, such as
-    http://127.0.0.1:8000/v1; its key comes from GST_MODEL_KEY. None: nobody is asked. With --live
-    it is asked for requests of policy model alone."""
+    """Address of an OpenAI-compatible server whose model reads the instruction, such as
+    http://127.0.0.1:8000/v1; its key comes from GST_MODEL_KEY. None: fixed rules read it. With
+    --live it is asked for requests of policy model alone."""
     model_name: str = ""
     """The server's name for that model."""
+    yes: bool = False
+    """Plan what the model understood without asking whether that was meant."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that plan nothing, and half of what a model needs."""
         refuse_outside(self, {"rounds": (1, 1000), "seed": (0, 2**63 - 1)})
         if bool(self.model) != bool(self.model_name):
             message = "a model is asked by its address and its name: --model URL --model-name NAME."
-            raise UsageError(message)
-        if self.policy == MODEL_POLICY and not self.model:
-            message = "policy model keeps what a model adds: --model URL --model-name NAME."
             raise UsageError(message)

@@ -23,8 +23,8 @@ from bridge.wire.config import WireConfig
 from twin.errors import TwinError
 from twin.plan.config import LivePlanConfig, PlanConfig
 from twin.plan.loop.nominal import POLICIES, PlanProposer
-from twin.plan.loop.propose import Candidate, NoPlanError, Proposer, choose
-from twin.plan.model_stages import Asked, ask_about, client_of
+from twin.plan.loop.propose import NoPlanError, Proposer, choose
+from twin.plan.model_goals import ask_for_goals, client_of
 from twin.plan.problem import Problem
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
@@ -82,17 +82,28 @@ class LivePlanner:
         if request.policy not in POLICIES:
             known = ", ".join(self.policies)
             raise NoPlanError(f"policy {request.policy!r} is unknown. There are: {known}.")
-        task = find_task_file(
+        file = find_task_file(
             request.task,
             tasks_dir=self._run.tasks_dir,
             attached=Attached(sha256=request.task_sha256),
-        ).task()
+        )
+        task = file.task()
         problem = self._problem(request, task)
         asked = None
         if request.policy == MODEL_POLICY and self._words is not None:
-            candidate, asked = self._chosen_with_model(request, problem, self._words)
-        else:
-            candidate = self._chosen(request, problem)
+            asked = ask_for_goals(
+                self._run, task.instruction, problem, self._words, file, is_fixed=True
+            )
+            problem = asked.problem
+        candidate = choose(
+            self._proposer(request.policy),
+            problem,
+            plan_id=f"plan_{request.round}",
+            seed=request.seed,
+            round_=request.round,
+            refused=request.refused,
+            most=MOST_CANDIDATES,
+        )
         plan = replace(
             candidate.plan,
             task_sha256=request.task_sha256,
@@ -102,30 +113,6 @@ class LivePlanner:
             grounding_source=GROUNDING if asked is None else f"{GROUNDING}; {asked.source}",
         )
         return PlanAnswer(plan=plan, remarks=() if asked is None else tuple(asked.lines()))
-
-    def _chosen(self, request: PlanRequest, problem: Problem) -> Candidate:
-        """The candidate of the request's round."""
-        return choose(
-            self._proposer(request.policy),
-            problem,
-            plan_id=f"plan_{request.round}",
-            seed=request.seed,
-            round_=request.round,
-            refused=request.refused,
-            most=MOST_CANDIDATES,
-        )
-
-    def _chosen_with_model(
-        self, request: PlanRequest, problem: Problem, words: PlanConfig
-    ) -> tuple[Candidate, Asked]:
-        """The same, and what the model said; without it where not even a first plan keeps it."""
-        asked = ask_about(self._run, problem, words, keep_refused=True)
-        if asked.problem is not problem:
-            try:
-                self._chosen(replace(request, round=0, refused=()), asked.problem)
-            except NoPlanError as error:
-                asked = asked.left_out(problem, error)
-        return self._chosen(request, asked.problem), asked
 
     def _problem(self, request: PlanRequest, task: Task) -> Problem:
         urdf = self._urdf()

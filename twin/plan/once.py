@@ -1,5 +1,6 @@
 """One plan from words to a verdict: the recorded start, candidates, what the twin says of each."""
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,11 +14,13 @@ from bridge.episode import streams
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import PLAN_REPLAY, REFUSED_PLAN, RunFolder
+from bridge.episode.streams import RgbdFrame
 from bridge.episode.topics import ROBOT_DESCRIPTION
-from bridge.errors import EpisodeError, UsageError
+from bridge.errors import EpisodeError, GstError, UsageError
 from bridge.geometry import se3
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.check import nearest
+from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
@@ -26,10 +29,9 @@ from twin.errors import TwinError
 from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.ground.run_tasks import UnderstoodTask, names_task, shown_task_file, understand
-from twin.plan.ground.vocabulary import GroundingError
-from twin.plan.loop.nominal import POLICIES, PlanProposer
+from twin.plan.loop.nominal import NOMINAL, PlanProposer
 from twin.plan.loop.propose import Attempt, NoPlanError, plan_and_verify
-from twin.plan.model_stages import Asked, ask_about, ask_for_goals, client_of, retasked
+from twin.plan.model_goals import Asked, ask_for_goals, client_of
 from twin.plan.problem import Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
@@ -41,7 +43,7 @@ from twin.replay.verdict import replay_plan
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.localise.stationary_frames import calibrated_cameras
+from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
 from twin.scene.store.calibration import read_calibration
 
 
@@ -106,7 +108,9 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
     episodes = [Episode.open(path) for path in paths]
     for episode in sorted(episodes, key=lambda each: streams.first_stamp_ns(each) or 0)[::-1]:
         path = episode.path
-        found = _localised(run, episode, task)
+        surfaces = scanned_surfaces(run, task).surfaces
+        poses = calibrated_cameras(episode, read_calibration(run))
+        found = localise_episode(episode, task, surfaces=surfaces, poses=poses)
         missing = {
             key: item.reason or "not found"
             for key, item in found.items()
@@ -116,17 +120,11 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
             return _start(run, episode, task, found, robot)
         why = ", ".join(f"{key} ({reason})" for key, reason in missing.items())
         lacking = lacking or f"{why} in {path.stem}"
-    message = (
-        f"not localised: {lacking}, and in no older episode all objects of task {task.name} are. "
-        f"Show them to the cameras and record again: robot-gst record {run.path}."
-    )
-    raise NoPlanError(message)
-
-
-def _localised(run: RunFolder, episode: Episode, task: Task) -> dict[str, LocalisedObject]:
-    surfaces = scanned_surfaces(run, task).surfaces
-    poses = calibrated_cameras(episode, read_calibration(run))
-    return localise_episode(episode, task, surfaces=surfaces, poses=poses)
+    if config.episode:
+        hint = "Name another --episode, or none for the newest that shows all"
+    else:
+        hint = f"No older episode shows all: record again: robot-gst record {run.path}"
+    raise NoPlanError(f"not localised: {lacking}; task {task.name} needs it. {hint}.")
 
 
 def _start(
@@ -187,32 +185,33 @@ class Begun:
 
 def begin(run: RunFolder, words: str, config: PlanConfig, robot: str = "") -> Begun:
     """Find out what is to be done and from where; a model is asked first where one is given."""
-    if config.policy not in POLICIES:
-        known, near = ", ".join(sorted(POLICIES)), nearest(config.policy, POLICIES)
-        raise UsageError(f"no policy {config.policy!r}. There are: {known}.{near}")
     if config.model:
         client_of(run, config)
-    if not config.model or names_task(words):
-        understood = understand(run, words)
-        start = start_of(run, understood.file.task(), config, robot)
-        asked = None
-        if config.model:
-            asked = ask_about(run, start.problem, config)
-        return Begun(understood=understood, start=start, asked=asked)
-    base = shown_task_file(run, config.episode)
-    start = start_of(run, base.task(), config, robot)
-    asked = ask_for_goals(run, words, base, start.problem, config)
-    if asked.understood is not None:
-        problem = retasked(start.problem, asked.understood.file.task())
-        start = replace(start, problem=problem)
-        return Begun(understood=asked.understood, start=start, asked=asked)
+    understood = None if config.model and not names_task(words) else understand(run, words)
+    file = shown_task_file(run, config.episode) if understood is None else understood.file
+    start = start_of(run, file.task(), config, robot)
+    if understood is not None and not config.model:
+        return Begun(understood=understood, start=start)
+    asked = ask_for_goals(
+        run,
+        words if understood is None else file.task().instruction,
+        start.problem,
+        config,
+        file,
+        is_fixed=understood is not None,
+        frames=_start_frames(run, start),
+    )
+    start = replace(start, problem=asked.problem)
+    return Begun(understood=asked.understood, start=start, asked=asked)
+
+
+def _start_frames(run: RunFolder, start: Start) -> list[RgbdFrame]:
+    """What each camera saw last before anything moved; nothing where there were none."""
     try:
-        understood = understand(run, words)
-    except GroundingError as error:
-        told = "; ".join(asked.remarks)
-        raise GroundingError(error.kind, f"{error} The model: {told}.") from error
-    start = start_of(run, understood.file.task(), config, robot)
-    return Begun(understood=understood, start=start, asked=replace(asked, problem=start.problem))
+        poses = calibrated_cameras(start.episode, read_calibration(run))
+        return stationary_frames(start.episode, 1, before_ns=start.seen_ns + 1, poses=poses)
+    except GstError:
+        return []
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,10 +231,7 @@ class Planned:
     def lines(self) -> list[str]:
         """Everything for a person."""
         told = [*self.begun.lines(), "", "constraints:"]
-        plan = self.last.candidate.plan
-        for stage in plan.stages:
-            told += _explained(self.begun.start.problem, plan, stage)
-        told += ["", "candidates:"]
+        told += [*self.explained(), "", "candidates:"]
         told += [f"  {_attempt_line(each)}" for each in self.attempts]
         told += ["", "where the numbers come from:"]
         told += [f"  {remark}" for remark in self.last.candidate.remarks]
@@ -266,31 +262,23 @@ class Planned:
                 }
                 for each in self.attempts
             ],
-            "constraints": [
-                line
-                for stage in self.last.candidate.plan.stages
-                for line in _explained(self.begun.start.problem, self.last.candidate.plan, stage)
-            ],
+            "constraints": self.explained(),
         }
+
+    def explained(self) -> list[str]:
+        """Each stage with its constraints."""
+        problem, plan = self.begun.start.problem, self.last.candidate.plan
+        return [line for stage in plan.stages for line in _explained(problem, plan, stage)]
 
 
 def plan_once(
     run: RunFolder, begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig
 ) -> Planned:
     """Propose, have the twin judge, steer, until a plan is accepted; write each with its replay."""
-    understood, start, asked = begun.understood, begun.start, begun.asked
-    try:
-        attempts = _attempts(
-            understood, start.problem if asked is None else asked.problem, judge, config, asked
-        )
-    except NoPlanError as error:
-        if asked is None or asked.problem is start.problem:
-            raise
-        asked = asked.left_out(start.problem, error)
-        attempts = _attempts(understood, start.problem, judge, config, asked)
-    paths = [_kept(run, start, each) for each in attempts]
+    attempts = _attempts(begun, judge, config)
+    paths = [_kept(run, begun.start, each) for each in attempts]
     path = paths[-1] if attempts[-1].verdict.accepted is True else None
-    return Planned(begun=replace(begun, asked=asked), attempts=attempts, path=path)
+    return Planned(begun=begun, attempts=attempts, path=path)
 
 
 def _kept(run: RunFolder, start: Start, attempt: Attempt) -> Path:
@@ -336,23 +324,22 @@ def _kept(run: RunFolder, start: Start, attempt: Attempt) -> Path:
     return path
 
 
-def _attempts(
-    understood: UnderstoodTask,
-    problem: Problem,
-    judge: Callable[[Plan], Verdict],
-    config: PlanConfig,
-    asked: Asked | None,
-) -> list[Attempt]:
-    name = understood.file.task().name
+def _attempts(begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig) -> list[Attempt]:
+    policy, answer = NOMINAL, ""
+    if begun.asked is not None:
+        policy = MODEL_POLICY
+        kept = json.dumps(begun.start.problem.scene.task.stages)
+        answer = f"_{hashlib.sha256(kept.encode()).hexdigest()[:8]}"
+    name, start = begun.understood.file.task().name, begun.start.episode.path.stem
     return plan_and_verify(
-        PlanProposer(config.policy),
-        problem,
+        PlanProposer(policy),
+        begun.start.problem,
         judge,
-        plan_id=f"{name}.{config.policy}.{config.seed}",
+        plan_id=f"{name}.{start}.{policy}{answer}.{config.seed}",
         seed=config.seed,
         rounds=config.rounds,
-        task_sha256=understood.file.sha256,
-        grounding_source="" if asked is None else asked.answered_by,
+        task_sha256=begun.understood.file.sha256,
+        grounding_source="" if begun.asked is None else begun.asked.answered_by,
     )
 
 

@@ -1,6 +1,7 @@
-"""Lets the tests of the planner use their own start, and the scenes of the replay's tests."""
+"""Lets the tests of the planner use their own scenes, and those of the replay's tests."""
 
 import sys
 from pathlib import Path
 
-sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "replay")]
+HERE = Path(__file__).parent
+sys.path += [str(HERE), str(HERE / "ground"), str(HERE / "constrain"), str(HERE.parent / "replay")]

@@ -5,31 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scripted_plans import scene_of_test
+from planned_start import CUBE as FILE
+from planned_start import problem_of_test, write_episode
 from verdicts import verdict_of
 
-from bridge.data_files import datasets_folder
 from bridge.episode import streams
-from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.plan import Plan
-from bridge.task.task_file import TaskFile
 from bridge.task.verdict import Factor, Verdict
 from dashboards.rerun_view import export_rrd, run_of
 from dashboards.rerun_viewer import episode_of
 from twin.plan.config import PlanConfig
 from twin.plan.ground.run_tasks import UnderstoodTask
 from twin.plan.once import Begun, Planned, Start, plan_once, start_of
-from twin.plan.problem import Problem
-from twin.plan.shapes import shapes_of
-from twin.robot.model import load_robot
 
-FILE = TaskFile.read(datasets_folder() / "tasks" / "cube_into_box.toml")
-HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
 SEEN_NS = 5_000_000_000
 
 
@@ -42,19 +33,13 @@ def verdict(plan: Plan, accepted: bool) -> Verdict:
 def planned(run: RunFolder, answers: list[bool]) -> Planned:
     """Rounds of planning, judged as told."""
     path = run.episodes_dir / "trial_0001.mcap"
-    with EpisodeWriter(path) as writer:
-        info = EpisodeInfo(
-            id="trial_0001", kind="trial", task="cube_into_box", task_sha256=FILE.sha256
-        )
-        writer.describe(info)
-        writer.attach(ATTACHMENT, FILE.data, media_type=MEDIA_TYPE, log_time_ns=1)
-    scene = replace(scene_of_test(), start_rad=HOME)
-    problem = Problem(scene=scene, robot=load_robot(scene.urdf), shapes=shapes_of(None, scene.task))
-    episode = Episode.open(path)
-    start = Start(episode=episode, seen_ns=SEEN_NS, localised={}, problem=problem, urdf=scene.urdf)
+    write_episode(path, FILE, kind="trial")
+    problem = problem_of_test()
+    episode, urdf = Episode.open(path), problem.scene.urdf
+    start = Start(episode=episode, seen_ns=SEEN_NS, localised={}, problem=problem, urdf=urdf)
     left = iter(answers)
     understood = UnderstoodTask(file=FILE, grounding=None)
-    config = PlanConfig(policy="nominal", rounds=len(answers))
+    config = PlanConfig(rounds=len(answers))
     begun = Begun(understood=understood, start=start)
     return plan_once(run, begun, lambda plan: verdict(plan, next(left)), config)
 
@@ -79,6 +64,12 @@ def test_the_refused_plan_stays_beside_the_accepted_one(steered: tuple[RunFolder
     kept = Plan.from_json((run.plans_dir / f"{refused.id}.refused.json").read_bytes())
     assert kept == refused
     assert json.loads(done.path.read_bytes())["parent_id"] == refused.id
+
+
+def test_a_plan_is_named_by_its_start(steered: tuple[RunFolder, Planned]) -> None:
+    _, done = steered
+    name = "cube_into_box.trial_0001.nominal.0"
+    assert [each.candidate.plan.id for each in done.attempts] == [f"{name}.0", f"{name}.1"]
 
 
 def test_a_replay_holds_the_plan_its_verdict_and_the_moving_arm(

@@ -180,3 +180,17 @@ def test_places_on_the_table_satisfy_what_is_asked(problem: Problem) -> None:
             width_m=np.zeros(1),
         )
         assert goal.violation(state)[0] <= 0, goal.explain(state)
+
+
+def test_a_speed_limit_shapes_the_times_and_is_kept(problem: Problem) -> None:
+    """By the straight way of the tool between waypoints, which no time law knows of."""
+    slow = {"kind": "speed", "max": 0.08}
+    task = problem.scene.task
+    stages = tuple({**table, "path": [slow]} for table in task.stages)
+    asked = replace(problem, scene=replace(problem.scene, task=replace(task, stages=stages)))
+    (found,) = PlanProposer().propose(asked, plan_id="p", seed=0, count=1, steer=None)
+    tau = found.plan.tau
+    seconds = np.diff([each.t_ns for each in tau]) * 1e-9
+    speeds = np.linalg.norm(np.diff([each.p_m for each in tau], axis=0), axis=1) / seconds
+    assert speeds.max() <= 0.08 * 1.01
+    assert speeds.max() >= 0.08 * 0.9

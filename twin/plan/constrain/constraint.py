@@ -41,20 +41,24 @@ class Term:
             return self.low - value
         return abs(value - (self.low + self.high) / 2) - (self.high - self.low) / 2
 
+    @property
+    def wanted(self) -> str:
+        """The interval in words, without the unit."""
+        factor, _ = SHOWN[self.unit]
+        low, high = self.low * factor + 0.0, self.high * factor + 0.0  # never -0
+        if np.isneginf(low):
+            return f"at most {high:.4g}"
+        if np.isposinf(low) or np.isposinf(high):
+            return f"at least {low:.4g}"
+        return f"{low:.4g} to {high:.4g}"
+
     def sentence(self, state: State) -> str:
         """What is measured in the first state, what is wanted, and by how much it misses."""
         factor, unit = SHOWN[self.unit]
-        value = float(self.measure(state)[0]) * factor
-        low, high = self.low * factor + 0.0, self.high * factor + 0.0  # never -0
-        if np.isneginf(low):
-            wanted = f"at most {high:.4g}"
-        elif np.isposinf(low) or np.isposinf(high):
-            wanted = f"at least {low:.4g}"
-        else:
-            wanted = f"{low:.4g} to {high:.4g}"
-        missed = max(value - high, low - value)
+        value = float(self.measure(state)[0])
+        missed = max(value - self.high, self.low - value) * factor
         verdict = f", missed by {missed:.3g}" if missed > 0 else ""
-        return f"{self.what} is {value:.4g} {unit} (wanted {wanted}{verdict})"
+        return f"{self.what} is {value * factor:.4g} {unit} (wanted {self.wanted}{verdict})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +87,11 @@ class Constraint:
     def unit(self) -> str:
         """Of the violation: ``m``, ``rad`` or ``m/s``."""
         return self.terms[0].unit
+
+    @property
+    def wanted(self) -> str:
+        """What is asked, in words."""
+        return "; ".join(f"{term.what} {term.wanted} {SHOWN[term.unit][1]}" for term in self.terms)
 
     def parts(self, state: State) -> Array:
         """Return f of each term, in the unit of the first one, ``(num_states, num_terms)``.

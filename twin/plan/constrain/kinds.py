@@ -4,7 +4,7 @@ Here are points and directions, distances and regions, and what is asked of a pa
 between bodies, which predicates decide too, are beside this in ``relations``.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -28,14 +28,14 @@ from twin.plan.constrain.bodies import (
 from twin.plan.constrain.constraint import Constraint, Term, flattened
 from twin.plan.constrain.distances import Boxes
 from twin.plan.constrain.relations import RELATIONS
-from twin.plan.constrain.schema import SCENE, Vocabulary, check_constraint
+from twin.plan.constrain.schema import SCENE, Vocabulary, check_constraint, values_of
 from twin.plan.problem import Array, Problem, State
 
 
 def compile_constraint(record: Record, problem: Problem) -> Constraint:
     """Make a constraint of a record that fits the schema of constraints."""
     check_constraint(record, Vocabulary.of_task(problem.scene.task))
-    for name in _named(record):
+    for name in values_of(record, _ID_KEYS):
         if name in problem.scene.missing():
             reason = problem.scene.reasons.get(name, "not found")
             message = f"{record['kind']}: {name} was not localised ({reason}). Look again."
@@ -44,16 +44,7 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
 
 
 _STRAIGHT = np.eye(1, 4)[0]
-_ID_KEYS = ("obj", "container", "support", "reference", "against", "over")
-
-
-def _named(record: Record) -> Iterator[str]:
-    """Ids of the objects that a record names anywhere."""
-    for key, value in record.items():
-        if isinstance(value, dict):
-            yield from _named(value)
-        elif key in (*_ID_KEYS, "frame"):
-            yield value
+_ID_KEYS = ("obj", "container", "support", "reference", "against", "over", "frame")
 
 
 def _distance(record: Record, problem: Problem) -> Constraint:

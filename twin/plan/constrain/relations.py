@@ -179,7 +179,9 @@ def _upright(record: Record, problem: Problem) -> Constraint:
         Term(
             what=f"the tilt of {obj}",
             measure=tilt,
-            high=float(np.radians(record["max_deg"])),
+            high=float(np.radians(record["max_deg"]))
+            if "max_deg" in record
+            else TILT_TOLERANCE_RAD,
             unit="rad",
         ),
     )
@@ -267,13 +269,11 @@ def constraint_of(predicate: Record, task: Task) -> dict[str, Any] | None:
     return record
 
 
-def predicate_of(record: Record) -> dict[str, Any] | None:
+def predicate_of(record: Record) -> dict[str, Any]:
     """Write a constraint about where an object ends as the success predicate that decides the same.
 
-    The other way round of ``constraint_of``; None: no predicate says it.
+    The other way round of ``constraint_of``.
     """
-    if record["kind"] not in PLACES:
-        return None
     names = {value: key for key, value in _KEYS.items()} | {"way": "direction"}
     names["vector"] = "direction"
     found = {names.get(key, key): value for key, value in record.items()}
@@ -281,6 +281,8 @@ def predicate_of(record: Record) -> dict[str, Any] | None:
         low, high = BESIDE_GAP_M
         low, high = found.pop("min_gap", low), found.pop("max_gap", high)
         found["gap_m"] = [low, max(low, high)]
+    if "max_deg" in found:
+        found["tolerance_rad"] = np.radians(found.pop("max_deg")).item()
     return found
 
 

@@ -1,36 +1,49 @@
-"""Replies of a model: text that nobody trusts becomes stages, or a list of what is wrong with it.
+"""Replies of a model: text that nobody trusts becomes goals and constraints, or what is wrong.
 
-Nothing in a reply is executed, formatted or trusted. What a plan may touch and what counts as
-success come from the task file; a reply that allows or asks for anything else is refused.
+Nothing in a reply is executed, formatted or trusted. It may name only what the scene has; what a
+plan may touch follows from the goals by fixed rules.
 """
 
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
+import numpy as np
+from jaxtyping import Float
+
 from bridge.errors import UsageError
-from bridge.task.plan import Stage
+from bridge.geometry import se3
+from bridge.task.check import nearest
+from twin.plan.constrain.bodies import surface_points
+from twin.plan.constrain.relations import PLACES
 from twin.plan.constrain.schema import (
     MOST_PROBLEMS,
     Problems,
     Repeated,
     Unreadable,
     Vocabulary,
+    Where,
     find_problems,
     meaning_problems,
     printable,
     shown,
     told,
+    values_of,
 )
+from twin.plan.problem import Problem
 
+VERSION = 2
 MAX_BYTES = 64 * 1024
 MAX_DEPTH = 12
 MAX_VALUES = 5000
-MAX_CONSTRAINTS = 16
-"""Of one stage, subgoal and path together."""
+OFF_OBJECT_M = 0.03
+"""A keypoint of an object may be so far off the box around it."""
 _MOST_DIGITS = 18
+_HEADS = ("version", "goals", "cannot")
+"""Keys by which an answer is told from other objects in a text."""
 
 
 class ReplyError(UsageError):
@@ -39,26 +52,96 @@ class ReplyError(UsageError):
     def __init__(self, *, problems: tuple[str, ...]) -> None:
         """Remember each problem with its place in the JSON."""
         self.problems = problems
-        listed = "\n".join(f"  {text}" for text in problems)
-        super().__init__(f"the model's reply cannot be used:\n{listed}")
+        super().__init__(f"the model's reply cannot be used: {'; '.join(problems)}")
 
 
-def read_reply(text: str | bytes, vocabulary: Vocabulary, task: str) -> tuple[Stage, ...]:
-    """Read the stages of a reply, if nothing in it is wrong.
+@dataclass(frozen=True, kw_only=True)
+class Keypoint:
+    """A named point of an object."""
 
-    A reply to another instruction is refused. The stages have no times, and printable texts.
+    obj: str
+    p_object_m: Float[np.ndarray, "3"]
+
+
+Keypoints = Mapping[str, Keypoint]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wish:
+    """A constraint, and when it is to be kept."""
+
+    when: str
+    """``grasp``, ``carry``, ``release`` or ``always``."""
+    moving: str | None
+    """While this object is moved; None: while any is."""
+    keep: Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reply:
+    """What a model asks for."""
+
+    goals: tuple[Mapping[str, Any], ...] = ()
+    """Constraints about where objects are at the end."""
+    in_order: bool = False
+    wishes: tuple[Wish, ...] = ()
+    cannot: str = ""
+    """Why it says that it cannot be done; empty: there are goals."""
+    remarks: tuple[str, ...] = ()
+    """What was passed over in the text."""
+
+
+def read_reply(
+    text: str | bytes, vocabulary: Vocabulary, problem: Problem, marks: Keypoints
+) -> Reply:
+    """Read what a reply asks for, if nothing in it is wrong.
+
+    Prose and fences around it are passed over; of several answers the last one counts. Keypoints
+    become points of their objects.
     """
-    record = parse_strictly(text)
-    problems = find_problems(record, "reply", vocabulary)
-    if not problems:
-        problems = told(_contradictions(record, vocabulary, task))
-    if problems:
+    record, remarks = _answer_in(text)
+    if problems := find_problems(record, "reply", vocabulary):
         raise ReplyError(problems=problems[:MOST_PROBLEMS])
-    return tuple(_stage(stage) for stage in record["stages"])
+    known, odd = _keypoints(record, problem, marks)
+    if problems := told([*odd, *_contradictions(record, known)]):
+        raise ReplyError(problems=problems)
+    if "cannot" in record:
+        return Reply(cannot=printable(record["cannot"]))
+    wishes = (
+        Wish(when=each["when"], moving=each.get("moving"), keep=_resolved(each["keep"], known))
+        for each in record.get("constraints", ())
+    )
+    return Reply(
+        goals=tuple(record["goals"]),
+        in_order=record.get("in_order", False),
+        wishes=tuple(wishes),
+        remarks=remarks,
+    )
 
 
-def parse_strictly(text: str | bytes) -> Any:
-    """Parse JSON that is short and flat; odd numbers and repeated keys are kept to be named."""
+def _answer_in(text: str | bytes) -> tuple[Any, tuple[str, ...]]:
+    """The answer in a text, and what was passed over."""
+    plain = _limited(text)
+    try:
+        return _parsed(plain), ()
+    except ValueError as error:
+        why = f"is not JSON: {error}"
+    found = []
+    for begin, end in _objects(plain):
+        try:
+            record = _parsed(plain[begin:end])
+        except ValueError as error:
+            why = f"is not JSON: {error}"
+            continue
+        if any(head in record for head in _HEADS):
+            found.append(record)
+    if not found:
+        _refuse(why)
+    several = f"the last of {len(found)} answers in one reply was read"
+    return found[-1], (several,) if any(each != found[-1] for each in found) else ()
+
+
+def _limited(text: str | bytes) -> str:
     try:
         data = text.encode() if isinstance(text, str) else text
         if len(data) > MAX_BYTES:
@@ -68,18 +151,45 @@ def parse_strictly(text: str | bytes) -> Any:
         _refuse("is not text in UTF-8")
     if plain.count("[") + plain.count("{") > MAX_VALUES:
         _refuse(f"has more than {MAX_VALUES} lists and objects")
-    if _is_deep(plain):
-        _refuse(f"is nested more than {MAX_DEPTH} deep")
+    depth = 0
+    for token in _TOKEN.finditer(plain):
+        depth += {"[": 1, "{": 1, "]": -1, "}": -1}.get(token[0], 0)
+        if depth > MAX_DEPTH:
+            _refuse(f"is nested more than {MAX_DEPTH} deep")
+    return plain
+
+
+_BRACE = re.compile(r"{")
+_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*+(?:"|\Z|\\\Z)|[\[\]{}]', re.DOTALL)
+"""Strings, so that brackets in them do not count, and brackets; never looks back."""
+
+
+def _objects(plain: str) -> Iterator[tuple[int, int]]:
+    """Where objects begin and end that lie in no other; a quote in prose is none of JSON's."""
+    depth, begin, at = 0, 0, 0
+    while match := (_TOKEN if depth else _BRACE).search(plain, at):
+        at = match.end()
+        if match[0] == "{":
+            begin = begin if depth else match.start()
+            depth += 1
+        elif match[0] == "}":
+            depth -= 1
+            if not depth:
+                yield begin, at
+
+
+def _parsed(text: str) -> Any:
+    """Parse JSON; odd numbers and repeated keys are kept to be named."""
     try:
         return json.loads(
-            plain,
+            text,
             parse_constant=Unreadable,
             parse_float=_float,
             parse_int=_int,
             object_pairs_hook=_object,
         )
-    except ValueError as error:
-        _refuse(f"is not JSON: {error}")
+    except RecursionError:  # brackets that a quote in prose hid from the count
+        _refuse(f"is nested more than {MAX_DEPTH} deep")
 
 
 def _refuse(found: str) -> NoReturn:
@@ -100,94 +210,66 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return record if len(record) == len(pairs) else Repeated(pairs)
 
 
-_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*+(?:"|\Z|\\\Z)|[\[\]{}]', re.DOTALL)
-"""Strings, so that brackets in them do not count, and brackets; never looks back."""
+def _keypoints(
+    record: Mapping[str, Any], problem: Problem, marks: Keypoints
+) -> tuple[dict[str, Keypoint], list[tuple[Where, str]]]:
+    """The marks and what a reply names besides, in the frames of their objects."""
+    known, odd = dict(marks), list[tuple[Where, str]]()
+    for number, item in enumerate(record.get("keypoints", ())):
+        where, name, obj = ("keypoints", number), item["name"], item["obj"]
+        T = problem.scene.Ts_base_object.get(obj)
+        if name in known:
+            odd.append(((*where, "name"), f"there is a keypoint {shown(name)} already"))
+        elif T is None:
+            odd.append(((*where, "obj"), f"nobody knows where {obj} is"))
+        else:
+            p_object = se3.apply(se3.invert(T), np.array(item["xyz"], dtype=np.float64))
+            surface = surface_points(problem, obj)
+            low, high = surface.min(axis=0) - OFF_OBJECT_M, surface.max(axis=0) + OFF_OBJECT_M
+            if ((p_object < low) | (p_object > high)).any():
+                odd.append(((*where, "xyz"), f"is not on {obj}, which is at {_metres(T[:3, 3])}"))
+            known[name] = Keypoint(obj=obj, p_object_m=p_object)
+    return known, odd
 
 
-def _is_deep(text: str) -> bool:
-    depth = 0
-    for token in _TOKEN.finditer(text):
-        first = text[token.start()]
-        if first in "[{":
-            depth += 1
-            if depth > MAX_DEPTH:
-                return True
-        elif first in "]}":
-            depth -= 1
-    return False
+def _metres(p_m: Float[np.ndarray, "3"]) -> str:
+    return "[" + ", ".join(f"{value:.3f}" for value in p_m) + "]"
 
 
-def _contradictions(record: Mapping[str, Any], vocabulary: Vocabulary, task: str) -> Problems:
+def _contradictions(record: Mapping[str, Any], known: Keypoints) -> Problems:
     """What is wrong with a reply of the right form."""
-    if _plain_words(record["task"]) != _plain_words(task):
-        yield ("task",), f"{shown(record['task'])} was not asked; the task is {shown(task)}"
-    seen: set[str] = set()
-    for index, stage in enumerate(record["stages"]):
-        where = ("stages", index)
-        if stage["id"] in seen:
-            yield (*where, "id"), f"there is a stage {shown(stage['id'])} already"
-        seen.add(stage["id"])
-        count = len(stage["subgoal"]) + len(stage["path"])
-        if count > MAX_CONSTRAINTS:
-            yield where, f"has {count} constraints; at most {MAX_CONSTRAINTS} are allowed"
-        for key in ("subgoal", "path"):
-            for number, constraint in enumerate(stage[key]):
-                yield from meaning_problems(constraint, (*where, key, number))
-                if key == "subgoal" and constraint["kind"] == "speed":
-                    yield (*where, key, number), "speed is about a path and belongs to path"
-    yield from _hand(record["stages"])
-    yield from _contacts(record["stages"], vocabulary)
+    if "cannot" in record:
+        for key in ("goals", "constraints"):
+            if key in record:
+                yield ("cannot",), f"says that it cannot be done, and {key} say what to do"
+        return
+    for number, goal in enumerate(record["goals"]):
+        yield from meaning_problems(goal, ("goals", number))
+    for number, wish in enumerate(record.get("constraints", ())):
+        where, keep = ("constraints", number, "keep"), wish["keep"]
+        unknown = [name for name in values_of(keep, ("keypoint",)) if name not in known]
+        for name in unknown:
+            near = nearest(name, known)
+            yield where, f"keypoint {shown(name)} is unknown. Known: {', '.join(known)}.{near}"
+        if unknown:
+            continue
+        yield from meaning_problems(_resolved(keep, known), where)
+        if keep["kind"] in PLACES:
+            yield (*where, "kind"), "where objects end is said by goals"
+        if keep["kind"] == "speed" and wish["when"] in ("grasp", "release"):
+            yield ("constraints", number, "when"), "speed is about a way: carry or always"
 
 
-def _plain_words(text: str) -> list[str]:
-    return text.casefold().rstrip(" .!").split()
-
-
-def _hand(stages: list[dict[str, Any]]) -> Problems:
-    """Follow what the hand holds: one thing at a time, released where it is held."""
-    held: str | None = None
-    for index, stage in enumerate(stages):
-        grasped, released = stage.get("grasp"), stage.get("release")
-        if grasped is not None and released is not None:
-            yield ("stages", index), "grasps and releases; make it two stages"
-            return
-        if grasped is not None:
-            if held is not None:
-                yield ("stages", index, "grasp"), f"the hand holds {held} already"
-            held = grasped
-        if released is not None:
-            if held != released:
-                holds = f"the hand holds {held}" if held else "the hand is empty"
-                yield ("stages", index, "release"), f"{released} is not held here: {holds}"
-            held = None
-    if held is not None:
-        yield ("stages", len(stages) - 1), f"{held} is never released"
-
-
-def _contacts(stages: list[dict[str, Any]], vocabulary: Vocabulary) -> Problems:
-    held: str | None = None
-    for index, stage in enumerate(stages):
-        held = stage.get("grasp") or held
-        for number, pair in enumerate(stage["allowed_contacts"]):
-            where = ("stages", index, "allowed_contacts", number)
-            allowed = vocabulary.allowed_contacts
-            if pair[0] == pair[1]:
-                yield where, f"{pair[0]} cannot touch itself"
-            elif allowed is not None and frozenset(pair) not in allowed:
-                yield where, f"the task never lets {pair[0]} touch {pair[1]}"
-            elif allowed is None and held not in pair:
-                yield where, f"is not about what the hand holds here ({held or 'nothing'})"
-        if stage.get("release"):
-            held = None
-
-
-def _stage(record: Mapping[str, Any]) -> Stage:
-    return Stage(
-        id=printable(record["id"]),
-        text=printable(record["text"]),
-        subgoal=tuple(record["subgoal"]),
-        path=tuple(record["path"]),
-        grasp=record.get("grasp"),
-        release=record.get("release"),
-        allowed_contacts=tuple((a, b) for a, b in record["allowed_contacts"]),
-    )
+def _resolved(record: Mapping[str, Any], known: Keypoints) -> dict[str, Any]:
+    """A constraint whose keypoints are points of their objects."""
+    found = {
+        key: _resolved(value, known) if isinstance(value, Mapping) else value
+        for key, value in record.items()
+    }
+    if "keypoint" not in record:
+        return found
+    del found["keypoint"]
+    point = known[record["keypoint"]]
+    offset = point.p_object_m + np.array(found.get("offset", (0.0, 0.0, 0.0)))
+    offset_m = [round(value, 4) for value in offset.tolist()]
+    return {"obj": point.obj, "anchor": "origin", "offset": offset_m}

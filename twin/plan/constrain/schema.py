@@ -16,7 +16,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from bridge.errors import UsageError
-from bridge.task.check import BODIES, CAVITIES, TABLE, nearest
+from bridge.task.check import CAVITIES, TABLE, nearest
 from bridge.task.task_file import Task
 
 if TYPE_CHECKING:
@@ -40,8 +40,6 @@ class Vocabulary:
     objects: tuple[str, ...]
     movable: tuple[str, ...]
     containers: tuple[str, ...] = ()
-    allowed_contacts: frozenset[frozenset[str]] | None = None
-    """Pairs that may touch at some time, from the task file; None: no task file says so yet."""
 
     @staticmethod
     def of_task(task: Task, *, objects_alone: bool = False) -> "Vocabulary":
@@ -49,16 +47,14 @@ class Vocabulary:
 
         Args:
             objects_alone: What the task does with its objects is not asked for: whatever is not
-                fixed may be moved, and contacts are not known yet.
+                fixed may be moved.
         """
-        pairs = (pair for stage in task.stages for pair in stage.get("allowed_contacts", ()))
         hollow = (key for key, m in task.objects.items() if {m.shape, m.mesh} & set(CAVITIES))
         free = tuple(key for key, model in task.objects.items() if not model.fixed)
         return Vocabulary(
             objects=tuple(task.objects),
             movable=free if objects_alone else task.manipulated,
             containers=tuple(hollow),
-            allowed_contacts=None if objects_alone else frozenset(map(frozenset, pairs)),
         )
 
     @cache  # noqa: B019  # as many as there are tasks
@@ -73,7 +69,6 @@ class Vocabulary:
             "support_id": (*tops, TABLE),
             "frame_id": (*self.objects, BASE),
             "obstacle_id": (*self.objects, TABLE, SCENE),
-            "body_id": (*self.objects, *BODIES),
         }
         for name, known in ids.items():
             schema["$defs"][name] = {"enum": list(known)}
@@ -85,6 +80,8 @@ class Vocabulary:
         import jsonschema_rs  # noqa: PLC0415  # most commands check no constraint
 
         defs = dict(self.schema()["$defs"])
+        if name != "reply":  # where a reply says keypoint, a task says object and offset
+            defs["keypoint_id"] = {"enum": []}
         kind = defs["constraint"]["properties"]["kind"]
         ways = [
             {"if": {"properties": {"kind": {"const": each}}}, "then": {"$ref": f"#/$defs/{each}"}}
@@ -114,6 +111,15 @@ class ConstraintError(UsageError):
         self.problems = problems
         listed = "\n".join(f"  {text}" for text in problems)
         super().__init__(f"not a constraint that can be planned with:\n{listed}")
+
+
+def values_of(record: Mapping[str, Any], keys: tuple[str, ...]) -> Iterator[str]:
+    """What stands behind some keys anywhere in a record."""
+    for key, value in record.items():
+        if isinstance(value, Mapping):
+            yield from values_of(value, keys)
+        elif key in keys:
+            yield value
 
 
 def check_constraint(record: Mapping[str, Any], vocabulary: Vocabulary) -> None:

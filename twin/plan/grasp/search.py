@@ -48,12 +48,18 @@ class NoGraspError(TwinError):
     """An object cannot be taken hold of; ``cause`` says why in one word."""
 
     def __init__(
-        self, *, object_id: str, cause: str, found: str, hint: str, rejected: Mapping[str, int]
+        self,
+        *,
+        object_id: str,
+        cause: str,
+        found: str,
+        hint: str,
+        rejected: Mapping[str, int] | None = None,
     ) -> None:
         """Remember the object, the cause and how many candidates fell to which cause."""
         self.object_id = object_id
         self.cause = cause
-        self.rejected = dict(rejected)
+        self.rejected = dict(rejected or {})
         super().__init__(f"no grasp of {object_id}: {found}. {hint}")
 
 
@@ -153,7 +159,6 @@ class GraspSearcher:
                 cause="no_gripper",
                 found=f"{robot.record.name} has no fingers that close",
                 hint="Give its gripper in the robot file (docs/robots.md).",
-                rejected={},
             )
         self.max_width_m = robot.record.gripper.max_width_m
         self._reach = ArmReach(problem)
@@ -161,7 +166,8 @@ class GraspSearcher:
 
     def search(self, object_id: str) -> GraspSearch:
         """Find grasps of an object."""
-        self._refuse(object_id)
+        self._refuse_covered(object_id)
+        self._refuse_too_heavy(object_id)
         hand, found, grasps = self._opened(object_id, self.max_width_m)
         first = found, hand
         for share in _OPENINGS:
@@ -190,23 +196,14 @@ class GraspSearcher:
         margin = self._margins(found, object_id, points, hand)
         return hand, found, self._choose(found, margin, object_id, hand)
 
-    def _refuse(self, object_id: str) -> None:
-        """Say what makes a search pointless."""
-        refusal = self._covered(object_id) or self._too_heavy(object_id)
-        if refusal is not None:
-            cause, found, hint = refusal
-            raise NoGraspError(
-                object_id=object_id, cause=cause, found=found, hint=hint, rejected={}
-            )
-
-    def _covered(self, object_id: str) -> tuple[str, str, str] | None:
-        """Whether something lies on it: lifting it would throw that down."""
+    def _refuse_covered(self, object_id: str) -> None:
+        """Refuse what something lies on: lifting it would throw that down."""
         scene, shapes = self.problem.scene, self.problem.shapes
         own = se3.apply(scene.Ts_base_object[object_id], shapes[object_id].vertices_m)
         try:
             sides = ConvexHull(own[:, :2]).equations
         except (QhullError, ValueError):
-            return None
+            return
         top_m = float(own[:, 2].max())
         middle = own[:, :2].mean(axis=0)
         reach_m = float(np.linalg.norm(own[:, :2] - middle, axis=1).max())
@@ -220,21 +217,21 @@ class GraspSearcher:
             other = se3.apply(T, self._surface(name).points(_NEIGHBOUR_POINTS, 0))
             over = other[(other[:, :2] @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)]
             if len(over) and over[:, 2].min() > top_m - _COVERED_M:
-                return ("covered", f"{name} is on top of it", f"Move {name} away first.")
-        return None
+                found, hint = f"{name} is on top of it", f"Move {name} away first."
+                raise NoGraspError(object_id=object_id, cause="covered", found=found, hint=hint)
 
-    def _too_heavy(self, object_id: str) -> tuple[str, str, str] | None:
+    def _refuse_too_heavy(self, object_id: str) -> None:
         model = self.problem.model(object_id)
         weight_N = model.mass_kg * PhysicsConfig().gravity_m_s2 * _SAFETY
         held_N = 2 * FRICTION * self._grip_N()
-        if weight_N <= held_N:
-            return None
-        return (
-            "weight",
-            f"friction holds {held_N:.0f} N, and lifting {model.mass_kg:.2f} kg takes up to "
-            f"{weight_N:.0f} N",
-            "Press harder (grip_force_N of the task file), or take something lighter.",
-        )
+        if weight_N > held_N:
+            raise NoGraspError(
+                object_id=object_id,
+                cause="weight",
+                found=f"friction holds {held_N:.0f} N, and lifting {model.mass_kg:.2f} kg takes up "
+                f"to {weight_N:.0f} N",
+                hint="Press harder (grip_force_N of the task file), or take something lighter.",
+            )
 
     def _grip_N(self) -> float:
         given = self.problem.scene.task.grip_force_N

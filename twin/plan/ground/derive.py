@@ -13,10 +13,11 @@ from typing import Any
 
 from bridge.task.check import GRIPPER, TABLE
 from bridge.task.find import union_of
+from bridge.task.summary import describe_predicate
 from bridge.task.task_file import TaskFile
 from twin.plan.ground.goals import Grounding
 
-RULES_VERSION = 1
+RULES_VERSION = 2
 """Of the rules below; a file says which it was made by."""
 SETTLED = {"max_speed_m_s": 0.02, "for_s": 0.3}
 SHAPE_TOLERANCE = 0.25
@@ -30,7 +31,7 @@ def derive_task(grounding: Grounding, base: Sequence[TaskFile], *, by: str = "gr
     tables = [tomllib.loads(file.data.decode()) for file in base]
     objects = {key: about for table in tables for key, about in table["objects"].items()}
     starts = {key: about for table in tables for key, about in table["start"].items()}
-    name = task_name(grounding.text, base)
+    name = task_name(grounding, base)
     forces = [table["grip_force_N"] for table in tables if "grip_force_N" in table]
     named = [goal["container"] for goal in grounding.goals if "container" in goal]
     top: dict[str, Any] = {
@@ -48,34 +49,30 @@ def derive_task(grounding: Grounding, base: Sequence[TaskFile], *, by: str = "gr
         "tasks": sorted({table["name"] for table in tables}),
         "explanation": list(grounding.explanation),
     }
-    text = "\n".join(
-        [
-            f"# Derived from an instruction by fixed rules, version {RULES_VERSION}.",
-            *(f"{key} = {_toml(value)}" for key, value in top.items()),
-            *_table("[derived]", derived),
-            *(line for key, about in objects.items() for line in _table(f"[objects.{key}]", about)),
-            *(line for key, about in starts.items() for line in _table(f"[start.{key}]", about)),
-            *(
-                line
-                for stage in stages_of(grounding, objects)
-                for line in _table("[[stages]]", stage)
-            ),
-            *(
-                line
-                for spec in success_of(grounding, objects)
-                for line in _table("[[success]]", spec)
-            ),
-        ]
-    )
+    parts = [
+        ("[derived]", derived),
+        *((f"[objects.{key}]", about) for key, about in objects.items()),
+        *((f"[start.{key}]", about) for key, about in starts.items()),
+        *(("[[stages]]", stage) for stage in stages_of(grounding, objects)),
+        *(("[[success]]", spec) for spec in success_of(grounding, objects)),
+    ]
+    lines = [
+        f"# Derived from an instruction by fixed rules, version {RULES_VERSION}.",
+        *(f"{key} = {_toml(value)}" for key, value in top.items()),
+        *(line for title, about in parts for line in _table(title, about)),
+    ]
+    text = "\n".join(lines)
     file = TaskFile(f"{text}\n".encode(), f"{name}.toml")
     file.task()
     return file
 
 
-def task_name(instruction: str, base: Sequence[TaskFile]) -> str:
-    """Name a derived task by its words and by what decides it."""
-    words = re.sub(r"[^a-z0-9]+", "_", instruction.lower())[:NAME_CHARACTERS].strip("_")
-    what = "\n".join([instruction, str(RULES_VERSION), *(file.sha256 for file in base)])
+def task_name(grounding: Grounding, base: Sequence[TaskFile]) -> str:
+    """Name a derived task by its words and by what decides it, its goals among that."""
+    words = re.sub(r"[^a-z0-9]+", "_", grounding.text.lower())[:NAME_CHARACTERS].strip("_")
+    meant = json.dumps([[dict(goal) for goal in grounding.goals], grounding.order])
+    files = (file.sha256 for file in base)
+    what = "\n".join([grounding.text, str(RULES_VERSION), meant, *files])
     digits = hashlib.sha256(what.encode()).hexdigest()[:8]
     return f"{words or 'task'}_{digits}"
 
@@ -101,7 +98,7 @@ def stages_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[str
         if any(goal["kind"] == "inside" for goal in goals):
             lands.append([GRIPPER, target])
         end = f"_{key}" if len(grounding.order) > 1 else ""
-        where = _where(goals)
+        where = " and ".join(describe_predicate(goal) for goal in goals)
         stages += [
             {
                 "id": f"grasp{end}",
@@ -111,13 +108,13 @@ def stages_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[str
             },
             {
                 "id": f"carry{end}",
-                "text": f"Carry {key} {where}.",
+                "text": f"Carry {key}, so that {where}.",
                 "carry": key,
                 "allowed_contacts": [*others, hand],
             },
             {
                 "id": f"release{end}",
-                "text": f"Let {key} go {where}.",
+                "text": f"Let {key} go, so that {where}.",
                 "release": key,
                 "allowed_contacts": [*others, hand, *lands],
             },
@@ -142,28 +139,6 @@ def _target(goals: Sequence[Mapping[str, Any]]) -> str:
         if goal["kind"] in ("inside", "on"):
             return str(goal.get("container") or goal["support"])
     return TABLE
-
-
-def _where(goals: Sequence[Mapping[str, Any]]) -> str:
-    told = []
-    for goal in goals:
-        side = goal.get("direction", "")
-        side = f" {side.replace('_', ' ')}" if isinstance(side, str) and side else ""
-        match goal["kind"]:
-            case "inside":
-                told.append(f"into {goal['container']}")
-            case "on":
-                told.append(f"onto {goal['support']}")
-            case "outside":
-                told.append(f"out of {goal['container']}")
-            case "beside":
-                told.append(f"next to {goal['reference']}{f' ({side.strip()})' if side else ''}")
-            case "upright":
-                told.append("upright")
-            case "moved":
-                length = goal.get("by_m", goal.get("at_least_m", 0.0))
-                told.append(f"by {length * 100:g} cm{side}")
-    return ", ".join(told)
 
 
 def success_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[str, Any]]:

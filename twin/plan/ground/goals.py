@@ -1,7 +1,7 @@
 """What an instruction asks for, whether it can be, and in which order it is done."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from bridge.task.check import REFERENCES, TABLE
@@ -53,18 +53,17 @@ class Grounding:
         }
 
 
+@dataclass
 class Goals:
     """Collects goals clause by clause, and refuses what cannot be."""
 
-    def __init__(self, vocabulary: Vocabulary) -> None:
-        """Begin without any."""
-        self.vocabulary = vocabulary
-        self.found: list[dict[str, Any]] = []
-        self.steps: list[tuple[str, ...]] = []
-        """Objects of each clause."""
-        self.edges: list[tuple[int, int]] = []
-        """Clauses that come before others."""
-        self.is_order_given = False
+    vocabulary: Vocabulary
+    found: list[dict[str, Any]] = field(default_factory=list)
+    steps: list[tuple[str, ...]] = field(default_factory=list)
+    """Objects of each clause."""
+    edges: list[tuple[int, int]] = field(default_factory=list)
+    """Clauses that come before others."""
+    is_order_given: bool = False
 
     def add_clause(self, goals: Sequence[dict[str, Any]]) -> None:
         """Take the goals of one clause."""
@@ -102,14 +101,9 @@ class Goals:
         """Refuse to move what cannot be."""
         for key in ids:
             if not self.vocabulary.things[key].movable:
-                told, movable = (
-                    self.vocabulary.describe([key]),
-                    ", ".join(self.vocabulary.movable()),
-                )
-                message = (
-                    f"{told} is fixed: nothing can move it. What can be moved: "
-                    f"{movable or 'nothing here'}."
-                )
+                movable = ", ".join(self.vocabulary.movable()) or "nothing here"
+                told = f"{self.vocabulary.describe([key])} is fixed: nothing can move it."
+                message = f"{told} What can be moved: {movable}."
                 raise GroundingError("fixed_object", message, candidates=[key])
 
     def checked(self) -> list[dict[str, Any]]:
@@ -157,8 +151,7 @@ def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]
             if other in before:
                 before[goal["object"]].add(other)
     relations = {key: set(values) for key, values in before.items()}
-    if _sorted(names, relations) is None:
-        circle = _circle(names, relations)
+    if circle := _sorted(names, relations)[1]:
         message = (
             f"{', '.join(circle)} each wait for another to be in place first. Let one of them stay "
             "where it is."
@@ -167,9 +160,8 @@ def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]
     for first, second in goals.edges:
         for later in goals.steps[second]:
             before[later] |= set(goals.steps[first]) - {later}
-    order = _sorted(names, before)
-    if order is None:
-        circle = _circle(names, before)
+    order, circle = _sorted(names, before)
+    if circle:
         message = (
             f"the order asked for cannot be: one of {', '.join(circle)} would be moved after "
             "something was put on it or beside it. Say it the other way round."
@@ -178,20 +170,10 @@ def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]
     return tuple(order)
 
 
-def _sorted(names: Sequence[str], before: Mapping[str, set[str]]) -> list[str] | None:
+def _sorted(names: Sequence[str], before: Mapping[str, set[str]]) -> tuple[list[str], list[str]]:
+    """An order, and those that wait for each other, for which there is none."""
     left, order = list(names), []
-    while left:
-        ready = next((key for key in left if not before[key] & set(left)), None)
-        if ready is None:
-            return None
+    while ready := next((key for key in left if not before[key] & set(left)), None):
         order.append(ready)
         left.remove(ready)
-    return order
-
-
-def _circle(names: Sequence[str], before: Mapping[str, set[str]]) -> list[str]:
-    """Those that wait for each other."""
-    left = set(names)
-    while ready := {key for key in left if not before[key] & left}:
-        left -= ready
-    return [key for key in names if key in left]
+    return order, left

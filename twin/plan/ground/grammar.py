@@ -1,92 +1,87 @@
 """A small grammar of English: from the words of an instruction to goals, in order.
 
-An instruction is cut into words, read from left to right once, clause by clause, and every word has
-to be used: one that is not is an error that names it. Nothing is guessed.
+Words become parts (a verb, a noun phrase, a relation, a length), each a letter, and the letters of
+a clause have to fit one pattern. Every word has to be used; nothing is guessed.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass
 from typing import Any
 
 from bridge.task.relations import SIDES
+from twin.plan.constrain.schema import printable
 from twin.plan.ground.goals import PLACES, Goals, Grounding, ordered
 from twin.plan.ground.nouns import Memory, NounPhrase, Nouns, with_shared_noun
 from twin.plan.ground.vocabulary import GroundingError, Vocabulary
-from twin.plan.ground.words import (
-    CARRIED,
-    ENDS_THERE,
-    GAP,
-    KNOWN,
-    NEGATIONS,
-    POLITE,
-    RELATIONS,
-    SIGNS,
-    THEN,
-    UNSUPPORTED_RELATIONS,
-    UNSUPPORTED_VERBS,
-    VERBS,
-    WAYS,
-    printable,
-    tokens_of,
-)
+from twin.plan.ground.words import CARRIED, NEGATIONS, PHRASES, RELATIONS, VERBS, WAYS, tokens_of
 
 GAP_TOLERANCE_M = 0.005
 """Of a gap that is given by one number."""
 MOST_M = 1.5
 _SLOTS = {"inside": "container", "outside": "container", "on": "support"}
+_PLACE = r"(?:B?L)?RN(?:GL)?|B?LW|WB?L|U"
+_CLAUSE = re.compile(
+    rf"(?P<between>[ASTFP]*)(?P<verb>V?)(?P<themes>N(?:S?A?N)*)?(?P<ends>E?)"
+    rf"(?P<places>(?:P*(?:S?A?P*(?:{_PLACE}))*P*))"
+)
+_PLACES = re.compile(_PLACE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """Some words that belong together."""
+
+    letter: str
+    begin: int
+    words: str
+    phrase: NounPhrase | None = None
+    length_m: tuple[float, float] = (0.0, 0.0)
 
 
 def ground(text: str, vocabulary: Vocabulary) -> Grounding:
     """Turn an instruction into goals and their order."""
-    return _Reader(text, vocabulary).read()
-
-
-@dataclass(kw_only=True)
-class _Clause:
-    """One verb with what it moves, and where to."""
-
-    verb: str
-    themes: tuple[str, ...]
-    goals: list[dict[str, Any]] = field(default_factory=list)
-
-    def add(self, kind: str, **about: Any) -> None:
-        """Ask for one relation of everything that is moved."""
-        self.goals += [{"kind": kind, "object": key, **about} for key in self.themes]
+    try:
+        return _Reader(text, vocabulary).read()
+    except GroundingError as error:
+        raise error.with_examples(vocabulary.examples()) from None
 
 
 class _Reader:
     """Reads one instruction."""
 
     def __init__(self, text: str, vocabulary: Vocabulary) -> None:
-        self.tokens, self.at = tokens_of(text), 0
-        self.vocabulary, self.memory = vocabulary, Memory()
+        self.text, self.tokens, self.vocabulary = text, tokens_of(text), vocabulary
+        self.memory = Memory()
         self.nouns, self.goals = Nouns(vocabulary, self.memory), Goals(vocabulary)
-        self.text, self.verb = text, ""
         self.held: dict[str, str] = {}
         """What was taken and has not been put anywhere, with the words that said so."""
 
     def read(self) -> Grounding:
         """Read all clauses."""
         self._refuse_words()
-        while True:
-            is_then = self._between()
-            if self.at == len(self.tokens):
-                break
+        parts = self._parts()
+        letters, at, verb = "".join(part.letter for part in parts), 0, ""
+        while at < len(parts):
+            found = next(_CLAUSE.finditer(letters, at))
+            if found.end() == at:
+                raise self._unknown(parts[at].begin)
             known = len(self.goals.steps)
-            self._clause()
-            if is_then and 0 < known < len(self.goals.steps):
+            if found.end() > found.end("between"):
+                verb = self._clause(found, parts, verb)
+            if "T" in found["between"] and 0 < known < len(self.goals.steps):
                 self.goals.edges.append((known - 1, known))
                 self.goals.is_order_given = True
+            at = found.end()
         for key, words in self.held.items():
             message = f"'{words}': say where {key} is to go; holding it is no end."
             raise GroundingError("unsupported_verb", message)
-        found = self.goals.checked()
-        if not found:
-            raise GroundingError("empty", f"the instruction asks for nothing. {KNOWN}")
+        goals = self.goals.checked()
+        if not goals:
+            raise GroundingError("empty", "the instruction asks for nothing.")
         return Grounding(
             text=self.text,
-            goals=tuple(found),
-            order=ordered(self.goals, found),
+            goals=tuple(goals),
+            order=ordered(self.goals, goals),
             is_order_given=self.goals.is_order_given,
             choices=tuple(self.memory.choices),
             explanation=tuple(dict.fromkeys(self.memory.explanation)),
@@ -99,239 +94,171 @@ class _Reader:
             raise GroundingError("alternative", "'or' leaves open what is wanted. Say which.")
         no = [w for w in words if w in NEGATIONS or w.startswith("non-") or w.endswith("n't")]
         if no:
-            message = f"'{printable(no[0])}' says what is not wanted. Say what is."
+            message = f"'{printable(no[0][:80])}' says what is not wanted. Say what is."
             raise GroundingError("negated", message)
 
-    def _match(self, phrases: Iterable[str]) -> str:
-        """The longest of these phrases that begins here, and go on behind it; empty: none."""
-        for length in (5, 4, 3, 2, 1):
-            words = self.tokens[self.at : self.at + length]
-            phrase = " ".join(token.text for token in words)
-            if len(words) == length and phrase in phrases:
-                self.at += length
-                return phrase
-        return ""
+    def _parts(self) -> list[_Part]:
+        """Cut the words into parts; one that is in none is an error that names it."""
+        parts: list[_Part] = []
+        at, slot = 0, "theme"
+        while at < len(self.tokens):
+            begin, token, phrase, letter = at, self.tokens[at], None, ""
+            for length in (5, 4, 3, 2, 1):
+                words = " ".join(each.text for each in self.tokens[at : at + length])
+                if letter := PHRASES.get(words, ""):
+                    at += min(length, len(self.tokens) - at)
+                    break
+            if not letter and token.length_m is not None:
+                letter, at = "L", at + 1
+            elif not letter:
+                self._refuse_unread(at, parts)
+                phrase, at = self.nouns.read(self.tokens, at, slot)
+                letter = "N"
+            words = " ".join(each.text for each in self.tokens[begin:at])
+            slot = _SLOTS.get(RELATIONS[words], "reference") if letter == "R" else "theme"
+            parts.append(
+                _Part(
+                    letter=letter,
+                    begin=begin,
+                    words=words,
+                    phrase=phrase,
+                    length_m=token.length_m or (0.0, 0.0),
+                )
+            )
+        return parts
+
+    def _refuse_unread(self, at: int, parts: list[_Part]) -> None:
+        """Raise unless a noun phrase may begin here."""
+        word, letters = self.tokens[at].text, self.nouns.letters(self.tokens[at:])
+        if letters[0] not in "x." or (parts and parts[-1].letter in "VR"):
+            return  # a noun, or one that nobody knows
+        first = not parts or parts[-1].letter in "ASTFP"
+        if re.match(r".[tqbyincs]*[hc]", letters):
+            if first:
+                raise GroundingError(
+                    "unsupported_verb", f"nobody here can '{printable(word[:80])}'."
+                )
+            message = f"the relation '{printable(word[:80])}' is not known."
+            raise GroundingError("unsupported_relation", message)
+        if first:
+            raise self._unknown(at)
+        raise self._unknown(max(0, at - 5), f"is not understood from '{printable(word[:80])}' on")
 
     def _rest(self, start: int, count: int = 6) -> str:
-        return printable(" ".join(token.text for token in self.tokens[start : start + count]))
+        return printable(" ".join(t.text for t in self.tokens[start : start + count])[:80])
 
     def _unknown(self, start: int, what: str = "is not understood") -> GroundingError:
-        message = f"'{self._rest(start)}' {what}. {KNOWN}"
-        return GroundingError("unknown_clause", message)
+        return GroundingError("unknown_clause", f"'{self._rest(start)}' {what}.")
 
-    def _word(self) -> str:
-        """The word that comes next; empty at the end."""
-        return self.tokens[self.at].text if self.at < len(self.tokens) else ""
+    def _clause(self, found: re.Match[str], parts: list[_Part], last_verb: str) -> str:
+        """One verb with what it moves, and where to; return the verb."""
 
-    def _between(self) -> bool:
-        """Skip what divides clauses; say whether one is to come after the other."""
-        is_then, start = False, -1
-        while self.at != start:
-            start = self.at
-            if self._word() in SIGNS:
-                self.at += 1
-            is_then |= bool(self._match(THEN))
-            self._match(("and", "first", *POLITE))
-        return is_then
+        def of(name: str) -> list[_Part]:
+            return parts[slice(*found.span(name))]
 
-    def _clause(self) -> None:
-        start = self.at
-        word = self._match(VERBS)
-        verb = VERBS.get(word, "")
-        if word in CARRIED:
-            self.memory.explanation.append(f"'{word}': it is carried there and let go")
-        if not verb:
-            self._refuse_verb()
-            verb = self.verb
-        clause = _Clause(verb=verb, themes=self._themes())
-        self.memory.themes = clause.themes
-        if self._match(ENDS_THERE):
-            clause.verb = "put"
-        if not clause.verb:
+        start = parts[found.end("between")].begin
+        verb = last_verb
+        for part in of("verb"):
+            verb = VERBS[part.words]
+            if part.words in CARRIED:
+                self.memory.explanation.append(f"'{part.words}': it is carried there and let go")
+        verb = "put" if found["ends"] else verb
+        phrases = [part.phrase for part in of("themes") if part.phrase is not None]
+        if not verb or not phrases:
             raise self._unknown(start)
-        self._places(clause, start)
-        self._close(clause, start)
-        self.verb = verb or clause.verb
-
-    def _refuse_verb(self) -> None:
-        """Raise unless a clause without a verb may begin here."""
-        here = self.tokens[self.at]
-        behind = self.tokens[self.at + 1 :]
-        is_unknown = not self.nouns.is_one(here.text)
-        if here.text in UNSUPPORTED_VERBS or (
-            is_unknown and behind and behind[0].text == "the" and self._names_thing(self.at + 1)
-        ):
-            message = f"nobody here can '{printable(here.text)}'. {KNOWN}"
-            raise GroundingError("unsupported_verb", message)
-        if is_unknown:
-            raise self._unknown(self.at)
-
-    def _names_thing(self, at: int) -> bool:
-        try:
-            phrase, _ = self.nouns.read(self.tokens, at, "theme")
-        except GroundingError:
-            return False
-        return bool(self.nouns.fitting(phrase))
-
-    def _themes(self) -> tuple[str, ...]:
-        """What is moved: one phrase, or several with "and" between."""
-        phrase, self.at = self.nouns.read(self.tokens, self.at, "theme")
-        phrases = [phrase]
-        while self._joins_noun():
-            phrase, self.at = self.nouns.read(self.tokens, self.at, "theme")
-            phrases.append(phrase)
         meant = [self.nouns.resolve(each, "theme") for each in with_shared_noun(phrases)]
-        return tuple(dict.fromkeys(key for ids in meant for key in ids))
+        themes = tuple(dict.fromkeys(key for ids in meant for key in ids))
+        self.memory.themes = themes
+        goals: list[dict[str, Any]] = []
+        for place in _PLACES.finditer("".join(part.letter for part in of("places"))):
+            goals += self._place(of("places")[slice(*place.span())], themes)
+        behind = parts[found.end() : found.end() + 1]
+        if behind and behind[0].letter not in "ASTFP":
+            self._refuse_place(behind[0], parts[found.end() + 1 :], start, themes)
+        elif not goals:
+            goals = self._without_place(verb, themes, start)
+        if verb == "stack" and len(themes) > 1:
+            message = f"which of {', '.join(themes)} is to be below? Say one by one."
+            raise GroundingError("ambiguous_relation", message, candidates=themes)
+        if goals:
+            goals = [{"kind": goal["kind"], "object": k, **goal} for goal in goals for k in themes]
+            self.goals.add_clause(goals)
+        if any(goal["kind"] in (*PLACES, "outside", "beside") for goal in goals):
+            self.held = {key: words for key, words in self.held.items() if key not in themes}
+        return verb
 
-    def _joins_noun(self) -> bool:
-        """Whether a comma or "and", and then another noun phrase, come next; skips the former."""
-        start = self.at
-        if self._word() == ",":
-            self.at += 1
-        self._match(("and",))
-        if self.at > start and self.nouns.is_one(self._word()):
-            return True
-        self.at = start
-        return False
-
-    def _places(self, clause: _Clause, start: int) -> None:
-        """Read where everything goes, until the clause ends."""
-        while self._word() and not self._ends():
-            before = self.at
-            self._place(clause)
-            self._match(POLITE)
-            if self.at == before:
-                raise self._unknown(start, f"is not understood from '{self._rest(before, 1)}' on")
-            joined = self.at
-            self.at += self._word() == ","
-            self._match(("and",))
-            if not self._begins_place():
-                self.at = joined
-
-    def _ends(self) -> bool:
-        here = self.at
-        ended = self.tokens[here].is_sign or bool(self._match(("and", *THEN)))
-        self.at = here
-        return ended
-
-    def _begins_place(self) -> bool:
-        here = self.at
-        begins = bool(self._match((*RELATIONS, *WAYS, "upright")))
-        self.at = here
-        return begins
-
-    def _place(self, clause: _Clause) -> None:
-        """One relation, movement or remark about the end."""
-        length = self._length()
-        relation = RELATIONS.get(self._match(RELATIONS), "")
-        if relation in SIDES or relation == "beside":
-            return self._beside(clause, relation, length)
-        way = "" if relation else WAYS.get(self._match(WAYS), "")
-        if way:
-            return self._moved(clause, way, length or self._length())
-        if length is not None:
-            raise self._unknown(self.at - 1, "says how far, and not from what or which way")
-        if relation:
-            return self._relation(clause, relation)
-        if self._match(("upright",)):
-            return clause.add("upright")
-        here = self.tokens[self.at].text
-        if here == "to" and self.at + 1 < len(self.tokens):
-            message = f"'{self._rest(self.at, 4)}': into, onto or next to it?"
+    def _refuse_place(
+        self, part: _Part, behind: list[_Part], start: int, themes: tuple[str, ...]
+    ) -> None:
+        """Say what is wrong where a clause does not go on as any does."""
+        if part.letter == "O" and behind:
+            message = f"'{self._rest(part.begin, 4)}': into, onto or next to it?"
             candidates = ("into", "onto", "next to")
             raise GroundingError("ambiguous_relation", message, candidates=candidates)
-        if here in UNSUPPORTED_RELATIONS:
-            message = f"the relation '{here}' is not known. {KNOWN}"
-            raise GroundingError("unsupported_relation", message)
-        return None
+        if part.letter == "W":
+            self.goals.refuse_fixed(themes)
+            what = "does not say how far: for example '10 cm to the left'"
+            raise self._unknown(part.begin, what)
+        if part.letter in "BL":
+            raise self._unknown(part.begin, "says how far, and not from what or which way")
+        raise self._unknown(start, f"is not understood from '{printable(part.words[:80])}' on")
 
-    def _length(self) -> tuple[float, float] | None:
-        """A length, with or without "by" before it."""
-        at = self.at + (self._word() == "by")
-        found = self.tokens[at].length_m if at < len(self.tokens) else None
-        self.at = self.at if found is None else at + 1
-        return found
-
-    def _one(self, clause: _Clause, slot: str) -> str:
-        """The one thing that a relation is to."""
-        phrase, self.at = self.nouns.read(self.tokens, self.at, slot)
-        return self._single(phrase, clause, slot)
-
-    def _single(self, phrase: NounPhrase, clause: _Clause, slot: str) -> str:
-        ids = self.nouns.resolve(phrase, slot, besides=clause.themes)
+    def _place(self, parts: list[_Part], themes: tuple[str, ...]) -> list[dict[str, Any]]:
+        """One relation, movement or remark about the end, without what it is about."""
+        of = {part.letter: part for part in parts}
+        if "U" in of:
+            return [{"kind": "upright"}]
+        length_m = of["L"].length_m if "L" in of else None
+        if "W" in of and length_m is not None:
+            self._say_directions()
+            low, high = (round(each, 6) for each in length_m)
+            if high > MOST_M:
+                message = f"{high:g} m is no distance that the arm can move something."
+                raise GroundingError("impossible", message, candidates=themes)
+            far = {"by_m": low} if low == high else {"at_least_m": low, "at_most_m": high}
+            return [{"kind": "moved", **far, "direction": WAYS[of["W"].words]}]
+        relation, phrase = RELATIONS[of["R"].words], of["N"].phrase
+        assert phrase is not None  # noqa: S101  # every N has one
+        slot = _SLOTS.get(relation, "reference")
+        if slot != "reference" and length_m is not None:
+            raise self._unknown(parts[0].begin, "says how far, and not from what or which way")
+        if of["R"].words == "from" and self.nouns.is_table(phrase):
+            return []  # where it lies now
+        ids = self.nouns.resolve(phrase, slot, besides=themes)
         if len(ids) != 1:
             told = self.vocabulary.describe(ids)
             message = f"'{phrase.text}' is more than one thing: {told}. Name one."
             raise GroundingError("ambiguous_object", message, candidates=ids)
-        return ids[0]
-
-    def _relation(self, clause: _Clause, relation: str) -> None:
-        slot = _SLOTS[relation]
-        source = self.tokens[self.at - 1].text
-        phrase, self.at = self.nouns.read(self.tokens, self.at, slot)
-        if source == "from" and self.nouns.is_table(phrase):
-            return  # where it lies now
-        clause.add(relation, **{slot: self._single(phrase, clause, slot)})
-
-    def _beside(self, clause: _Clause, relation: str, length: tuple[float, float] | None) -> None:
-        about: dict[str, Any] = {"reference": self._one(clause, "reference")}
+        if slot != "reference":
+            return [{"kind": relation, slot: ids[0]}]
+        about: dict[str, Any] = {"kind": "beside", "reference": ids[0]}
         if relation in SIDES:
             about["direction"] = relation
             self._say_directions()
-        if self._match(GAP):
-            length = self._length()
-            if length is None:
-                raise self._unknown(self.at - 1, "does not say how large the gap is")
-        if length is not None:
-            low, high = length
+        if length_m is not None:
+            low, high = length_m
             slack = GAP_TOLERANCE_M if low == high else 0.0
             about["gap_m"] = [round(max(0.0, low - slack), 6), round(high + slack, 6)]
-        clause.add("beside", **about)
-
-    def _moved(self, clause: _Clause, way: str, length: tuple[float, float] | None) -> None:
-        self._say_directions()
-        if length is None:
-            self.goals.refuse_fixed(clause.themes)
-            raise self._unknown(
-                self.at - 1, "does not say how far: for example '10 cm to the left'"
-            )
-        low, high = (round(each, 6) for each in length)
-        if high > MOST_M:
-            message = f"{high:g} m is no distance that the arm can move something."
-            raise GroundingError("impossible", message, candidates=clause.themes)
-        about = {"by_m": low} if low == high else {"at_least_m": low, "at_most_m": high}
-        clause.add("moved", **about, direction=way)
+        return [about]
 
     def _say_directions(self) -> None:
         told = "directions are as the robot sees them: forwards is away from its base"
         self.memory.explanation.append(told)
 
-    def _close(self, clause: _Clause, start: int) -> None:
-        """Take over the goals of a clause that is read to its end."""
-        if not clause.goals and clause.verb == "pack":
-            clause.add("inside", container=self._only_container(start))
-        elif not clause.goals and clause.verb == "take":
-            self.held |= dict.fromkeys(clause.themes, self._rest(start))
-            return
-        elif not clause.goals:
-            self.goals.refuse_fixed(clause.themes)
+    def _without_place(
+        self, verb: str, themes: tuple[str, ...], start: int
+    ) -> list[dict[str, Any]]:
+        """What a clause asks for that says no place."""
+        if verb == "take":
+            self.held |= dict.fromkeys(themes, self._rest(start))
+            return []
+        if verb != "pack":
+            self.goals.refuse_fixed(themes)
             raise self._unknown(start, "does not say where")
-        if clause.verb == "stack" and len(clause.themes) > 1:
-            message = f"which of {', '.join(clause.themes)} is to be below? Say one by one."
-            raise GroundingError("ambiguous_relation", message, candidates=clause.themes)
-        self.goals.add_clause(clause.goals)
-        for key in clause.themes:
-            if any(goal["kind"] in (*PLACES, "outside", "beside") for goal in clause.goals):
-                self.held.pop(key, None)
-
-    def _only_container(self, start: int) -> str:
         where = self.vocabulary.containers()
         if len(where) != 1:
-            message = f"'{self._rest(start)}': into what?"
             kind = "ambiguous_object" if where else "unknown_object"
-            raise GroundingError(kind, message, candidates=where)
-        told = (
-            f"packed into {self.vocabulary.describe(where)}: nothing else here can be packed into"
-        )
-        self.memory.explanation.append(told)
-        return where[0]
+            raise GroundingError(kind, f"'{self._rest(start)}': into what?", candidates=where)
+        told = self.vocabulary.describe(where)
+        self.memory.explanation.append(f"packed into {told}: nothing else here can be packed into")
+        return [{"kind": "inside", "container": where[0]}]

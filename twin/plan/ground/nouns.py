@@ -1,5 +1,6 @@
 """Noun phrases: how they are read, and which things of the vocabulary they mean."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -8,21 +9,23 @@ import numpy as np
 from bridge.task.check import TABLE, nearest
 from twin.naming.colours import COLOUR_NAMES
 from twin.naming.words import SAME_COLOURS, SAME_NOUNS, colour_of, singular
+from twin.plan.constrain.schema import printable
 from twin.plan.ground.vocabulary import GroundingError, Thing, Vocabulary
-from twin.plan.ground.words import (
-    ALL,
-    ARTICLES,
-    CLOSED,
-    NUMBERS,
-    PRONOUNS,
-    SIZES,
-    TABLES,
-    Token,
-    printable,
-)
+from twin.plan.ground.words import CLOSED, NUMBERS, PRONOUNS, SIZES, TABLES, Token
 
 APART = 1.25
 """A thing is large beside one that it is so many times larger than, by volume."""
+_LETTERS = {
+    "the": "t", "of": "o", "both": "b", "any": "y", "everything": "e", "ones": "w",
+    **dict.fromkeys(("a", "an"), "i"), **dict.fromkeys(("all", "every", "each"), "q"),
+    **dict.fromkeys(SIZES, "s"), **dict.fromkeys(TABLES, "d"), **dict.fromkeys(PRONOUNS, "p"),
+}  # fmt: skip
+"""What a word may be in a noun phrase; a number is n, a colour c, a noun h, an unknown word x."""
+_PHRASE = re.compile(
+    r"(?P<pronoun>p)"
+    r"|(?P<lead>e|i|bo?t?|(?P<quantifier>[qy])?(?:(?P<count>n)o?t?|(?:(?<=[qy])o)?t?(?P<more>n)?))"
+    r"(?P<adjectives>[cs]*)(?P<head>h+|d|w)?(?:(?<=h)(?P<number>n))?"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +36,8 @@ class NounPhrase:
     colours: tuple[str, ...] = ()
     sizes: tuple[str, ...] = ()
     nouns: tuple[str, ...] = ()
-    """Singular, or the id of a thing."""
-    every: bool = False
-    """All that fit: "all", or a plural."""
     count: int | None = None
+    every: bool = False
     loose: bool = False
     """Any of those that fit will do: "a cube", "two cubes"; not "the cube"."""
     pronoun: str = ""
@@ -73,105 +74,76 @@ class Nouns:
         self._ids = {key.lower(): key for key in vocabulary.things}
         self._nouns = {noun for thing in things for noun in (*thing.names, thing.shape)} - {""}
 
-    def is_one(self, word: str) -> bool:
-        """Whether a word may begin a noun phrase, and no other part of a clause."""
-        determiners = (*ARTICLES, *ALL, *PRONOUNS, *NUMBERS, *TABLES, "both", "any")
-        return word in determiners or bool(self._meaning(word))
+    def letters(self, tokens: Sequence[Token]) -> str:
+        """What each word may be in a noun phrase; a full stop ends one."""
+        return "".join(self._letter(tokens, at) for at in range(len(tokens)))
 
-    def _meaning(self, word: str) -> str:
-        """``id``, ``colour``, ``size``, ``noun``, or empty: the word means nothing here."""
+    def _letter(self, tokens: Sequence[Token], at: int) -> str:
+        token, word = tokens[at], tokens[at].text
+        if word == "one":  # a number, or what stands for a noun
+            behind = self._letter(tokens, at + 1) if at + 1 < len(tokens) else "."
+            return "n" if behind in "ocsh" else "w"
         if colour_of(word) is not None and word not in self._nouns:
-            return "colour"
-        if word in self._ids:
-            return "id"
-        if word in SIZES:
-            return "size"
-        is_noun = word in ("one", "ones", *TABLES) or _plain(word) in self._nouns
-        return "noun" if is_noun else ""
+            return "c"
+        if _plain(word) in self._nouns or word in self._ids:
+            return "h"
+        if word in _LETTERS:
+            return _LETTERS[word]
+        if token.number is not None or word in NUMBERS:
+            return "n"
+        is_end = token.length_m is not None or word in CLOSED
+        return "." if is_end else "x"
 
     def read(self, tokens: Sequence[Token], at: int, slot: str) -> tuple[NounPhrase, int]:
         """Read the noun phrase that begins here, and say where it ends."""
-        start = at
-        if at < len(tokens) and tokens[at].text in PRONOUNS:
-            return NounPhrase(text=tokens[at].text, pronoun=tokens[at].text), at + 1
-        phrase, at = self._determiner(tokens, at)
-        is_headed = False
-        while at < len(tokens) and not is_headed:
-            token = tokens[at]
-            ends = token.text in CLOSED and _plain(token.text) not in self._nouns
-            if token.is_sign or ends or token.length_m is not None:
-                break
-            phrase, is_headed = self._with_word(phrase, tokens, at, slot)
-            at += 1
-        if phrase.nouns and at < len(tokens) and tokens[at].number is not None:
-            numbered = f"{phrase.nouns[-1]}_{tokens[at].number}"  # duck 2
-            phrase = replace(phrase, nouns=(*phrase.nouns[:-1], numbered))
-            at += 1
-        text = " ".join(token.text for token in tokens[start:at])
-        if not (phrase.colours or phrase.nouns or phrase.every):
-            there = " ".join(token.text for token in tokens[max(start - 1, 0) : at + 1])
-            message = f"'{printable(there)}' names no object."
-            raise GroundingError("unknown_clause", message, candidates=self._of(slot))
-        if phrase.nouns == ("everything",) or not (phrase.colours or phrase.nouns):
-            phrase = replace(phrase, nouns=("object",))
-        return replace(phrase, text=text), at
+        letters = self.letters(tokens[at:])
+        found = next(_PHRASE.finditer(letters))  # it may be empty
+        words = [token.text for token in tokens[at : at + found.end()]]
+        text = " ".join(words)
+        if found["pronoun"]:
+            return NounPhrase(text=text, pronoun=text), at + 1
+        if not found["head"] and letters[found.end() : found.end() + 1] == "x":
+            self._refuse_unknown(tokens[at + found.end()].text, slot)
 
-    def _determiner(self, tokens: Sequence[Token], at: int) -> tuple[NounPhrase, int]:
-        """All, any two of the, the five: how many are meant; each of these words comes once."""
-        words = [token.text for token in tokens[at : at + 5]] + [""] * 5
-        used = 0
-        quantifier = words[0] if words[0] in (*ALL, "both", "any", "a", "an") else ""
-        used += bool(quantifier)
-        if quantifier in ("everything", "a", "an"):
-            return NounPhrase(text="", every=quantifier in ALL, loose=quantifier not in ALL), at + 1
-        count = self._number(tokens, at + used) if quantifier != "both" else None
-        loose = quantifier == "any" or (count is not None and not quantifier)
-        used += count is not None
-        used += bool(used) and words[used] == "of"
-        used += words[used] == "the"
-        if count is None and quantifier != "both":
-            count = self._number(tokens, at + used)
-            used += count is not None
-        count = 2 if quantifier == "both" else count
-        return NounPhrase(text="", every=quantifier in ALL, count=count, loose=loose), at + used
+        def part(name: str) -> list[str]:
+            return words[slice(*found.span(name))] if found[name] else []
 
-    def _number(self, tokens: Sequence[Token], at: int) -> int | None:
-        """A number of things; "one" may also stand for a noun."""
-        if at >= len(tokens):
-            return None
-        word = tokens[at].text
-        following = tokens[at + 1].text if at + 1 < len(tokens) else ""
-        if word == "one" and following != "of" and not self._meaning(following):
-            return None
-        return tokens[at].number if tokens[at].number is not None else NUMBERS.get(word)
+        def number(name: str) -> int | None:
+            (word,) = part(name) or [""]
+            return int(word) if word.isdigit() else NUMBERS.get(word)
 
-    def _with_word(
-        self, phrase: NounPhrase, tokens: Sequence[Token], at: int, slot: str
-    ) -> tuple[NounPhrase, bool]:
-        """One more word, and whether it was the head."""
-        word = tokens[at].text
-        meaning = self._meaning(word)
-        if not meaning:
-            known = sorted(self._nouns | set(COLOUR_NAMES) | set(SAME_COLOURS) | set(SIZES))
-            message = f"'{printable(word)}' is not known here.{nearest(word, known)}"
-            raise GroundingError("unknown_object", message, candidates=self._of(slot))
-        if meaning == "colour":
-            return replace(phrase, colours=(*phrase.colours, colour_of(word) or word)), False
-        if meaning == "size":
-            return replace(phrase, sizes=(*phrase.sizes, word)), False
-        if meaning == "id":
-            return replace(phrase, nouns=(*phrase.nouns, word)), True
-        plural = singular(word) != word
-        nouns: tuple[str, ...] = (_plain(word),)
-        if word in ("one", "ones"):
+        head, quantifier = part("head"), found["quantifier"]
+        nouns = tuple(w if w in self._ids else _plain(w) for w in head)
+        if found["head"] == "w":
             nouns = self.memory.nouns.get(slot) or self.memory.nouns.get("theme", ())
-        following = tokens[at + 1].text if at + 1 < len(tokens) else ""
-        is_headed = self._meaning(following) not in ("noun", "id") or following in TABLES
-        return replace(
-            phrase,
-            nouns=(*phrase.nouns, *nouns),
-            every=phrase.every or (plural and phrase.count is None),
-        ), is_headed
+        if found["number"] and nouns:
+            nouns = (*nouns[:-1], f"{nouns[-1]}_{number('number')}")  # duck 2
+        colours = tuple(c for w in part("adjectives") if (c := colour_of(w)) is not None)
+        every = found["lead"] == "e" or quantifier == "q"
+        if not (colours or nouns or every):
+            there = " ".join(token.text for token in tokens[max(at - 1, 0) : at + found.end() + 1])
+            message = f"'{printable(there[:80])}' names no object."
+            raise GroundingError("unknown_clause", message, candidates=self._of(slot))
+        first = 2 if found["lead"][:1] == "b" else number("count")
+        count = first if first is not None else number("more")
+        is_plural = any(singular(word) != word for word in head if word not in self._ids)
+        phrase = NounPhrase(
+            text=text,
+            colours=colours,
+            sizes=tuple(word for word in part("adjectives") if word in SIZES),
+            nouns=nouns if nouns or colours else ("object",),
+            count=count,
+            every=every or (is_plural and count is None),
+            loose=found["lead"] == "i"
+            or quantifier == "y"
+            or (not quantifier and number("count") is not None),
+        )
+        return phrase, at + found.end()
+
+    def _refuse_unknown(self, word: str, slot: str) -> None:
+        known = sorted(self._nouns | set(COLOUR_NAMES) | set(SAME_COLOURS) | set(SIZES))
+        message = f"'{printable(word[:80])}' is not known here.{nearest(word, known)}"
+        raise GroundingError("unknown_object", message, candidates=self._of(slot))
 
     def is_table(self, phrase: NounPhrase) -> bool:
         """Whether a phrase means the table."""
@@ -187,12 +159,10 @@ class Nouns:
     def resolve(
         self, phrase: NounPhrase, slot: str, *, besides: Sequence[str] = ()
     ) -> tuple[str, ...]:
-        """Say which things a phrase means.
+        """Say which things a phrase means in a slot; those besides only if nothing else is meant.
 
-        Args:
-            slot: ``theme``, ``container``, ``support`` or ``reference``: what moves, what it goes
-                into or onto, or what is named beside it.
-            besides: What moves, where the phrase says where to: meant only if nothing else is.
+        What moves is the ``theme``, what it goes into, onto or beside a ``container``, ``support``
+        or ``reference``.
         """
         if phrase.pronoun:
             return self._pronoun(phrase, slot)
@@ -225,11 +195,11 @@ class Nouns:
     def fitting(self, phrase: NounPhrase) -> tuple[str, ...]:
         """What all words fit; a thing's own name comes before what else it may be called."""
         things = self.vocabulary.things
-        for names in (_own, _own_or_shape, _any):
-            pool = [key for key in things if set(phrase.nouns) <= names(things[key])]
+        for rank in range(3):  # its own name, its shape, what else it may be called
+            pool = [key for key in things if set(phrase.nouns) <= _names(things[key])[rank]]
             fitting = [key for key in pool if set(phrase.colours) <= {things[key].colour}]
             fitting = [key for key in fitting if self._has_sizes(key, phrase, pool)]
-            if fitting or (pool and names is _own_or_shape):
+            if fitting or (pool and rank == 1):
                 return tuple(fitting)
         return ()
 
@@ -286,16 +256,9 @@ def _plain(word: str) -> str:
     return SAME_NOUNS.get(single, single)
 
 
-def _own(thing: Thing) -> frozenset[str]:
-    return thing.own_names | {thing.id.lower()}
-
-
-def _own_or_shape(thing: Thing) -> frozenset[str]:
-    return _own(thing) | {thing.shape}
-
-
-def _any(thing: Thing) -> frozenset[str]:
-    return _own_or_shape(thing) | thing.names
+def _names(thing: Thing) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
+    own = thing.own_names | {thing.id.lower()}
+    return own, own | {thing.shape}, own | {thing.shape} | thing.names
 
 
 def with_shared_noun(phrases: Sequence[NounPhrase]) -> Iterator[NounPhrase]:

@@ -11,25 +11,10 @@ from twin.errors import TwinError
 from twin.naming.colours import colour_name
 from twin.naming.words import KIND_NAMES, colour_of, kind_of, label_of, spoken_name, words_of
 
-KINDS = (
-    "alternative",
-    "ambiguous_object",
-    "ambiguous_relation",
-    "contradiction",
-    "cyclic",
-    "empty",
-    "fixed_object",
-    "impossible",
-    "negated",
-    "too_few_objects",
-    "too_long",
-    "unknown_clause",
-    "unknown_object",
-    "unsupported_relation",
-    "unsupported_verb",
-)
 AT_FAULT = ("contradiction", "cyclic", "fixed_object")
 """Kinds whose candidates are at fault, and named by the message: there is nothing to choose."""
+UNREAD = ("empty", "unknown_clause", "unknown_object", "unsupported_relation", "unsupported_verb")
+"""Kinds that are answered with examples of what is understood."""
 ANY_THING = ("object", "thing", "item")
 ALSO_CALLED = {"cube": ("block", "brick"), "block": ("cube", "brick"), "brick": ("block", "cube")}
 """Other nouns for the same, where nothing in the scene has that noun as its own. A bin is no mug:
@@ -48,6 +33,15 @@ class GroundingError(TwinError):
         choices = () if kind in AT_FAULT else self.candidates
         listed = f" There is: {', '.join(choices)}." if choices else ""
         super().__init__(f"{message}{listed}")
+
+    def with_examples(self, examples: Sequence[str]) -> "GroundingError":
+        """The same with what would be understood, where that helps."""
+        if self.kind not in UNREAD or not examples:
+            return self
+        told = " Understood is, for example: " + ", ".join(f"'{text}'" for text in examples) + "."
+        error = GroundingError(self.kind, str(self) + told)
+        error.candidates = self.candidates
+        return error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,10 +72,15 @@ class Thing:
             self, "names", frozenset(names | ({"container"} if self.container else set()))
         )
 
+    @property
+    def called(self) -> str:
+        """Its label with its colour."""
+        is_named = not self.colour or self.colour in self.label
+        return self.label if is_named else f"{self.colour} {self.label}"
+
     def describe(self) -> str:
         """Its id and what it is."""
-        words = [self.colour] if self.colour and self.colour not in self.label else []
-        return f"{self.id} ({' '.join([*words, self.label])})"
+        return f"{self.id} ({self.called})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +96,22 @@ class Vocabulary:
     def containers(self) -> tuple[str, ...]:
         """Ids of what things can be put into."""
         return tuple(key for key, thing in self.things.items() if thing.container)
+
+    def called(self, key: str) -> str:
+        """What only this thing is called."""
+        name = self.things[key].called
+        return key if [each.called for each in self.things.values()].count(name) > 1 else name
+
+    def examples(self) -> list[str]:
+        """Three instructions about what is here."""
+        if not self.movable():
+            return []
+        first, *others = (f"the {self.called(key)}" for key in self.movable())
+        boxes = [f"the {self.called(key)}" for key in self.containers()]
+        found = [f"put {first} into {box}" for box in boxes[:1]]
+        found += [f"stack {first} on {other}" for other in others[:1]]
+        found += [f"put {first} left of {other}" for other in (others + boxes)[:1]]
+        return [*found, f"move {first} 10 cm to the left", f"push {first} forwards by 5 cm"][:3]
 
     def describe(self, ids: Sequence[str]) -> str:
         """Name things with what they are."""

@@ -13,13 +13,7 @@ from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan, Waypoint
-from twin.plan.constrain.constraint import (
-    SHOWN,
-    Constraint,
-    flattened,
-    violated,
-    worst_along,
-)
+from twin.plan.constrain.constraint import SHOWN, Constraint, flattened, violated, worst_along
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
 from twin.plan.loop.places import lying_there, places_on_table
@@ -32,15 +26,11 @@ from twin.plan.loop.tau import (
     goals_of,
     plan_stage,
     refuse_without_stages,
+    speed_limits,
+    stage_of_leg,
     stages_of,
 )
-from twin.plan.path.planner import (
-    BUDGET_SPENT,
-    START_TOUCHES,
-    NoPathError,
-    PathConfig,
-    plan_move,
-)
+from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, NoPathError, PathConfig, plan_move
 from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
 from twin.plan.problem import Grasp, Problem, Release, State
 from twin.plan.release.final_states import ReleaseConfig, final_states
@@ -106,12 +96,11 @@ class Transfer:
         return np.asarray(self.legs[-1].movement.path.joints_rad[-1])
 
 
+@dataclass(frozen=True)
 class PlanProposer:
     """Offers plans of one policy; see ``Proposer``."""
 
-    def __init__(self, policy: str = NOMINAL) -> None:
-        """Remember what is optimised."""
-        self._policy = policy
+    policy: str = NOMINAL
 
     def propose(
         self, problem: Problem, *, plan_id: str, seed: int, count: int, steer: Steer | None
@@ -126,7 +115,7 @@ class PlanProposer:
         found: list[Candidate] = []
         for transfers in search.sequences():
             try:
-                plan, remarks = _plan_of(problem, transfers, self._policy, plan_id, seed)
+                plan, remarks = _plan_of(problem, transfers, self.policy, plan_id, seed)
             except NoPathError as error:
                 search.why = f"{error}."
                 continue
@@ -145,7 +134,7 @@ class PlanProposer:
             if len(found) == count:
                 break
             try:
-                plan = _written(problem, self._policy, plan_id, *pushed(problem, choice))
+                plan = _written(problem, self.policy, plan_id, *pushed(problem, choice))
             except NoPlanError as error:
                 why = str(error)
                 continue
@@ -230,6 +219,7 @@ class _Search:
     ) -> Transfer:
         """The first way that keeps what holds on the way."""
         kept = _kept_on_the_way(problem, grasp)
+        limits = speed_limits(problem.scene.task, grasp.object_id)
         ways, base = _WAYS, PathConfig()
         steer = self._mine(grasp.object_id)
         if steer is not None and steer.change == "path":
@@ -237,17 +227,17 @@ class _Search:
             eps_m = base.replay.eps_col_m + WIDER_M
             base = replace(base, replay=replace(base.replay, eps_col_m=eps_m))
             base = replace(base, seed=len(steer.refused))
-        failure: NoPathError | None = None
+        failures: list[NoPathError] = []
         for way in ways:
             config = replace(base, seed=base.seed + self._seed % 2**31 + way.more_seed)
             try:
                 legs = plan_transfer(
                     problem, grasp, release, start_rad, config,
-                    lift_m=way.lift_m, straight=way.straight,
+                    lift_m=way.lift_m, straight=way.straight, tool_m_s=limits,
                 )  # fmt: skip
                 kept(legs)
             except NoPathError as error:
-                failure = failure or error
+                failures.append(error)
                 if error.reason != NOT_KEPT and not way.straight:
                     break  # where nothing is free, another height is not either
                 continue
@@ -260,9 +250,7 @@ class _Search:
                 cost=release.cost + erfc(grasp.margin / sqrt(2.0)) / 2,
                 remarks=options.remarks_of(grasp, release, legs),
             )
-        if failure is None:
-            raise NoPathError(reason="unreachable", detail="no way is tried")
-        raise failure
+        raise failures[0]
 
 
 def _why_not_moved(problem: Problem, key: str, error: NoPathError) -> str:
@@ -327,7 +315,7 @@ class _Options:
             T = grasp.T_object_tcp
             return steer.has_grasp_like(key, T) or steer.has_grasp_like(key, turned(T[None])[0])
 
-        if steer.change in ("grasp", "branch"):
+        if steer.change == "grasp":
             return [grasp for grasp in grasps if not refused(grasp)]
         if steer.change == "grasp_shift" and steer.toward_m is not None:
             toward = np.array(steer.toward_m)
@@ -448,9 +436,9 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
 
     def check(legs: tuple[Leg, ...]) -> None:
         for leg in legs:
-            stage = _stage_of_leg(leg.name, ids)
-            if stage is None:
-                continue
+            if not leg.g:
+                continue  # it lies where it lay; the time law keeps speeds there
+            stage = stage_of_leg(leg.name, ids)
             states = _states_along(problem, grasp, leg)
             times_s = leg.movement.path.times_s
             asked = [(each, worst_along(each, states, times_s=times_s)) for each in of_stage[stage]]
@@ -467,14 +455,6 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
                     raise error
 
     return check
-
-
-def _stage_of_leg(name: str, ids: Mapping[str, str]) -> str | None:
-    if name == "lift":
-        return ids.get("grasp")
-    if name == "carry":
-        return ids.get("carry", ids.get("release"))
-    return ids.get("release") if name == "lower" else None
 
 
 def _states_along(problem: Problem, grasp: Grasp, leg: Leg) -> State:
@@ -502,7 +482,8 @@ def _plan_of(
     start = problem.scene.start_rad
     home_rad = problem.robot.home_rad if start is None else start
     open_m = transfers[-1].grasp.open_m
-    config = PathConfig(seed=seed % 2**31)
+    slow = speed_limits(task, transfers[-1].key).get("leave", 0.0)
+    config = PathConfig(seed=seed % 2**31, tool_m_s=slow)
     try:
         home = plan_move(last, transfers[-1].end_rad, home_rad[None], config, width_m=open_m)
     except NoPathError as error:

@@ -18,7 +18,7 @@ from twin.plan.loop.tau import stages_of
 from twin.plan.path.planner import waypoint
 from twin.plan.problem import Problem
 from twin.robot.config import IkConfig
-from twin.robot.inverse import solve_ik
+from twin.robot.follow import follow_poses
 
 STEP_S = 0.04
 HOVER_M = 0.13
@@ -31,6 +31,7 @@ PUSH_GAP_M, PUSH_OVER_M, FINGERS_HALF_M = 0.03, 0.004, 0.011
 PUSH_SPEED_M_S, RAMP_S, PUSH_STEP_S = 0.1, 0.12, 0.02
 """Of a push whose task says no speed; time to reach it and to stop; between its waypoints."""
 WAIT_S = 0.3
+MOST_STEP_RAD = 0.3
 ASIDE_M = (0.0, 0.012, -0.012)
 """Of the fingers, along the pads, from the middle of the object."""
 AHEAD_M = ((0.0, 0.0), (0.015, 0.0), (-0.015, 0.0), (0.0, 0.015), (0.0, -0.015))
@@ -168,16 +169,17 @@ def _followed(
             np.array([se3.quaternion_from_rotation(each[:3, :3]) for each in ends]),
         )
         begin_ns = round(t_s * 1e9)
-        for share, pose in zip(u, line.at((law * 1e9).astype(np.int64)).transforms(), strict=True):
-            solution = solve_ik(robot, pose, IkConfig(), warm_start_rad=joints)
-            if not solution.reached or np.abs(solution.joints_rad - joints).max() > 0.3:
-                x, y, z = pose[:3, 3]
-                raise NoPlanError(
-                    f"the arm cannot follow to ({x:.3f}, {y:.3f}, {z:.3f}) m in stage "
-                    f"{leg.stage}. Move the object, or where it goes, nearer to the arm."
-                )
-            joints = solution.joints_rad
-            tau.append(waypoint(t_s + float(share) * seconds, pose, joints, g=leg.g))
+        Ts = line.at((law * 1e9).astype(np.int64)).transforms()
+        found = follow_poses(robot, Ts, start_rad=joints, config=IkConfig())
+        rows = np.vstack([joints, found.joints_rad])
+        if not found.reached.all() or np.abs(np.diff(rows, axis=0)).max() > MOST_STEP_RAD:
+            raise NoPlanError(
+                f"the arm cannot follow stage {leg.stage}. Move the object, or where it goes, "
+                "nearer to the arm."
+            )
+        for share, pose, row in zip(u, Ts, found.joints_rad, strict=True):
+            tau.append(waypoint(t_s + float(share) * seconds, pose, row, g=leg.g))
+        joints = rows[-1]
         t_s += seconds
         T = leg.T_base_tcp
         bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], round(t_s * 1e9))

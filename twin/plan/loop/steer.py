@@ -15,18 +15,11 @@ from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 
-Change = Literal["grasp", "grasp_shift", "release", "path", "branch", "any"]
+Change = Literal["grasp", "grasp_shift", "release", "path", "any"]
 ALIKE_M = 0.01
 ALIKE_RAD = np.radians(10.0)
 """Two grasps or releases nearer than both are one."""
 
-_BRANCH = (
-    Cause.UNREACHABLE,
-    Cause.JOINTS_DISAGREE,
-    Cause.JOINT_LIMIT,
-    Cause.JOINT_JUMP,
-    Cause.SELF_COLLISION,
-)
 _SQUEEZED = (Cause.EXPLODED, Cause.SHAPE, Cause.PROBABILITY)
 _IN_OBJECT = (Cause.DEEP_CONTACT, Cause.PRE_GRASP_PENETRATION)
 
@@ -48,8 +41,8 @@ class Steer:
 
     change: Change
     """``grasp``: another one, or another width; ``grasp_shift``: nearer to where a finger touched;
-    ``release``: another final state; ``path``: another way or approach; ``branch``: another posture
-    or order; ``any``: nothing in particular."""
+    ``release``: another final state; ``path``: another way or approach; ``any``: nothing in
+    particular."""
     clause: str
     """Factor and cause: ``terminal.inside``."""
     bodies: tuple[str, ...] = ()
@@ -100,7 +93,7 @@ def _change(
 ) -> Change:
     cause = factor.cause or ""
     if name == "ik":
-        return "branch" if cause in _BRANCH else "path"
+        return "path" if cause == Cause.JOINT_SPEED else "grasp"  # which brings other postures
     if name == "limits":
         return "path"
     if name in ("clearance", "audit"):

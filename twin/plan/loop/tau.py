@@ -19,6 +19,9 @@ from twin.robot.model import RobotModel
 
 Bounds = Mapping[str, tuple[int, int]]
 """When each stage begins and ends, from the start of the plan [ns]."""
+LEGS = ("around", "approach", "lift", "carry", "lower", "leave")
+KEPT_SHARE = 0.99
+"""Of a speed limit that is driven at most, so that rounding breaks none."""
 SETTLE_S, CLOSE_S, OPEN_S = 0.2, 0.7, 0.5
 """Standing still before the hand moves, while it closes, and while it opens."""
 
@@ -36,10 +39,8 @@ class Trajectory:
         self, legs: Sequence[Leg], grasp: Grasp, stages: Mapping[str, str], closed_m: float
     ) -> None:
         """Append a pick and place."""
-        pick, place = stages["grasp"], stages["release"]
-        of = {"around": pick, "approach": pick, "lift": pick, "carry": stages.get("carry", place)}
         for leg in legs:
-            stage = of.get(leg.name, place)
+            stage = stage_of_leg(leg.name, stages)
             width_m = closed_m if leg.g else grasp.open_m
             self.add(leg, stage, width_m)
             if leg.name == "approach":
@@ -79,6 +80,24 @@ def stages_of(task: Task, key: str) -> dict[str, str]:
         for verb in ("grasp", "carry", "release", "push")
         if table.get(verb) == key
     }
+
+
+def stage_of_leg(leg: str, stages: Mapping[str, str]) -> str:
+    """Id of the stage to which a movement of a pick and place belongs."""
+    if leg in ("around", "approach", "lift"):
+        return stages["grasp"]
+    return stages.get("carry", stages["release"]) if leg == "carry" else stages["release"]
+
+
+def speed_limits(task: Task, key: str) -> dict[str, float]:
+    """How fast anything may be on each leg that moves an object [m/s]."""
+    ids = stages_of(task, key)
+    of_stage: dict[str, list[float]] = {}
+    for table in task.stages:
+        found = [way["max"] for way in table.get("path", ()) if way["kind"] == "speed"]
+        of_stage[str(table["id"])] = found
+    limits = {leg: of_stage[stage_of_leg(leg, ids)] for leg in LEGS}
+    return {leg: KEPT_SHARE * min(found) for leg, found in limits.items() if found}
 
 
 def refuse_without_stages(task: Task) -> None:

@@ -59,6 +59,8 @@ class PathConfig:
     acceleration_share: float = 0.33
     """Share of the limits of acceleration; a third of the UR5's is what MoveIt assumes of it."""
     seed: int = 0
+    tool_m_s: float = 0.0
+    """Most speed of the tool; 0: what the robot file allows."""
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
 
@@ -226,7 +228,7 @@ def timed_path(
 ) -> TimedPath:
     """Give a path of straight lines its times: corners rounded where that is free."""
     speed, acceleration, limit_m_s = limits_of(world.robot, config)
-    wanted = [value for value in (limit_m_s, tool_m_s) if value]
+    wanted = [value for value in (limit_m_s, tool_m_s, config.tool_m_s) if value]
     rows = np.ascontiguousarray(knots_rad, dtype=np.float64)
     tool = min(wanted, default=0.0)
 

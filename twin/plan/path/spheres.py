@@ -9,27 +9,9 @@ from scipy.spatial import ConvexHull, QhullError
 
 SPHERES = 16
 """For each hull of a link or box that is carried."""
-_ROUNDS = 200
-"""Steps towards the centre of the smallest sphere (Badoiu, Clarkson 2003)."""
 _GROWN = 1e-9
 """Relative; so that rounding leaves no corner outside [1]."""
 _PROBES = 64
-
-
-def enclosing_sphere(
-    points_m: Float[np.ndarray, "num_points 3"],
-) -> tuple[Float[np.ndarray, "3"], float]:
-    """Return centre and radius [m] of a sphere that holds points, nearly the smallest."""
-    low, high = points_m.min(axis=0), points_m.max(axis=0)
-    centre = (low + high) / 2
-    best, least = centre, float(np.linalg.norm(points_m - centre, axis=1).max())
-    for step in range(1, _ROUNDS):
-        away = np.linalg.norm(points_m - centre, axis=1)
-        farthest = int(away.argmax())
-        if away[farthest] < least:
-            best, least = centre, float(away[farthest])
-        centre = centre + (points_m[farthest] - centre) / (step + 1)
-    return best, least * (1 + _GROWN)
 
 
 def covering_spheres(
@@ -57,7 +39,8 @@ _Part = tuple[float, int, Float[np.ndarray, "num_points 3"], Float[np.ndarray, "
 
 
 def _part(corners_m: Float[np.ndarray, "num_points 3"], number: int) -> _Part:
-    centre, radius = enclosing_sphere(corners_m)
+    centre = (corners_m.min(axis=0) + corners_m.max(axis=0)) / 2
+    radius = float(np.linalg.norm(corners_m - centre, axis=1).max()) * (1 + _GROWN)
     # A long part wastes more than a round one of the same size.
     spread = np.linalg.svd(corners_m - corners_m.mean(axis=0), full_matrices=False)[2]
     thinnest = float(np.ptp(corners_m @ spread[2]))

@@ -1,6 +1,6 @@
 """Pick and place as movements: around, straight down, straight up, around, straight down, away."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -52,12 +52,14 @@ def plan_transfer(
     *,
     lift_m: float = LIFT_M,
     straight: bool = False,
+    tool_m_s: Mapping[str, float] | None = None,
 ) -> tuple[Leg, ...]:
     """Plan all movements from where the arm stands to where it has let go and left.
 
     Args:
         lift_m: How far the object is lifted, and let down, straight; less where that is not free.
         straight: Carry it along a straight line of the tool, turned evenly; else around.
+        tool_m_s: How fast the tool may be on some legs.
     """
     transfer = _Transfer(
         problem=problem,
@@ -66,6 +68,7 @@ def plan_transfer(
         config=config,
         lift_m=lift_m,
         straight=straight,
+        tool_m_s=tool_m_s or {},
     )
     taken = transfer.take(start_rad)
     lifted_rad = taken[-1].movement.path.joints_rad[-1]
@@ -88,22 +91,28 @@ class _Transfer:
     config: PathConfig
     lift_m: float
     straight: bool
+    tool_m_s: Mapping[str, float]
+
+    def _driven(self, leg: str) -> PathConfig:
+        return replace(self.config, tool_m_s=self.tool_m_s.get(leg, 0.0))
 
     def take(self, start_rad: Float[np.ndarray, " num_joints"]) -> tuple[Leg, Leg, Leg]:
         """From where the arm stands to the lifted object."""
-        grasp, config = self.grasp, self.config
+        grasp = self.grasp
         taking = self._touching("grasp")
         with _named("approach"):
             T_base_tcp = self.problem.robot.T_base_tcp(grasp.joints_rad)
             back = T_base_tcp @ _along_z(-grasp.pregrasp_m)
             out = plan_straight(
-                self.problem, grasp.joints_rad, back, config, width_m=grasp.open_m, allowed=taking
-            )
+                self.problem, grasp.joints_rad, back, self._driven("approach"),
+                width_m=grasp.open_m, allowed=taking,
+            )  # fmt: skip
         with _named("around"):
             ends = out.path.joints_rad[-1:]
-            around = plan_move(self.problem, start_rad, ends, config, width_m=grasp.open_m)
+            driven = self._driven("around")
+            around = plan_move(self.problem, start_rad, ends, driven, width_m=grasp.open_m)
         with _named("lift"):
-            lift = self._straight_up(grasp.joints_rad, taking)
+            lift = self._straight_up(grasp.joints_rad, taking, self._driven("lift"))
         return (
             Leg(name="around", movement=around, g=0),
             Leg(name="approach", movement=_backwards(out), g=0),
@@ -118,7 +127,7 @@ class _Transfer:
         """From the lifted object to where the arm has left, let go with these joints."""
         leaving = self._touching("release")
         with _named("lower"):
-            rise = self._straight_up(joints_rad, leaving)
+            rise = self._straight_up(joints_rad, leaving, self._driven("lower"))
         with _named("carry"):
             over_rad = rise.path.joints_rad[-1]
             carry = (self._carry_straight if self.straight else self._carry)(lifted_rad, over_rad)
@@ -144,7 +153,7 @@ class _Transfer:
         return self.problem.contacts_of(verb, self.grasp.object_id) | self._grip
 
     def _straight_up(
-        self, joints_rad: Float[np.ndarray, " num_joints"], allowed: Allowed
+        self, joints_rad: Float[np.ndarray, " num_joints"], allowed: Allowed, config: PathConfig
     ) -> Movement:
         """Lift as far as is free and within reach, at least two centimetres."""
         rise_m = self.lift_m
@@ -153,7 +162,7 @@ class _Transfer:
             T[2, 3] += rise_m
             try:
                 return plan_straight(
-                    self.problem, joints_rad, T, self.config, width_m=self.grasp.width_m,
+                    self.problem, joints_rad, T, config, width_m=self.grasp.width_m,
                     carried=self._held, allowed=allowed,
                 )  # fmt: skip
             except NoPathError:
@@ -168,8 +177,8 @@ class _Transfer:
     ) -> Movement:
         """Carry around whatever stands in between."""
         return plan_move(
-            self.problem, start_rad, goal_rad[None], self.config, width_m=self.grasp.width_m,
-            carried=self._held, allowed=self._grip,
+            self.problem, start_rad, goal_rad[None], self._driven("carry"),
+            width_m=self.grasp.width_m, carried=self._held, allowed=self._grip,
         )  # fmt: skip
 
     def _carry_straight(
@@ -180,7 +189,7 @@ class _Transfer:
         """Carry along a straight line that ends on the branch on which the object is let down."""
         goal = self.problem.robot.T_base_tcp(goal_rad)
         movement = plan_straight(
-            self.problem, start_rad, goal, self.config, width_m=self.grasp.width_m,
+            self.problem, start_rad, goal, self._driven("carry"), width_m=self.grasp.width_m,
             carried=self._held, allowed=self._grip,
         )  # fmt: skip
         off_rad = float(np.abs(movement.path.joints_rad[-1] - goal_rad).max())
@@ -194,17 +203,17 @@ class _Transfer:
         scene, release = self.problem.scene, self.release
         poses = {**scene.Ts_base_object, self.grasp.object_id: release.T_base_object}
         placed = replace(self.problem, scene=replace(scene, Ts_base_object=poses))
+        failure = NoPathError(reason="unreachable")
         for more_m in _LEAVE_MORE_M:
             away = release.T_base_tcp @ _along_z(-self.grasp.pregrasp_m - more_m)
             try:
                 return plan_straight(
-                    placed, joints_rad, away, self.config, width_m=self.grasp.open_m,
+                    placed, joints_rad, away, self._driven("leave"), width_m=self.grasp.open_m,
                     allowed=allowed,
                 )  # fmt: skip
-            except NoPathError:
-                if more_m == _LEAVE_MORE_M[-1]:
-                    raise
-        raise NoPathError(reason="unreachable", detail="no way to leave is tried")
+            except NoPathError as error:
+                failure = error
+        raise failure
 
 
 @contextmanager

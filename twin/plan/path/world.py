@@ -93,20 +93,11 @@ def chain_of(hulls: RobotHulls, width_m: float) -> Chain:
     )
 
 
-@dataclass(frozen=True)
-class _HullSpheres:
-    spheres_m: Float[np.ndarray, "num_spheres 4"]
-    excess_m: float
-
-
 @lru_cache(maxsize=4)
-def _link_spheres(hulls: RobotHulls) -> tuple[_HullSpheres, ...]:
-    """Spheres of each hull in its own frame, fitted once for a robot."""
-    found = []
-    for hull in hulls.hulls:
-        spheres = covering_spheres(hull.points_m)
-        found.append(_HullSpheres(spheres, excess_m(hull.points_m, spheres)))
-    return tuple(found)
+def _link_spheres(hulls: RobotHulls) -> list[tuple[Float[np.ndarray, "num_spheres 4"], float]]:
+    """Spheres of each hull in its own frame, and how far they stand out; once for a robot."""
+    fitted = [covering_spheres(hull.points_m) for hull in hulls.hulls]
+    return [(s, excess_m(hull.points_m, s)) for hull, s in zip(hulls.hulls, fitted, strict=True)]
 
 
 @lru_cache(maxsize=4)
@@ -294,8 +285,8 @@ def _add_bodies(
         motion.add_body(
             chain.joint_of[index],
             se3.apply(T, hull.points_m),
-            _placed_spheres(T, fitted[index].spheres_m),
-            fitted[index].excess_m,
+            _placed_spheres(T, fitted[index][0]),
+            fitted[index][1],
             cover,
             *roots,
         )

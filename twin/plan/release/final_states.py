@@ -11,11 +11,7 @@ from bridge.geometry import se3
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import SHOWN, Constraint
 from twin.plan.problem import Array, Grasp, Problem, Release, State
-from twin.plan.release.obstacles import (
-    allowed_with,
-    hand_points,
-    obstacles_of,
-)
+from twin.plan.release.obstacles import allowed_with, hand_points, obstacles_of
 from twin.plan.release.resting import (
     NoFinalStateError,
     Target,
@@ -291,8 +287,8 @@ class ReleaseSearch:
     def _nothing(self, stage: StageProblem, nearest: StageCandidate) -> NoFinalStateError:
         """Say what was in the way where the least was."""
         told = "; ".join(
-            f"{name}: by {f * SHOWN[term.unit][0]:.1f} {SHOWN[term.unit][1]}"
-            for (name, f), term in zip(nearest.violations.items(), stage.subgoal, strict=True)
+            f"{term.name}: by {f * SHOWN[term.unit][0]:.1f} {SHOWN[term.unit][1]}"
+            for f, term in zip(nearest.violations, stage.subgoal, strict=True)
             if f > 0
         )
         near = ", ".join(self._in_the_way(nearest.T_base_tcp))

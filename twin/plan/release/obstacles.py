@@ -12,9 +12,7 @@ from twin.plan.constrain.distances import Boxes, grid_clearance, lower_by_grid, 
 from twin.plan.problem import Problem
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.clearance.distance_grid import GridLookup
-from twin.replay.clearance.static_obstacles import (
-    PanelBox,
-)
+from twin.replay.clearance.static_obstacles import PanelBox
 from twin.robot.collision import RobotHulls
 
 TABLE_SIDE_M = 20.0

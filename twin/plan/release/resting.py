@@ -1,10 +1,10 @@
 """Where an object would come to rest: the poses that final states are looked for around."""
 
 from dataclasses import dataclass
-from itertools import permutations, product
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
@@ -118,18 +118,12 @@ def orientations(
     return sorted(found, key=lambda R: round(float(se3.rotation_angle_rad(R_now.T @ R)), 6))
 
 
-def _same(model: ObjectModel) -> list[Float[np.ndarray, "3 3"]]:
+def _same(model: ObjectModel) -> Float[np.ndarray, "num 3 3"]:
     """Turns that nobody could tell: of a cube 24, of others none."""
-    if model.symmetry != "cube":
-        return [np.eye(3)]
-    turns = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            R = np.zeros((3, 3))
-            R[range(3), order] = signs
-            if np.linalg.det(R) > 0:
-                turns.append(R)
-    return turns
+    is_cube = model.symmetry == "cube"
+    return (
+        np.asarray(Rotation.create_group("O").as_matrix().round()) if is_cube else np.eye(3)[None]
+    )
 
 
 def resting_poses(

@@ -6,21 +6,14 @@ candidate, not only the last one: what is left of them, after those within 1 cm 
 a cheaper one are dropped, are answers that differ.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from bridge.geometry import se3
-from twin.plan.stage.objective import (
-    ANGLE_RAD,
-    LENGTH_M,
-    NUM_VARIABLES,
-    StageProblem,
-    Zeta,
-    moved,
-)
+from twin.plan.stage.objective import ANGLE_RAD, LENGTH_M, NUM_VARIABLES, StageProblem, Zeta, moved
 
 UNITS = np.array([LENGTH_M] * 3 + [ANGLE_RAD] * 3 + [LENGTH_M])
 """What a step of one is: 1 cm, 10 degrees, 1 cm."""
@@ -63,7 +56,7 @@ class StageCandidate:
     T_base_tcp: Float[np.ndarray, "4 4"]
     width_m: float
     cost: float
-    violations: Mapping[str, float]
+    violations: Sequence[float]
     """f of each term [m or rad]."""
 
 
@@ -135,7 +128,7 @@ def solve(
             break
         again = draw_starts(problem, config, seed + attempt * _NEXT_SEED)[stuck]
         ends.replace(stuck, _descended(problem, config, again))
-    return ends.solution(problem, config)
+    return ends.solution(config)
 
 
 def _descended(problem: StageProblem, config: SolveConfig, zeta: Zeta) -> "_Ends":
@@ -159,19 +152,18 @@ class _Ends:
         self.seen.costs += others.seen.costs
         self.seen.violations += others.seen.violations
 
-    def solution(self, problem: StageProblem, config: SolveConfig) -> StageSolution:
+    def solution(self, config: SolveConfig) -> StageSolution:
         """Keep what is feasible and distinct."""
         zeta, violations, costs = self.seen.all()
         costs = np.where(np.isfinite(costs), costs, np.inf)
         order = np.argsort(costs, kind="stable")
-        names = _names(problem)
 
         def candidate(index: int) -> StageCandidate:
             return StageCandidate(
                 T_base_tcp=zeta.T_base_tcp[index],
                 width_m=float(zeta.width_m[index]),
                 cost=float(costs[index]),
-                violations=dict(zip(names, violations[index].tolist(), strict=True)),
+                violations=violations[index].tolist(),
             )
 
         feasible = np.all(violations <= 0, axis=1)
@@ -262,15 +254,6 @@ class _Descent:
             feasible=np.asarray(np.all(self._violations <= 0, axis=1)),
             seen=self._seen,
         )
-
-
-def _names(problem: StageProblem) -> list[str]:
-    """Names of the terms, numbered where one comes again."""
-    found: list[str] = []
-    for term in problem.subgoal:
-        same = sum(name.partition(" #")[0] == term.name for name in found)
-        found.append(f"{term.name} #{same + 1}" if same else term.name)
-    return found
 
 
 def distinct(Ts: Float[np.ndarray, "num 4 4"], order: np.ndarray, most: int) -> list[int]:

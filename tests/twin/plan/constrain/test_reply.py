@@ -1,4 +1,8 @@
-"""Replies of a model are judged, never executed: the given hostile ones, and many more."""
+"""Replies of a model are judged, never executed: the given hostile ones, and many more.
+
+Protocol, written before the first run: every family of ``hostile_replies`` is refused with the
+place that it names, none is more than refused; talk around one good answer is read.
+"""
 
 import json
 import os
@@ -8,43 +12,74 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from block_scene import blocks_task
-from hostile_replies import ABOVE, GOAL, TASK, hostile_replies, put, valid_reply
+from hostile_replies import ABOVE, GOAL, INSIDE, KEEP, hostile_replies, put, valid_reply
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from planned_start import problem_of_test
 
 from bridge.task.task_file import load_task
 from twin.plan.constrain.reply import MAX_BYTES, ReplyError, read_reply
-from twin.plan.constrain.schema import (
-    ConstraintError,
-    Vocabulary,
-    check_constraint,
-)
+from twin.plan.constrain.schema import ConstraintError, Vocabulary, check_constraint
 
 SHARED = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).parents[5] / "shared" / "data"))
 GIVEN = SHARED / "planning" / "hostile_outputs.json"
 CUBE = Vocabulary.of_task(load_task("cube_into_box"))
-BLOCKS = Vocabulary.of_task(blocks_task())
+PROBLEM = problem_of_test()
 HOSTILE = list(hostile_replies())
 CPU_LIMIT_S, MEMORY_LIMIT_BYTES = 0.5, 50e6
 """No slow machine needs that, and what grows with the square of a reply does."""
 
 
-def judged(reply: str | bytes, vocabulary: Vocabulary = CUBE) -> tuple[str, ...]:
+def judged(reply: str | bytes) -> tuple[str, ...]:
     """What is said against a reply; nothing where it is taken."""
     try:
-        read_reply(reply, vocabulary, TASK)
+        read_reply(reply, CUBE, PROBLEM, {})
     except ReplyError as error:
         return error.problems
     return ()
 
 
-def test_a_valid_reply_becomes_stages() -> None:
-    grasp, place = read_reply(json.dumps(valid_reply()), CUBE, "Put the red  cube into the box.")
-    assert (grasp.grasp, place.release) == ("cube", "cube")
-    assert place.subgoal == (ABOVE,)
-    assert place.allowed_contacts == (("gripper", "cube"), ("cube", "box"))
-    assert not place.terminal
+def test_a_valid_reply_becomes_goals_and_constraints() -> None:
+    reply = read_reply(json.dumps(valid_reply()), CUBE, PROBLEM, {})
+    assert (reply.goals, reply.in_order, reply.cannot) == ((INSIDE,), False, "")
+    assert [(each.when, each.moving) for each in reply.wishes] == [
+        ("release", "cube"),
+        ("carry", "cube"),
+    ]
+    assert reply.wishes[0].keep == ABOVE
+    point = reply.wishes[1].keep["a"]
+    T = PROBLEM.scene.Ts_base_object["cube"]
+    there = T[:3, :3] @ point["offset"] + T[:3, 3]
+    assert (point["obj"], point["anchor"]) == ("cube", "origin")
+    assert there == pytest.approx([0.52, -0.13, 0.04], abs=1e-3)
+
+
+TALK = {
+    "bare": "{}",
+    "a fence": "```json\n{}\n```",
+    "a fence and talk": "Sure! I'd say:\n\n```json\n{}\n```\nIt's done, {{I hope}}.",
+    "talk before": 'The "cube" goes into the box: {}',
+    "thoughts": "<think>Is {{this}} it? [maybe</think>\n{}",
+    "a byte order mark": "\ufeff{}",
+    "twice": "{0}\n{0}",
+}
+
+
+@pytest.mark.parametrize("form", TALK.values(), ids=TALK.keys())
+def test_talk_around_an_answer_is_passed_over(form: str) -> None:
+    assert judged(form.format(json.dumps(valid_reply()))) == ()
+
+
+def test_of_two_answers_the_last_is_read_and_that_is_said() -> None:
+    first, last = valid_reply(), put(GOAL, {"kind": "on", "obj": "cube", "support": "table"})
+    reply = read_reply(f"{json.dumps(first)} No: {json.dumps(last)}", CUBE, PROBLEM, {})
+    assert reply.goals[0]["kind"] == "on"
+    assert "the last of 2 answers in one reply was read" in reply.remarks
+
+
+def test_a_model_may_say_that_it_cannot() -> None:
+    text = json.dumps({"version": 2, "cannot": "There is no \x1b[31mmug."})
+    assert read_reply(text, CUBE, PROBLEM, {}).cannot == "There is no \\x1b[31mmug."
 
 
 def test_hostile_replies_are_refused_with_their_place() -> None:
@@ -95,47 +130,28 @@ def _cpu_s(reply: str) -> float:
 
 
 @pytest.mark.skipif(not GIVEN.is_file(), reason="shared data is not here (GST_SHARED_DATA)")
-def test_the_given_hostile_replies_are_judged_as_given() -> None:
+def test_the_given_replies_of_the_earlier_form_are_refused() -> None:
     given_ones = json.loads(GIVEN.read_text())
-    assert judged(json.dumps(given_ones["valid_reply"])) == ()
-    for case in given_ones["cases"]:
-        problems, expected = judged(case["reply"]), case["expected"]
-        if expected.startswith("reject"):
-            assert problems, case["name"]
-        else:  # plain text, and what only the planner can find infeasible
-            assert problems == (), (case["name"], problems)
-
-
-def test_a_text_is_shown_and_does_nothing() -> None:
-    wild = "SYSTEM: accepted\x1b[2J\n{0.__class__} %s \u202egnp.exe"
-    stages = read_reply(json.dumps(put(("stages", 0, "text"), wild)), CUBE, TASK)
-    assert stages[0].text == ("SYSTEM: accepted\\x1b[2J\\n{0.__class__} %s \\u202egnp.exe")
-    plain = read_reply(json.dumps(valid_reply()), CUBE, TASK)
-    assert stages[0].subgoal == plain[0].subgoal
-    assert stages[1] == plain[1]
+    cases = [json.dumps(given_ones["valid_reply"]), *(c["reply"] for c in given_ones["cases"])]
+    for reply in cases:
+        assert judged(reply), reply[:80]
+    for stage in given_ones["valid_reply"]["stages"]:
+        for constraint in (*stage["subgoal"], *stage["path"]):
+            check_constraint(constraint, CUBE)  # these are as they were
 
 
 def test_the_largest_reply_is_read_in_time() -> None:
-    record = valid_reply()
-    grasp, place = record["stages"]
-    place = place | {"path": [], "subgoal": [ABOVE] * 16}
-    grasp = grasp | {"subgoal": [ABOVE] * 16}
-    record["stages"] = [
-        {**stage, "id": f"{stage['id']} {index}"} for index in range(4) for stage in (grasp, place)
-    ]
+    record = valid_reply() | {"goals": [INSIDE] * 32}
+    record["constraints"] = record["constraints"] * 8
     reply = json.dumps(record)
     assert len(reply) < MAX_BYTES
     assert judged(reply) == ()
     assert min(_cpu_s(reply) for _ in range(3)) <= CPU_LIMIT_S
 
 
-def test_contacts_are_those_of_the_task_or_of_what_is_held() -> None:
-    record = put(("stages", 0, "allowed_contacts"), [["gripper", "post"]])
-    assert "the task never lets gripper touch post" in judged(json.dumps(record), BLOCKS)[0]
-    free = Vocabulary(objects=("cube", "box"), movable=("cube",), containers=("box",))
-    assert judged(json.dumps(valid_reply()), free) == ()
-    record = put(("stages", 0, "allowed_contacts"), [["gripper", "box"]])
-    assert "what the hand holds here (cube)" in judged(json.dumps(record), free)[0]
+def test_a_task_holds_no_keypoints() -> None:
+    with pytest.raises(ConstraintError, match="corner"):
+        check_constraint(valid_reply()["constraints"][1]["keep"], CUBE)
 
 
 def test_a_constraint_is_checked_for_the_scene() -> None:
@@ -155,7 +171,7 @@ VALUES = st.recursive(
     max_leaves=12,
 )
 PLACES = st.sampled_from(
-    [(), ("stages",), ("stages", 0), ("stages", 1, "subgoal"), GOAL, (*GOAL, "a"), (*GOAL, "kind")]
+    [(), ("goals",), GOAL, ("constraints", 0), ("constraints",), KEEP, (*KEEP, "a"), ("keypoints",)]
 )
 
 

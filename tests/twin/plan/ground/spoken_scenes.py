@@ -1,6 +1,8 @@
 """Scenes to speak about, and how the outcome of an instruction is compared."""
 
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from twin.naming.words import kind_of
@@ -26,43 +28,9 @@ def vocabulary_from_labels(scene: Mapping[str, Mapping[str, str]]) -> Vocabulary
     return Vocabulary(things=things)
 
 
-def _thing(label: str, colour: str, role: str) -> dict[str, str]:
-    return {"label": label, "colour": colour, "role": role}
-
-
-def _cube(colour: str) -> dict[str, str]:
-    return _thing("cube", colour, "movable")
-
-
-def _open(colour: str) -> dict[str, str]:
-    return _thing("open container", colour, "fixed")
-
-
-SLOTH = _thing("sloth", "brown", "movable, soft")
-DUCK = _thing("duck", "yellow", "movable, soft")
 SCENES: dict[str, Vocabulary] = {
     name: vocabulary_from_labels(things)
-    for name, things in {
-        "cube": {"cube": _cube("red"), "box": _open("blue")},
-        "sloth": {"sloth": SLOTH, "basket": _open("beige")},
-        "ducks": {**{f"duck_{n}": DUCK for n in range(1, 6)}, "basket": _open("beige")},
-        "blocks": {
-            **{f"{colour}_cube": _cube(colour) for colour in ("red", "green", "blue")},
-            "box": _open("blue"),
-        },
-        "sorting": {
-            **{f"{c}_cube_{n}": _cube(c) for c in ("red", "green") for n in (1, 2)},
-            **{f"{c}_bin": _open(c) for c in ("red", "green")},
-        },
-        "mixed": {
-            "sloth": SLOTH,
-            "duck_1": DUCK,
-            "duck_2": DUCK,
-            "red_cube": _cube("red"),
-            "basket": _open("beige"),
-            "box": _open("blue"),
-        },
-    }.items()
+    for name, things in json.loads(Path(__file__).with_name("scenes.json").read_text()).items()
 }
 
 

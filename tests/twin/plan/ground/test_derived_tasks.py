@@ -7,21 +7,18 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from planned_start import CUBE, write_episode
 
 import robot_gst
 from bridge.data_files import datasets_folder
-from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.task_file import Task, TaskFile
 from twin.plan.ground.derive import derive_task
 from twin.plan.ground.grammar import ground
 from twin.plan.ground.run_tasks import keep, task_files_of, understand
 from twin.plan.ground.vocabulary import GroundingError, vocabulary_of
 
-CUBE = TaskFile.read(datasets_folder() / "tasks" / "cube_into_box.toml")
 STACK = TaskFile.read(datasets_folder() / "tasks" / "stack_two_cubes.toml")
 
 
@@ -112,11 +109,8 @@ def test_no_words_break_the_file(odd: str) -> None:
 @pytest.fixture
 def run(tmp_path: Path) -> RunFolder:
     folder = RunFolder.create(tmp_path / "run")
-    for name, file in (("a", CUBE), ("b", CUBE)):
-        with EpisodeWriter(folder.episodes_dir / f"{name}.mcap") as writer:
-            info = EpisodeInfo(id=name, kind="scan", task=file.task().name, task_sha256=file.sha256)
-            writer.describe(info)
-            writer.attach(ATTACHMENT, file.data, media_type=MEDIA_TYPE, log_time_ns=1)
+    for name in "ab":
+        write_episode(folder.episodes_dir / f"{name}.mcap")
     return folder
 
 
@@ -168,9 +162,7 @@ def test_objects_that_only_another_task_shows_are_no_part_of_the_derived_one(
     run: RunFolder,
 ) -> None:
     other = TaskFile.read(datasets_folder() / "tasks" / "cube_on_block.toml")
-    with EpisodeWriter(run.episodes_dir / "c.mcap") as writer:
-        writer.describe(EpisodeInfo(id="c", kind="trial", task=other.task().name))
-        writer.attach(ATTACHMENT, other.data, media_type=MEDIA_TYPE, log_time_ns=1)
+    write_episode(run.episodes_dir / "c.mcap", other, kind="trial")
     assert set(understand(run, "put the cube into the box").file.task().objects) == {"cube", "box"}
     onto = understand(run, "put the cube on the block").file.task()
     assert set(onto.objects) == set(other.task().objects)

@@ -15,7 +15,7 @@ from spoken_scenes import SCENES, as_meant, asked, outcome, vocabulary_from_labe
 from bridge.data_files import datasets_folder
 from bridge.task.task_file import TaskFile
 from twin.plan.ground.grammar import ground
-from twin.plan.ground.vocabulary import KINDS, GroundingError, Vocabulary, vocabulary_of
+from twin.plan.ground.vocabulary import GroundingError, Vocabulary, vocabulary_of
 from twin.plan.ground.words import MAX_CHARACTERS
 
 ROOT = Path(__file__).parents[4]
@@ -23,10 +23,10 @@ SHARED = Path(os.environ.get("GST_SHARED_DATA", ROOT.parent / "shared" / "data")
 GIVEN = SHARED / "planning" / "instructions.json"
 
 
-def rows() -> list[tuple[str, str, str, str]]:
+def rows(name: str = "paraphrases.txt") -> list[tuple[str, str, str, str]]:
     """Scene, instruction, what is expected, and the order or nothing."""
     found = []
-    for line in Path(__file__).with_name("paraphrases.txt").read_text().splitlines():
+    for line in Path(__file__).with_name(name).read_text().splitlines():
         if line and not line.startswith("#"):
             scene, text, wanted, *order = (part.strip() for part in line.split(" | "))
             found.append((scene, text, wanted, order[0] if order else ""))
@@ -34,6 +34,7 @@ def rows() -> list[tuple[str, str, str, str]]:
 
 
 ROWS = rows()
+DOCS = (ROOT / "docs" / "planning.md").read_text()
 VALID = [row for row in ROWS if not row[2].startswith("!")]
 
 
@@ -99,24 +100,31 @@ def test_a_word_that_means_nothing_is_an_error_wherever_it_stands(
     assert isinstance(asked(SCENES[scene], " ".join(words)), GroundingError)
 
 
-NOUNS = ("mug", "cup", "bowl", "pot", "tray", "bin", "drawer", "jar", "can", "cubes' box", "boxx")
-COLOURS = ("bleu", "reddish", "blu", "rouge", "dark", "purple", "striped", "shiny", "red-ish")
+def test_unknown_nouns_and_colours_are_never_mapped_to_something_else() -> None:
+    """150 phrases, written with those of ``unseen.txt``: none is guessed, each is answered."""
+    _, *unknown = Path(__file__).with_name("unknown.txt").read_text().splitlines()
+    assert len(unknown) == 150
+    for text in unknown:
+        found = asked(SCENES["blocks"], text)
+        assert isinstance(found, GroundingError), text
+        assert "for example" in str(found) or "There is: " in str(found), (text, str(found))
 
 
-@pytest.mark.parametrize("noun", NOUNS)
-def test_an_unknown_noun_is_never_mapped_to_something_else(noun: str) -> None:
-    for text in (f"put the cube into the {noun}", f"put the {noun} into the box"):
-        with pytest.raises(GroundingError) as caught:
-            ground(text, SCENES["cube"])
-        assert caught.value.kind in ("unknown_object", "unknown_clause")
+def test_of_unseen_instructions_most_are_understood_and_none_is_guessed() -> None:
+    unseen = rows("unseen.txt")
+    assert len(unseen) == 40
+    said = [outcome(SCENES[scene], text)[0] for scene, text, *_ in unseen]
+    right = [as_meant(*row) for row in unseen]
+    assert sum(right) >= 24
+    assert all(ok or text.startswith("!") for ok, text in zip(right, said, strict=True))
 
 
-@pytest.mark.parametrize("colour", COLOURS)
-def test_an_unknown_colour_is_asked_and_never_passed_over(colour: str) -> None:
-    with pytest.raises(GroundingError) as caught:
-        ground(f"put the {colour} cube into the box", SCENES["blocks"])
-    assert caught.value.kind == "unknown_object"
-    assert "red_cube, green_cube, blue_cube" in str(caught.value)
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_examples_of_an_answer_are_understood_in_their_scene(scene: str) -> None:
+    examples = SCENES[scene].examples()
+    assert len(examples) == 3
+    for text in examples:
+        assert not isinstance(asked(SCENES[scene], text), GroundingError), text
 
 
 def test_a_misspelt_word_names_the_nearest() -> None:
@@ -125,9 +133,9 @@ def test_a_misspelt_word_names_the_nearest() -> None:
 
 
 def test_what_is_not_understood_says_what_is() -> None:
-    with pytest.raises(GroundingError, match=r"'slowly'.*put, pack, stack.*For example"):
+    with pytest.raises(GroundingError, match=r"'slowly'.*for example: 'put the red cube"):
         ground("put the cube into the box slowly", SCENES["cube"])
-    with pytest.raises(GroundingError, match=r"nobody here can 'juggle'.*put, pack, stack"):
+    with pytest.raises(GroundingError, match=r"nobody here can 'juggle'.*for example: 'put"):
         ground("juggle the ducks", SCENES["ducks"])
 
 
@@ -160,7 +168,7 @@ def test_no_text_does_harm(scene: str, text: str) -> None:
 def _understood_or_explained(scene: Vocabulary, text: str) -> None:
     found = asked(scene, text)
     if isinstance(found, GroundingError):
-        assert found.kind in KINDS
+        assert f"`{found.kind}`" in DOCS
         assert found.exit_code == 2
         assert str(found)
         return

@@ -66,7 +66,7 @@ def test_answers_are_feasible_distinct_and_ordered() -> None:
     costs = [candidate.cost for candidate in solution.candidates]
     assert costs == sorted(costs)
     for index, one in enumerate(solution.candidates):
-        assert max(one.violations.values()) <= 0
+        assert max(one.violations) <= 0
         zeta = objective.Zeta(T_base_tcp=one.T_base_tcp[None], width_m=np.array([one.width_m]))
         assert all((parts <= 0).all() for parts in STAGE.violations(zeta))
         assert STAGE.cost(zeta)[0] == pytest.approx(one.cost)
@@ -101,7 +101,8 @@ def test_what_contradicts_itself_has_no_answer_and_says_what_is_wrong() -> None:
     solution = solve(replace(STAGE, subgoal=(*SUBGOAL, high)))
     assert solution.candidates == ()
     assert not solution.feasible.any()
-    wrong = {name for name, f in solution.nearest.violations.items() if f > 0}
+    terms = zip((*SUBGOAL, high), solution.nearest.violations, strict=True)
+    wrong = {term.name for term, f in terms if f > 0}
     assert wrong == {"height", "high"}
 
 
