@@ -144,7 +144,7 @@ def _hull_volume(points: np.ndarray) -> float:
 
 def _rectangle(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Smallest rectangle around points: centre, sides (longer first), yaw, share that is hull."""
-    yaw = rectangle_yaw_rad(xy)
+    yaw = rectangle_yaw_rad(xy, kept_percent=100.0)
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, -s], [s, c]])
     low, high = (xy @ R).min(axis=0), (xy @ R).max(axis=0)

@@ -59,15 +59,15 @@ def starts(
     return states
 
 
-def rectangle_yaw_rad(xy: Float[np.ndarray, "num_points 2"]) -> float:
+def rectangle_yaw_rad(xy: Float[np.ndarray, "num_points 2"], kept_percent: float = 98.0) -> float:
     """Direction of a side of the smallest enclosing rectangle, in [-45, 45) degrees.
 
-    The smallest rectangle has a side along an edge of the hull (Freeman and Shapira 1975). The
-    outermost points are noisy, so the few per cent farthest out are left out first. Points on
+    The smallest rectangle has a side along an edge of the hull (Freeman and Shapira 1975). Where
+    the outermost points are noisy, the few per cent farthest out are left out first. Points on
     one line have the direction 0.
     """
     distance = np.linalg.norm(xy - np.median(xy, axis=0), axis=1)
-    core = xy[distance <= np.percentile(distance, 98)]
+    core = xy[distance <= np.percentile(distance, kept_percent)]
     try:
         hull = core[ConvexHull(core).vertices]
     except QhullError:
