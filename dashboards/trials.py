@@ -134,7 +134,7 @@ def roll_out(run: Path, config: TrialsConfig, output: Output) -> None:
         try:
             step(output, f"rolling {policy} out in the twin", acting_command(run, config, policy))
         except StepFailedError as error:  # 2: some say nothing of it, which was printed
-            if error.code != 2:  # noqa: PLR2004
+            if error.code != 2:
                 raise
 
 

@@ -198,7 +198,7 @@ def results_facts(checkout: Checkout, folder: Path) -> Facts:
         each["id"]: {
             "rows": [
                 dict(zip(each["columns"], checkout.plain(row), strict=True)) for row in each["rows"]
-            ],
+            ]
         }
         for each in results["tables"]
     }
