@@ -28,7 +28,7 @@ class TrialsConfig:
     of which model needs --model and --model-name; or one that acts: NAME=ws://HOST:PORT or
     NAME=module:function, as robot-gst rollout has it, which is rolled out in the twin afterwards.
     The first one is tried in --arms, the others, and who acts, in the arm without alone."""
-    map: Path | None = None
+    map: Annotated[Path | None, RARE] = None
     """Mapping of the policies that act."""
     trials: int = 5
     """Starts of each task; each is tried once in each arm of each policy."""

@@ -236,9 +236,10 @@ class Trial:
         """Ask and follow until it is over; the arm is held while the policy thinks."""
         robot = self._robot()
         speak = Interpreter(self._runner.mapping, robot, self._begun.instruction)
-        cameras = self._cameras(speak)
+        self._cameras(speak)  # waits for those that are named
         if not self._wait_until(self._now_ns() + LOOK_NS, READY_S):
             return
+        cameras = self._cameras(speak)
         joints_rad, width_m = self._posture(robot)
         knots: list[Knot] = [(self._now_ns(), joints_rad)]
         self._policy.reset(self._begun.seed)
