@@ -38,7 +38,7 @@ NEAR = 0.15
 
 def chosen() -> list[int]:
     """Numbers of the policies."""
-    return np.linspace(0, len(ERRORS_MM) - 1, COUNT).round().astype(int).tolist()
+    return [int(number) for number in np.linspace(0, len(ERRORS_MM) - 1, COUNT).round()]
 
 
 def run_study(run: Path) -> dict[str, Any]:
@@ -57,7 +57,7 @@ def main() -> None:
     results = run_study(run)
     by_id = {item["id"]: item for item in results["measurements"]}
     rates = [by_id[name]["value"] for name in by_id if name.startswith("rate.recorded.")]
-    best_of = {}
+    best_of: dict[str, list[float]] = {}
     for name, item in by_id.items():
         if name.startswith("rate.recorded.") and item["value"] is not None:
             task = name.split(".")[2]
@@ -69,12 +69,16 @@ def main() -> None:
     low = (r["interval"] or {}).get("low")
     high = (regret["interval"] or {}).get("high")
     excluded = [item["reason"] for item in results["exclusions"] if item["scope"] == "agreement"]
+    rows = (
+        ("r over groups", r["value"], 0.85, "", False),
+        ("lower end of its interval", low, 0.6, "", False),
+        ("MMRV", mmrv["value"], 0.05, "", True),
+        ("upper end of the regret's interval", high, 10.0, "pp", True),
+        ("policies within 15 points of the best", near, 4, "", False),
+    )
     targets = [
-        Target("r over groups", number(r["value"]), 0.85, at_most=False),
-        Target("lower end of its interval", number(low), 0.6, at_most=False),
-        Target("MMRV", number(mmrv["value"]), 0.05),
-        Target("upper end of the regret's interval", number(high), 10.0, "pp"),
-        Target("policies within 15 points of the best", near, 4, at_most=False),
+        Target(what=what, measured=number(value), limit=limit, unit=unit, at_most=at_most)
+        for what, value, limit, unit, at_most in rows
     ]
     note = f"{len(rates)} groups of {STARTS} trials ({len(ERRORS_MM) * len(TASKS)} of {FULL_STARTS}"
     note += f" asked for), regret {regret['value']}, {len(excluded)} trials left out; {run}"
