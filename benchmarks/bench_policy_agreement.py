@@ -64,7 +64,8 @@ def main() -> None:
             best_of.setdefault(task, []).append(item["value"])
     near = min((sum(r >= max(row) - NEAR for r in row) for row in best_of.values()), default=0)
     r, mmrv, regret = (
-        by_id[name] for name in ("agreement.pearson_r", "agreement.mmrv_recorded_gap", REGRET)
+        by_id.get(name, UNDEFINED)
+        for name in ("agreement.pearson_r", "agreement.mmrv_recorded_gap", REGRET)
     )
     low = (r["interval"] or {}).get("low")
     high = (regret["interval"] or {}).get("high")
@@ -86,6 +87,7 @@ def main() -> None:
 
 
 REGRET = "decision.regret_pp"
+UNDEFINED: dict[str, Any] = {"value": None, "interval": None}
 
 
 def number(value: float | None) -> float:

@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -28,6 +29,8 @@ LOOK_NS = ns_from_s(0.5)
 ASK_S = 10.0
 BY_OPERATOR = "operator"
 """How it begins what stopped a trial whose episode a person ended."""
+LAG_TICKS = round(ns_from_s(0.3) / TICK_NS)
+"""The arm may be where it was sent so long ago."""
 TRACKING_RAD = ROBOT.tracking_error_rad or np.inf
 """The controller stops an arm that is farther from its target."""
 
@@ -94,6 +97,7 @@ class Controller:
         cell = self._cell
         began_ns, began_s, ends_ns = cell.now_ns, time.monotonic(), None
         line = _Line(cell.target_rad.copy(), cell.target_rad.copy(), cell.now_ns, period_s)
+        sent = deque[np.ndarray](maxlen=LAG_TICKS)
         fresh_ns, looked_ns = None, cell.now_ns
         self._fresh()
         while ends_ns is None or cell.now_ns < ends_ns:
@@ -111,7 +115,9 @@ class Controller:
             elif fresh_ns is not None and cell.now_ns - fresh_ns > HOLD_NS:
                 line.hold(cell.now_ns)
             cell.follow(np.array([TICK_NS]), line.at(cell.now_ns + TICK_NS)[None])
-            off_rad = np.abs(cell.world.joints_rad + cell.hidden.joint_offset_rad - cell.target_rad)
+            sent.append(cell.target_rad)
+            there_rad = cell.world.joints_rad + cell.hidden.joint_offset_rad
+            off_rad = np.abs(there_rad - np.array(sent)).min(axis=0)
             if off_rad.max() > TRACKING_RAD:
                 joint = ARM_JOINTS[int(np.argmax(off_rad))]
                 return f"tracking: {joint} is {off_rad.max():.3f} rad from where it was sent"
