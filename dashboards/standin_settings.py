@@ -25,8 +25,11 @@ class TrialsConfig:
     """Tasks: names in datasets/tasks, files, or all, which is every one that ships."""
     policies: tuple[str, ...] = ("perturbed",)
     """How plans are made: perturbed, the cell's own planner, or a policy of robot-gst plan --live,
-    of which model needs --model and --model-name.
-    The first one is tried in --arms, the others in the arm without alone."""
+    of which model needs --model and --model-name; or one that acts: NAME=ws://HOST:PORT or
+    NAME=module:function, as robot-gst rollout has it, which is rolled out in the twin afterwards.
+    The first one is tried in --arms, the others, and who acts, in the arm without alone."""
+    map: Annotated[Path | None, RARE] = None
+    """Mapping of the policies that act."""
     trials: int = 5
     """Starts of each task; each is tried once in each arm of each policy."""
     first_start: int = 0
@@ -77,12 +80,23 @@ class TrialsConfig:
             },
         )
         named = {bool(self.model), bool(self.model_name), MODEL_POLICY in self.policies}
+        acting = self.acting()
+        if len(acting) < sum("=" in each for each in self.policies):
+            raise UsageError(f"--policies: two that act have the same name: {self.policies}.")
         if len(named) > 1:
             message = (
                 "policy model and the model it asks go together: --policies model --model URL "
                 "--model-name NAME."
             )
             raise UsageError(message)
+
+    def acting(self) -> dict[str, str]:
+        """How each policy that acts is opened, by its name."""
+        return dict(each.split("=", 1) for each in self.policies if "=" in each)
+
+    def names(self) -> tuple[str, ...]:
+        """What the policies are called, each once."""
+        return tuple(dict.fromkeys(each.split("=", 1)[0] for each in self.policies))
 
 
 DEMO_TASKS = ("cube_into_box", "cube_on_block")

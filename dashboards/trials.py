@@ -56,6 +56,7 @@ from dashboards.demo import (
 from dashboards.standin_settings import BUILT_IN_POLICY, TrialsConfig
 
 EVERY_TASK = "all"
+CELL = "standin"
 POLL_S = 0.2
 
 
@@ -110,11 +111,31 @@ def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
         if left:
             _scan(run, config, left, output)
             _do(run, config, left, output)
+        if config.acting():
+            roll_out(path, config, output)
         step(
             output, "replaying every plan", ["replay", str(path), "--samples", f"{config.samples}"]
         )
         step(output, "evaluating", ["evaluate", str(path)], show_result=True)
     return 0
+
+
+def acting_command(run: Path, config: TrialsConfig, policy: str) -> list[str]:
+    """The command that lets a policy act."""
+    words = ["rollout", str(run), "--policy", config.acting()[policy], "--name", policy]
+    return words if config.map is None else [*words, "--map", str(config.map)]
+
+
+def roll_out(run: Path, config: TrialsConfig, output: Output) -> None:
+    """Rebuild the scene where there is none, and let those who acted in the cell act in it."""
+    if not (run / "scene" / "scene.json").is_file():
+        step(output, "rebuilding the scene", ["rebuild", str(run), "--iterations", "3000"])
+    for policy in config.acting():
+        try:
+            step(output, f"rolling {policy} out in the twin", acting_command(run, config, policy))
+        except StepFailedError as error:  # 2: some say nothing of it, which was printed
+            if error.code != 2:
+                raise
 
 
 def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
@@ -137,9 +158,9 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
         )
         for file in files.values()
     )
-    first, *others = dict.fromkeys(config.policies)
+    first, *others = config.names()
     policies = (
-        PolicyArms(policy=first, arms=config.arms),
+        PolicyArms(policy=first, arms=("without",) if first in config.acting() else config.arms),
         *(PolicyArms(policy=each, arms=("without",)) for each in others),
     )
     if config.model:
@@ -394,7 +415,7 @@ def _laboratory(
         gate, gate_log = start("gate", ["gate", str(run.path), *connect])
         gate.wait_until(lambda: "gate ready" in gate_log.read_text(errors="replace"))
         there.append(gate)
-        if any(job.policy != BUILT_IN_POLICY for job in jobs):
+        if {job.policy for job in jobs} - {BUILT_IN_POLICY, *config.acting()}:
             model = ["--model", config.model, "--model-name", config.model_name]
             asking = model if config.model else []
             planner, log = start("plan", ["plan", str(run.path), "--live", *connect, *asking])
@@ -414,7 +435,13 @@ def _try(
     """Let a cell try one start in all its arms, unless it is told to stop."""
     arguments = command_of(job, config, endpoint)
     log = run.notes_dir / "logs" / f"start_{job.number:04d}.log"
-    with log.open("wb") as stream:
+    with ExitStack() as stack:
+        if job.policy in config.acting():
+            own = [*acting_command(run.path, config, job.policy), "--cell", CELL]
+            heard = log.with_suffix(".policy.log")
+            runner = stack.enter_context(running([*own, "--connect", endpoint], heard))
+            runner.wait_until(lambda: "policy ready" in heard.read_text(errors="replace"))
+        stream = stack.enter_context(log.open("wb"))
         process = start_command(arguments, stdout=stream, stderr=subprocess.STDOUT)
         try:
             while process.poll() is None and not stop.is_set():
@@ -428,6 +455,13 @@ def _try(
         raise StepFailedError(command=command, code=process.returncode, log=log)
 
 
+def planner_of(policy: str, config: TrialsConfig) -> str:
+    """Whom the cell asks: its own planner, one on the wire, or who acts."""
+    if policy in config.acting():
+        return "policy"
+    return "built_in" if policy == BUILT_IN_POLICY else "wire"
+
+
 def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
     """The command that tries one start."""
     options: dict[str, Any] = {
@@ -437,7 +471,7 @@ def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
         "--first-start": job.start,
         "--first-trial": job.first_trial,
         "--trials": 1,
-        "--planner": "built_in" if job.policy == BUILT_IN_POLICY else "wire",
+        "--planner": planner_of(job.policy, config),
         "--policy": job.policy,
         "--rounds": config.rounds,
         "--study-seed": config.study_seed,

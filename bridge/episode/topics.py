@@ -44,6 +44,10 @@ GATE = "/gate/verdict"
 """A service, not a topic: a plan is asked, a verdict is answered."""
 LOCALISE = "/gate/localise"
 """A service, not a topic: the name of a task is asked, where its objects are is answered."""
+POLICY = "/policy"
+"""A service, not a topic: who acts under a policy's name is answered, and a trial is begun."""
+POLICY_TARGETS = "/policy/targets"
+"""Joint positions and the distance between the pads, as a policy's runner sends them."""
 LOCALISATION = "/localisation"
 CLEARANCE = "/replay/clearance"
 CONTACT = "/replay/contact"
@@ -72,7 +76,7 @@ _TYPES: tuple[tuple[str, str], ...] = (
     (f"{CAMERAS}[^/]+{DEPTH_IMAGE}$", schema.IMAGE),
     (f"{CAMERAS}[^/]+({COLOR_INFO}|{DEPTH_INFO})$", schema.CAMERA_INFO),
     (f"{JOINT_STATES}$", schema.JOINT_STATE),
-    (f"{GRIPPER_STATE}$", schema.JOINT_STATE),
+    (f"({GRIPPER_STATE}|{POLICY_TARGETS})$", schema.JOINT_STATE),
     (f"^({TF}|{TF_STATIC})$", schema.TF_MESSAGE),
     (f"^{ROBOT_DESCRIPTION}$", schema.STRING),
     (f"{PLAN}$", schema.PLAN),
@@ -102,6 +106,11 @@ def camera_topic(cell: str, camera_id: str, ending: str = "") -> str:
     return f"/{cell}{CAMERAS}{camera_id}{ending}"
 
 
+def policy_key(cell: str, policy: str) -> str:
+    """Key on which the runner of a policy answers, whatever letters its name has."""
+    return f"{cell}{POLICY}/{re.sub(r'[^A-Za-z0-9_-]', '-', policy)}"
+
+
 def object_topic(cell: str, object_id: str, what: Literal["pose", "nodes"]) -> str:
     """Name the topic of an object's pose or, of a soft one, of its points."""
     return f"/{cell}{OBJECTS}{object_id}/{what}"
@@ -117,8 +126,8 @@ def service_of_topic(topic: str) -> Service:
     """Say how a topic should travel when the network is behind; ``wire.qos`` has the presets."""
     if topic.endswith((COLOR_IMAGE, DEPTH_IMAGE, POINTS)) or TACTILE in topic:
         return "camera"
-    control = (JOINT_STATES, JOINT_TARGETS, GRIPPER_STATE, SPEED_SCALING, TCP_POSE, WRENCH, TF)
-    return "control" if topic.endswith((*control, IMU, ODOMETRY)) else "reliable"
+    control = (JOINT_STATES, JOINT_TARGETS, POLICY_TARGETS, GRIPPER_STATE, SPEED_SCALING, TCP_POSE)
+    return "control" if topic.endswith((*control, WRENCH, TF, IMU, ODOMETRY)) else "reliable"
 
 
 def is_truth(topic: str) -> bool:

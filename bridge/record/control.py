@@ -5,19 +5,20 @@ that a status is never behind a stop.
 """
 
 import json
-from collections.abc import Callable
-from dataclasses import asdict, fields
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, fields, replace
 from typing import Any, TypeVar
 
 import msgspec
 
 from bridge.episode import metadata
 from bridge.episode.run_folder import check_episode_id
+from bridge.episode.topics import policy_key
 from bridge.record.errors import ControlError
 from bridge.record.recorder import Recorder
 from bridge.task.record import check_record
 from bridge.task.task_file import MAX_BYTES, TaskFile
-from bridge.wire.errors import WireError
+from bridge.wire.errors import NoReplyError, WireError
 from bridge.wire.session import Service, WireSession
 
 
@@ -77,16 +78,25 @@ Record = TypeVar("Record")
 
 def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
     """Answer the control keys until the session closes."""
+    begun: list[metadata.EpisodeInfo] = []
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "start", {"id", "info", "anyway", "task_file"})
         info = parse_info(request.get("id"), request.get("info", {}))
         task = parse_task_file(request.get("task_file"))
-        return recorder.start(info, task, anyway=request.get("anyway") is True)
+        info = replace(info, tags=tuple(dict.fromkeys((*info.tags, *_ask_policy(session, info)))))
+        answer = recorder.start(info, task, anyway=request.get("anyway") is True)
+        told = info.instruction or (task.task().instruction if task else "")
+        about = {"episode": info.id, "instruction": told, "start_seed": info.start_seed}
+        begun[:] = [info] if _ask_policy(session, info, about) else []
+        return answer
 
     def stop(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "stop", {"outcome", "discard"})
         outcome = parse_outcome(request.get("outcome"))
+        for info in begun:
+            _ask_policy(session, info, {"over": info.id, "by": "operator"})
+        begun.clear()
         return recorder.stop(outcome=outcome, discard=request.get("discard") is True)
 
     def mark(request: dict[str, Any]) -> dict[str, Any]:
@@ -134,6 +144,30 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         session.serve(control_key(recorder.config.recorder, verb), _json_handler(verb, act))
         for verb, act in verbs.items()
     ]
+
+
+ASK_S = 10.0
+"""A policy's runner says who acts and begins at once; nobody waits longer for it."""
+
+
+def _ask_policy(
+    session: WireSession, info: metadata.EpisodeInfo, about: Mapping[str, Any] | None = None
+) -> tuple[str, ...]:
+    """Ask the runner of an episode's policy who acts, let it begin, or stop it.
+
+    Returns:
+        Tags of the episode; none: nobody answers for the policy.
+    """
+    if info.kind != "trial" or not info.policy or not info.cell:
+        return ()
+    key, request = policy_key(info.cell, info.policy), {"policy": info.policy, **(about or {})}
+    try:
+        answer = json.loads(session.query(key, json.dumps(request).encode(), timeout_s=ASK_S))
+        return tuple(map(str, answer["tags"]))
+    except NoReplyError:
+        return ()
+    except (ValueError, TypeError, KeyError) as error:
+        raise ControlError(f"what answers on {key} is no policy's runner ({error!r}).") from error
 
 
 def _json_handler(

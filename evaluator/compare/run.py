@@ -18,7 +18,7 @@ from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.images.methods import compare_renders
 from evaluator.compare.images.scores import open_net
 from evaluator.compare.images.views import compare_views
-from evaluator.compare.measure import Part, joined
+from evaluator.compare.measure import Part, joined, refuse_changed
 from evaluator.compare.motion import motion_results
 from evaluator.compare.notes import check_settings, with_notes
 from evaluator.compare.policies import START_LIMIT_M, compare_policies
@@ -31,7 +31,7 @@ from evaluator.compare.trial import Trial, lay_out
 from evaluator.metrics.image_options import ImageOptions
 from evaluator.result import Exclusion
 from evaluator.run_reader.contents import ODD, RunContents, broken, read_contents
-from evaluator.run_reader.episodes import DerivedIndex
+from evaluator.run_reader.episodes import DerivedIndex, rollout_of
 
 QUIET = Output(quiet=True)
 MADE_FROM = ("source_sha256", "scene_hash", "engine", "seed")
@@ -209,6 +209,7 @@ def _with_parts(base: Comparison, parts: Sequence[Part]) -> Comparison:
 
 def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:
     """Lay every recorded trial beside its replays; one that cannot be judged is left out."""
+    refuse_changed(_who_acted(contents))
     index = DerivedIndex(contents.derived)
     trials, left_out = [], []
     for recorded in contents.recorded:
@@ -220,6 +221,17 @@ def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:
             trials.append(trial)
             left_out += trial.exclusions
     return trials, left_out
+
+
+def _who_acted(contents: RunContents) -> Iterator[tuple[str, str, str]]:
+    """Who acted under which policy's name, in the cell and in the twin."""
+    for each in contents.recorded:
+        info = each.facts.info
+        yield each.file.name, info.policy, info.checkpoint
+    for file in contents.derived:
+        told = rollout_of(file)
+        if told.get("success") is not None:
+            yield file.name, str(told.get("policy", "")), str(told.get("checkpoint", ""))
 
 
 def _task_hashes(contents: RunContents) -> dict[str, frozenset[str]]:

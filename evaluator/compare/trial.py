@@ -11,12 +11,14 @@ from bridge.task.verdict import SAME_ENGINE, is_same_engine
 from evaluator.compare.rows import TrialRow
 from evaluator.result import Exclusion
 from evaluator.run_reader.episodes import (
+    ROLLOUT,
     DerivedFile,
     DerivedIndex,
     RecordedFacts,
     Replay,
     RunFile,
     positions_at_start,
+    rollout_of,
 )
 
 TRAJECTORIES = ("planned", "executed")
@@ -59,9 +61,10 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
         facts = replace(facts, verdict=None)
     found = dict.fromkeys(TRAJECTORIES, Replay())
     cells_engine: bool | None = None
-    if facts.plan_id is None:
+    rolled = index.rollout(facts.info) if facts.plan_id in (None, NO_PLAN) else None
+    if facts.plan_id is None and rolled is None:
         lacking.append("no execution_started event: no plan was sent")
-    else:
+    elif facts.plan_id is not None and rolled is None:
         asked = TRAJECTORIES if facts.plan_id != NO_PLAN else ("executed",)
         sent = {**made_from, "plan_id": facts.plan_id}
         found |= {name: index.replay(**sent, trajectory=name) for name in asked}
@@ -72,6 +75,8 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
         lacking.append(f"{localised.path.name}: {localised.facts.broken}")
     replays = {name: replay.file for name, replay in found.items() if replay.file is not None}
     row = _row(file, facts, found, localised, replays)
+    if rolled is not None:
+        row = _with_rollout(row, rolled)
     if cells_engine is not None:
         row = replace(row, baselines=((CELLS_ENGINE, cells_engine),))
     return Trial(
@@ -81,6 +86,21 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
         impossible_count=_impossible_count(facts.outcome),
         replays=replays,
         localised=localised,
+    )
+
+
+def _with_rollout(row: TrialRow, rolled: DerivedFile) -> TrialRow:
+    """Lay a trial of a policy beside its rollout in the twin, which stands where a plan's would."""
+    told = rollout_of(rolled)
+    success = bool(told["success"])
+    return replace(
+        row,
+        plan_id=ROLLOUT,
+        nothing_executed=False,
+        sim_planned=success,
+        planned_replay=rolled.file_name,
+        first_failing=None if success else "terminal",
+        failing_detail=None if success else str(told.get("detail") or "") or None,
     )
 
 

@@ -394,6 +394,16 @@ def _without_seed(derived: metadata.Derived) -> metadata.Derived:
     return replace(derived, settings={**derived.settings, "config": kept})
 
 
+ROLLOUT = "rollout"
+"""Kind of a derived episode in which a policy acted in the twin, and where its row lies."""
+
+
+def rollout_of(file: DerivedFile) -> Mapping[str, Any]:
+    """What a rollout says of itself: policy, task, start, number, success and who acted."""
+    row = file.derived.settings.get(ROLLOUT)
+    return row if isinstance(row, dict) else {}
+
+
 def _is_dynamic(derived: metadata.Derived) -> bool:
     return derived.kind == "replay" and derived.mode == "dynamic"
 
@@ -405,8 +415,11 @@ class DerivedIndex:
         """Sort the derived episodes of a run."""
         self._replays: dict[tuple[str, str | None, str | None], list[DerivedFile]] = {}
         self._localised: dict[str, list[DerivedFile]] = {}
+        self._rollouts: dict[tuple[str, str, str], dict[int, DerivedFile]] = {}
         for file in files:
             made = file.derived
+            if made.kind == ROLLOUT:
+                self._keep_rollout(file, rollout_of(file))
             if _is_dynamic(made):
                 key = (made.source_episode, made.plan_id, made.trajectory)
                 self._replays.setdefault(key, []).append(file)
@@ -438,6 +451,21 @@ class DerivedIndex:
         undecided = f"the twin could not decide the {trajectory} replay: {decided.why_undecided}"
         why = undecided if decided.accepted is None else None
         return Replay(file=file, verdict=decided, reason=why)
+
+    def _keep_rollout(self, file: DerivedFile, row: Mapping[str, Any]) -> None:
+        policy, task, start = (str(row.get(name, "")) for name in ("policy", "task", "start_id"))
+        if row.get("success") is None:
+            return
+        numbered, number = (
+            self._rollouts.setdefault((policy, task, start), {}),
+            int(row.get("number") or 0),
+        )
+        numbered[number] = _newest([file, *([numbered[number]] if number in numbered else [])])
+
+    def rollout(self, info: metadata.EpisodeInfo) -> DerivedFile | None:
+        """Take the next rollout of a trial's policy from its start; each is taken once."""
+        numbered = self._rollouts.get((info.policy, info.task, info.start_id or info.id), {})
+        return numbered.pop(min(numbered)) if numbered else None
 
     def answer_of_cells_engine(
         self, *, source: str, source_sha256: str, plan_id: str

@@ -18,7 +18,15 @@ from bridge.task.protocol import read_protocol
 from bridge.terminal import Output
 from dashboards import trials
 from dashboards.standin_settings import TrialsConfig
-from dashboards.trials import Job, command_of, jobs_of, keep_protocol, protocol_of, run_trials
+from dashboards.trials import (
+    Job,
+    acting_command,
+    command_of,
+    jobs_of,
+    keep_protocol,
+    protocol_of,
+    run_trials,
+)
 
 QUIET = Output(quiet=True)
 ARMS = ("without", "with", "control")
@@ -225,3 +233,22 @@ def test_each_task_is_scanned_once_before_its_first_trial(
     assert asked == ["stack_two_cubes"]
     trials._scan(run, replace(STUDY, rate_hz=0.0), both, QUIET)  # without pictures
     assert asked == ["stack_two_cubes"]
+
+
+def test_who_acts_is_tried_without_replanning_and_rolled_out(tmp_path: Path) -> None:
+    mapping = tmp_path / "droid.toml"
+    config = replace(STUDY, policies=("pi0=ws://127.0.0.1:8000", "single"), map=mapping)
+    protocol, chosen = protocol_of(config)
+    assert [(each.policy, each.arms) for each in protocol.policies] == [
+        ("pi0", ("without",)),
+        ("single", ("without",)),
+    ]
+    job = next(job for job in jobs_of(protocol, chosen) if job.policy == "pi0")
+    words = command_of(job, config, "tcp/127.0.0.1:7447")
+    assert words[words.index("--planner") + 1] == "policy"
+    assert words[words.index("--policy") + 1] == "pi0"
+    acting = ["rollout", "runs/x", "--policy", "ws://127.0.0.1:8000", "--name", "pi0"]
+    assert acting_command(Path("runs/x"), config, "pi0") == [*acting, "--map", str(mapping)]
+    assert acting_command(Path("runs/x"), replace(config, map=None), "pi0") == acting
+    with pytest.raises(UsageError, match="two that act have the same name"):
+        replace(STUDY, policies=("a=m:f", "a=m:g"))

@@ -1,6 +1,5 @@
 """Physics of the cell between two targets of a policy, and the limits at which it would stop."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,11 +12,11 @@ from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
 from twin.physics.engines import PhysicsWorld, open_world
 from twin.policies.errors import StoppedError
+from twin.policies.limits import refuse_target
 from twin.policies.starts import Start
 from twin.replay.dynamics import Samples, free_start, mesh_hulls, soft_models, spawn
-from twin.replay.motion import motion_failures
 from twin.replay.observed import observed_plan
-from twin.replay.path import JointPath, outside_limits
+from twin.replay.path import JointPath
 from twin.replay.result import ReplayResult
 from twin.replay.verdict import Commanded, judge_states
 from twin.robot.collision import hulls_of
@@ -96,7 +95,7 @@ class TwinCell:
         """
         joints_rad = np.asarray(joints_rad, dtype=np.float64)
         count = self.steps_of(duration_s)
-        self._refuse(joints_rad, width_m, count / self._rate_hz)
+        refuse_target(self.robot, self._knots, joints_rad, width_m, count / self._rate_hz)
         velocity = ((joints_rad - self.target_rad) / count * self._rate_hz).tolist()
         self.target_width_m = float(width_m)
         self._follow(count, joints_rad, velocity)
@@ -119,26 +118,6 @@ class TwinCell:
             if self._steps % self._stride == 0 and not self._samples.take(self._world, self.t_ns):
                 self.burst = True
                 return
-
-    def _refuse(
-        self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float, duration_s: float
-    ) -> None:
-        robot = self.robot
-        if joints_rad.shape != self.target_rad.shape or not (
-            np.isfinite(joints_rad).all() and np.isfinite(width_m)
-        ):
-            raise StoppedError(
-                name="target",
-                detail=f"{len(robot.joints)} joints and a width were expected, all of them finite; "
-                f"got {np.array2string(joints_rad, precision=3)} and {width_m}",
-            )
-        length_ns = round(duration_s * 1e9)
-        stood = [(-length_ns, self.target_rad)] if len(self._knots) == 1 else []
-        knots = [*stood, *self._knots[-2:], (self.t_ns + length_ns, joints_rad)]
-        path = replace(self._path(knots), moving=True)
-        failures = outside_limits(robot, path.times_ns[-1:], joints_rad[None])
-        for failure in failures or motion_failures(path, robot):
-            raise StoppedError(name="limits", detail=failure.detail)
 
     def _stop_where_the_arm_would(self) -> None:
         record, found = self.robot.record, self.posture()[0]

@@ -15,6 +15,7 @@ def rollout(run: Path, /, *, config: RolloutConfig, output: Output = OUTPUT) -> 
     nothing of the policy, with the reason.
     Example: robot-gst rollout runs/monday --policy ws://127.0.0.1:8000 --map droid.toml
     Example: robot-gst rollout runs/monday --policy my_policy:make --check
+    In the cell: robot-gst rollout runs/monday --policy ws://127.0.0.1:8000 --name pi0 --cell lab
 
     Args:
         run: Run folder.
@@ -24,6 +25,12 @@ def rollout(run: Path, /, *, config: RolloutConfig, output: Output = OUTPUT) -> 
     from twin.policies.runs import describe_rollouts, roll_out_run
 
     folder = RunFolder.open(run)
+    if config.cell:
+        from twin.policies.runner import serve_cell
+
+        count = serve_cell(config, output)
+        output.result({"trials": count}, f"{count} trials of {config.name or config.policy}")
+        return 0
     if config.check:
         found = check_policy(folder, config)
         output.result(found, describe_check(found))

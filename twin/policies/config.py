@@ -8,6 +8,7 @@ from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
 from bridge.terminal import RARE
+from bridge.wire.config import LOOPBACK
 
 
 @Parameter(name="*")
@@ -27,6 +28,11 @@ class RolloutConfig:
     """Those of recorded trials, or so many drawn from the task file."""
     times: Annotated[int, RARE] = 1
     """Rollouts from each start; three or more show how much a policy varies by itself."""
+    cell: str = ""
+    """Act in this cell instead, in every trial of the policy that is started at the recorder
+    (robot-gst ctl start --policy NAME), until that trial is ended."""
+    connect: tuple[str, ...] = LOOPBACK
+    """With --cell: where the recorder listens."""
     check: bool = False
     """Send one recorded start, explain the answer, and move nothing."""
     workers: Annotated[int | None, RARE] = None

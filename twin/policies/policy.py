@@ -3,15 +3,19 @@
 import importlib
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from bridge.episode.provenance import hash_settings
 from twin.policies.errors import PolicyError
+from twin.policies.mapping import PolicyMap
 from twin.policies.openpi import ServedPolicy
 
 WORDS = ("ws://", "wss://")
+HASHES = ("server=", "code=", "map=")
+"""How it begins who acted, where no checkpoint is named."""
 
 
 @runtime_checkable
@@ -99,3 +103,16 @@ def _takes_one(found: Callable[..., Any]) -> bool:
         return False
     needed = [p for p in inspect.signature(found).parameters.values() if p.default is p.empty]
     return len(needed) == 1
+
+
+def who_acts(address: str, mapping: PolicyMap, metadata: Mapping[str, Any]) -> str:
+    """Say who acts: the checkpoint that a server names, else a hash of what it says; the mapping.
+
+    Code of this Python is what it is called.
+    """
+    who = str(metadata.get("checkpoint") or "")
+    if not who and metadata:
+        who = f"server={hash_settings(dict(metadata))}"
+    elif not who and not address.startswith(WORDS):
+        who = f"code={address}"
+    return f"{who} map={mapping.sha256()[:12]}".strip()

@@ -20,7 +20,7 @@ from bridge.task.plan import Plan
 from twin.policies.cell import TwinCell
 from twin.policies.errors import PolicyError, StoppedError
 from twin.policies.mapping import Interpreter, PolicyMap
-from twin.policies.policy import WORDS, Policy, open_policy
+from twin.policies.policy import Policy, open_policy, who_acts
 from twin.policies.starts import Start, drawn_starts, open_start
 from twin.policies.views import Pictures, TwinCameras
 from twin.replay.output import ReplayOrigin, write_replay
@@ -33,9 +33,6 @@ LOOK_S = 0.5
 """How often it is asked whether the task is done."""
 ROLLOUT = "rollout"
 """Kind of the derived episode, its trajectory, and where its row lies among its settings."""
-
-HASHES = ("server=", "code=", "map=")
-"""How it begins who acted, where no checkpoint is named."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +131,7 @@ def _roll_out(
         info = replace(episode.info, policy=job.name, task=start.task.name)
         result, plan = cell.judged(info)
         row = _row(job, info, start.id, acted, result)
-        row["checkpoint"] = _who(job, policy.metadata)
+        row["checkpoint"] = who_acts(job.policy, job.mapping, policy.metadata)
         _write(job, episode, start, (result, plan), acted, row, policy.metadata)
         return row
     finally:
@@ -220,19 +217,6 @@ def _row(
         "answer_s": round(acted.answer_s, 3),
         "file": job.path().name,
     }
-
-
-def _who(job: RolloutJob, metadata: Mapping[str, Any]) -> str:
-    """Who acts: the checkpoint that a server names, else a hash of what it says; and the mapping.
-
-    Code of this Python is what it is called.
-    """
-    who = str(metadata.get("checkpoint") or "")
-    if not who and metadata:
-        who = f"server={hash_settings(dict(metadata))}"
-    elif not who and not job.policy.startswith(WORDS):
-        who = f"code={job.policy}"
-    return f"{who} map={job.mapping.sha256()[:12]}".strip()
 
 
 def _write(

@@ -17,7 +17,8 @@ from bridge.terminal import Output
 from bridge.whole_file import write_whole
 from twin.policies.config import RolloutConfig
 from twin.policies.mapping import read_mapping
-from twin.policies.rollout import HASHES, ROLLOUT, RolloutJob, roll_out, row_of_file
+from twin.policies.policy import HASHES
+from twin.policies.rollout import ROLLOUT, RolloutJob, roll_out, row_of_file
 from twin.policies.starts import trial_episodes
 
 RESULTS = {"success": True, "failure": False}
@@ -111,7 +112,7 @@ def write_table(run: RunFolder) -> Path:
         name = f"{row['policy']} {row['start_id']} {number}"
         about = (row["task"], row["policy"], row["start_id"])
         stand_in, acted = str(row["stand_in"]).lower(), row.get("checkpoint", "")
-        if acted.startswith(HASHES):
+        if acted.startswith(HASHES) and not who.startswith(HASHES):
             acted = f"{who} {acted}".strip()
         elif who and not f"{acted} ".startswith(f"{who} "):
             of_cell = f"{name} recorded"

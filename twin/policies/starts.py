@@ -74,7 +74,7 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
     task = streams.task_file(episode).task()
     begun_ns = first_execution_ns(episode)
     stamp_ns = begun_ns or streams.first_stamp_ns(episode) or episode.start_ns
-    found = localised_starts(run, episode, task, scene_hash=scene_hash_of(run)).at(stamp_ns)
+    found = localised_starts(run, episode, task, scene_hash=scene_hash_of(run)).at(0)  # at first
     rebuilt = read_rebuilt_scene(run, task)
     scene = rebuilt.scene(task, urdf, found.Ts_base_object, reasons=found.reasons)
     if scene.missing():

@@ -185,6 +185,11 @@ class StandinCell:
             self._target_rad = row
             self._tick()
 
+    @property
+    def target_rad(self) -> Float[np.ndarray, "6"]:
+        """Where the arm is sent now."""
+        return self._target_rad
+
     def grip(self, width_m: float) -> None:
         """Tell the gripper which opening to go to; it moves while time passes."""
         self._width_target_m = width_m

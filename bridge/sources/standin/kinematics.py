@@ -56,6 +56,23 @@ class Kinematics:
         self._q_ids = np.array([joint.idx_q for joint in joints])
         self._v_ids = np.array([joint.idx_v for joint in joints])
 
+    def why_refused(
+        self, joints_rad: Float[np.ndarray, "6"], last_rad: Float[np.ndarray, "6"], in_s: float
+    ) -> str:
+        """Why the controller refuses a target; empty: it does not."""
+        model, ids = self._model, self._q_ids
+        lower, upper = model.lowerPositionLimit[ids], model.upperPositionLimit[ids]
+        for index in np.flatnonzero((joints_rad < lower) | (joints_rad > upper))[:1]:
+            limits = f"{lower[index]:.3f} to {upper[index]:.3f} rad"
+            return f"limits: {ARM_JOINTS[index]} at {joints_rad[index]:.3f} rad, allowed {limits}"
+        speeds, most = np.abs(joints_rad - last_rad) / in_s, model.velocityLimit[self._v_ids]
+        for index in np.flatnonzero(speeds > most)[:1]:
+            found = (
+                f"{ARM_JOINTS[index]} at {speeds[index]:.2f} rad/s, it reaches {most[index]:.2f}"
+            )
+            return f"limits: {found}"
+        return ""
+
     def T_base_tcp(self, joints_rad: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
         """Return where the tool is at these joints."""
         return self.T_base_frame(joints_rad, TCP_FRAME)

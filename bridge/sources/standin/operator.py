@@ -24,10 +24,11 @@ from bridge.episode.metadata import (
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
-from bridge.sources.standin.cell import StandinCell, TruthLog
+from bridge.sources.standin.cell import StandinCell, StoppedError, TruthLog
 from bridge.sources.standin.decisions import Decider
+from bridge.sources.standin.driven import BY_OPERATOR, Controller
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
-from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, SessionConfig
+from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, POLICY, SessionConfig
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done
@@ -242,6 +243,8 @@ class Operator:
         self._sent = {} if task_file is None else {"task_file": task_file.data.decode()}
         sha256 = "" if task_file is None else task_file.sha256
         self._decider = Decider(cell, session, config, sha256)
+        driven = config.planner == POLICY
+        self._controller = Controller(cell, session, config.cell, config.policy) if driven else None
         self._open = False
         self.scanned = False
         self.results: list[tuple[EpisodeInfo, Outcome]] = []
@@ -379,24 +382,44 @@ class Operator:
         cell.reset(self.start_poses(info.start_seed or 0, treatment.name, retry=retry))
         self._begin(info)
         cell.cameras_running = True
-        cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
+        if self._controller is not None:  # the policy's runner looks first
+            outcome = self._drive(info, self._controller)
+        else:
+            cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
+            outcome = self._plan(info, treatment, seed)
+        text = f"{outcome.result}: {outcome.detail}"
+        cell.streams.event("label", cell.now_ns, text=text, outcome=asdict(outcome))
+        cell.cameras_running = False
+        self._end(outcome)
+        return outcome
+
+    def _drive(self, info: EpisodeInfo, controller: Controller) -> Outcome:
+        """Let a policy act, and label; a limit that stops it is a failure."""
+        cell = self._cell
+        driven = controller.drive(info.id, self._config.max_s)
+        if driven.stopped.startswith(BY_OPERATOR):
+            self._open = False
+            raise StoppedError
+        cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
+        if driven.problem:
+            return void_trial(cell.task, driven.problem)
+        outcome = label_trial(cell.world.task, cell.truth, executed=True, remark=driven.stopped)
+        if not driven.stopped:
+            return outcome
+        return replace(outcome, result="failure", k=0 if outcome.unit == "trial" else outcome.k)
+
+    def _plan(self, info: EpisodeInfo, treatment: Treatment, seed: int) -> Outcome:
+        """Plan, execute and label."""
+        cell = self._cell
         decision = self._decider.still_allowed(self._decider.decide(info, seed))
         if decision.plan is not None:
             execute_plan(cell, decision.plan)
         else:
             cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
         if decision.void and not treatment.study_arm:
-            outcome = void_trial(cell.task, decision.remark)
-        else:
-            executed = decision.plan is not None
-            outcome = label_trial(
-                cell.world.task, cell.truth, executed=executed, remark=decision.remark
-            )
-        text = f"{outcome.result}: {outcome.detail}"
-        cell.streams.event("label", cell.now_ns, text=text, outcome=asdict(outcome))
-        cell.cameras_running = False
-        self._end(outcome)
-        return outcome
+            return void_trial(cell.task, decision.remark)
+        executed = decision.plan is not None
+        return label_trial(cell.world.task, cell.truth, executed=executed, remark=decision.remark)
 
     def _info(self, episode_id: str, *, kind: str, **fields: Any) -> EpisodeInfo:
         task = self._cell.task

@@ -9,8 +9,8 @@ from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.terminal import RARE
 
 CONDITIONS = (WITHOUT, WITH)
-BUILT_IN, WIRE = "built_in", "wire"
-PLANNERS = (BUILT_IN, WIRE)
+BUILT_IN, WIRE, POLICY = "built_in", "wire", "policy"
+PLANNERS = (BUILT_IN, WIRE, POLICY)
 INTERRUPTED = "interrupted"
 """What an episode's outcome says that was ended before its time."""
 
@@ -42,10 +42,13 @@ class SessionConfig:
     """Record only the trials of which the recorder has none yet with the same task, start,
     condition and policy: completes a session that was interrupted."""
     planner: str = BUILT_IN
-    """Who plans: built_in (scripted, careless) or wire, whoever answers on the cell's service plan
-    (robot-gst plan RUN --live)."""
+    """Who plans: built_in (scripted, careless); wire, whoever answers on the cell's service plan
+    (robot-gst plan RUN --live); or policy: nobody, and the targets of a policy are followed
+    (robot-gst rollout RUN --cell)."""
     policy: str = ""
     """How it plans; empty: perturbed for the built-in planner, nominal for one on the wire."""
+    max_s: Annotated[float, RARE] = 30.0
+    """A policy's trial ends after so long."""
     planner_timeout_s: Annotated[float, RARE] = 600.0
     """Last resort on the wall clock against a planner that hangs."""
     study_arms: Annotated[tuple[str, ...], RARE] = ()
@@ -82,6 +85,8 @@ class SessionConfig:
         _refuse_other("--study-arms", self.study_arms, tuple(CONDITION_OF))
         if "control" in self.study_arms and self.coin is None:
             raise UsageError("the arm control needs --coin, the chance of yes to each plan.")
+        if self.planner == POLICY and not self.policy:
+            raise UsageError("--planner policy needs --policy NAME, as robot-gst rollout has it.")
         most = float("inf")
         allowed: dict[str, tuple[int | float, int | float]] = {
             "seed": (0, 2**31),
@@ -90,6 +95,7 @@ class SessionConfig:
             "first_trial": (0, 9_999),
             "rounds": (1, 1_000),
             "planner_timeout_s": (0.1, most),
+            "max_s": (0.1, 600),
             "study_seed": (0, 2**31),
             "coin": (0, 1),
             "gate_timeout_s": (0.1, most),

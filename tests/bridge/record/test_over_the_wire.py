@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from loopback import free_endpoint
+from loopback import recording
 from PIL import Image
 
 import robot_gst
@@ -15,8 +15,7 @@ from bridge.data_files import datasets_folder
 from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.record.control import RecorderClient, serve_control
-from bridge.record.recorder import Recorder
+from bridge.record.control import RecorderClient
 from bridge.record.status import describe_status
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
@@ -31,14 +30,8 @@ class Joined(NamedTuple):
 
 @pytest.fixture
 def joined(run: RunFolder) -> Iterator[Joined]:
-    endpoint = free_endpoint()
-    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
-        recorder = Recorder(run, now_ns=session.now_ns)
-        session.subscribe("**", recorder.receive)
-        serve_control(session, recorder)
-        with open_session(WireConfig(connect=(endpoint,))) as client:
-            yield Joined(run, client, endpoint)
-        recorder.close()
+    with recording(run) as endpoint, open_session(WireConfig(connect=(endpoint,))) as client:
+        yield Joined(run, client, endpoint)
 
 
 def test_a_stop_comes_after_everything_sent_before_it(joined: Joined) -> None:

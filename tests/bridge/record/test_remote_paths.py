@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from loopback import free_endpoint
+from loopback import recording
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError
-from bridge.record.control import RecorderClient, serve_control
-from bridge.record.recorder import Recorder
+from bridge.record.control import RecorderClient
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
 from bridge.wire.session import open_session
@@ -46,13 +45,8 @@ class Remote(NamedTuple):
 def remote(tmp_path: Path) -> Iterator[Remote]:
     around = tmp_path / "around"
     run = RunFolder.create(around / "inner" / "run")
-    endpoint = free_endpoint()
-    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
-        recorder = Recorder(run, now_ns=session.now_ns)
-        serve_control(session, recorder)
-        with open_session(WireConfig(connect=(endpoint,))) as client:
-            yield Remote(RecorderClient(client, timeout_s=10.0), run, around)
-        recorder.close()
+    with recording(run) as endpoint, open_session(WireConfig(connect=(endpoint,))) as client:
+        yield Remote(RecorderClient(client, timeout_s=10.0), run, around)
 
 
 def outside(remote: Remote) -> list[Path]:

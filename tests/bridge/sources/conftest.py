@@ -9,12 +9,11 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from loopback import free_endpoint
+from loopback import recording
 from rtde_server import RtdeServer, counting_state
 
 from bridge.episode.run_folder import RunFolder
-from bridge.record.control import RecorderClient, serve_control
-from bridge.record.recorder import Recorder
+from bridge.record.control import RecorderClient
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
 
@@ -39,12 +38,6 @@ def server() -> Iterator[RtdeServer]:
 
 @pytest.fixture
 def joined(tmp_path: Path) -> Iterator[Joined]:
-    endpoint = free_endpoint()
     run = RunFolder.create(tmp_path / "run")
-    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
-        recorder = Recorder(run, now_ns=session.now_ns)
-        session.subscribe("**", recorder.receive)
-        serve_control(session, recorder)
-        with open_session(WireConfig(connect=(endpoint,))) as client:
-            yield Joined(run, client, RecorderClient(client, timeout_s=10.0), endpoint)
-        recorder.close()
+    with recording(run) as endpoint, open_session(WireConfig(connect=(endpoint,))) as client:
+        yield Joined(run, client, RecorderClient(client, timeout_s=10.0), endpoint)

@@ -56,3 +56,10 @@ def broken(observation: dict[str, Any]) -> np.ndarray:
 
 def raising(observation: dict[str, Any]) -> np.ndarray:
     raise KeyError("wrist")
+
+
+def nodding(observation: dict[str, Any]) -> np.ndarray:
+    """Turns the whole arm slowly."""
+    rows = np.repeat(np.array(observation["agent_pos"], dtype=np.float64)[None], 10, axis=0)
+    rows[:, 0] += 0.03 * np.arange(1, 11)
+    return rows

@@ -17,6 +17,8 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import GstError, UsageError
 from bridge.exchange.trials_csv import read_trials
 from bridge.terminal import Output
+from evaluator.cache import SummaryCache
+from evaluator.compare.run import compare_run, read_run
 from twin.policies.check import check_policy, describe_check
 from twin.policies.config import RolloutConfig
 from twin.policies.policy import open_policy
@@ -184,3 +186,34 @@ def test_lerobots_policies_are_asked_as_they_are(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("scripted_policies.Acts", Acts, raising=False)
     policy = open_policy("scripted_policies:Acts", 1.0)
     assert policy.infer({"agent_pos": [1.0]}).tolist() == [1.0]
+
+
+def test_a_run_is_evaluated_with_its_rollouts(run: RunFolder) -> None:
+    """Each recorded trial of a policy has its own rollout beside it, and no table is written."""
+    write_trial(run, "trial_4", "start 1")
+    write_trial(run, "trial_5", "start 1", policy="another")
+    for name, result in (("1", "success"), ("2", "failure"), ("4", "failure"), ("5", "failure")):
+        label_episode(run, f"trial_{name}", Outcome(result=result))
+    found = roll_out_run(run, config("Scripted", max_s=30.0, times=2), QUIET)
+    files = {(row["start_id"], row["number"]): row["file"] for row in found["rows"]}
+    trials = {
+        trial.row.episode: trial.row for trial in read_run(run, SummaryCache(None), QUIET).trials
+    }
+    assert {name: row.twin for name, row in trials.items()} == {
+        "trial_1": True, "trial_2": True, "trial_4": True, "trial_5": None,
+    }  # fmt: skip
+    assert trials["trial_1"].twin_replay == files["start 1", 0]
+    assert trials["trial_4"].twin_replay == files["start 1", 1]
+    assert trials["trial_2"].twin_replay == files["start 2", 0]
+    comparison = compare_run(run)
+    by_id = {item.id: item for item in comparison.measurements}
+    for side, counted in (("recorded", (1, 3)), ("sim_planned", (3, 3))):
+        rate = by_id[f"rate.{side}.cube_into_box.-.Scripted"]
+        assert (rate.k, rate.n) == counted
+
+
+def test_another_checkpoint_in_the_cell_ends_the_evaluation(run: RunFolder) -> None:
+    write_trial(run, "trial_6", "start 1", tags=("checkpoint:code=other:act map=0123",))
+    roll_out_run(run, config("Scripted", max_s=1.0), QUIET)
+    with pytest.raises(UsageError, match=r"policy 'Scripted' is map .* in episodes/trial_6"):
+        compare_run(run)

@@ -1,0 +1,171 @@
+"""Follow the targets that a policy's runner sends, as a robot's controller does: the fresh ones."""
+
+import json
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from bridge.clock import ns_from_s
+from bridge.episode.cdr.codec import MalformedMessageError
+from bridge.episode.cdr.messages import JointSample
+from bridge.episode.topics import POLICY_TARGETS, cell_topic, policy_key
+from bridge.errors import BridgeError, UsageError
+from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M, ROBOT
+from bridge.robots.robot import GRIPPER_WIDTH
+from bridge.sources.standin.cell import TICK_NS, StandinCell
+from bridge.sources.standin.streams import Session
+from bridge.task.predicate import all_hold, evaluate_success
+
+HOLD_NS, STOP_NS = ns_from_s(0.2), ns_from_s(1.0)
+"""Without a fresh target for so long the arm is held, and the trial stopped; the cell's clock."""
+FIRST_NS = ns_from_s(30.0)
+"""A policy may load before its first target."""
+LOOK_NS = ns_from_s(0.5)
+"""How often the operator looks whether the task is done."""
+ASK_S = 10.0
+BY_OPERATOR = "operator"
+"""How it begins what stopped a trial whose episode a person ended."""
+LAG_TICKS = round(ns_from_s(0.3) / TICK_NS)
+"""The arm may be where it was sent so long ago."""
+TRACKING_RAD = ROBOT.tracking_error_rad or np.inf
+"""The controller stops an arm that is farther from its target."""
+
+
+@runtime_checkable
+class Hearing(Session, Protocol):
+    """A session that can listen, too."""
+
+    def subscribe(self, key_expression: str, callback: Any) -> Any:
+        """Receive what matches."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Driven:
+    """How a trial by a policy ended."""
+
+    stopped: str = ""
+    """The limit or the person who stopped it; empty: nothing did."""
+    problem: str = ""
+    """Why it says nothing of the policy; empty: it does."""
+
+
+class Controller:
+    """Takes targets for one cell; without them nothing moves."""
+
+    def __init__(self, cell: StandinCell, session: Session, name: str, policy: str) -> None:
+        """Listen."""
+        if not isinstance(session, Hearing):
+            raise UsageError("a policy drives a cell over zenoh alone")
+        self._cell, self._session, self._key = cell, session, policy_key(name, policy)
+        self._lock, self._newest = threading.Lock(), b""
+        session.subscribe(cell_topic(name, POLICY_TARGETS)[1:], self._take)
+
+    def _take(self, sample: Any) -> None:
+        with self._lock:
+            self._newest = sample.data
+
+    def _fresh(self) -> bytes:
+        with self._lock:
+            found, self._newest = self._newest, b""
+        return found
+
+    def _ask(self, **request: Any) -> dict[str, Any]:
+        data = json.dumps(request).encode()
+        return dict(json.loads(self._session.query(self._key, data, timeout_s=ASK_S)))
+
+    def drive(self, episode: str, max_s: float) -> Driven:
+        """Follow until the task is done, something stops it, or time is up."""
+        try:
+            stopped = self._follow(1.0 / float(self._ask()["rate_hz"]), max_s)
+            told = dict(self._ask(over=episode, by="cell")["ended"])
+        except BridgeError as error:
+            return Driven(problem=f"no policy acts: {error}")
+        except (ValueError, KeyError, TypeError) as error:
+            return Driven(problem=f"what answers on {self._key} is no policy's runner ({error!r})")
+        if stopped.startswith(("limits", "tracking")):
+            return Driven(stopped=stopped)
+        unasked = "" if told["asked"] else "the policy gave no answer in time"
+        problem = told["problem"] or ("" if told["stopped"] else stopped or unasked)
+        return Driven(stopped=told["stopped"], problem=problem)
+
+    def _follow(self, period_s: float, max_s: float) -> str:
+        """What stopped it; empty: the task is done, or time is up."""
+        cell = self._cell
+        began_ns, began_s, ends_ns = cell.now_ns, time.monotonic(), None
+        line = _Line(cell.target_rad.copy(), cell.target_rad.copy(), cell.now_ns, period_s)
+        sent = deque[np.ndarray](maxlen=LAG_TICKS)
+        fresh_ns, looked_ns = None, cell.now_ns
+        self._fresh()
+        while ends_ns is None or cell.now_ns < ends_ns:
+            data = self._fresh()
+            if data:
+                refused = self._take_target(data, line)
+                if refused:
+                    return refused
+                fresh_ns = cell.now_ns
+                ends_ns = ends_ns or fresh_ns + ns_from_s(max_s)
+            elif fresh_ns is None and cell.now_ns - began_ns > FIRST_NS:
+                return f"watchdog: no target came in {FIRST_NS * 1e-9:g} s"
+            elif fresh_ns is not None and cell.now_ns - fresh_ns > STOP_NS:
+                return f"watchdog: no fresh target for {STOP_NS * 1e-9:g} s"
+            elif fresh_ns is not None and cell.now_ns - fresh_ns > HOLD_NS:
+                line.hold(cell.now_ns)
+            cell.follow(np.array([TICK_NS]), line.at(cell.now_ns + TICK_NS)[None])
+            sent.append(cell.target_rad)
+            there_rad = cell.world.joints_rad + cell.hidden.joint_offset_rad
+            off_rad = np.abs(there_rad - np.array(sent)).min(axis=0)
+            if off_rad.max() > TRACKING_RAD:
+                joint = ARM_JOINTS[int(np.argmax(off_rad))]
+                return f"tracking: {joint} is {off_rad.max():.3f} rad from where it was sent"
+            if cell.now_ns - looked_ns >= LOOK_NS:
+                looked_ns = cell.now_ns
+                if self._is_done():
+                    break
+            ahead_s = (cell.now_ns - began_ns) * 1e-9 - (time.monotonic() - began_s)
+            if ahead_s > 0:
+                time.sleep(ahead_s)
+        return ""
+
+    def _take_target(self, data: bytes, line: "_Line") -> str:
+        """Go to a target from here on; why not, if it is refused."""
+        try:
+            sample = JointSample.from_cdr(data)
+        except MalformedMessageError as error:
+            return f"target: {error}"
+        names = (*ARM_JOINTS, GRIPPER_WIDTH)
+        if sample.names != names or not np.isfinite(sample.position).all():
+            return f"target: {', '.join(sample.names)} at {sample.position} is none of this arm"
+        joints_rad, width_m = sample.position[:-1], float(sample.position[-1])
+        now_rad = line.at(self._cell.now_ns)
+        refused = self._cell.kinematics.why_refused(joints_rad, line.goal_rad, line.period_s)
+        if refused:
+            return refused
+        line.start_rad, line.goal_rad, line.since_ns = now_rad, joints_rad, self._cell.now_ns
+        self._cell.grip(min(max(width_m, 0.0), MAX_WIDTH_M))
+        return ""
+
+    def _is_done(self) -> bool:
+        found = evaluate_success(self._cell.world.task, self._cell.truth.rollout())
+        return all_hold(found) is True
+
+
+@dataclass
+class _Line:
+    """From one target to the next."""
+
+    start_rad: np.ndarray
+    goal_rad: np.ndarray
+    since_ns: int
+    period_s: float
+
+    def at(self, now_ns: int) -> np.ndarray:
+        share = min((now_ns - self.since_ns) * 1e-9 / self.period_s, 1.0)
+        return np.asarray(self.start_rad + (self.goal_rad - self.start_rad) * share)
+
+    def hold(self, now_ns: int) -> None:
+        """Stay where it is now."""
+        self.start_rad = self.goal_rad = self.at(now_ns)

@@ -1,0 +1,193 @@
+"""A policy drives the stand-in cell over zenoh: real sessions, a real recorder, a real server."""
+
+import json
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from loopback import recording
+from test_openpi import pack, served
+
+from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import JointSample
+from bridge.episode.metadata import tagged
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import POLICY_TARGETS
+from bridge.record.control import RecorderClient
+from bridge.robots.default import ARM_JOINTS
+from bridge.robots.robot import GRIPPER_WIDTH
+from bridge.sources.standin.session import run_session
+from bridge.sources.standin.settings import SessionConfig
+from bridge.terminal import Output
+from bridge.wire.config import WireConfig
+from bridge.wire.session import WireSession, open_session
+from twin.policies import runner as running
+from twin.policies.config import RolloutConfig
+from twin.policies.runner import CellRunner
+
+QUIET = Output(quiet=True)
+NODDING = "scripted_policies:nodding"
+
+
+class Laboratory(NamedTuple):
+    """A recorder behind a router, and whoever joins."""
+
+    run: RunFolder
+    endpoint: str
+
+    def join(self) -> WireSession:
+        return open_session(WireConfig(connect=(self.endpoint,)))
+
+    @contextmanager
+    def acting(self, policy: str, **more: Any) -> Iterator[CellRunner]:
+        about = {"name": "mine", "cell": "standin", "timeout_s": 1.0, **more}
+        stop = threading.Event()
+        with self.join() as session:
+            runner = CellRunner(session, RolloutConfig(policy=policy, **about), QUIET)
+            thread = threading.Thread(target=runner.run, args=(stop,))
+            thread.start()
+            try:
+                yield runner
+            finally:
+                stop.set()
+                thread.join()
+                runner.close()
+
+    def trial(self, max_s: float = 1.5) -> tuple[dict[str, Any], Episode, str, float]:
+        """One start, driven by whoever acts: how it was labelled, and how far a joint moved."""
+        config = SessionConfig(
+            planner="policy", policy="mine", scan=False, trials=1, max_s=max_s,
+            conditions=("without_replanning",), image_scale=0.1,
+        )  # fmt: skip
+        with self.join() as session:
+            summary = run_session(session, config, QUIET)
+        episode = Episode.open(self.run.episodes_dir / "trial_0001.mcap")
+        assert episode.outcome is not None
+        moved = float(np.ptp(streams.joint_track(episode).position, axis=0).max())
+        return summary, episode, f"{episode.outcome.result}: {episode.outcome.detail}", moved
+
+
+@pytest.fixture
+def laboratory(run: RunFolder) -> Iterator[Laboratory]:
+    with recording(run) as endpoint:
+        yield Laboratory(run, endpoint)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "run")
+
+
+def test_what_a_policy_sends_moves_the_arm_and_says_who_acted(laboratory: Laboratory) -> None:
+    with laboratory.acting(NODDING):
+        _, episode, label, _ = laboratory.trial(max_s=3.0)
+    assert label.startswith("failure: cube centre is")
+    assert episode.info.policy == "mine"
+    assert tagged(episode.info.tags, "checkpoint:").startswith(f"code={NODDING} map=")
+    assert len(tagged(episode.info.tags, "mapping:")) > 6
+    began, ended = (e for e in streams.events(episode) if e["type"].startswith("execution"))
+    assert began["data"]["prompt"] == "Put the red cube into the box."
+    assert ended["data"]["asked"] > 0
+    sent = streams.joint_track(episode, POLICY_TARGETS)
+    assert sent.names == (*ARM_JOINTS, GRIPPER_WIDTH)
+    pan, went = streams.joint_track(episode).position[:, 0], sent.position[:, 0]
+    assert went.max() > went[0] + 0.1
+    assert pan.max() == pytest.approx(went.max(), abs=0.06)  # the last one may not be reached
+
+
+def lasting(data: bytes) -> bytes:
+    time.sleep(3.0)
+    return data
+
+
+def failing(_: bytes) -> bytes:
+    raise ValueError("the server closes the connection")
+
+
+def sending(*numbers: float) -> Callable[[bytes], bytes]:
+    return lambda _: pack({"actions": np.array(numbers)})
+
+
+BAD: list[tuple[Callable[[bytes], bytes | str], str]] = [
+    (lasting, "unknown: .* said nothing for 1 s"),
+    (lambda _: "Traceback\nValueError: no such key", "unknown: .* ValueError: no such key"),
+    (failing, "unknown: .* closed the connection"),
+    (lambda _: bytes(65 << 20), "unknown: .* closed the connection"),
+    (lambda _: pack({"actions": np.zeros((2, 2, 7))}), "unknown: .* have shape"),
+    (sending(*[np.nan] * 7), "unknown: .* not finite"),
+    (sending(*[0.0] * 8), "unknown: .* takes rows of 7"),  # of another arm
+    (sending(*[9.0] * 7), "failure: limits: .* beyond its limits"),
+    (sending(-15, -98, 78, -70, -90, 75, 0.08), "failure: limits: .* degrees = true"),
+    (sending(*[0.0] * 7), "failure: limits: .* moves at"),  # too far for a tenth of a second
+]
+
+
+@pytest.mark.parametrize(("answer", "words"), BAD)
+def test_a_bad_answer_moves_nothing_and_is_told(
+    laboratory: Laboratory, answer: Callable[[bytes], bytes | str], words: str
+) -> None:
+    with served(answer) as (address, _), laboratory.acting(address):
+        _, _, label, moved = laboratory.trial(max_s=4.0)
+    assert re.match(words, label)
+    assert moved < 0.01
+
+
+def test_a_camera_that_the_cell_lacks_is_named(
+    laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(running, "READY_S", 3.0)
+    mapping = tmp_path / "map.toml"
+    mapping.write_text('[images.front]\ncamera = "front"\n')
+    with laboratory.acting("scripted_policies:still", map=mapping):
+        _, _, label, moved = laboratory.trial()
+    assert "nothing came on /standin/cam/front/color/image in 3 s" in label
+    assert "the cell shows /robot_description, " in label
+    assert moved < 0.01
+
+
+def test_the_operators_stop_ends_it(laboratory: Laboratory) -> None:
+    def stop() -> None:
+        began.wait(60.0)
+        RecorderClient(client).stop({"result": "failure", "k": 0, "n": 1, "detail": "stop"})
+
+    began, thread = threading.Event(), threading.Thread(target=stop)
+    with laboratory.acting(NODDING) as runner, laboratory.join() as client:
+        client.subscribe(f"standin{POLICY_TARGETS}", lambda _: began.set())
+        thread.start()
+        summary, _, label, _ = laboratory.trial(max_s=60.0)
+        thread.join()
+    assert (summary["stopped"], label) == (True, "failure: stop")
+    assert runner.ended.stopped == "operator: the episode was ended"
+
+
+def test_the_cell_holds_without_a_fresh_target_and_then_stops(laboratory: Laboratory) -> None:
+    """A runner that dies in the middle of a motion; nobody at all before it."""
+    ended = {"episode": "trial_0001", "stopped": "", "problem": "", "asked": 1}
+    about = {"policy": "mine", "rate_hz": 2.0, "tags": [], "ended": ended}
+    sent, none = list[int](), np.zeros(0)
+
+    def on_joints(sample: Any) -> None:
+        if len(sent) < 5:
+            joints = JointSample.from_cdr(sample.data)
+            goal = np.append(joints.position + 0.1 * np.eye(6)[0], 0.085)
+            names, sent[:] = (*ARM_JOINTS, GRIPPER_WIDTH), [*sent, joints.stamp_ns]
+            told = {"stamp_ns": sent[-1], "names": names, "velocity": none, "effort": none}
+            targets.put(JointSample(position=goal, **told).to_cdr(), source_ns=sent[-1])
+
+    with laboratory.join() as session:
+        targets = session.publisher(f"/standin{POLICY_TARGETS}", schema.JOINT_STATE)
+        session.serve("standin/policy/mine", lambda _: json.dumps(about).encode())
+        session.subscribe("standin/joint_states", on_joints)
+        _, episode, label, moved = laboratory.trial(max_s=30.0)
+    assert label == "unknown: watchdog: no fresh target for 1 s"
+    track = streams.joint_track(episode)
+    quiet = track.stamps_ns > sent[-1] + 450_000_000  # 0.2 s, and what a message takes
+    assert 0.02 < moved < 0.1  # within the period of 0.5 s it was held
+    assert np.ptp(track.position[quiet, 0]) < 0.005
