@@ -16,7 +16,11 @@ import robot_gst
 from bridge.episode import schema, streams
 from bridge.episode.catalogue import find_episodes
 from bridge.episode.cdr.codec import MalformedMessageError
-from bridge.episode.cdr.messages import FrameTransform, transforms_from_cdr, transforms_to_cdr
+from bridge.episode.cdr.messages import (
+    FrameTransform,
+    transforms_from_cdr,
+    transforms_to_cdr,
+)
 from bridge.episode.check import check_episode
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode

@@ -18,7 +18,10 @@ def settings(folder: Path, text: str) -> str:
     ("table", "said"),
     [
         ("replays", "has [replays], but no command has that name. There are: doctor, record"),
-        ("publish.stand-in", "has [publish.stand-in], but no command has that name. There are:"),
+        (
+            "publish.stand-in",
+            "has [publish.stand-in], but no command has that name. There are:",
+        ),
     ],
 )
 def test_a_table_that_is_named_like_no_command_is_refused(

@@ -156,7 +156,10 @@ def test_a_folder_that_is_being_recorded_into_is_refused(run: RunFolder) -> None
 
 @pytest.mark.parametrize(
     ("config", "named"),
-    [(DemoConfig(seed=2), "--seed 1"), (DemoConfig(task=("sloth_into_basket",)), f"--task {TASK}")],
+    [
+        (DemoConfig(seed=2), "--seed 1"),
+        (DemoConfig(task=("sloth_into_basket",)), f"--task {TASK}"),
+    ],
 )
 def test_another_demo_does_not_record_into_the_same_folder(
     run: RunFolder, config: DemoConfig, named: str

@@ -18,7 +18,12 @@ from bridge.episode.run_folder import RunFolder
 from bridge.media.color import decode_color
 from dashboards import clips
 from dashboards.comparison import judge
-from evaluator.compare.failures import NO_ANSWER, TWIN_SUCCEEDS, failure_kind, start_regions
+from evaluator.compare.failures import (
+    NO_ANSWER,
+    TWIN_SUCCEEDS,
+    failure_kind,
+    start_regions,
+)
 from evaluator.compare.rows import TrialRow
 from evaluator.review_index import FAILURE_PARTS, NOT_KNOWN, FailureSelection
 

@@ -15,7 +15,11 @@ def signal(values: np.ndarray) -> figures.Signal:
     )
 
 
-@given(st.floats(-1e6, 1e6, allow_nan=False), st.floats(1e-6, 1e6), st.integers(2, 10))
+@given(
+    st.floats(-1e6, 1e6, allow_nan=False),
+    st.floats(1e-6, 1e6),
+    st.integers(2, 10),
+)
 def test_ticks_are_inside_few_and_evenly_spaced(low: float, span: float, wanted: int) -> None:
     high = low + span
     ticks = figures.nice_ticks(low, high, wanted)

@@ -38,7 +38,9 @@ def test_disagreements_come_first_and_outcomes_have_words(browser: Any) -> None:
         assert word in page
 
 
-def test_a_selection_in_the_address_filters_the_list_and_keeps_the_headline(browser: Any) -> None:
+def test_a_selection_in_the_address_filters_the_list_and_keeps_the_headline(
+    browser: Any,
+) -> None:
     page = browser.get("/?show=disagree").text
     assert re.findall(r'href="/episode/(trial_\d+)', page) == ["trial_0002"]
     assert "2 of 3" in words(page)
@@ -252,7 +254,9 @@ def test_an_open_address_asks_for_its_token(synthetic: ModuleType, shared_run: R
 def test_nothing_but_labels_can_be_asked_to_write(shared_run: RunFolder, browser: Any) -> None:
     app = create_app(Library.open([shared_run.path]))
     routes = [(getattr(r, "path", ""), getattr(r, "methods", None) or set()) for r in app.routes]
-    assert [path for path, methods in routes if methods - {"GET", "HEAD"}] == ["/label"]
+    assert [path for path, methods in routes if methods - {"GET", "HEAD"}] == [
+        "/label",
+    ]
     for path in ("/", "/queue", "/label", "/reviews", "/episode/trial_0001"):
         foreign = browser.post(path, headers={"Origin": "http://evil.example"}, content=b"")
         assert foreign.status_code == 403

@@ -51,7 +51,9 @@ def test_views_without_scores_are_shown_in_recorded_order(copy: RunFolder) -> No
     assert {view.camera_id for view in page.views} == {"side"}
 
 
-def test_both_sides_of_a_view_are_images_and_a_third_side_is_refused(shared_run: RunFolder) -> None:
+def test_both_sides_of_a_view_are_images_and_a_third_side_is_refused(
+    shared_run: RunFolder,
+) -> None:
     view = build_twin(shared_run, judge(shared_run)).views[0]
     path = shared_run.derived_dir / view.file
     for side in ("recorded", "rendered"):

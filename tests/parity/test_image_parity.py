@@ -55,7 +55,9 @@ def test_scores_agree_with_scikit_image(seed: int, size: tuple[int, int]) -> Non
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("size", SIZES)
 def test_scores_agree_with_torchmetrics(seed: int, size: tuple[int, int]) -> None:
-    from torchmetrics.functional.image import peak_signal_noise_ratio as their_psnr
+    from torchmetrics.functional.image import (
+        peak_signal_noise_ratio as their_psnr,
+    )
 
     images = pair(seed, size)
     recorded, replayed = tensors(images)

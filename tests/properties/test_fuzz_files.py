@@ -28,7 +28,11 @@ def small_file(compression: CompressionType, *, use_chunking: bool) -> bytes:
     """No CRCs: they would find every change before anything else has to."""
     stream = io.BytesIO()
     writer = Writer(
-        stream, chunk_size=80, compression=compression, enable_crcs=False, use_chunking=use_chunking
+        stream,
+        chunk_size=80,
+        compression=compression,
+        enable_crcs=False,
+        use_chunking=use_chunking,
     )
     writer.start(profile="ros2", library="robot-gst")
     channel = writer.register_channel("/a", "json", writer.register_schema("gst/Event", "", b"{}"))

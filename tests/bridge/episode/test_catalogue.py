@@ -8,7 +8,10 @@ import pytest
 
 import robot_gst
 from bridge.episode import metadata
-from bridge.episode.catalogue import find_episodes, label_episode
+from bridge.episode.catalogue import (
+    find_episodes,
+    label_episode,
+)
 from bridge.episode.catalogue_query import CatalogueQuery
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.run_folder import RunFolder
@@ -103,7 +106,11 @@ def test_what_other_programs_wrote_is_listed(run: RunFolder) -> None:
     for name, values in (("a", {}), ("b", drops)):
         with EpisodeWriter(run.episodes_dir / f"{name}.mcap") as writer:
             info = metadata.to_strings(EpisodeInfo(id=name, kind="trial"))
-            odd = {"trial": "1" + "0" * 40, "tags": '["1", "\\ud800"]', "task": '"\\u0000"'}
+            odd = {
+                "trial": "1" + "0" * 40,
+                "tags": '["1", "\\ud800"]',
+                "task": '"\\u0000"',
+            }
             writer.add_metadata("episode", {**info, **odd})
             if values:
                 writer.add_metadata("drops", values)

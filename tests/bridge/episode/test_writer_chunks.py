@@ -93,7 +93,10 @@ def test_one_topic_with_two_schemas_of_one_name_has_two_channels(tmp_path: Path)
     with EpisodeWriter(path) as writer:
         for index in range(6):
             record = schema.Schema(
-                name="x/Y", schema_encoding="ros2msg", message_encoding="cdr", data=texts[index % 2]
+                name="x/Y",
+                schema_encoding="ros2msg",
+                message_encoding="cdr",
+                data=texts[index % 2],
             )
             writer.write_foreign("/t", bytes([index]), schema_record=record, log_time_ns=index)
     summary = summary_of(path)

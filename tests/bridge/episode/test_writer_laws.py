@@ -8,7 +8,10 @@ from mcap_samples import summary_of
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 
 
-@given(gaps=st.lists(st.integers(0, 120), min_size=1, max_size=30), flush=st.integers(50, 400))
+@given(
+    gaps=st.lists(st.integers(0, 120), min_size=1, max_size=30),
+    flush=st.integers(50, 400),
+)
 @settings(max_examples=50)
 def test_no_message_waits_longer_than_the_flush_time(
     tmp_path_factory: pytest.TempPathFactory, gaps: list[int], flush: int

@@ -117,7 +117,9 @@ def test_two_sources_of_one_cell_are_told_apart(live: tuple[LiveRecorder, str]) 
         assert offsets_s == pytest.approx([0.0, 1800.0], abs=0.5)
 
 
-def test_the_cameras_of_an_arm_that_left_are_still_there(live: tuple[LiveRecorder, str]) -> None:
+def test_the_cameras_of_an_arm_that_left_are_still_there(
+    live: tuple[LiveRecorder, str],
+) -> None:
     recorder, endpoint = live
     wire = WireConfig(connect=(endpoint,))
     with open_session(wire) as cameras:

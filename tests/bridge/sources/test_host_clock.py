@@ -27,7 +27,10 @@ def run(
     return np.array(taken), np.array(mapped)
 
 
-@given(st.lists(st.integers(0, 50 * MS), min_size=200, max_size=400), st.integers(0, 2 * 10**18))
+@given(
+    st.lists(st.integers(0, 50 * MS), min_size=200, max_size=400),
+    st.integers(0, 2 * 10**18),
+)
 def test_stamps_keep_their_order_and_are_never_early(delays_ns: list[int], offset_ns: int) -> None:
     taken, mapped = run(delays_ns, offset_ns=offset_ns)
     assert len(mapped) > 0

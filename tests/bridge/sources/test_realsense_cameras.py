@@ -248,7 +248,10 @@ def test_two_cameras_are_recorded_and_check_clean(
         ' "wrist": {"parent": "tool0_controller", "p_m": [0, 0, 0.1], "q_wxyz": [1, 0, 0, 0]}}'
     )
     config = RealSenseConfig(
-        cell="lab", camera=("side=111", "wrist=222"), color=color, mounts=tmp_path / "mounts.json"
+        cell="lab",
+        camera=("side=111", "wrist=222"),
+        color=color,
+        mounts=tmp_path / "mounts.json",
     )
     joined.control.start("t1", {"kind": "scan", "cell": "lab"})
     running = Running(joined, config, lambda: [side.device, wrist.device])

@@ -71,6 +71,9 @@ def test_the_stand_in_says_that_it_is_alive() -> None:
     endpoint = free_endpoint()
     idle = SessionConfig(cell="lab", task="cube_into_box", scan=False, trials=0)
     router = WireConfig(mode="router", listen=(endpoint,), connect=())
-    with open_session(router) as recorder, open_session(WireConfig(connect=(endpoint,))) as client:
+    with (
+        open_session(router) as recorder,
+        open_session(WireConfig(connect=(endpoint,))) as client,
+    ):
         StandinSource(idle).run(client, threading.Event(), Output(quiet=True))
         assert recorder.query_alive("**") == ["lab/alive"]

@@ -16,7 +16,9 @@ from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, draw_hidden
 from bridge.sources.standin.destination import ON_CLEARANCE_M
 from bridge.sources.standin.operator import execute_plan, label_trial
-from bridge.sources.standin.planner import NO_ERROR
+from bridge.sources.standin.planner import (
+    NO_ERROR,
+)
 from bridge.sources.standin.session import run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import Streams

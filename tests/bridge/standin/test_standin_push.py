@@ -73,7 +73,11 @@ def test_geometry_carries_the_cube_in_front_of_the_fingers(push: Task) -> None:
 @pytest.mark.parametrize(("friction", "result"), [(0.5, "success"), (0.06, "failure")])
 @pytest.mark.usefixtures("unchecked")
 def test_friction_decides_whether_the_cube_stops_at_the_mark(
-    push: Task, make_session: Callable[..., Any], cell_file: CellFile, friction: float, result: str
+    push: Task,
+    make_session: Callable[..., Any],
+    cell_file: CellFile,
+    friction: float,
+    result: str,
 ) -> None:
     hidden = replace(nominal_hidden(cell_file), object_friction=friction)
     cell = StandinCell(

@@ -159,7 +159,9 @@ def test_a_turn_the_wrist_cannot_make_is_made_the_other_way_round(sloth: Task) -
     assert yaw_of(T @ np.diag([-1.0, 1.0, -1.0, 1.0])) == pytest.approx(turned + np.pi, abs=1e-6)
 
 
-def test_each_object_has_its_own_error_and_the_first_keeps_the_old_one(toys_cell: CellFile) -> None:
+def test_each_object_has_its_own_error_and_the_first_keeps_the_old_one(
+    toys_cell: CellFile,
+) -> None:
     noise = toys_cell.noise_for("five_ducks_into_basket")
     errors = planner.draw_errors(noise, 5, start_seed=SEED, round_=1)
     assert errors[0] == planner.draw_error(noise, start_seed=SEED, round_=1)

@@ -118,7 +118,9 @@ random_boxes = st.tuples(st.integers(0, 2**32 - 1), st.booleans())
 
 
 @given(random_boxes)
-def test_the_gap_is_that_of_the_projected_corners(drawn: tuple[int, bool]) -> None:
+def test_the_gap_is_that_of_the_projected_corners(
+    drawn: tuple[int, bool],
+) -> None:
     rng = np.random.default_rng(drawn[0])
     boxes = []
     for _ in range(2):

@@ -49,7 +49,10 @@ def test_settings_of_an_endpoint_are_not_shown(
     settings = f"#connect_private_key_base64={SECRET}"
     cases: list[tuple[type[GstError], WireConfig]] = [
         (NoPeerError, WireConfig(connect=(f"tls/127.0.0.1:1{settings}",), connect_timeout_s=0.2)),
-        (PortTakenError, WireConfig(mode="router", connect=(), listen=(f"{endpoint}{settings}",))),
+        (
+            PortTakenError,
+            WireConfig(mode="router", connect=(), listen=(f"{endpoint}{settings}",)),
+        ),
         (WireConfigError, WireConfig(connect=(f"127.0.0.1:1{settings}",))),
     ]
     for kind, config in cases:

@@ -58,7 +58,10 @@ def test_an_action_takes_effect_after_the_latency(run: RunFolder) -> None:
 
 @pytest.mark.parametrize(
     ("control", "action"),
-    [("joint_velocity", [1.0, 0, 0, 0, 0, 0, 0.08]), ("joint_delta", [0.1, 0, 0, 0, 0, 0, 0.08])],
+    [
+        ("joint_velocity", [1.0, 0, 0, 0, 0, 0, 0.08]),
+        ("joint_delta", [0.1, 0, 0, 0, 0, 0, 0.08]),
+    ],
 )
 def test_kinds_of_control_mean_the_same(run: RunFolder, control: str, action: list[float]) -> None:
     env = TwinEnv(run.path, cameras=["side"], control=control)  # type: ignore[arg-type]

@@ -110,7 +110,9 @@ def test_a_file_that_is_removed_while_it_is_written_is_written_anew(
     nothing_invented(read(cell.path("t1")), flow.sent())
 
 
-def test_a_disk_that_breaks_ends_the_recorder_with_clear_words(cell: FaultCell) -> None:
+def test_a_disk_that_breaks_ends_the_recorder_with_clear_words(
+    cell: FaultCell,
+) -> None:
     recorder = cell.record(
         "--episode", "t1", "--cell", "cell", program=str(HERE / "failing_recorder.py")
     )

@@ -143,7 +143,9 @@ def test_taking_a_container_out_leaves_distances_that_are_never_too_large() -> N
     assert np.abs(local.values_m - full.values_m)[close & (full.values_m > 0)].max() < 2 * VOXEL_M
 
 
-def test_no_point_of_a_hull_is_farther_from_its_tree_than_is_subtracted(hulls: RobotHulls) -> None:
+def test_no_point_of_a_hull_is_farther_from_its_tree_than_is_subtracted(
+    hulls: RobotHulls,
+) -> None:
     from scipy.spatial import ConvexHull, cKDTree
 
     rng = np.random.default_rng(5)
