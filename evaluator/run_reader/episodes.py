@@ -415,11 +415,13 @@ class DerivedIndex:
         """Sort the derived episodes of a run."""
         self._replays: dict[tuple[str, str | None, str | None], list[DerivedFile]] = {}
         self._localised: dict[str, list[DerivedFile]] = {}
-        self._rollouts: dict[tuple[str, str, str], dict[int, DerivedFile]] = {}
+        self._rollouts: dict[tuple[str, ...], dict[int, DerivedFile]] = {}
         for file in files:
             made = file.derived
-            if made.kind == ROLLOUT:
-                self._keep_rollout(file, rollout_of(file))
+            if (row := rollout_of(file)).get("success") is not None:
+                whose = tuple(str(row.get(name, "")) for name in ("policy", "task", "start_id"))
+                numbered, number = self._rollouts.setdefault(whose, {}), int(row.get("number") or 0)
+                numbered[number] = _newest([file, numbered.get(number, file)])
             if _is_dynamic(made):
                 key = (made.source_episode, made.plan_id, made.trajectory)
                 self._replays.setdefault(key, []).append(file)
@@ -452,20 +454,10 @@ class DerivedIndex:
         why = undecided if decided.accepted is None else None
         return Replay(file=file, verdict=decided, reason=why)
 
-    def _keep_rollout(self, file: DerivedFile, row: Mapping[str, Any]) -> None:
-        policy, task, start = (str(row.get(name, "")) for name in ("policy", "task", "start_id"))
-        if row.get("success") is None:
-            return
-        numbered, number = (
-            self._rollouts.setdefault((policy, task, start), {}),
-            int(row.get("number") or 0),
-        )
-        numbered[number] = _newest([file, *([numbered[number]] if number in numbered else [])])
-
     def rollout(self, info: metadata.EpisodeInfo) -> DerivedFile | None:
         """Take the next rollout of a trial's policy from its start; each is taken once."""
-        numbered = self._rollouts.get((info.policy, info.task, info.start_id or info.id), {})
-        return numbered.pop(min(numbered)) if numbered else None
+        left = self._rollouts.get((info.policy, info.task, info.start_id or info.id), {})
+        return left.pop(min(left)) if left else None
 
     def answer_of_cells_engine(
         self, *, source: str, source_sha256: str, plan_id: str
