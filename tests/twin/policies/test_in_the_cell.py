@@ -62,27 +62,24 @@ class Laboratory(NamedTuple):
 
     def trial(self, max_s: float = 1.5) -> tuple[dict[str, Any], Episode, str, float]:
         """One start, driven by whoever acts: how it was labelled, and how far a joint moved."""
+        number = 1 + len(list(self.run.episodes_dir.glob("trial_*.mcap")))
         config = SessionConfig(
-            planner="policy", policy="mine", scan=False, trials=1, max_s=max_s,
+            planner="policy", policy="mine", scan=False, trials=1, first_trial=number, max_s=max_s,
             conditions=("without_replanning",), image_scale=0.1,
         )  # fmt: skip
         with self.join() as session:
             summary = run_session(session, config, QUIET)
-        episode = Episode.open(self.run.episodes_dir / "trial_0001.mcap")
+        episode = Episode.open(self.run.episodes_dir / f"trial_{number:04d}.mcap")
         assert episode.outcome is not None
         moved = float(np.ptp(streams.joint_track(episode).position, axis=0).max())
         return summary, episode, f"{episode.outcome.result}: {episode.outcome.detail}", moved
 
 
-@pytest.fixture
-def laboratory(run: RunFolder) -> Iterator[Laboratory]:
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Laboratory]:
+    run = RunFolder.create(tmp_path_factory.mktemp("laboratory") / "run")
     with recording(run) as endpoint:
         yield Laboratory(run, endpoint)
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 def test_what_a_policy_sends_moves_the_arm_and_says_who_acted(laboratory: Laboratory) -> None:
@@ -169,7 +166,7 @@ def test_the_operators_stop_ends_it(laboratory: Laboratory) -> None:
 
 def test_the_cell_holds_without_a_fresh_target_and_then_stops(laboratory: Laboratory) -> None:
     """A runner that dies in the middle of a motion; nobody at all before it."""
-    ended = {"episode": "trial_0001", "stopped": "", "problem": "", "asked": 1}
+    ended = {"episode": "", "stopped": "", "problem": "", "asked": 1}
     about = {"policy": "mine", "rate_hz": 2.0, "tags": [], "ended": ended}
     sent, none = list[int](), np.zeros(0)
 
