@@ -122,7 +122,7 @@ class StandinCell:
         begins = [first_start] if first_start else []
         self._rng = np.random.default_rng([SENSOR_STREAM, seed, *begins])
         self._should_stop = should_stop
-        self._target_rad, self._width_m = self.home_rad, MAX_WIDTH_M
+        self.target_rad, self._width_m = self.home_rad, MAX_WIDTH_M
         self._width_target_m = MAX_WIDTH_M
         self._due = dict.fromkeys(("gripper", "truth", "camera", "frames"), start_ns)
         self.cameras_running = False
@@ -144,7 +144,7 @@ class StandinCell:
         """
         if self.hidden.deviations is not None:
             Ts_base_object = self.hidden.deviations.put_down(self.world.task, Ts_base_object)
-        self._target_rad = self.home_rad
+        self.target_rad = self.home_rad
         self._width_m = self._width_target_m = MAX_WIDTH_M
         self.world.reset(self.home_rad - self.hidden.joint_offset_rad, Ts_base_object)
         self.truth.clear()
@@ -182,13 +182,8 @@ class StandinCell:
         ticks_ns = np.arange(1, count + 1) * TICK_NS
         columns = [np.interp(ticks_ns, times_ns, joints_rad[:, joint]) for joint in range(6)]
         for row in np.stack(columns, axis=1):
-            self._target_rad = row
+            self.target_rad = row
             self._tick()
-
-    @property
-    def target_rad(self) -> Float[np.ndarray, "6"]:
-        """Where the arm is sent now."""
-        return self._target_rad
 
     def grip(self, width_m: float) -> None:
         """Tell the gripper which opening to go to; it moves while time passes."""
@@ -200,7 +195,7 @@ class StandinCell:
         step = FINGER_SPEED_M_S * TICK_NS * 1e-9
         self._width_m += float(np.clip(self._width_target_m - self._width_m, -step, step))
         # The controller closes its loop on encoder readings, which are off by a constant.
-        true_target = self._target_rad - self.hidden.joint_offset_rad
+        true_target = self.target_rad - self.hidden.joint_offset_rad
         self.world.command(true_target, self._width_m)
         for _ in range(self._steps_per_tick):
             self.world.step()

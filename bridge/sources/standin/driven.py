@@ -5,7 +5,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from bridge.clock import ns_from_s
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import JointSample
 from bridge.episode.topics import POLICY_TARGETS, cell_topic, policy_key
-from bridge.errors import BridgeError, UsageError
+from bridge.errors import BridgeError
 from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M, ROBOT
 from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.sources.standin.cell import TICK_NS, StandinCell
@@ -35,14 +35,6 @@ TRACKING_RAD = ROBOT.tracking_error_rad or np.inf
 """The controller stops an arm that is farther from its target."""
 
 
-@runtime_checkable
-class Hearing(Session, Protocol):
-    """A session that can listen, too."""
-
-    def subscribe(self, key_expression: str, callback: Any) -> Any:
-        """Receive what matches."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Driven:
     """How a trial by a policy ended."""
@@ -58,8 +50,6 @@ class Controller:
 
     def __init__(self, cell: StandinCell, session: Session, name: str, policy: str) -> None:
         """Listen."""
-        if not isinstance(session, Hearing):
-            raise UsageError("a policy drives a cell over zenoh alone")
         self._cell, self._session, self._key = cell, session, policy_key(name, policy)
         self._lock, self._newest = threading.Lock(), b""
         session.subscribe(cell_topic(name, POLICY_TARGETS)[1:], self._take)

@@ -28,7 +28,7 @@ from bridge.sources.standin.cell import StandinCell, StoppedError, TruthLog
 from bridge.sources.standin.decisions import Decider
 from bridge.sources.standin.driven import BY_OPERATOR, Controller
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
-from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, POLICY, SessionConfig
+from bridge.sources.standin.settings import INTERRUPTED, POLICY, SessionConfig
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done
@@ -234,10 +234,6 @@ class Operator:
         task_file: TaskFile | None = None,
     ) -> None:
         """Prepare; nothing is published before ``scan`` or ``trials``."""
-        unknown = sorted(set(config.conditions) - set(CONDITIONS))
-        if unknown:
-            message = f"condition {unknown[0]!r} is unknown. There are: {', '.join(CONDITIONS)}."
-            raise UsageError(message)
         self._cell, self._session, self._config = cell, session, config
         self._output = output or Output(quiet=True)
         self._sent = {} if task_file is None else {"task_file": task_file.data.decode()}
@@ -286,16 +282,11 @@ class Operator:
         all_ = [(s, t) for s in self.start_seeds(config.trials) for t in self._treatments(s)]
         if not config.missing:
             return all_
-        if not config.study_arms:
-            there = {
-                (item["start_id"], item["condition"], item["policy"]) for item in self._recorded()
-            }
-            return [(s, t) for s, t in all_ if (f"{task}/{s}", t.condition, policy) not in there]
-        tried = {
-            (item["start_id"], study_arm_of(item["tags"]), item["policy"])
-            for item in self._recorded()
-        }
-        return [(s, t) for s, t in all_ if (f"{task}/{s}", t.study_arm, policy) not in tried]
+        tried = set()
+        for item in self._recorded():
+            name = study_arm_of(item["tags"]) if config.study_arms else item["condition"]
+            tried.add((item["start_id"], name, item["policy"]))
+        return [(s, t) for s, t in all_ if (f"{task}/{s}", t.name, policy) not in tried]
 
     def start_poses(
         self, start_seed: int, treatment: str, *, retry: bool = False

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bridge.clock import AnchoredClock
 from bridge.episode import topics
-from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.errors import BridgeError
 from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
@@ -114,10 +114,8 @@ class StandinSource:
 def _summary(
     operator: Operator, config: SessionConfig, task_name: str, *, stopped: bool
 ) -> dict[str, Any]:
-    counts: dict[str, Counter[str]] = {}
     objects: dict[str, dict[str, int]] = {}
     for info, outcome in operator.results:
-        counts.setdefault(_treatment(info), Counter())[outcome.result] += 1
         if outcome.unit == "object":
             sums = objects.setdefault(_treatment(info), {"k": 0, "n": 0})
             sums["k"], sums["n"] = sums["k"] + outcome.k, sums["n"] + outcome.n
@@ -127,18 +125,18 @@ def _summary(
         "task": task_name,
         "seed": config.seed,
         "scan": operator.scanned,
-        "outcomes": {condition: dict(counter) for condition, counter in counts.items()},
+        "outcomes": _counts(operator.results),
         "objects": objects,
-        "retries": _retry_counts(operator),
+        "retries": _counts(operator.retries),
         "unknown": {i.id: o.detail for i, o in operator.results if o.result == "unknown"},
         "stopped": stopped,
     }
 
 
-def _retry_counts(operator: Operator) -> dict[str, dict[str, int]]:
-    """Per treatment, how new starts after a failed execution ended; in no count of trials."""
+def _counts(attempts: list[tuple[EpisodeInfo, Outcome]]) -> dict[str, dict[str, int]]:
+    """Per treatment, how attempts ended; new starts after a failure are in no count of trials."""
     counts: dict[str, Counter[str]] = {}
-    for info, outcome in operator.retries:
+    for info, outcome in attempts:
         counts.setdefault(_treatment(info), Counter())[outcome.result] += 1
     return {treatment: dict(counter) for treatment, counter in counts.items()}
 
