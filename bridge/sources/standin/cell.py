@@ -21,7 +21,7 @@ from bridge.sources.standin.surfaces import (
     robot_surfaces,
     true_robot_surfaces,
 )
-from bridge.sources.standin.world import World, standing_clutter
+from bridge.sources.standin.world import World
 from bridge.task.predicate import Rollout
 from bridge.task.task_file import Task
 
@@ -57,20 +57,13 @@ class CellConfig:
 
 @dataclass
 class TruthLog:
-    """What really happened since ``clear``, at 30 Hz; the operator looks at this."""
+    """What really happened since the last reset, at 30 Hz; the operator looks at this."""
 
     stamps_ns: list[int] = field(default_factory=list)
     poses: dict[str, list[Float[np.ndarray, "4 4"]]] = field(default_factory=dict)
     contact: dict[str, list[bool]] = field(default_factory=dict)
     extents_m: dict[str, list[Float[np.ndarray, "3"]]] = field(default_factory=dict)
     """Of soft objects."""
-
-    def clear(self) -> None:
-        """Forget."""
-        self.stamps_ns.clear()
-        self.poses.clear()
-        self.contact.clear()
-        self.extents_m.clear()
 
     def rollout(self) -> Rollout:
         """Return the record in the form the predicates read."""
@@ -130,9 +123,8 @@ class StandinCell:
     @cached_property
     def _renderer(self) -> Renderer:
         """Made with the first picture; a cell that takes none saves a second."""
-        hidden = self.hidden
-        deviations = hidden.deviations
-        clutter = clutter_surfaces(standing_clutter(self.file.clutter, hidden))
+        deviations = self.hidden.deviations
+        clutter = clutter_surfaces(self.world.clutter)
         lab = [*lab_surfaces(self._seed, deviations), *clutter]
         robot = robot_surfaces() if deviations is None else true_robot_surfaces(deviations)
         return Renderer([*robot, *object_surfaces(self.world.task, deviations), *lab])
@@ -147,7 +139,7 @@ class StandinCell:
         self.target_rad = self.home_rad
         self._width_m = self._width_target_m = MAX_WIDTH_M
         self.world.reset(self.home_rad - self.hidden.joint_offset_rad, Ts_base_object)
-        self.truth.clear()
+        self.truth = TruthLog()
 
     def announce(self) -> None:
         """Publish what a listener needs before anything else: URDF, calibration, frames."""
@@ -221,13 +213,12 @@ class StandinCell:
         streams.joints(encoders, world.joint_speeds_rad_s, world.joint_efforts_Nm, self.now_ns)
         streams.tcp(self.kinematics.T_base_tcp(encoders), self.now_ns)
         if self._is_due("frames", FRAMES_NS):
-            streams.camera_poses(self._believed_moving(encoders), self.now_ns, static=False)
+            streams.camera_poses(self._believed(encoders), self.now_ns, static=False)
         if self._is_due("gripper", GRIPPER_NS):
             streams.gripper(world.width_m, self.now_ns)
 
-    def _believed_moving(
-        self, encoders_rad: Float[np.ndarray, "6"]
-    ) -> dict[str, Float[np.ndarray, "4 4"]]:
+    def _believed(self, encoders_rad: Float[np.ndarray, "6"]) -> dict[str, np.ndarray]:
+        """Poses of the moving cameras."""
         return {
             key: self.kinematics.T_base_frame(encoders_rad, mount.parent) @ mount.T_parent_camera
             for key, mount in self.file.cameras.items()

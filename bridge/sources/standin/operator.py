@@ -27,7 +27,7 @@ from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.cell import StandinCell, StoppedError, TruthLog
 from bridge.sources.standin.decisions import Decider
 from bridge.sources.standin.driven import BY_OPERATOR, Controller
-from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
+from bridge.sources.standin.scan import joint_move, scan_joints
 from bridge.sources.standin.settings import INTERRUPTED, POLICY, SessionConfig
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
@@ -316,7 +316,7 @@ class Operator:
         mount = next(item for item in cell.file.cameras.values() if item.moving)
         cell.wait(STILL_S)
         cell.capture()
-        stops = scan_joints(mount, cell.kinematics, joints, ScanConfig())
+        stops = scan_joints(mount, cell.kinematics, joints)
         with self._output.progress("scan", len(stops)) as advance:
             for done, target in enumerate(stops, start=1):
                 self._move(joints, target)
