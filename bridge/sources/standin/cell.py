@@ -19,7 +19,6 @@ from bridge.sources.standin.surfaces import (
     lab_surfaces,
     object_surfaces,
     robot_surfaces,
-    true_robot_surfaces,
 )
 from bridge.sources.standin.world import World
 from bridge.task.predicate import Rollout
@@ -126,7 +125,7 @@ class StandinCell:
         deviations = self.hidden.deviations
         clutter = clutter_surfaces(self.world.clutter)
         lab = [*lab_surfaces(self._seed, deviations), *clutter]
-        robot = robot_surfaces() if deviations is None else true_robot_surfaces(deviations)
+        robot = robot_surfaces(deviations)
         return Renderer([*robot, *object_surfaces(self.world.task, deviations), *lab])
 
     def reset(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:

@@ -64,10 +64,8 @@ class Kinematics:
             return f"limits: {ARM_JOINTS[index]} at {joints_rad[index]:.3f} rad, allowed {limits}"
         speeds, most = np.abs(joints_rad - last_rad) / in_s, model.velocityLimit[self._v_ids]
         for index in np.flatnonzero(speeds > most)[:1]:
-            found = (
-                f"{ARM_JOINTS[index]} at {speeds[index]:.2f} rad/s, it reaches {most[index]:.2f}"
-            )
-            return f"limits: {found}"
+            at = f"{speeds[index]:.2f} rad/s, it reaches {most[index]:.2f}"
+            return f"limits: {ARM_JOINTS[index]} at {at}"
         return ""
 
     def T_base_tcp(self, joints_rad: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:

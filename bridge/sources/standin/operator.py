@@ -62,7 +62,10 @@ def label_trial(task: Task, truth: TruthLog, *, executed: bool, remark: str = ""
         n=len(task.manipulated),
         by=OPERATOR,
         detail=f"{remark}: {detail}" if remark else detail,
-        stages=_stage_results(task, truth, done, verdict) if executed else (),
+        stages=tuple(
+            {"id": stage["id"], "result": RESULTS[_stage_result(stage, task, truth, done, verdict)]}
+            for stage in (task.stages if executed else ())
+        ),
     )
 
 
@@ -71,15 +74,6 @@ def void_trial(task: Task, reason: str) -> Outcome:
     count = len(task.manipulated)
     unit = "object" if count > 1 else "trial"
     return Outcome(result="unknown", unit=unit, k=0, n=count, by=OPERATOR, detail=reason)
-
-
-def _stage_results(
-    task: Task, truth: TruthLog, done: Mapping[str, bool | None], verdict: bool | None
-) -> tuple[dict[str, str], ...]:
-    return tuple(
-        {"id": stage["id"], "result": RESULTS[_stage_result(stage, task, truth, done, verdict)]}
-        for stage in task.stages
-    )
 
 
 def _stage_result(
@@ -387,15 +381,15 @@ class Operator:
     def _drive(self, info: EpisodeInfo, controller: Controller) -> Outcome:
         """Let a policy act, and label; a limit that stops it is a failure."""
         cell = self._cell
-        driven = controller.drive(info.id, self._config.max_s)
-        if driven.stopped.startswith(BY_OPERATOR):
+        stopped, problem = controller.drive(info.id, self._config.max_s)
+        if stopped.startswith(BY_OPERATOR):
             self._open = False
             raise StoppedError
         cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
-        if driven.problem:
-            return void_trial(cell.task, driven.problem)
-        outcome = label_trial(cell.world.task, cell.truth, executed=True, remark=driven.stopped)
-        if not driven.stopped:
+        if problem:
+            return void_trial(cell.task, problem)
+        outcome = label_trial(cell.world.task, cell.truth, executed=True, remark=stopped)
+        if not stopped:
             return outcome
         return replace(outcome, result="failure", k=0 if outcome.unit == "trial" else outcome.k)
 

@@ -88,7 +88,6 @@ class StandinSource:
             topics.PLAN_PATH,
             topics.EVENT,
         )
-        soft = [key for key, model in task.objects.items() if model.soft is not None]
         return (
             *(topics.cell_topic(cell, ending) for ending in of_cell),
             *(
@@ -97,7 +96,7 @@ class StandinSource:
                 for ending in endings
             ),
             *(topics.object_topic(topics.TRUTH, key, "pose") for key in task.objects),
-            *(topics.object_topic(topics.TRUTH, key, "nodes") for key in soft),
+            *(topics.object_topic(topics.TRUTH, key, "nodes") for key in task.soft_objects),
             TRUTH_PARAMETERS,
             topics.TF,
             topics.TF_STATIC,

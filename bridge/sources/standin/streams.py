@@ -116,11 +116,8 @@ class Streams:
         """Publish the intrinsics of colour and (aligned) depth."""
         for stream, frame in (("color", color_frame(camera_id)), ("depth", depth_frame(camera_id))):
             info = CameraInfo(stamp_ns=stamp_ns, frame_id=frame, camera=camera)
-            self._put(
-                topics.camera_topic(self._cell, camera_id, f"/{stream}/info"),
-                info.to_cdr(),
-                stamp_ns,
-            )
+            topic = topics.camera_topic(self._cell, camera_id, f"/{stream}/info")
+            self._put(topic, info.to_cdr(), stamp_ns)
 
     def frame(
         self,

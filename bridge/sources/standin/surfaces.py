@@ -200,14 +200,8 @@ def make_surface(
     )
 
 
-@cache
-def robot_surfaces() -> tuple[Surface, ...]:
-    """The arm as published, in light grey with blue caps at its joints' housings."""
-    return tuple(true_robot_surfaces(None))
-
-
-def true_robot_surfaces(deviations: Deviations | None) -> list[Surface]:
-    """The arm as it is; its gripper is dark."""
+def robot_surfaces(deviations: Deviations | None = None) -> list[Surface]:
+    """The arm in light grey with blue caps at its joints' housings; its gripper is dark."""
     surfaces = []
     for link in true_links(deviations):
         for shape in link.shapes:
@@ -227,6 +221,7 @@ _LINK_COLORS = {
 }
 
 
+@cache
 def _shape_surface(body: str, shape: LinkShape, color: tuple[float, float, float]) -> Surface:
     if shape.box_m is not None:
         return box_surface(body, shape.T_link_shape[:3, 3], np.array(shape.box_m), color)

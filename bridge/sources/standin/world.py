@@ -4,6 +4,7 @@ import xml.etree.ElementTree as ET
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import mujoco
@@ -28,9 +29,9 @@ from bridge.sources.standin.soft import SoftBody, soft_body, soft_model_xml
 from bridge.task.task_file import ObjectModel, Task
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LinkShape:
-    """One solid of a link: a mesh file or a box."""
+    """One solid of a link: a mesh file or a box; itself alone is equal to it."""
 
     T_link_shape: Float[np.ndarray, "4 4"]
     mesh: str | None
@@ -50,12 +51,12 @@ class LinkModel:
     T_parent_link: Float[np.ndarray, "4 4"]
     mass_kg: float
     T_link_inertial: Float[np.ndarray, "4 4"]
-    inertia: tuple[float, float, float, float, float, float]
-    """xx, yy, zz, xy, xz, yz [kg m^2]."""
+    inertia_kgm2: Float[np.ndarray, "3 3"]
     shapes: tuple[LinkShape, ...]
 
 
-def robot_links() -> list[LinkModel]:
+@cache
+def robot_links() -> tuple[LinkModel, ...]:
     """Return every link, parents before children, starting at ``base_link``."""
     root = ET.fromstring(ROBOT.urdf_text())
     elements = {item.attrib["name"]: item for item in root.findall("link")}
@@ -68,7 +69,7 @@ def robot_links() -> list[LinkModel]:
         for item in joints:
             if _child_of(item, "parent") == name:
                 waiting.append((_child_of(item, "child"), item))
-    return links
+    return tuple(links)
 
 
 def _child_of(joint: ET.Element, tag: str) -> str:
@@ -82,6 +83,7 @@ def _link(element: ET.Element, joint: ET.Element | None) -> LinkModel:
     tensor = None if inertial is None else inertial.find("inertia")
     names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
     values = [0.0] * 6 if tensor is None else [float(tensor.attrib[name]) for name in names]
+    xx, yy, zz, xy, xz, yz = values
     axis = None if joint is None else joint.find("axis")
     limit = None if joint is None else joint.find("limit")
     return LinkModel(
@@ -96,7 +98,7 @@ def _link(element: ET.Element, joint: ET.Element | None) -> LinkModel:
         T_parent_link=_origin(joint),
         mass_kg=0.0 if mass is None else float(mass.attrib["value"]),
         T_link_inertial=_origin(inertial),
-        inertia=(values[0], values[1], values[2], values[3], values[4], values[5]),
+        inertia_kgm2=np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
         shapes=tuple(_shapes(element)),
     )
 
@@ -132,12 +134,11 @@ def _origin(element: ET.Element | None) -> Float[np.ndarray, "4 4"]:
     return se3.transform_from(q, np.array(_vector(origin.attrib.get("xyz"), (0.0, 0.0, 0.0))))
 
 
-def true_links(deviations: Deviations | None) -> list[LinkModel]:
+def true_links(deviations: Deviations | None) -> tuple[LinkModel, ...]:
     """Return every link as it is, not as the URDF describes it; both agree without deviations."""
-    links = robot_links()
     if deviations is None:
-        return links
-    return [_true_link(link, deviations) for link in links]
+        return robot_links()
+    return tuple(_true_link(link, deviations) for link in robot_links())
 
 
 def _true_link(link: LinkModel, deviations: Deviations) -> LinkModel:
@@ -231,8 +232,7 @@ def _set_inertia(body: Any, link: LinkModel) -> None:
     p = link.T_link_inertial[:3, 3]
     if link.mass_kg > 0:
         R = link.T_link_inertial[:3, :3]
-        xx, yy, zz, xy, xz, yz = link.inertia
-        tensor = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
+        tensor = R @ link.inertia_kgm2 @ R.T
         body.mass, body.ipos = link.mass_kg, p
         body.fullinertia = [
             tensor[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -242,26 +242,20 @@ def _set_inertia(body: Any, link: LinkModel) -> None:
 
 
 def _add_joint(body: Any, link: LinkModel, deviations: Deviations | None) -> None:
-    if link.joint_type == "revolute":
-        drag_Nm = 0.0
-        if deviations is not None and link.joint in ARM_JOINTS:
-            drag_Nm = deviations.joint_drag_Nm[ARM_JOINTS.index(link.joint)]
-        body.add_joint(
-            name=link.joint,
-            type=mujoco.mjtJoint.mjJNT_HINGE,
-            axis=link.axis,
-            range=link.limits,
-            armature=ARM_ARMATURE,
-            frictionloss=drag_Nm,
-        )
-    elif link.joint_type == "prismatic":
-        body.add_joint(
-            name=link.joint,
-            type=mujoco.mjtJoint.mjJNT_SLIDE,
-            axis=link.axis,
-            range=link.limits,
-            armature=FINGER_ARMATURE,
-        )
+    if link.joint_type == "fixed":
+        return
+    turns = link.joint_type == "revolute"
+    drag_Nm = 0.0
+    if deviations is not None and link.joint in ARM_JOINTS:
+        drag_Nm = deviations.joint_drag_Nm[ARM_JOINTS.index(link.joint)]
+    body.add_joint(
+        name=link.joint,
+        type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=link.axis,
+        range=link.limits,
+        armature=ARM_ARMATURE if turns else FINGER_ARMATURE,
+        frictionloss=drag_Nm,
+    )
 
 
 def _add_shape(
