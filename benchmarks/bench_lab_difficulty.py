@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from bridge.geometry import se3
-from bridge.sources.standin.cell import CellConfig, StandinCell
+from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.deviations import Deviations
 from bridge.sources.standin.kinematics import UnreachablePoseError
@@ -150,7 +150,7 @@ def trial(cell: StandinCell, start_seed: int, lab: int | None = None) -> dict[st
         plan = planned(cell, perceived)
     except UnreachablePoseError as error:
         return {"start": start_seed, "result": "failure", "cause": "no plan", "detail": str(error)}
-    cell.truth.clear()
+    cell.truth = TruthLog()
     execute_plan(cell, plan)
     outcome = label_trial(cell.world.task, cell.truth, executed=True)
     failed = [stage["id"] for stage in outcome.stages if stage["result"] != "success"]

@@ -13,7 +13,7 @@ from bridge.media.color import decode_color, encode_jpeg
 from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import STILL_S
-from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
+from bridge.sources.standin.scan import joint_move, scan_joints
 from bridge.sources.standin.streams import Streams
 from bridge.task.task_file import Task, load_task
 
@@ -140,7 +140,7 @@ def look_around(task_name: str, seed: int, *, honest: bool = False) -> Start:
     mount = next(item for item in file.cameras.values() if item.moving)
     joints = cell.home_rad
     cell.capture()
-    for target in scan_joints(mount, cell.kinematics, joints, ScanConfig()):
+    for target in scan_joints(mount, cell.kinematics, joints):
         cell.follow(*joint_move(joints, target, file.max_joint_speed_rad_s))
         cell.wait(STILL_S)
         cell.capture()

@@ -43,8 +43,7 @@ class StepFailedError(DashboardError):
     """One of the demo's commands failed; its own message was printed above."""
 
     def __init__(self, *, command: str, code: int, log: Path | None) -> None:
-        """Remember the command and its exit code."""
-        self.command = command
+        """Remember the exit code."""
         self.code = code
         where = f" Its output is in {log}." if log else ""
         super().__init__(f"'{command}' ended with exit code {code}.{where}")

@@ -27,7 +27,7 @@ from bridge.sources.realsense import publish  # noqa: E402
 from bridge.sources.standin.cell import TICK_NS, CellConfig, StandinCell  # noqa: E402
 from bridge.sources.standin.cell_file import CellFile, draw_hidden, load_cell  # noqa: E402
 from bridge.sources.standin.kinematics import arm_kinematics  # noqa: E402
-from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints  # noqa: E402
+from bridge.sources.standin.scan import joint_move, scan_joints  # noqa: E402
 from bridge.task.find import chosen_task_file  # noqa: E402
 from robot_gst import run as type_here  # noqa: E402
 
@@ -80,7 +80,7 @@ def perform(file: CellFile) -> dict[str, Tape]:
         cell.capture()
         if name == "scan_1":
             at = cell.home_rad
-            for stop in scan_joints(file.cameras["wrist"], cell.kinematics, at, ScanConfig()):
+            for stop in scan_joints(file.cameras["wrist"], cell.kinematics, at):
                 cell.follow(*joint_move(at, stop, file.max_joint_speed_rad_s))
                 cell.wait(0.2)
                 cell.capture()

@@ -19,9 +19,8 @@ from bridge.sources.standin.surfaces import (
     lab_surfaces,
     object_surfaces,
     robot_surfaces,
-    true_robot_surfaces,
 )
-from bridge.sources.standin.world import World, standing_clutter
+from bridge.sources.standin.world import World
 from bridge.task.predicate import Rollout
 from bridge.task.task_file import Task
 
@@ -57,20 +56,13 @@ class CellConfig:
 
 @dataclass
 class TruthLog:
-    """What really happened since ``clear``, at 30 Hz; the operator looks at this."""
+    """What really happened since the last reset, at 30 Hz; the operator looks at this."""
 
     stamps_ns: list[int] = field(default_factory=list)
     poses: dict[str, list[Float[np.ndarray, "4 4"]]] = field(default_factory=dict)
     contact: dict[str, list[bool]] = field(default_factory=dict)
     extents_m: dict[str, list[Float[np.ndarray, "3"]]] = field(default_factory=dict)
     """Of soft objects."""
-
-    def clear(self) -> None:
-        """Forget."""
-        self.stamps_ns.clear()
-        self.poses.clear()
-        self.contact.clear()
-        self.extents_m.clear()
 
     def rollout(self) -> Rollout:
         """Return the record in the form the predicates read."""
@@ -122,7 +114,7 @@ class StandinCell:
         begins = [first_start] if first_start else []
         self._rng = np.random.default_rng([SENSOR_STREAM, seed, *begins])
         self._should_stop = should_stop
-        self._target_rad, self._width_m = self.home_rad, MAX_WIDTH_M
+        self.target_rad, self._width_m = self.home_rad, MAX_WIDTH_M
         self._width_target_m = MAX_WIDTH_M
         self._due = dict.fromkeys(("gripper", "truth", "camera", "frames"), start_ns)
         self.cameras_running = False
@@ -130,11 +122,10 @@ class StandinCell:
     @cached_property
     def _renderer(self) -> Renderer:
         """Made with the first picture; a cell that takes none saves a second."""
-        hidden = self.hidden
-        deviations = hidden.deviations
-        clutter = clutter_surfaces(standing_clutter(self.file.clutter, hidden))
+        deviations = self.hidden.deviations
+        clutter = clutter_surfaces(self.world.clutter)
         lab = [*lab_surfaces(self._seed, deviations), *clutter]
-        robot = robot_surfaces() if deviations is None else true_robot_surfaces(deviations)
+        robot = robot_surfaces(deviations)
         return Renderer([*robot, *object_surfaces(self.world.task, deviations), *lab])
 
     def reset(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
@@ -144,10 +135,10 @@ class StandinCell:
         """
         if self.hidden.deviations is not None:
             Ts_base_object = self.hidden.deviations.put_down(self.world.task, Ts_base_object)
-        self._target_rad = self.home_rad
+        self.target_rad = self.home_rad
         self._width_m = self._width_target_m = MAX_WIDTH_M
         self.world.reset(self.home_rad - self.hidden.joint_offset_rad, Ts_base_object)
-        self.truth.clear()
+        self.truth = TruthLog()
 
     def announce(self) -> None:
         """Publish what a listener needs before anything else: URDF, calibration, frames."""
@@ -182,13 +173,8 @@ class StandinCell:
         ticks_ns = np.arange(1, count + 1) * TICK_NS
         columns = [np.interp(ticks_ns, times_ns, joints_rad[:, joint]) for joint in range(6)]
         for row in np.stack(columns, axis=1):
-            self._target_rad = row
+            self.target_rad = row
             self._tick()
-
-    @property
-    def target_rad(self) -> Float[np.ndarray, "6"]:
-        """Where the arm is sent now."""
-        return self._target_rad
 
     def grip(self, width_m: float) -> None:
         """Tell the gripper which opening to go to; it moves while time passes."""
@@ -200,7 +186,7 @@ class StandinCell:
         step = FINGER_SPEED_M_S * TICK_NS * 1e-9
         self._width_m += float(np.clip(self._width_target_m - self._width_m, -step, step))
         # The controller closes its loop on encoder readings, which are off by a constant.
-        true_target = self._target_rad - self.hidden.joint_offset_rad
+        true_target = self.target_rad - self.hidden.joint_offset_rad
         self.world.command(true_target, self._width_m)
         for _ in range(self._steps_per_tick):
             self.world.step()
@@ -226,13 +212,12 @@ class StandinCell:
         streams.joints(encoders, world.joint_speeds_rad_s, world.joint_efforts_Nm, self.now_ns)
         streams.tcp(self.kinematics.T_base_tcp(encoders), self.now_ns)
         if self._is_due("frames", FRAMES_NS):
-            streams.camera_poses(self._believed_moving(encoders), self.now_ns, static=False)
+            streams.camera_poses(self._believed(encoders), self.now_ns, static=False)
         if self._is_due("gripper", GRIPPER_NS):
             streams.gripper(world.width_m, self.now_ns)
 
-    def _believed_moving(
-        self, encoders_rad: Float[np.ndarray, "6"]
-    ) -> dict[str, Float[np.ndarray, "4 4"]]:
+    def _believed(self, encoders_rad: Float[np.ndarray, "6"]) -> dict[str, np.ndarray]:
+        """Poses of the moving cameras."""
         return {
             key: self.kinematics.T_base_frame(encoders_rad, mount.parent) @ mount.T_parent_camera
             for key, mount in self.file.cameras.items()

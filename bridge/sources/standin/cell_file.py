@@ -25,7 +25,6 @@ PERCEPTIONS = ("noise", "gate")
 class CameraMount:
     """One camera as the laboratory believes it to be."""
 
-    id: str
     camera: Camera
     parent: str
     """``tool0`` for the wrist camera, ``base_link`` for a fixed one."""
@@ -159,7 +158,7 @@ def _cell_from(table: dict[str, Any]) -> CellFile:
         name=table["name"],
         home_m=(x, y, z),
         max_joint_speed_rad_s=table["robot"]["max_joint_speed_rad_s"],
-        cameras={key: _mount_from(key, value) for key, value in table["cameras"].items()},
+        cameras={key: _mount_from(value) for key, value in table["cameras"].items()},
         uniform={key: (low, high) for key, (low, high) in table["hidden"]["uniform"].items()},
         normal=dict(table["hidden"]["normal"]),
         sensors=SensorModel(**table["sensors"]),
@@ -216,7 +215,7 @@ def _pair(values: list[int]) -> tuple[int, int]:
     return first, last
 
 
-def _mount_from(camera_id: str, table: dict[str, Any]) -> CameraMount:
+def _mount_from(table: dict[str, Any]) -> CameraMount:
     width, height = table["width"], table["height"]
     camera = Camera(
         width=width,
@@ -226,9 +225,7 @@ def _mount_from(camera_id: str, table: dict[str, Any]) -> CameraMount:
         cx=table.get("cx", width / 2),
         cy=table.get("cy", height / 2),
     )
-    return CameraMount(
-        id=camera_id, camera=camera, parent=table["parent"], T_parent_camera=_mount_pose(table)
-    )
+    return CameraMount(camera=camera, parent=table["parent"], T_parent_camera=_mount_pose(table))
 
 
 def _mount_pose(table: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
@@ -270,11 +267,7 @@ class HiddenParameters:
 
     def to_record(self) -> dict[str, Any]:
         """Return plain numbers for the truth topic."""
-        record = asdict(self)
-        if self.stiffness_scale is None:
-            del record["stiffness_scale"]
-        if self.deviations is None:
-            del record["deviations"]
+        record = {key: value for key, value in asdict(self).items() if value is not None}
         record["joint_offset_rad"] = self.joint_offset_rad.tolist()
         record["camera_errors"] = {
             key: T.round(9).tolist() for key, T in self.camera_errors.items()

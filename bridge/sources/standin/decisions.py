@@ -24,7 +24,7 @@ from bridge.sources.standin.planner import (
     GROUNDING,
     GROUNDING_GATE,
     POLICY_NAME,
-    draw_errors,
+    draw_error,
     perceive,
     plan_pick_and_place,
 )
@@ -51,12 +51,13 @@ class BuiltInPlanner:
         """Draw the candidate of this start and round."""
         cell = self._cell
         noise = cell.file.noise_for(cell.task.name)
-        count = len(cell.task.manipulated)
+        seeds = {"start_seed": request.seed, "round_": request.round}
+        several = range(len(cell.task.manipulated))
         try:
             plan = plan_pick_and_place(
                 cell.task,
                 request.Ts_base_object(),
-                draw_errors(noise, count, start_seed=request.seed, round_=request.round),
+                [draw_error(noise, **seeds, index=index) for index in several],
                 kinematics=cell.kinematics,
                 joints_start_rad=np.array(request.joints_rad),
                 max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
@@ -131,16 +132,6 @@ class Decider:
             else WirePlanner(session, config.cell, config.planner_timeout_s)
         )
 
-    def look(self) -> GateSight:
-        """Ask the gate where the objects are; what it says is all that is known of them."""
-        return ask_where(
-            self._session,
-            self._config.cell,
-            self._cell.task,
-            self._task_sha256,
-            timeout_s=self._config.gate_timeout_s,
-        )
-
     def decide(self, info: EpisodeInfo, start_seed: int) -> Decision:
         """Propose, ask the gate and draw again, as the trial's condition or study arm says.
 
@@ -148,16 +139,19 @@ class Decider:
         in *control* the first for which a coin says yes, whose planner hears of no verdict. Outside
         a study the conditions mean the first two.
         """
-        sight = self.look() if self.sees_by_gate else None
+        config, task = self._config, (self._cell.task, self._task_sha256)
+        sight: GateSight | None = None
+        if self.sees_by_gate:  # what the gate says is all that is known of the objects
+            sight = ask_where(self._session, config.cell, *task, timeout_s=config.gate_timeout_s)
         if sight is not None and not sight.found:
             return self._nothing(sight.problem, void=sight.found is None)
         arm = info.study_arm or ARM_OF[info.condition]
         request = self._request(info, start_seed, sight)
-        coin = np.random.default_rng([COIN_STREAM, self._config.study_seed, start_seed])
+        coin = np.random.default_rng([COIN_STREAM, config.study_seed, start_seed])
         refusals: list[Refusal] = []
         parent: Plan | None = None
         why = ""
-        for round_ in range(1 if arm == "without" else self._config.rounds):
+        for round_ in range(1 if arm == "without" else config.rounds):
             steering = tuple(refusals) if arm == "with" else ()
             answer = self._ask(replace(request, round=round_, refused=steering))
             if answer.plan is None:
@@ -168,12 +162,14 @@ class Decider:
                 continue
             plan = _stamped(answer.plan, info, round_, parent)
             self._cell.streams.plan(plan, self._cell.now_ns)
-            verdict, reason = self._judged(plan, arm, bool(info.study_arm))
+            # It is asked in every arm of a study, and obeyed in one.
+            asked = arm == "with" or info.study_arm or config.ask_always
+            verdict, reason = self._ask_gate(plan) if asked else (None, "")
             if arm == "without":
                 return Decision(plan=plan, void=False, remark="")
-            last = round_ == self._config.rounds - 1
+            last = round_ == config.rounds - 1
             if arm == "control":
-                if coin.random() < (self._config.coin or 0.0):
+                if coin.random() < (config.coin or 0.0):
                     return Decision(plan=plan, void=False, remark="")
                 self._note_refusal(plan, "the coin says no", last=last)
                 parent, why = plan, f"the coin said no to {round_ + 1} plans"
@@ -234,24 +230,16 @@ class Decider:
         unfit = "" if answer.plan is None else request.why_unfit(answer.plan)
         return PlanAnswer(reason=f"its answer is refused: {unfit}") if unfit else answer
 
-    def _judged(self, plan: Plan, arm: str, in_study: bool) -> tuple[Verdict | None, str]:
-        """The gate's verdict; it is asked in every arm of a study and obeyed in one."""
-        if arm == "with" or in_study or self._config.ask_always:
-            return self._ask_gate(plan)
-        return None, ""
-
-    def _nothing(self, why: str, *, void: bool) -> Decision:
+    def _nothing(self, why: str, *, void: bool, **about: str) -> Decision:
         remark = f"{NOTHING_EXECUTED}, {why}"
-        self._note(remark)
+        self._note(remark, **about)
         return Decision(plan=None, void=void, remark=remark)
 
-    def _note(self, text: str) -> None:
-        self._cell.streams.event("note", self._cell.now_ns, text=text)
+    def _note(self, text: str, **about: str) -> None:
+        self._cell.streams.event("note", self._cell.now_ns, **about, text=text)
 
     def _unverified(self, plan: Plan, reason: str) -> Decision:
-        remark = f"{NOTHING_EXECUTED}, no verdict ({reason})"
-        self._cell.streams.event("note", self._cell.now_ns, plan_id=plan.id, text=remark)
-        return Decision(plan=None, void=True, remark=remark)
+        return self._nothing(f"no verdict ({reason})", void=True, plan_id=plan.id)
 
     def _note_refusal(self, plan: Plan, reason: str, *, last: bool) -> None:
         self._cell.streams.event(

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.errors import UsageError
+from bridge.sources.standin.kinematics import yaw_of
 from bridge.task.check import TABLE
 from bridge.task.relations import BESIDE_GAP_M, direction_of
 from bridge.task.task_file import ObjectModel, Task
@@ -73,13 +74,8 @@ class Destination:
         """
         if not self.is_turned:
             return yaw
-        half_turns = np.round((yaw - self.yaw_rad) / np.pi)
-        return self.yaw_rad + float(half_turns) * np.pi
-
-    @property
-    def yaw_rad(self) -> float:
-        """How it lies, turned about the vertical."""
-        return float(np.arctan2(self.T_base[1, 0], self.T_base[0, 0]))
+        lies = yaw_of(self.T_base)
+        return lies + float(np.round((yaw - lies) / np.pi)) * np.pi
 
 
 def destination_of(

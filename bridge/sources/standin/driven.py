@@ -1,11 +1,10 @@
 """Follow the targets that a policy's runner sends, as a robot's controller does: the fresh ones."""
 
 import json
-import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from bridge.clock import ns_from_s
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import JointSample
 from bridge.episode.topics import POLICY_TARGETS, cell_topic, policy_key
-from bridge.errors import BridgeError, UsageError
+from bridge.errors import BridgeError
 from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M, ROBOT
 from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.sources.standin.cell import TICK_NS, StandinCell
@@ -35,62 +34,39 @@ TRACKING_RAD = ROBOT.tracking_error_rad or np.inf
 """The controller stops an arm that is farther from its target."""
 
 
-@runtime_checkable
-class Hearing(Session, Protocol):
-    """A session that can listen, too."""
-
-    def subscribe(self, key_expression: str, callback: Any) -> Any:
-        """Receive what matches."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Driven:
-    """How a trial by a policy ended."""
-
-    stopped: str = ""
-    """The limit or the person who stopped it; empty: nothing did."""
-    problem: str = ""
-    """Why it says nothing of the policy; empty: it does."""
-
-
 class Controller:
     """Takes targets for one cell; without them nothing moves."""
 
     def __init__(self, cell: StandinCell, session: Session, name: str, policy: str) -> None:
         """Listen."""
-        if not isinstance(session, Hearing):
-            raise UsageError("a policy drives a cell over zenoh alone")
         self._cell, self._session, self._key = cell, session, policy_key(name, policy)
-        self._lock, self._newest = threading.Lock(), b""
+        self._newest = deque[bytes](maxlen=1)
         session.subscribe(cell_topic(name, POLICY_TARGETS)[1:], self._take)
 
     def _take(self, sample: Any) -> None:
-        with self._lock:
-            self._newest = sample.data
-
-    def _fresh(self) -> bytes:
-        with self._lock:
-            found, self._newest = self._newest, b""
-        return found
+        self._newest.append(sample.data)
 
     def _ask(self, **request: Any) -> dict[str, Any]:
         data = json.dumps(request).encode()
         return dict(json.loads(self._session.query(self._key, data, timeout_s=ASK_S)))
 
-    def drive(self, episode: str, max_s: float) -> Driven:
-        """Follow until the task is done, something stops it, or time is up."""
+    def drive(self, episode: str, max_s: float) -> tuple[str, str]:
+        """Follow until the task is done, something stops it, or time is up.
+
+        Returns:
+            The limit or the person who stopped it, and why it says nothing of the policy; or "".
+        """
         try:
             stopped = self._follow(1.0 / float(self._ask()["rate_hz"]), max_s)
             told = dict(self._ask(over=episode, by="cell")["ended"])
         except BridgeError as error:
-            return Driven(problem=f"no policy acts: {error}")
+            return "", f"no policy acts: {error}"
         except (ValueError, KeyError, TypeError) as error:
-            return Driven(problem=f"what answers on {self._key} is no policy's runner ({error!r})")
+            return "", f"what answers on {self._key} is no policy's runner ({error!r})"
         if stopped.startswith(("limits", "tracking")):
-            return Driven(stopped=stopped)
+            return stopped, ""
         unasked = "" if told["asked"] else "the policy gave no answer in time"
-        problem = told["problem"] or ("" if told["stopped"] else stopped or unasked)
-        return Driven(stopped=told["stopped"], problem=problem)
+        return told["stopped"], told["problem"] or ("" if told["stopped"] else stopped or unasked)
 
     def _follow(self, period_s: float, max_s: float) -> str:
         """What stopped it; empty: the task is done, or time is up."""
@@ -99,11 +75,10 @@ class Controller:
         line = _Line(cell.target_rad.copy(), cell.target_rad.copy(), cell.now_ns, period_s)
         sent = deque[np.ndarray](maxlen=LAG_TICKS)
         fresh_ns, looked_ns = None, cell.now_ns
-        self._fresh()
+        self._newest.clear()
         while ends_ns is None or cell.now_ns < ends_ns:
-            data = self._fresh()
-            if data:
-                refused = self._take_target(data, line)
+            if self._newest:
+                refused = self._take_target(self._newest.pop(), line)
                 if refused:
                     return refused
                 fresh_ns = cell.now_ns
@@ -123,11 +98,10 @@ class Controller:
                 return f"tracking: {joint} is {off_rad.max():.3f} rad from where it was sent"
             if cell.now_ns - looked_ns >= LOOK_NS:
                 looked_ns = cell.now_ns
-                if self._is_done():
+                if all_hold(evaluate_success(cell.world.task, cell.truth.rollout())) is True:
                     break
             ahead_s = (cell.now_ns - began_ns) * 1e-9 - (time.monotonic() - began_s)
-            if ahead_s > 0:
-                time.sleep(ahead_s)
+            time.sleep(max(ahead_s, 0.0))
         return ""
 
     def _take_target(self, data: bytes, line: "_Line") -> str:
@@ -147,10 +121,6 @@ class Controller:
         line.start_rad, line.goal_rad, line.since_ns = now_rad, joints_rad, self._cell.now_ns
         self._cell.grip(min(max(width_m, 0.0), MAX_WIDTH_M))
         return ""
-
-    def _is_done(self) -> bool:
-        found = evaluate_success(self._cell.world.task, self._cell.truth.rollout())
-        return all_hold(found) is True
 
 
 @dataclass

@@ -30,10 +30,7 @@ class UnreachablePoseError(BridgeError):
     def __init__(
         self, *, p_m: tuple[float, float, float], residual_m: float, beyond: Sequence[str] = ()
     ) -> None:
-        """Remember the position asked for, how close the arm came, and joints past their limits."""
-        self.p_m = p_m
-        self.residual_m = residual_m
-        self.beyond = tuple(beyond)
+        """Say the position asked for, how close the arm came, and joints past their limits."""
         x, y, z = p_m
         off = f"the best joints are {residual_m * 1e3:.1f} mm off"
         if beyond:
@@ -67,10 +64,8 @@ class Kinematics:
             return f"limits: {ARM_JOINTS[index]} at {joints_rad[index]:.3f} rad, allowed {limits}"
         speeds, most = np.abs(joints_rad - last_rad) / in_s, model.velocityLimit[self._v_ids]
         for index in np.flatnonzero(speeds > most)[:1]:
-            found = (
-                f"{ARM_JOINTS[index]} at {speeds[index]:.2f} rad/s, it reaches {most[index]:.2f}"
-            )
-            return f"limits: {found}"
+            at = f"{speeds[index]:.2f} rad/s, it reaches {most[index]:.2f}"
+            return f"limits: {ARM_JOINTS[index]} at {at}"
         return ""
 
     def T_base_tcp(self, joints_rad: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
@@ -198,8 +193,6 @@ class Leg:
     T_base_tcp: Float[np.ndarray, "4 4"]
     duration_s: float
     g: int
-    width_m: float | None = None
-    """Commanded opening at its end, evenly from the one before; None: shut or wide open by g."""
     law: TimeLaw = minimum_jerk
     step_s: float = WAYPOINT_S
     """Between its waypoints."""
@@ -220,7 +213,7 @@ class Track:
     ) -> "Track":
         """Start with an open gripper."""
         return Track(
-            tau=(_waypoint(0, T_base_tcp, joints_rad, 0, MAX_WIDTH_M),),
+            tau=(_waypoint(0, T_base_tcp, joints_rad, 0),),
             bounds={},
             T_base_tcp=T_base_tcp,
         )
@@ -246,28 +239,18 @@ def follow_legs(
                 break
             count = int(np.ceil(count * 1.02 * speed / max_joint_speed_rad_s))
         begin_ns = t_ns
-        for T, row, width in zip(Ts, rows[1:], _widths(tau[-1].width_m, leg, count), strict=True):
+        for T, row in zip(Ts, rows[1:], strict=True):
             t_ns += ns_from_s(leg.step_s)
-            tau.append(_waypoint(t_ns, T, row, leg.g, width))
+            tau.append(_waypoint(t_ns, T, row, leg.g))
         bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], t_ns)
         T_from, joints = leg.T_base_tcp, rows[-1]
     return Track(tau=tuple(tau), bounds=bounds, T_base_tcp=T_from)
 
 
-def _widths(before_m: float | None, leg: Leg, count: int) -> list[float]:
-    if leg.width_m is None:
-        return [0.0 if leg.g else MAX_WIDTH_M] * count
-    first = MAX_WIDTH_M if before_m is None else before_m
-    return [first + (leg.width_m - first) * k / count for k in range(1, count + 1)]
-
-
 def _waypoint(
-    t_ns: int,
-    T: Float[np.ndarray, "4 4"],
-    joints_rad: Float[np.ndarray, "6"],
-    g: int,
-    width_m: float,
+    t_ns: int, T: Float[np.ndarray, "4 4"], joints_rad: Float[np.ndarray, "6"], g: int
 ) -> Waypoint:
+    """The gripper wide open, or told to shut (g)."""
     q, p = se3.split(T)
     w, x, y, z = (float(value) for value in q)
     return Waypoint(
@@ -275,6 +258,6 @@ def _waypoint(
         p_m=(float(p[0]), float(p[1]), float(p[2])),
         q_wxyz=(w, x, y, z),
         g=g,
-        width_m=width_m,
+        width_m=0.0 if g else MAX_WIDTH_M,
         joints_rad=tuple(float(value) for value in joints_rad),
     )

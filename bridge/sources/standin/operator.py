@@ -27,8 +27,8 @@ from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.cell import StandinCell, StoppedError, TruthLog
 from bridge.sources.standin.decisions import Decider
 from bridge.sources.standin.driven import BY_OPERATOR, Controller
-from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
-from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, POLICY, SessionConfig
+from bridge.sources.standin.scan import joint_move, scan_joints
+from bridge.sources.standin.settings import INTERRUPTED, POLICY, SessionConfig
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done
@@ -62,7 +62,10 @@ def label_trial(task: Task, truth: TruthLog, *, executed: bool, remark: str = ""
         n=len(task.manipulated),
         by=OPERATOR,
         detail=f"{remark}: {detail}" if remark else detail,
-        stages=_stage_results(task, truth, done, verdict) if executed else (),
+        stages=tuple(
+            {"id": stage["id"], "result": RESULTS[_stage_result(stage, task, truth, done, verdict)]}
+            for stage in (task.stages if executed else ())
+        ),
     )
 
 
@@ -71,15 +74,6 @@ def void_trial(task: Task, reason: str) -> Outcome:
     count = len(task.manipulated)
     unit = "object" if count > 1 else "trial"
     return Outcome(result="unknown", unit=unit, k=0, n=count, by=OPERATOR, detail=reason)
-
-
-def _stage_results(
-    task: Task, truth: TruthLog, done: Mapping[str, bool | None], verdict: bool | None
-) -> tuple[dict[str, str], ...]:
-    return tuple(
-        {"id": stage["id"], "result": RESULTS[_stage_result(stage, task, truth, done, verdict)]}
-        for stage in task.stages
-    )
 
 
 def _stage_result(
@@ -234,10 +228,6 @@ class Operator:
         task_file: TaskFile | None = None,
     ) -> None:
         """Prepare; nothing is published before ``scan`` or ``trials``."""
-        unknown = sorted(set(config.conditions) - set(CONDITIONS))
-        if unknown:
-            message = f"condition {unknown[0]!r} is unknown. There are: {', '.join(CONDITIONS)}."
-            raise UsageError(message)
         self._cell, self._session, self._config = cell, session, config
         self._output = output or Output(quiet=True)
         self._sent = {} if task_file is None else {"task_file": task_file.data.decode()}
@@ -286,16 +276,11 @@ class Operator:
         all_ = [(s, t) for s in self.start_seeds(config.trials) for t in self._treatments(s)]
         if not config.missing:
             return all_
-        if not config.study_arms:
-            there = {
-                (item["start_id"], item["condition"], item["policy"]) for item in self._recorded()
-            }
-            return [(s, t) for s, t in all_ if (f"{task}/{s}", t.condition, policy) not in there]
-        tried = {
-            (item["start_id"], study_arm_of(item["tags"]), item["policy"])
-            for item in self._recorded()
-        }
-        return [(s, t) for s, t in all_ if (f"{task}/{s}", t.study_arm, policy) not in tried]
+        tried = set()
+        for item in self._recorded():
+            name = study_arm_of(item["tags"]) if config.study_arms else item["condition"]
+            tried.add((item["start_id"], name, item["policy"]))
+        return [(s, t) for s, t in all_ if (f"{task}/{s}", t.name, policy) not in tried]
 
     def start_poses(
         self, start_seed: int, treatment: str, *, retry: bool = False
@@ -325,7 +310,7 @@ class Operator:
         mount = next(item for item in cell.file.cameras.values() if item.moving)
         cell.wait(STILL_S)
         cell.capture()
-        stops = scan_joints(mount, cell.kinematics, joints, ScanConfig())
+        stops = scan_joints(mount, cell.kinematics, joints)
         with self._output.progress("scan", len(stops)) as advance:
             for done, target in enumerate(stops, start=1):
                 self._move(joints, target)
@@ -396,15 +381,15 @@ class Operator:
     def _drive(self, info: EpisodeInfo, controller: Controller) -> Outcome:
         """Let a policy act, and label; a limit that stops it is a failure."""
         cell = self._cell
-        driven = controller.drive(info.id, self._config.max_s)
-        if driven.stopped.startswith(BY_OPERATOR):
+        stopped, problem = controller.drive(info.id, self._config.max_s)
+        if stopped.startswith(BY_OPERATOR):
             self._open = False
             raise StoppedError
         cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
-        if driven.problem:
-            return void_trial(cell.task, driven.problem)
-        outcome = label_trial(cell.world.task, cell.truth, executed=True, remark=driven.stopped)
-        if not driven.stopped:
+        if problem:
+            return void_trial(cell.task, problem)
+        outcome = label_trial(cell.world.task, cell.truth, executed=True, remark=stopped)
+        if not stopped:
             return outcome
         return replace(outcome, result="failure", k=0 if outcome.unit == "trial" else outcome.k)
 

@@ -163,16 +163,6 @@ def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int 
     )
 
 
-def draw_errors(
-    noise: PlannerNoise, count: int, *, start_seed: int, round_: int
-) -> tuple[GraspError, ...]:
-    """Draw an error for each of several objects."""
-    return tuple(
-        draw_error(noise, start_seed=start_seed, round_=round_, index=index)
-        for index in range(count)
-    )
-
-
 def perceive(
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]], noise: PlannerNoise, *, start_seed: int
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
@@ -366,16 +356,10 @@ def _heights_m(
     A stage that carries may say how close over the destination's top the object passes.
     """
     base_m = destination.top_m + below_tool_m
-    near_m = next(
-        (
-            s["clearance_m"]
-            for s in task.stages
-            if s.get("carry") == object_id and "clearance_m" in s
-        ),
-        None,
-    )
-    if near_m is None:
+    near = [s for s in task.stages if s.get("carry") == object_id and "clearance_m" in s]
+    if not near:
         return CARRY_M, base_m + destination.clearance_m
+    near_m = near[0]["clearance_m"]
     return base_m + near_m, base_m + min(near_m, destination.clearance_m)
 
 

@@ -191,9 +191,7 @@ class Renderer:
                 continue
             mine = np.flatnonzero(surface_ids == index)
             if len(mine):
-                u, v = item.texture_axes
-                where = points[mine][:, [u, v]] - np.array(item.texture_shift_m, dtype=np.float32)
-                colors[mine] = item.texture.sample(where)
+                colors[mine] = item.texture.sample(points[mine][:, list(item.texture_axes)])
         return np.asarray(colors)
 
     def _paint(

@@ -1,14 +1,12 @@
 """Where the arm carries the wrist camera during a scan, and how it gets there."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.robots.default import TCP_FRAME
 from bridge.sources.standin.cell_file import CameraMount
-from bridge.sources.standin.kinematics import Kinematics, UnreachablePoseError
+from bridge.sources.standin.kinematics import Kinematics, UnreachablePoseError, minimum_jerk
 
 SAFE_HEIGHT_M = {"forearm_link": 0.12, "wrist_1_link": 0.10, "wrist_2_link": 0.10, TCP_FRAME: 0.09}
 """Lowest allowed height of links above the table, on the way too."""
@@ -23,28 +21,16 @@ LARGEST_MOVE_RAD = 2.4
 """Between neighbouring viewpoints, of any one joint."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScanConfig:
-    """The dome of viewpoints over the table."""
-
-    center_m: tuple[float, float, float] = (0.49, 0.0, 0.02)
-    """What the camera circles."""
-    rings: tuple[tuple[float, float, int], ...] = (
-        (1.35, 0.50, 5),
-        (1.05, 0.46, 11),
-        (0.80, 0.44, 15),
-        (0.58, 0.42, 14),
-    )
-    """Elevation [rad], distance [m] and number of viewpoints of each ring."""
-    aim_spread_m: float = 0.13
-    """How far the point looked at wanders along the table, so that its ends are seen as well."""
+CENTER_M = (0.49, 0.0, 0.02)
+"""What the camera circles."""
+RINGS = ((1.35, 0.50, 5), (1.05, 0.46, 11), (0.80, 0.44, 15), (0.58, 0.42, 14))
+"""Elevation [rad], distance [m] and number of viewpoints of each ring."""
+AIM_SPREAD_M = 0.13
+"""How far the point looked at wanders along the table, so that its ends are seen as well."""
 
 
 def scan_joints(
-    mount: CameraMount,
-    kinematics: Kinematics,
-    joints_start_rad: Float[np.ndarray, "6"],
-    config: ScanConfig,
+    mount: CameraMount, kinematics: Kinematics, joints_start_rad: Float[np.ndarray, "6"]
 ) -> list[Float[np.ndarray, "6"]]:
     """Find joints for each viewpoint that can be reached safely from the one before.
 
@@ -55,7 +41,7 @@ def scan_joints(
     ) @ kinematics.T_base_tcp(joints_start_rad)
     T_camera_tcp = se3.invert(mount.T_parent_camera) @ T_parent_tcp
     joints, found = joints_start_rad, []
-    for T_base_camera in viewpoints(config):
+    for T_base_camera in viewpoints():
         reached = _reach(T_base_camera, T_camera_tcp, kinematics, joints)
         if reached is not None:
             found.append(reached)
@@ -63,15 +49,15 @@ def scan_joints(
     return found
 
 
-def viewpoints(config: ScanConfig) -> list[Float[np.ndarray, "4 4"]]:
+def viewpoints() -> list[Float[np.ndarray, "4 4"]]:
     """Camera poses ring by ring, turning back at the end of each ring so that moves stay short."""
     poses = []
-    for ring, (elevation, distance, count) in enumerate(config.rings):
+    for ring, (elevation, distance, count) in enumerate(RINGS):
         # Azimuth 0 is the far side of the table, where the arm cannot look back from.
         azimuths = np.linspace(-2.6, 2.6, count) + np.pi
         for k, azimuth in enumerate(azimuths[:: -1 if ring % 2 else 1]):
-            wander = config.aim_spread_m * np.array([0.35 * (-1) ** k, np.sin(2.4 * k), 0.0])
-            target = np.array(config.center_m) + wander
+            wander = AIM_SPREAD_M * np.array([0.35 * (-1) ** k, np.sin(2.4 * k), 0.0])
+            target = np.array(CENTER_M) + wander
             out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) * np.cos(elevation)
             eye = target + distance * (out + np.array([0.0, 0.0, np.sin(elevation)]))
             up = np.array([0.0, 0.0, 1.0]) if elevation < 1.5 else np.array([1.0, 0.0, 0.0])
@@ -127,6 +113,5 @@ def joint_move(
     # The minimum-jerk law peaks at 15/8 of its mean speed.
     duration_s = max(1.875 * largest / max_speed_rad_s, 0.1)
     s = np.linspace(0.0, 1.0, max(round(duration_s / 0.04), 2) + 1)
-    law = s**3 * (10 - 15 * s + 6 * s**2)
     times = np.rint(s * duration_s * 1e9).astype(np.int64)
-    return times, start_rad + law[:, None] * (end_rad - start_rad)
+    return times, start_rad + minimum_jerk(s)[:, None] * (end_rad - start_rad)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bridge.clock import AnchoredClock
 from bridge.episode import topics
-from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.errors import BridgeError
 from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
@@ -88,7 +88,6 @@ class StandinSource:
             topics.PLAN_PATH,
             topics.EVENT,
         )
-        soft = [key for key, model in task.objects.items() if model.soft is not None]
         return (
             *(topics.cell_topic(cell, ending) for ending in of_cell),
             *(
@@ -97,7 +96,7 @@ class StandinSource:
                 for ending in endings
             ),
             *(topics.object_topic(topics.TRUTH, key, "pose") for key in task.objects),
-            *(topics.object_topic(topics.TRUTH, key, "nodes") for key in soft),
+            *(topics.object_topic(topics.TRUTH, key, "nodes") for key in task.soft_objects),
             TRUTH_PARAMETERS,
             topics.TF,
             topics.TF_STATIC,
@@ -114,10 +113,8 @@ class StandinSource:
 def _summary(
     operator: Operator, config: SessionConfig, task_name: str, *, stopped: bool
 ) -> dict[str, Any]:
-    counts: dict[str, Counter[str]] = {}
     objects: dict[str, dict[str, int]] = {}
     for info, outcome in operator.results:
-        counts.setdefault(_treatment(info), Counter())[outcome.result] += 1
         if outcome.unit == "object":
             sums = objects.setdefault(_treatment(info), {"k": 0, "n": 0})
             sums["k"], sums["n"] = sums["k"] + outcome.k, sums["n"] + outcome.n
@@ -127,18 +124,18 @@ def _summary(
         "task": task_name,
         "seed": config.seed,
         "scan": operator.scanned,
-        "outcomes": {condition: dict(counter) for condition, counter in counts.items()},
+        "outcomes": _counts(operator.results),
         "objects": objects,
-        "retries": _retry_counts(operator),
+        "retries": _counts(operator.retries),
         "unknown": {i.id: o.detail for i, o in operator.results if o.result == "unknown"},
         "stopped": stopped,
     }
 
 
-def _retry_counts(operator: Operator) -> dict[str, dict[str, int]]:
-    """Per treatment, how new starts after a failed execution ended; in no count of trials."""
+def _counts(attempts: list[tuple[EpisodeInfo, Outcome]]) -> dict[str, dict[str, int]]:
+    """Per treatment, how attempts ended; new starts after a failure are in no count of trials."""
     counts: dict[str, Counter[str]] = {}
-    for info, outcome in operator.retries:
+    for info, outcome in attempts:
         counts.setdefault(_treatment(info), Counter())[outcome.result] += 1
     return {treatment: dict(counter) for treatment, counter in counts.items()}
 

@@ -82,6 +82,7 @@ class SessionConfig:
     def __post_init__(self) -> None:
         """Refuse numbers and words that no session can have."""
         _refuse_other("--planner", (self.planner,), PLANNERS)
+        _refuse_other("--conditions", self.conditions, CONDITIONS)
         _refuse_other("--study-arms", self.study_arms, tuple(CONDITION_OF))
         if "control" in self.study_arms and self.coin is None:
             raise UsageError("the arm control needs --coin, the chance of yes to each plan.")

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from bridge.clock import split_ns
-from bridge.episode import schema
+from bridge.episode import schema, topics
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -21,25 +21,6 @@ from bridge.episode.cdr.messages import (
     string_to_cdr,
     transforms_to_cdr,
 )
-from bridge.episode.topics import (
-    COLOR_IMAGE,
-    DEPTH_IMAGE,
-    EVENT,
-    GRIPPER_STATE,
-    JOINT_STATES,
-    PLAN,
-    PLAN_PATH,
-    PLAN_TRAJECTORY,
-    ROBOT_DESCRIPTION,
-    TCP_POSE,
-    TF,
-    TF_STATIC,
-    TRUTH,
-    camera_topic,
-    cell_topic,
-    object_topic,
-    type_of_topic,
-)
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.robots.default import ARM_JOINTS, BASE_FRAME
@@ -48,7 +29,7 @@ from bridge.task.plan import Plan
 from bridge.task.record import check_record
 from bridge.wire.qos import Qos
 
-TRUTH_PARAMETERS = cell_topic(TRUTH, "/parameters")
+TRUTH_PARAMETERS = topics.cell_topic(topics.TRUTH, "/parameters")
 
 
 @runtime_checkable
@@ -68,6 +49,9 @@ class Session(Protocol):
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask and wait."""
+
+    def subscribe(self, key_expression: str, callback: Any) -> Any:
+        """Receive what matches."""
 
 
 def color_frame(camera_id: str) -> str:
@@ -93,14 +77,14 @@ class Streams:
     def _put(self, topic: str, data: bytes, stamp_ns: int, type_name: str | None = None) -> None:
         publisher = self._publishers.get(topic)
         if publisher is None:
-            known = type_name or type_of_topic(topic)
+            known = type_name or topics.type_of_topic(topic)
             publisher = self._session.publisher(topic, known or schema.STRING, qos=Qos.RELIABLE)
             self._publishers[topic] = publisher
         publisher.put(data, source_ns=stamp_ns)
 
     def description(self, urdf: str, stamp_ns: int) -> None:
         """Publish the robot's URDF."""
-        self._put(ROBOT_DESCRIPTION, string_to_cdr(urdf), stamp_ns)
+        self._put(topics.ROBOT_DESCRIPTION, string_to_cdr(urdf), stamp_ns)
 
     def camera_poses(
         self, poses: Mapping[str, Float[np.ndarray, "4 4"]], stamp_ns: int, *, static: bool
@@ -113,7 +97,7 @@ class Streams:
             for camera_id, T in poses.items()
         ]
         if items:
-            self._put(TF_STATIC if static else TF, transforms_to_cdr(items), stamp_ns)
+            self._put(topics.TF_STATIC if static else topics.TF, transforms_to_cdr(items), stamp_ns)
 
     def depth_frames(self, camera_ids: Iterable[str], stamp_ns: int) -> None:
         """Publish that depth is aligned: each depth frame coincides with its colour frame."""
@@ -126,15 +110,14 @@ class Streams:
             )
             for camera_id in camera_ids
         ]
-        self._put(TF_STATIC, transforms_to_cdr(items), stamp_ns)
+        self._put(topics.TF_STATIC, transforms_to_cdr(items), stamp_ns)
 
     def camera_info(self, camera_id: str, camera: Camera, stamp_ns: int) -> None:
         """Publish the intrinsics of colour and (aligned) depth."""
         for stream, frame in (("color", color_frame(camera_id)), ("depth", depth_frame(camera_id))):
             info = CameraInfo(stamp_ns=stamp_ns, frame_id=frame, camera=camera)
-            self._put(
-                camera_topic(self._cell, camera_id, f"/{stream}/info"), info.to_cdr(), stamp_ns
-            )
+            topic = topics.camera_topic(self._cell, camera_id, f"/{stream}/info")
+            self._put(topic, info.to_cdr(), stamp_ns)
 
     def frame(
         self,
@@ -151,9 +134,9 @@ class Streams:
             data=encode_jpeg(image_u8),
         )
         depth = DepthImage(stamp_ns=stamp_ns, frame_id=depth_frame(camera_id), depth_mm=depth_mm)
-        prefix = camera_topic(self._cell, camera_id)
-        self._put(f"{prefix}{COLOR_IMAGE}", color.to_cdr(), stamp_ns)
-        self._put(f"{prefix}{DEPTH_IMAGE}", depth.to_cdr(), stamp_ns)
+        prefix = topics.camera_topic(self._cell, camera_id)
+        self._put(f"{prefix}{topics.COLOR_IMAGE}", color.to_cdr(), stamp_ns)
+        self._put(f"{prefix}{topics.DEPTH_IMAGE}", depth.to_cdr(), stamp_ns)
 
     def joints(
         self,
@@ -167,12 +150,12 @@ class Streams:
             stamp_ns=stamp_ns, names=ARM_JOINTS, position=position, velocity=velocity, effort=effort
         )
         self._latest_joints = sample.to_cdr(), stamp_ns
-        self._put(cell_topic(self._cell, JOINT_STATES), *self._latest_joints)
+        self._put(topics.cell_topic(self._cell, topics.JOINT_STATES), *self._latest_joints)
 
     def joints_again(self) -> None:
         """Publish the latest joint states once more: time stands still, and so does the arm."""
         if self._latest_joints is not None:
-            self._put(cell_topic(self._cell, JOINT_STATES), *self._latest_joints)
+            self._put(topics.cell_topic(self._cell, topics.JOINT_STATES), *self._latest_joints)
 
     def gripper(self, width_m: float, stamp_ns: int) -> None:
         """Publish the distance between the pads."""
@@ -183,12 +166,12 @@ class Streams:
             velocity=np.zeros(0),
             effort=np.zeros(0),
         )
-        self._put(cell_topic(self._cell, GRIPPER_STATE), sample.to_cdr(), stamp_ns)
+        self._put(topics.cell_topic(self._cell, topics.GRIPPER_STATE), sample.to_cdr(), stamp_ns)
 
     def tcp(self, T_base_tcp: Float[np.ndarray, "4 4"], stamp_ns: int) -> None:
         """Publish the controller's own forward kinematics."""
         sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_tcp)
-        topic = cell_topic(self._cell, TCP_POSE)
+        topic = topics.cell_topic(self._cell, topics.TCP_POSE)
         self._put(topic, sample.to_cdr(), stamp_ns, schema.POSE_STAMPED)
 
     def truth_object(
@@ -196,14 +179,14 @@ class Streams:
     ) -> None:
         """Publish a true pose, for tests and the evaluator's perception metrics only."""
         sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_object)
-        self._put(object_topic(TRUTH, object_id, "pose"), sample.to_cdr(), stamp_ns)
+        self._put(topics.object_topic(topics.TRUTH, object_id, "pose"), sample.to_cdr(), stamp_ns)
 
     def truth_nodes(
         self, object_id: str, points_m: Float[np.ndarray, "num_points 3"], stamp_ns: int
     ) -> None:
         """Publish where the points of a soft object really are, in ``base_link``."""
         sample = PointCloudSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, points_m=points_m)
-        self._put(object_topic(TRUTH, object_id, "nodes"), sample.to_cdr(), stamp_ns)
+        self._put(topics.object_topic(topics.TRUTH, object_id, "nodes"), sample.to_cdr(), stamp_ns)
 
     def truth_parameters(self, record: Mapping[str, Any], stamp_ns: int) -> None:
         """Publish the hidden parameters as JSON text, under truth only."""
@@ -211,20 +194,24 @@ class Streams:
 
     def plan(self, plan: Plan, stamp_ns: int) -> None:
         """Publish a plan: the authority, and two forms of it for viewers."""
-        self._put(cell_topic(self._cell, PLAN), plan.to_json(), stamp_ns)
+        self._put(topics.cell_topic(self._cell, topics.PLAN), plan.to_json(), stamp_ns)
         times = [waypoint.t_ns for waypoint in plan.tau]
         joints = np.array([waypoint.joints_rad for waypoint in plan.tau], dtype=np.float64)
         trajectory = joint_trajectory_to_cdr(
             stamp_ns=stamp_ns, names=plan.joint_names, times_ns=times, positions_rad=joints
         )
-        self._put(cell_topic(self._cell, PLAN_TRAJECTORY), trajectory, stamp_ns)
-        self._put(cell_topic(self._cell, PLAN_PATH), _path_json(plan, stamp_ns), stamp_ns)
+        self._put(topics.cell_topic(self._cell, topics.PLAN_TRAJECTORY), trajectory, stamp_ns)
+        self._put(
+            topics.cell_topic(self._cell, topics.PLAN_PATH), _path_json(plan, stamp_ns), stamp_ns
+        )
 
     def event(self, kind: str, stamp_ns: int, **fields: Any) -> None:
         """Publish one event; the schema lists the kinds and the fields."""
         record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, **fields}
         check_record(record, name="event", package="bridge.episode")
-        self._put(cell_topic(self._cell, EVENT), json.dumps(record).encode(), stamp_ns)
+        self._put(
+            topics.cell_topic(self._cell, topics.EVENT), json.dumps(record).encode(), stamp_ns
+        )
 
 
 def _path_json(plan: Plan, stamp_ns: int) -> bytes:

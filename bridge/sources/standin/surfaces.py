@@ -16,6 +16,7 @@ from jaxtyping import Float, Int, UInt32
 from scipy.ndimage import gaussian_filter, zoom
 
 from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners
 from bridge.robots.default import FINGER_LINKS
 from bridge.sources.standin.cell_file import Clutter
 from bridge.sources.standin.clutter import CLUTTER
@@ -23,7 +24,7 @@ from bridge.sources.standin.deviations import Deviations, parts_of
 from bridge.sources.standin.world import TABLE_CENTRE_M, TABLE_SIZE_M, LinkShape, true_links
 from bridge.task.meshes.catalogue import ToyMesh, object_mesh, scaled_mesh
 from bridge.task.meshes.toys import Paint
-from bridge.task.task_file import ObjectModel, Task
+from bridge.task.task_file import Task
 
 TABLE_RESOLUTION_M = 0.001
 ROOM_RESOLUTION_M = 0.01
@@ -108,7 +109,10 @@ def _add_patches(
 
 
 def lab_texture(
-    size_m: tuple[float, float], base: tuple[float, float, float], seed: int
+    size_m: tuple[float, float],
+    origin_m: tuple[float, float],
+    base: tuple[float, float, float],
+    seed: int,
 ) -> Texture:
     """Floor or wall: large soft blotches and tile lines, low contrast."""
     rng = np.random.default_rng([8, seed])
@@ -120,7 +124,7 @@ def lab_texture(
     image[::tile] *= 0.7
     image[:, ::tile] *= 0.7
     image = gaussian_filter(np.clip(image, 0, 1), (0.8, 0.8, 0)).astype(np.float32)
-    return Texture(image=image, origin_m=(0.0, 0.0), resolution_m=ROOM_RESOLUTION_M)
+    return Texture(image=image, origin_m=origin_m, resolution_m=ROOM_RESOLUTION_M)
 
 
 CREASE_COSINE = 0.8
@@ -143,7 +147,6 @@ class Surface:
     texture: Texture | None = None
     texture_axes: tuple[int, int] = (0, 1)
     """Which coordinates of the body lie along the texture's columns and rows."""
-    texture_shift_m: tuple[float, float] = (0.0, 0.0)
     paint: Paint | None = None
     """Colour by place in ``paint_vertices_m``; finer than the triangles."""
     paint_vertices_m: Float[np.ndarray, "num_vertices 3"] | None = None
@@ -159,12 +162,11 @@ def box_surface(
     color: tuple[float, float, float],
 ) -> Surface:
     """A box with hard edges, of a body that moves or ("") of the laboratory."""
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     faces = np.array(
         [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     )
     triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
-    return make_surface(body, corners * size_m + centre_m, triangles, color)
+    return make_surface(body, box_corners(size_m) + centre_m, triangles, color)
 
 
 def make_surface(
@@ -198,14 +200,8 @@ def make_surface(
     )
 
 
-@cache
-def robot_surfaces() -> tuple[Surface, ...]:
-    """The arm as published, in light grey with blue caps at its joints' housings."""
-    return tuple(true_robot_surfaces(None))
-
-
-def true_robot_surfaces(deviations: Deviations | None) -> list[Surface]:
-    """The arm as it is; its gripper is dark."""
+def robot_surfaces(deviations: Deviations | None = None) -> list[Surface]:
+    """The arm in light grey with blue caps at its joints' housings; its gripper is dark."""
     surfaces = []
     for link in true_links(deviations):
         for shape in link.shapes:
@@ -225,6 +221,7 @@ _LINK_COLORS = {
 }
 
 
+@cache
 def _shape_surface(body: str, shape: LinkShape, color: tuple[float, float, float]) -> Surface:
     if shape.box_m is not None:
         return box_surface(body, shape.T_link_shape[:3, 3], np.array(shape.box_m), color)
@@ -240,7 +237,7 @@ def object_surfaces(task: Task, deviations: Deviations | None = None) -> list[Su
     own = {} if deviations is None else deviations.objects
     for object_id, model in task.objects.items():
         if model.mesh is not None:
-            surfaces.append(_painted_surface(model))
+            surfaces.append(_mesh_surface(object_id, object_mesh(model), model.soft is not None))
             continue
         red, green, blue = (channel / 255 for channel in model.color_srgb)
         for part in parts_of(model, own.get(object_id)):
@@ -248,12 +245,7 @@ def object_surfaces(task: Task, deviations: Deviations | None = None) -> list[Su
     return surfaces
 
 
-def _painted_surface(model: ObjectModel) -> Surface:
-    surface = _mesh_surface(model.id, object_mesh(model))
-    return replace(surface, soft=model.soft is not None)
-
-
-def _mesh_surface(body: str, mesh: ToyMesh) -> Surface:
+def _mesh_surface(body: str, mesh: ToyMesh, soft: bool = False) -> Surface:
     """A closed mesh with smooth normals, painted."""
     vertices = mesh.vertices_m.astype(np.float32)
     return Surface(
@@ -264,6 +256,7 @@ def _mesh_surface(body: str, mesh: ToyMesh) -> Surface:
         color=(0.5, 0.5, 0.5),
         paint=mesh.paint,
         paint_vertices_m=vertices,
+        soft=soft,
     )
 
 
@@ -292,11 +285,10 @@ def clutter_surfaces(clutter: Sequence[Clutter]) -> list[Surface]:
     for item in clutter:
         if item.shape == "box":
             red, green, blue = (channel / 255 for channel in item.color_srgb)
-            box = box_surface("", np.zeros(3), np.array(item.size_m), (red, green, blue))
-            surfaces.append(_placed(box, item.T_base_clutter))
+            surface = box_surface("", np.zeros(3), np.array(item.size_m), (red, green, blue))
         else:
             surface = _mesh_surface("", scaled_mesh(CLUTTER[item.shape], item.size_m))
-            surfaces.append(_placed(surface, item.T_base_clutter))
+        surfaces.append(_placed(surface, item.T_base_clutter))
     return surfaces
 
 
@@ -316,7 +308,7 @@ def lab_surfaces(seed: int, deviations: Deviations | None = None) -> list[Surfac
     top = box_surface(
         "", np.array([*TABLE_CENTRE_M, -z / 2]), np.array(TABLE_SIZE_M), (0.7, 0.56, 0.4)
     )
-    table = _textured(top, texture, (0, 1), (0.0, 0.0))
+    table = replace(top, texture=texture)
     if deviations is not None:
         table = _placed(table, deviations.T_base_table)
     return [table, *_walls(seed)]
@@ -337,15 +329,9 @@ def _walls(seed: int) -> list[Surface]:
     surfaces = []
     for index, ((centre, size, axes), color) in enumerate(zip(walls, colors, strict=True)):
         extents = np.array(size)
-        texture = lab_texture((size[axes[0]], size[axes[1]]), color, seed + index)
         corner = centre - extents / 2
+        of_wall, origin = (size[axes[0]], size[axes[1]]), (corner[axes[0]], corner[axes[1]])
+        texture = lab_texture(of_wall, origin, color, seed + index)
         surface = box_surface("", centre, extents, color)
-        surfaces.append(_textured(surface, texture, axes, (corner[axes[0]], corner[axes[1]])))
+        surfaces.append(replace(surface, texture=texture, texture_axes=axes))
     return surfaces
-
-
-def _textured(
-    surface: Surface, texture: Texture, axes: tuple[int, int], shift_m: tuple[float, float]
-) -> Surface:
-    shift = (float(shift_m[0]), float(shift_m[1]))
-    return replace(surface, texture=texture, texture_axes=axes, texture_shift_m=shift)

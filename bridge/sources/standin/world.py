@@ -4,11 +4,13 @@ import xml.etree.ElementTree as ET
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
 from bridge.robots.default import (
@@ -27,9 +29,9 @@ from bridge.sources.standin.soft import SoftBody, soft_body, soft_model_xml
 from bridge.task.task_file import ObjectModel, Task
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LinkShape:
-    """One solid of a link: a mesh file or a box."""
+    """One solid of a link: a mesh file or a box; itself alone is equal to it."""
 
     T_link_shape: Float[np.ndarray, "4 4"]
     mesh: str | None
@@ -49,12 +51,12 @@ class LinkModel:
     T_parent_link: Float[np.ndarray, "4 4"]
     mass_kg: float
     T_link_inertial: Float[np.ndarray, "4 4"]
-    inertia: tuple[float, float, float, float, float, float]
-    """xx, yy, zz, xy, xz, yz [kg m^2]."""
+    inertia_kgm2: Float[np.ndarray, "3 3"]
     shapes: tuple[LinkShape, ...]
 
 
-def robot_links() -> list[LinkModel]:
+@cache
+def robot_links() -> tuple[LinkModel, ...]:
     """Return every link, parents before children, starting at ``base_link``."""
     root = ET.fromstring(ROBOT.urdf_text())
     elements = {item.attrib["name"]: item for item in root.findall("link")}
@@ -67,7 +69,7 @@ def robot_links() -> list[LinkModel]:
         for item in joints:
             if _child_of(item, "parent") == name:
                 waiting.append((_child_of(item, "child"), item))
-    return links
+    return tuple(links)
 
 
 def _child_of(joint: ET.Element, tag: str) -> str:
@@ -81,6 +83,7 @@ def _link(element: ET.Element, joint: ET.Element | None) -> LinkModel:
     tensor = None if inertial is None else inertial.find("inertia")
     names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
     values = [0.0] * 6 if tensor is None else [float(tensor.attrib[name]) for name in names]
+    xx, yy, zz, xy, xz, yz = values
     axis = None if joint is None else joint.find("axis")
     limit = None if joint is None else joint.find("limit")
     return LinkModel(
@@ -95,7 +98,7 @@ def _link(element: ET.Element, joint: ET.Element | None) -> LinkModel:
         T_parent_link=_origin(joint),
         mass_kg=0.0 if mass is None else float(mass.attrib["value"]),
         T_link_inertial=_origin(inertial),
-        inertia=(values[0], values[1], values[2], values[3], values[4], values[5]),
+        inertia_kgm2=np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
         shapes=tuple(_shapes(element)),
     )
 
@@ -127,28 +130,15 @@ def _origin(element: ET.Element | None) -> Float[np.ndarray, "4 4"]:
     if origin is None:
         return np.eye(4)
     roll, pitch, yaw = _vector(origin.attrib.get("rpy"), (0.0, 0.0, 0.0))
-    q = _multiply(_about(2, yaw), _multiply(_about(1, pitch), _about(0, roll)))
+    q = Rotation.from_euler("xyz", (roll, pitch, yaw)).as_quat(scalar_first=True)
     return se3.transform_from(q, np.array(_vector(origin.attrib.get("xyz"), (0.0, 0.0, 0.0))))
 
 
-def _about(axis: int, angle_rad: float) -> Float[np.ndarray, "4"]:
-    q = np.zeros(4)
-    q[0], q[1 + axis] = np.cos(angle_rad / 2), np.sin(angle_rad / 2)
-    return q
-
-
-def _multiply(a: Float[np.ndarray, "4"], b: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
-    """Hamilton product of two wxyz quaternions."""
-    w = a[0] * b[0] - a[1:] @ b[1:]
-    return np.concatenate([[w], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
-
-
-def true_links(deviations: Deviations | None) -> list[LinkModel]:
+def true_links(deviations: Deviations | None) -> tuple[LinkModel, ...]:
     """Return every link as it is, not as the URDF describes it; both agree without deviations."""
-    links = robot_links()
     if deviations is None:
-        return links
-    return [_true_link(link, deviations) for link in links]
+        return robot_links()
+    return tuple(_true_link(link, deviations) for link in robot_links())
 
 
 def _true_link(link: LinkModel, deviations: Deviations) -> LinkModel:
@@ -197,21 +187,17 @@ _ROBOT_BITS = {"contype": 1, "conaffinity": 2}
 _WORLD_BITS = {"contype": 2, "conaffinity": 3}
 
 
-def step_s_of(task: Task) -> float:
-    """Return the length of one physics step of a task [s]."""
-    return SOFT_STEP_S if task.soft_objects else STEP_S
-
-
 def build_model(task: Task, hidden: HiddenParameters, clutter: Sequence[Clutter] = ()) -> Any:
     """Compile the laboratory with its true parameters into an ``mjModel``."""
     if task.soft_objects:
         spec = mujoco.MjSpec.from_string(soft_model_xml(task, hidden))
+        spec.option.timestep = SOFT_STEP_S
         # The only integrator that takes the elasticity of flexes.
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     else:
         spec = mujoco.MjSpec()
+        spec.option.timestep = STEP_S
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.timestep = step_s_of(task)
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0  # friction held stiffly: no creep of a grasped object
     spec.compiler.degree = False
@@ -246,8 +232,7 @@ def _set_inertia(body: Any, link: LinkModel) -> None:
     p = link.T_link_inertial[:3, 3]
     if link.mass_kg > 0:
         R = link.T_link_inertial[:3, :3]
-        xx, yy, zz, xy, xz, yz = link.inertia
-        tensor = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
+        tensor = R @ link.inertia_kgm2 @ R.T
         body.mass, body.ipos = link.mass_kg, p
         body.fullinertia = [
             tensor[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -257,26 +242,20 @@ def _set_inertia(body: Any, link: LinkModel) -> None:
 
 
 def _add_joint(body: Any, link: LinkModel, deviations: Deviations | None) -> None:
-    if link.joint_type == "revolute":
-        drag_Nm = 0.0
-        if deviations is not None and link.joint in ARM_JOINTS:
-            drag_Nm = deviations.joint_drag_Nm[ARM_JOINTS.index(link.joint)]
-        body.add_joint(
-            name=link.joint,
-            type=mujoco.mjtJoint.mjJNT_HINGE,
-            axis=link.axis,
-            range=link.limits,
-            armature=ARM_ARMATURE,
-            frictionloss=drag_Nm,
-        )
-    elif link.joint_type == "prismatic":
-        body.add_joint(
-            name=link.joint,
-            type=mujoco.mjtJoint.mjJNT_SLIDE,
-            axis=link.axis,
-            range=link.limits,
-            armature=FINGER_ARMATURE,
-        )
+    if link.joint_type == "fixed":
+        return
+    turns = link.joint_type == "revolute"
+    drag_Nm = 0.0
+    if deviations is not None and link.joint in ARM_JOINTS:
+        drag_Nm = deviations.joint_drag_Nm[ARM_JOINTS.index(link.joint)]
+    body.add_joint(
+        name=link.joint,
+        type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=link.axis,
+        range=link.limits,
+        armature=ARM_ARMATURE if turns else FINGER_ARMATURE,
+        frictionloss=drag_Nm,
+    )
 
 
 def _add_shape(
@@ -323,7 +302,7 @@ def _add_object(spec: Any, model: ObjectModel, hidden: HiddenParameters) -> None
             type=mujoco.mjtGeom.mjGEOM_BOX,
             pos=part.centre_m,
             quat=part.q_wxyz,
-            size=_half(part.size_m),
+            size=part.size_m / 2,
             mass=mass,
             priority=1,
             condim=4,
@@ -348,21 +327,9 @@ def _add_clutter(spec: Any, item: Clutter, index: int) -> None:
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=p,
         quat=q,
-        size=_half(np.array(item.size_m)),
+        size=np.array(item.size_m) / 2,
         **_WORLD_BITS,
     )
-
-
-def standing_clutter(clutter: Sequence[Clutter], hidden: HiddenParameters) -> tuple[Clutter, ...]:
-    """What stands about as published, on the plane z = 0, where it stands on the true table."""
-    if hidden.deviations is None:
-        return tuple(clutter)
-    T = hidden.deviations.T_base_table
-    return tuple(replace(item, T_base_clutter=T @ item.T_base_clutter) for item in clutter)
-
-
-def _half(size: Float[np.ndarray, "3"]) -> list[float]:
-    return [float(extent) / 2 for extent in size]
 
 
 def _add_actuators(spec: Any, hidden: HiddenParameters) -> None:
@@ -393,15 +360,15 @@ class World:
     ) -> None:
         """Build the model and stand still with the gripper open.
 
-        ``task`` is then the one with the objects' true sizes.
+        ``task`` is then the one with the objects' true sizes, and ``clutter`` on the true table.
         """
         if hidden.deviations is not None:
             task = hidden.deviations.true_task(task)
-            clutter = standing_clutter(clutter, hidden)
-        self.task = task
-        self.step_s = step_s_of(task)
-        self._hidden = hidden
+            T = hidden.deviations.T_base_table
+            clutter = [replace(item, T_base_clutter=T @ item.T_base_clutter) for item in clutter]
+        self.task, self.clutter = task, clutter
         self._model: Any = build_model(task, hidden, clutter)
+        self.step_s = float(self._model.opt.timestep)
         self._data: Any = mujoco.MjData(self._model)
         self._arm = [self._joint_address(name) for name in ARM_JOINTS]
         self._fingers = [self._joint_address(name) for name in FINGER_JOINTS]
@@ -409,14 +376,13 @@ class World:
         self._links = [link.name for link in robot_links() if link.shapes]
         self._finger_geoms = {int(self._model.geom(f"{name}_0").id) for name in FINGER_LINKS}
         own = {} if hidden.deviations is None else hidden.deviations.objects
-        self._object_geoms = {
-            object_id: {
-                int(self._model.geom(f"{object_id}_{index}").id)
-                for index in range(len(parts_of(model, own.get(object_id))))
-            }
+        self._objects = {
+            int(self._model.geom(f"{object_id}_{index}").id): object_id
             for object_id, model in task.objects.items()
             if model.soft is None
+            for index in range(len(parts_of(model, own.get(object_id))))
         }
+        """By the geoms of rigid ones."""
         self._soft: dict[str, SoftBody] = {
             object_id: soft_body(task.objects[object_id], self._model)
             for object_id in task.soft_objects
@@ -546,14 +512,9 @@ class World:
         """Per object: whether a finger touches it now."""
         touched = dict.fromkeys(self.task.objects, False)
         contacts = self._data.contact
-        for pair, flexes in zip(contacts.geom, contacts.flex, strict=True):
-            for finger, flex in ((pair[0], flexes[1]), (pair[1], flexes[0])):
-                if finger in self._finger_geoms and flex in self._flexes:
-                    touched[self._flexes[int(flex)]] = True
-        for first, second in contacts.geom:
-            for object_id, geoms in self._object_geoms.items():
-                if (first in geoms and second in self._finger_geoms) or (
-                    second in geoms and first in self._finger_geoms
-                ):
-                    touched[object_id] = True
+        for pair, flexes in zip(contacts.geom.tolist(), contacts.flex.tolist(), strict=True):
+            for finger, geom, flex in ((*pair, flexes[1]), (*pair[::-1], flexes[0])):
+                name = self._objects.get(geom) or self._flexes.get(flex)
+                if name and finger in self._finger_geoms:
+                    touched[name] = True
         return touched

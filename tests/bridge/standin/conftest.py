@@ -62,6 +62,9 @@ class FakeSession:
             return json.dumps(self.gate(request)).encode()
         raise NoReplyError(key=key, timeout_s=timeout_s)
 
+    def subscribe(self, key_expression: str, callback: object) -> None:
+        """Nobody else sends."""
+
     def of(self, ending: str) -> list[Sent]:
         return [item for item in self.sent if item.topic.endswith(ending)]
 

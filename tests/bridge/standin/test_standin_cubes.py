@@ -11,7 +11,7 @@ from standin_plans import planned
 
 from bridge.data_files import dataset_file
 from bridge.geometry import se3
-from bridge.sources.standin.cell import CellConfig, StandinCell
+from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.destination import destination_of
 from bridge.sources.standin.kinematics import tool_down
@@ -152,7 +152,7 @@ def test_a_plan_that_leaves_the_block_runs_into_it_and_fails(
     cell.reset(task.draw_start(np.random.default_rng(SEED)))
     cell.wait(0.2)
     plan = planned(task, cell.world.Ts_base_object())
-    cell.truth.clear()
+    cell.truth = TruthLog()
     execute_plan(cell, plan)
     moved_m = np.linalg.norm(np.ptp(np.array(cell.truth.poses["block"])[:, :2, 3], axis=0))
     assert moved_m > 0.01

@@ -163,7 +163,9 @@ def test_each_object_has_its_own_error_and_the_first_keeps_the_old_one(
     toys_cell: CellFile,
 ) -> None:
     noise = toys_cell.noise_for("five_ducks_into_basket")
-    errors = planner.draw_errors(noise, 5, start_seed=SEED, round_=1)
+    errors = [
+        planner.draw_error(noise, start_seed=SEED, round_=1, index=index) for index in range(5)
+    ]
     assert errors[0] == planner.draw_error(noise, start_seed=SEED, round_=1)
     assert len({error.along_m for error in errors}) == 5
     assert noise.release_m < toys_cell.noise_for("sloth_into_basket").release_m
