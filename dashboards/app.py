@@ -27,7 +27,7 @@ from dashboards.errors import NotHereError
 from dashboards.guard import Admission, Guard
 from dashboards.library import Library, derived_path, episode_path, scene_stamps
 from dashboards.loading import LOADING
-from dashboards.overview_page import build_overview, neighbours
+from dashboards.overview_page import build_overview
 from dashboards.review_routes import review_routes
 from dashboards.study_routes import StudyPages
 from evaluator.review_index import SHOW, Selection
@@ -63,7 +63,7 @@ def create_app(
         Route("/episode/{id}/scene.jpg", pages.scene_picture),
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
-        *pages.reviews(),
+        *pages.reviews,
         *pages.studies.routes(),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
@@ -152,12 +152,9 @@ class Pages:
         """Remember the runs and load the templates."""
         self._library = library
         self._environment = _environment()
-        self.studies = StudyPages(
-            self._run,
-            self._page,
-            self._part,
-            live,
-        )
+        self.studies = StudyPages(self._run, self._page, self._part, live)
+        self.reviews = review_routes(self._run, self._page)
+        """``/queue``, ``/label`` and ``/reviews``: which trial first, labels, what raters said."""
 
     def _part(self, name: str, state: object) -> str:
         return self._environment.get_template(f"live_{name}.html").render(state=state)
@@ -199,7 +196,9 @@ class Pages:
         judgement = judge(run)
         page = build_page(run, episode_id, judgement.row(episode_id), _seconds(request))
         selection = Selection.of(request.query_params)
-        before, after = neighbours(judgement, selection, episode_id)
+        index = judgement.index
+        around = None if index is None else index.neighbours(selection, episode_id)
+        before, after = around or (None, None)
         return self._page(
             "episode.html",
             request,
@@ -269,10 +268,6 @@ class Pages:
     def derived_file(self, request: Request) -> Response:
         """``/derived/<file>/file``: a derived episode."""
         return _download(derived_path(self._run(request), request.path_params["name"]))
-
-    def reviews(self) -> list[Route]:
-        """``/queue``, ``/label`` and ``/reviews``: which trial first, labels, what raters said."""
-        return review_routes(self._run, self._page)
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

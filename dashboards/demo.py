@@ -317,16 +317,14 @@ def _record_trials(
     output: Output,
 ) -> None:
     connect, logs = ["--connect", endpoint], run.notes_dir / "logs"
-    gate_log, planner_log = logs / "gate.log", logs / "plan.log"
     left = [(each, len(set(missing) & set(each.trials(config)))) for each in groups_of(config)]
     with ExitStack() as stack:
-        gate = stack.enter_context(running(["gate", str(run.path), *connect], gate_log))
-        gate.wait_until(lambda: "ready" in gate_log.read_text(errors="replace"))
+        watch = running(["gate", str(run.path), *connect], logs / "gate.log", "ready")
+        gate = stack.enter_context(watch)
         there = [recorder, gate]
         if any(count and group.policy != BUILT_IN_POLICY for group, count in left):
             live = ["plan", str(run.path), "--live", *connect]
-            planner = stack.enter_context(running(live, planner_log))
-            planner.wait_until(lambda: "ready" in planner_log.read_text(errors="replace"))
+            planner = stack.enter_context(running(live, logs / "plan.log", "ready"))
             there.append(planner)
         for group, count in left:
             if not count:
@@ -404,13 +402,15 @@ def start_command(
 
 
 @contextmanager
-def running(arguments: list[str], log: Path) -> Iterator[Background]:
-    """Leave a command running while the context lasts."""
+def running(arguments: list[str], log: Path, words: str = "") -> Iterator[Background]:
+    """Leave a command running while the context lasts, which begins when it has said something."""
     with ExitStack() as stack, log.open("wb") as stream:
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
         process = start_command(arguments, stdout=stream, stderr=subprocess.STDOUT, env=environment)
         stack.callback(stop_command, process)
-        yield Background(command=f"robot-gst {' '.join(arguments)}", process=process, log=log)
+        started = Background(command=f"robot-gst {' '.join(arguments)}", process=process, log=log)
+        started.wait_until(lambda: words in log.read_text(errors="replace"))
+        yield started
 
 
 def answers(endpoint: str, key: str) -> bool:

@@ -57,21 +57,21 @@ class FailuresPage:
     """Everything the template needs."""
 
     selection: FailureSelection
-    kinds: tuple[Kind, ...]
-    num_kinds: int
-    count: int
-    """Failures selected."""
-    of: int
-    """Failures in the run."""
-    num_trials: int
-    only_motions: bool
-    """Whether the run holds imported motions and not one trial."""
-    facets: tuple[Facet, ...]
-    failed: tuple[tuple[str, str, int], ...]
-    """Value, words and number of each choice of who failed."""
-    page: int
-    pages: int
     can_film: bool
+    kinds: tuple[Kind, ...] = ()
+    num_kinds: int = 0
+    count: int = 0
+    """Failures selected."""
+    of: int = 0
+    """Failures in the run."""
+    num_trials: int = 0
+    only_motions: bool = False
+    """Whether the run holds imported motions and not one trial."""
+    facets: tuple[Facet, ...] = ()
+    failed: tuple[tuple[str, str, int], ...] = ()
+    """Value, words and number of each choice of who failed."""
+    page: int = 1
+    pages: int = 1
 
 
 def build_failures(
@@ -80,20 +80,7 @@ def build_failures(
     """Gather one screen of failures."""
     index = judgement.index
     if index is None:
-        return FailuresPage(
-            selection=selection,
-            kinds=(),
-            num_kinds=0,
-            count=0,
-            of=0,
-            num_trials=0,
-            only_motions=False,
-            facets=(),
-            failed=(),
-            page=1,
-            pages=1,
-            can_film=can_film(),
-        )
+        return FailuresPage(selection=selection, can_film=can_film())
     groups = index.failure_groups(selection)
     count = sum(group.count for group in groups)
     is_alone = len(groups) == 1

@@ -92,7 +92,8 @@ def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
         stamp_ns: Source time of the wanted instant [ns].
     """
     track = _track_of(path, camera_id)
-    message = _find(Episode.open(path), track, track.nearest(stamp_ns))
+    index = track.nearest(stamp_ns)
+    _, message = next(_in_one_pass(path, track, index, index), (index, None))
     if message is None:
         text = f"{path.name} changed while it was read; reload the page."
         raise NotHereError(text)
@@ -168,15 +169,6 @@ def _in_one_pass(
         place = places.get(message.publish_time_ns)
         if place is not None:
             yield place, message
-
-
-def _find(episode: Episode, track: CameraTrack, index: int) -> RawMessage | None:
-    """The image of a track's frame."""
-    log_ns = track.log_times_ns[index]
-    for message in episode.messages([track.topic], start_ns=log_ns, end_ns=log_ns + 1):
-        if message.publish_time_ns == track.stamps_ns[index]:
-            return message
-    return None
 
 
 def media_type(data: bytes, path: Path) -> str:

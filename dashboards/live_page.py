@@ -207,7 +207,7 @@ class LiveFeed:
                     self._stay()
             except WireError as error:
                 self._problem = str(error)
-                self._pause(RETRY_S)
+                self._changed.wait(RETRY_S)
         with self._lock:  # a picture of a session that is over is not live
             self._heard = _Heard() if self._viewers == 0 else self._heard
 
@@ -215,7 +215,7 @@ class LiveFeed:
         """Hear until nobody looks, or until the recorder falls silent."""
         opened_s = self._now_s()
         while self._is_watched():
-            self._pause(0.25)
+            self._changed.wait(0.25)
             with self._lock:
                 last_s = max(opened_s, self._heard.status_s)
             if self._now_s() - last_s > QUIET_S:
@@ -224,9 +224,6 @@ class LiveFeed:
                     f"{self._recorder!r} says anything there."
                 )
                 return
-
-    def _pause(self, seconds: float) -> None:
-        self._changed.wait(seconds)
 
     def _hear_status(self, sample: WireSample) -> None:
         record = _json_of(sample)

@@ -347,19 +347,6 @@ class Overview:
     is_being_read: bool
 
 
-def neighbours(
-    judgement: Judgement, selection: Selection, episode_id: str
-) -> tuple[str | None, str | None]:
-    """Return the trials before and after one in the filtered list.
-
-    Args:
-        episode_id: The trial in question; outside the list it has no neighbours.
-    """
-    if judgement.index is None:
-        return None, None
-    return judgement.index.neighbours(selection, episode_id)
-
-
 def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -> Overview:
     """Gather the first page of one run.
 

@@ -100,11 +100,6 @@ class QueuePage:
     problems: tuple[str, ...]
 
 
-def rank(row: TrialRow) -> int:
-    """Place a trial among ``REASONS``, 0 first."""
-    return severity(row)[0]
-
-
 def recorded_trials(judgement: Judgement) -> list[TrialRow]:
     """Return the trials that have a recording to look at: wrong yes, wrong no, undecided, the rest.
 
@@ -133,7 +128,7 @@ def build_queue(
     rows = recorded_trials(judgement)
     chosen = {
         "": rows,
-        "wrong_yes": [row for row in rows if rank(row) == 0],
+        "wrong_yes": [row for row in rows if severity(row)[0] == 0],
         "disagree": [row for row in rows if row.agrees is False],
         "diverged": sorted(
             (row for row in rows if row.distance_m is not None),
@@ -153,7 +148,7 @@ def build_queue(
         items=tuple(
             QueueItem(
                 row=row,
-                reason=REASONS[rank(row)],
+                reason=REASONS[severity(row)[0]],
                 distance_m=row.distance_m,
                 moment=(moment := moment_of(run, row)),
                 moment_t_s=None if moment is None else _page_t_s(run, row, moment),

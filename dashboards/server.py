@@ -62,16 +62,14 @@ def listen(config: DashboardConfig) -> socket.socket:
             config.host, config.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
         listener = socket.socket(family, kind, protocol)
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(address)
+            listener.listen(64)
+        except OSError:
+            listener.close()
+            raise
     except OSError as error:
-        raise AddressTakenError(
-            host=config.host, port=config.port, reason=error.strerror or str(error)
-        ) from error
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
-        listener.listen(64)
-    except OSError as error:
-        listener.close()
         raise AddressTakenError(
             host=config.host, port=config.port, reason=error.strerror or str(error)
         ) from error
@@ -101,7 +99,8 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
     text = f"Dashboard: {address.url}\nFrom another computer: {address.ssh_line}\nStop with Ctrl-C."
     record = {"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}
     others = set(threading.enumerate())
-    threading.Thread(target=_ask_ahead, args=(library,), daemon=True).start()
+    # The evaluator reads the first run while the reader is still opening the page.
+    threading.Thread(target=judge, args=(library.pick(None),), daemon=True).start()
     app.state.studies.is_ending = lambda: server.should_exit
     with listener, _ending_on_signals(server):
         output.result(record, text)
@@ -124,11 +123,6 @@ def _are_at_work(threads: set[threading.Thread]) -> bool:
     for thread in threads:
         thread.join(max(0.0, ends_s - time.monotonic()))
     return any(thread.is_alive() for thread in threads)
-
-
-def _ask_ahead(library: Library) -> None:
-    """Let the evaluator read the first run while the reader is still opening the page."""
-    judge(library.pick(None))
 
 
 @contextmanager

@@ -94,10 +94,6 @@ class TrialsConfig:
         """How each policy that acts is opened, by its name."""
         return dict(each.split("=", 1) for each in self.policies if "=" in each)
 
-    def names(self) -> tuple[str, ...]:
-        """What the policies are called, each once."""
-        return tuple(dict.fromkeys(each.split("=", 1)[0] for each in self.policies))
-
 
 DEMO_TASKS = ("cube_into_box", "cube_on_block")
 """Two, so that the correlation over groups is defined."""

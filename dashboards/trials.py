@@ -158,7 +158,7 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
         )
         for file in files.values()
     )
-    first, *others = config.names()
+    first, *others = dict.fromkeys(each.split("=", 1)[0] for each in config.policies)
     policies = (
         PolicyArms(policy=first, arms=("without",) if first in config.acting() else config.arms),
         *(PolicyArms(policy=each, arms=("without",)) for each in others),
@@ -403,24 +403,22 @@ def _laboratory(
     logs.mkdir(parents=True, exist_ok=True)
     connect = ["--connect", endpoint]
     with ExitStack() as stack:
+        there: list[Background] = []
 
-        def start(name: str, arguments: list[str]) -> tuple[Background, Path]:
+        def start(name: str, arguments: list[str], words: str = "") -> Background:
             log = logs / f"{name}_{index}.log"
-            return stack.enter_context(running(arguments, log)), log
+            there.append(stack.enter_context(running(arguments, log, words)))
+            return there[-1]
 
         own = ["--listen", endpoint, "--shares-folder"]  # each job numbers its own episodes
-        recorder, _ = start("record", ["record", str(run.path), *own])
+        recorder = start("record", ["record", str(run.path), *own])
         recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
-        there = [recorder]
-        gate, gate_log = start("gate", ["gate", str(run.path), *connect])
-        gate.wait_until(lambda: "gate ready" in gate_log.read_text(errors="replace"))
-        there.append(gate)
+        start("gate", ["gate", str(run.path), *connect], "gate ready")
         if {job.policy for job in jobs} - {BUILT_IN_POLICY, *config.acting()}:
             model = ["--model", config.model, "--model-name", config.model_name]
             asking = model if config.model else []
-            planner, log = start("plan", ["plan", str(run.path), "--live", *connect, *asking])
-            planner.wait_until(lambda: "planner ready" in log.read_text(errors="replace"))
-            there.append(planner)
+            live = ["plan", str(run.path), "--live", *connect, *asking]
+            start("plan", live, "planner ready")
         yield endpoint, there
 
 
@@ -438,9 +436,8 @@ def _try(
     with ExitStack() as stack:
         if job.policy in config.acting():
             own = [*acting_command(run.path, config, job.policy), "--cell", CELL]
-            heard = log.with_suffix(".policy.log")
-            runner = stack.enter_context(running([*own, "--connect", endpoint], heard))
-            runner.wait_until(lambda: "policy ready" in heard.read_text(errors="replace"))
+            own += ["--connect", endpoint]
+            stack.enter_context(running(own, log.with_suffix(".policy.log"), "policy ready"))
         stream = stack.enter_context(log.open("wb"))
         process = start_command(arguments, stdout=stream, stderr=subprocess.STDOUT)
         try:
@@ -455,15 +452,9 @@ def _try(
         raise StepFailedError(command=command, code=process.returncode, log=log)
 
 
-def planner_of(policy: str, config: TrialsConfig) -> str:
-    """Whom the cell asks: its own planner, one on the wire, or who acts."""
-    if policy in config.acting():
-        return "policy"
-    return "built_in" if policy == BUILT_IN_POLICY else "wire"
-
-
 def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
-    """The command that tries one start."""
+    """The command that tries one start; its cell asks its own planner, who acts, or the wire."""
+    asked = {BUILT_IN_POLICY: "built_in", **dict.fromkeys(config.acting(), "policy")}
     options: dict[str, Any] = {
         "--connect": endpoint,
         "--task": job.chosen,
@@ -471,7 +462,7 @@ def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
         "--first-start": job.start,
         "--first-trial": job.first_trial,
         "--trials": 1,
-        "--planner": planner_of(job.policy, config),
+        "--planner": asked.get(job.policy, "wire"),
         "--policy": job.policy,
         "--rounds": config.rounds,
         "--study-seed": config.study_seed,

@@ -140,7 +140,7 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
 
 
 def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:
-    temporary = path.with_name(_final_name(path) + TEMPORARY)
+    temporary = path.with_name(path.name.removesuffix(PART) + TEMPORARY)
     temporary.unlink(missing_ok=True)  # of a recovery that was killed; the lock is ours
     tally = RecoveryTally()
     target: CopyTarget | None = None
@@ -179,7 +179,7 @@ def _prove(path: Path) -> None:
 def _keep_original(path: Path) -> Path | None:
     if not path.name.endswith(PART):
         return path
-    kept = path.with_name(_final_name(path) + ".damaged")
+    kept = path.with_name(path.name.removesuffix(PART) + ".damaged")
     try:
         if not kept.exists():
             kept.hardlink_to(path)
@@ -200,14 +200,10 @@ def _replace(path: Path, temporary: Path) -> Path:
 
 
 def _publish(part_path: Path) -> Path:
-    output = _free_name(part_path.with_name(_final_name(part_path)), taken=False)
+    output = _free_name(part_path.with_name(part_path.name.removesuffix(PART)), taken=False)
     part_path.rename(output)
     sync_folder(output.parent)
     return output
-
-
-def _final_name(path: Path) -> str:
-    return path.name.removesuffix(PART)
 
 
 def _free_name(path: Path, *, taken: bool) -> Path:

@@ -160,10 +160,6 @@ class RunFolder:
             message = f"no episodes in {self.path}. Record some: robot-gst record {self.path}."
             raise UsageError(message)
 
-    def parts(self, path: Path) -> list[Path]:
-        """All files of the episode that begins with this one, in order."""
-        return part_paths(path)
-
     def derived(self, pattern: str = "*") -> list[Path]:
         """Derived episode files, in name order."""
         names = (n for n in file_names(self.derived_dir) if fnmatchcase(n, pattern + SUFFIX))

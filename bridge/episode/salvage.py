@@ -107,8 +107,6 @@ class CopyTarget:
                 self._take_message(found)
             case AttachmentSpan():
                 self._take_attachment(found)
-            case _:
-                pass
 
     def _without_contradictions(self, found: CutChunk) -> tuple[bytes, Contents]:
         """Leave out definitions that no CRC proves and that others contradict."""

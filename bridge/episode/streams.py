@@ -332,9 +332,7 @@ def recorded_robot(episode: Episode) -> Robot:
 
 def robot_description(episode: Episode) -> str | None:
     """Return the URDF text, from ``/robot_description`` or the attachment ``robot.urdf``."""
-    for message in episode.messages(
-        topic for topic in episode.topics() if topic == ROBOT_DESCRIPTION
-    ):
+    for message in episode.messages([ROBOT_DESCRIPTION]):
         return string_from_cdr(message.data)
     attached = episode.attachment("robot.urdf")
     return None if attached is None else attached.decode()

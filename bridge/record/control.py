@@ -81,7 +81,6 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
     begun: list[metadata.EpisodeInfo] = []
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "start", {"id", "info", "anyway", "task_file"})
         info = parse_info(request.get("id"), request.get("info", {}))
         task = parse_task_file(request.get("task_file"))
         info = replace(info, tags=tuple(dict.fromkeys((*info.tags, *_ask_policy(session, info)))))
@@ -92,19 +91,13 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         return answer
 
     def stop(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "stop", {"outcome", "discard"})
         outcome = parse_outcome(request.get("outcome"))
         for info in begun:
             _ask_policy(session, info, {"over": info.id, "by": "operator"})
         begun.clear()
         return recorder.stop(outcome=outcome, discard=request.get("discard") is True)
 
-    def mark(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "mark", {"text"})
-        return recorder.mark(_text(request))
-
     def label(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "label", {"text", "outcome", "episode"})
         episode = request.get("episode")
         return recorder.label(
             text=_text(request),
@@ -113,36 +106,23 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         )
 
     def snapshot(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "snapshot", {"id", "info", "task_file"})
         info = parse_info(request.get("id"), request.get("info", {}))
         return recorder.snapshot(info, parse_task_file(request.get("task_file")))
 
-    def pause(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "pause", set())
-        return recorder.pause()
-
-    def resume(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "resume", set())
-        return recorder.resume()
-
-    def list_(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "list", {"last"})
-        return recorder.episodes(_whole_number(request, "last", MAX_LISTED))
-
-    verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
-        "start": start,
-        "stop": stop,
-        "mark": mark,
-        "label": label,
-        "pause": pause,
-        "resume": resume,
-        "snapshot": snapshot,
-        "list": list_,
-        "status": lambda request: recorder.status(),
+    verbs: dict[str, tuple[set[str] | None, Callable[[dict[str, Any]], dict[str, Any]]]] = {
+        "start": ({"id", "info", "anyway", "task_file"}, start),
+        "stop": ({"outcome", "discard"}, stop),
+        "mark": ({"text"}, lambda request: recorder.mark(_text(request))),
+        "label": ({"text", "outcome", "episode"}, label),
+        "pause": (set(), lambda request: recorder.pause()),
+        "resume": (set(), lambda request: recorder.resume()),
+        "snapshot": ({"id", "info", "task_file"}, snapshot),
+        "list": ({"last"}, lambda request: recorder.episodes(_whole_number(request, "last"))),
+        "status": (None, lambda request: recorder.status()),
     }
     return [
-        session.serve(control_key(recorder.config.recorder, verb), _json_handler(verb, act))
-        for verb, act in verbs.items()
+        session.serve(control_key(recorder.config.recorder, verb), _json_handler(verb, *how))
+        for verb, how in verbs.items()
     ]
 
 
@@ -171,7 +151,7 @@ def _ask_policy(
 
 
 def _json_handler(
-    verb: str, act: Callable[[dict[str, Any]], dict[str, Any]]
+    verb: str, known: set[str] | None, act: Callable[[dict[str, Any]], dict[str, Any]]
 ) -> Callable[[bytes], bytes]:
     def handler(payload: bytes) -> bytes:
         try:
@@ -180,6 +160,8 @@ def _json_handler(
             raise ControlError(f"{verb}: the request is not JSON ({error}).") from error
         if not isinstance(request, dict):
             raise ControlError(f"{verb}: the request must be a JSON object, got {request!r:.80}.")
+        if known is not None:
+            _only(request, verb, known)
         return json.dumps(act(request)).encode()
 
     return handler
@@ -193,10 +175,12 @@ def _only(request: dict[str, Any], verb: str, known: set[str]) -> None:
         )
 
 
-def _whole_number(request: dict[str, Any], name: str, most: int) -> int:
-    number = request.get(name, most)
-    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= most:
-        raise ControlError(f"{name} must be a whole number from 1 to {most}, got {number!r:.80}.")
+def _whole_number(request: dict[str, Any], name: str) -> int:
+    number = request.get(name, MAX_LISTED)
+    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= MAX_LISTED:
+        raise ControlError(
+            f"{name} must be a whole number from 1 to {MAX_LISTED}, got {number!r:.80}."
+        )
     return number
 
 

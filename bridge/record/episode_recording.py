@@ -133,12 +133,15 @@ class Channels:
         if encoding not in ("", known.message_encoding if known else "cdr"):
             return _name_only(type_name, encoding), False
         type_hash = sample.type_hash if sample.type_hash.startswith(HASH_PREFIX) else ""
-        newest = _newest_hash(type_name, self._msg_folder) if type_hash else None
+        newest = None
+        with contextlib.suppress(MissingDependencyError):
+            newest = type_hash_of(type_name, folder=self._msg_folder) if type_hash else None
         if known is not None and newest in (None, type_hash):
             return known, False
-        found = _from_ros(type_name, type_hash, self._msg_folder)
-        if found is not None:
-            return found, False
+        with contextlib.suppress(MissingDependencyError):
+            found = ros_schema(type_name, type_hash=type_hash, folder=self._msg_folder)
+            if found is not None:
+                return found, False
         is_first = not type_hash or self._hashes.setdefault(type_name, type_hash) == type_hash
         if newest is None and is_first:
             return _name_only(type_name, encoding), False
@@ -147,20 +150,6 @@ class Channels:
 
 def _name_only(name: str, encoding: str) -> schema.Schema:
     return schema.Schema(name=name, schema_encoding="", message_encoding=encoding, data=b"")
-
-
-def _newest_hash(type_name: str, folder: Path | None) -> str | None:
-    try:
-        return type_hash_of(type_name, folder=folder)
-    except MissingDependencyError:
-        return None
-
-
-def _from_ros(type_name: str, type_hash: str, folder: Path | None) -> schema.Schema | None:
-    try:
-        return ros_schema(type_name, type_hash=type_hash, folder=folder)
-    except MissingDependencyError:
-        return None
 
 
 class EpisodeRecording:

@@ -63,10 +63,8 @@ def stamp_reader(record: schema.Schema | None) -> Callable[[bytes], int | None] 
 
     For messages that came without an attachment: ``header.stamp`` of a ROS 2 type.
     """
-    if record is None:
-        return None
-    if record.schema_encoding == "ros2msg" and codec.begins_with_header(record.data):
-        return _header_stamp_ns
+    if record is not None and record.schema_encoding == "ros2msg":
+        return _header_stamp_ns if codec.begins_with_header(record.data) else None
     return None
 
 
@@ -109,11 +107,7 @@ def _inspect_json(newest: int, data: bytes) -> MessageState:
         record = json.loads(data)
     except (ValueError, RecursionError):
         return MessageState.UNDECODABLE
-    if not isinstance(record, dict):
-        return MessageState.UNDECODABLE
-    version = record.get("schema_version", 1)
+    version = record.get("schema_version", 1) if isinstance(record, dict) else None
     if not isinstance(version, int):
         return MessageState.UNDECODABLE
-    if version > newest:
-        return MessageState.NEWER_VERSION
-    return GOOD
+    return MessageState.NEWER_VERSION if version > newest else GOOD

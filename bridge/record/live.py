@@ -26,7 +26,7 @@ from bridge.record.errors import FolderTakenError
 from bridge.record.presence import Heartbeat, PresenceMonitor
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
-from bridge.record.ros2 import watch_ros2
+from bridge.record.ros2 import Ros2Graph
 from bridge.task.task_file import TaskFile
 from bridge.wire import rmw
 from bridge.wire.clocks import ALIVE
@@ -220,7 +220,7 @@ class LiveRecorder:
             for key in config.topics
         ]
         self._departures = PublisherLiveliness(session, core)
-        self._graph = watch_ros2(session, core, config.msg_folder)
+        self._graph = Ros2Graph(session, core, config.msg_folder)
         core.also_tell("ros2_warnings", self._graph.warnings)
         core.also_tell("clocks", core.clocks.status)
         core.also_tell("receive_errors", lambda: session.receive_errors)

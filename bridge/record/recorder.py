@@ -306,11 +306,7 @@ class Recorder:
 
     def forget(self, prefix: str, but: tuple[str, ...] = ()) -> None:
         """Repeat no latched message of topics that begin so: their publisher has gone."""
-
-        def act(command: Command) -> None:
-            self._life.latched.forget(prefix, but)
-
-        self.input_queue.put_command(Command(action=act, received_ns=0, is_barrier=False))
+        self._aside(lambda command: self._life.latched.forget(prefix, but))
 
     def note_recovered(self, reports: list[Answer]) -> None:
         """Show in the status what was found cut off when the recorder began."""

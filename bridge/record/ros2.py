@@ -33,10 +33,16 @@ class Receiver(Protocol):
 
 
 class Ros2Graph:
-    """The ROS 2 endpoints on the network, followed from their liveliness tokens."""
+    """The ROS 2 endpoints on the network, followed from their liveliness tokens until ``close``."""
 
-    def __init__(self, session: WireSession, recorder: Receiver, msg_folder: Path | None) -> None:
-        """Use ``watch_ros2``."""
+    def __init__(
+        self, session: WireSession, recorder: Receiver, msg_folder: Path | None = None
+    ) -> None:
+        """Begin to follow.
+
+        Subscribe to the topics first: what is published meanwhile then arrives twice rather than
+        not at all, and the second copy is left out or counted as repeated.
+        """
         self._session = session
         self._recorder = recorder
         self._msg_folder = msg_folder
@@ -144,17 +150,6 @@ class Ros2Graph:
                 )
         except MissingDependencyError as error:
             self._warn(str(error))
-
-
-def watch_ros2(
-    session: WireSession, recorder: Receiver, msg_folder: Path | None = None
-) -> Ros2Graph:
-    """Follow the ROS 2 endpoints on the network until ``close``.
-
-    Subscribe to the topics first: what is published meanwhile then arrives twice rather than not
-    at all, and the second copy is left out or counted as repeated.
-    """
-    return Ros2Graph(session, recorder, msg_folder)
 
 
 def _cache_keys(endpoint: rmw.RosEndpoint) -> tuple[str, str]:

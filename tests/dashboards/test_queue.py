@@ -19,7 +19,7 @@ from bridge.exchange.reviews import Review
 from bridge.media.color import decode_color
 from dashboards import queue_page
 from dashboards.comparison import judge
-from dashboards.queue_page import build_queue, moment_of, rank, recorded_trials, thumbnail
+from dashboards.queue_page import build_queue, moment_of, recorded_trials, thumbnail
 from evaluator.review_index import severity
 
 CARRIED_NS = 2_800_000_000
@@ -54,7 +54,7 @@ def test_a_wrong_yes_comes_before_a_wrong_no_and_far_before_near(shared_run: Run
     assert [each.episode for each in recorded_trials(found)] == [
         *("wrong_yes", "wrong_no", "nobody", "far", "near")
     ]
-    assert [rank(each) for each in recorded_trials(found)] == [0, 1, 2, 3, 3]
+    assert [severity(each)[0] for each in recorded_trials(found)] == [0, 1, 2, 3, 3]
     flag = [Review(trial_id="near", rater="Ann", result="unrated", flag=True)]
     shown = {
         show: [

@@ -177,7 +177,7 @@ def test_a_model_is_named_to_the_planner_and_to_nothing_else(
     started: list[list[str]] = []
 
     @contextmanager
-    def running(arguments: list[str], _: Path) -> Iterator[Started]:
+    def running(arguments: list[str], *_: object) -> Iterator[Started]:
         started.append(arguments)
         yield Started()
 

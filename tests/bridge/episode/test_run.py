@@ -24,14 +24,14 @@ def test_a_split_episode_is_listed_once_and_all_its_parts_are_found(tmp_path: Pa
     names = [run_folder.part_name("t1", index) for index in range(1, 12)]
     run = run_with(tmp_path, *reversed(names), "t2.mcap")
     assert listed(run) == ["t1.mcap", "t2.mcap"]
-    assert [path.name for path in run.parts(run.episodes()[0])] == names
-    assert run.parts(run.episodes()[1]) == [run.episodes()[1]]
+    assert [path.name for path in run_folder.part_paths(run.episodes()[0])] == names
+    assert run_folder.part_paths(run.episodes()[1]) == [run.episodes()[1]]
 
 
 def test_parts_behind_a_missing_one_go_with_their_episode(tmp_path: Path) -> None:
     run = run_with(tmp_path, "t1.mcap", "t1.3.mcap", "t1.4.mcap", "t2.10.mcap", "t2.2.mcap")
     assert listed(run) == ["t1.mcap", "t2.2.mcap"]
-    found = [[path.name for path in run.parts(first)] for first in run.episodes()]
+    found = [[path.name for path in run_folder.part_paths(first)] for first in run.episodes()]
     assert found == [["t1.mcap", "t1.3.mcap", "t1.4.mcap"], ["t2.2.mcap", "t2.10.mcap"]]
 
 
@@ -41,7 +41,8 @@ def test_parts_behind_a_missing_one_go_with_their_episode(tmp_path: Path) -> Non
 def test_a_name_that_only_looks_like_a_part_stands_for_itself(tmp_path: Path, name: str) -> None:
     run = run_with(tmp_path, "t1.mcap", "a.b.mcap", name)
     assert name in listed(run)
-    assert [part.name for path in run.episodes() for part in run.parts(path)] == listed(run)
+    parts = [part.name for path in run.episodes() for part in run_folder.part_paths(path)]
+    assert parts == listed(run)
 
 
 def test_files_of_takes_still_open_are_no_episodes(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.record.recorder import Recorder
-from bridge.record.ros2 import Ros2Graph, watch_ros2
+from bridge.record.ros2 import Ros2Graph
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSample, WireSession, open_session
 
@@ -66,7 +66,7 @@ class Cell:
 
     def listen(self) -> Ros2Graph:
         self.session.subscribe("**", self.receive)
-        self.graph = watch_ros2(self.session, self)
+        self.graph = Ros2Graph(self.session, self)
         return self.graph
 
     def robot(self, *arguments: str) -> Robot:
