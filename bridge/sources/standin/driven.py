@@ -100,6 +100,9 @@ class Controller:
                 looked_ns = cell.now_ns
                 if all_hold(evaluate_success(cell.world.task, cell.truth.rollout())) is True:
                     break
+                ended = self._ask()["ended"] if fresh_ns is None else {}
+                if ended.get("stopped") or ended.get("problem"):
+                    break
             ahead_s = (cell.now_ns - began_ns) * 1e-9 - (time.monotonic() - began_s)
             time.sleep(max(ahead_s, 0.0))
         return ""
