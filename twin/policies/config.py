@@ -31,7 +31,7 @@ class RolloutConfig:
     cell: str = ""
     """Act in this cell instead, in every trial of the policy that is started at the recorder
     (robot-gst ctl start --policy NAME), until that trial is ended."""
-    connect: tuple[str, ...] = LOOPBACK
+    connect: Annotated[tuple[str, ...], RARE] = LOOPBACK
     """With --cell: where the recorder listens."""
     check: bool = False
     """Send one recorded start, explain the answer, and move nothing."""

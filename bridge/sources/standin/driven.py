@@ -23,9 +23,8 @@ HOLD_NS, STOP_NS = ns_from_s(0.2), ns_from_s(1.0)
 """Without a fresh target for so long the arm is held, and the trial stopped; the cell's clock."""
 FIRST_NS = ns_from_s(30.0)
 """A policy may load before its first target."""
-LOOK_NS = ns_from_s(0.5)
-"""How often the operator looks whether the task is done."""
-ASK_S = 10.0
+LOOK_NS, ASK_S = ns_from_s(0.5), 10.0
+"""How often the operator looks whether the task is done, and how long a runner may be silent."""
 BY_OPERATOR = "operator"
 """How it begins what stopped a trial whose episode a person ended."""
 LAG_TICKS = round(ns_from_s(0.3) / TICK_NS)

@@ -36,15 +36,14 @@ class SessionConfig:
     """Leave out so many starts of the session: one that is tried alone is the same start."""
     conditions: tuple[str, ...] = CONDITIONS
     """without_replanning, with_replanning or both."""
-    first_trial: int | None = None
+    first_trial: Annotated[int | None, RARE] = None
     """Number of the first trial's episode; without it the run's numbering goes on."""
     missing: Annotated[bool, RARE] = False
     """Record only the trials of which the recorder has none yet with the same task, start,
     condition and policy: completes a session that was interrupted."""
     planner: str = BUILT_IN
-    """Who plans: built_in (scripted, careless); wire, whoever answers on the cell's service plan
-    (robot-gst plan RUN --live); or policy: nobody, and the targets of a policy are followed
-    (robot-gst rollout RUN --cell)."""
+    """Who plans: built_in (scripted, careless), wire (robot-gst plan RUN --live), or policy,
+    whose targets are followed instead (robot-gst rollout RUN --cell)."""
     policy: str = ""
     """How it plans; empty: perturbed for the built-in planner, nominal for one on the wire."""
     max_s: Annotated[float, RARE] = 30.0
