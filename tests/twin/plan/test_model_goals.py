@@ -31,6 +31,7 @@ from twin.gate import twin_process
 from twin.plan import once
 from twin.plan.config import PlanConfig
 from twin.plan.constrain.relations import constraint_of, predicate_of
+from twin.plan.ground.picture import marked_picture
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
 from twin.robot.model import load_robot
@@ -69,6 +70,20 @@ def looking_down(problem: Problem) -> RgbdFrame:
         T_base_color=T,
         T_base_depth=T,
     )
+
+
+def test_only_what_the_camera_measured_is_marked_and_where_it_is() -> None:
+    problem = problem_of_test()
+    frame = looking_down(problem)
+    shown = marked_picture(problem, [frame])
+    assert shown is not None
+    assert {point.obj for point in shown.keypoints.values()} == {*problem.scene.Ts_base_object}
+    for point in shown.keypoints.values():
+        p_base = se3.apply(problem.scene.Ts_base_object[point.obj], point.p_object_m[None])
+        (u, v), z = (x[0] for x in frame.color_camera.project(p_base * (1, -1, -1) - (0.5, 0, -1)))
+        assert frame.depth_m[int(v), int(u)] == pytest.approx(z, abs=0.012)
+    hand = replace(frame, depth_m=np.full_like(frame.depth_m, 0.3))  # held before the lens
+    assert marked_picture(problem, [hand]) is None
 
 
 def problem_about(task: Task) -> Problem:

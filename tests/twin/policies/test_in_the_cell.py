@@ -23,6 +23,7 @@ from bridge.episode.topics import POLICY_TARGETS
 from bridge.record.control import RecorderClient
 from bridge.robots.default import ARM_JOINTS
 from bridge.robots.robot import GRIPPER_WIDTH
+from bridge.sources.standin.driven import HOLD_NS, STOP_NS
 from bridge.sources.standin.session import run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.terminal import Output
@@ -183,8 +184,9 @@ def test_the_cell_holds_without_a_fresh_target_and_then_stops(laboratory: Labora
         session.serve("standin/policy/mine", lambda _: json.dumps(about).encode())
         session.subscribe("standin/joint_states", on_joints)
         _, episode, label, moved = laboratory.trial(max_s=30.0)
+    assert (HOLD_NS, STOP_NS) == (200_000_000, 1_000_000_000)  # as docs/policies.md says
     assert label == "unknown: watchdog: no fresh target for 1 s"
     track = streams.joint_track(episode)
-    quiet = track.stamps_ns > sent[-1] + 450_000_000  # 0.2 s, and what a message takes
+    quiet = track.stamps_ns > sent[-1] + HOLD_NS + 250_000_000  # which a message may take
     assert 0.02 < moved < 0.1  # within the period of 0.5 s it was held
     assert np.ptp(track.position[quiet, 0]) < 0.005

@@ -55,8 +55,7 @@ def marked_picture(problem: Problem, frames: Sequence[RgbdFrame]) -> MarkedPictu
 
     def shown(view: tuple[RgbdFrame, Mapping[str, _Seen]]) -> tuple[int, float]:
         """How many objects, and how large."""
-        extents = (float(np.ptp(each.outline_px, axis=0).prod()) for each in view[1].values())
-        return sum(len(each.points_m) > 0 for each in view[1].values()), sum(extents)
+        return len(view[1]), sum(np.ptp(e.outline_px, axis=0).prod() for e in view[1].values())
 
     frame, seen = max(views, key=shown)
     if not seen:
@@ -74,9 +73,10 @@ def _views(problem: Problem, frame: RgbdFrame) -> dict[str, _Seen]:
     for key, T in problem.scene.Ts_base_object.items():
         points = se3.apply(T, surface_points(problem, key, CANDIDATES))
         pixels, is_seen = _pixels(frame.color_camera, frame.T_base_color, points)
-        if not is_seen.any():
+        measured = points[is_seen & _measured(frame, points)]
+        if not len(measured):  # out of sight
             continue
-        marks = spread_points(points[is_seen & _measured(frame, points)], MARKS)
+        marks = spread_points(measured, MARKS)
         found[key] = _Seen(
             outline_px=_hull(pixels),
             points_m=se3.apply(se3.invert(T), marks),
