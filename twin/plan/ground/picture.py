@@ -20,9 +20,8 @@ from twin.plan.problem import Problem
 from twin.plan.release.obstacles import spread_points
 
 LONG_SIDE_PX = 1280
-MARKS = 5
+MARKS, CANDIDATES = 5, 400
 """Of one object."""
-CANDIDATES = 400
 SEEN_M = 0.012
 """A point is seen where the depth image measured its distance to within this."""
 _FONT_PX, _MARK_PX, _AWAY_PX = 22, 6, 36
@@ -55,7 +54,8 @@ def marked_picture(problem: Problem, frames: Sequence[RgbdFrame]) -> MarkedPictu
 
     def shown(view: tuple[RgbdFrame, Mapping[str, _Seen]]) -> tuple[int, float]:
         """How many objects, and how large."""
-        return len(view[1]), sum(np.ptp(e.outline_px, axis=0).prod() for e in view[1].values())
+        areas = [np.ptp(each.outline_px, axis=0).prod() for each in view[1].values()]
+        return len(areas), float(sum(areas))
 
     frame, seen = max(views, key=shown)
     if not seen:
