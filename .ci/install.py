@@ -207,7 +207,7 @@ def install(stage: str, *, much: bool) -> int:
     started = time.monotonic()
     fetched = settings is not None and run([*beside, str(TEMPORARY / "uv"), "uv"])
     fetched = fetched and run(uv, settings)
-    done = fetched or run([*pip, *wanted])
+    done = fetched or run([*pip, *(() if much else ("--quiet",)), *wanted])
     if stage == "demo" and done:
         say("Compiling the extension modules, a minute or two")
         tools = [tool for tool in BUILD_TOOLS if not is_installed(tool.split(">")[0])]
