@@ -227,7 +227,7 @@ def _who_acted(contents: RunContents) -> Iterator[tuple[str, str, str]]:
     """Who acted under which policy's name, in the cell and in the twin."""
     for each in contents.recorded:
         info = each.facts.info
-        yield each.file.name, info.policy, info.checkpoint
+        yield info.id, info.policy, info.checkpoint
     for file in contents.derived:
         told = rollout_of(file)
         if told.get("success") is not None:
