@@ -215,5 +215,5 @@ def test_a_run_is_evaluated_with_its_rollouts(run: RunFolder) -> None:
 def test_another_checkpoint_in_the_cell_ends_the_evaluation(run: RunFolder) -> None:
     write_trial(run, "trial_6", "start 1", tags=("checkpoint:code=other:act map=0123",))
     roll_out_run(run, config("Scripted", max_s=1.0), QUIET)
-    with pytest.raises(UsageError, match=r"policy 'Scripted' is map .* in episodes/trial_6"):
+    with pytest.raises(UsageError, match=r"policy 'Scripted' is map .* in trial_6"):
         compare_run(run)

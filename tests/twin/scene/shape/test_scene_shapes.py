@@ -12,7 +12,6 @@ from bridge.task.meshes.solids import is_closed
 from bridge.task.task_file import load_task
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import LibraryObject, ObjectSplats
 from twin.scene.shape.from_training import masked_view, shapes_of
 from twin.scene.shape.known import pose_of
@@ -68,16 +67,8 @@ def library_object(key: str, shape: ObjectShape | str) -> LibraryObject:
         model=TASK.objects[key],
         splats=ObjectSplats(cloud=cloud, T_base_object=POSES[key]),
         shape=shape,
-        localised=localised(key),
         episode_id="scan_0001",
     )
-
-
-def localised(key: str) -> LocalisedObject:
-    return LocalisedObject(
-        object_id=key, T_base_object=POSES[key], covariance=None, confidence=1.0,
-        method="given", reason=None, stamp_ns=1,
-    )  # fmt: skip
 
 
 def test_the_known_shape_stands_in_with_the_reason(tmp_path: Path) -> None:
