@@ -80,7 +80,6 @@ DEMO = {
 }
 TEST = {
     "ray": (79, 240),
-    "numba": (62, 208),
     "opencv-python-headless": (61, 153),
     "atheris": (35, 110),
     "av": (36, 104),
