@@ -16,6 +16,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Mapping
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -33,18 +34,13 @@ CACHE = TEMPORARY / "cache"
 """Beside .venv, so that uv links a package instead of copying it."""
 UV = ("pip", "install", "--no-config", "--python", sys.executable, "--cache-dir", str(CACHE))
 BUILD_TOOLS = ("scikit-build-core>=1.0", "nanobind>=2.4", "cmake", "ninja")
-FROM_PIP = {
-    "index-url": "UV_DEFAULT_INDEX",
-    "extra-index-url": "UV_INDEX",
-    "find-links": "UV_FIND_LINKS",
-    "constraint": "UV_CONSTRAINT",
-    "trusted-host": "UV_INSECURE_HOST",
+AS_ENVIRONMENT = {
     "cert": "SSL_CERT_FILE",
     "proxy": "ALL_PROXY",
     "timeout": "UV_HTTP_TIMEOUT",
     "default-timeout": "UV_HTTP_TIMEOUT",
 }
-"""What pip was told, by the name that uv knows it by."""
+"""Settings of pip that uv takes from the environment; the others are its flags, by their names."""
 WITHOUT_EFFECT = {"disable-pip-version-check", "no-cache-dir", "progress-bar", "root-user-action"}
 """Settings of pip that change nothing of what is installed."""
 SELDOM_IMPORTED = (
@@ -153,11 +149,7 @@ def torch_remarks(wheel: Path | None) -> tuple[str, ...]:
 
 def local_torch() -> Path | None:
     """Find a wheel of the wanted torch in the folders that pip looks into."""
-    config = subprocess.run(
-        [sys.executable, "-m", "pip", "config", "list"], capture_output=True, text=True, check=False
-    ).stdout
-    folders = " ".join(re.findall(r"find-links='([^']*)'", config)).replace("\\n", " ").split()
-    for folder in folders:
+    for folder in settings_of_pip().get("find-links", ()):
         place = Path(folder.removeprefix("file://"))
         tag = f"cp{sys.version_info.major}{sys.version_info.minor}"
         found = sorted(place.glob(f"torch-{torch_version()}*-{tag}-*.whl"))
@@ -201,11 +193,10 @@ def install(stage: str, *, much: bool) -> int:
     pip = [sys.executable, "-m", "pip", "install", "--no-compile", "--disable-pip-version-check"]
     pip += ["-c", "constraints.txt"]
     beside = [*pip, "--quiet", "--target"]
-    wanted, settings = requirements(EXTRAS[stage]), settings_of_pip() if much else None
-    uv = [str(TEMPORARY / "uv" / "bin" / "uv"), *UV, *wanted]
+    wanted, (flags, settings) = requirements(EXTRAS[stage]), settings_for_uv()
+    uv = [str(TEMPORARY / "uv" / "bin" / "uv"), *UV, *flags, *wanted]
     started = time.monotonic()
-    fetched = settings is not None and run([*beside, str(TEMPORARY / "uv"), "uv"])
-    fetched = fetched and run(uv, settings)
+    fetched = much and run([*beside, str(TEMPORARY / "uv"), "uv"]) and run(uv, settings)
     done = fetched or run([*pip, *(() if much else ("--quiet",)), *wanted])
     if stage == "demo" and done:
         say("Compiling the extension modules, a minute or two")
@@ -226,21 +217,29 @@ def install(stage: str, *, much: bool) -> int:
     return 0
 
 
-def settings_of_pip() -> dict[str, str] | None:
-    """Say for uv where pip was told to look; None if pip was told what uv is not asked for."""
+def settings_for_uv() -> tuple[list[str], dict[str, str]]:
+    """Hand on what pip was told; where uv does not know a flag it fails, and pip goes on."""
+    flags = ["--constraint", "constraints.txt", "--index-strategy", "unsafe-best-match"]
+    environment = {}
+    for name, values in settings_of_pip().items():
+        if name in AS_ENVIRONMENT:
+            environment[AS_ENVIRONMENT[name]] = " ".join(values)
+        elif name not in WITHOUT_EFFECT:
+            flags += [word for value in values for word in (f"--{name}", value)]
+    return flags, environment
+
+
+@cache
+def settings_of_pip() -> dict[str, list[str]]:
+    """Read what pip was told for an install, by files and, which is stronger, the environment."""
     told = [sys.executable, "-m", "pip", "config", "list"]
     lines = subprocess.run(told, capture_output=True, text=True, check=False).stdout.splitlines()
-    found = {"UV_CONSTRAINT": "constraints.txt", "UV_INDEX_STRATEGY": "unsafe-best-match"}
-    for key, _, value in (line.partition("=") for line in lines):
-        scope, _, name = key.rpartition(".")
-        if scope not in {"global", "install", ":env:"} or name in WITHOUT_EFFECT:
-            continue
-        if name not in FROM_PIP:
-            return None
-        places = ast.literal_eval(value).split()
-        if name == "constraint":
-            places.insert(0, found["UV_CONSTRAINT"])
-        found[FROM_PIP[name]] = " ".join(places)
+    found: dict[str, list[str]] = {}
+    for strength in ("global", "install", ":env:"):
+        for key, _, value in (line.partition("=") for line in lines):
+            scope, _, name = key.rpartition(".")
+            if scope == strength:
+                found[name] = ast.literal_eval(value).split()
     return found
 
 
