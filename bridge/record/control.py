@@ -83,11 +83,14 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
     def start(request: dict[str, Any]) -> dict[str, Any]:
         info = parse_info(request.get("id"), request.get("info", {}))
         task = parse_task_file(request.get("task_file"))
-        info = replace(info, tags=tuple(dict.fromkeys((*info.tags, *_ask_policy(session, info)))))
+        who_acts = _ask_policy(session, info)
+        info = replace(info, tags=tuple(dict.fromkeys((*info.tags, *who_acts))))
         answer = recorder.start(info, task, anyway=request.get("anyway") is True)
-        told = info.instruction or (task.task().instruction if task else "")
-        about = {"episode": info.id, "instruction": told, "start_seed": info.start_seed}
-        begun[:] = [info] if _ask_policy(session, info, about) else []
+        begun.clear()
+        if who_acts:
+            told = info.instruction or (task.task().instruction if task else "")
+            about = {"episode": info.id, "instruction": told, "start_seed": info.start_seed}
+            begun.extend([info] if _ask_policy(session, info, about) else [])
         return answer
 
     def stop(request: dict[str, Any]) -> dict[str, Any]:
