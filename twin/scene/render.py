@@ -126,8 +126,8 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     episode, camera_id = trial.recorded, camera_of(trial.recorded, config.camera)
     camera = sized_camera(streams.camera_info(episode, camera_id).camera, config.size)
     stamps = _stamps(trial, camera_id, config)
-    _, _, robot = posture_of(trial, int(stamps[0]), config)
-    frames = _frames(run, scene, trial, camera_id, stamps, config)
+    first = posture_of(trial, int(stamps[0]), config)
+    frames = _frames(run, scene, trial, camera_id, stamps, config, first)
     agreement = ImageAgreement() if config.compare and config.is_sequence else None
     meshes = {} if agreement is None else trial.meshes(run)
     recorded = recorded_images(episode, camera_id)
@@ -153,7 +153,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
         "scene_hash": scene.scene_hash,
         "episode": episode.info.id,
         "camera": camera_id,
-        "robot": robot,
+        "robot": first[2],
         "frames": len(frames),
         "frames_without_pose": len(stamps) - len(frames),
         "notes": list(trial.notes),
@@ -206,14 +206,20 @@ def _frames(
     camera_id: str,
     stamps_ns: Int[np.ndarray, " num_stamps"],
     config: RenderConfig,
+    first: tuple[Posture | None, str, str],
 ) -> list[Frame]:
-    """The instants that can be drawn, in the order of time; at least one."""
+    """The instants that can be drawn, in the order of time; at least one.
+
+    Args:
+        first: How the robot stands at the first; with ``--joints`` at all of them.
+    """
     moved = object_places(config.object, list(trial.parts.objects))
     cameras = camera_places(run, scene, trial, camera_id, stamps_ns, config)
     frames = []
     for stamp_ns, T_base_camera in zip(stamps_ns.tolist(), cameras, strict=True):
         if T_base_camera is not None:
-            posture, urdf, _ = posture_of(trial, stamp_ns, config)
+            given = config.joints is not None
+            posture, urdf, _ = first if given else posture_of(trial, stamp_ns, config)
             frames.append(
                 Frame(
                     stamp_ns=stamp_ns,
