@@ -120,6 +120,8 @@ SAME_ENGINE_KEY = "same_engine_as_cell"
 """Among the settings of a replay whose engine moved the cell itself: shown, never counted."""
 SECOND_ENGINE_KEY = "second_engine"
 """Among the settings of a replay beside the one that decides: shown, never counted."""
+ROLLOUT = "rollout"
+"""Kind of a derived episode in which a policy acted in the twin, and where its row lies."""
 
 
 @dataclass(frozen=True, kw_only=True)

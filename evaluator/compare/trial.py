@@ -5,13 +5,12 @@ from dataclasses import dataclass, field, replace
 
 from bridge.episode.catalogue_query import UNLABELLED
 from bridge.episode.executions import NO_PLAN
-from bridge.episode.metadata import NOTHING_EXECUTED, Outcome, treatment_of
+from bridge.episode.metadata import NOTHING_EXECUTED, ROLLOUT, Outcome, treatment_of
 from bridge.exchange.trials_csv import MOST_IN_TRIAL
 from bridge.task.verdict import SAME_ENGINE, is_same_engine
 from evaluator.compare.rows import TrialRow
 from evaluator.result import Exclusion
 from evaluator.run_reader.episodes import (
-    ROLLOUT,
     DerivedFile,
     DerivedIndex,
     RecordedFacts,

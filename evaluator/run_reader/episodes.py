@@ -394,13 +394,9 @@ def _without_seed(derived: metadata.Derived) -> metadata.Derived:
     return replace(derived, settings={**derived.settings, "config": kept})
 
 
-ROLLOUT = "rollout"
-"""Kind of a derived episode in which a policy acted in the twin, and where its row lies."""
-
-
 def rollout_of(file: DerivedFile) -> Mapping[str, Any]:
     """What a rollout says of itself: policy, task, start, number, success and who acted."""
-    row = file.derived.settings.get(ROLLOUT)
+    row = file.derived.settings.get(metadata.ROLLOUT)
     return row if isinstance(row, dict) else {}
 
 

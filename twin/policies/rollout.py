@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bridge.episode.cdr.messages import CompressedColor
-from bridge.episode.metadata import Derived, EpisodeInfo
+from bridge.episode.metadata import ROLLOUT, Derived, EpisodeInfo
 from bridge.episode.provenance import hash_settings
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -31,8 +31,6 @@ ROLLOUT_VERSION = 1
 """Raise it when the same inputs give another rollout, so that old files are redone."""
 LOOK_S = 0.5
 """How often it is asked whether the task is done."""
-ROLLOUT = "rollout"
-"""Kind of the derived episode, its trajectory, and where its row lies among its settings."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 from bridge.episode.catalogue import find_episodes
 from bridge.episode.catalogue_query import CatalogueQuery
-from bridge.episode.metadata import CHECKPOINT_TAG, WITH, tagged
+from bridge.episode.metadata import CHECKPOINT_TAG, ROLLOUT, WITH, tagged
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
@@ -18,7 +18,7 @@ from bridge.whole_file import write_whole
 from twin.policies.config import RolloutConfig
 from twin.policies.mapping import read_mapping
 from twin.policies.policy import HASHES
-from twin.policies.rollout import ROLLOUT, RolloutJob, roll_out, row_of_file
+from twin.policies.rollout import RolloutJob, roll_out, row_of_file
 from twin.policies.starts import trial_episodes
 
 RESULTS = {"success": True, "failure": False}
