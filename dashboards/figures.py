@@ -4,6 +4,7 @@ Only the layout of a drawing is worked out here; every number that is shown come
 """
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -311,8 +312,6 @@ def _bar(span: Span, x: Axis) -> Bar:
 
 
 SIZE = 360
-BESIDE_PX, PER_ROW = 7.0, 5
-"""Points that coincide are drawn side by side, towards the middle, so many in a row."""
 MARKERS = ("circle", "square", "diamond", "triangle")
 
 
@@ -354,6 +353,8 @@ class Scatter:
     axis_x: Axis
     axis_y: Axis
     points: tuple[Point, ...]
+    alike: tuple[tuple[float, float, int], ...]
+    """Where groups coincide [px], and how many."""
     joins: tuple[str, ...]
     series: tuple[tuple[str, str], ...]
     """Name of a series and its marker."""
@@ -368,18 +369,15 @@ def scatter(groups: Sequence[RateGroup]) -> Scatter | None:
     axis_y = axis(0.0, 1.0, SIZE - 44, 12)
     series = list(dict.fromkeys(group.series for group in drawable))
     markers = {name: MARKERS[index % len(MARKERS)] for index, name in enumerate(series)}
-    taken: dict[tuple[float, float], int] = {}
     points = []
     for group in drawable:
         x, y = axis_x.px(group.replayed.value or 0.0), axis_y.px(group.recorded.value or 0.0)
-        count = taken.get((x, y), 0)
-        taken[x, y] = count + 1
         across, upright = group.replayed.interval, group.recorded.interval
         points.append(
             Point(
                 group=group,
-                x=x + (BESIDE_PX if 2 * x < SIZE else -BESIDE_PX) * (count % PER_ROW),
-                y=y + (BESIDE_PX if 2 * y < SIZE else -BESIDE_PX) * (count // PER_ROW),
+                x=x,
+                y=y,
                 marker=markers[group.series],
                 x_low=None if across is None else axis_x.px(across.low),
                 x_high=None if across is None else axis_x.px(across.high),
@@ -392,6 +390,7 @@ def scatter(groups: Sequence[RateGroup]) -> Scatter | None:
         axis_x=axis_x,
         axis_y=axis_y,
         points=tuple(points),
+        alike=tuple((*at, n) for at, n in Counter((p.x, p.y) for p in points).items() if n > 1),
         joins=tuple(_join(points, name) for name in series),
         series=tuple(markers.items()),
     )

@@ -94,11 +94,12 @@ def group(replayed: float, recorded: float) -> figures.RateGroup:
     )
 
 
-def test_a_group_in_agreement_lies_on_the_identity_line() -> None:
-    drawn = figures.scatter([group(0.7, 0.7)])
+def test_groups_in_agreement_lie_on_the_identity_line_also_two_alike() -> None:
+    drawn = figures.scatter([group(0.7, 0.7), group(0.7, 0.7), group(0.2, 0.4)])
     assert drawn is not None
-    point = drawn.points[0]
-    across = (point.x - drawn.axis_x.px(0)) / (drawn.axis_x.px(1) - drawn.axis_x.px(0))
-    upright = (point.y - drawn.axis_y.px(0)) / (drawn.axis_y.px(1) - drawn.axis_y.px(0))
-    assert across == pytest.approx(0.7, abs=1e-3)
-    assert across == pytest.approx(upright, abs=1e-3)
+    for point in drawn.points[:2]:
+        across = (point.x - drawn.axis_x.px(0)) / (drawn.axis_x.px(1) - drawn.axis_x.px(0))
+        upright = (point.y - drawn.axis_y.px(0)) / (drawn.axis_y.px(1) - drawn.axis_y.px(0))
+        assert across == pytest.approx(0.7, abs=1e-3)
+        assert across == pytest.approx(upright, abs=1e-3)
+    assert drawn.alike == ((drawn.points[0].x, drawn.points[0].y, 2),)
