@@ -27,6 +27,7 @@ from bridge.episode.topics import (
     JOINT_STATES,
     POLICY_TARGETS,
     ROBOT_DESCRIPTION,
+    STOPPED_BY_OPERATOR,
     cell_topic,
     policy_key,
     refuse_bad_name,
@@ -55,7 +56,6 @@ POLL_S = 0.2
 LOOK_NS = 1_000_000_000
 """The start is seen at rest for so long before anything moves."""
 LEAVE_S = 2.0
-ENDED = "operator: the episode was ended"
 
 
 class Begun(NamedTuple):
@@ -169,7 +169,7 @@ class CellRunner:
             self._begun.put(self._last)
         elif request.get("over") == self.ended.episode:
             if request.get("by") != "cell" and not self._last.over.is_set():
-                self.ended.stopped = self.ended.stopped or ENDED
+                self.ended.stopped = self.ended.stopped or STOPPED_BY_OPERATOR
             self._last.over.set()
             self._last.left.wait(LEAVE_S)
         answer = {**self.identity(), "ended": vars(self.ended)}
@@ -213,7 +213,7 @@ class CellRunner:
                 ended.stopped = f"recorder: it does not answer ({error})"
                 return
             if now != ended.episode:
-                ended.stopped = ended.stopped or ENDED
+                ended.stopped = ended.stopped or STOPPED_BY_OPERATOR
                 return
 
     def close(self) -> None:

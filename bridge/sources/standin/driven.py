@@ -25,8 +25,6 @@ FIRST_NS = ns_from_s(30.0)
 """A policy may load before its first target."""
 LOOK_NS, ASK_S = ns_from_s(0.5), 10.0
 """How often the operator looks whether the task is done, and how long a runner may be silent."""
-BY_OPERATOR = "operator"
-"""How it begins what stopped a trial whose episode a person ended."""
 LAG_TICKS = round(ns_from_s(0.3) / TICK_NS)
 """The arm may be where it was sent so long ago."""
 TRACKING_RAD = ROBOT.tracking_error_rad or np.inf

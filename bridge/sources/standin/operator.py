@@ -21,12 +21,13 @@ from bridge.episode.metadata import (
     Outcome,
     study_arm_of,
 )
+from bridge.episode.topics import STOPPED_BY_OPERATOR
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.cell import StandinCell, StoppedError, TruthLog
 from bridge.sources.standin.decisions import Decider
-from bridge.sources.standin.driven import BY_OPERATOR, Controller
+from bridge.sources.standin.driven import Controller
 from bridge.sources.standin.scan import joint_move, scan_joints
 from bridge.sources.standin.settings import INTERRUPTED, POLICY, SessionConfig
 from bridge.sources.standin.streams import Session
@@ -382,7 +383,7 @@ class Operator:
         """Let a policy act, and label; a limit that stops it is a failure."""
         cell = self._cell
         stopped, problem = controller.drive(info.id, self._config.max_s)
-        if stopped.startswith(BY_OPERATOR):
+        if stopped == STOPPED_BY_OPERATOR:
             self._open = False
             raise StoppedError
         cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
