@@ -5,6 +5,7 @@ import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cached_property
 from pathlib import Path
 
 from bridge.errors import PathNotFoundError, UsageError
@@ -106,7 +107,7 @@ class RunFolder:
             raise UsageError(message) from error
         return run
 
-    @property
+    @cached_property
     def episodes_dir(self) -> Path:
         """Recorded episodes."""
         return self.path / "episodes"
@@ -116,7 +117,7 @@ class RunFolder:
         """The rebuilt scene."""
         return self.path / "scene"
 
-    @property
+    @cached_property
     def derived_dir(self) -> Path:
         """Replays, localisations and views made by the twin."""
         return self.path / "derived"

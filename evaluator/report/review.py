@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import RunFolder, file_names
 from bridge.errors import GstError, PathNotFoundError
 from bridge.exchange.trials_csv import trials_text
 from bridge.whole_file import write_whole
@@ -194,12 +194,12 @@ def _outdated(run: RunFolder, rows: Sequence[TrialRow]) -> str | None:
 
 def _files(run: RunFolder, read: _Read, trials: set[str]) -> Iterator[review_index.IndexedFile]:
     """Name what is no trial; derived files that were read well are not opened again."""
-    for path in run.episodes():
-        if path.name not in trials:
-            yield _file(run, path)
-    for path in run.derived():
-        was_read = f"{run.derived_dir.name}/{path.name}" in read.derived
-        if not was_read and (found := _file(run, path)).error:
+    for name in run.episode_parts():
+        if name not in trials:
+            yield _file(run, run.episodes_dir / name)
+    for name in file_names(run.derived_dir):
+        was_read = f"{run.derived_dir.name}/{name}" in read.derived
+        if not was_read and (found := _file(run, run.derived_dir / name)).error:
             yield found
     for path in run.unfinished():
         reason = "not finished: still being recorded, or its recorder was stopped"

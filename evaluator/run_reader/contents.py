@@ -18,7 +18,7 @@ from bridge.episode.assigned import TRIAL_SUFFIX
 from bridge.episode.catalogue_query import LABEL_SUFFIX, stamp_of
 from bridge.episode.provenance import hash_file, hash_files
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import RunFolder, file_names
 from bridge.errors import GstError
 from bridge.process_pool import SERIAL, ProcessPool, Serial
 from bridge.terminal import Output
@@ -99,7 +99,7 @@ def _take_inventory(
     """Hash what is new or has changed: recorded files, derived ones, and what cannot be read."""
     now_ns = time.time_ns()
     groups = [(run.episodes_dir, parts) for parts in run.episode_parts().values()]
-    groups += [(run.derived_dir, [path.name]) for path in run.derived()]
+    groups += [(run.derived_dir, [name]) for name in file_names(run.derived_dir)]
     hashes: dict[str, str | Exception] = {}
     unknown: dict[str, tuple[Path, ...]] = {}
     keys: dict[str, str] = {}  # what a hash is kept under; none where the stamp cannot be relied on
