@@ -1,4 +1,4 @@
-"""The README's "Record your own cell", typed as written, in a laboratory that nobody plans for."""
+"""docs/tutorials/record_live.md, "Your own cell", typed in a laboratory that nobody plans for."""
 
 import json
 import os
