@@ -157,7 +157,7 @@ class Results:
             ],
             "exclusions": [dict(vars(item)) for item in self.exclusions],
             "missing": list(self.missing),
-            "provenance": json.loads(json.dumps(self.provenance)),
+            "provenance": msgspec.to_builtins(self.provenance),
         }
         _check(record)
         return record
