@@ -80,10 +80,11 @@ def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list
         within, between = within_and_between(pairs)
     except UndefinedStatisticError:
         return []
-    if within * between >= 0:
-        return []
     r = by_id.get("agreement.pearson_r")
-    text = "" if r is None or r.value is None else f"r = {r.value:.2f} over all groups hides this: "
+    over_all = between if r is None or r.value is None else r.value
+    if within * over_all >= 0:
+        return []
+    text = "" if r is None else f"r = {over_all:.2f} over all groups hides this: "
     text += f"inside tasks r = {within:.2f}, between tasks r = {between:.2f} (Simpson's paradox)"
     if within < 0:
         text += ". Inside a task, what the twin ranks higher did worse: do not choose by it"

@@ -34,6 +34,14 @@ SAYS_NOTHING = "says nothing"
 """Said of r by a note, which the first page does not say twice."""
 TAKE = "take "
 """How a step begins after which no trial is needed."""
+NEVER, USE = "not for this", " Use the recorded rates."
+"""Of a task whose rates the twin gets surely wrong; and what to do instead."""
+TOO_MANY = 3
+"""More trials than so many times those that were made are no advice."""
+IF_THAT_STAYS = "; if that stays"
+"""What an open comparison goes on with; the first page says under "Next" what to do."""
+NO_N, NO_INTERVAL = "rates without n", ", without an interval"
+"""Of rates without n the first page says once that they have no interval."""
 FIGURES = ("scatter", "success")
 """The picture beside the sentences: the first that was drawn."""
 Row = Mapping[str, Cell]
@@ -43,8 +51,8 @@ Row = Mapping[str, Cell]
 class Front:
     """What a reader sees first."""
 
-    sentences: Sequence[str]
-    """Over all tasks."""
+    answers: Sequence[tuple[str, str]]
+    """Over all tasks, each with the question that it answers."""
     next_step: str
     """What to do next; empty where nothing would settle more."""
     command: str
@@ -55,6 +63,11 @@ class Front:
     notes: Sequence[tuple[str, str]]
     """What must be known before a number is used."""
 
+    @property
+    def sentences(self) -> list[str]:
+        """The answers, one after the other."""
+        return [f"{asked}: {text}" for asked, text in self.answers]
+
 
 def front(results: Results) -> Front:
     """Write the first page of some results."""
@@ -62,6 +75,13 @@ def front(results: Results) -> Front:
     about = [(str(row["about"]), str(row["note"])) for row in rows_of(results, "notes")]
     opposed = [text for _, text in about if SIMPSON in text]
     told = _summary(results, len(rows))
+    trust = [*_trust(results), *_regret(results)]
+    answers = {
+        "What happened" if _all_alike(results)[0] else "Which is better": _compared(results),
+        "Trust the twin": trust,
+        "In numbers": [*told, *(f"{text}." for text in opposed)],
+    }
+    told_once = (NO_INTERVAL, "") if NO_N in " ".join(trust) else ("", "")
     about = [
         (name, text)
         for name, text in about
@@ -69,10 +89,10 @@ def front(results: Results) -> Front:
         if not (SAYS_NOTHING in text and SAYS_NOTHING in " ".join(told))
     ]
     return Front(
-        sentences=[*_trust(results), *_compared(results), *(f"{t}." for t in opposed), *told],
+        answers=[(n, " ".join(s).replace(*told_once)) for n, s in answers.items() if s],
         next_step=(step := next_trials(results)),
         command=_again(results) if step and not step.startswith(TAKE) else "",
-        tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
+        tasks=[(str(row["task"]), sentence(row).replace(*told_once)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[
             (
@@ -85,9 +105,11 @@ def front(results: Results) -> Front:
 
 
 def _compared(results: Results) -> list[str]:
-    """Say which candidate is better, of the questions over all tasks, and what the twin's cost."""
+    """Say which candidate is better, of the questions over all tasks."""
     rows = rows_of(results, "comparisons")
-    sentences = [str(row["answer"]) for row in rows if row["task"] == ALL_TASKS]
+    sentences = [
+        str(row["answer"]).partition(IF_THAT_STAYS)[0] for row in rows if row["task"] == ALL_TASKS
+    ]
     heads = ("undecided", "no difference")  # others begin with a name, which keeps its letters
     split = _by_task(results)
     standing, beaten = _standing(results)
@@ -102,15 +124,19 @@ def _compared(results: Results) -> list[str]:
         f"{text[0].upper() if text.startswith(heads) else text[0]}{text[1:]}."
         for text in sentences[: SHOWN_ANSWERS - len(standing) - SHOWN_ANSWERS * len(split)]
     ]
-    if alike := _all_alike(results)[0]:
-        return [alike]
+    alike = _all_alike(results)[0]
+    return [alike] if alike else [*split, *found]
+
+
+def _regret(results: Results) -> list[str]:
+    """Say what it costs to take what the twin ranks first."""
     regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
-    if regret is not None and regret.value is not None:
-        name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
-        taken = "one of them by chance" if " or " in name else "that"
-        words = f"The twin ranks {name} first; who takes {taken} is {_points(regret.value)}"
-        found.append(f"{words}{_ends(regret, '.0f')} below the best recorded rate over all tasks.")
-    return [*split, *found]
+    if regret is None or regret.value is None or _all_alike(results)[0]:
+        return []
+    name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
+    taken = "one of them by chance" if " or " in name else "it"
+    words = f"The twin ranks {name} first; taking {taken} costs {_points(regret.value)}"
+    return [f"{words}{_ends(regret, '.0f')} against the best recorded rate over all tasks."]
 
 
 def _by_task(results: Results) -> list[str]:
@@ -183,7 +209,7 @@ def answer(row: Row) -> str:
         return "not yet"
     if max(-low, high) <= CLOSE_PP:
         return "yes"
-    return "not for this" if direction(low, high) else "not yet"
+    return NEVER if direction(low, high) else "not yet"
 
 
 def next_trials(results: Results) -> str:
@@ -212,13 +238,21 @@ def next_trials(results: Results) -> str:
     if _by_task(results):
         return f"{TAKE}for each task one that was not beaten there; none is best on all tasks."
     if not wanted:
-        return ""
+        without = any(NO_N in text for text in results.missing)
+        return "give n: a column n, or 7/10 in the place of 70 %." if without else ""
     more, pair = min(wanted)
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
     one = -(-more // max(1, len(tasks)))
     (first, second), shared = _differing(pair)
     sides = [n if n.startswith("with") else f"of {n}" for n in (first, second)]
     where = f": {', '.join(tasks)}" if len(tasks) <= SHOWN_TASKS else ""
+    open_ = list(dict.fromkeys(name for _, pair in wanted for name in pair))
+    made = sum(m.n or 0 for m in results.measurements if m.id.startswith("rate.recorded."))
+    if len({n for _, each in asked for n in each}) * more > TOO_MANY * made > 0:
+        names = " or ".join(filter(None, (", ".join(open_[:-1]), open_[-1])))
+        apart = "them" if len(open_) == 2 else "even two of them"
+        words = f"each may be best, and to tell {apart} apart would take about {2 * more} more"
+        return f"{TAKE}{names}: {words} trials."
     in_all = f" ({2 * one * len(tasks)} trials in all)" if len(tasks) > 1 else ""
     split = f" on each of {len(tasks)} tasks{where}{in_all}" if len(tasks) > 1 else ""
     alone = f"{shared}, " if shared else ""
@@ -281,30 +315,40 @@ def _trust(results: Results) -> list[str]:
             and f"it takes {GROUPS_FOR_R} groups or more, and here is {bias.n}"
         )
         why = few or str(r.reason_if_undefined or r.reason_without_interval).replace(";", ",")
+        why = NO_N if why.startswith(NO_N) else why
         unknown.append(f"whether its rates follow the recorded ones is not known: {why}")
     elif high < FOLLOWS_R:
         against.append(f"its rates hardly follow the recorded ones (r at most {high:.2f})")
     elif low <= 0:
-        unknown.append(f"its rates may or may not follow the recorded ones (r in{_ends(r, '.2f')})")
+        unknown.append(
+            f"whether its rates follow the recorded ones is open (r in{_ends(r, '.2f')})"
+        )
     rows = rows_of(results, "conclusions")
     found = [answer(row) for row in rows]
-    off, open_, many = found.count("not for this"), found.count("not yet"), len(found)
-    if (ends := bias.interval) and answer({"low": ends.low, "high": ends.high}) == "not for this":
+    off, open_, many = found.count(NEVER), found.count("not yet"), len(found)
+    if (ends := bias.interval) and answer({"low": ends.low, "high": ends.high}) == NEVER:
         against.append(f"over all groups it is {direction(ends.low, ends.high)}")
     if off:
-        biases = [_number(row["bias (pp)"]) or 0.0 for row in rows if answer(row) == "not for this"]
-        which = "too high" if min(biases) > 0 else "too low" if max(biases) < 0 else "wrong"
-        words = f"in {off} of {many} {noun('task', many)} its rate is {which}"
+        bad = {str(r["task"]): _number(r["bias (pp)"]) or 0.0 for r in rows if answer(r) == NEVER}
+        which = "wrong"
+        if min(bad.values()) > 0 or max(bad.values()) < 0:
+            which = "too high" if min(bad.values()) > 0 else "too low"
+        named = f" ({', '.join(bad)})" if off <= SHOWN_ANSWERS and many > 1 else ""
+        words = f"{_of_tasks(off, many)}its rate is {which}{named}"
         (against if 2 * off > many else unknown).append(words)
     if open_ or not many:
-        where = f"in {open_} of {many} tasks " if many > 1 else ""
+        where = _of_tasks(open_, many)
         unknown.append(f"{where}its rate may be more than {CLOSE_PP:.0f} points off")
     yes = f"in each of these tasks its rate is within {CLOSE_PP:.0f} points of the recorded one, "
     yes += f"it follows from group to group (r at least {low:.2f}), and no group looks blind"
-    told = "no" if against else "can't tell yet" if unknown else "yes"
+    told = "No" if against else "Can't tell yet" if unknown else "Yes"
     why = "; ".join(against or unknown or [yes])
-    why = f"{why[0].upper()}{why[1:]}.{' Use the recorded rates.' if against else ''}"
-    return [f"Trust the twin's success rates: {told}. {why}"]
+    then = USE if against else f" Until then,{USE.lower()}" if unknown else ""
+    return [f"{told}. {why[0].upper()}{why[1:]}.{then}"]
+
+
+def _of_tasks(some: int, many: int) -> str:
+    return "" if many < 2 else f"in {f'{some} of' if some < many else 'all'} {many} tasks "
 
 
 def _bias_words(row: Row) -> str:
@@ -313,7 +357,7 @@ def _bias_words(row: Row) -> str:
         return "the bias is not known"
     size = f"bias {_signed(bias)} {noun('point', abs(round(bias)))}"
     if low is None or high is None:
-        return f"{size}, without an interval"
+        return f"{size}{NO_INTERVAL}"
     ends = f"[{_signed(low)}, {_signed(high)}]"
     found = direction(low, high)
     return f"{size} {ends}: the twin is {found}" if found else f"{size}; interval {ends} includes 0"
@@ -382,7 +426,7 @@ def _all_alike(results: Results) -> tuple[str, str]:
     )
     told += f"{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
     each = f"record {SAYS_LITTLE} trials or more of each candidate"
-    few = f"{each}, in {GROUPS_FOR_R} groups or more to judge the twin."
+    few = f"{each}; to judge the twin, in {GROUPS_FOR_R} groups (policies times tasks) or more."
     why = "where all trials end alike, none can be shown to be better"
     alike = f"check how success is scored, then {each} on {task} task: {why}."
     return told, few if n < SAYS_LITTLE else alike
@@ -391,7 +435,7 @@ def _all_alike(results: Results) -> tuple[str, str]:
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:
     interval = measurement.interval
     if interval is None:
-        return ", without an interval"
+        return NO_INTERVAL
     return f" [{interval.low:{digits}}, {interval.high:{digits}}]"
 
 

@@ -192,7 +192,7 @@ def test_regret_is_what_taking_the_twins_first_costs() -> None:
     assert measurements({"A": (9, 9)}) == {}
     named = tuple(measurements({"A (v2)": (9, 9), "B": (6, 7)}).values())
     told = front(Results(run="r", source="trials", stand_in=None, measurements=named)).sentences
-    assert "The twin ranks A (v2) first; who takes that is 0 points" in " ".join(told)
+    assert "The twin ranks A (v2) first; taking it costs 0 points" in " ".join(told)
 
 
 def test_rates_with_n_are_compared_without_their_trials() -> None:
@@ -303,7 +303,7 @@ def test_the_first_page_begins_with_who_may_be_best(four_policies: Comparison) -
 def test_a_study_where_all_trials_end_alike_says_so_first(k: int, words: str) -> None:
     rows = [row(n, "AB"[n % 2], n // 2 < k, start_id=f"s{n // 2}") for n in range(20)]
     found = compare_rows(rows, run="r", source="trials", stand_in=None)
-    summary = " ".join(front(found.results()).sentences)
+    summary = dict(front(found.results()).answers)["What happened"]
     assert summary.startswith(words)
     assert "you lose" not in summary
 
@@ -314,7 +314,7 @@ def test_a_study_without_a_twin_says_nothing_of_a_twin() -> None:
     assert not {"confusion", "conclusions"} & {table.id for table in found.tables}
     (success,) = [table for table in found.tables if table.id == "success"]
     assert {row[3] for row in success.rows} == {"recorded"}
-    assert front(found.results()).sentences[0].startswith("B is better than A: 30 of 40")
+    assert front(found.results()).answers[0][1].startswith("B is better than A: 30 of 40")
 
 
 def with_measures(count: int = 40, seed: int = 1, gain: float = 0.3) -> list[TrialRow]:

@@ -129,6 +129,11 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     results = Results(run="r", source="trials", stand_in=None, tables=(table,))
     words = "make 1 more trial of C and 1 of B; that would likely tell these two apart; A and B"
     assert next_trials(results) == f"{words} would take 40 of each."
+    made = Measurement(id="rate.recorded.a", value=0.5, unit="1", definition="d", k=1, n=2)
+    few = replace(table, rows=(compared(ALL_TASKS, "A", "no", 4),))
+    told = next_trials(replace(results, tables=(few,), measurements=(made,)))
+    assert told.startswith("take A or B: each may be best, and to tell them apart")
+    assert "about 8 more trials" in told
     in_tasks = replace(
         table, rows=(rows[0], *(compared(t, "A", "no", 9) for t in ("pour", "stir")))
     )
@@ -151,7 +156,7 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     )
     assert "of A and 40 of B" in next_trials(replace(results, tables=(table, beaten)))
     round_ = replace(beaten, rows=tuple((name, 5, 9, "no") for name in "ABC"))
-    told = " ".join(front(replace(results, tables=(round_,))).sentences)
+    told = dict(front(replace(results, tables=(round_,))).answers)["Which is better"]
     assert told == "Each of 3 candidates lost to another: none is the best."
     pair = [compared(ALL_TASKS, "A, without replanning", "no", 9)]
     pair[0] = (*pair[0][:3], "A, with replanning", *pair[0][4:])
@@ -172,18 +177,18 @@ def trusted(tmp_path: Path, sim: tuple[int, ...], n: int) -> str:
     """What the first page says of a twin in ten tasks, of which tenths succeed on the robot."""
     cells = product(range(10), range(2), range(n))
     rows = [f"t{t},p{p},{int(i % 10 < t)},{int(i % 10 < sim[t])}" for t, p, i in cells]
-    return shown(tmp_path, "\n".join(["task,policy,recorded,sim_planned", *rows]))[0]
+    told = shown(tmp_path, "\n".join(["task,policy,recorded,sim_planned", *rows]))[0]
+    return told.partition("Trust the twin: ")[2]
 
 
 def test_a_twin_is_trusted_only_where_the_numbers_say_so(tmp_path: Path) -> None:
-    head = "Trust the twin's success rates: "
     right, off = tuple(range(10)), (4, 5, 6, 7, 8, 9, 10, 10, 9, 9)
-    assert trusted(tmp_path, right, 100).startswith(f"{head}yes. In each of these tasks")
-    assert trusted(tmp_path, right, 4).startswith(f"{head}can't tell yet. ")
-    assert trusted(tmp_path, off, 100).startswith(f"{head}no. ")
-    assert trusted(tmp_path, right[::-1], 100).startswith(f"{head}no. ")
+    assert trusted(tmp_path, right, 100).startswith("Yes. In each of these tasks")
+    assert trusted(tmp_path, right, 4).startswith("Can't tell yet. ")
+    assert trusted(tmp_path, off, 100).startswith("No. ")
+    assert trusted(tmp_path, right[::-1], 100).startswith("No. ")
     blind = trusted(tmp_path, (9, *right[1:]), 100)  # in one task it says success throughout
-    assert blind.startswith(f"{head}no. In 2 of 20 groups its rate is far from")
+    assert blind.startswith("No. In 2 of 20 groups its rate is far from")
 
 
 def test_rates_without_n_ask_for_it_and_claim_no_interval(tmp_path: Path) -> None:
