@@ -60,7 +60,7 @@ def compare_run(
     # Words of what is missing come first, then those of images and imported motions.
     return replace(
         _with_parts(base, (views, methods, motions)),
-        provenance={**base.provenance, **images.origin()},
+        provenance={"folder": str(run.path), **base.provenance, **images.origin()},
     )
 
 

@@ -55,8 +55,8 @@ class Front:
     """Over all tasks, each with the question that it answers."""
     next_step: str
     """What to do next; empty where nothing would settle more."""
-    command: str
-    """What to type once it is done; empty where nothing is to be tried."""
+    commands: Sequence[str]
+    """What to type for it and once it is done; empty where nothing is to be tried."""
     tasks: Sequence[tuple[str, str]]
     """Task and sentence."""
     more_tasks: int
@@ -91,7 +91,7 @@ def front(results: Results) -> Front:
     return Front(
         answers=[(n, " ".join(s).replace(*told_once)) for n, s in answers.items() if s],
         next_step=(step := next_trials(results)),
-        command=_again(results) if step and not step.startswith(TAKE) else "",
+        commands=_again(results) if step and not step.startswith(TAKE) else (),
         tasks=[(str(row["task"]), sentence(row).replace(*told_once)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[
@@ -283,12 +283,13 @@ def _settled(compared: Sequence[Row], standing: Sequence[Row]) -> str:
     return f"{TAKE}{best[0]}; no more trials are needed to choose." if len(best) == 1 else ""
 
 
-def _again(results: Results) -> str:
-    """Return what to type once further trials are recorded, or stand in the table."""
-    name = shlex.quote(results.run)
+def _again(results: Results) -> tuple[str, ...]:
+    """Return how further trials are recorded, and what to type once they are there."""
     if results.source == "run":
-        return f"robot-gst replay {name} && robot-gst evaluate {name}"
-    return f"robot-gst evaluate {shlex.join(results.provenance.get('files', ())) or name}"
+        name = shlex.quote(str(results.provenance.get("folder", results.run)))
+        return f"robot-gst record {name}", f"robot-gst replay {name} && robot-gst evaluate {name}"
+    files = shlex.join(results.provenance.get("files", ())) or shlex.quote(results.run)
+    return (f"robot-gst evaluate {files}",)
 
 
 def _trust(results: Results) -> list[str]:
@@ -348,7 +349,9 @@ def _trust(results: Results) -> list[str]:
 
 
 def _of_tasks(some: int, many: int) -> str:
-    return "" if many < 2 else f"in {f'{some} of' if some < many else 'all'} {many} tasks "
+    if some == many:
+        return "" if many < 2 else "in both tasks " if many == 2 else f"in all {many} tasks "
+    return f"in {some} of {many} tasks "
 
 
 def _bias_words(row: Row) -> str:

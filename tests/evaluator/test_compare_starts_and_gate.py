@@ -74,6 +74,7 @@ def test_a_pose_that_is_not_a_number_leaves_the_tool_error_undefined(maker: Any)
 
 def test_every_input_file_is_named_with_its_hash(six_trials: Any) -> None:
     provenance = compare_run(six_trials.run).provenance
+    assert provenance["folder"] == str(six_trials.run.path)
     assert provenance["episodes"]["episodes/a1.mcap"] == hash_file(
         six_trials.run.episodes_dir / "a1.mcap"
     )
