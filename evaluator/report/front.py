@@ -1,7 +1,7 @@
 """The first two pages: what an evaluation means, in one line per task, before any table."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import shorten
 
@@ -241,31 +241,25 @@ def next_trials(results: Results) -> str:
         without = any(NO_N in text for text in results.missing)
         return "give n: a column n, or 7/10 in the place of 70 %." if without else ""
     more, pair = min(wanted)
+    made = sum(m.n or 0 for m in results.measurements if m.id.startswith("rate.recorded."))
+    if len({name for _, each in asked for name in each}) * more > TOO_MANY * made > 0:
+        names = list(dict.fromkeys(name for _, each in wanted for name in each))
+        apart = "them" if len(names) == 2 else "even two of them"
+        words = f"each may be best, and to tell {apart} apart would take about {2 * more} more"
+        return f"{TAKE}{', '.join(names[:-1])} or {names[-1]}: {words} trials."
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
+    return f"{_more_trials(more, pair, tasks)}; that would likely tell these two apart."
+
+
+def _more_trials(more: int, pair: tuple[str, str], tasks: Sequence[str]) -> str:
     one = -(-more // max(1, len(tasks)))
     (first, second), shared = _differing(pair)
     sides = [n if n.startswith("with") else f"of {n}" for n in (first, second)]
     where = f": {', '.join(tasks)}" if len(tasks) <= SHOWN_TASKS else ""
-    open_ = list(dict.fromkeys(name for _, pair in wanted for name in pair))
-    made = sum(m.n or 0 for m in results.measurements if m.id.startswith("rate.recorded."))
-    if len({n for _, each in asked for n in each}) * more > TOO_MANY * made > 0:
-        names = " or ".join(filter(None, (", ".join(open_[:-1]), open_[-1])))
-        apart = "them" if len(open_) == 2 else "even two of them"
-        words = f"each may be best, and to tell {apart} apart would take about {2 * more} more"
-        return f"{TAKE}{names}: {words} trials."
-    in_all = f" ({2 * one * len(tasks)} trials in all)" if len(tasks) > 1 else ""
-    split = f" on each of {len(tasks)} tasks{where}{in_all}" if len(tasks) > 1 else ""
+    in_all = f" on each of {len(tasks)} tasks{where} ({2 * one * len(tasks)} trials in all)"
     alone = f"{shared}, " if shared else ""
-    words = f"{alone}make {one} more {noun('trial', one)} {sides[0]} and {one} {sides[1]}{split}"
-    then = ["that would likely tell these two apart"]
-    for many, others in sorted(wanted)[1:SHOWN_ANSWERS]:
-        each = (
-            f"{-(-many // len(tasks))} of each on each task"
-            if len(tasks) > 1
-            else f"{many} of each"
-        )
-        then.append(f"{' and '.join(_differing(others)[0])} would take {each}")
-    return f"{words}; {'; '.join(then)}."
+    words = f"{alone}make {one} more {noun('trial', one)} {sides[0]} and {one} {sides[1]}"
+    return f"{words}{in_all if len(tasks) > 1 else ''}"
 
 
 def _differing(pair: tuple[str, str]) -> tuple[list[str], str]:
@@ -301,51 +295,61 @@ def _trust(results: Results) -> list[str]:
     r, bias = by_id.get("agreement.pearson_r"), by_id.get("agreement.bias_pp")
     if r is None or bias is None or not bias.n:
         return []
-    against, unknown = [], []
+    found = [*_blind(results, bias.n), *_followed(r, bias.n), *_near(results, bias)]
     if results.stand_in:
-        unknown.append("what was recorded is a simulation itself")
+        found.insert(0, (False, "what was recorded is a simulation itself"))
+    against = [words for is_sure, words in found if is_sure]
+    low = 0.0 if r.interval is None else r.interval.low
+    yes = f"in each of these tasks its rate is within {CLOSE_PP:.0f} points of the recorded one, "
+    yes += f"it follows from group to group (r at least {low:.2f}), and no group looks blind"
+    told = "No" if against else "Can't tell yet" if found else "Yes"
+    why = "; ".join(against or [words for _, words in found] or [yes])
+    then = USE if against else f" Until then,{USE.lower()}" if found else ""
+    return [f"{told}. {why[0].upper()}{why[1:]}.{then}"]
+
+
+Against = Iterator[tuple[bool, str]]
+"""What speaks against the twin, and whether it is sure."""
+
+
+def _blind(results: Results, num_groups: int) -> Against:
     notes = rows_of(results, "notes")
     if blind := [str(row["about"]) for row in notes if BLIND_HERE in str(row["note"])]:
         named = [*blind[:SHOWN_TASKS], *["..."] * (len(blind) > SHOWN_TASKS)]
-        words = f"in {len(blind)} of {bias.n} groups its rate is far from the recorded one"
-        against.append(f"{words}, unlike in the others ({' / '.join(named)})")
-    low, high = (0.0, 1.0) if r.interval is None else (r.interval.low, r.interval.high)
+        words = f"in {len(blind)} of {num_groups} groups its rate is far from the recorded one"
+        yield True, f"{words}, unlike in the others ({' / '.join(named)})"
+
+
+def _followed(r: Measurement, num_groups: int) -> Against:
     if r.interval is None or r.value is None:
-        few = (
-            bias.n < GROUPS_FOR_R
-            and f"it takes {GROUPS_FOR_R} groups or more, and here is {bias.n}"
-        )
-        why = few or str(r.reason_if_undefined or r.reason_without_interval).replace(";", ",")
+        why = str(r.reason_if_undefined or r.reason_without_interval).replace(";", ",")
+        if num_groups < GROUPS_FOR_R:
+            why = f"it takes {GROUPS_FOR_R} groups or more, and here is {num_groups}"
         why = NO_N if why.startswith(NO_N) else why
-        unknown.append(f"whether its rates follow the recorded ones is not known: {why}")
-    elif high < FOLLOWS_R:
-        against.append(f"its rates hardly follow the recorded ones (r at most {high:.2f})")
-    elif low <= 0:
-        unknown.append(
-            f"whether its rates follow the recorded ones is open (r in{_ends(r, '.2f')})"
-        )
+        yield False, f"whether its rates follow the recorded ones is not known: {why}"
+    elif r.interval.high < FOLLOWS_R:
+        high = r.interval.high
+        yield True, f"its rates hardly follow the recorded ones (r at most {high:.2f})"
+    elif r.interval.low <= 0:
+        ends = _ends(r, ".2f")
+        yield False, f"whether its rates follow the recorded ones is open (r in{ends})"
+
+
+def _near(results: Results, bias: Measurement) -> Against:
     rows = rows_of(results, "conclusions")
     found = [answer(row) for row in rows]
     off, open_, many = found.count(NEVER), found.count("not yet"), len(found)
     if (ends := bias.interval) and answer({"low": ends.low, "high": ends.high}) == NEVER:
-        against.append(f"over all groups it is {direction(ends.low, ends.high)}")
+        yield True, f"over all groups it is {direction(ends.low, ends.high)}"
     if off:
         bad = {str(r["task"]): _number(r["bias (pp)"]) or 0.0 for r in rows if answer(r) == NEVER}
-        which = "wrong"
-        if min(bad.values()) > 0 or max(bad.values()) < 0:
-            which = "too high" if min(bad.values()) > 0 else "too low"
+        least, most = min(bad.values()), max(bad.values())
+        which = "too high" if least > 0 else "too low" if most < 0 else "wrong"
         named = f" ({', '.join(bad)})" if off <= SHOWN_ANSWERS and many > 1 else ""
-        words = f"{_of_tasks(off, many)}its rate is {which}{named}"
-        (against if 2 * off > many else unknown).append(words)
+        yield 2 * off > many, f"{_of_tasks(off, many)}its rate is {which}{named}"
     if open_ or not many:
         where = _of_tasks(open_, many)
-        unknown.append(f"{where}its rate may be more than {CLOSE_PP:.0f} points off")
-    yes = f"in each of these tasks its rate is within {CLOSE_PP:.0f} points of the recorded one, "
-    yes += f"it follows from group to group (r at least {low:.2f}), and no group looks blind"
-    told = "No" if against else "Can't tell yet" if unknown else "Yes"
-    why = "; ".join(against or unknown or [yes])
-    then = USE if against else f" Until then,{USE.lower()}" if unknown else ""
-    return [f"{told}. {why[0].upper()}{why[1:]}.{then}"]
+        yield False, f"{where}its rate may be more than {CLOSE_PP:.0f} points off"
 
 
 def _of_tasks(some: int, many: int) -> str:
