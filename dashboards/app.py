@@ -30,6 +30,7 @@ from dashboards.loading import LOADING
 from dashboards.overview_page import build_overview
 from dashboards.review_routes import review_routes
 from dashboards.study_routes import StudyPages
+from evaluator.report.wording import minus
 from evaluator.review_index import SHOW, Selection
 
 HERE = Path(__file__).parent
@@ -106,6 +107,7 @@ def _environment() -> Environment:
         wording.answer_tone,
         wording.length_text,
         wording.breakable,
+        minus,
     ):
         environment.filters[function.__name__] = function
     environment.filters["quoted"] = lambda path: shlex.quote(str(path))

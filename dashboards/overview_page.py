@@ -307,13 +307,12 @@ class Overview:
 
     selection: Selection
     stand_in: bool | None
-    summary: str
+    answers: list[tuple[str, str]]
     notes: tuple[tuple[str, str], ...]
     tasks: tuple[Mapping[str, str], ...]
     """Task, its slug, answer and sentence."""
     more_tasks: int
     close_pp: float
-    next_trials: str
     cards: tuple[Card, ...]
     has_headline: bool
     """Whether at least one card has a value or a reason."""
@@ -365,12 +364,11 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
     return Overview(
         selection=selection,
         stand_in=judgement.stand_in,
-        summary=about.get("summary", ""),
+        answers=about.get("answers", []),
         notes=tuple((name, text) for name, text in about.get("notes", [])),
         tasks=tuple(tasks[:MOST_TASKS]),
         more_tasks=max(0, len(tasks) - MOST_TASKS),
         close_pp=about.get("close_pp", 0.0),
-        next_trials=about.get("next_trials", ""),
         cards=cards,
         has_headline=any(card.state != "missing" for card in cards),
         scatter=scatter([g for g in groups if g in drawn]),

@@ -24,7 +24,7 @@ from evaluator.result import Measurement
 from evaluator.trial_row import TrialRow
 
 FILE_NAME = "review_index.msgpack"
-VERSION = 8
+VERSION = 9
 """Raise it whenever what a field holds changes."""
 NO_RESULTS = "no results yet"
 """Why there are no numbers of a run that was never evaluated."""

@@ -32,6 +32,8 @@ SIMPSON = "Simpson's paradox"
 """What the report begins with, where a note says it."""
 SAYS_NOTHING = "says nothing"
 """Said of r by a note, which the first page does not say twice."""
+IN_NUMBERS = "In numbers"
+"""What a page leaves out that has cards of them."""
 TAKE = "take "
 """How a step begins after which no trial is needed."""
 NEVER, USE = "not for this", " Use the recorded rates."
@@ -79,7 +81,7 @@ def front(results: Results) -> Front:
     answers = {
         "What happened" if _all_alike(results)[0] else "Which is better": _compared(results),
         "Trust the twin": trust,
-        "In numbers": [*told, *(f"{text}." for text in opposed)],
+        IN_NUMBERS: [*told, *(f"{text}." for text in opposed)],
     }
     told_once = (NO_INTERVAL, "") if NO_N in " ".join(trust) else ("", "")
     about = [

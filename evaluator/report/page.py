@@ -4,7 +4,6 @@ What the page says stands in ``templates/``; here is what it says it about, in r
 """
 
 import json
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -20,6 +19,7 @@ from evaluator.report.figures import DARK, LIGHT, Drawing
 from evaluator.report.front import FIGURES, front
 from evaluator.report.sections import OTHER, SECTIONS, TRIALS, Section
 from evaluator.report.views import Figures, Shown, is_number, used_columns, view
+from evaluator.report.wording import minus
 from evaluator.result import Measurement, Results, Table
 
 try:
@@ -197,12 +197,6 @@ def environment() -> Environment:
 def breakable(text: str) -> Markup:
     """Escape text; a long name may break after an underscore."""
     return escape(text).replace("_", Markup("_<wbr>"))
-
-
-def minus(text: str) -> str:
-    """Write a minus as long as a plus is wide; keep together percent and number, and intervals."""
-    text = re.sub(r"(?<![\w.])-(?=[\d.])", "−", text)
-    return re.sub(r" %|\[\S+ \S+\]", lambda found: found[0].replace(" ", "\xa0"), text)
 
 
 def thousands(count: int) -> str:

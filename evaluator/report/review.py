@@ -24,7 +24,7 @@ from evaluator.compare.spreadsheet import record_from_row
 from evaluator.compare.stages import first_failed_stage
 from evaluator.memory import without_collecting
 from evaluator.quantity import slug
-from evaluator.report.front import CLOSE_PP, answer, front, rows_of, sentence
+from evaluator.report.front import CLOSE_PP, IN_NUMBERS, answer, front, rows_of, sentence
 from evaluator.report.page import grid
 from evaluator.report.wording import cell_text
 from evaluator.result import Results, Table, load_results
@@ -144,7 +144,8 @@ def _about(results: Results | None, *, has_trials: bool) -> dict[str, Any]:
         "exclusions": [dict(vars(each)) for each in results.exclusions[:SHOWN_EXCLUSIONS]],
         "num_exclusions": len(results.exclusions),
         "missing": list(results.missing),
-        "summary": " ".join(first.sentences),
+        "answers": [("Next", first.next_step)] * bool(first.next_step)
+        + [(asked, text) for asked, text in first.answers if asked != IN_NUMBERS],
         "notes": [list(note) for note in first.notes],
         "close_pp": CLOSE_PP,
         "tasks": [
@@ -156,7 +157,6 @@ def _about(results: Results | None, *, has_trials: bool) -> dict[str, Any]:
             }
             for line in rows_of(results, "conclusions")
         ],
-        "next_trials": first.next_step,
         "failures": [list(row.values()) for row in rows_of(results, "failures")],
         "tables": [] if has_trials else [_shown(t) for t in results.tables if t.rows],
     }

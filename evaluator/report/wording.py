@@ -1,6 +1,7 @@
 """How numbers are written for people: rounding happens here and nowhere earlier."""
 
 import math
+import re
 from collections.abc import Mapping
 
 from evaluator.compare.tables import METHOD_NAMES
@@ -145,3 +146,9 @@ def cell_text(cell: Shown) -> str:
     if isinstance(cell, bool):
         return "yes" if cell else "no"
     return f"{cell + 0.0:g}" if isinstance(cell, float) else str(cell)  # -0.0 is 0
+
+
+def minus(text: str) -> str:
+    """Write a minus as long as a plus is wide; keep together percent and number, and intervals."""
+    text = re.sub(r"(?<![\w.])-(?=[\d.])", "−", text)
+    return re.sub(r" %|\[\S+ \S+\]", lambda found: found[0].replace(" ", "\xa0"), text)
