@@ -57,9 +57,9 @@ class RunContents:
     """Files that could not be read, and why."""
 
     @property
-    def sources(self) -> dict[str, tuple[Path, str]]:
-        """File and content hash of every recorded episode by its id."""
-        return {each.facts.info.id: (each.file.path, each.file.sha256) for each in self.recorded}
+    def sources(self) -> dict[str, RunFile]:
+        """Recorded episodes by their id."""
+        return {each.facts.info.id: each.file for each in self.recorded}
 
 
 def read_contents(

@@ -21,7 +21,7 @@ from bridge.exchange.csv_export import seconds_text
 from bridge.media.color import JPEG_MAGIC, decode_color, open_image
 from evaluator.compare.images import scores as image_scores
 from evaluator.compare.images.scores import RECORDED, RENDERED, images_of, measure_images
-from evaluator.compare.images.views import TWIN, Source, agreed_setting, newest_views, opened
+from evaluator.compare.images.views import TWIN, agreed_setting, newest_views, opened
 from evaluator.compare.measure import Part
 from evaluator.compare.rows import Comparison
 from evaluator.errors import EvaluatorError
@@ -29,7 +29,7 @@ from evaluator.measurements import RENDERS, slug
 from evaluator.metrics.image import ImageScore, PerceptualNet, score_pair
 from evaluator.metrics.image_options import UNSTATED, ImageOptions
 from evaluator.result import Cell, Exclusion, Measurement, Table
-from evaluator.run_reader.episodes import DerivedFile
+from evaluator.run_reader.episodes import DerivedFile, RunFile
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 READ = (".png", ".jpg", ".jpeg")
@@ -149,7 +149,7 @@ def compare_folders(options: ImageOptions) -> Comparison:
 def compare_renders(
     options: ImageOptions,
     files: Sequence[DerivedFile],
-    sources: Mapping[str, Source],
+    sources: Mapping[str, RunFile],
     *,
     net: PerceptualNet | None = None,
 ) -> Part:
@@ -208,7 +208,7 @@ def other_names(views: Iterable[str]) -> dict[str, str]:
 
 
 def _sets_of(
-    files: Sequence[DerivedFile], sources: Mapping[str, Source]
+    files: Sequence[DerivedFile], sources: Mapping[str, RunFile]
 ) -> tuple[ImageSet, ImageSet]:
     """Return recorded images, and the twin's renders, of the views of a run."""
     recorded, rendered = {}, {}

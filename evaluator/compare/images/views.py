@@ -6,7 +6,6 @@ episode are found, and their scores become measurements, each with its protocol.
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from bridge.episode.reader import Episode
@@ -24,17 +23,15 @@ from evaluator.measurements import DEPTHS, LPIPS_MISSING, VIEWS
 from evaluator.metrics.image import GAIN, LPIPS_NOT_COMPUTED, METRICS, PerceptualNet
 from evaluator.metrics.image_options import UNSTATED
 from evaluator.result import Cell, Exclusion, Measurement, Table
-from evaluator.run_reader.episodes import DerivedFile
+from evaluator.run_reader.episodes import DerivedFile, RunFile
 
 TWIN = "twin"
 """What the run's own renders are called beside other methods."""
-Source = tuple[Path, str]
-"""A recorded episode: its file, and the content hash of it."""
 
 
 def compare_views(
     files: Sequence[DerivedFile],
-    sources: Mapping[str, Source],
+    sources: Mapping[str, RunFile],
     *,
     net: PerceptualNet | None = None,
     cache: SummaryCache | None = None,
@@ -52,7 +49,7 @@ def compare_views(
     for file in views:
         name, source = file.path.stem, file.derived.source_episode
         recorded = sources.get(source)
-        sha256 = "-" if recorded is None else recorded[1]
+        sha256 = "-" if recorded is None else recorded.sha256
         key = " ".join([file.sha256, sha256, *([net.weights] if net else ())])
         try:
             scores = cache.kept_or_made(ViewScore, key, partial(_scored, file, recorded, net))
@@ -75,13 +72,13 @@ def compare_views(
 
 
 def _scored(
-    file: DerivedFile, source: Source | None, net: PerceptualNet | None
+    file: DerivedFile, source: RunFile | None, net: PerceptualNet | None
 ) -> tuple[ViewScore, ...]:
     return score_views(images_of(file.episode, opened(source)), net=net)
 
 
 def newest_views(
-    files: Sequence[DerivedFile], sources: Mapping[str, Source]
+    files: Sequence[DerivedFile], sources: Mapping[str, RunFile]
 ) -> tuple[list[DerivedFile], list[Exclusion]]:
     """Find the newest views of each recorded episode; stale and older ones are left out by name."""
     newest: dict[str, DerivedFile] = {}
@@ -89,7 +86,7 @@ def newest_views(
     views = [file for file in files if file.derived.kind == "views"]
     for file in sorted(views, key=lambda file: file.age):
         source = sources.get(file.derived.source_episode)
-        if source is not None and file.derived.source_sha256 not in ("", source[1]):
+        if source is not None and file.derived.source_sha256 not in ("", source.sha256):
             why[file.name] = "made from another version of the episode (its hash differs); rebuild"
             continue
         older = newest.get(file.derived.source_episode)
@@ -104,9 +101,9 @@ def newest_views(
     return [file for file in views if file.name not in why], left_out
 
 
-def opened(source: Source | None) -> Episode | None:
+def opened(source: RunFile | None) -> Episode | None:
     """Open a recorded episode, where there is one."""
-    return None if source is None else Episode.open(source[0])
+    return None if source is None else Episode.open(source.path)
 
 
 def _table(table_id: str, title: str, scores: Sequence[ViewScore]) -> Table:
