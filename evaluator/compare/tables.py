@@ -60,7 +60,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
     )
     return Table(
         id="success",
-        title="Success",
+        title="Success rates",
         columns=(
             *("task", "condition", "policy", "side", "unit"),
             *(*RATE_COLUMNS, f"sim - {word} (pp)", "why undefined"),

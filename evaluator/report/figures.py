@@ -28,6 +28,7 @@ MOST = 40
 NAMED = 6
 """Groups that the words for those who cannot see it name one by one."""
 
+BOTH_KNOWN = ", over the trials where both sides are known; bars are 95 % intervals of both rates"
 Px = float | int
 
 
@@ -83,25 +84,26 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | None:
     if not known:
         return None
     shown = known[:MOST]
-    bottom = 40 + 52 * len(shown)
     has_twin = any(group.shown_sim.value is not None for group in known)
+    step = 52 if has_twin else 38
+    bottom = 40 + step * len(shown)
     marks = [*_axis(12, 340, bottom, 30)]
     if has_twin:
         marks += ('<circle cx="17" cy="16" r="5" fill="{sim}"/>', _text(28, 20, "twin", "ink"))
         marks.append('<rect x="78" y="11" width="10" height="10" fill="{rec}"/>')
         marks.append(_text(94, 20, word, "ink"))
     for index, group in enumerate(shown):
-        y = 50 + 52 * index
+        y = 50 + step * index
         marks.append(_text(12, y, group.label, "ink"))
         marks += _rate(group.shown_sim, y + 14, "sim") if has_twin else ()
-        marks += _rate(group.recorded, y + 30, "rec")
+        marks += _rate(group.recorded, y + step - 22, "rec")
     more = len(known) - len(shown)
     rest = f" The first {MOST} of {len(known)} groups; the table has all." if more else ""
     side = "planned" if any(group.executed is None for group in known) else "executed"
     return Drawing(
         id="success",
         title=f"Success rates in the twin and {word}" if has_twin else f"Success rates, {word}",
-        caption=f"{f'Circle: {side}-in-twin; square' if has_twin else 'Square'}: {word}. Bars "
+        caption=f"{f'Circle: {side}-in-twin; square: {word}. ' if has_twin else ''}Bars "
         f"are 95 % intervals; the counts stand at the right.{rest}",
         alt=_alt("Rates", word, [(g.label, g.shown_sim, g.recorded) for g in known]),
         height=bottom + 42,
@@ -147,12 +149,15 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
             marks.append(_text(x, y, f"\u00d7{together}", "ink"))
     with_too = any(group.condition == WITH for group in drawn)
     filled = " Hollow: without replanning; solid: with." if with_too else ""
+    each = [n for n in ("task", "condition", "policy") if any(getattr(g, n) for g in drawn)]
+    bars = any(rate.interval for group in drawn for rate in group.pair)
+    drawn_as = f"One mark per group ({', '.join(each)}){BOTH_KNOWN if bars else ''}. Below the"
+    alike = " \u00d72: two at one place." if len({*places}) < len(places) else ""
     return Drawing(
         id="scatter",
         title=f"Success in the twin against {word} success",
-        caption="One mark per group (task, condition, policy), over the trials where both sides "
-        "are known; bars are 95 % intervals of both rates. Below the dashed line the twin is "
-        f"optimistic. \u00d72: two alike.{filled}",
+        caption=f"{drawn_as} dashed line the twin is optimistic, above it pessimistic.{alike}"
+        f"{filled}",
         alt=_alt("Scatter", word, [(group.label, *group.pair) for group in drawn]),
         height=top + side + 48,
         marks=tuple(marks),

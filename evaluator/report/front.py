@@ -42,7 +42,9 @@ TOO_MANY = 3
 """More trials than so many times those that were made are no advice."""
 IF_THAT_STAYS = "; if that stays"
 """What an open comparison goes on with; the first page says under "Next" what to do."""
+GIVE_N = "add the number of trials behind each rate: a column n, or 7/10 where 70 % stands."
 NO_N, NO_INTERVAL = "rates without n", ", without an interval"
+NO_TRIALS = "the table gives no numbers of trials"
 """Of rates without n the first page says once that they have no interval."""
 FIGURES = ("scatter", "success")
 """The picture beside the sentences: the first that was drawn."""
@@ -57,8 +59,8 @@ class Front:
     """Over all tasks, each with the question that it answers."""
     next_step: str
     """What to do next; empty where nothing would settle more."""
-    commands: Sequence[str]
-    """What to type for it and once it is done; empty where nothing is to be tried."""
+    commands: Sequence[tuple[str, str]]
+    """What to do for it, and to type then; empty where nothing is to be tried."""
     tasks: Sequence[tuple[str, str]]
     """Task and sentence."""
     more_tasks: int
@@ -79,11 +81,11 @@ def front(results: Results) -> Front:
     told = _summary(results, len(rows))
     trust = [*_trust(results), *_regret(results)]
     answers = {
-        "What happened" if _all_alike(results)[0] else "Which is better": _compared(results),
+        "Which is better": _compared(results),
         "Trust the twin": trust,
         IN_NUMBERS: [*told, *(f"{text}." for text in opposed)],
     }
-    told_once = (NO_INTERVAL, "") if NO_N in " ".join(trust) else ("", "")
+    told_once = (NO_INTERVAL, "") if NO_TRIALS in " ".join(trust) else ("", "")
     about = [
         (name, text)
         for name, text in about
@@ -93,7 +95,7 @@ def front(results: Results) -> Front:
     return Front(
         answers=[(n, " ".join(s).replace(*told_once)) for n, s in answers.items() if s],
         next_step=(step := next_trials(results)),
-        commands=_again(results) if step and not step.startswith(TAKE) else (),
+        commands=_again(results, step) if step and not step.startswith(TAKE) else (),
         tasks=[(str(row["task"]), sentence(row).replace(*told_once)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[
@@ -110,7 +112,9 @@ def _compared(results: Results) -> list[str]:
     """Say which candidate is better, of the questions over all tasks."""
     rows = rows_of(results, "comparisons")
     sentences = [
-        str(row["answer"]).partition(IF_THAT_STAYS)[0] for row in rows if row["task"] == ALL_TASKS
+        str(row["answer"]).partition(IF_THAT_STAYS)[0].removesuffix("; stop here")
+        for row in rows
+        if row["task"] == ALL_TASKS
     ]
     heads = ("undecided", "no difference")  # others begin with a name, which keeps its letters
     split = _by_task(results)
@@ -126,8 +130,10 @@ def _compared(results: Results) -> list[str]:
         f"{text[0].upper() if text.startswith(heads) else text[0]}{text[1:]}."
         for text in sentences[: SHOWN_ANSWERS - len(standing) - SHOWN_ANSWERS * len(split)]
     ]
-    alike = _all_alike(results)[0]
-    return [alike] if alike else [*split, *found]
+    cannot = _all_alike(results)[0]
+    if not rows and any(NO_N in text for text in results.missing):
+        cannot = f"Cannot be told: {NO_TRIALS}."
+    return [cannot] if cannot else [*split, *found]
 
 
 def _regret(results: Results) -> list[str]:
@@ -136,9 +142,11 @@ def _regret(results: Results) -> list[str]:
     if regret is None or regret.value is None or _all_alike(results)[0]:
         return []
     name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
-    taken = "one of them by chance" if " or " in name else "it"
-    words = f"The twin ranks {name} first; taking {taken} costs {_points(regret.value)}"
-    return [f"{words}{_ends(regret, '.0f')} against the best recorded rate over all tasks."]
+    if round(regret.value) == 0:
+        return [f"The twin ranks {name} first, and so do the recorded rates."]
+    taken = "one of them by chance" if " or " in name else "its recorded rate"
+    words = f"The twin ranks {name} first; {taken} is {_points(regret.value)}"
+    return [f"{words}{_ends(regret, '.0f')} below the best over all tasks."]
 
 
 def _by_task(results: Results) -> list[str]:
@@ -175,7 +183,8 @@ def _standing(results: Results) -> tuple[list[str], list[str]]:
     if len(best) > 1:
         listed = ", ".join(str(row["candidate"]) for row in best[:SHOWN_TASKS])
         more = " ..." if len(best) > SHOWN_TASKS else ""
-        return [f"{len(best)} of {len(rows)} candidates may be best: {listed}{more}."], beaten
+        lost = f"; not the best: {', '.join(beaten[:SHOWN_TASKS])}"
+        return [f"{listed}{more} may be best{lost}."], beaten
     name, of = best[0]["candidate"], f"({best[0]['k']} of {best[0]['n']})"
     over_all = all(f", {name}, " in f", {row['beaten by']}, " for row in rows if row not in best)
     why = "it is better than each of the others" if over_all else "only it lost no comparison"
@@ -234,21 +243,24 @@ def next_trials(results: Results) -> str:
         if row["decided"] == "no" and not {*pair} & {*beaten}
         if isinstance(more := row["more trials of each"], int) and more > 0
     ]
-    settled = "" if wanted else _settled([row for row, _ in of_all], rows_of(results, "standing"))
+    standing = rows_of(results, "standing")
+    settled = "" if wanted else _settled([row for row, _ in of_all], standing)
     if settled:
         return settled
     if _by_task(results):
         return f"{TAKE}for each task one that was not beaten there; none is best on all tasks."
     if not wanted:
         without = any(NO_N in text for text in results.missing)
-        return "give n: a column n, or 7/10 in the place of 70 %." if without else ""
+        return GIVE_N if without else ""
     more, pair = min(wanted)
     made = sum(m.n or 0 for m in results.measurements if m.id.startswith("rate.recorded."))
     if len({name for _, each in asked for name in each}) * more > TOO_MANY * made > 0:
-        names = list(dict.fromkeys(name for _, each in wanted for name in each))
+        won = {str(row["candidate"]): _number(row["k"]) or 0.0 for row in standing}
+        names = sorted({n for _, each in wanted for n in each}, key=lambda n: (-won.get(n, 0), n))
         apart = "them" if len(names) == 2 else "even two of them"
         words = f"each may be best, and to tell {apart} apart would take about {2 * more} more"
-        return f"{TAKE}{', '.join(names[:-1])} or {names[-1]}: {words} trials."
+        first = " (most successes)" if won else ""
+        return f"{TAKE}{names[0]}{first} or {' or '.join(names[1:])}: {words} trials in all."
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
     return f"{_more_trials(more, pair, tasks)}; that would likely tell these two apart."
 
@@ -279,13 +291,15 @@ def _settled(compared: Sequence[Row], standing: Sequence[Row]) -> str:
     return f"{TAKE}{best[0]}; no more trials are needed to choose." if len(best) == 1 else ""
 
 
-def _again(results: Results) -> tuple[str, ...]:
-    """Return how further trials are recorded, and what to type once they are there."""
+def _again(results: Results, step: str) -> tuple[tuple[str, str], ...]:
     if results.source == "run":
         name = shlex.quote(str(results.provenance.get("folder", results.run)))
-        return f"robot-gst record {name}", f"robot-gst replay {name} && robot-gst evaluate {name}"
+        then = f"robot-gst replay {name} && robot-gst evaluate {name}"
+        return ("Record that with", f"robot-gst record {name}"), (", then type", then)
     files = shlex.join(results.provenance.get("files", ())) or shlex.quote(results.run)
-    return (f"robot-gst evaluate {files}",)
+    what = "counts" if results.source == "rates" else "outcomes"
+    first = "Then type" if step == GIVE_N else f"Add the {what} to the table, then type"
+    return ((first, f"robot-gst evaluate {files}"),)
 
 
 def _trust(results: Results) -> list[str]:
@@ -304,10 +318,9 @@ def _trust(results: Results) -> list[str]:
     low = 0.0 if r.interval is None else r.interval.low
     yes = f"in each of these tasks its rate is within {CLOSE_PP:.0f} points of the recorded one, "
     yes += f"it follows from group to group (r at least {low:.2f}), and no group looks blind"
-    told = "No" if against else "Can't tell yet" if found else "Yes"
+    told = "No" if against else "Not yet" if found else "Yes"
     why = "; ".join(against or [words for _, words in found] or [yes])
-    then = USE if against else f" Until then,{USE.lower()}" if found else ""
-    return [f"{told}. {why[0].upper()}{why[1:]}.{then}"]
+    return [f"{told}. {why[0].upper()}{why[1:]}.{USE if found else ''}"]
 
 
 Against = Iterator[tuple[bool, str]]
@@ -326,15 +339,15 @@ def _followed(r: Measurement, num_groups: int) -> Against:
     if r.interval is None or r.value is None:
         why = str(r.reason_if_undefined or r.reason_without_interval).replace(";", ",")
         if num_groups < GROUPS_FOR_R:
-            why = f"it takes {GROUPS_FOR_R} groups or more, and here is {num_groups}"
-        why = NO_N if why.startswith(NO_N) else why
-        yield False, f"whether its rates follow the recorded ones is not known: {why}"
+            there = "there is 1" if num_groups == 1 else f"there are {num_groups}"
+            why = f"it takes {GROUPS_FOR_R} groups (policies times tasks) or more, and {there}"
+        why = NO_TRIALS if why.startswith(NO_N) else why
+        yield False, f"whether its rates follow the recorded ones cannot be told: {why}"
     elif r.interval.high < FOLLOWS_R:
         high = r.interval.high
         yield True, f"its rates hardly follow the recorded ones (r at most {high:.2f})"
     elif r.interval.low <= 0:
-        ends = _ends(r, ".2f")
-        yield False, f"whether its rates follow the recorded ones is open (r in{ends})"
+        yield False, "its correlation with the recorded rates is too uncertain to use"
 
 
 def _near(results: Results, bias: Measurement) -> Against:
@@ -351,7 +364,7 @@ def _near(results: Results, bias: Measurement) -> Against:
         yield 2 * off > many, f"{_of_tasks(off, many)}its rate is {which}{named}"
     if open_ or not many:
         where = _of_tasks(open_, many)
-        yield False, f"{where}its rate may be more than {CLOSE_PP:.0f} points off"
+        yield False, f"{where}an error above {CLOSE_PP:.0f} points cannot be ruled out"
 
 
 def _of_tasks(some: int, many: int) -> str:
@@ -386,10 +399,10 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
     parts: list[str] = []
     side = agreeing_side(by_id)
     rate = by_id.get(f"agreement.{side}.rate")
-    if rate is not None and rate.k is not None and rate.n:
+    if rate is not None and rate.k is not None and rate.n and rate.n >= SAYS_LITTLE:
         who = "Twin" if side == "sim_planned" else "Without plans, what was executed in the twin"
-        of = f"{rate.k} of {rate.n} {noun('trial', rate.n)}"
-        parts.append(f"{who} and recorded outcome agree in {of}{_by_chance(results, rate.n)}.")
+        of = f"{rate.k} of {rate.n} trials ({100 * rate.k / rate.n:.0f} %"
+        parts.append(f"{who} and recorded outcome agree in {of}{_by_chance(results, rate.n)}).")
     bias = by_id.get("agreement.bias_pp")
     if bias and bias.value is not None and (bias.n or 0) > 1 and (num_tasks > 1 or bias.interval):
         size = f"{_points(bias.value)} {'below' if bias.value < 0 else 'above'}"
@@ -416,10 +429,10 @@ def _by_chance(results: Results, num_trials: int) -> str:
         sum(n for row in rows if isinstance(n := row.get(name), int)) / num_trials
         for name in ("yes", "succeeded", "trials")
     )
-    if known != 1 or num_trials < SAYS_LITTLE:  # or older results, which miss some
+    if known != 1:  # or older results, which miss some
         return ""
     by_chance = num_trials * (yes * succeeded + (1 - yes) * (1 - succeeded))
-    return f"; by chance they would in {by_chance:.0f}"
+    return f"; {100 * by_chance / num_trials:.0f} % by chance"
 
 
 def _all_alike(results: Results) -> tuple[str, str]:
@@ -430,13 +443,11 @@ def _all_alike(results: Results) -> tuple[str, str]:
         return "", ""
     word, task = ("Nothing", "an easier") if k == 0 else ("Everything", "a harder")
     ends = wilson(k, n)
-    told = (
-        f"{word} succeeded: {k} of {n} recorded {noun('trial', n)}; over all, the rate is between "
-    )
-    told += f"{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
-    each = f"record {SAYS_LITTLE} trials or more of each candidate"
-    few = f"{each}; to judge the twin, in {GROUPS_FOR_R} groups (policies times tasks) or more."
-    why = "where all trials end alike, none can be shown to be better"
+    told = f"{word.lower()} succeeded, {k} of {n} recorded {noun('trial', n)}; the rate over all "
+    told = f"Cannot be told: {told}lies between {100 * ends.low:.0f} and {100 * ends.high:.0f} %."
+    each = f"record {SAYS_LITTLE} trials or more of each policy"
+    few = f"{each}; to judge the twin, in {GROUPS_FOR_R} pairs of policy and task or more."
+    why = "while all trials end alike, no policy can be shown to be better"
     alike = f"check how success is scored, then {each} on {task} task: {why}."
     return told, few if n < SAYS_LITTLE else alike
 

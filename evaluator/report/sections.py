@@ -83,11 +83,11 @@ agreement | Agreement over groups | agreement.[!sv]* agreement.spearman_rho deci
     does not show that the right decision follows, nor that there is no bias.
 comparisons | Which is better |  | comparisons standing
     Policies, and each without and with replanning, as recorded.
-gate | Trial by trial: the gate's scorecard | agreement.sim_planned.* agreement.verdict* baseline.* | confusion
+gate | Trial by trial: twin and outcome | agreement.sim_planned.* agreement.verdict* baseline.* | confusion
     What the twin said of each plan against how it ended, and what obeying it costs and avoids.
 raters | Other raters |  | raters
     How far raters of the same trials agree.
-stages | Where trials are lost |  | funnel failures
+stages | Where trials fail |  | funnel failures
     Which stage ends a trial, and what failed first on each side.
 motion | Motions | motion.* | motion* end_points_*
     How far the recorded robot lies from the replayed one: planned tells about the controller,

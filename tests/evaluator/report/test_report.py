@@ -218,7 +218,7 @@ def test_a_report_shows_what_somebody_decides_by_and_all_of_it_when_asked(
     assert len(shown) == 4
     assert shown < {table.id for table in comparison.tables}
     for name in shown:
-        assert f"Decides {sections.decides(name)}." in text
+        assert f"To decide {sections.decides(name)}." in text
     everything = write_report(comparison, tmp_path, everything=True)
     assert {path.stem for path in (tmp_path / "tables").iterdir()} == {
         table.id for table in everything.content.tables

@@ -184,7 +184,7 @@ def trusted(tmp_path: Path, sim: tuple[int, ...], n: int) -> str:
 def test_a_twin_is_trusted_only_where_the_numbers_say_so(tmp_path: Path) -> None:
     right, off = tuple(range(10)), (4, 5, 6, 7, 8, 9, 10, 10, 9, 9)
     assert trusted(tmp_path, right, 100).startswith("Yes. In each of these tasks")
-    assert trusted(tmp_path, right, 4).startswith("Can't tell yet. ")
+    assert trusted(tmp_path, right, 4).startswith("Not yet. ")
     assert trusted(tmp_path, off, 100).startswith("No. ")
     assert trusted(tmp_path, right[::-1], 100).startswith("No. ")
     blind = trusted(tmp_path, (9, *right[1:]), 100)  # in one task it says success throughout
@@ -194,6 +194,7 @@ def test_a_twin_is_trusted_only_where_the_numbers_say_so(tmp_path: Path) -> None
 def test_rates_without_n_ask_for_it_and_claim_no_interval(tmp_path: Path) -> None:
     rates = "policy,real,sim\nA,50%,60%\nB,70%,65%\nC,30%,45%\nD,10%,20%\nE,80%,75%\n"
     page_text, terminal = shown(tmp_path, rates)
+    assert "Which is better: Cannot be told: the table gives no numbers" in page_text
     assert "a column n" in page_text
     for text in (page_text, terminal):
         assert re.search(r"r .*0\.9", text)
@@ -209,7 +210,7 @@ def test_a_table_without_a_twin_is_told_nothing_about_one(tmp_path: Path) -> Non
             assert word not in text, (word, text)
 
 
-@pytest.mark.parametrize(("k", "words"), [(0, "Nothing succeeded: 0 of 6"), (3, "Everything")])
+@pytest.mark.parametrize(("k", "words"), [(0, "nothing succeeded, 0 of 6"), (3, "everything")])
 def test_a_study_of_which_all_trials_end_alike_says_so(tmp_path: Path, k: int, words: str) -> None:
     trials = "task,policy,recorded,sim_planned\n" + "".join(
         f"cup,{policy},{int(i < k)},{int(i < 1)}\n" for policy in "AB" for i in range(3)
