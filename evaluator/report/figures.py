@@ -23,6 +23,8 @@ LIGHT = {**palette.LIGHT, **{name: palette.LIGHT[meaning] for name, meaning in N
 DARK = {**palette.DARK, **{name: palette.DARK[meaning] for name, meaning in NAMES.items()}}
 """The same names on a dark page."""
 WIDTH = 440
+HIGH = 0.94
+"""Rates so near the edge that what belongs to a mark stands inside of it."""
 MOST = 40
 """Groups drawn; a longer figure would not fit a page."""
 NAMED = 6
@@ -145,8 +147,12 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
         )
     for at, together in Counter(places).items():
         if together > 1:
-            x, y = left + side * at[0] + 8, top + side * (1 - at[1]) - 8
-            marks.append(_text(x, y, f"\u00d7{together}", "ink"))
+            x, y = left + side * at[0], top + side * (1 - at[1]) + (20 if at[1] > HIGH else -8)
+            right = at[0] > HIGH
+            words = f"\u00d7{together}"
+            marks.append(
+                _text(x - 8 if right else x + 8, y, words, "ink", "end" if right else "start")
+            )
     with_too = any(group.condition == WITH for group in drawn)
     filled = " Hollow: without replanning; solid: with." if with_too else ""
     each = [n for n in ("task", "condition", "policy") if any(getattr(g, n) for g in drawn)]
