@@ -152,6 +152,7 @@ def build_page(
     moment = None if row is None else moment_of(run, row)
     divergence_t_s = None if moment is None else clock.of_plan_time(moment.plan_id, moment.t_ns)
     shown = shown_replays(replays, sent_plan)
+    failed = {name for name, answer in (row.stages if row else ()) if answer is False}
     known = (t for t in (t_s, divergence_t_s, failure_t_s) if t is not None)
     cursor = clock.clamp(next(known, clock.end_s))
     not_scanned = problems.attempt(lambda: not_scanned_in(run, Episode.open(path)), list[str]())
@@ -162,7 +163,7 @@ def build_page(
         label=problems.attempt(lambda: outcome_of(run, Episode.open(path)), recording.outcome),
         verdicts=verdicts,
         gated=any(view.title == GATE_BEFORE and view.of_sent_plan for view in verdicts),
-        stages=trial_lanes(recording, shown, clock, failure_t_s),
+        stages=trial_lanes(recording, shown, clock, failure_t_s, failed),
         replans=replans(recording, clock),
         plots=main_plots(recording, replays, sent_plan, row, clock),
         joint_plots=plots_of_joints(recording, shown, clock),

@@ -1,6 +1,6 @@
 """Lanes of a trial on the page's clock: stages, what the hand touches, and what is apart."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,11 +36,13 @@ def trial_lanes(
     replays: Mapping[str, Recording],
     clock: PageClock,
     failure_t_s: float | None,
+    failed: Collection[str] = (),
 ) -> StageChart | None:
     """Draw stages, touches and divergences, and marks for failure, replanning and divergence.
 
     Args:
         failure_t_s: Page time of the first failure in the twin [s]; None marks none.
+        failed: Stages that failed as recorded.
     """
     marks = [(each.t_s, f"replan: {each.reason}", "replan") for each in replans(recording, clock)]
     if failure_t_s is not None:
@@ -51,7 +53,7 @@ def trial_lanes(
     return stage_chart(
         [
             ("planned", _planned_stages(recording, clock)),
-            ("recorded", _recorded_stages(recording, clock)),
+            ("recorded", _recorded_stages(recording, clock, failed)),
             *touches,
             *_apart(replays, clock),
         ],
@@ -150,7 +152,7 @@ def _planned_stages(recording: Recording, clock: PageClock) -> list[Span]:
     return spans
 
 
-def _recorded_stages(recording: Recording, clock: PageClock) -> list[Span]:
+def _recorded_stages(recording: Recording, clock: PageClock, failed: Collection[str]) -> list[Span]:
     order = {
         stage.id: index for _, plan in recording.plans for index, stage in enumerate(plan.stages)
     }
@@ -162,6 +164,8 @@ def _recorded_stages(recording: Recording, clock: PageClock) -> list[Span]:
             begun[stage_id] = clock.seconds(event["stamp_ns"])
         elif event["type"] == "stage_ended" and stage_id in begun:
             start, end = begun.pop(stage_id), clock.seconds(event["stamp_ns"])
-            style = f"stage-{order.get(stage_id, 0) % 4}"
-            spans.append(Span(start_s=start, end_s=end, label=stage_id, style=style))
+            style, label = f"stage-{order.get(stage_id, 0) % 4}", stage_id
+            if stage_id in failed:
+                style, label = "apart", f"✗ {stage_id}"
+            spans.append(Span(start_s=start, end_s=end, label=label, style=style))
     return spans

@@ -1,6 +1,7 @@
 """The player of a trial: opens at the divergence, and shows recorded, twin and difference."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -91,9 +92,13 @@ def test_lanes_say_what_is_apart_from_when_on_and_why_plans_were_sent_back(
 ) -> None:
     planned = next(p for p in run.derived(f"{ID}.replay.planned.*") if "drawn" not in p.name)
     write_touches(planned, synthetic)
-    chart = page(run).stages
+    row = replace(judge(run).row(ID), stages=(("carry", False), ("release", None)))
+    chart = build_page(run, ID, row, None).stages
     assert chart is not None
     lanes = {lane.name: lane for lane in chart.lanes}
+    assert [(b.label, b.style) for b in lanes["recorded"].bars if b.style == "apart"] == [
+        ("✗ carry", "apart")
+    ]
     (bar,) = lanes["object apart"].bars
     assert bar.x == pytest.approx(chart.x.px(1 + 2.0))  # the plan starts after one second
     assert bar.label == "planned – recorded: 69.0\u00a0mm"
