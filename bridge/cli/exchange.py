@@ -181,6 +181,7 @@ def import_rgbd(
         episode: Id of the new episode.
     """
     from bridge.episode.metadata import EpisodeInfo
+    from bridge.exchange.output import Unused, tell_unused
     from bridge.sources.folder.messages import (
         describe_folder,
         folder_messages,
@@ -197,15 +198,17 @@ def import_rgbd(
     total = num_frames(index, config)
     path = _import_scan(run, info, folder_messages(index, config, None), total, source, output)
     left_out = index.num_unposed + index.num_unpaired
+    unused = [Unused(*item) for item in index.unused]
     data = {
         "file": str(path),
         "layout": index.layout,
         "frames": total,
         "frames_left_out": left_out,
         "assumed": index.assumed,
+        "unused": [item._asdict() for item in unused],
     }
     output.result(data, f"{path}: {total} frames of a folder in {index.layout} layout")
-    return 0
+    return tell_unused(output, unused)
 
 
 def _import_scan(

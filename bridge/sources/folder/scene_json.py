@@ -7,6 +7,7 @@ and ``T_world_cam`` (of the depth camera, metres, OpenCV axes; null where tracki
 """
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,19 @@ from bridge.sources.folder.frames import (
     FolderFrame,
     FolderIndex,
     checked_rotation,
+    refuse_bent,
     refuse_scale_without_use,
     require_image,
+    unread,
 )
 
 INDEX_NAME = "scene.json"
+_READ = {"name", "depth_unit_m", "depth_invalid_values", "depth_encoding", "depth_intrinsics"} | {
+    *("color_registered_to_depth", "color_camera_estimate", "frames", "color", "depth"),
+    *("T_world_cam", "id", "pose_convention", "note", "formula", "fx", "fy", "cx", "cy", "width"),
+    *("height", "t_color_from_depth_m", "R_color_from_depth"),
+}
+"""Keys that are read, and those that say something to people."""
 _KEYS_HINT = "docs/rgbd_folder.md lists the keys."
 
 
@@ -37,6 +46,11 @@ def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
     registered = record.get("color_registered_to_depth", True)
     color_camera, T_depth_color = (None, np.eye(4)) if registered else _color(path, record)
     frames, num_unposed = _frames(path, record)
+    parts = [record, *record["frames"]]
+    for part in parts:
+        refuse_bent(path, "the folder", part)
+    parts += [part for part in record.values() if isinstance(part, dict)]
+    keys = Counter(key for part in parts for key in part)
     return FolderIndex(
         path=path,
         layout="scene.json",
@@ -49,6 +63,7 @@ def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
         T_depth_color=T_depth_color,
         frames=frames,
         num_unposed=num_unposed,
+        unused=tuple(unread(keys, _READ, {})),
     )
 
 
@@ -86,6 +101,7 @@ def _camera(path: Path, record: dict[str, Any], key: str) -> Camera:
     values = _value(path, record, key)
     if not isinstance(values, dict):
         raise FolderError(path=path, found=f"{key} is not an object", hint=_KEYS_HINT)
+    refuse_bent(path, key, values)
     numbers = {name: _positive(path, values, name) for name in ("fx", "fy", "cx", "cy")}
     return Camera.from_ros(
         width=int(_positive(path, values, "width")),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import robot_gst
 from bridge.episode import schema
 from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage, transforms_from_cdr
 from bridge.episode.metadata import EpisodeInfo
@@ -245,6 +246,42 @@ def test_a_matrix_that_is_no_rotation_is_refused(
     rewrite(folder, index_record)
     with pytest.raises(FolderError, match=r"rotation of frames\[1\] is none"):
         read_index(folder)
+
+
+LENSES = (
+    *({"k1": -0.1}, {"is_fisheye": True}, {"distortion": [0, 0.1]}, {"D": {"k1": 0.1}}),
+    *({"camera_model": "OPENCV_FISHEYE"}, {"distortion_model": "equidistant", "D": [0, 0]}),
+)
+STRAIGHT = {"camera_model": "PINHOLE", "distortion_model": "plumb_bob", "k1": 0, "D": [0.0] * 5}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("where", ["", "depth_intrinsics", "frames"])
+def test_a_lens_is_refused_whichever_key_says_it(
+    folder: Path, index_record: dict[str, Any], lens: dict[str, Any], where: str
+) -> None:
+    part = index_record[where] if where else index_record
+    part = part[1] if where == "frames" else part
+    part |= STRAIGHT
+    rewrite(folder, index_record)
+    assert read_index(folder).unused == ()
+    part |= lens
+    rewrite(folder, index_record)
+    with pytest.raises(FolderError, match=f"{'|'.join(lens)}|the model.*image_undistorter"):
+        read_index(folder)
+
+
+def test_keys_that_nobody_reads_are_named_with_their_frames(
+    folder: Path, index_record: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for frame in index_record["frames"]:
+        frame["mask"] = "m.png"
+    index_record["depth_intrinsics"]["skew"] = 0.1
+    rewrite(folder, index_record)
+    assert robot_gst.run(["import", "rgbd", str(folder), str(folder / "run")]) == 0
+    said = capsys.readouterr().err
+    assert "not used: mask of 2 frames: not read" in said
+    assert "not used: skew: not read" in said
 
 
 def test_missing_files_are_named(folder: Path, tmp_path: Path) -> None:
