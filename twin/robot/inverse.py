@@ -9,7 +9,7 @@ towards home.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -66,6 +66,8 @@ def solve_ik(
             best = _from_branches(robot, T_base_tcp, best, start, config)
         return best
     best = _descend(robot, T_base_tcp, start, config, bounded=True)
+    if not best.reached and len(start) < NUM_POSE:
+        return _position_first(robot, T_base_tcp, warm_start_rad, config)
     if not best.reached:
         best = _from_nearest(robot, T_base_tcp, best, config)
         return _nearer(robot, T_base_tcp, best, start, config) if best.reached else best
@@ -156,6 +158,45 @@ def _from_nearest(
     return best
 
 
+_TURN_WEIGHT, _LITTLE_RAD = 0.05, 0.35
+"""Of a radian against a metre, where a tool cannot be turned at will; and what little is left."""
+
+
+def _position_first(
+    robot: RobotModel,
+    T_base_tcp: Float[np.ndarray, "4 4"],
+    warm_start_rad: Float[np.ndarray, " num_joints"] | None,
+    config: IkConfig,
+) -> IkSolution:
+    """Put the tool where it is wanted, turned as nearly so as an arm of few joints can.
+
+    ``reached`` is of the position alone. What a warm start leads to is taken where little is left,
+    so that a path stays one; else the posture that turns the tool best, of those near the pose.
+    """
+    enough_rad = config.rotation_tolerance_rad if warm_start_rad is None else _LITTLE_RAD
+    tries = [(robot.home_rad if warm_start_rad is None else warm_start_rad, _TURN_WEIGHT)]
+    if config.restarts and np.isfinite(T_base_tcp).all():
+        rows, tree = _postures(robot)
+        near = tree.query(_features(T_base_tcp[None])[0], k=3 * config.restarts)[1]
+        tries += [(rows[index], _TURN_WEIGHT) for index in near]
+        away_m = np.linalg.norm(tree.data[:, :3] - T_base_tcp[:3, 3], axis=1)
+        tries += [(rows[index], 0.0) for index in np.argsort(away_m)[: config.restarts]]
+    found: list[tuple[bool, float, int, IkSolution]] = []
+    for start_rad, weight in tries:
+        if not weight and not min(found)[0]:
+            break
+        turned = _descend(robot, T_base_tcp, start_rad, config, bounded=True, turn_weight=weight)
+        other = _descend(
+            robot, T_base_tcp, turned.joints_rad, config, bounded=True, turn_weight=0.0
+        )
+        is_there = other.position_error_m <= config.position_tolerance_m
+        missed = other.rotation_error_rad if is_there else other.position_error_m
+        found.append((not is_there, missed, len(found), replace(other, reached=is_there)))
+        if is_there and missed <= enough_rad:
+            break
+    return min(found)[3]
+
+
 _DISTINCT_RAD = 0.5
 _MOST_SOLUTIONS = 8
 _LOOKED_AT = 80
@@ -239,10 +280,12 @@ def _descend(
     config: IkConfig,
     *,
     bounded: bool = False,
+    turn_weight: float | None = None,
 ) -> IkSolution:
     """One descent. Calls into pinocchio take a microsecond each, so each is made once a step.
 
-    ``bounded`` leaves out joints that a limit stops: the others then do their part.
+    ``bounded`` leaves out joints that a limit stops: the others then do their part. With a
+    ``turn_weight`` position and orientation count apart, so that one may be left.
     """
     model, data, tcp_id = robot.model, robot.data, robot.tcp_id
     lower, upper, arm = robot.lower_rad, robot.upper_rad, robot.arm_ids
@@ -250,21 +293,27 @@ def _descend(
     joints = np.minimum(np.maximum(start_rad, lower), upper)
     q = robot.configuration(joints)
     damping, last = 1e-6, math.inf
-    accepted, misses = joints, target.translation
+    accepted, misses = joints, target
     jacobian, error = np.zeros((6, len(joints))), np.zeros(6)
     for _ in range(config.max_iterations):
         q[arm] = joints
         pin.computeJointJacobians(model, data, q)
         difference = pin.updateFramePlacement(model, data, tcp_id).actInv(target)
-        trial = pin.log6(difference).vector
+        if turn_weight is None:
+            trial = pin.log6(difference).vector
+        else:
+            turn = turn_weight * pin.log3(difference.rotation)
+            trial = np.concatenate([difference.translation, turn])
         norm = math.sqrt(trial @ trial)
         if norm < last:
-            accepted, last, error, misses = joints, norm, trial, difference.translation
+            accepted, last, error, misses = joints, norm, trial, difference
             if norm < _CONVERGED:
                 break
             damping = max(damping * 0.2, 1e-9)
             full = pin.getFrameJacobian(model, data, tcp_id, pin.LOCAL)
             jacobian = full[:, robot.arm_velocity_ids]
+            if turn_weight is not None:
+                jacobian = jacobian * np.repeat((1.0, turn_weight), 3)[:, None]
             if bounded:
                 pull = jacobian.T @ trial
                 stopped = ((joints <= lower) & (pull < 0)) | ((joints >= upper) & (pull > 0))
@@ -277,8 +326,7 @@ def _descend(
         square.flat[::7] += damping
         weights = dposv(square, error)[1]
         joints = np.minimum(np.maximum(accepted + jacobian.T @ weights, lower), upper)
-    # The angular part of the twist is the rotation vector of what is left.
-    position, rotation = math.hypot(*misses), math.hypot(*error[3:])
+    position, rotation = math.hypot(*misses.translation), math.hypot(*pin.log3(misses.rotation))
     return IkSolution(
         joints_rad=accepted,
         position_error_m=position,

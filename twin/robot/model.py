@@ -291,7 +291,7 @@ class RobotModel:
             if self._slides(name):
                 raise RobotDescriptionError(
                     found=f"has the joint {name!r}, which slides",
-                    hint="An arm of six or seven joints that turn is needed.",
+                    hint="An arm of five to seven joints that turn is needed.",
                 )
         for finger in self.record.gripper.fingers:
             name, wanted = finger.joint, "turn" if finger.turns else "slide"
