@@ -1,10 +1,9 @@
 """Inverse kinematics: joints that put the tool centre point where a plan wants it.
 
 Levenberg-Marquardt on the SE(3) error with a warm start, because the next waypoint of a
-trajectory is near. Where it fails, the descent begins again from elsewhere: for UR-type arms, whose
-closed form gives all eight branches at once, from random postures of a fixed seed; for all others
-from those of many random postures whose poses are nearest. What a seventh joint leaves open goes
-towards home.
+trajectory is near. Where it fails, the descent begins again from elsewhere: for UR-type arms from
+the branches of the closed form, then from those of many random postures whose poses are nearest.
+What a seventh joint leaves open goes towards home.
 """
 
 import math
@@ -58,57 +57,14 @@ def solve_ik(
 ) -> IkSolution:
     """The best joints within limits for a pose, by the warm start (None: home); see ``reached``."""
     start = robot.home_rad if warm_start_rad is None else warm_start_rad
-    if UrInverse.for_robot(robot) is not None:
-        best = _descend(robot, T_base_tcp, start, config)
-        if not best.reached:
-            best = _from_random(robot, T_base_tcp, best, config)
-        if not best.reached and config.restarts:
-            best = _from_branches(robot, T_base_tcp, best, start, config)
-        return best
-    best = _descend(robot, T_base_tcp, start, config, bounded=True)
+    best = _descend(robot, T_base_tcp, start, config)
     if not best.reached and len(start) < NUM_POSE:
         return _position_first(robot, T_base_tcp, warm_start_rad, config)
     if not best.reached:
-        best = _from_nearest(robot, T_base_tcp, best, config)
+        best = _from_nearest(robot, T_base_tcp, best, start, config)
         return _nearer(robot, T_base_tcp, best, start, config) if best.reached else best
     if warm_start_rad is None and len(start) > NUM_POSE:
         return _nearer(robot, T_base_tcp, best, start, config)
-    return best
-
-
-def _from_random(
-    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], best: IkSolution, config: IkConfig
-) -> IkSolution:
-    """Begin at random postures."""
-    rng = np.random.default_rng(config.seed)
-    span = np.minimum(np.pi, (robot.upper_rad - robot.lower_rad) / 2)
-    for _ in range(config.restarts):
-        start = np.clip(rng.uniform(-span, span), robot.lower_rad, robot.upper_rad)
-        other = _descend(robot, T_base_tcp, start, config)
-        if other.reached or other.position_error_m < best.position_error_m:
-            best = other
-        if best.reached:
-            break
-    return best
-
-
-def _from_branches(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    best: IkSolution,
-    near_rad: Float[np.ndarray, " num_joints"],
-    config: IkConfig,
-) -> IkSolution:
-    """Begin at the branches of the closed form, which knows stretched arms; the nearest first."""
-    inverse = UrInverse.for_robot(robot)
-    if inverse is None:
-        return best
-    raw, valid, _ = inverse.solve(T_base_tcp[None])
-    rows = raw[0, valid[0]]
-    for row in rows[np.argsort(np.abs(rows - near_rad).sum(axis=1), kind="stable")]:
-        other = _descend(robot, T_base_tcp, row, config)
-        if other.reached:
-            return other
     return best
 
 
@@ -139,18 +95,26 @@ def _features(Ts: Float[np.ndarray, "num_poses 4 4"]) -> Float[np.ndarray, "num_
 
 
 def _from_nearest(
-    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], best: IkSolution, config: IkConfig
+    robot: RobotModel,
+    T_base_tcp: Float[np.ndarray, "4 4"],
+    best: IkSolution,
+    near_rad: Float[np.ndarray, " num_joints"],
+    config: IkConfig,
 ) -> IkSolution:
-    """Begin at the postures whose poses are nearest."""
-    if not np.isfinite(T_base_tcp).all():
+    """Begin at the branches of the closed form, then at the postures whose poses are nearest."""
+    if not (np.isfinite(T_base_tcp).all() and config.restarts):
         return best
     rows, tree = _postures(robot)
-    count = min(_STARTS_PER_RESTART * config.restarts, len(rows))
-    if not count:
-        return best
-    _, found = tree.query(_features(T_base_tcp[None])[0], k=count)
-    for index in np.atleast_1d(found).tolist():
-        other = _descend(robot, T_base_tcp, rows[index], config, bounded=True)
+    inverse, branches = UrInverse.for_robot(robot), rows[:0]
+    if inverse is not None:  # it knows stretched arms
+        raw, valid, _ = inverse.solve(T_base_tcp[None])
+        branches = raw[0, valid[0]]
+        order = np.argsort(np.abs(branches - near_rad).sum(axis=1), kind="stable")
+        branches = branches[order]
+    count = config.restarts * (_STARTS_PER_RESTART if inverse is None else 1)
+    found = tree.query(_features(T_base_tcp[None])[0], k=min(count, len(rows)))[1]
+    for start_rad in (*branches, *rows[np.atleast_1d(found)]):
+        other = _descend(robot, T_base_tcp, start_rad, config)
         if other.reached or other.position_error_m < best.position_error_m:
             best = other
         if best.reached:
@@ -185,10 +149,8 @@ def _position_first(
     for start_rad, weight in tries:
         if not weight and not min(found)[0]:
             break
-        turned = _descend(robot, T_base_tcp, start_rad, config, bounded=True, turn_weight=weight)
-        other = _descend(
-            robot, T_base_tcp, turned.joints_rad, config, bounded=True, turn_weight=0.0
-        )
+        turned = _descend(robot, T_base_tcp, start_rad, config, weight)
+        other = _descend(robot, T_base_tcp, turned.joints_rad, config, 0.0)
         is_there = other.position_error_m <= config.position_tolerance_m
         missed = other.rotation_error_rad if is_there else other.position_error_m
         found.append((not is_there, missed, len(found), replace(other, reached=is_there)))
@@ -218,7 +180,7 @@ def solutions(
     found = [first.joints_rad]
     _, near = tree.query(_features(T_base_tcp[None])[0], k=_LOOKED_AT)
     for index in near.tolist():
-        other = _descend(robot, T_base_tcp, rows[index], config, bounded=True)
+        other = _descend(robot, T_base_tcp, rows[index], config)
         away = other.joints_rad - np.array(found)
         if other.reached and np.abs(away).max(axis=1).min() > _DISTINCT_RAD:
             yield other
@@ -248,7 +210,7 @@ def _nearer(
     turned = found.joints_rad + _TURN * turns
     inside = (turned >= robot.lower_rad) & (turned <= robot.upper_rad)
     joints = np.where(inside, turned, found.joints_rad)
-    best = _descend(robot, T_base_tcp, joints, config, bounded=True)
+    best = _descend(robot, T_base_tcp, joints, config)
     if not best.reached:
         return found
     if len(joints) <= NUM_POSE:
@@ -265,7 +227,7 @@ def _nearer(
         if size < _SETTLED_RAD:
             break
         step *= min(1.0, _STEP_RAD / size)
-        other = _descend(robot, T_base_tcp, best.joints_rad + step, config, bounded=True)
+        other = _descend(robot, T_base_tcp, best.joints_rad + step, config)
         closer = np.linalg.norm(wanted_rad - other.joints_rad) < np.linalg.norm(away)
         if not (other.reached and closer):
             break
@@ -278,14 +240,12 @@ def _descend(
     T_base_tcp: Float[np.ndarray, "4 4"],
     start_rad: Float[np.ndarray, " num_joints"],
     config: IkConfig,
-    *,
-    bounded: bool = False,
     turn_weight: float | None = None,
 ) -> IkSolution:
     """One descent. Calls into pinocchio take a microsecond each, so each is made once a step.
 
-    ``bounded`` leaves out joints that a limit stops: the others then do their part. With a
-    ``turn_weight`` position and orientation count apart, so that one may be left.
+    Joints that a limit stops are left out: the others then do their part. With a ``turn_weight``
+    position and orientation count apart, so that one may be left.
     """
     model, data, tcp_id = robot.model, robot.data, robot.tcp_id
     lower, upper, arm = robot.lower_rad, robot.upper_rad, robot.arm_ids
@@ -314,10 +274,9 @@ def _descend(
             jacobian = full[:, robot.arm_velocity_ids]
             if turn_weight is not None:
                 jacobian = jacobian * np.repeat((1.0, turn_weight), 3)[:, None]
-            if bounded:
-                pull = jacobian.T @ trial
-                stopped = ((joints <= lower) & (pull < 0)) | ((joints >= upper) & (pull > 0))
-                jacobian = np.where(stopped, 0.0, jacobian)
+            pull = jacobian.T @ trial
+            stopped = ((joints <= lower) & (pull < 0)) | ((joints >= upper) & (pull > 0))
+            jacobian = np.where(stopped, 0.0, jacobian)
         else:
             damping *= 10.0
             if not damping < _MAX_DAMPING:
