@@ -102,12 +102,7 @@ def export_csv(
 
 
 def export_rosbag2(
-    episode: Path,
-    out: Path,
-    /,
-    *,
-    force: bool = False,
-    output: Output = OUTPUT,
+    episode: Path, out: Path, /, *, force: bool = False, output: Output = OUTPUT
 ) -> int:
     """Write an episode as a rosbag2 folder: one MCAP file and metadata.yaml.
 

@@ -366,12 +366,7 @@ class Lifecycle:
         return self.take
 
     def stop(
-        self,
-        outcome: metadata.Outcome | None,
-        command: Command,
-        *,
-        discard: bool,
-        reason: str,
+        self, outcome: metadata.Outcome | None, command: Command, *, discard: bool, reason: str
     ) -> Answer:
         """Finish the episode, or throw it away."""
         take = self._open_take()
@@ -434,12 +429,7 @@ class Lifecycle:
             take.refuse(rest())
         self._reserve.release()
         try:
-            take.close(
-                end_ns=now_ns,
-                reason=reason,
-                outcome=None,
-                health=self._health(),
-            )
+            take.close(end_ns=now_ns, reason=reason, outcome=None, health=self._health())
             error = DiskError(path=take.path, cause=cause, is_finished=True)
             self.last_episode = take.info.id
         except OSError:

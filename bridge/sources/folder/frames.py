@@ -144,9 +144,7 @@ def read_color(path: Path) -> StoredColor:
         return StoredColor(stored=stored, image_u8=decode_color(stored))
     except (UnreadableImageError, OSError) as error:
         raise FolderError(
-            path=path,
-            found=str(error).rstrip("."),
-            hint="Restore the file or remove the frame.",
+            path=path, found=str(error).rstrip("."), hint="Restore the file or remove the frame."
         ) from error
 
 
@@ -166,9 +164,7 @@ def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
         return decode_depth_png(path.read_bytes())
     except (UnreadableImageError, OSError) as error:
         raise FolderError(
-            path=path,
-            found=str(error).rstrip("."),
-            hint="Restore the file or remove the frame.",
+            path=path, found=str(error).rstrip("."), hint="Restore the file or remove the frame."
         ) from error
 
 
@@ -176,9 +172,7 @@ def require_image(path: Path, *, what: str, named_by: str) -> Path:
     """Return the path if the file is there."""
     if not path.is_file():
         raise PathNotFoundError(
-            path=path,
-            what=f"{what} image",
-            hint=f"{named_by}; restore it or remove the frame.",
+            path=path, what=f"{what} image", hint=f"{named_by}; restore it or remove the frame."
         )
     return path
 

@@ -28,10 +28,7 @@ COLMAP_FILES = ("cameras.txt", "images.txt")
 COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 TRANSFORMS = "transforms.json"
 IMAGE_FOLDERS = ("images", ".")
-PARAMETERS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-}
+PARAMETERS = {"SIMPLE_PINHOLE": ("f", "cx", "cy"), "PINHOLE": ("fx", "fy", "cx", "cy")}
 """COLMAP's models that are read, with the names of their numbers."""
 _READ = {"frames", "w", "h", "camera_angle_x", "fl_x", "fl_y", "cx", "cy"} | {
     *("file_path", "transform_matrix")
