@@ -55,10 +55,10 @@ def _fewer_around(points_m: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarr
     return np.asarray(middle + (few - middle) * max(1.0, share))
 
 
-def collision_geometry(robot: RobotModel) -> pin.GeometryModel:
+def collision_geometry(model: pin.Model, urdf: str) -> pin.GeometryModel:
     """Read the collision shapes of a description."""
     try:
-        return pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+        return pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(
             found=f"has collision shapes that cannot be read ({str(error)[:200]})",
@@ -68,12 +68,12 @@ def collision_geometry(robot: RobotModel) -> pin.GeometryModel:
 
 def link_hulls(robot: RobotModel) -> list[LinkHull]:
     """Return one hull for each collision element of the description."""
-    geometry = collision_geometry(robot)
+    geometry = collision_geometry(robot.model, robot.urdf)
     hulls = []
     for item in geometry.geometryObjects:
         frame = robot.model.frames[item.parentFrame]
         T_link_shape = frame.placement.inverse() * item.placement
-        points = _points(item) @ T_link_shape.rotation.T + T_link_shape.translation
+        points = corners_of(item) @ T_link_shape.rotation.T + T_link_shape.translation
         if not _has_volume(points):
             raise RobotDescriptionError(
                 found=f"has a collision shape without volume at the link {frame.name!r}",
@@ -99,7 +99,8 @@ def _has_volume(points_m: Float[np.ndarray, "num_points 3"]) -> bool:
     return bool(spread[2] > _THINNEST_M)
 
 
-def _points(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
+def corners_of(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
+    """Points whose hull contains a collision shape, in its own frame [m]."""
     shape = item.geometry
     if isinstance(shape, coal.BVHModelBase):
         return np.array(shape.vertices())

@@ -21,6 +21,8 @@ from bridge.geometry import se3
 from twin.robot.config import IkConfig
 from twin.robot.model import RobotModel
 
+Pose = Float[np.ndarray, "4 4"]
+Joints = Float[np.ndarray, " num_joints"]
 _CONVERGED = 1e-8
 """Norm of the error twist at which iterating stops: far below the tolerance, so that a round
 trip is exact and the tolerance decides feasibility only."""
@@ -31,29 +33,21 @@ _MAX_DAMPING = 1e3
 class IkSolution:
     """Joints, and how far they miss the wanted pose."""
 
-    joints_rad: Float[np.ndarray, " num_joints"]
+    joints_rad: Joints
     position_error_m: float
     rotation_error_rad: float
     reached: bool
     """Whether both errors are within the tolerance."""
 
 
-def pose_error(
-    robot: RobotModel,
-    joints_rad: Float[np.ndarray, " num_joints"],
-    T_base_tcp: Float[np.ndarray, "4 4"],
-) -> tuple[float, float]:
+def pose_error(robot: RobotModel, joints_rad: Joints, T_base_tcp: Pose) -> tuple[float, float]:
     """Distance [m] and angle [rad] between where joints put the tool and a wanted pose."""
     error = pin.SE3(robot.T_base_tcp(joints_rad)).actInv(pin.SE3(T_base_tcp))
     return float(np.linalg.norm(error.translation)), float(np.linalg.norm(pin.log3(error.rotation)))
 
 
 def solve_ik(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    config: IkConfig,
-    *,
-    warm_start_rad: Float[np.ndarray, " num_joints"] | None = None,
+    robot: RobotModel, T_base_tcp: Pose, config: IkConfig, *, warm_start_rad: Joints | None = None
 ) -> IkSolution:
     """The best joints within limits for a pose, by the warm start (None: home); see ``reached``."""
     start = robot.home_rad if warm_start_rad is None else warm_start_rad
@@ -95,11 +89,7 @@ def _features(Ts: Float[np.ndarray, "num_poses 4 4"]) -> Float[np.ndarray, "num_
 
 
 def _from_nearest(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    best: IkSolution,
-    near_rad: Float[np.ndarray, " num_joints"],
-    config: IkConfig,
+    robot: RobotModel, T_base_tcp: Pose, best: IkSolution, near_rad: Joints, config: IkConfig
 ) -> IkSolution:
     """Begin at the branches of the closed form, then at the postures whose poses are nearest."""
     if not (np.isfinite(T_base_tcp).all() and config.restarts):
@@ -127,10 +117,7 @@ _TURN_WEIGHT, _LITTLE_RAD = 0.05, 0.35
 
 
 def _position_first(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    warm_start_rad: Float[np.ndarray, " num_joints"] | None,
-    config: IkConfig,
+    robot: RobotModel, T_base_tcp: Pose, warm_start_rad: Joints | None, config: IkConfig
 ) -> IkSolution:
     """Put the tool where it is wanted, turned as nearly so as an arm of few joints can.
 
@@ -165,9 +152,7 @@ _LOOKED_AT = 80
 """Nearest known postures from which further solutions are looked for."""
 
 
-def solutions(
-    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], config: IkConfig
-) -> Iterator[IkSolution]:
+def solutions(robot: RobotModel, T_base_tcp: Pose, config: IkConfig) -> Iterator[IkSolution]:
     """Yield what ``solve_ik`` finds, then other solutions of an arm without a closed form.
 
     Each differs from all before by half a radian in some joint. They are looked for one at a time.
@@ -196,11 +181,7 @@ _STEP_RAD, _SETTLED_RAD = 0.3, 1e-3
 
 
 def _nearer(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    found: IkSolution,
-    wanted_rad: Float[np.ndarray, " num_joints"],
-    config: IkConfig,
+    robot: RobotModel, T_base_tcp: Pose, found: IkSolution, wanted_rad: Joints, config: IkConfig
 ) -> IkSolution:
     """Go from a solution to the one near it that is nearest to a posture.
 
@@ -237,8 +218,8 @@ def _nearer(
 
 def _descend(
     robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    start_rad: Float[np.ndarray, " num_joints"],
+    T_base_tcp: Pose,
+    start_rad: Joints,
     config: IkConfig,
     turn_weight: float | None = None,
 ) -> IkSolution:
@@ -324,14 +305,14 @@ class UrGeometry:
     signs: Float[np.ndarray, "6"]
     offsets_rad: Float[np.ndarray, "6"]
     """theta = signs * joints + offsets."""
-    T_base_0: Float[np.ndarray, "4 4"]
+    T_base_0: Pose
     """First axis along z; the origin is where the first two axes meet."""
-    T_6_tcp: Float[np.ndarray, "4 4"]
+    T_6_tcp: Pose
     """Sixth axis along z; the origin is where the last two axes meet."""
     deviation: float = 0.0
     """Largest entry of the difference to pinocchio's poses over random postures."""
 
-    def forward(self, joints_rad: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+    def forward(self, joints_rad: Float[np.ndarray, "6"]) -> Pose:
         """Pose ``T_base_tcp`` of one posture."""
         theta = self.signs * joints_rad + self.offsets_rad
         a = (0.0, self.a2_m, self.a3_m, 0.0, 0.0, 0.0)
@@ -365,7 +346,7 @@ def _axes(robot: RobotModel) -> tuple[Float[np.ndarray, "6 3"], Float[np.ndarray
 
 
 def _through(
-    w: Float[np.ndarray, "6 3"], p: Float[np.ndarray, "6 3"], T_base_tcp: Float[np.ndarray, "4 4"]
+    w: Float[np.ndarray, "6 3"], p: Float[np.ndarray, "6 3"], T_base_tcp: Pose
 ) -> UrGeometry | None:
     """Lay the chain through the axes; None when they do not stand to each other as a UR's do."""
     across = [w[0] @ w[1], w[3] @ w[4], w[4] @ w[5]]
@@ -425,7 +406,7 @@ def _meeting(
     return np.asarray(p + along * v)
 
 
-def _link(theta: float, a_m: float, d_m: float, alpha: float) -> Float[np.ndarray, "4 4"]:
+def _link(theta: float, a_m: float, d_m: float, alpha: float) -> Pose:
     """Rotate about z, move along z, move along the new x, rotate about it."""
     c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
     return np.array(
