@@ -192,13 +192,12 @@ def import_rgbd(
     source = describe_folder(index, config)
     total = num_frames(index, config)
     path = _import_scan(run, info, folder_messages(index, config, None), total, source, output)
-    left_out = index.num_unposed + index.num_unpaired
     unused = [Unused(*item) for item in index.unused]
     data = {
         "file": str(path),
         "layout": index.layout,
         "frames": total,
-        "frames_left_out": left_out,
+        "frames_left_out": index.num_unposed + index.num_unpaired,
         "assumed": index.assumed,
         "unused": [item._asdict() for item in unused],
     }
@@ -255,8 +254,7 @@ def import_images(
     from bridge.sources.folder.posed_index import read_posed_index
     from bridge.sources.folder.posed_messages import describe_posed, posed_messages
 
-    index = read_posed_index(folder)
-    source = describe_posed(index, config)
+    source = describe_posed(index := read_posed_index(folder), config)
     output.say(f"{index.path}: {index.layout}, {len(index.images)} images")
     for name, value in index.assumed.items():
         output.say(f"  assumed {name}: {value}")
@@ -266,8 +264,8 @@ def import_images(
             "--metres-per-unit says how long a unit of the folder is"
         )
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
-    images = posed_messages(index, config)
-    path = _import_scan(run, info, images, len(index.images), source, output)
+    made = posed_messages(index, config)
+    path = _import_scan(run, info, made, len(index.images), source, output)
     unused = [Unused(*item) for item in index.unused]
     data = {"file": str(path), "images": len(index.images), **source}
     data["unused"] = [item._asdict() for item in unused]

@@ -267,9 +267,7 @@ class Robot:
                 )
 
     def _file(self, uri: str) -> Path:
-        if uri.startswith("package://"):
-            return resolve_mesh(uri)
-        return resolve_mesh(str(self.folder / uri))
+        return resolve_mesh(uri if uri.startswith("package:/") else str(self.folder / uri))
 
 
 _OF_FILES = ("attached", "flange", "prefix", "held", "mesh_folders", "folder")

@@ -19,7 +19,6 @@ _POSES, _SEED = 20, 0
 _MOST_RAD = 8 * np.pi
 """No arm turns more than four times to one side; degrees look like it."""
 _ROUNDED = 1e-3
-_LIMITS = ("lower", "upper", "velocity")
 _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
@@ -134,10 +133,11 @@ def _in_text(record: Robot, text: str) -> Iterator[tuple[str, str]]:
     root = ET.fromstring(text)
     limits = {joint.get("name"): joint.find("limit") for joint in root.findall("joint")}
     for index, name in enumerate(record.joints):
-        limit = limits.get(name)
-        if limit is None:
+        if (limit := limits.get(name)) is None:
             continue
-        lower, upper, speed = (number_of(limit.get(key, "0")) for key in _LIMITS)
+        lower, upper, speed = (
+            number_of(limit.get(key, "0")) for key in ("lower", "upper", "velocity")
+        )
         if record.position_rad is not None:
             lower, upper = record.position_rad[index]
         if max(abs(lower), abs(upper)) > _MOST_RAD:

@@ -119,8 +119,7 @@ def corners_of(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
         ring = np.stack([np.cos(angle) * radius, np.sin(angle) * radius], axis=1)
         ends = [np.column_stack([ring, np.full(len(ring), s)]) for s in (-1, 1)]
         prism: Float[np.ndarray, "num_points 3"] = np.concatenate(ends)
-        ball_m = shape.radius if isinstance(shape, coal.Capsule) else 0.0
-        prism[:, 2] *= float(shape.halfLength) + ball_m
+        prism[:, 2] *= shape.halfLength + shape.radius * isinstance(shape, coal.Capsule)
         return prism
     raise RobotDescriptionError(
         found=f"has a collision shape {type(shape).__name__} at {item.name}",

@@ -99,8 +99,7 @@ def _from_nearest(
     if inverse is not None:  # it knows stretched arms
         raw, valid, _ = inverse.solve(T_base_tcp[None])
         branches = raw[0, valid[0]]
-        order = np.argsort(np.abs(branches - near_rad).sum(axis=1), kind="stable")
-        branches = branches[order]
+        branches = branches[np.abs(branches - near_rad).sum(axis=1).argsort(kind="stable")]
     count = config.restarts * (_STARTS_PER_RESTART if inverse is None else 1)
     found = tree.query(_features(T_base_tcp[None])[0], k=min(count, len(rows)))[1]
     for start_rad in (*branches, *rows[np.atleast_1d(found)]):

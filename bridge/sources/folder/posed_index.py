@@ -104,8 +104,7 @@ def _read_colmap(folder: Path, model: Path) -> PosedIndex:
     path = model / "images.txt"
     images, range_found = [], _sparse_depths(model / "points3D.txt")
     for number, line in enumerate(_pose_lines(path), start=1):
-        image = _colmap_image(path, number, line, folder, cameras)
-        images.append(image)
+        images.append(_colmap_image(path, number, line, folder, cameras))
     if not images:
         raise FolderError(path=path, found="no image", hint="Reconstruct again.")
     ordered = tuple(sorted(images, key=lambda image: str(image.path)))
