@@ -104,7 +104,7 @@ class Channels:
             self._warn(
                 f"{topic}: {type_name} was built from another definition ({sample.type_hash})"
             )
-        look = inspector("" if is_strange else type_name, sample.message_encoding)
+        look = inspector("" if is_strange else type_name, sample.message_encoding, sample.topic)
         last_ns = self._last_ns.setdefault(topic, [0])
         content = ContentWatch(topic, type_name)
         return Channel(record, look, last_ns, stamp_reader(record), content)
@@ -388,18 +388,17 @@ class EpisodeRecording:
                 self.ledger.count_dropped(entry)
 
     def close(
-        self,
-        *,
-        end_ns: int,
-        reason: str,
-        outcome: metadata.Outcome | None,
-        health: dict[str, int],
+        self, *, end_ns: int, reason: str, outcome: metadata.Outcome | None, health: dict[str, int]
     ) -> Path:
         """Write the accounts, finish the file and give it its final name.
 
         May be called again after an OSError, when there is space.
         """
         self._write_ledger(None, end_ns, health)
+        for news in self.news:
+            if "by_ns" in news.data:  # of a clock that was set: nothing else in the file says it
+                self.write_event("note", stamp_ns=end_ns, text=news.text, data=news.data)
+        self.news.clear()
         if not self._is_summed_up:
             self._sum_up(end_ns, reason, outcome or self.outcome)
             self._is_summed_up = True

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,6 +53,13 @@ def jpeg(number: int, data: bytes, form: str = "jpeg") -> bytes:
     return codec.encode(schema.COMPRESSED_IMAGE, about)
 
 
+def lens(number: int) -> bytes:
+    """A camera without coefficients whose model bends all the same."""
+    k, p = [50.0, 0, 32, 0, 50, 24, 0, 0, 1], [50.0, 0, 32, 0, 0, 50, 24, 0, 0, 0, 1, 0]
+    about = {"header": header(number), "height": 48, "width": 64, "k": k, "p": p, "d": [0.0] * 4}
+    return codec.encode(schema.CAMERA_INFO, {**about, "distortion_model": "equidistant"})
+
+
 STILL, FLAT = noise(), noise(1, np.uint16)
 STILL_JPEG = encode_jpeg(STILL)
 EMPTY = np.zeros((48, 64), np.uint16)
@@ -92,13 +100,20 @@ FAULTS: dict[str, tuple[str, str, str, Make]] = {
     ),
     "nv24": ("unreadable", COLOR, schema.IMAGE, lambda n: image(n, noise(3), "nv24")),
     "depth of 8 bits": ("unreadable", DEPTH, schema.IMAGE, lambda n: image(n, noise(1), "8UC1")),
+    "nv24 elsewhere": ("unreadable", "/eye", schema.IMAGE, lambda n: image(n, noise(3), "nv24")),
+    "bent lens": ("unreadable", "/c/cam/a/color/info", schema.CAMERA_INFO, lens),
     "no jpeg": ("unreadable", COLOR, schema.COMPRESSED_IMAGE, lambda n: jpeg(n, b"h264")),
     "cdr 2": ("unreadable", JOINTS, schema.JOINT_STATE, lambda n: b"\0\7\0\0" + joints(n)[4:]),
 }
 
 
-def recorded(run: RunFolder, streams: dict[str, tuple[str, Make]], rate_hz: float = 20.0) -> dict:
-    """Record three seconds of streams, given at once, and return the answer to the stop."""
+def recorded(
+    run: RunFolder, streams: dict[str, tuple[str, Make]], rate_hz: float = 20.0, set_s: int = 0
+) -> dict:
+    """Record sixty messages, given at once, and return the answer to the stop.
+
+    The clock of all publishers is set by ``set_s`` in the middle.
+    """
     clock = AnchoredClock()
     recorder = Recorder(run, now_ns=clock.now_ns)
     recorder.start(EpisodeInfo(id="t1", kind="trial", cell="c"))
@@ -111,7 +126,7 @@ def recorded(run: RunFolder, streams: dict[str, tuple[str, Make]], rate_hz: floa
                 type_name=type_name,
                 message_encoding="cdr",
                 data=make(number),
-                source_ns=at_ns,
+                source_ns=at_ns + (number >= 30) * set_s * NS_PER_S,
                 sequence=number,
                 source_gid=b"g" * 16,
                 received_ns=at_ns,
@@ -154,6 +169,18 @@ def test_a_fault_has_one_name_everywhere(
     for command in (["info", str(path)], ["ls", str(run.path)]):
         assert robot_gst.run(command) == 0
         assert words in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("set_s", [3600, -3600])
+def test_a_clock_that_is_set_is_named_however_soon_the_episode_ends(
+    run: RunFolder, set_s: int
+) -> None:
+    (told,) = recorded(run, {JOINTS: GOOD[JOINTS]}, 10.0, set_s)["findings"]
+    (found,) = check_episode(run.episodes_dir / "t1.mcap").findings
+    assert (told["name"], told["about"]) == (found.name, found.about) == ("clock_jump", JOINTS)
+    side = "ahead" if set_s > 0 else "back"
+    assert told["text"] == found.text
+    assert re.search(f"jumped {side} by (3600.0|3599.9)", found.text)
 
 
 def test_a_fault_of_a_moment_is_none_and_one_that_comes_back_is_one(tmp_path: Path) -> None:
