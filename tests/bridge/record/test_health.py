@@ -107,6 +107,15 @@ FAULTS: dict[str, tuple[str, str, str, Make]] = {
 }
 
 
+def sample(
+    topic: str, type_name: str, data: bytes, number: int, *, received_ns: int, source_ns: int
+) -> WireSample:
+    return WireSample(
+        topic=topic, type_name=type_name, message_encoding="cdr", data=data, source_ns=source_ns,
+        sequence=number, source_gid=b"g" * 16, received_ns=received_ns,
+    )  # fmt: skip
+
+
 def recorded(
     run: RunFolder, streams: dict[str, tuple[str, Make]], rate_hz: float = 20.0, set_s: int = 0
 ) -> dict:
@@ -120,17 +129,9 @@ def recorded(
     begun_ns = clock.now_ns()
     for number, (topic, (type_name, make)) in itertools.product(range(60), streams.items()):
         at_ns = begun_ns + round(number / rate_hz * NS_PER_S) - 3 * NS_PER_S
+        source_ns = at_ns + (number >= 30) * set_s * NS_PER_S
         recorder.receive(
-            WireSample(
-                topic=topic,
-                type_name=type_name,
-                message_encoding="cdr",
-                data=make(number),
-                source_ns=at_ns + (number >= 30) * set_s * NS_PER_S,
-                sequence=number,
-                source_gid=b"g" * 16,
-                received_ns=at_ns,
-            )
+            sample(topic, type_name, make(number), number, received_ns=at_ns, source_ns=source_ns)
         )
     answer = recorder.stop()
     recorder.close()
@@ -213,20 +214,8 @@ def test_what_nobody_can_read_is_told_within_a_second(run: RunFolder) -> None:
     clock = AnchoredClock()
     recorder = Recorder(run, now_ns=clock.now_ns)
     recorder.start(EpisodeInfo(id="t1", kind="trial", cell="c"))
-    data = image(1, noise(3), "nv24")
-    begun_ns = clock.now_ns()
-    recorder.receive(
-        WireSample(
-            topic=COLOR,
-            type_name=schema.IMAGE,
-            message_encoding="cdr",
-            data=data,
-            source_ns=1,
-            sequence=0,
-            source_gid=b"g" * 16,
-            received_ns=begun_ns,
-        )
-    )
+    data, begun_ns = image(1, noise(3), "nv24"), clock.now_ns()
+    recorder.receive(sample(COLOR, schema.IMAGE, data, 0, received_ns=begun_ns, source_ns=1))
     assert recorder.news_arrived.wait(5.0)
     assert clock.now_ns() - begun_ns < 1.5 * NS_PER_S  # a second, and what a busy machine takes
     assert f"{COLOR}: messages cannot be read" in recorder.news[0]

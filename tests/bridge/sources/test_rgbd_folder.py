@@ -149,16 +149,6 @@ def test_frames_without_depth_are_sent_to_the_import_of_images(
         read_index(folder)
 
 
-def test_tenths_of_millimetres_are_rounded(
-    folder: Path, stored: np.ndarray, index_record: dict[str, Any]
-) -> None:
-    rewrite(folder, {**index_record, "depth_unit_m": 0.0001})
-    found = depth_of(messages_of(folder)[0])
-    assert found[0, 2] == 1234  # 12345 x 0.1 mm, half to even
-    valid = stored != 65535
-    assert np.abs(found[valid] - stored[valid] * 0.1).max() <= 0.5
-
-
 def test_rotated_bits_are_turned_back(
     folder: Path, stored: np.ndarray, index_record: dict[str, Any]
 ) -> None:
