@@ -132,7 +132,7 @@ def test_what_no_engine_takes_is_refused_with_every_name(
         check_robot(written(tmp_path, urdf))
 
 
-@pytest.mark.parametrize("how", ["capsule", "capsule that pinocchio makes", "cone of 300 sides"])
+@pytest.mark.parametrize("how", ["capsule", "capsule of pinocchio", "sphere", "cone"])
 def test_a_shape_lies_inside_its_hull(tmp_path: Path, how: str) -> None:
     check_robot(written(tmp_path, URDF), urdf_out=tmp_path / "described.urdf")
     text = (tmp_path / "described.urdf").read_text()
@@ -146,11 +146,11 @@ def test_a_shape_lies_inside_its_hull(tmp_path: Path, how: str) -> None:
         named = text.replace('name="l0">', checking, 1).replace(
             "<collision>", '<collision name="l0">', 1
         )
-        capsule = text.replace("<cylinder", "<capsule", 1)
-        points = link_hulls(RobotModel(capsule if how == "capsule" else named))[0].points_m
+        shape = text.replace("<cylinder", f"<{how}", 1) if " " not in how else named
+        points = link_hulls(RobotModel(shape))[0].points_m
         ball = np.random.default_rng(0).normal(size=(500, 3))
         ball *= 0.03 / np.linalg.norm(ball, axis=1, keepdims=True)
-        end = np.array([0, 0, 0.05])
+        end = np.array([0, 0, 0.0 if how == "sphere" else 0.05])
         inside, most_m = np.concatenate([ball + end, ball - end]), 0.081
     faces = ConvexHull(points).equations
     assert (inside @ faces[:, :3].T + faces[:, 3]).max() <= 1e-6
