@@ -13,7 +13,7 @@ from bridge.robots.robot import Gripper, Robot, number_of, read_robot
 from twin.robot.collision import RobotHulls
 from twin.robot.config import IkConfig
 from twin.robot.inverse import NUM_POSE, UrInverse, solve_ik
-from twin.robot.model import RobotModel, numbers_in, without_dynamics
+from twin.robot.model import RobotModel, without_dynamics
 
 _POSES, _SEED = 20, 0
 _MOST_RAD = 8 * np.pi
@@ -147,7 +147,7 @@ def _in_text(record: Robot, text: str) -> Iterator[tuple[str, str]]:
             yield "gate", f"the joint {name!r} has a speed of {speed:g}; set velocity_rad_s"
     for link in root.findall("link"):
         for inertia in link.findall("inertial/inertia"):
-            xx, yy, zz, xy, xz, yz = numbers_in(inertia, *_INERTIA)
+            xx, yy, zz, xy, xz, yz = (number_of(inertia.get(key, "")) for key in _INERTIA)
             matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             moments = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else [np.nan] * 3
             if not moments[0] + moments[1] >= moments[2] * (1 - _ROUNDED):

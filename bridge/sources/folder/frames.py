@@ -96,8 +96,8 @@ def refuse_bent(path: Path, what: str, record: Mapping[str, Any]) -> None:
         value = record.get(key) or ""
         if key in _MODELS and str(value).upper() not in STRAIGHT:
             raise FolderError(path=path, found=f"{what} has the model {value!r}", hint=STRAIGHTEN)
-        numbers = value.values() if isinstance(value, dict) else np.ravel(value)
-        if key in _BENDING and any(numbers):
+        numbers = value.values() if isinstance(value, dict) else value
+        if key in _BENDING and any(numbers if isinstance(value, list | dict) else [value]):
             raise FolderError(path=path, found=f"{what} has {key}", hint=STRAIGHTEN)
 
 

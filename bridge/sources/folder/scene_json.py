@@ -42,7 +42,14 @@ def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
     """Read and check ``scene.json``; every image file it names must exist."""
     path = folder / INDEX_NAME
     refuse_scale_without_use(config, path)
-    record = _load(path)
+    try:
+        return _read(folder, path, _load(path))
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        found = f"a value of another kind ({error})"
+        raise FolderError(path=path, found=found, hint=_KEYS_HINT) from error
+
+
+def _read(folder: Path, path: Path, record: dict[str, Any]) -> FolderIndex:
     registered = record.get("color_registered_to_depth", True)
     color_camera, T_depth_color = (None, np.eye(4)) if registered else _color(path, record)
     frames, num_unposed = _frames(path, record)
@@ -67,16 +74,13 @@ def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
     )
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> Any:
     try:
-        record = json.loads(path.read_text())
+        return json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise FolderError(
             path=path, found=f"not readable as JSON ({error})", hint="Repair the file."
         ) from error
-    if not isinstance(record, dict):
-        raise FolderError(path=path, found="not a JSON object", hint=_KEYS_HINT)
-    return record
 
 
 def _value(path: Path, record: dict[str, Any], key: str) -> Any:
@@ -99,8 +103,6 @@ def _positive(path: Path, record: dict[str, Any], key: str) -> float:
 
 def _camera(path: Path, record: dict[str, Any], key: str) -> Camera:
     values = _value(path, record, key)
-    if not isinstance(values, dict):
-        raise FolderError(path=path, found=f"{key} is not an object", hint=_KEYS_HINT)
     refuse_bent(path, key, values)
     numbers = {name: _positive(path, values, name) for name in ("fx", "fy", "cx", "cy")}
     return Camera.from_ros(
@@ -143,11 +145,8 @@ def _frames(path: Path, record: dict[str, Any]) -> tuple[tuple[FolderFrame, ...]
     entries = _value(path, record, "frames")
     if not isinstance(entries, list) or not entries:
         raise FolderError(path=path, found="no frames", hint="List at least one frame.")
-    frames = []
-    for number, entry in enumerate(entries):
-        frame = _frame(path, entry, f"frames[{number}]")
-        if frame is not None:
-            frames.append(frame)
+    found = [_frame(path, entry, f"frames[{number}]") for number, entry in enumerate(entries)]
+    frames = [frame for frame in found if frame is not None]
     if not frames:
         raise FolderError(path=path, found="no frame has a pose", hint="Poses are T_world_cam.")
     return tuple(frames), len(entries) - len(frames)

@@ -211,9 +211,10 @@ def broken(record: dict[str, Any], key: str, value: Any = None) -> dict[str, Any
     [
         ("depth_unit_m", None, r"scene.json: key 'depth_unit_m' is missing \(there: color_regis"),
         ("depth_intrinsics", None, "key 'depth_intrinsics' is missing"),
-        ("frames", None, "key 'frames' is missing"),
+        ("depth_invalid_values", 0, "scene.json: a value of another kind .'int' object is not"),
         ("frames", [], "no frames"),
         ("depth_unit_m", -1, "depth_unit_m = -1. It must be a number above zero"),
+        ("depth_encoding", [0], "scene.json: a value of another kind"),
         ("depth_encoding", "morse", "'morse' is unknown. Known: 'rotated3'"),
         ("color_registered_to_depth", False, "'color_camera_estimate' is missing"),
     ],
