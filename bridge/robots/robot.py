@@ -414,9 +414,10 @@ def _check_names(robot: Robot) -> None:
     named: dict[str, tuple[str, ...]] = {
         "joints": (*robot.joints, *robot.finger_joints, *robot.held),
         "links": gripper.links,
+        "name": (robot.name,),
     }
     for what, values in named.items():
-        if not all(values):
+        if not all(value and value.isprintable() for value in values):
             raise ValueError(f"{what} must be names")
         if len(set(values)) != len(values):
             twice = sorted({name for name in values if values.count(name) > 1})
