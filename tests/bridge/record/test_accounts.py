@@ -120,7 +120,7 @@ def test_a_gap_booked_elsewhere_is_not_taken_back_here() -> None:
 def test_the_seconds_add_up_to_the_totals_also_when_they_come_late() -> None:
     ledger = Ledger()
     sample = replace(numbered(3), received_ns=10**9, source_ns=10**9 - 5)
-    ledger.count_received(item_of(sample, Step(gap=3)), MessageState.UNDECODABLE)
+    ledger.count_received(item_of(sample, Step(gap=3)), MessageState.UNDECODABLE, sample.source_ns)
     first = list(ledger.close_seconds())
     ledger.count_received(item_of(sample, Step(fills=0)), GOOD)
     count = DropCount(messages=2, shed=3, gaps=4, fills=[0])

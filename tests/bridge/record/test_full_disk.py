@@ -74,7 +74,6 @@ def test_a_start_without_space_is_refused(
         sent += 1
         time.sleep(0.01)
     assert "6 MB must be left" in recorder.status()["error"]
-    assert recorder.status()["disk_free_bytes"] < 6_000_000
     recorder.close()
     assert 3_000_000 < free_bytes(small_disk) < 6_100_000
     episode = Episode.open(run.episodes_dir / "t1.mcap")
