@@ -81,7 +81,7 @@ class FolderIndex:
 
 _MODELS = ("camera_model", "distortion_model", "model")
 _BENDING = (
-    *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "is_fisheye", "distortion", "coeffs"),
+    *("is_fisheye", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion", "coeffs"),
     *("distortion_coefficients", "distortion_params", "D", "d"),
 )
 """Keys under which a lens is described."""
