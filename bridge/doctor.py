@@ -53,9 +53,7 @@ EXTRAS = {
     "mujoco": Extra("replay --engine mujoco or both", ("mujoco",), is_optional=True),
     "twin": Extra("what needs torch in the twin", ("torch",), is_optional=True),
     "foundation": Extra(
-        "SAM 3, CLIP from folders of weights",
-        ("transformers", "safetensors"),
-        is_optional=True,
+        "SAM 3, CLIP from folders of weights", ("transformers", "safetensors"), is_optional=True
     ),
     "lpips": Extra("LPIPS", ("torch", "safetensors", "torchmetrics"), is_optional=True),
     "gpu": Extra("drawing on CUDA", ("gsplat",), is_optional=True),
@@ -90,21 +88,19 @@ def examine() -> list[InstallCheck]:
 
 
 def _package(name: str, extra: str) -> InstallCheck:
-    what, purpose = f"{name} [{extra}]", EXTRAS[extra].purpose
+    about, found, advice = EXTRAS[extra], "", ""
     try:
         found = metadata.version(name)
     except metadata.PackageNotFoundError:
-        is_optional = EXTRAS[extra].is_optional
-        return InstallCheck(
-            what=what,
-            found="missing (optional)" if is_optional else "missing",
-            ok=is_optional,
-            advice=f"pip install 'robot-gst[{extra}]'"
-            if extra != "base"
-            else "pip install robot-gst",
-            purpose=purpose,
-        )
-    return InstallCheck(what=what, found=found, ok=True, purpose=purpose)
+        wanted = "robot-gst" if extra == "base" else f"'robot-gst[{extra}]'"
+        advice = f"pip install {wanted}"
+    return InstallCheck(
+        what=f"{name} [{extra}]",
+        found=found or ("missing (optional)" if about.is_optional else "missing"),
+        ok=bool(found) or about.is_optional,
+        advice=advice,
+        purpose=about.purpose,
+    )
 
 
 def _native(what: str, module: str, without: str) -> InstallCheck:
@@ -129,13 +125,8 @@ def _system_libraries() -> list[InstallCheck]:
     folders = [Path("/lib"), Path("/usr/lib"), *Path("/usr/lib").glob("*-linux-gnu")]
     findings = []
     for library, package in wanted.items():
-        present = any((folder / library).exists() for folder in folders)
-        findings.append(
-            InstallCheck(
-                what=library,
-                found="present" if present else "missing",
-                ok=present,
-                advice="" if present else f"apt-get install --no-install-recommends {package}",
-            )
-        )
+        ok = any((folder / library).exists() for folder in folders)
+        found = "present" if ok else "missing"
+        advice = "" if ok else f"apt-get install --no-install-recommends {package}"
+        findings.append(InstallCheck(what=library, found=found, ok=ok, advice=advice))
     return findings

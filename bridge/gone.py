@@ -4,25 +4,23 @@ from collections.abc import Sequence
 
 from bridge.errors import UsageError
 
-FIXED = (
-    *("start-rad", "start-m", "start-overlap-m", "max-contact-depth-m", "pre-grasp-depth-m"),
-    *("pre-grasp-soft-depth-m", "max-slip-m", "moved-m", "path-step-s", "max-joint-step-rad"),
-    *("squeeze-m", "grip-delay-s", "physics.finger-speed-m-s", "physics.soft-substeps"),
-    "physics.soft-stiffness-scale",
-)
+_FIXED = (
+    "--replay.start-rad start-m start-overlap-m max-contact-depth-m pre-grasp-depth-m squeeze-m "
+    "pre-grasp-soft-depth-m max-slip-m moved-m path-step-s max-joint-step-rad grip-delay-s "
+    "physics.finger-speed-m-s physics.soft-substeps physics.soft-stiffness-scale"
+).replace(" ", " --replay.")
 """Settings of a replay that are constants now."""
 
-GONE: dict[str, str] = {
+_TOLD = {
     "design --width": "Give --gain with --rate; at a given size use --starts.",
-    **dict.fromkeys(("design --agrees-above", "design --agreement"), "Use evaluate --fail-under."),
+    "design --agrees-above --agreement": "Use evaluate --fail-under.",
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
     "export catalogue": "robot-gst ls RUN --json lists all of it.",
     "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
     "export corrected": "export csv, tum and lerobot take --clock corrected.",
-    **dict.fromkeys(
-        ("label --flag", "label --unflag", "ls --flagged", "ls --no-flagged"),
-        "Flag trials in the dashboard, on the page label (key f); /queue?show=flagged lists them.",
+    "label --flag --unflag|ls --flagged --no-flagged": (
+        "Flag trials in the dashboard, on the page label (key f); /queue?show=flagged lists them."
     ),
     "dashboard --console": "Use robot-gst ctl start and stop, and the dashboard's page label.",
     "prune": "robot-gst ls RUN --json lists age, size and outcome for a script of yours.",
@@ -33,36 +31,31 @@ GONE: dict[str, str] = {
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
     "record --failover": "A failing disk ends the recording; begin anew on another disk.",
     "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
-    **dict.fromkeys(
-        ("record --split-mb", "record --split-s"),
-        "Stop and start another episode; episodes of several parts are read as before.",
+    "record --split-mb --split-s": (
+        "Stop and start another episode; episodes of several parts are read as before."
     ),
     "record --triggers": "Record with --preroll-s 5, and send robot-gst ctl snapshot.",
-    **dict.fromkeys(
-        ("publish episode --loop", "publish episode --paused", "publish episode --name"),
-        "A playback begins at once and plays once; --start-s and --rate say from where, how fast.",
+    "publish episode --loop --paused --name": (
+        "A playback begins at once and plays once; --start-s and --rate say from where, how fast."
     ),
     "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
     "recover --in-place": "Free some space, or use another disk: a copy is made beside it.",
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": "robot-gst rebuild makes scenes; splat viewers open scene/background.ply.",
-    **dict.fromkeys(
-        ("rebuild --align-poses", "rebuild --refine-poses", "rebuild --align-holdout"),
-        "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them.",
+    "rebuild --align-poses --refine-poses --align-holdout": (
+        "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them."
     ),
     "rebuild --correct-geometry": "Import again: import rgbd --depth-unit-m, --depth-intrinsics.",
     "rebuild --features": "Nothing read them; with --clip robot-gst find goes by meaning.",
-    "rebuild --feature-channels": "Nothing read features; see rebuild --clip.",
-    "rebuild --feature-stride": "Nothing read features; see rebuild --clip.",
+    "rebuild --feature-channels --feature-stride": "Nothing read features; see rebuild --clip.",
     "rebuild --depth-model": "rebuild needs depth images: it finds no depth of its own.",
-    "rebuild --generator": "Shapes are carved from what the cameras saw.",
-    "rebuild --generator-timeout-s": "Shapes are carved from what the cameras saw.",
-    **dict.fromkeys(
-        ("evaluate --live", "evaluate --recorder", "evaluate --connect", "evaluate --goal"),
-        "evaluate says how many more trials would likely decide a comparison.",
+    "rebuild --generator --generator-timeout-s": "Shapes are carved from what the cameras saw.",
+    "evaluate --live --recorder --connect --goal": (
+        "evaluate says how many more trials would likely decide a comparison."
     ),
-    "evaluate --interval": "Intervals are Wilson's; results.json holds k and n for others.",
-    "design --interval": "Intervals are Wilson's; results.json holds k and n for others.",
+    "evaluate --interval|design --interval": (
+        "Intervals are Wilson's; results.json holds k and n for others."
+    ),
     "evaluate --axes": "Evaluate the rows of each setting as a table of their own.",
     "evaluate --names": "Spell names alike that are one, and others further apart.",
     "design --past": "Say what is expected: --rate, --gain.",
@@ -73,10 +66,9 @@ GONE: dict[str, str] = {
     "evaluate --against": "Evaluate each run; trials.csv has the same trials in both.",
     "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
     "render --rate-hz": "One frame is drawn for each recorded image.",
-    **dict.fromkeys(("replay --grasp", "gate --grasp"), "A grasp holds by friction, as in life."),
-    **dict.fromkeys(
-        ("replay --engines-must-agree", "gate --engines-must-agree"),
-        "--engine both replays in both and says where they differ.",
+    "replay --grasp|gate --grasp": "A grasp holds by friction, as in life.",
+    "replay --engines-must-agree|gate --engines-must-agree": (
+        "--engine both replays in both and says where they differ."
     ),
     "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
@@ -86,23 +78,19 @@ GONE: dict[str, str] = {
     "calibrate --pairs": "Record /CELL/cam/ID/target/pose, then robot-gst calibrate RUN --cameras.",
     "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
-    **dict.fromkeys(
-        (
-            *(f"{command} --replay.{name}" for command in ("replay", "gate") for name in FIXED),
-            "gate --max-audit-distances",
-            *("plan --candidates", "plan --policy"),
-            *(f"publish standin --{name}" for name in ("real-time", "execute-unverified")),
-            *(f"publish standin --{name}" for name in ("scan-id", "first-probe", "gate-cell")),
-            *(f"rebuild --{name}" for name in ("slab", "harmonics", "exposure", "densify", "loss")),
-            *(f"rebuild --{name}" for name in ("flatness", "opacity", "footprint-factor")),
-            *(f"rebuild --{name}" for name in ("depth-weight", "coarse-fraction", "no-densify")),
-            "rebuild --appearance-steps",
-            *(f"gate --{name}" for name in ("frames", "max-frame-age-s", "max-silence-s")),
-            *(f"gate --{name}" for name in ("max-joint-age-s", "other-scene-m", "moved-m")),
-            "gate --moved-rad",
-        ),
-        "Nobody set it, so it is a constant of the code now.",
+    f"replay {_FIXED}|gate {_FIXED} --max-audit-distances --frames --max-frame-age-s "
+    "--max-silence-s --max-joint-age-s --other-scene-m --moved-m --moved-rad|plan --candidates "
+    "--policy|publish standin --real-time --execute-unverified --scan-id --first-probe --gate-cell"
+    "|rebuild --slab --harmonics --exposure --densify --loss --flatness --opacity "
+    "--footprint-factor --depth-weight --coarse-fraction --no-densify --appearance-steps": (
+        "Nobody set it, so it is a constant of the code now."
     ),
+}
+GONE = {
+    f"{command} --{flag}" if flag else command: text
+    for names, text in _TOLD.items()
+    for command, *flags in (each.split(" --") for each in names.split("|"))
+    for flag in flags or ("",)
 }
 """By command, or by command and flag (``"record --quota-mb"``); each text is a sentence."""
 

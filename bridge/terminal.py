@@ -71,8 +71,6 @@ class Output:
 
 def printable(text: str) -> str:
     """Keep text of other programs from moving the cursor; line breaks and tabs stay."""
-    if text.isprintable():
-        return text
     return "".join(sign if sign.isprintable() or sign in "\n\t" else "?" for sign in text)
 
 

@@ -410,10 +410,7 @@ def _notes(entry: "Entry", *, is_named: bool) -> str:
 
 def _shown(text: str, most: int = 200) -> str:
     """Text of other programs without what would move the cursor, and not endless."""
-    text = text[:most]
-    if text.isprintable():
-        return text
-    return "".join(sign if sign.isprintable() else "?" for sign in text)
+    return "".join(sign if sign.isprintable() else "?" for sign in text[:most])
 
 
 def label(
@@ -445,11 +442,7 @@ def label(
         by: Who says so.
         detail: What happened, in words.
     """
-    from bridge.episode.catalogue import (
-        assign_trial,
-        label_episode,
-        refuse_without_task,
-    )
+    from bridge.episode.catalogue import assign_trial, label_episode, refuse_without_task
     from bridge.episode.metadata import Outcome
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError

@@ -102,12 +102,7 @@ def export_csv(
 
 
 def export_rosbag2(
-    episode: Path,
-    out: Path,
-    /,
-    *,
-    force: bool = False,
-    output: Output = OUTPUT,
+    episode: Path, out: Path, /, *, force: bool = False, output: Output = OUTPUT
 ) -> int:
     """Write an episode as a rosbag2 folder: one MCAP file and metadata.yaml.
 
@@ -181,6 +176,7 @@ def import_rgbd(
         episode: Id of the new episode.
     """
     from bridge.episode.metadata import EpisodeInfo
+    from bridge.exchange.output import Unused, tell_unused
     from bridge.sources.folder.messages import (
         describe_folder,
         folder_messages,
@@ -196,16 +192,17 @@ def import_rgbd(
     source = describe_folder(index, config)
     total = num_frames(index, config)
     path = _import_scan(run, info, folder_messages(index, config, None), total, source, output)
-    left_out = index.num_unposed + index.num_unpaired
+    unused = [Unused(*item) for item in index.unused]
     data = {
         "file": str(path),
         "layout": index.layout,
         "frames": total,
-        "frames_left_out": left_out,
+        "frames_left_out": index.num_unposed + index.num_unpaired,
         "assumed": index.assumed,
+        "unused": [item._asdict() for item in unused],
     }
     output.result(data, f"{path}: {total} frames of a folder in {index.layout} layout")
-    return 0
+    return tell_unused(output, unused)
 
 
 def _import_scan(
@@ -257,8 +254,7 @@ def import_images(
     from bridge.sources.folder.posed_index import read_posed_index
     from bridge.sources.folder.posed_messages import describe_posed, posed_messages
 
-    index = read_posed_index(folder)
-    source = describe_posed(index, config)
+    source = describe_posed(index := read_posed_index(folder), config)
     output.say(f"{index.path}: {index.layout}, {len(index.images)} images")
     for name, value in index.assumed.items():
         output.say(f"  assumed {name}: {value}")
@@ -268,8 +264,8 @@ def import_images(
             "--metres-per-unit says how long a unit of the folder is"
         )
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
-    images = posed_messages(index, config)
-    path = _import_scan(run, info, images, len(index.images), source, output)
+    made = posed_messages(index, config)
+    path = _import_scan(run, info, made, len(index.images), source, output)
     unused = [Unused(*item) for item in index.unused]
     data = {"file": str(path), "images": len(index.images), **source}
     data["unused"] = [item._asdict() for item in unused]

@@ -33,8 +33,7 @@ class Decoder:
     """Reads messages and forgets them, but for the drop log and the sizes of depth images.
 
     A topic of the contract must hold what ``docs/episode_format.md`` says. Any other topic of a
-    known type need only be valid: a camera of another maker may send raw colour or a distorted
-    lens.
+    known type need only be valid, and its images readable: a lens may be distorted.
     """
 
     def __init__(self) -> None:
@@ -64,7 +63,8 @@ class Decoder:
         if known is None or encoding not in ("", known.message_encoding):
             self.unused[topic] = type_name or encoding or "no type"
             return
-        if type_of_topic(topic) is None and type_name in DEFINITIONS:
+        is_known = type_of_topic(topic) is not None or type_name == schema.IMAGE
+        if type_name in DEFINITIONS and not is_known:
             codec.decode(type_name, data)
             return
         try:

@@ -61,9 +61,14 @@ class DiskConfig:
         refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
 
     @property
+    def reserve_mb(self) -> int:
+        """What is held back: at most a half of what must be left, so that an end comes first."""
+        return min(self.footer_mb, self.min_free_mb // 2 or self.footer_mb)
+
+    @property
     def backlog_bytes(self) -> int:
         """What may wait for a slow disk; the reserve must take it when the disk is full."""
-        held = self.footer_mb * BYTES_PER_MB // 4
+        held = self.reserve_mb * BYTES_PER_MB // 4
         return min(MAX_BACKLOG_BYTES, held) if held else MAX_BACKLOG_BYTES
 
 

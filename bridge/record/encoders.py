@@ -23,7 +23,7 @@ from bridge.episode.cdr.images import (
 )
 from bridge.episode.topics import COLOR_TOPIC
 from bridge.record.config import RecorderConfig
-from bridge.record.inspection import GOOD, MessageState, inspect
+from bridge.record.inspection import GOOD, MessageState, inspector
 from bridge.record.queue import REDUCED_QUALITY, Item, LoadShedding
 from bridge.wire.session import WireSample
 
@@ -48,7 +48,7 @@ class ImageEncoder:
         """Replace the item's message where the profile asks for it; flag what is broken."""
         sample = item.sample
         if item.type_name != schema.IMAGE or sample.message_encoding not in ("", "cdr"):
-            item.finding = inspect(item.type_name, sample.message_encoding, sample.data)
+            item.finding = inspector(item.type_name, sample.message_encoding)(sample.data)
             if sample.topic not in self.kinds:
                 is_depth = b"compressedDepth" in sample.data[:256]
                 self.kinds[sample.topic] = "depth" if is_depth else "color"

@@ -104,7 +104,7 @@ class Channels:
             self._warn(
                 f"{topic}: {type_name} was built from another definition ({sample.type_hash})"
             )
-        look = inspector("" if is_strange else type_name, sample.message_encoding)
+        look = inspector("" if is_strange else type_name, sample.message_encoding, sample.topic)
         last_ns = self._last_ns.setdefault(topic, [0])
         content = ContentWatch(topic, type_name)
         return Channel(record, look, last_ns, stamp_reader(record), content)
@@ -261,11 +261,11 @@ class EpisodeRecording:
         finding = GOOD if is_known else item.finding or channel.inspect(item.sample.data)
         self._look(channel, item, finding, is_known=is_known)
         try:
-            self._append(channel, item.sample, item.sample.received_ns, item.image_encoding)
+            at_ns = self._append(channel, item.sample, item.sample.received_ns, item.image_encoding)
         except OSError:
             self.ledger.count_refused(item)
             raise
-        self.ledger.count_received(item, finding)
+        self.ledger.count_received(item, finding, at_ns)
 
     def _look(self, channel: Channel, item: Item, finding: MessageState, *, is_known: bool) -> None:
         """Tell of what is wrong with a message, once for each topic and kind."""
@@ -294,7 +294,7 @@ class EpisodeRecording:
 
     def _append(
         self, channel: Channel, sample: WireSample, stamp_ns: int, image_encoding: str = ""
-    ) -> None:
+    ) -> int | None:
         log_ns = channel.later(stamp_ns)
         source_ns = sample.source_ns
         if source_ns is None and channel.stamp_ns is not None:
@@ -309,6 +309,7 @@ class EpisodeRecording:
             sequence=sample.sequence,
             about=(("image_encoding", image_encoding),) if image_encoding else (),
         )
+        return source_ns
 
     def tick(self, now_ns: int, health: dict[str, int]) -> None:
         """Write what has waited long enough, and the drop log of the seconds that are over."""
@@ -388,18 +389,17 @@ class EpisodeRecording:
                 self.ledger.count_dropped(entry)
 
     def close(
-        self,
-        *,
-        end_ns: int,
-        reason: str,
-        outcome: metadata.Outcome | None,
-        health: dict[str, int],
+        self, *, end_ns: int, reason: str, outcome: metadata.Outcome | None, health: dict[str, int]
     ) -> Path:
         """Write the accounts, finish the file and give it its final name.
 
         May be called again after an OSError, when there is space.
         """
         self._write_ledger(None, end_ns, health)
+        for news in self.news:
+            if "by_ns" in news.data:  # of a clock that was set: nothing else in the file says it
+                self.write_event("note", stamp_ns=end_ns, text=news.text, data=news.data)
+        self.news.clear()
         if not self._is_summed_up:
             self._sum_up(end_ns, reason, outcome or self.outcome)
             self._is_summed_up = True

@@ -13,6 +13,7 @@ from bridge.clock import join_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import check_image, image_header
+from bridge.episode.cdr.messages import CameraInfo
 from bridge.episode.topics import type_of_topic
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -39,21 +40,16 @@ def resolve_type(topic: str, type_name: str) -> str:
     return type_name or type_of_topic(topic) or ""
 
 
-def inspect(type_name: str, message_encoding: str, data: bytes) -> MessageState:
-    """Check a message without building anything from it."""
-    return inspector(type_name, message_encoding)(data)
-
-
 @lru_cache(maxsize=4096)
-def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], MessageState]:
-    """Return the check for the messages of one type."""
+def inspector(type_name: str, encoding: str, topic: str = "") -> Callable[[bytes], MessageState]:
+    """Return the check for the messages of one type; of topics of the contract it asks more."""
     known = schema.schema_for(type_name) if type_name else None
     if known is None:
         return lambda data: MessageState.UNKNOWN_TYPE
-    if message_encoding not in ("", known.message_encoding):
+    if encoding not in ("", known.message_encoding):
         return lambda data: MessageState.UNDECODABLE
     if known.message_encoding == "cdr":
-        return lambda data: _inspect_cdr(type_name, data)
+        return lambda data: _inspect_cdr(topic, type_name, data)
     version = schema.json_schema_version(type_name)
     return lambda data: _inspect_json(version, data)
 
@@ -74,12 +70,18 @@ def _header_stamp_ns(data: bytes) -> int | None:
     return None if stamp is None else join_ns(*stamp) or None
 
 
-def _inspect_cdr(type_name: str, data: bytes) -> MessageState:
+def _read(topic: str, type_name: str, data: bytes) -> codec.Message:
+    if type_name == schema.IMAGE:
+        check_image(topic, image_header(data))
+        return {}
+    if type_name == schema.CAMERA_INFO and type_of_topic(topic):
+        CameraInfo.from_cdr(data)
+    return codec.decode(type_name, data)
+
+
+def _inspect_cdr(topic: str, type_name: str, data: bytes) -> MessageState:
     try:
-        if type_name == schema.IMAGE:
-            check_image("", image_header(data))
-            return GOOD
-        message = codec.decode(type_name, data)
+        message = _read(topic, type_name, data)
     except codec.MalformedMessageError:
         return MessageState.UNDECODABLE
     if type_name == schema.COMPRESSED_IMAGE:
@@ -93,10 +95,8 @@ def _inspect_cdr(type_name: str, data: bytes) -> MessageState:
 def why_unreadable(topic: str, type_name: str, data: bytes) -> str:
     """Say what is wrong with a message that was found undecodable."""
     try:
-        if type_name == schema.IMAGE:
-            check_image(topic, image_header(data))
-        elif type_name in schema.DEFINITIONS:
-            codec.decode(type_name, data)
+        if type_name in schema.DEFINITIONS:
+            _read(topic, type_name, data)
     except codec.MalformedMessageError as error:
         return str(error)
     return f"not what {type_name} says"

@@ -126,8 +126,8 @@ class Ledger:
     def _was_booked(self, ticket: int) -> bool:
         return any(first <= ticket and (end is None or ticket < end) for first, end in self._spans)
 
-    def count_received(self, item: Item, finding: MessageState) -> None:
-        """Book a message that was written."""
+    def count_received(self, item: Item, found: MessageState, made_ns: int | None = None) -> None:
+        """Book a message that was written, and was made then."""
         sample = item.sample
         tally = self._tally(sample.topic, second_of(sample.received_ns))
         tally.received += 1
@@ -144,10 +144,10 @@ class Ledger:
             presence = self.presences[sample.topic] = Presence()
         if presence is not None:
             presence.see(sample.received_ns, self.pauses)
-        if sample.source_ns is not None:
-            tally.see_offset(sample.received_ns - sample.source_ns)
-        if finding is not GOOD:
-            setattr(tally, finding.value, getattr(tally, finding.value) + 1)
+        if made_ns is not None:
+            tally.see_offset(sample.received_ns - made_ns)
+        if found is not GOOD:
+            setattr(tally, found.value, getattr(tally, found.value) + 1)
 
     def count_refused(self, item: Item) -> None:
         """Book a message that came out of the queue but could not be written."""

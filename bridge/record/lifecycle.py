@@ -40,6 +40,11 @@ class DiskReserve:
         self._bytes = size_mb * BYTES_PER_MB
         self._descriptor: int | None = None
 
+    @property
+    def held_bytes(self) -> int:
+        """What comes back when it is released."""
+        return 0 if self._descriptor is None else self._bytes
+
     def hold(self) -> None:
         """Allocate it, if it is not yet."""
         if self._descriptor is not None or not self._bytes:
@@ -173,11 +178,11 @@ class Lifecycle:
             max_bytes=config.preroll_mb * BYTES_PER_MB,
             passed=lambda item: self.latched.remember(item.sample),
         )
+        self._reserve = DiskReserve(run.episodes_dir, config.disk.reserve_mb)
         self.free_bytes = free_bytes(run.path)
         self._run = run
         self._config = config
         self._queued_bytes = queued_bytes
-        self._reserve = DiskReserve(run.episodes_dir, config.disk.footer_mb)
         self._unwritable: set[str] = set()
 
     @property
@@ -254,7 +259,7 @@ class Lifecycle:
 
     def look_at_disk(self) -> str:
         """Return why the open episode must end now, or ""."""
-        self.free_bytes = free_bytes(self._run.path)
+        self.free_bytes = free_bytes(self._run.path) + self._reserve.held_bytes
         if self.take is None or self.free_bytes >= self._min_free_bytes:
             return ""
         free_mb, min_mb = self.free_bytes // BYTES_PER_MB, self._config.disk.min_free_mb
@@ -311,7 +316,7 @@ class Lifecycle:
         later = next(self._run.episodes_dir.glob(f"{episode_id}.[0-9]*.mcap"), None)
         if later is not None:
             raise UsageError(f"{later} exists already. Choose another episode id.")
-        self.free_bytes = free_bytes(self._run.path)
+        self.free_bytes = free_bytes(self._run.path) + self._reserve.held_bytes
         if self.free_bytes < self._min_free_bytes:
             raise NoSpaceError(
                 folder=self._run.path,
@@ -361,12 +366,7 @@ class Lifecycle:
         return self.take
 
     def stop(
-        self,
-        outcome: metadata.Outcome | None,
-        command: Command,
-        *,
-        discard: bool,
-        reason: str,
+        self, outcome: metadata.Outcome | None, command: Command, *, discard: bool, reason: str
     ) -> Answer:
         """Finish the episode, or throw it away."""
         take = self._open_take()
@@ -429,12 +429,7 @@ class Lifecycle:
             take.refuse(rest())
         self._reserve.release()
         try:
-            take.close(
-                end_ns=now_ns,
-                reason=reason,
-                outcome=None,
-                health=self._health(),
-            )
+            take.close(end_ns=now_ns, reason=reason, outcome=None, health=self._health())
             error = DiskError(path=take.path, cause=cause, is_finished=True)
             self.last_episode = take.info.id
         except OSError:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.topics import type_of_topic
-from bridge.record.inspection import GOOD, MessageState, inspect, resolve_type, stamp_reader
+from bridge.record.inspection import GOOD, MessageState, inspector, resolve_type, stamp_reader
 from bridge.record.sequence import SequenceTracker
 from bridge.wire import rmw
 from bridge.wire.clocks import ALIVE
@@ -144,7 +144,7 @@ class WireListener:
             heard.last_numbers[sample.source_gid] = sample.sequence
         self._note_time(heard, sample)
         type_name = resolve_type(sample.topic, sample.type_name)
-        state = inspect(type_name, sample.message_encoding, sample.data)
+        state = inspector(type_name, sample.message_encoding)(sample.data)
         heard.states[state] = heard.states.get(state, 0) + 1
 
     def _note_time(self, heard: TopicHeard, sample: WireSample) -> None:

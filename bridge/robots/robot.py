@@ -38,7 +38,7 @@ GRIPPER_WIDTH = "gripper_width"
 """The one joint in the messages of a gripper's state: the distance between its pads [m]."""
 RECORD_TAG = "robot_gst"
 """Element of a URDF that holds the record; readers of URDF pass over what they do not know."""
-NUM_JOINTS = (6, 7)
+NUM_JOINTS = range(5, 8)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +122,7 @@ class Robot:
     """``package://PACKAGE/PATH``, or a path, relative to the robot file."""
     attached: tuple[str, ...] = ()
     """URDF files whose links and joints are added: gripper, tool. Each is mounted by a joint of its
-    own whose parent is a link of the arm."""
+    own whose parent is a link of the arm; a link of the arm gets the shapes it has there."""
     flange: str = ""
     """Link of the arm that attached files are mounted on; "": the one that they name."""
     prefix: str = ""
@@ -190,7 +190,10 @@ class Robot:
         for name in self.attached:
             part = self._parsed(name)
             self._mount(part, arm, name)
-            arm.extend(list(part))
+            there = {link.get("name"): link for link in arm.findall("link")}
+            for item in part:
+                known = there.get(item.get("name")) if item.tag == "link" else None
+                arm.append(item) if known is None else known.extend(list(item))
         if self.prefix:
             _put_before(self.prefix, arm)
         for joint in arm.findall("joint"):
@@ -216,7 +219,7 @@ class Robot:
     def _parsed(self, uri: str) -> ET.Element:
         path = self._file(uri)
         text = path.read_text()
-        if "<xacro:" in text:
+        if "<xacro:" in re.sub("<!--.*?-->", "", text, flags=re.DOTALL):
             raise UsageError(
                 f"{path} is a xacro file; expand it first: xacro {path} > {path.stem}.urdf, and "
                 "name that."
@@ -227,13 +230,19 @@ class Robot:
             raise UsageError(f"{path} is not XML ({error}).") from error
         if root.tag != "robot":
             raise UsageError(f"{path} has the root element <{root.tag}>, not <robot>.")
+        lost: dict[str, None] = {}
         for mesh in root.iter("mesh"):
-            mesh.set("filename", self._mesh(mesh.get("filename", ""), path.parent))
+            try:
+                mesh.set("filename", self._mesh(mesh.get("filename", ""), path.parent))
+            except UsageError as error:
+                lost[str(error)] = None
+        if lost:
+            raise UsageError(" ".join(lost))
         return root
 
     def _mesh(self, uri: str, folder: Path) -> str:
         """Leave the meshes of the known package; find those of others."""
-        match = re.fullmatch(r"package://([^/]+)/(.+)", uri)
+        match = re.fullmatch(r"package:/{2,}([^/]+)/(.+)", uri)
         if match is None:
             path = Path(uri.removeprefix("file://"))
             return str(resolve_mesh(str(path if path.is_absolute() else folder / path)))
@@ -258,9 +267,7 @@ class Robot:
                 )
 
     def _file(self, uri: str) -> Path:
-        if uri.startswith("package://"):
-            return resolve_mesh(uri)
-        return resolve_mesh(str(self.folder / uri))
+        return resolve_mesh(uri if uri.startswith("package:/") else str(self.folder / uri))
 
 
 _OF_FILES = ("attached", "flange", "prefix", "held", "mesh_folders", "folder")
@@ -407,16 +414,17 @@ def _check_names(robot: Robot) -> None:
     named: dict[str, tuple[str, ...]] = {
         "joints": (*robot.joints, *robot.finger_joints, *robot.held),
         "links": gripper.links,
+        "name": (robot.name,),
     }
     for what, values in named.items():
-        if not all(values):
+        if not all(value and value.isprintable() for value in values):
             raise ValueError(f"{what} must be names")
         if len(set(values)) != len(values):
             twice = sorted({name for name in values if values.count(name) > 1})
             raise ValueError(f"{what} are named twice: {', '.join(twice)}")
     if len(robot.joints) not in NUM_JOINTS:
         raise ValueError(
-            f"joints lists {len(robot.joints)}; arms of {NUM_JOINTS[0]} or {NUM_JOINTS[1]} joints "
+            f"joints lists {len(robot.joints)}; arms of {NUM_JOINTS[0]} to {NUM_JOINTS[-1]} joints "
             "are supported"
         )
     if not set(gripper.finger_links) <= set(gripper.links):
@@ -477,7 +485,7 @@ def resolve_mesh(uri: str) -> Path:
     Raises:
         UsageError: Another package, or a path that leaves the data folder.
     """
-    match = re.fullmatch(r"package://([^/]+)/(.+)", uri)
+    match = re.fullmatch(r"package:/{2,}([^/]+)/(.+)", uri)
     if match is None:
         path = Path(uri.removeprefix("file://"))
     elif match[1] == PACKAGE:

@@ -92,8 +92,10 @@ def test_lanes_say_what_is_apart_from_when_on_and_why_plans_were_sent_back(
 ) -> None:
     planned = next(p for p in run.derived(f"{ID}.replay.planned.*") if "drawn" not in p.name)
     write_touches(planned, synthetic)
-    row = replace(judge(run).row(ID), stages=(("carry", False), ("release", None)))
-    chart = build_page(run, ID, row, None).stages
+    row = judge(run).row(ID)
+    assert row is not None
+    failed = replace(row, stages=(("carry", False), ("release", None)))
+    chart = build_page(run, ID, failed, None).stages
     assert chart is not None
     lanes = {lane.name: lane for lane in chart.lanes}
     assert [(b.label, b.style) for b in lanes["recorded"].bars if b.style == "apart"] == [

@@ -369,7 +369,7 @@ def _link_bodies(robot: RobotModel) -> tuple[_Body, ...]:
     import fcl  # noqa: PLC0415
 
     bodies = []
-    for item in collision_geometry(robot).geometryObjects:
+    for item in collision_geometry(robot.model, robot.urdf).geometryObjects:
         frame = robot.model.frames[item.parentFrame]
         T_link_shape = frame.placement.inverse() * item.placement
         shape = item.geometry

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from bridge.errors import GstError, UsageError
-from bridge.robots.robot import Gripper, read_robot
+from bridge.robots.robot import Gripper, Robot, number_of, read_robot
 from twin.robot.collision import RobotHulls
 from twin.robot.config import IkConfig
-from twin.robot.inverse import UrInverse, solve_ik
-from twin.robot.model import RobotModel, numbers_in, without_dynamics
+from twin.robot.inverse import NUM_POSE, UrInverse, solve_ik
+from twin.robot.model import RobotModel, without_dynamics
 
 _POSES, _SEED = 20, 0
 _MOST_RAD = 8 * np.pi
@@ -24,13 +24,14 @@ _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
     """Read a robot file, build all that replays need of it, and say what was found."""
-    record = read_robot(name)
+    record, text = read_robot(name), ""
     try:
         text = record.description()
         robot = RobotModel(text)
         hulls = RobotHulls(robot)
     except GstError as error:
-        raise UsageError(f"{record.name}: {error}") from error
+        more = [f"\n  {level}: {told}" for level, told in _in_text(record, text)] if text else []
+        raise UsageError(f"{record.name}: {error}{''.join(more)}") from error
     if urdf_out is not None:
         urdf_out.parent.mkdir(parents=True, exist_ok=True)
         urdf_out.write_text(text)
@@ -95,6 +96,10 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
         found.append(f"the URDF lacks the finger joints {', '.join(lost)}: no dynamic replay")
     if not record.gripper.fingers:
         found.append("a fixed tool: plans that grasp are refused")
+    if len(record.joints) < NUM_POSE:
+        found.append(
+            "of a pose the position is reached; the tool turns as far as its joints let it"
+        )
     bare = sorted({*record.gripper.finger_links} - {hull.link for hull in hulls.hulls})
     if bare:
         found.append(f"{', '.join(bare)} have no collision shapes: they touch nothing")
@@ -107,14 +112,7 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
 
 def _findings(robot: RobotModel, hulls: RobotHulls, text: str) -> Iterator[tuple[str, str]]:
     """Say of each link and joint what it cannot be used for: kinematic, dynamic or gate."""
-    names, low, high = robot.joints, robot.lower_rad, robot.upper_rad
-    for name, *ends in zip(names, low, high, strict=True):
-        if max(map(abs, ends)) > _MOST_RAD:
-            told = " to ".join(f"{end:g}" for end in ends)
-            yield "kinematic", f"the joint {name!r} is limited to {told} rad; are these degrees?"
-    for name, speed in zip(names, robot.velocity_limit_rad_s, strict=True):
-        if not speed > 0:
-            yield "gate", f"the joint {name!r} has a speed of 0; set velocity_rad_s"
+    yield from _in_text(robot.record, text)
     for lacking in without_dynamics(robot):
         yield "dynamic", f"the URDF gives {lacking}"
     watched = Counter(hull.link for hull in hulls.hulls)
@@ -123,16 +121,38 @@ def _findings(robot: RobotModel, hulls: RobotHulls, text: str) -> Iterator[tuple
         if watched[name] < shapes or (name in robot.bodies and not shapes):
             told = f"{watched[name]} of its {shapes} collision shapes are read"
             yield "gate", f"the link {name!r} is not watched: {told}"
-        for inertia in link.findall("inertial/inertia"):
-            xx, yy, zz, xy, xz, yz = numbers_in(inertia, *_INERTIA)
-            moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            if not moments[0] + moments[1] >= moments[2] * (1 - _ROUNDED):
-                yield "dynamic", f"the inertia of the link {name!r} is no body's: A + B < C"
     if oversized := hulls.oversized():
         yield "gate", oversized
         return
     for links, why in hulls.left_out.items():
         yield "kinematic", f"{links} are not watched against each other: {why}"
+
+
+def _in_text(record: Robot, text: str) -> Iterator[tuple[str, str]]:
+    """What numbers of a description cannot be, whether or not an arm can be made of it."""
+    root = ET.fromstring(text)
+    limits = {joint.get("name"): joint.find("limit") for joint in root.findall("joint")}
+    for index, name in enumerate(record.joints):
+        if (limit := limits.get(name)) is None:
+            continue
+        lower, upper, speed = (
+            number_of(limit.get(key, "0")) for key in ("lower", "upper", "velocity")
+        )
+        if record.position_rad is not None:
+            lower, upper = record.position_rad[index]
+        if max(abs(lower), abs(upper)) > _MOST_RAD:
+            told = f"{lower:g} to {upper:g} rad; are these degrees?"
+            yield "kinematic", f"the joint {name!r} is limited to {told}"
+        if record.velocity_rad_s is None and not speed > 0:
+            yield "gate", f"the joint {name!r} has a speed of {speed:g}; set velocity_rad_s"
+    for link in root.findall("link"):
+        for inertia in link.findall("inertial/inertia"):
+            xx, yy, zz, xy, xz, yz = (number_of(inertia.get(key, "")) for key in _INERTIA)
+            matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            moments = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else [np.nan] * 3
+            if not moments[0] + moments[1] >= moments[2] * (1 - _ROUNDED):
+                told = f"the inertia of the link {link.get('name')!r} is no body's: A + B < C"
+                yield "dynamic", told
 
 
 def describe_robot(found: dict[str, Any]) -> str:

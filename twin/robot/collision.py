@@ -9,6 +9,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
 from twin.robot.model import RobotDescriptionError, RobotModel
 
@@ -18,7 +19,7 @@ from twin.robot.model import RobotDescriptionError, RobotModel
 # unsafe side. ``ConvexBase.convexHull`` computes a true hull; a test pins hull distance <= mesh
 # distance.
 
-_CYLINDER_SIDES = 24
+_CYLINDER_SIDES, _FEW = 24, 200
 _THINNEST_M = 1e-7
 
 
@@ -38,13 +39,26 @@ def convex_hull(points_m: Float[np.ndarray, "num_points 3"]) -> coal.ConvexBase:
     stored = coal.StdVec_Vec3s()
     for point in points_m:
         stored.append(np.asarray(point, dtype=np.float64))
-    return coal.ConvexBase.convexHull(stored, False, "Qt")
+    try:
+        return coal.ConvexBase.convexHull(stored, False, "Qt")
+    except RuntimeError:  # a corner with more than 255 neighbours
+        return convex_hull(_fewer_around(points_m))
 
 
-def collision_geometry(robot: RobotModel) -> pin.GeometryModel:
+def _fewer_around(points_m: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "few 3"]:
+    """Some of the points, moved away from their middle until their hull contains all."""
+    directions = np.random.default_rng(0).normal(size=(_FEW, 3))
+    few = points_m[np.unique(np.argmax(points_m @ directions.T, axis=0))]
+    middle = few.mean(axis=0)
+    faces = ConvexHull(few - middle).equations
+    share = ((points_m - middle) @ faces[:, :3].T / -faces[:, 3]).max()
+    return np.asarray(middle + (few - middle) * max(1.0, share))
+
+
+def collision_geometry(model: pin.Model, urdf: str) -> pin.GeometryModel:
     """Read the collision shapes of a description."""
     try:
-        return pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+        return pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(
             found=f"has collision shapes that cannot be read ({str(error)[:200]})",
@@ -54,12 +68,12 @@ def collision_geometry(robot: RobotModel) -> pin.GeometryModel:
 
 def link_hulls(robot: RobotModel) -> list[LinkHull]:
     """Return one hull for each collision element of the description."""
-    geometry = collision_geometry(robot)
+    geometry = collision_geometry(robot.model, robot.urdf)
     hulls = []
     for item in geometry.geometryObjects:
         frame = robot.model.frames[item.parentFrame]
         T_link_shape = frame.placement.inverse() * item.placement
-        points = _points(item) @ T_link_shape.rotation.T + T_link_shape.translation
+        points = corners_of(item) @ T_link_shape.rotation.T + T_link_shape.translation
         if not _has_volume(points):
             raise RobotDescriptionError(
                 found=f"has a collision shape without volume at the link {frame.name!r}",
@@ -85,7 +99,8 @@ def _has_volume(points_m: Float[np.ndarray, "num_points 3"]) -> bool:
     return bool(spread[2] > _THINNEST_M)
 
 
-def _points(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
+def corners_of(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
+    """Points whose hull contains a collision shape, in its own frame [m]."""
     shape = item.geometry
     if isinstance(shape, coal.BVHModelBase):
         return np.array(shape.vertices())
@@ -97,18 +112,18 @@ def _points(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
         return corners
     if isinstance(shape, coal.Sphere):
         return _circumscribed(float(shape.radius))
-    if isinstance(shape, coal.Cylinder):
+    if isinstance(shape, coal.Cylinder | coal.Capsule):
         angle = np.arange(_CYLINDER_SIDES) * 2 * np.pi / _CYLINDER_SIDES
         # Corners on the circumscribed circle: the prism contains the cylinder (safe side).
         radius = shape.radius / np.cos(np.pi / _CYLINDER_SIDES)
         ring = np.stack([np.cos(angle) * radius, np.sin(angle) * radius], axis=1)
         ends = [np.column_stack([ring, np.full(len(ring), s)]) for s in (-1, 1)]
         prism: Float[np.ndarray, "num_points 3"] = np.concatenate(ends)
-        prism[:, 2] *= float(shape.halfLength)
+        prism[:, 2] *= shape.halfLength + shape.radius * isinstance(shape, coal.Capsule)
         return prism
     raise RobotDescriptionError(
         found=f"has a collision shape {type(shape).__name__} at {item.name}",
-        hint="Known: mesh, box, cylinder, sphere.",
+        hint="Known: mesh, box, cylinder, sphere, capsule.",
     )
 
 

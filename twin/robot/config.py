@@ -14,7 +14,5 @@ class IkConfig:
     max_iterations: int = 60
     """Iterations of one Levenberg-Marquardt descent."""
     restarts: int = 20
-    """Other starts tried after the warm start fails: random ones, or ten times as many of the
-    nearest known postures; 0: none."""
-    seed: int = 0
-    """Seed of the random starts."""
+    """Other starts tried after the warm start fails, ten times as many of arms without a closed
+    form; 0: none."""

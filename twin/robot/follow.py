@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from twin.robot.config import IkConfig
-from twin.robot.inverse import NUM_BRANCHES, UrInverse, solutions, solve_ik
+from twin.robot.inverse import NUM_BRANCHES, Joints, UrInverse, solutions, solve_ik
 from twin.robot.model import RobotModel
 
+Poses = Float[np.ndarray, "num_poses 4 4"]
 Clearance = Callable[
     [Float[np.ndarray, "num_postures num_joints"]], Float[np.ndarray, " num_postures"]
 ]
@@ -49,9 +50,9 @@ class Followed:
 
 def follow_poses(
     robot: RobotModel,
-    Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"],
+    Ts_base_tcp: Poses,
     *,
-    start_rad: Float[np.ndarray, " num_joints"] | None,  # before the first pose; None: any
+    start_rad: Joints | None,  # before the first pose; None: any
     config: IkConfig,
     clearance: Clearance | None = None,  # asked only about postures that are wanted
 ) -> Followed:
@@ -74,10 +75,7 @@ def follow_poses(
 
 
 def _freest(
-    robot: RobotModel,
-    Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"],
-    config: IkConfig,
-    clearance: Clearance | None,
+    robot: RobotModel, Ts_base_tcp: Poses, config: IkConfig, clearance: Clearance | None
 ) -> Followed:
     """Iterate from several postures for the first pose, until one leads to the end freely.
 
@@ -104,10 +102,10 @@ def _freest(
 
 def _completed(
     robot: RobotModel,
-    Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"],
+    Ts_base_tcp: Poses,
     joints: Float[np.ndarray, "num_poses num_joints"],
     branch: Int[np.ndarray, " num_poses"],
-    start_rad: Float[np.ndarray, " num_joints"] | None,
+    start_rad: Joints | None,
     config: IkConfig,
     *,
     exact: bool,
@@ -118,7 +116,7 @@ def _completed(
         if branch[index] != NO_BRANCH and exact:
             continue
         if branch[index] != NO_BRANCH:
-            warm: Float[np.ndarray, " num_joints"] | None = joints[index]
+            warm: Joints | None = joints[index]
         elif index:
             warm = joints[index - 1]
         else:

@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from twin.robot.collision import convex_hull
-from twin.robot.model import RobotDescriptionError, parse_description
+from twin.robot.collision import collision_geometry, convex_hull, corners_of
+from twin.robot.model import RobotDescriptionError, built, parse_description
 
 _PACKAGE = "package://"
 _WHOLE_TURN_RAD = "6.283185307179586"
@@ -30,13 +30,8 @@ class Hand:
         root = parse_description(urdf.read_text())
         _with_local_meshes(root, urdf.parent)
         text = ET.tostring(root, encoding="unicode")
-        try:
-            self._model = pin.buildModelFromXML(text)
-            geometry = pin.buildGeomFromUrdfString(self._model, text, pin.GeometryType.COLLISION)
-        except (ValueError, RuntimeError) as error:
-            raise RobotDescriptionError(
-                found=f"is refused by pinocchio ({str(error)[:200]})", hint="Check it."
-            ) from error
+        self._model = built(text)
+        geometry = collision_geometry(self._model, text)
         self._data = self._model.createData()
         known = list(self._model.names)[1:]
         missing = [name for name in joints if name not in known]
@@ -51,7 +46,7 @@ class Hand:
         self._frame = self._model.getFrameId(hand_link)
         links = _behind(root, hand_link)
         self._pieces = [
-            (item.parentJoint, item.placement, np.array(convex_hull(_corners(item)).points()))
+            (item.parentJoint, item.placement, np.array(convex_hull(corners_of(item)).points()))
             for item in geometry.geometryObjects
             if self._model.frames[item.parentFrame].name in links
         ]
@@ -79,16 +74,6 @@ class Hand:
             T = (T_hand_base * self._data.oMi[joint] * placement).homogeneous
             hulls.append(corners @ T[:3, :3].T + T[:3, 3])
         return hulls
-
-
-def _corners(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
-    try:
-        return np.array(item.geometry.vertices())
-    except AttributeError:
-        raise RobotDescriptionError(
-            found=f"has a collision shape at {item.name} that is not a mesh",
-            hint="Links that push boxes need collision meshes.",
-        ) from None
 
 
 def _with_local_meshes(root: ET.Element, folder: Path) -> None:

@@ -1,15 +1,14 @@
 """Inverse kinematics: joints that put the tool centre point where a plan wants it.
 
 Levenberg-Marquardt on the SE(3) error with a warm start, because the next waypoint of a
-trajectory is near. Where it fails, the descent begins again from elsewhere: for UR-type arms, whose
-closed form gives all eight branches at once, from random postures of a fixed seed; for all others
-from those of many random postures whose poses are nearest. What a seventh joint leaves open goes
-towards home.
+trajectory is near. Where it fails, the descent begins again from elsewhere: for UR-type arms from
+the branches of the closed form, then from those of many random postures whose poses are nearest.
+What a seventh joint leaves open goes towards home.
 """
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -22,6 +21,8 @@ from bridge.geometry import se3
 from twin.robot.config import IkConfig
 from twin.robot.model import RobotModel
 
+Pose = Float[np.ndarray, "4 4"]
+Joints = Float[np.ndarray, " num_joints"]
 _CONVERGED = 1e-8
 """Norm of the error twist at which iterating stops: far below the tolerance, so that a round
 trip is exact and the tolerance decides feasibility only."""
@@ -32,81 +33,32 @@ _MAX_DAMPING = 1e3
 class IkSolution:
     """Joints, and how far they miss the wanted pose."""
 
-    joints_rad: Float[np.ndarray, " num_joints"]
+    joints_rad: Joints
     position_error_m: float
     rotation_error_rad: float
     reached: bool
     """Whether both errors are within the tolerance."""
 
 
-def pose_error(
-    robot: RobotModel,
-    joints_rad: Float[np.ndarray, " num_joints"],
-    T_base_tcp: Float[np.ndarray, "4 4"],
-) -> tuple[float, float]:
+def pose_error(robot: RobotModel, joints_rad: Joints, T_base_tcp: Pose) -> tuple[float, float]:
     """Distance [m] and angle [rad] between where joints put the tool and a wanted pose."""
     error = pin.SE3(robot.T_base_tcp(joints_rad)).actInv(pin.SE3(T_base_tcp))
     return float(np.linalg.norm(error.translation)), float(np.linalg.norm(pin.log3(error.rotation)))
 
 
 def solve_ik(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    config: IkConfig,
-    *,
-    warm_start_rad: Float[np.ndarray, " num_joints"] | None = None,
+    robot: RobotModel, T_base_tcp: Pose, config: IkConfig, *, warm_start_rad: Joints | None = None
 ) -> IkSolution:
     """The best joints within limits for a pose, by the warm start (None: home); see ``reached``."""
     start = robot.home_rad if warm_start_rad is None else warm_start_rad
-    if UrInverse.for_robot(robot) is not None:
-        best = _descend(robot, T_base_tcp, start, config)
-        if not best.reached:
-            best = _from_random(robot, T_base_tcp, best, config)
-        if not best.reached and config.restarts:
-            best = _from_branches(robot, T_base_tcp, best, start, config)
-        return best
-    best = _descend(robot, T_base_tcp, start, config, bounded=True)
+    best = _descend(robot, T_base_tcp, start, config)
+    if not best.reached and len(start) < NUM_POSE:
+        return _position_first(robot, T_base_tcp, warm_start_rad, config)
     if not best.reached:
-        best = _from_nearest(robot, T_base_tcp, best, config)
+        best = _from_nearest(robot, T_base_tcp, best, start, config)
         return _nearer(robot, T_base_tcp, best, start, config) if best.reached else best
     if warm_start_rad is None and len(start) > NUM_POSE:
         return _nearer(robot, T_base_tcp, best, start, config)
-    return best
-
-
-def _from_random(
-    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], best: IkSolution, config: IkConfig
-) -> IkSolution:
-    """Begin at random postures."""
-    rng = np.random.default_rng(config.seed)
-    span = np.minimum(np.pi, (robot.upper_rad - robot.lower_rad) / 2)
-    for _ in range(config.restarts):
-        start = np.clip(rng.uniform(-span, span), robot.lower_rad, robot.upper_rad)
-        other = _descend(robot, T_base_tcp, start, config)
-        if other.reached or other.position_error_m < best.position_error_m:
-            best = other
-        if best.reached:
-            break
-    return best
-
-
-def _from_branches(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    best: IkSolution,
-    near_rad: Float[np.ndarray, " num_joints"],
-    config: IkConfig,
-) -> IkSolution:
-    """Begin at the branches of the closed form, which knows stretched arms; the nearest first."""
-    inverse = UrInverse.for_robot(robot)
-    if inverse is None:
-        return best
-    raw, valid, _ = inverse.solve(T_base_tcp[None])
-    rows = raw[0, valid[0]]
-    for row in rows[np.argsort(np.abs(rows - near_rad).sum(axis=1), kind="stable")]:
-        other = _descend(robot, T_base_tcp, row, config)
-        if other.reached:
-            return other
     return best
 
 
@@ -137,23 +89,60 @@ def _features(Ts: Float[np.ndarray, "num_poses 4 4"]) -> Float[np.ndarray, "num_
 
 
 def _from_nearest(
-    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], best: IkSolution, config: IkConfig
+    robot: RobotModel, T_base_tcp: Pose, best: IkSolution, near_rad: Joints, config: IkConfig
 ) -> IkSolution:
-    """Begin at the postures whose poses are nearest."""
-    if not np.isfinite(T_base_tcp).all():
+    """Begin at the branches of the closed form, then at the postures whose poses are nearest."""
+    if not (np.isfinite(T_base_tcp).all() and config.restarts):
         return best
     rows, tree = _postures(robot)
-    count = min(_STARTS_PER_RESTART * config.restarts, len(rows))
-    if not count:
-        return best
-    _, found = tree.query(_features(T_base_tcp[None])[0], k=count)
-    for index in np.atleast_1d(found).tolist():
-        other = _descend(robot, T_base_tcp, rows[index], config, bounded=True)
+    inverse, branches = UrInverse.for_robot(robot), rows[:0]
+    if inverse is not None:  # it knows stretched arms
+        raw, valid, _ = inverse.solve(T_base_tcp[None])
+        branches = raw[0, valid[0]]
+        branches = branches[np.abs(branches - near_rad).sum(axis=1).argsort(kind="stable")]
+    count = config.restarts * (_STARTS_PER_RESTART if inverse is None else 1)
+    found = tree.query(_features(T_base_tcp[None])[0], k=min(count, len(rows)))[1]
+    for start_rad in (*branches, *rows[np.atleast_1d(found)]):
+        other = _descend(robot, T_base_tcp, start_rad, config)
         if other.reached or other.position_error_m < best.position_error_m:
             best = other
         if best.reached:
             break
     return best
+
+
+_TURN_WEIGHT, _LITTLE_RAD = 0.05, 0.35
+"""Of a radian against a metre, where a tool cannot be turned at will; and what little is left."""
+
+
+def _position_first(
+    robot: RobotModel, T_base_tcp: Pose, warm_start_rad: Joints | None, config: IkConfig
+) -> IkSolution:
+    """Put the tool where it is wanted, turned as nearly so as an arm of few joints can.
+
+    ``reached`` is of the position alone. What a warm start leads to is taken where little is left,
+    so that a path stays one; else the posture that turns the tool best, of those near the pose.
+    """
+    enough_rad = config.rotation_tolerance_rad if warm_start_rad is None else _LITTLE_RAD
+    tries = [(robot.home_rad if warm_start_rad is None else warm_start_rad, _TURN_WEIGHT)]
+    if config.restarts and np.isfinite(T_base_tcp).all():
+        rows, tree = _postures(robot)
+        near = tree.query(_features(T_base_tcp[None])[0], k=3 * config.restarts)[1]
+        tries += [(rows[index], _TURN_WEIGHT) for index in near]
+        away_m = np.linalg.norm(tree.data[:, :3] - T_base_tcp[:3, 3], axis=1)
+        tries += [(rows[index], 0.0) for index in np.argsort(away_m)[: config.restarts]]
+    found: list[tuple[bool, float, int, IkSolution]] = []
+    for start_rad, weight in tries:
+        if not weight and not min(found)[0]:
+            break
+        turned = _descend(robot, T_base_tcp, start_rad, config, weight)
+        other = _descend(robot, T_base_tcp, turned.joints_rad, config, 0.0)
+        is_there = other.position_error_m <= config.position_tolerance_m
+        missed = other.rotation_error_rad if is_there else other.position_error_m
+        found.append((not is_there, missed, len(found), replace(other, reached=is_there)))
+        if is_there and missed <= enough_rad:
+            break
+    return min(found)[3]
 
 
 _DISTINCT_RAD = 0.5
@@ -162,9 +151,7 @@ _LOOKED_AT = 80
 """Nearest known postures from which further solutions are looked for."""
 
 
-def solutions(
-    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], config: IkConfig
-) -> Iterator[IkSolution]:
+def solutions(robot: RobotModel, T_base_tcp: Pose, config: IkConfig) -> Iterator[IkSolution]:
     """Yield what ``solve_ik`` finds, then other solutions of an arm without a closed form.
 
     Each differs from all before by half a radian in some joint. They are looked for one at a time.
@@ -177,7 +164,7 @@ def solutions(
     found = [first.joints_rad]
     _, near = tree.query(_features(T_base_tcp[None])[0], k=_LOOKED_AT)
     for index in near.tolist():
-        other = _descend(robot, T_base_tcp, rows[index], config, bounded=True)
+        other = _descend(robot, T_base_tcp, rows[index], config)
         away = other.joints_rad - np.array(found)
         if other.reached and np.abs(away).max(axis=1).min() > _DISTINCT_RAD:
             yield other
@@ -193,11 +180,7 @@ _STEP_RAD, _SETTLED_RAD = 0.3, 1e-3
 
 
 def _nearer(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    found: IkSolution,
-    wanted_rad: Float[np.ndarray, " num_joints"],
-    config: IkConfig,
+    robot: RobotModel, T_base_tcp: Pose, found: IkSolution, wanted_rad: Joints, config: IkConfig
 ) -> IkSolution:
     """Go from a solution to the one near it that is nearest to a posture.
 
@@ -207,7 +190,7 @@ def _nearer(
     turned = found.joints_rad + _TURN * turns
     inside = (turned >= robot.lower_rad) & (turned <= robot.upper_rad)
     joints = np.where(inside, turned, found.joints_rad)
-    best = _descend(robot, T_base_tcp, joints, config, bounded=True)
+    best = _descend(robot, T_base_tcp, joints, config)
     if not best.reached:
         return found
     if len(joints) <= NUM_POSE:
@@ -224,7 +207,7 @@ def _nearer(
         if size < _SETTLED_RAD:
             break
         step *= min(1.0, _STEP_RAD / size)
-        other = _descend(robot, T_base_tcp, best.joints_rad + step, config, bounded=True)
+        other = _descend(robot, T_base_tcp, best.joints_rad + step, config)
         closer = np.linalg.norm(wanted_rad - other.joints_rad) < np.linalg.norm(away)
         if not (other.reached and closer):
             break
@@ -234,15 +217,15 @@ def _nearer(
 
 def _descend(
     robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    start_rad: Float[np.ndarray, " num_joints"],
+    T_base_tcp: Pose,
+    start_rad: Joints,
     config: IkConfig,
-    *,
-    bounded: bool = False,
+    turn_weight: float | None = None,
 ) -> IkSolution:
     """One descent. Calls into pinocchio take a microsecond each, so each is made once a step.
 
-    ``bounded`` leaves out joints that a limit stops: the others then do their part.
+    Joints that a limit stops are left out: the others then do their part. With a ``turn_weight``
+    position and orientation count apart, so that one may be left.
     """
     model, data, tcp_id = robot.model, robot.data, robot.tcp_id
     lower, upper, arm = robot.lower_rad, robot.upper_rad, robot.arm_ids
@@ -250,25 +233,30 @@ def _descend(
     joints = np.minimum(np.maximum(start_rad, lower), upper)
     q = robot.configuration(joints)
     damping, last = 1e-6, math.inf
-    accepted, misses = joints, target.translation
+    accepted, misses = joints, target
     jacobian, error = np.zeros((6, len(joints))), np.zeros(6)
     for _ in range(config.max_iterations):
         q[arm] = joints
         pin.computeJointJacobians(model, data, q)
         difference = pin.updateFramePlacement(model, data, tcp_id).actInv(target)
-        trial = pin.log6(difference).vector
+        if turn_weight is None:
+            trial = pin.log6(difference).vector
+        else:
+            turn = turn_weight * pin.log3(difference.rotation)
+            trial = np.concatenate([difference.translation, turn])
         norm = math.sqrt(trial @ trial)
         if norm < last:
-            accepted, last, error, misses = joints, norm, trial, difference.translation
+            accepted, last, error, misses = joints, norm, trial, difference
             if norm < _CONVERGED:
                 break
             damping = max(damping * 0.2, 1e-9)
             full = pin.getFrameJacobian(model, data, tcp_id, pin.LOCAL)
             jacobian = full[:, robot.arm_velocity_ids]
-            if bounded:
-                pull = jacobian.T @ trial
-                stopped = ((joints <= lower) & (pull < 0)) | ((joints >= upper) & (pull > 0))
-                jacobian = np.where(stopped, 0.0, jacobian)
+            if turn_weight is not None:
+                jacobian = jacobian * np.repeat((1.0, turn_weight), 3)[:, None]
+            pull = jacobian.T @ trial
+            stopped = ((joints <= lower) & (pull < 0)) | ((joints >= upper) & (pull > 0))
+            jacobian = np.where(stopped, 0.0, jacobian)
         else:
             damping *= 10.0
             if not damping < _MAX_DAMPING:
@@ -277,8 +265,7 @@ def _descend(
         square.flat[::7] += damping
         weights = dposv(square, error)[1]
         joints = np.minimum(np.maximum(accepted + jacobian.T @ weights, lower), upper)
-    # The angular part of the twist is the rotation vector of what is left.
-    position, rotation = math.hypot(*misses), math.hypot(*error[3:])
+    position, rotation = math.hypot(*misses.translation), math.hypot(*pin.log3(misses.rotation))
     return IkSolution(
         joints_rad=accepted,
         position_error_m=position,
@@ -317,14 +304,14 @@ class UrGeometry:
     signs: Float[np.ndarray, "6"]
     offsets_rad: Float[np.ndarray, "6"]
     """theta = signs * joints + offsets."""
-    T_base_0: Float[np.ndarray, "4 4"]
+    T_base_0: Pose
     """First axis along z; the origin is where the first two axes meet."""
-    T_6_tcp: Float[np.ndarray, "4 4"]
+    T_6_tcp: Pose
     """Sixth axis along z; the origin is where the last two axes meet."""
     deviation: float = 0.0
     """Largest entry of the difference to pinocchio's poses over random postures."""
 
-    def forward(self, joints_rad: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+    def forward(self, joints_rad: Float[np.ndarray, "6"]) -> Pose:
         """Pose ``T_base_tcp`` of one posture."""
         theta = self.signs * joints_rad + self.offsets_rad
         a = (0.0, self.a2_m, self.a3_m, 0.0, 0.0, 0.0)
@@ -344,9 +331,7 @@ def ur_geometry(robot: RobotModel) -> UrGeometry | None:
     return None if geometry is None else _checked(geometry, robot)
 
 
-def _axes(
-    robot: RobotModel,
-) -> tuple[Float[np.ndarray, "6 3"], Float[np.ndarray, "6 3"]] | None:
+def _axes(robot: RobotModel) -> tuple[Float[np.ndarray, "6 3"], Float[np.ndarray, "6 3"]] | None:
     """Direction of each joint axis at zero and the point on it nearest the base's origin."""
     if len(robot.arm_ids) != 6:
         return None
@@ -360,7 +345,7 @@ def _axes(
 
 
 def _through(
-    w: Float[np.ndarray, "6 3"], p: Float[np.ndarray, "6 3"], T_base_tcp: Float[np.ndarray, "4 4"]
+    w: Float[np.ndarray, "6 3"], p: Float[np.ndarray, "6 3"], T_base_tcp: Pose
 ) -> UrGeometry | None:
     """Lay the chain through the axes; None when they do not stand to each other as a UR's do."""
     across = [w[0] @ w[1], w[3] @ w[4], w[4] @ w[5]]
@@ -420,7 +405,7 @@ def _meeting(
     return np.asarray(p + along * v)
 
 
-def _link(theta: float, a_m: float, d_m: float, alpha: float) -> Float[np.ndarray, "4 4"]:
+def _link(theta: float, a_m: float, d_m: float, alpha: float) -> Pose:
     """Rotate about z, move along z, move along the new x, rotate about it."""
     c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
     return np.array(

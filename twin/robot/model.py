@@ -205,7 +205,8 @@ def _bodies(urdf: str) -> set[str]:
 _OTHER_ROBOT = "Another robot's file is named by --robot FILE.toml."
 
 
-def _built(urdf: str) -> pin.Model:
+def built(urdf: str) -> pin.Model:
+    """Build what pinocchio makes of a URDF text."""
     try:
         return pin.buildModelFromXML(urdf)
     except (ValueError, RuntimeError) as error:
@@ -229,12 +230,12 @@ class RobotModel:
         mimics = mimicked(urdf)
         self.bodies = _bodies(urdf)
         self.urdf = _with_limits(with_absolute_meshes(urdf), self.record)
-        self.model = _built(self.urdf)
+        self.model = built(self.urdf)
         self._check_names()
         T_root_base = self._T_root_base()
         if np.abs(T_root_base - np.eye(4)).max() > _SAME_FRAME:
             self.urdf = _rooted(self.urdf, np.linalg.inv(T_root_base))
-            self.model = _built(self.urdf)
+            self.model = built(self.urdf)
         self.name = str(self.model.name)
         self._check_joints()
         self.data = self.model.createData()
@@ -291,7 +292,7 @@ class RobotModel:
             if self._slides(name):
                 raise RobotDescriptionError(
                     found=f"has the joint {name!r}, which slides",
-                    hint="An arm of six or seven joints that turn is needed.",
+                    hint="An arm of five to seven joints that turn is needed.",
                 )
         for finger in self.record.gripper.fingers:
             name, wanted = finger.joint, "turn" if finger.turns else "slide"

@@ -65,7 +65,7 @@ def fixed_links(robot: RobotModel) -> frozenset[str]:
 @lru_cache(maxsize=4)
 def link_surfaces(robot: RobotModel) -> tuple[LinkSurface, ...]:
     """Read the surface of every link once."""
-    geometry = collision_geometry(robot)
+    geometry = collision_geometry(robot.model, robot.urdf)
     surfaces = []
     for item in geometry.geometryObjects:
         frame = robot.model.frames[item.parentFrame]
@@ -129,9 +129,7 @@ class PosedSurface:
         )
 
     def depth_along(
-        self,
-        rays_camera: Float[np.ndarray, "*shape 3"],
-        T_base_camera: Float[np.ndarray, "4 4"],
+        self, rays_camera: Float[np.ndarray, "*shape 3"], T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "*shape"]:
         """Depth at which rays with z = 1 in the camera meet the robot; infinite where they miss."""
         turned = rays_camera @ T_base_camera[:3, :3].T

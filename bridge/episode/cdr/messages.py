@@ -27,8 +27,8 @@ from bridge.media import depth
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.media.pixels import COLORS, rgb_from
 
-FISHEYES = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "ftheta", "f-theta")
-"""Distortion models that bend straight lines whatever their numbers are."""
+STRAIGHT = ("", "none", "pinhole", "plumb_bob", "rational_polynomial", "thin_prism_model")
+"""Distortion models that bend no line where their numbers are 0, and what ends in brown_conrady."""
 
 
 def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
@@ -200,22 +200,14 @@ class DepthImage:
         Metres of encoding 32FC1 are rounded to whole millimetres.
         """
         header = image_header(data)
-        if header.encoding == FLOAT_DEPTH:
-            rows = np.ascontiguousarray(pixel_rows(header))
-            depth_m = rows.view(">f4" if header.is_bigendian else "<f4").astype(np.float32)
-            return DepthImage(
-                stamp_ns=header.stamp_ns,
-                frame_id=header.frame_id,
-                depth_mm=depth.from_metres(depth_m),
-            )
-        if header.encoding not in DEPTH_ENCODINGS:
+        if header.encoding not in (*DEPTH_ENCODINGS, FLOAT_DEPTH):
             raise no_encoding(header.encoding, (*DEPTH_ENCODINGS, FLOAT_DEPTH))
-        rows = np.ascontiguousarray(pixel_rows(header))
-        return DepthImage(
-            stamp_ns=header.stamp_ns,
-            frame_id=header.frame_id,
-            depth_mm=rows.view(">u2" if header.is_bigendian else "<u2").astype(np.uint16),
-        )
+        rows, order = np.ascontiguousarray(pixel_rows(header)), "<>"[header.is_bigendian]
+        if header.encoding == FLOAT_DEPTH:
+            depth_mm = depth.from_metres(rows.view(f"{order}f4").astype(np.float32))
+        else:
+            depth_mm = rows.view(f"{order}u2").astype(np.uint16)
+        return DepthImage(stamp_ns=header.stamp_ns, frame_id=header.frame_id, depth_mm=depth_mm)
 
     @staticmethod
     def from_message(type_name: str, data: bytes) -> "DepthImage":
@@ -259,14 +251,19 @@ class CameraInfo:
 
     @staticmethod
     def from_cdr(data: bytes) -> "CameraInfo":
-        """Read a sensor_msgs/CameraInfo; refuses lens distortion instead of ignoring it."""
-        message = codec.decode(schema.CAMERA_INFO, data)
+        """Read a sensor_msgs/CameraInfo; refuses what it cannot use instead of ignoring it."""
+        message, found = codec.decode(schema.CAMERA_INFO, data), ""
         k, model = message["k"], str(message["distortion_model"])
-        found = ""
-        if np.any(np.asarray(message["d"]) != 0) or model.lower() in FISHEYES:
+        is_straight = model.lower() in STRAIGHT or model.lower().endswith("brown_conrady")
+        if np.any(np.asarray(message["d"]) != 0) or not is_straight:
             found = f"lens distortion ({model or 'no model'}) is not zero; publish rectified images"
-        elif not (np.isfinite(k).all() and min(k[0], k[4]) > 0):
-            found = f"focal lengths of {k[0]:g} and {k[4]:g} pixels; calibrate the camera"
+        elif not (
+            np.isfinite(k).all() and min(k[0], k[4], message["width"], message["height"]) > 0
+        ):
+            size = f"images of {message['width']} x {message['height']}"
+            found = f"focal lengths of {k[0]:g} and {k[4]:g} pixels, {size}; calibrate the camera"
+        elif k[1] or max(message["binning_x"], message["binning_y"]) > 1:
+            found = f"skew of {k[1]:g}, or binned images; publish what K says of the images as sent"
         if found:
             hint = "Mend what publishes it."
             raise codec.MalformedMessageError(type_name=schema.CAMERA_INFO, found=found, hint=hint)

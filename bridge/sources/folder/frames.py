@@ -1,8 +1,10 @@
 """What every layout of an RGB-D folder is read into, and the checks they share."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -57,6 +59,8 @@ class FolderIndex:
     """``T_world_depth`` at the folder's own rate; None: one pose per frame."""
     assumed: dict[str, str] = field(default_factory=dict)
     """What the folder does not say and which values were taken instead."""
+    unused: tuple[tuple[str, str, bool], ...] = ()
+    """Keys that are not read, why, and whether a later command needs them."""
 
     @property
     def has_times(self) -> bool:
@@ -73,6 +77,38 @@ class FolderIndex:
         if self.num_unpaired:
             text += f", {self.num_unpaired} colour images without depth left out"
         return text
+
+
+_MODELS = ("camera_model", "distortion_model", "model")
+_BENDING = (
+    *("is_fisheye", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion", "coeffs"),
+    *("distortion_coefficients", "distortion_params", "D", "d"),
+)
+"""Keys under which a lens is described."""
+STRAIGHT = ("SIMPLE_PINHOLE", "PINHOLE", "OPENCV", "PLUMB_BOB", "NONE", "")
+"""Models that keep straight lines straight where all their numbers are 0."""
+STRAIGHTEN = "Straighten the images: colmap image_undistorter writes PINHOLE."
+
+
+def refuse_bent(path: Path, what: str, record: Mapping[str, Any]) -> None:
+    """Refuse a lens that bends straight lines, whichever key says so."""
+    for key in (*_MODELS, *_BENDING):
+        value = record.get(key) or ""
+        if key in _MODELS and str(value).upper() not in STRAIGHT:
+            raise FolderError(path=path, found=f"{what} has the model {value!r}", hint=STRAIGHTEN)
+        numbers = value.values() if isinstance(value, dict) else value
+        if key in _BENDING and any(numbers if isinstance(value, list | dict) else [value]):
+            raise FolderError(path=path, found=f"{what} has {key}", hint=STRAIGHTEN)
+
+
+def unread(
+    keys: Counter[str], read: Collection[str], why_of: Mapping[str, str]
+) -> Iterator[tuple[str, str, bool]]:
+    """Say which keys nobody reads, in how many frames, and which are needed and why not read."""
+    for key, count in keys.items():
+        if key not in (*read, *_MODELS, *_BENDING):
+            where = f"{key} of {count} frames" if count > 1 else key
+            yield where, why_of.get(key, "not read"), key in why_of
 
 
 def checked_rotation(
@@ -108,9 +144,7 @@ def read_color(path: Path) -> StoredColor:
         return StoredColor(stored=stored, image_u8=decode_color(stored))
     except (UnreadableImageError, OSError) as error:
         raise FolderError(
-            path=path,
-            found=str(error).rstrip("."),
-            hint="Restore the file or remove the frame.",
+            path=path, found=str(error).rstrip("."), hint="Restore the file or remove the frame."
         ) from error
 
 
@@ -130,9 +164,7 @@ def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
         return decode_depth_png(path.read_bytes())
     except (UnreadableImageError, OSError) as error:
         raise FolderError(
-            path=path,
-            found=str(error).rstrip("."),
-            hint="Restore the file or remove the frame.",
+            path=path, found=str(error).rstrip("."), hint="Restore the file or remove the frame."
         ) from error
 
 
@@ -140,9 +172,7 @@ def require_image(path: Path, *, what: str, named_by: str) -> Path:
     """Return the path if the file is there."""
     if not path.is_file():
         raise PathNotFoundError(
-            path=path,
-            what=f"{what} image",
-            hint=f"{named_by}; restore it or remove the frame.",
+            path=path, what=f"{what} image", hint=f"{named_by}; restore it or remove the frame."
         )
     return path
 

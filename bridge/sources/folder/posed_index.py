@@ -9,7 +9,7 @@ backwards). Lenses that bend straight lines are refused.
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,22 +22,18 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.cameras_view import distance_to_what_is_seen
 from bridge.sources.folder.config import FolderError
-from bridge.sources.folder.frames import checked_rotation
+from bridge.sources.folder.frames import STRAIGHTEN, checked_rotation, refuse_bent, unread
 
 COLMAP_FILES = ("cameras.txt", "images.txt")
 COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 TRANSFORMS = "transforms.json"
 IMAGE_FOLDERS = ("images", ".")
-PARAMETERS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-}
+PARAMETERS = {"SIMPLE_PINHOLE": ("f", "cx", "cy"), "PINHOLE": ("fx", "fy", "cx", "cy")}
 """COLMAP's models that are read, with the names of their numbers."""
-BENDING_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_READ = {"frames", "camera_model", "is_fisheye", "w", "h", "camera_angle_x", *BENDING_KEYS} | {
-    *("fl_x", "fl_y", "cx", "cy", "file_path", "transform_matrix")
+_READ = {"frames", "w", "h", "camera_angle_x", "fl_x", "fl_y", "cx", "cy"} | {
+    *("file_path", "transform_matrix")
 }
-STRAIGHTEN = "Straighten the images: colmap image_undistorter writes PINHOLE."
+_NEEDED = {"depth_file_path": "depth is not read here; import rgbd reads it"}
 MOST_PX = 65_500
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SPARSE_PERCENT = (2.0, 98.0)
@@ -108,8 +104,7 @@ def _read_colmap(folder: Path, model: Path) -> PosedIndex:
     path = model / "images.txt"
     images, range_found = [], _sparse_depths(model / "points3D.txt")
     for number, line in enumerate(_pose_lines(path), start=1):
-        image = _colmap_image(path, number, line, folder, cameras)
-        images.append(image)
+        images.append(_colmap_image(path, number, line, folder, cameras))
     if not images:
         raise FolderError(path=path, found="no image", hint="Reconstruct again.")
     ordered = tuple(sorted(images, key=lambda image: str(image.path)))
@@ -251,28 +246,14 @@ def _read_transforms(folder: Path) -> PosedIndex:
     ordered = tuple(sorted(images, key=lambda image: str(image.path)))
     return PosedIndex(
         path=path, layout=TRANSFORMS, name=folder.resolve().name, cameras=cameras, images=ordered,
-        sparse_range=None, assumed=assumed, unused=tuple(_unused(keys)),
+        sparse_range=None, assumed=assumed, unused=tuple(unread(keys, _READ, _NEEDED)),
     )  # fmt: skip
-
-
-def _unused(keys: Counter[str]) -> Iterator[tuple[str, str, bool]]:
-    """Say which keys nobody reads, in how many frames."""
-    for key, count in keys.items():
-        if key in _READ:
-            continue
-        is_depth = key == "depth_file_path"
-        why = "depth is not read here; import rgbd reads it" if is_depth else "not read"
-        yield (f"{key} of {count} frames" if count > 1 else key), why, is_depth
 
 
 def _frame_camera(path: Path, number: int, record: dict[str, Any]) -> tuple[Camera, bool]:
     """The camera of one frame, and whether its principal point had to be assumed."""
     what = f"frame {number}"
-    model = str(record.get("camera_model", "OPENCV"))
-    bent = [key for key in ("is_fisheye", *BENDING_KEYS) if record.get(key)]
-    if bent or model not in (*PARAMETERS, "OPENCV"):
-        found = f"{what} has {bent[0]}" if bent else f"{what} has the model {model!r}"
-        raise FolderError(path=path, found=found, hint=STRAIGHTEN)
+    refuse_bent(path, what, record)
     missing = [key for key in ("w", "h") if key not in record]
     if missing or not ("fl_x" in record or "camera_angle_x" in record):
         found = f"{what}: {', '.join(missing) or 'fl_x'} is missing"

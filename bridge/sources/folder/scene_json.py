@@ -7,6 +7,7 @@ and ``T_world_cam`` (of the depth camera, metres, OpenCV axes; null where tracki
 """
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,19 @@ from bridge.sources.folder.frames import (
     FolderFrame,
     FolderIndex,
     checked_rotation,
+    refuse_bent,
     refuse_scale_without_use,
     require_image,
+    unread,
 )
 
 INDEX_NAME = "scene.json"
+_READ = {"name", "depth_unit_m", "depth_invalid_values", "depth_encoding", "depth_intrinsics"} | {
+    *("color_registered_to_depth", "color_camera_estimate", "frames", "color", "depth"),
+    *("T_world_cam", "id", "pose_convention", "note", "formula", "fx", "fy", "cx", "cy", "width"),
+    *("height", "t_color_from_depth_m", "R_color_from_depth"),
+}
+"""Keys that are read, and those that say something to people."""
 _KEYS_HINT = "docs/rgbd_folder.md lists the keys."
 
 
@@ -33,10 +42,22 @@ def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
     """Read and check ``scene.json``; every image file it names must exist."""
     path = folder / INDEX_NAME
     refuse_scale_without_use(config, path)
-    record = _load(path)
+    try:
+        return _read(folder, path, _load(path))
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        found = f"a value of another kind ({error})"
+        raise FolderError(path=path, found=found, hint=_KEYS_HINT) from error
+
+
+def _read(folder: Path, path: Path, record: dict[str, Any]) -> FolderIndex:
     registered = record.get("color_registered_to_depth", True)
     color_camera, T_depth_color = (None, np.eye(4)) if registered else _color(path, record)
     frames, num_unposed = _frames(path, record)
+    parts = [record, *record["frames"]]
+    for part in parts:
+        refuse_bent(path, "the folder", part)
+    parts += [part for part in record.values() if isinstance(part, dict)]
+    keys = Counter(key for part in parts for key in part)
     return FolderIndex(
         path=path,
         layout="scene.json",
@@ -49,19 +70,17 @@ def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
         T_depth_color=T_depth_color,
         frames=frames,
         num_unposed=num_unposed,
+        unused=tuple(unread(keys, _READ, {})),
     )
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> Any:
     try:
-        record = json.loads(path.read_text())
+        return json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise FolderError(
             path=path, found=f"not readable as JSON ({error})", hint="Repair the file."
         ) from error
-    if not isinstance(record, dict):
-        raise FolderError(path=path, found="not a JSON object", hint=_KEYS_HINT)
-    return record
 
 
 def _value(path: Path, record: dict[str, Any], key: str) -> Any:
@@ -84,8 +103,7 @@ def _positive(path: Path, record: dict[str, Any], key: str) -> float:
 
 def _camera(path: Path, record: dict[str, Any], key: str) -> Camera:
     values = _value(path, record, key)
-    if not isinstance(values, dict):
-        raise FolderError(path=path, found=f"{key} is not an object", hint=_KEYS_HINT)
+    refuse_bent(path, key, values)
     numbers = {name: _positive(path, values, name) for name in ("fx", "fy", "cx", "cy")}
     return Camera.from_ros(
         width=int(_positive(path, values, "width")),
@@ -127,11 +145,8 @@ def _frames(path: Path, record: dict[str, Any]) -> tuple[tuple[FolderFrame, ...]
     entries = _value(path, record, "frames")
     if not isinstance(entries, list) or not entries:
         raise FolderError(path=path, found="no frames", hint="List at least one frame.")
-    frames = []
-    for number, entry in enumerate(entries):
-        frame = _frame(path, entry, f"frames[{number}]")
-        if frame is not None:
-            frames.append(frame)
+    found = [_frame(path, entry, f"frames[{number}]") for number, entry in enumerate(entries)]
+    frames = [frame for frame in found if frame is not None]
     if not frames:
         raise FolderError(path=path, found="no frame has a pose", hint="Poses are T_world_cam.")
     return tuple(frames), len(entries) - len(frames)

@@ -51,7 +51,7 @@ def check(folder: Path, fill: Callable[[EpisodeWriter], None], info: Any = INFO)
     return check_episode(path)
 
 
-def write_joints(writer: EpisodeWriter, sequences: list[int], step_ns: int = 1) -> None:
+def write_joints(writer: EpisodeWriter, sequences: list[int] | range, step_ns: int = 1) -> None:
     for number, sequence in enumerate(sequences):
         writer.write(
             JOINTS,
@@ -149,12 +149,8 @@ def test_without_a_ledger_numbers_prove_nothing(tmp_path: Path) -> None:
 
 
 def test_rates_are_reported(tmp_path: Path) -> None:
-    def fill(writer: EpisodeWriter) -> None:
-        write_joints(writer, list(range(11)), step_ns=10_000_000)
-
-    report = check(tmp_path, fill)
-    found = report.topics[JOINTS]
-    assert found.rate_hz == pytest.approx(100)
+    report = check(tmp_path, lambda writer: write_joints(writer, range(11), step_ns=10_000_000))
+    assert report.topics[JOINTS].rate_hz == pytest.approx(100)
     assert report.exit_code == 0
 
 

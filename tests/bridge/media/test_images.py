@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
-from bridge.media.depth import decode_depth_png
 
 
 def png(array: np.ndarray) -> bytes:
@@ -42,8 +41,3 @@ def test_a_truncated_jpeg_is_refused(cut: int) -> None:
 def test_arbitrary_bytes_are_no_image(data: bytes) -> None:
     with pytest.raises(UnreadableImageError):
         decode_color(data)
-
-
-def test_an_eight_bit_image_is_no_depth() -> None:
-    with pytest.raises(UnreadableImageError, match="16-bit"):
-        decode_depth_png(png(np.zeros((4, 4), dtype=np.uint8)))

@@ -15,7 +15,7 @@ from bridge.episode.cdr.messages import (
     FrameTransform,
     transforms_to_cdr,
 )
-from bridge.record.inspection import MessageState, inspect
+from bridge.record.inspection import MessageState, inspector
 from bridge.record.ledger import OTHER_TOPICS, Ledger
 from bridge.record.queue import DropCount, Dropped, Item, LatchedMessages
 from bridge.record.sequence import MAX_HOLES, SequenceTracker, Step
@@ -120,7 +120,7 @@ def test_a_gap_booked_elsewhere_is_not_taken_back_here() -> None:
 def test_the_seconds_add_up_to_the_totals_also_when_they_come_late() -> None:
     ledger = Ledger()
     sample = replace(numbered(3), received_ns=10**9, source_ns=10**9 - 5)
-    ledger.count_received(item_of(sample, Step(gap=3)), MessageState.UNDECODABLE)
+    ledger.count_received(item_of(sample, Step(gap=3)), MessageState.UNDECODABLE, sample.source_ns)
     first = list(ledger.close_seconds())
     ledger.count_received(item_of(sample, Step(fills=0)), GOOD)
     count = DropCount(messages=2, shed=3, gaps=4, fills=[0])
@@ -150,29 +150,28 @@ def jpeg_message(data: bytes) -> bytes:
 
 def test_newer_json_is_flagged_and_broken_messages_are_found(make_sample: MakeSample) -> None:
     good = make_sample().data
-    assert inspect(schema.JOINT_STATE, "cdr", good) is GOOD
-    assert inspect(schema.JOINT_STATE, "cdr", good[:-3]) is MessageState.UNDECODABLE
-    assert inspect(schema.JOINT_STATE, "json", good) is MessageState.UNDECODABLE
-    assert inspect(schema.EVENT, "json", b'{"schema_version": 1}') is GOOD
-    assert inspect(schema.EVENT, "json", b'{"schema_version": 99}') is MessageState.NEWER_VERSION
-    assert inspect(schema.EVENT, "json", b"{") is MessageState.UNDECODABLE
-    assert inspect("my/Thing", "cdr", b"") is MessageState.UNKNOWN_TYPE
+    assert inspector(schema.JOINT_STATE, "cdr")(good) is GOOD
+    assert inspector(schema.JOINT_STATE, "cdr")(good[:-3]) is MessageState.UNDECODABLE
+    assert inspector(schema.JOINT_STATE, "json")(good) is MessageState.UNDECODABLE
+    assert inspector(schema.EVENT, "json")(b'{"schema_version": 1}') is GOOD
+    assert inspector(schema.EVENT, "json")(b'{"schema_version": 99}') is MessageState.NEWER_VERSION
+    assert inspector(schema.EVENT, "json")(b"{") is MessageState.UNDECODABLE
+    assert inspector("my/Thing", "cdr")(b"") is MessageState.UNKNOWN_TYPE
 
 
 def test_cut_images_are_found_without_decoding_them() -> None:
     jpeg = b"\xff\xd8" + bytes(500) + b"\xff\xd9"
-    assert inspect(schema.COMPRESSED_IMAGE, "cdr", jpeg_message(jpeg)) is GOOD
-    assert inspect(schema.COMPRESSED_IMAGE, "cdr", jpeg_message(jpeg + bytes(9))) is GOOD
-    assert (
-        inspect(schema.COMPRESSED_IMAGE, "cdr", jpeg_message(jpeg[:-9])) is MessageState.UNDECODABLE
-    )
+    assert inspector(schema.COMPRESSED_IMAGE, "cdr")(jpeg_message(jpeg)) is GOOD
+    assert inspector(schema.COMPRESSED_IMAGE, "cdr")(jpeg_message(jpeg + bytes(9))) is GOOD
+    cut = jpeg_message(jpeg[:-9])
+    assert inspector(schema.COMPRESSED_IMAGE, "cdr")(cut) is MessageState.UNDECODABLE
     other = jpeg_message(b"\x89PNG" + bytes(90))
-    assert inspect(schema.COMPRESSED_IMAGE, "cdr", other) is GOOD
+    assert inspector(schema.COMPRESSED_IMAGE, "cdr")(other) is GOOD
     depth = DepthImage(stamp_ns=0, frame_id="c", depth_mm=np.zeros((4, 6), np.uint16)).to_cdr()
-    assert inspect(schema.IMAGE, "cdr", depth) is GOOD
-    assert inspect(schema.IMAGE, "cdr", depth[:-1]) is MessageState.UNDECODABLE
+    assert inspector(schema.IMAGE, "cdr")(depth) is GOOD
+    assert inspector(schema.IMAGE, "cdr")(depth[:-1]) is MessageState.UNDECODABLE
     wrong_size = depth.replace(b"\x04\0\0\0\x06\0\0\0", b"\x05\0\0\0\x06\0\0\0")
-    assert inspect(schema.IMAGE, "cdr", wrong_size) is MessageState.UNDECODABLE
+    assert inspector(schema.IMAGE, "cdr")(wrong_size) is MessageState.UNDECODABLE
 
 
 @settings(max_examples=50)
@@ -180,7 +179,7 @@ def test_cut_images_are_found_without_decoding_them() -> None:
 def test_inspection_never_raises(data: bytes) -> None:
     names = (schema.JOINT_STATE, schema.IMAGE, schema.COMPRESSED_IMAGE, schema.PLAN, "x")
     for name in names:
-        assert isinstance(inspect(name, "", data), MessageState)
+        assert isinstance(inspector(name, "")(data), MessageState)
 
 
 def static_transform(*children: str) -> bytes:

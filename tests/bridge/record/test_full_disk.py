@@ -13,11 +13,12 @@ import pytest
 from bridge.clock import AnchoredClock
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
 from bridge.episode.recover import recover_parts
 from bridge.episode.run_folder import RunFolder
 from bridge.record.config import DiskConfig, RecorderConfig
 from bridge.record.errors import NoSpaceError
-from bridge.record.lifecycle import DiskReserve
+from bridge.record.lifecycle import DiskReserve, free_bytes
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
 
@@ -64,10 +65,19 @@ def test_a_start_without_space_is_refused(
         make_recorder(run).start(INFO)
     with pytest.raises(NoSpaceError, match="--footer-mb"):
         make_recorder(run, min_free_mb=0, footer_mb=50).start(INFO)
-    recorder = make_recorder(run, min_free_mb=1, footer_mb=2)
+    recorder = make_recorder(run, min_free_mb=6)  # with the usual reserve of 64
     recorder.start(INFO)
-    recorder.receive(make_sample())
-    assert recorder.stop()["messages"] == 1
+    sent, end_s = 0, time.monotonic() + 60.0
+    while not recorder.failed.is_set():
+        assert time.monotonic() < end_s
+        recorder.receive(make_sample(topic="/a", type_name="", data=os.urandom(20_000)))
+        sent += 1
+        time.sleep(0.01)
+    assert "6 MB must be left" in recorder.status()["error"]
+    recorder.close()
+    assert 3_000_000 < free_bytes(small_disk) < 6_100_000
+    episode = Episode.open(run.episodes_dir / "t1.mcap")
+    assert 100 < episode.topics()["/a"].count <= sent
 
 
 def test_the_space_held_back_has_no_name_and_comes_back(small_disk: Path) -> None:

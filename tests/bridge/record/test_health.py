@@ -2,6 +2,8 @@
 
 import itertools
 import json
+import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,6 +54,16 @@ def jpeg(number: int, data: bytes, form: str = "jpeg") -> bytes:
     return codec.encode(schema.COMPRESSED_IMAGE, about)
 
 
+SKEW = {"k": [50.0, 1, 32, 0, 50, 24, 0, 0, 1]}
+ODD = (SKEW, {"binning_x": 2}, {"width": 0}, *({"distortion_model": m} for m in ("mei", "fisheye")))
+
+
+def lens(number: int) -> bytes:
+    """A camera without coefficients that is no pinhole all the same, in one way after another."""
+    about = {"height": 48, "width": 64, "k": [50.0, 0, 32, 0, 50, 24, 0, 0, 1], "d": [0.0] * 4}
+    return codec.encode(schema.CAMERA_INFO, about | ODD[number % len(ODD)])
+
+
 STILL, FLAT = noise(), noise(1, np.uint16)
 STILL_JPEG = encode_jpeg(STILL)
 EMPTY = np.zeros((48, 64), np.uint16)
@@ -92,30 +104,38 @@ FAULTS: dict[str, tuple[str, str, str, Make]] = {
     ),
     "nv24": ("unreadable", COLOR, schema.IMAGE, lambda n: image(n, noise(3), "nv24")),
     "depth of 8 bits": ("unreadable", DEPTH, schema.IMAGE, lambda n: image(n, noise(1), "8UC1")),
+    "nv24 elsewhere": ("unreadable", "/eye", schema.IMAGE, lambda n: image(n, noise(3), "nv24")),
+    "bent lens": ("unreadable", "/c/cam/a/color/info", schema.CAMERA_INFO, lens),
     "no jpeg": ("unreadable", COLOR, schema.COMPRESSED_IMAGE, lambda n: jpeg(n, b"h264")),
     "cdr 2": ("unreadable", JOINTS, schema.JOINT_STATE, lambda n: b"\0\7\0\0" + joints(n)[4:]),
 }
 
 
-def recorded(run: RunFolder, streams: dict[str, tuple[str, Make]], rate_hz: float = 20.0) -> dict:
-    """Record three seconds of streams, given at once, and return the answer to the stop."""
+def sample(
+    topic: str, type_name: str, data: bytes, number: int, *, received_ns: int, source_ns: int | None
+) -> WireSample:
+    return WireSample(
+        topic=topic, type_name=type_name, message_encoding="cdr", data=data, source_ns=source_ns,
+        sequence=number, source_gid=b"g" * 16, received_ns=received_ns,
+    )  # fmt: skip
+
+
+def recorded(
+    run: RunFolder, streams: dict[str, tuple[str, Make]], rate_hz: float = 20.0, set_s: float = 0
+) -> dict:
+    """Record sixty messages, given at once, and return the answer to the stop.
+
+    The clock of all publishers is set by ``set_s`` in the middle; NaN: they do not say.
+    """
     clock = AnchoredClock()
     recorder = Recorder(run, now_ns=clock.now_ns)
     recorder.start(EpisodeInfo(id="t1", kind="trial", cell="c"))
     begun_ns = clock.now_ns()
     for number, (topic, (type_name, make)) in itertools.product(range(60), streams.items()):
         at_ns = begun_ns + round(number / rate_hz * NS_PER_S) - 3 * NS_PER_S
+        source_ns = None if set_s != set_s else at_ns + (number >= 30) * int(set_s) * NS_PER_S
         recorder.receive(
-            WireSample(
-                topic=topic,
-                type_name=type_name,
-                message_encoding="cdr",
-                data=make(number),
-                source_ns=at_ns,
-                sequence=number,
-                source_gid=b"g" * 16,
-                received_ns=at_ns,
-            )
+            sample(topic, type_name, make(number), number, received_ns=at_ns, source_ns=source_ns)
         )
     answer = recorder.stop()
     recorder.close()
@@ -144,16 +164,32 @@ def test_a_fault_has_one_name_everywhere(
     ]
     assert report.exit_code == (1 if name == "unreadable" else 3)
     found = answer["findings"][0]
-    if name != "unreadable":
+    if name == "unreadable":
+        assert found["text"].startswith("60 of 60 ")
+    else:
         assert found["last_ns"] - found["first_ns"] > NS_PER_S
-        assert (found["first_ns"], found["count"]) == (
-            report.findings[0].first_ns,
-            report.findings[0].count,
-        )
+        same = report.findings[0]
+        assert (found["first_ns"], found["count"]) == (same.first_ns, same.count)
     words = f"{name.replace('_', ' ')}: {topic}"
     for command in (["info", str(path)], ["ls", str(run.path)]):
         assert robot_gst.run(command) == 0
         assert words in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(("set_s", "says"), [(3600, "attachment"), (-3600, "header")])
+def test_a_clock_that_is_set_is_named_at_the_end_too(run: RunFolder, set_s: int, says: str) -> None:
+    def late(number: int) -> bytes:
+        at_ns = time.time_ns() + number * NS_PER_S // 10 + (number >= 30) * set_s * NS_PER_S
+        stamp = {"sec": at_ns // NS_PER_S, "nanosec": at_ns % NS_PER_S}
+        return joints(number, header={"stamp": stamp, "frame_id": ""})
+
+    streams = {JOINTS: (schema.JOINT_STATE, late if says == "header" else joints)}
+    (told,) = recorded(run, streams, 10.0, set_s if says != "header" else np.nan)["findings"]
+    (found,) = check_episode(run.episodes_dir / "t1.mcap").findings
+    assert (told["name"], told["about"]) == (found.name, found.about) == ("clock_jump", JOINTS)
+    side = "ahead" if set_s > 0 else "back"
+    assert told["text"] == found.text
+    assert re.search(f"jumped {side} by (3600.0|3599.[89])", found.text)
 
 
 def test_a_fault_of_a_moment_is_none_and_one_that_comes_back_is_one(tmp_path: Path) -> None:
@@ -186,20 +222,8 @@ def test_what_nobody_can_read_is_told_within_a_second(run: RunFolder) -> None:
     clock = AnchoredClock()
     recorder = Recorder(run, now_ns=clock.now_ns)
     recorder.start(EpisodeInfo(id="t1", kind="trial", cell="c"))
-    data = image(1, noise(3), "nv24")
-    begun_ns = clock.now_ns()
-    recorder.receive(
-        WireSample(
-            topic=COLOR,
-            type_name=schema.IMAGE,
-            message_encoding="cdr",
-            data=data,
-            source_ns=1,
-            sequence=0,
-            source_gid=b"g" * 16,
-            received_ns=begun_ns,
-        )
-    )
+    data, begun_ns = image(1, noise(3), "nv24"), clock.now_ns()
+    recorder.receive(sample(COLOR, schema.IMAGE, data, 0, received_ns=begun_ns, source_ns=1))
     assert recorder.news_arrived.wait(5.0)
     assert clock.now_ns() - begun_ns < 1.5 * NS_PER_S  # a second, and what a busy machine takes
     assert f"{COLOR}: messages cannot be read" in recorder.news[0]

@@ -149,6 +149,7 @@ STRETCHED = {"file_path": "images/000.jpg", "transform_matrix": np.diag([2.0, 2,
         ({"fl_x": 10**400}, "fl_x"),
         ({"w": 1e12}, "At most 65500"),
         ({"camera_angle_x": 0}, "camera_angle_x of 0"),
+        ({"distortion_model": "kannala_brandt4"}, "has the model 'kannala_brandt4'"),
     ],
 )
 def test_a_wrong_transforms_file_is_refused_by_name(

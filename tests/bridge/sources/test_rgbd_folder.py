@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import robot_gst
 from bridge.episode import schema
 from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage, transforms_from_cdr
 from bridge.episode.metadata import EpisodeInfo
@@ -148,16 +149,6 @@ def test_frames_without_depth_are_sent_to_the_import_of_images(
         read_index(folder)
 
 
-def test_tenths_of_millimetres_are_rounded(
-    folder: Path, stored: np.ndarray, index_record: dict[str, Any]
-) -> None:
-    rewrite(folder, {**index_record, "depth_unit_m": 0.0001})
-    found = depth_of(messages_of(folder)[0])
-    assert found[0, 2] == 1234  # 12345 x 0.1 mm, half to even
-    valid = stored != 65535
-    assert np.abs(found[valid] - stored[valid] * 0.1).max() <= 0.5
-
-
 def test_rotated_bits_are_turned_back(
     folder: Path, stored: np.ndarray, index_record: dict[str, Any]
 ) -> None:
@@ -220,9 +211,10 @@ def broken(record: dict[str, Any], key: str, value: Any = None) -> dict[str, Any
     [
         ("depth_unit_m", None, r"scene.json: key 'depth_unit_m' is missing \(there: color_regis"),
         ("depth_intrinsics", None, "key 'depth_intrinsics' is missing"),
-        ("frames", None, "key 'frames' is missing"),
+        ("depth_invalid_values", 0, "scene.json: a value of another kind .'int' object is not"),
         ("frames", [], "no frames"),
         ("depth_unit_m", -1, "depth_unit_m = -1. It must be a number above zero"),
+        ("depth_encoding", [0], "scene.json: a value of another kind"),
         ("depth_encoding", "morse", "'morse' is unknown. Known: 'rotated3'"),
         ("color_registered_to_depth", False, "'color_camera_estimate' is missing"),
     ],
@@ -245,6 +237,41 @@ def test_a_matrix_that_is_no_rotation_is_refused(
     rewrite(folder, index_record)
     with pytest.raises(FolderError, match=r"rotation of frames\[1\] is none"):
         read_index(folder)
+
+
+LENSES = (
+    *({"k1": -0.1}, {"is_fisheye": True}, {"distortion": [0, 0.1]}, {"D": {"k1": 0.1}}),
+    *({"camera_model": "OPENCV_FISHEYE"}, {"distortion_model": "equidistant", "D": [0, 0]}),
+)
+STRAIGHT = {"camera_model": "PINHOLE", "distortion_model": "plumb_bob", "k1": 0, "D": [0.0] * 5}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("where", ["", "depth_intrinsics", "frames"])
+def test_a_lens_is_refused_whichever_key_says_it(
+    folder: Path, index_record: dict[str, Any], lens: dict[str, Any], where: str
+) -> None:
+    part = index_record[where] if where else index_record
+    part = part[1] if where == "frames" else part
+    part |= STRAIGHT
+    rewrite(folder, index_record)
+    assert read_index(folder).unused == ()
+    part |= lens
+    rewrite(folder, index_record)
+    with pytest.raises(FolderError, match=f"{'|'.join(lens)}|the model.*image_undistorter"):
+        read_index(folder)
+
+
+def test_keys_that_nobody_reads_are_named_with_their_frames(
+    folder: Path, index_record: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for frame in index_record["frames"]:
+        frame["mask"] = "m.png"
+    index_record["depth_intrinsics"]["skew"] = 0.1
+    rewrite(folder, index_record)
+    assert robot_gst.run(["import", "rgbd", str(folder), str(folder / "run")]) == 0
+    said = capsys.readouterr().err
+    assert all(f"not used: {what}: not read" in said for what in ("mask of 2 frames", "skew"))
 
 
 def test_missing_files_are_named(folder: Path, tmp_path: Path) -> None:

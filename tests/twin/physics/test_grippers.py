@@ -32,7 +32,7 @@ def commanded(world: World, model: RobotModel, width_m: float, seconds: float = 
 
 
 @pytest.mark.parametrize(
-    "name", ["panda", "z1", "xarm7_parallel_gripper", "ur10e_parallel_gripper"]
+    "name", ["panda", "z1", "so100", "so101", "xarm7_parallel_gripper", "ur10e_parallel_gripper"]
 )
 def test_the_fingers_go_to_the_width_that_they_are_told(name: str) -> None:
     robot = read_robot(name)

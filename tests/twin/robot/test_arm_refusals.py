@@ -12,7 +12,7 @@ from bridge.data_files import datasets_folder
 from bridge.errors import GstError, UsageError
 from bridge.robots.robot import Robot, read_robot
 from twin.robot.check import check_robot
-from twin.robot.collision import RobotHulls, link_hulls
+from twin.robot.collision import RobotHulls
 from twin.robot.model import RobotDescriptionError, RobotModel, check_dynamics
 
 ROBOTS = sorted(path.stem for path in (datasets_folder() / "robots").glob("*.toml"))
@@ -104,21 +104,6 @@ def test_limits_of_the_record_go_before_those_of_the_urdf() -> None:
     np.testing.assert_allclose(limited.upper_rad, 2.0)
     np.testing.assert_allclose(limited.velocity_limit_rad_s, speeds)
     np.testing.assert_allclose(limited.home_rad, (limited.lower_rad + limited.upper_rad) / 2)
-
-
-def test_a_sphere_lies_inside_its_hull() -> None:
-    more = WHEEL.format(name="ball", kind="fixed", parent="panda_link0").replace(
-        '<link name="wheel"/>',
-        '<link name="wheel"><collision><geometry><sphere radius="0.1"/></geometry></collision>'
-        "</link>",
-    )
-    robot = model(PANDA, PANDA.urdf_text().replace("</robot>", more))
-    points = next(hull.points_m for hull in link_hulls(robot) if hull.link == "wheel")
-    from scipy.spatial import ConvexHull
-
-    offsets = ConvexHull(points).equations[:, 3]
-    assert 0.1 <= -offsets.max() < 0.102
-    assert np.linalg.norm(points, axis=1).max() < 0.11
 
 
 def dh_pose(theta: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
 from bridge.robots.robot import read_robot
@@ -10,7 +11,8 @@ from twin.robot.follow import follow_poses
 from twin.robot.inverse import UrInverse, pose_error, solutions, solve_ik
 from twin.robot.model import RobotModel, load_robot
 
-ITERATED = ("panda", "kinova_j2s6s200", "xarm7_parallel_gripper", "z1")
+FIVE = ("so100", "so101")
+ITERATED = ("panda", "kinova_j2s6s200", "xarm7_parallel_gripper", "z1", *FIVE)
 
 
 def model(name: str) -> RobotModel:
@@ -45,6 +47,25 @@ def test_every_pose_that_some_posture_reaches_is_reached(name: str) -> None:
     robot = model(name)
     assert UrInverse.for_robot(robot) is None
     check_reached(robot, postures(robot, 200, seed=2))
+
+
+@pytest.mark.parametrize("name", FIVE)
+def test_an_arm_of_five_joints_reaches_every_position_and_turns_as_far_as_it_can(name: str) -> None:
+    """Law: exact in place, and what is left to turn is told and no more from there."""
+    robot, rng = model(name), np.random.default_rng(4)
+    for row in postures(robot, 60, seed=5):
+        T = robot.T_base_tcp(row)
+        T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+        found = solve_ik(robot, T, IkConfig())
+        assert found.reached
+        position_m, left_rad = pose_error(robot, found.joints_rad, T)
+        assert position_m <= IkConfig().position_tolerance_m
+        assert left_rad == pytest.approx(found.rotation_error_rad, abs=1e-6)
+        warm = solve_ik(robot, T, IkConfig(), warm_start_rad=found.joints_rad)
+        assert warm.reached
+        assert warm.rotation_error_rad <= left_rad + 1e-3
+        T[:3, 3] *= 10
+        assert not solve_ik(robot, T, IkConfig(restarts=1)).reached
 
 
 def test_a_pose_out_of_reach_of_seven_joints_is_not_reached() -> None:

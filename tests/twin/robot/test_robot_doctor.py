@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from bridge.errors import UsageError
 from twin.robot.check import check_robot
-from twin.robot.collision import link_hulls
+from twin.robot.collision import convex_hull, link_hulls
 from twin.robot.model import RobotModel
 
 RECORD = """schema_version = 1
@@ -103,6 +104,22 @@ def test_what_a_description_lacks_is_named_with_its_level(
         (of_link(0, SHAPE, '<box size="1 x 1"/>'), "the link 'l0' with a box of size 1 nan 1"),
         (URDF.replace(SHAPE, ""), "gives no link a collision shape"),
         (
+            URDF.replace('name="j1" type="revolute"', 'name="jx" type="revolute"')
+            .replace('ixx="0.01"', "", 1)
+            .replace('lower="-3" upper="3" velocity="2"', 'lower="-90" upper="90" velocity="0"'),
+            r"lacks the joints j1.*\n  kinematic: .*'j2' is limited to -90 .*\n(.*\n)*"
+            r"  gate: the joint 'j6' has a speed of 0.*\n  dynamic: the inertia of the link 'l0'",
+        ),
+        (
+            URDF.replace(
+                "</robot>",
+                '<link name="a"><visual><geometry><mesh filename="a.stl"/>'
+                '</geometry></visual><visual><geometry><mesh filename="b.stl"/></geometry></visual>'
+                "</link></robot>",
+            ),
+            "a.stl' is not there .* '.*b.stl' is not there",
+        ),
+        (
             URDF.replace("<link", '<xacro:property name="a" value="1"/><link', 1),
             "is a xacro file; expand it first: xacro .*arm.urdf",
         ),
@@ -115,21 +132,29 @@ def test_what_no_engine_takes_is_refused_with_every_name(
         check_robot(written(tmp_path, urdf))
 
 
-def test_a_capsule_lies_inside_its_hull(tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", ["capsule", "capsule of pinocchio", "sphere", "cone"])
+def test_a_shape_lies_inside_its_hull(tmp_path: Path, how: str) -> None:
     check_robot(written(tmp_path, URDF), urdf_out=tmp_path / "described.urdf")
     text = (tmp_path / "described.urdf").read_text()
-    capsule = text.replace("<cylinder", "<capsule", 1)
-    hull = link_hulls(RobotModel(capsule))[0]
-    from scipy.spatial import ConvexHull
-
-    rng = np.random.default_rng(0)
-    ball = rng.normal(size=(500, 3))
-    ball *= 0.03 / np.linalg.norm(ball, axis=1, keepdims=True)
-    end = np.array([0, 0, 0.05])
-    on_capsule = np.concatenate([ball + end, ball - end])
-    faces = ConvexHull(hull.points_m).equations
-    assert (on_capsule @ faces[:, :3].T + faces[:, 3]).max() <= 1e-6
-    assert np.abs(hull.points_m[:, 2]).max() < 0.081
+    if how.startswith("cone"):
+        turns = np.linspace(0, 2 * np.pi, 300, endpoint=False)
+        ring = 0.05 * np.stack([np.cos(turns), np.sin(turns), np.zeros(300)], axis=1)
+        inside = np.vstack([ring, [[0, 0, 0.1]]])
+        points, most_m = np.array(convex_hull(inside).points()), 0.102
+    else:
+        checking = 'name="l0"><collision_checking><capsule name="l0"/></collision_checking>'
+        named = text.replace('name="l0">', checking, 1).replace(
+            "<collision>", '<collision name="l0">', 1
+        )
+        shape = text.replace("<cylinder", f"<{how}", 1) if " " not in how else named
+        points = link_hulls(RobotModel(shape))[0].points_m
+        ball = np.random.default_rng(0).normal(size=(500, 3))
+        ball *= 0.03 / np.linalg.norm(ball, axis=1, keepdims=True)
+        end = np.array([0, 0, 0.0 if how == "sphere" else 0.05])
+        inside, most_m = np.concatenate([ball + end, ball - end]), 0.081
+    faces = ConvexHull(points).equations
+    assert (inside @ faces[:, :3].T + faces[:, 3]).max() <= 1e-6
+    assert np.abs(points[:, 2]).max() < most_m
 
 
 def test_a_robot_file_is_found_from_wherever_it_is_called(

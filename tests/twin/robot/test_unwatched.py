@@ -21,18 +21,6 @@ def test_a_link_that_can_be_seen_and_has_no_shape_is_named() -> None:
     assert found == "the links forearm_link have no collision shapes: nobody watches them"
 
 
-def test_a_mesh_in_millimetres_is_named_with_its_unit() -> None:
-    text, count = re.subn(
-        r'(<link name="forearm_link">.*?<collision>.*?<mesh )',
-        r'\1scale="1000 1000 1000" ',
-        ROBOT.urdf_text(),
-        flags=re.DOTALL,
-    )
-    assert count == 1
-    found = RobotHulls(RobotModel(text)).blind()
-    assert re.search(r"the link 'forearm_link' is \d+ m long; is it in millimetres", str(found))
-
-
 def test_pairs_that_are_left_out_are_told_and_too_many_are_no_yes() -> None:
     hulls = RobotHulls(RobotModel(read_robot("ur10e_parallel_gripper").description()))
     assert hulls.left_out == {"base_link and upper_arm_link": "they touch at home"}

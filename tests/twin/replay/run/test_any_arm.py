@@ -1,4 +1,4 @@
-"""Arms of six and seven joints, from a TOML and a URDF only: recorded, replayed, judged, drawn."""
+"""Arms of five to seven joints, from a TOML and a URDF only: recorded, replayed, judged, drawn."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -69,6 +69,8 @@ CASES = {
     "xarm7": Case("xarm7_parallel_gripper"),
     "kinova": Case("kinova_j2s6s200", None),
     "z1": Case("z1", None),
+    "so100": Case("so100", None),
+    "so101": Case("so101", None),
 }
 
 
