@@ -37,7 +37,7 @@ IN_NUMBERS = "In numbers"
 TAKE = "take "
 """How a step begins after which no trial is needed."""
 NEVER, USE = "not for this", " Use the recorded rates."
-"""Of a task whose rates the twin gets surely wrong; and what to do instead."""
+"""Of a task whose rates the twin gets wrong, with confidence; and what to do instead."""
 TOO_MANY = 3
 """More trials than so many times those that were made are no advice."""
 IF_THAT_STAYS = "; if that stays"
@@ -257,8 +257,8 @@ def next_trials(results: Results) -> str:
     if len({name for _, each in asked for name in each}) * more > TOO_MANY * made > 0:
         won = {str(row["candidate"]): _number(row["k"]) or 0.0 for row in standing}
         names = sorted({n for _, each in wanted for n in each}, key=lambda n: (-won.get(n, 0), n))
-        apart = "them" if len(names) == 2 else "even two of them"
-        words = f"each may be best, and to tell {apart} apart would take about {2 * more} more"
+        whom = "them" if len(names) == 2 else "even two of them"
+        words = f"each may be best, and to tell {whom} apart would take about {2 * more} more"
         first = " (most successes)" if won else ""
         return f"{TAKE}{names[0]}{first} or {' or '.join(names[1:])}: {words} trials in all."
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
