@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.episode import streams
 from bridge.episode.metadata import Derived
@@ -26,6 +25,7 @@ from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.whole_file import write_whole
 from twin.errors import TwinError
+from twin.plan.arrays import Pose
 from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.ground.run_tasks import UnderstoodTask, names_task, shown_task_file, understand
@@ -128,11 +128,7 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
 
 
 def _start(
-    run: RunFolder,
-    episode: Episode,
-    task: Task,
-    found: Mapping[str, LocalisedObject],
-    robot: str,
+    run: RunFolder, episode: Episode, task: Task, found: Mapping[str, LocalisedObject], robot: str
 ) -> Start:
     urdf = streams.robot_description(episode)
     if robot:
@@ -374,7 +370,7 @@ def _explained(problem: Problem, plan: Plan, stage: Stage) -> list[str]:
 
 def _state(problem: Problem, plan: Plan, stage: Stage | None) -> State:
     """The start, or what a plan predicts of the end of a stage."""
-    Ts: dict[str, Float[np.ndarray, "4 4"]] = dict(problem.scene.Ts_base_object)
+    Ts: dict[str, Pose] = dict(problem.scene.Ts_base_object)
     at = plan.tau[0]
     if stage is not None:
         at = [w for w in plan.tau if w.t_ns <= stage.t_end_ns][-1]
@@ -387,5 +383,5 @@ def _state(problem: Problem, plan: Plan, stage: Stage | None) -> State:
     return State.single(Ts, _tool(at), at.width_m or 0.0)
 
 
-def _tool(at: Waypoint) -> Float[np.ndarray, "4 4"]:
+def _tool(at: Waypoint) -> Pose:
     return se3.transform_from(np.array(at.q_wxyz), np.array(at.p_m))

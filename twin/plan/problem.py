@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from bridge.task.task_file import ObjectModel
+from twin.plan.arrays import Joints, Numbers, Points, Pose, Postures
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
 
@@ -23,7 +24,7 @@ Array = Any
 class Shape:
     """The surface of one object, in its own frame."""
 
-    vertices_m: Float[np.ndarray, "num_vertices 3"]
+    vertices_m: Points
     triangles: Int[np.ndarray, "num_triangles 3"]
     """Counter-clockwise seen from outside."""
     source: str
@@ -72,11 +73,7 @@ class State:
     """``(num_states,)``, between the finger pads."""
 
     @staticmethod
-    def single(
-        Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
-        T_base_tcp: Float[np.ndarray, "4 4"],
-        width_m: float,
-    ) -> "State":
+    def single(Ts_base_object: Mapping[str, Pose], T_base_tcp: Pose, width_m: float) -> "State":
         """A batch of one."""
         return State(
             Ts_base_object={name: T[None] for name, T in Ts_base_object.items()},
@@ -90,7 +87,7 @@ class Grasp:
     """One way to take hold of an object."""
 
     object_id: str
-    T_object_tcp: Float[np.ndarray, "4 4"]
+    T_object_tcp: Pose
     """Tool at the grasp instant, in the object's frame (errata: Eq. 9)."""
     width_m: float
     """Distance between the two surfaces it closes on."""
@@ -98,7 +95,7 @@ class Grasp:
     """Opening of the hand on its way there."""
     margin: float
     """How many standard deviations of the object's pose it bears; greater is better."""
-    joints_rad: Float[np.ndarray, " num_joints"]
+    joints_rad: Joints
     """Arm at the grasp, from the base's side."""
     pregrasp_m: float
     """Length of the straight approach along the tool's z axis."""
@@ -109,8 +106,8 @@ class Release:
     """One final state of a carried object (Eq. 8 and 9)."""
 
     object_id: str
-    T_base_object: Float[np.ndarray, "4 4"]
-    T_base_tcp: Float[np.ndarray, "4 4"]
+    T_base_object: Pose
+    T_base_tcp: Pose
     """Tool at the release: ``T_base_object @ T_object_tcp`` of the grasp."""
     clearance_m: float
     """Least signed distance of the object's points to what stands still, allowed pairs left out."""
@@ -122,7 +119,7 @@ class Release:
 class TimedPath:
     """One collision-free movement with its times."""
 
-    times_s: Float[np.ndarray, " num_points"]
-    joints_rad: Float[np.ndarray, "num_points num_joints"]
+    times_s: Numbers
+    joints_rad: Postures
     work: Mapping[str, float] = field(default_factory=dict)
     """Counted steps: nodes, checks, halvings; never seconds."""

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
@@ -12,6 +11,7 @@ from bridge.episode.topics import JOINT_STATES
 from bridge.errors import BridgeError
 from bridge.robots.robot import Robot
 from bridge.task.check import TABLE
+from twin.plan.arrays import Joints, Vector
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.problem import Problem
 from twin.replay.rebuilt_scene import scene_of_other_robot
@@ -49,7 +49,7 @@ def refuse_unusable(problem: Problem) -> None:
 
 def start_posture(
     episode: Episode, stamp_ns: int, joints: Sequence[str]
-) -> tuple[Float[np.ndarray, " num_joints"] | None, str]:
+) -> tuple[Joints | None, str]:
     """Where the arm was recorded to stand at the start [rad], or why nobody knows."""
     found = recorded_start(episode, stamp_ns, joints)
     if found is not None:
@@ -122,9 +122,7 @@ def _refuse_far(problem: Problem) -> None:
             _refuse_far_place(problem, f"the mark of {name}", name, p, hint)
 
 
-def _refuse_far_place(
-    problem: Problem, what: str, name: str, p_m: Float[np.ndarray, "3"], hint: str
-) -> None:
+def _refuse_far_place(problem: Problem, what: str, name: str, p_m: Vector, hint: str) -> None:
     """Beyond what the links laid out straight reach, with the object's own size to spare."""
     p_shoulder, length_m = _outer_reach(problem)
     away_m = float(np.linalg.norm(p_m - p_shoulder))
@@ -137,7 +135,7 @@ def _refuse_far_place(
         )
 
 
-def _outer_reach(problem: Problem) -> tuple[Float[np.ndarray, "3"], float]:
+def _outer_reach(problem: Problem) -> tuple[Vector, float]:
     """Where the arm's first joint is in the base frame, and the lengths of the links behind it [m].
 
     The placements of the joints and the tool in the robot description, one behind the other.

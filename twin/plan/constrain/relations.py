@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.errors import UsageError
 from bridge.task.check import TABLE
@@ -23,6 +22,7 @@ from bridge.task.relations import (
     footprint_gap_m,
 )
 from bridge.task.task_file import Task
+from twin.plan.arrays import Numbers
 from twin.plan.constrain.bodies import (
     Record,
     box_pose,
@@ -217,7 +217,7 @@ def _moved(record: Record, problem: Problem) -> Constraint:
     return Constraint.of(record, *terms)
 
 
-def _near_point(obj: str, target: Float[np.ndarray, " num"], tol: float) -> Term:
+def _near_point(obj: str, target: Numbers, tol: float) -> Term:
     """An object's origin near a point of the base frame; near one of two numbers from above."""
 
     def off(state: State) -> Array:

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.check import nearest
+from twin.plan.arrays import Vector
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.relations import PLACES
 from twin.plan.constrain.schema import (
@@ -60,7 +60,7 @@ class Keypoint:
     """A named point of an object."""
 
     obj: str
-    p_object_m: Float[np.ndarray, "3"]
+    p_object_m: Vector
 
 
 Keypoints = Mapping[str, Keypoint]
@@ -232,7 +232,7 @@ def _keypoints(
     return known, odd
 
 
-def _metres(p_m: Float[np.ndarray, "3"]) -> str:
+def _metres(p_m: Vector) -> str:
     return "[" + ", ".join(f"{value:.3f}" for value in p_m) + "]"
 
 

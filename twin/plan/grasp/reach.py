@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from twin.plan.arrays import Flags, Joints, Poses, Postures
 from twin.plan.grasp.open_hand import OpenHand
 from twin.plan.problem import Problem
 from twin.replay.clearance.bodies import own_links
@@ -24,7 +25,7 @@ _TURN = 2 * np.pi
 class Reached:
     """How the arm stands at a grasp."""
 
-    joints_rad: Float[np.ndarray, " num_joints"]
+    joints_rad: Joints
     turned: bool
     """Whether with the hand turned half about its approach."""
 
@@ -42,7 +43,7 @@ class ArmReach:
         start = problem.scene.start_rad
         self.start_rad = self.robot.home_rad if start is None else start
 
-    def is_clear(self, joints_rad: Float[np.ndarray, " num_joints"], open_m: float) -> bool:
+    def is_clear(self, joints_rad: Joints, open_m: float) -> bool:
         """Whether arm and hand keep clear of the robot itself and of what stands still."""
         self.hulls.place(joints_rad, open_m)
         if self._links.touch():
@@ -54,11 +55,7 @@ class Reaches:
     """Solutions of many grasps, looked at one at a time."""
 
     def __init__(
-        self,
-        arm: ArmReach,
-        Ts_base_tcp: Float[np.ndarray, "num_grasps 4 4"],
-        hand: OpenHand,
-        pregrasp_m: float,
+        self, arm: ArmReach, Ts_base_tcp: Poses, hand: OpenHand, pregrasp_m: float
     ) -> None:
         """Solve many grasps at once, where the arm has a closed form."""
         self._arm, self._hand = arm, hand
@@ -93,7 +90,7 @@ class Reaches:
             for table in (self._grasps, self._starts)
         )
         before = self._nearest(before, at)
-        smooth: Bool[np.ndarray, " n"] = np.abs(at - before).max(axis=1) <= MOST_TURN_RAD
+        smooth: Flags = np.abs(at - before).max(axis=1) <= MOST_TURN_RAD
         if not smooth.any():
             return "approach"
         cost = np.abs(before - self._arm.start_rad).max(axis=1)
@@ -104,10 +101,8 @@ class Reaches:
         return "arm"
 
     def _nearest(
-        self,
-        joints_rad: Float[np.ndarray, "num_solutions num_joints"],
-        wanted_rad: Float[np.ndarray, "*batch num_joints"],
-    ) -> Float[np.ndarray, "num_solutions num_joints"]:
+        self, joints_rad: Postures, wanted_rad: Float[np.ndarray, "*batch num_joints"]
+    ) -> Postures:
         """The same postures by whole turns nearer to a wanted one, within the limits."""
         robot = self._arm.robot
         moved = joints_rad + _TURN * np.rint((wanted_rad - joints_rad) / _TURN)
@@ -122,10 +117,7 @@ class Reaches:
                     break
                 why = max(why, "approach", key=_PROGRESS.index)
                 before = solve_ik(
-                    robot,
-                    self._before[index, turned],
-                    config,
-                    warm_start_rad=found.joints_rad,
+                    robot, self._before[index, turned], config, warm_start_rad=found.joints_rad
                 )
                 far = np.abs(before.joints_rad - found.joints_rad).max() > MOST_TURN_RAD
                 if not before.reached or far:
@@ -135,11 +127,7 @@ class Reaches:
                 why = "arm"
         return why
 
-    def _is_clear(
-        self,
-        at_rad: Float[np.ndarray, " num_joints"],
-        before_rad: Float[np.ndarray, " num_joints"],
-    ) -> bool:
+    def _is_clear(self, at_rad: Joints, before_rad: Joints) -> bool:
         """At the grasp and where its approach begins; the hand was looked at all the way."""
         return all(self._arm.is_clear(row, self._hand.open_m) for row in (at_rad, before_rad))
 

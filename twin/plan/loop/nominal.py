@@ -7,12 +7,12 @@ from math import erfc, sqrt
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan, Waypoint
+from twin.plan.arrays import Joints, Pose, Vector
 from twin.plan.constrain.constraint import SHOWN, Constraint, flattened, violated, worst_along
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
@@ -85,13 +85,13 @@ class Transfer:
     grasp: Grasp
     release: Release
     legs: tuple[Leg, ...]
-    T_base_lies: Float[np.ndarray, "4 4"]
+    T_base_lies: Pose
     cost: float
     """J of the final state, plus the chance that the grasp misses."""
     remarks: tuple[str, ...] = ()
 
     @property
-    def end_rad(self) -> Float[np.ndarray, " num_joints"]:
+    def end_rad(self) -> Joints:
         """Arm when it has let go and left."""
         return np.asarray(self.legs[-1].movement.path.joints_rad[-1])
 
@@ -214,7 +214,7 @@ class _Search:
         problem: Problem,
         grasp: Grasp,
         release: Release,
-        start_rad: Float[np.ndarray, " num_joints"],
+        start_rad: Joints,
         options: "_Options",
     ) -> Transfer:
         """The first way that keeps what holds on the way."""
@@ -320,15 +320,14 @@ class _Options:
         if steer.change == "grasp_shift" and steer.toward_m is not None:
             toward = np.array(steer.toward_m)
             near = sorted(
-                grasps,
-                key=lambda each: float(np.linalg.norm(each.T_object_tcp[:3, 3] - toward)),
+                grasps, key=lambda each: float(np.linalg.norm(each.T_object_tcp[:3, 3] - toward))
             )
             fresh = [grasp for grasp in near if not refused(grasp)]
             shifted = self._shifted(next((g for g in grasps if refused(g)), grasps[0]), toward)
             return [*shifted, *fresh]
         return sorted(grasps, key=lambda each: not refused(each))
 
-    def _shifted(self, grasp: Grasp, toward_m: Float[np.ndarray, "3"]) -> list[Grasp]:
+    def _shifted(self, grasp: Grasp, toward_m: Vector) -> list[Grasp]:
         """The refused grasp moved along its pads to where a finger met the object."""
         T = grasp.T_object_tcp.copy()
         way = toward_m - T[:3, 3]
@@ -501,7 +500,7 @@ def _written(
     plan_id: str,
     tau: tuple[Waypoint, ...],
     bounds: Bounds,
-    there: Mapping[str, Float[np.ndarray, "4 4"]],
+    there: Mapping[str, Pose],
 ) -> Plan:
     """A plan of a trajectory that leaves its objects there."""
     task, record = problem.scene.task, problem.robot.record

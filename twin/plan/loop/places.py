@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.task.check import TABLE
+from twin.plan.arrays import Pose, Poses
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import Constraint
 from twin.plan.constrain.kinds import compile_constraint
@@ -21,7 +21,7 @@ _PLACES = 4
 _SPACING_M = 0.03
 
 
-def lying_there(problem: Problem, release: Release) -> Float[np.ndarray, "4 4"]:
+def lying_there(problem: Problem, release: Release) -> Pose:
     """Where an object comes to lie that is let go a little above: straight below."""
     T = release.T_base_object.copy()
     points = se3.apply(T, surface_points(problem, release.object_id))
@@ -38,7 +38,7 @@ def _support_m(problem: Problem, key: str) -> float:
 
 def places_on_table(
     problem: Problem, key: str, goals: Sequence[Constraint], *, seed: int
-) -> list[Float[np.ndarray, "4 4"]]:
+) -> list[Pose]:
     """Poses on the table, as the object lies now or turned by quarters, that satisfy goals."""
     T_now = problem.scene.Ts_base_object[key]
     points = se3.apply(T_now, surface_points(problem, key))
@@ -75,9 +75,7 @@ def places_on_table(
     return _spaced(Ts[fits[np.argsort(travel - 0.2 * slack, kind="stable")]])
 
 
-def _grid(
-    problem: Problem, T_now: Float[np.ndarray, "4 4"], rest_m: float, seed: int
-) -> Float[np.ndarray, "num 4 4"]:
+def _grid(problem: Problem, T_now: Pose, rest_m: float, seed: int) -> Poses:
     """Places all over the table: turned as now, and along the sides of the other objects."""
     shift = np.random.default_rng(seed).uniform(0.0, _STEP_M, 2)
     axes = [np.arange(low, high, _STEP_M) for low, high in _AREA_M]
@@ -97,9 +95,9 @@ def _grid(
     return np.concatenate(found)
 
 
-def _spaced(Ts: Float[np.ndarray, "num 4 4"]) -> list[Float[np.ndarray, "4 4"]]:
+def _spaced(Ts: Poses) -> list[Pose]:
     """The first few that are not next to each other."""
-    kept: list[Float[np.ndarray, "4 4"]] = []
+    kept: list[Pose] = []
     for T in Ts:
         if all(np.linalg.norm(T[:2, 3] - other[:2, 3]) > _SPACING_M for other in kept):
             kept.append(T)

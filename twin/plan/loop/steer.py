@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
@@ -14,6 +13,7 @@ from bridge.task.plan import Plan, Waypoint
 from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
+from twin.plan.arrays import Pose
 
 Change = Literal["grasp", "grasp_shift", "release", "path", "any"]
 ALIKE_M = 0.01
@@ -29,9 +29,9 @@ class Tried:
     """How a plan took hold of an object and let it go."""
 
     object_id: str
-    T_object_tcp: Float[np.ndarray, "4 4"]
+    T_object_tcp: Pose
     """Tool where the gripper is told to close, in the object's frame at the start."""
-    T_base_release: Float[np.ndarray, "4 4"] | None = None
+    T_base_release: Pose | None = None
     """Tool where the gripper is told to open; None where it never is."""
 
 
@@ -52,18 +52,18 @@ class Steer:
     """Where the tool was in the object's frame when a finger first touched it in the twin."""
     refused: tuple[Tried, ...] = ()
 
-    def has_grasp_like(self, object_id: str, T_object_tcp: Float[np.ndarray, "4 4"]) -> bool:
+    def has_grasp_like(self, object_id: str, T_object_tcp: Pose) -> bool:
         """Whether a grasp was refused that is the same within 1 cm and 10 degrees."""
         mine = [tried for tried in self.refused if tried.object_id == object_id]
         return any(alike(tried.T_object_tcp, T_object_tcp) for tried in mine)
 
-    def has_release_like(self, object_id: str, T_base_tcp: Float[np.ndarray, "4 4"]) -> bool:
+    def has_release_like(self, object_id: str, T_base_tcp: Pose) -> bool:
         """Whether a release was refused that is the same within 1 cm and 10 degrees."""
         mine = [tried.T_base_release for tried in self.refused if tried.object_id == object_id]
         return any(T is not None and alike(T, T_base_tcp) for T in mine)
 
 
-def alike(T_first: Float[np.ndarray, "4 4"], T_second: Float[np.ndarray, "4 4"]) -> bool:
+def alike(T_first: Pose, T_second: Pose) -> bool:
     """Whether two poses are one within 1 cm and 10 degrees."""
     near = float(np.linalg.norm(T_first[:3, 3] - T_second[:3, 3])) < ALIKE_M
     turned_rad = float(se3.rotation_angle_rad(T_first[:3, :3].T @ T_second[:3, :3]))
@@ -160,5 +160,5 @@ def _first(plan: Plan, from_ns: int, *, g: int) -> Waypoint | None:
     return next((each for each in plan.tau if each.t_ns >= from_ns and each.g == g), None)
 
 
-def _pose(waypoint: Waypoint) -> Float[np.ndarray, "4 4"]:
+def _pose(waypoint: Waypoint) -> Pose:
     return se3.transform_from(np.array(waypoint.q_wxyz), np.array(waypoint.p_m))

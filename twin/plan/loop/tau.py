@@ -4,12 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
 from bridge.geometry import se3
 from bridge.task.plan import Stage, Waypoint
 from bridge.task.task_file import Task
+from twin.plan.arrays import Pose
 from twin.plan.constrain.relations import constraint_of
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.path.planner import waypoints_of
@@ -124,10 +122,7 @@ def refuse_without_stages(task: Task) -> None:
 
 
 def plan_stage(
-    task: Task,
-    table: Mapping[str, Any],
-    bounds: Bounds,
-    there: Mapping[str, Float[np.ndarray, "4 4"]],
+    task: Task, table: Mapping[str, Any], bounds: Bounds, there: Mapping[str, Pose]
 ) -> Stage:
     """What a plan says of one stage of its task: when it is, what may touch, where it leads."""
     stage_id = str(table["id"])

@@ -4,8 +4,9 @@ import heapq
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
+
+from twin.plan.arrays import Points, Spheres, Vector
 
 SPHERES = 16
 """For each hull of a link or box that is carried."""
@@ -14,9 +15,7 @@ _GROWN = 1e-9
 _PROBES = 64
 
 
-def covering_spheres(
-    corners_m: Float[np.ndarray, "num_points 3"], count: int = SPHERES
-) -> Float[np.ndarray, "num_spheres 4"]:
+def covering_spheres(corners_m: Points, count: int = SPHERES) -> Spheres:
     """Cover the convex hull of points by spheres."""
     heap = [_part(corners_m, 0)]
     done: list[_Part] = []
@@ -34,11 +33,11 @@ def covering_spheres(
     return np.array([[*centre, radius] for *_, centre, radius in parts])
 
 
-_Part = tuple[float, int, Float[np.ndarray, "num_points 3"], Float[np.ndarray, "3"], float]
+_Part = tuple[float, int, Points, Vector, float]
 """How little its sphere wastes, its number, its corners, centre and radius."""
 
 
-def _part(corners_m: Float[np.ndarray, "num_points 3"], number: int) -> _Part:
+def _part(corners_m: Points, number: int) -> _Part:
     centre = (corners_m.min(axis=0) + corners_m.max(axis=0)) / 2
     radius = float(np.linalg.norm(corners_m - centre, axis=1).max()) * (1 + _GROWN)
     # A long part wastes more than a round one of the same size.
@@ -47,9 +46,7 @@ def _part(corners_m: Float[np.ndarray, "num_points 3"], number: int) -> _Part:
     return (thinnest / 2 - radius, number, corners_m, centre, radius)
 
 
-def _halves(
-    corners_m: Float[np.ndarray, "num_points 3"],
-) -> list[Float[np.ndarray, "_ 3"]] | None:
+def _halves(corners_m: Points) -> list[Points] | None:
     """Cut a convex part by the plane across the middle of its longest axis."""
     try:
         hull = ConvexHull(corners_m)
@@ -70,9 +67,7 @@ def _halves(
     return [np.concatenate([corners[side], cut]) for side in (above, ~above)]
 
 
-def excess_m(
-    corners_m: Float[np.ndarray, "num_points 3"], spheres_m: Float[np.ndarray, "num_spheres 4"]
-) -> float:
+def excess_m(corners_m: Points, spheres_m: Spheres) -> float:
     """How far spheres stand out of the hull of points at most [m], looked at in some directions."""
     equations = ConvexHull(corners_m).equations
     normals, offsets = equations[:, :3], equations[:, 3]
@@ -84,9 +79,7 @@ def excess_m(
 
 
 @lru_cache(maxsize=64)
-def box_spheres(
-    size_m: tuple[float, float, float], count: int = SPHERES
-) -> Float[np.ndarray, "num_spheres 4"]:
+def box_spheres(size_m: tuple[float, float, float], count: int = SPHERES) -> Spheres:
     """Cover a box around the origin; the same for all boxes of a size."""
     half = np.array(size_m) / 2
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])

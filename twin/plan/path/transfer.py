@@ -5,9 +5,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.geometry import se3
+from twin.plan.arrays import Joints, Pose
 from twin.plan.path.planner import (
     Movement,
     NoPathError,
@@ -47,7 +47,7 @@ def plan_transfer(
     problem: Problem,
     grasp: Grasp,
     release: Release,
-    start_rad: Float[np.ndarray, " num_joints"],
+    start_rad: Joints,
     config: PathConfig,
     *,
     lift_m: float = LIFT_M,
@@ -96,7 +96,7 @@ class _Transfer:
     def _driven(self, leg: str) -> PathConfig:
         return replace(self.config, tool_m_s=self.tool_m_s.get(leg, 0.0))
 
-    def take(self, start_rad: Float[np.ndarray, " num_joints"]) -> tuple[Leg, Leg, Leg]:
+    def take(self, start_rad: Joints) -> tuple[Leg, Leg, Leg]:
         """From where the arm stands to the lifted object."""
         grasp = self.grasp
         taking = self._touching("grasp")
@@ -119,11 +119,7 @@ class _Transfer:
             Leg(name="lift", movement=lift, g=1),
         )
 
-    def put(
-        self,
-        lifted_rad: Float[np.ndarray, " num_joints"],
-        joints_rad: Float[np.ndarray, " num_joints"],
-    ) -> tuple[Leg, Leg, Leg]:
+    def put(self, lifted_rad: Joints, joints_rad: Joints) -> tuple[Leg, Leg, Leg]:
         """From the lifted object to where the arm has left, let go with these joints."""
         leaving = self._touching("release")
         with _named("lower"):
@@ -152,9 +148,7 @@ class _Transfer:
     def _touching(self, verb: str) -> Allowed:
         return self.problem.contacts_of(verb, self.grasp.object_id) | self._grip
 
-    def _straight_up(
-        self, joints_rad: Float[np.ndarray, " num_joints"], allowed: Allowed, config: PathConfig
-    ) -> Movement:
+    def _straight_up(self, joints_rad: Joints, allowed: Allowed, config: PathConfig) -> Movement:
         """Lift as far as is free and within reach, at least two centimetres."""
         rise_m = self.lift_m
         while True:
@@ -170,22 +164,14 @@ class _Transfer:
                     raise
             rise_m /= 2
 
-    def _carry(
-        self,
-        start_rad: Float[np.ndarray, " num_joints"],
-        goal_rad: Float[np.ndarray, " num_joints"],
-    ) -> Movement:
+    def _carry(self, start_rad: Joints, goal_rad: Joints) -> Movement:
         """Carry around whatever stands in between."""
         return plan_move(
             self.problem, start_rad, goal_rad[None], self._driven("carry"),
             width_m=self.grasp.width_m, carried=self._held, allowed=self._grip,
         )  # fmt: skip
 
-    def _carry_straight(
-        self,
-        start_rad: Float[np.ndarray, " num_joints"],
-        goal_rad: Float[np.ndarray, " num_joints"],
-    ) -> Movement:
+    def _carry_straight(self, start_rad: Joints, goal_rad: Joints) -> Movement:
         """Carry along a straight line that ends on the branch on which the object is let down."""
         goal = self.problem.robot.T_base_tcp(goal_rad)
         movement = plan_straight(
@@ -198,7 +184,7 @@ class _Transfer:
             raise NoPathError(reason="branch", detail=detail)
         return movement
 
-    def _leave(self, joints_rad: Float[np.ndarray, " num_joints"], allowed: Allowed) -> Movement:
+    def _leave(self, joints_rad: Joints, allowed: Allowed) -> Movement:
         """Straight back; the farther the better, for next to a rim nothing else may be planned."""
         scene, release = self.problem.scene, self.release
         poses = {**scene.Ts_base_object, self.grasp.object_id: release.T_base_object}
@@ -226,7 +212,7 @@ def _named(leg: str) -> Iterator[None]:
         raise
 
 
-def _along_z(way_m: float) -> Float[np.ndarray, "4 4"]:
+def _along_z(way_m: float) -> Pose:
     T = np.eye(4)
     T[2, 3] = way_m
     return T
@@ -237,11 +223,8 @@ def _backwards(movement: Movement) -> Movement:
 
 
 def nearest_solutions(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    near_rad: Float[np.ndarray, " num_joints"],
-    config: IkConfig,
-) -> list[Float[np.ndarray, " num_joints"]]:
+    robot: RobotModel, T_base_tcp: Pose, near_rad: Joints, config: IkConfig
+) -> list[Joints]:
     """Joints that reach a pose, each turned as near as its limits let it, nearest first."""
     inverse = UrInverse.for_robot(robot)
     if inverse is not None:

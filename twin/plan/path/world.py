@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
-from jaxtyping import Bool, Float
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
+from twin.plan.arrays import Flags, Numbers, Points, Pose, Poses, Spheres, Vector
 from twin.plan.constrain.distances import scene_grid
 from twin.plan.path._motion import Motion
 from twin.plan.path.spheres import box_spheres, covering_spheres, excess_m
@@ -40,21 +40,21 @@ class Carried:
     """An object in the hand."""
 
     object_id: str
-    T_tcp_object: Float[np.ndarray, "4 4"]
+    T_tcp_object: Pose
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
     """The arm's joints one after the other, and its hulls in their frames, at one gripper width."""
 
-    placements: Float[np.ndarray, "num_joints 4 4"]
+    placements: Poses
     """Each joint's frame in that of the one before, at 0."""
-    axes: Float[np.ndarray, "num_joints 3"]
-    slides: Bool[np.ndarray, " num_joints"]
-    T_last_tcp: Float[np.ndarray, "4 4"]
+    axes: Points
+    slides: Flags
+    T_last_tcp: Pose
     joint_of: tuple[int, ...]
     """For each hull: how many joints move it."""
-    Ts_joint_hull: Float[np.ndarray, "num_hulls 4 4"]
+    Ts_joint_hull: Poses
 
 
 def chain_of(hulls: RobotHulls, width_m: float) -> Chain:
@@ -94,7 +94,7 @@ def chain_of(hulls: RobotHulls, width_m: float) -> Chain:
 
 
 @lru_cache(maxsize=4)
-def _link_spheres(hulls: RobotHulls) -> list[tuple[Float[np.ndarray, "num_spheres 4"], float]]:
+def _link_spheres(hulls: RobotHulls) -> list[tuple[Spheres, float]]:
     """Spheres of each hull in its own frame, and how far they stand out; once for a robot."""
     fitted = [covering_spheres(hull.points_m) for hull in hulls.hulls]
     return [(s, excess_m(hull.points_m, s)) for hull, s in zip(hulls.hulls, fitted, strict=True)]
@@ -169,9 +169,7 @@ class _Builder:
         self.limits_m.append(limit_m)
 
 
-def _placed_spheres(
-    T: Float[np.ndarray, "4 4"], spheres_m: Float[np.ndarray, "num_spheres 4"]
-) -> Float[np.ndarray, "num_spheres 4"]:
+def _placed_spheres(T: Pose, spheres_m: Spheres) -> Spheres:
     return np.column_stack([se3.apply(T, spheres_m[:, :3]), spheres_m[:, 3]])
 
 
@@ -218,15 +216,10 @@ def build_world(
     builder.add_standing([name for name, *_ in obstacles], has_grid=lookup is not None)
     builder.add_own()
     motion.prepare()
-    return World(
-        motion=motion,
-        names=builder.names,
-        robot=robot,
-        limits_m=builder.limits_m,
-    )
+    return World(motion=motion, names=builder.names, robot=robot, limits_m=builder.limits_m)
 
 
-PlacedBox = tuple[str, Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]
+PlacedBox = tuple[str, Pose, Vector]
 """Its name, ``T_base_box`` and extents [m]."""
 
 
@@ -250,12 +243,12 @@ def _obstacles(problem: Problem, carried: Carried | None) -> list[PlacedBox]:
 class _Points:
     """Trees of points behind each other."""
 
-    points: list[Float[np.ndarray, "n 3"]] = field(default_factory=list)
-    radii: list[Float[np.ndarray, " n"]] = field(default_factory=list)
+    points: list[Points] = field(default_factory=list)
+    radii: list[Numbers] = field(default_factory=list)
     children: list[np.ndarray] = field(default_factory=list)
     count: int = 0
 
-    def add(self, tree: BoundingSphereTree, T: Float[np.ndarray, "4 4"]) -> tuple[int, int]:
+    def add(self, tree: BoundingSphereTree, T: Pose) -> tuple[int, int]:
         """Put a tree behind the others; where its roots begin and end."""
         begin = self.count
         self.points.append(se3.apply(T, tree.points_m))

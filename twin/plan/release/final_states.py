@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
+from twin.plan.arrays import Numbers, Pose, Poses
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import SHOWN, Constraint
 from twin.plan.problem import Array, Grasp, Problem, Release, State
@@ -76,7 +76,7 @@ def final_states(
     grasp: Grasp,
     *,
     constraints: Sequence[Constraint] = (),
-    near: Sequence[Float[np.ndarray, "4 4"]] | None = None,
+    near: Sequence[Pose] | None = None,
     config: ReleaseConfig | None = None,
     seed: int = 0,
 ) -> tuple[Release, ...]:
@@ -93,11 +93,7 @@ def final_states(
     if target is not None:
         search.check_size(target)
         ways = resting_poses(
-            problem,
-            grasp,
-            target,
-            drop_m=DROP_M,
-            most_tilted_rad=MOST_TOOL_TILT_RAD,
+            problem, grasp, target, drop_m=DROP_M, most_tilted_rad=MOST_TOOL_TILT_RAD
         )[: config.num_ways]
     else:
         ways = list(near or ())
@@ -149,7 +145,7 @@ class ReleaseSearch:
             )
             raise NoFinalStateError(cause="container_too_small", message=message)
 
-    def stage(self, T_rest: Float[np.ndarray, "4 4"], target: Target | None) -> StageProblem:
+    def stage(self, T_rest: Pose, target: Target | None) -> StageProblem:
         """Write one way to rest as a stage problem.
 
         Args:
@@ -182,13 +178,13 @@ class ReleaseSearch:
         keep_m = self._keep_m(self._hand_allowed)
         return -self._obstacles.margins(self._hand_m, state.T_base_tcp, keep_m, most_m=NEAR_M)
 
-    def _keep_m(self, allowed: Array) -> Float[np.ndarray, " num_obstacles"]:
+    def _keep_m(self, allowed: Array) -> Numbers:
         return np.asarray(self._config.eps_col_m * (1.0 - allowed))
 
     def _not_open(self, state: State) -> Array:
         return self._grasp.width_m + OPEN_MORE_M / 2 - state.width_m
 
-    def _placed(self, T_rest: Float[np.ndarray, "4 4"], target: Target) -> list[CostTerm]:
+    def _placed(self, T_rest: Pose, target: Target) -> list[CostTerm]:
         """Inside of the area, at a small height, level."""
         config, name = self._config, self._grasp.object_id
         margin = config.sigmas * float(np.hypot(target.sigma_m, self._sigma_m))
@@ -252,7 +248,7 @@ class ReleaseSearch:
 
     def _perturbed(
         self, stage: StageProblem, nominal: StageCandidate, count: int, rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, "num 4 4"], Float[np.ndarray, " num"]]:
+    ) -> tuple[Poses, Numbers]:
         """Draw poses around one and keep those that satisfy everything, with their J."""
         T = perturbed(
             nominal.T_base_tcp, tau_p_m=TAU_P_M, tau_r_rad=TAU_R_RAD, count=count, rng=rng
@@ -265,9 +261,7 @@ class ReleaseSearch:
         J = np.square(stage.residuals(zeta, violations)).sum(axis=1)
         return T[free], J[free]
 
-    def _releases(
-        self, Ts: Float[np.ndarray, "num 4 4"], costs: Float[np.ndarray, " num"]
-    ) -> tuple[Release, ...]:
+    def _releases(self, Ts: Poses, costs: Numbers) -> tuple[Release, ...]:
         order = np.argsort(costs, kind="stable")
         chosen = distinct(Ts, order, self._config.max_releases)
         Ts_object = Ts[chosen] @ self._T_tcp_object
@@ -299,7 +293,7 @@ class ReleaseSearch:
         )
         return NoFinalStateError(cause="no_free_pose", message=message)
 
-    def _in_the_way(self, T_base_tcp: Float[np.ndarray, "4 4"]) -> list[str]:
+    def _in_the_way(self, T_base_tcp: Pose) -> list[str]:
         """What the object or the open hand would be too near to."""
         bodies = (
             (self._points_m, T_base_tcp @ self._T_tcp_object, self._allowed),
@@ -312,13 +306,8 @@ class ReleaseSearch:
 
 
 def perturbed(
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    *,
-    tau_p_m: float,
-    tau_r_rad: float,
-    count: int,
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "count 4 4"]:
+    T_base_tcp: Pose, *, tau_p_m: float, tau_r_rad: float, count: int, rng: np.random.Generator
+) -> Poses:
     """Draw end-effector poses around a nominal one, Eq. 8 and 9 of the paper.
 
     The position moves by a vector uniform in a box. The paper bounds the rotation vector and says

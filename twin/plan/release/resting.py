@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from twin.errors import TwinError
+from twin.plan.arrays import Pose, RotationMatrix, Vector
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.problem import Grasp, Problem
 
@@ -32,7 +33,7 @@ class Target:
     relation: str
     """inside, on, or at: a mark on the table."""
     name: str
-    T_base: Float[np.ndarray, "4 4"]
+    T_base: Pose
     """Upright frame in the middle of the area, at the height on which the object comes to lie."""
     half_m: tuple[float, float]
     """Half the extents of the area, along its axes."""
@@ -86,9 +87,7 @@ def sideways_sigma_m(problem: Problem, name: str) -> float:
     return float(np.sqrt(max(np.linalg.eigvalsh(np.asarray(covariance)[:2, :2])[-1], 0.0)))
 
 
-def upright_frame(
-    T: Float[np.ndarray, "4 4"], p_m: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
+def upright_frame(T: Pose, p_m: Vector) -> Pose:
     """Frame at a point with z up and x along the heading of a pose."""
     yaw = np.arctan2(T[1, 0], T[0, 0])
     frame = np.eye(4)
@@ -98,10 +97,10 @@ def upright_frame(
 
 
 def orientations(
-    model: ObjectModel, R_now: Float[np.ndarray, "3 3"], R_target: Float[np.ndarray, "3 3"]
-) -> list[Float[np.ndarray, "3 3"]]:
+    model: ObjectModel, R_now: RotationMatrix, R_target: RotationMatrix
+) -> list[RotationMatrix]:
     """Rotations in which an object may come to rest, the one nearest to now first."""
-    found: list[Float[np.ndarray, "3 3"]] = []
+    found: list[RotationMatrix] = []
     for S in _same(model):
         R = R_now @ S
         heading = (
@@ -128,7 +127,7 @@ def _same(model: ObjectModel) -> Float[np.ndarray, "num 3 3"]:
 
 def resting_poses(
     problem: Problem, grasp: Grasp, target: Target, *, drop_m: float, most_tilted_rad: float
-) -> list[Float[np.ndarray, "4 4"]]:
+) -> list[Pose]:
     """Poses ``T_base_object`` a little above where the object would lie, in the middle."""
     T_now = problem.scene.Ts_base_object.get(grasp.object_id)
     if T_now is None:

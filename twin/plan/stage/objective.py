@@ -13,9 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from bridge.geometry import se3
+from twin.plan.arrays import Ids, Numbers, Pose, Poses
 from twin.plan.constrain.constraint import Constraint
 from twin.plan.problem import Array, State
 
@@ -56,21 +57,19 @@ class CostTerm:
 class Zeta:
     """Decision variables of many states at once."""
 
-    T_base_tcp: Float[np.ndarray, "num_states 4 4"]
-    width_m: Float[np.ndarray, " num_states"]
+    T_base_tcp: Poses
+    width_m: Numbers
 
     def __len__(self) -> int:
         """How many states."""
         return len(self.T_base_tcp)
 
-    def __getitem__(self, rows: Int[np.ndarray, " num_rows"]) -> "Zeta":
+    def __getitem__(self, rows: Ids) -> "Zeta":
         """Some of the states."""
         return Zeta(T_base_tcp=self.T_base_tcp[rows], width_m=self.width_m[rows])
 
 
-def moved(
-    T: Float[np.ndarray, "num 4 4"], step: Float[np.ndarray, "num num_variables"]
-) -> Float[np.ndarray, "num 4 4"]:
+def moved(T: Poses, step: Float[np.ndarray, "num num_variables"]) -> Poses:
     """Poses after steps: of the position in the base frame [m], of a turn in the tool's [rad]."""
     found = T.copy()
     found[:, :3, :3] = T[:, :3, :3] @ se3.rotation_from_vector(step[:, 3:6])
@@ -82,13 +81,13 @@ def moved(
 class StageProblem:
     """One stage as an optimisation problem."""
 
-    nominal_T_base_tcp: Float[np.ndarray, "4 4"]
+    nominal_T_base_tcp: Pose
     nominal_width_m: float
     subgoal: tuple[CostTerm, ...]
     """What must hold where the stage ends; at least one."""
-    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
+    Ts_base_object: Mapping[str, Pose] = field(default_factory=dict)
     """Objects that stay where they are during the stage."""
-    Ts_tcp_object: Mapping[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
+    Ts_tcp_object: Mapping[str, Pose] = field(default_factory=dict)
     """Objects that move with the tool, as it took them (errata: at the grasp instant)."""
     max_width_m: float = 0.1
 
@@ -109,7 +108,7 @@ class StageProblem:
         columns.append(self._deviation(zeta) * float(np.sqrt(LAMBDA_REG)))
         return np.concatenate(columns, axis=1)
 
-    def cost(self, zeta: Zeta) -> Float[np.ndarray, " num_states"]:
+    def cost(self, zeta: Zeta) -> Numbers:
         """Evaluate J."""
         residuals = self.residuals(zeta, self.violations(zeta))
         return np.asarray(np.square(residuals).sum(axis=1))

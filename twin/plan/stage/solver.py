@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from bridge.geometry import se3
+from twin.plan.arrays import Flags, Pose, Poses
 from twin.plan.stage.objective import ANGLE_RAD, LENGTH_M, NUM_VARIABLES, StageProblem, Zeta, moved
 
 UNITS = np.array([LENGTH_M] * 3 + [ANGLE_RAD] * 3 + [LENGTH_M])
@@ -53,7 +53,7 @@ class SolveConfig:
 class StageCandidate:
     """One answer of a stage."""
 
-    T_base_tcp: Float[np.ndarray, "4 4"]
+    T_base_tcp: Pose
     width_m: float
     cost: float
     violations: Sequence[float]
@@ -68,7 +68,7 @@ class StageSolution:
     """Feasible and distinct, the cheapest first; empty when none was found."""
     nearest: StageCandidate
     """The cheapest state of all, feasible or not: what it violates says what is in the way."""
-    feasible: Bool[np.ndarray, " num_starts"]
+    feasible: Flags
     """Whether each start ended with every constraint satisfied."""
 
 
@@ -113,10 +113,7 @@ def draw_starts(problem: StageProblem, config: SolveConfig, seed: int) -> Zeta:
 
 
 def solve(
-    problem: StageProblem,
-    config: SolveConfig | None = None,
-    *,
-    seed: int = 0,
+    problem: StageProblem, config: SolveConfig | None = None, *, seed: int = 0
 ) -> StageSolution:
     """Minimise J from all starts and keep the distinct feasible states."""
     config = SolveConfig() if config is None else config
@@ -142,7 +139,7 @@ def _descended(problem: StageProblem, config: SolveConfig, zeta: Zeta) -> "_Ends
 class _Ends:
     """Where starts ended, and all they have seen."""
 
-    feasible: Bool[np.ndarray, " num_starts"]
+    feasible: Flags
     seen: _Seen
 
     def replace(self, rows: np.ndarray, others: "_Ends") -> None:
@@ -185,8 +182,8 @@ class _Descent:
         self._T, self._width = zeta.T_base_tcp.copy(), zeta.width_m.copy()
         self._violations, self._r, self._J = linearised(problem, zeta)
         self._damping = np.full(num, DAMPING)
-        self._drawn: Bool[np.ndarray, " num_starts"] = np.all(self._violations <= 0, axis=1)
-        self._open: Bool[np.ndarray, " num_starts"] = np.isfinite(self._r).all(axis=1)
+        self._drawn: Flags = np.all(self._violations <= 0, axis=1)
+        self._open: Flags = np.isfinite(self._r).all(axis=1)
         self._seen = _Seen()
         self._seen.add(zeta, self._violations.copy(), np.square(self._r).sum(axis=1))
 
@@ -250,13 +247,10 @@ class _Descent:
 
     def ends(self) -> _Ends:
         """Say where all starts are now."""
-        return _Ends(
-            feasible=np.asarray(np.all(self._violations <= 0, axis=1)),
-            seen=self._seen,
-        )
+        return _Ends(feasible=np.asarray(np.all(self._violations <= 0, axis=1)), seen=self._seen)
 
 
-def distinct(Ts: Float[np.ndarray, "num 4 4"], order: np.ndarray, most: int) -> list[int]:
+def distinct(Ts: Poses, order: np.ndarray, most: int) -> list[int]:
     """Go through poses in an order and keep those that differ from all that are kept."""
     kept: list[int] = []
     rest = np.asarray(order, dtype=np.int64)
