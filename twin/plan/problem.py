@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
-from twin.plan.arrays import Joints, Numbers, Points, Pose, Postures
+from twin.plan.arrays import Joints, Numbers, Points, Pose, Poses, Postures, RotationMatrix, Vector
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
 
@@ -99,6 +100,46 @@ class Grasp:
     """Arm at the grasp, from the base's side."""
     pregrasp_m: float
     """Length of the straight approach along the tool's z axis."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Miss:
+    """How far an object came to lie from straight below where it was let go.
+
+    The pads shift and turn it as they close. It moves with the object's frame, for the same grasp
+    does the same elsewhere.
+    """
+
+    shift_m: Vector = field(default_factory=lambda: np.zeros(3))
+    """In the object's frame."""
+    turn_rad: float = 0.0
+    """About the vertical."""
+
+    @staticmethod
+    def measured(T_meant: Pose, T_found: Pose) -> "Miss":
+        """What lies between two poses ``T_base_object``, seen from above."""
+        way = (T_found[:3, 3] - T_meant[:3, 3]) * (1.0, 1.0, 0.0)
+        R = T_found[:3, :3] @ T_meant[:3, :3].T
+        turn_rad = float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
+        return Miss(shift_m=T_meant[:3, :3].T @ way, turn_rad=turn_rad)
+
+    def applied(self, Ts: Poses) -> Poses:
+        """Where objects meant to be here come to lie, their height left as it is."""
+        found = Ts.copy()
+        found[:, :2, 3] += (Ts[:, :3, :3] @ self.shift_m)[:, :2]
+        found[:, :3, :3] = _about_z(self.turn_rad) @ Ts[:, :3, :3]
+        return found
+
+    def undone(self, T: Pose) -> Pose:
+        """The pose from which an object comes to lie here."""
+        found = T.copy()
+        found[:3, :3] = _about_z(-self.turn_rad) @ T[:3, :3]
+        found[:2, 3] -= (found[:3, :3] @ self.shift_m)[:2]
+        return found
+
+
+def _about_z(angle_rad: float) -> RotationMatrix:
+    return se3.rotation_from_vector(np.array([0.0, 0.0, angle_rad]))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,6 +36,7 @@ def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict
                 "touched": bool(contact.any()),
                 "held": name in held,
                 "p_object_m": p_object_m,
+                "T_base_object": se3.pose_record(result.Ts_base_object[name][-1]),
             }
         )
     return tuple(seen)

@@ -16,7 +16,7 @@ from twin.plan.arrays import Joints, Pose, Vector
 from twin.plan.constrain.constraint import SHOWN, Constraint, flattened, violated, worst_along
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
-from twin.plan.loop.places import lying_there, places_on_table
+from twin.plan.loop.places import places_on_table
 from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
 from twin.plan.loop.push import push_choices, pushed
 from twin.plan.loop.steer import Steer
@@ -32,9 +32,9 @@ from twin.plan.loop.tau import (
 )
 from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, NoPathError, PathConfig, plan_move
 from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
-from twin.plan.problem import Grasp, Problem, Release, State
-from twin.plan.release.final_states import ReleaseConfig, final_states
-from twin.plan.release.resting import NoFinalStateError
+from twin.plan.problem import Grasp, Miss, Problem, Release, State
+from twin.plan.release.final_states import MAX_RELEASES, final_states
+from twin.plan.release.resting import NoFinalStateError, lying_there
 from twin.replay.clearance.bodies import SCENE
 from twin.robot.config import IkConfig
 
@@ -44,6 +44,8 @@ CLOSED_M = 0.0
 GRASPS = 6
 WIDER_M = 0.003
 """Kept beyond what was asked for where a path was refused."""
+SLOWER = 0.7
+"""Share of speeds and accelerations that is kept where a limit was passed."""
 NOT_KEPT = "not kept on the way"
 MOST_TRIED = 16
 """Pairs of grasp and final state of one object that a way is sought for."""
@@ -224,9 +226,12 @@ class _Search:
         steer = self._mine(grasp.object_id)
         if steer is not None and steer.change == "path":
             ways = ways[2:]
-            eps_m = base.replay.eps_col_m + WIDER_M
+            eps_m = base.replay.eps_col_m + WIDER_M + steer.lacking_m
             base = replace(base, replay=replace(base.replay, eps_col_m=eps_m))
             base = replace(base, seed=len(steer.refused))
+        elif steer is not None and steer.change == "slower":
+            speed, acceleration = base.speed_share * SLOWER, base.acceleration_share * SLOWER
+            base = replace(base, speed_share=speed, acceleration_share=acceleration)
         failures: list[NoPathError] = []
         for way in ways:
             config = replace(base, seed=base.seed + self._seed % 2**31 + way.more_seed)
@@ -246,7 +251,7 @@ class _Search:
                 grasp=grasp,
                 release=release,
                 legs=legs,
-                T_base_lies=lying_there(problem, release),
+                T_base_lies=lying_there(problem, release, options.miss_with(grasp)),
                 cost=release.cost + erfc(grasp.margin / sqrt(2.0)) / 2,
                 remarks=options.remarks_of(grasp, release, legs),
             )
@@ -297,7 +302,8 @@ class _Options:
             compile_constraint(record, problem)
             for record in records
             if record["kind"] not in _PLACED or record.get("support") == TABLE
-        ] + _subgoals(problem, key, "release")
+        ]
+        self._wishes = _subgoals(problem, key, "release")
         self.why = ""
         self._given_up: list[Grasp] = []
 
@@ -341,7 +347,7 @@ class _Options:
     def pairs(self) -> Iterator[tuple[Grasp, Release]]:
         """Every grasp with its cheapest final state, then every grasp with the next, and so on."""
         states: dict[int, tuple[Release, ...]] = {}
-        for rank in range(ReleaseConfig().max_releases):
+        for rank in range(MAX_RELEASES):
             for number, grasp in enumerate(self.grasps):
                 if any(grasp is each for each in self._given_up):
                     continue
@@ -361,11 +367,13 @@ class _Options:
                 raise
             return ()
         steer = self._steer
-        if steer is not None and steer.change == "release":
-            releases = tuple(
-                each for each in releases if not steer.has_release_like(self._key, each.T_base_tcp)
-            )
-        return releases
+        if steer is None or steer.change != "release" or self.miss_with(grasp) is not None:
+            return releases  # a measured miss changes where they are
+        return tuple(each for each in releases if not steer.has_end_like(each))
+
+    def miss_with(self, grasp: Grasp) -> Miss | None:
+        """How far beside it is known to let the object go with a grasp."""
+        return None if self._steer is None else self._steer.miss_with(grasp)
 
     def _final_states(self, grasp: Grasp) -> tuple[Release, ...]:
         problem = self._problem
@@ -374,7 +382,10 @@ class _Options:
         near = None
         if not placed or (relation is None and problem.scene.task.mark_of(self._key) is None):
             near = places_on_table(problem, self._key, self._goals, seed=self._seed)
-        return final_states(problem, grasp, constraints=self._goals, near=near, seed=self._seed)
+        return final_states(
+            problem, grasp, goals=self._goals, wishes=self._wishes, near=near,
+            miss=self.miss_with(grasp), seed=self._seed,
+        )  # fmt: skip
 
     def remarks_of(self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]) -> tuple[str, ...]:
         """Where the numbers of a transfer come from, in words."""

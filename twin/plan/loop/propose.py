@@ -67,7 +67,7 @@ def choose(
                 "rounds, or begin from another start."
             )
         return named(ranked[round_], problem, seed=seed)
-    steer = steer_by(refused, problem.scene.task, fingers_of(problem))
+    steer = steer_by(refused, problem)
     known = [refusal.plan.tau for refusal in refused]
 
     def fresh_of(steer: Steer | None, counts: Sequence[int]) -> Candidate | None:
@@ -105,12 +105,6 @@ def named(
         scene_hash=problem.scene.scene_hash,
     )
     return replace(candidate, plan=plan)
-
-
-def fingers_of(problem: Problem) -> tuple[str, ...]:
-    """Names by which failures call the hand."""
-    gripper = problem.robot.record.gripper
-    return ("gripper", gripper.name, *gripper.links)
 
 
 @dataclass(frozen=True, kw_only=True)

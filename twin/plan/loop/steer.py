@@ -14,12 +14,16 @@ from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from twin.plan.arrays import Pose
+from twin.plan.problem import Grasp, Miss, Problem, Release
+from twin.replay.config import ReplayConfig
 
-Change = Literal["grasp", "grasp_shift", "release", "path", "any"]
+Change = Literal["grasp", "grasp_shift", "release", "path", "slower", "any"]
 ALIKE_M = 0.01
 ALIKE_RAD = np.radians(10.0)
 """Two grasps or releases nearer than both are one."""
 
+MOST_MISS_M, MOST_MISS_RAD = 0.04, np.radians(30.0)
+"""An object that ends farther from where it was let go fell, or was knocked over."""
 _SQUEEZED = (Cause.EXPLODED, Cause.SHAPE, Cause.PROBABILITY)
 _IN_OBJECT = (Cause.DEEP_CONTACT, Cause.PRE_GRASP_PENETRATION)
 
@@ -34,6 +38,12 @@ class Tried:
     T_base_release: Pose | None = None
     """Tool where the gripper is told to open; None where it never is."""
 
+    @property
+    def T_base_object(self) -> Pose | None:
+        """Where the object was meant to be then; None where it is never let go."""
+        T = self.T_base_release
+        return None if T is None else T @ se3.invert(self.T_object_tcp)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Steer:
@@ -41,8 +51,8 @@ class Steer:
 
     change: Change
     """``grasp``: another one, or another width; ``grasp_shift``: nearer to where a finger touched;
-    ``release``: another final state; ``path``: another way or approach; ``any``: nothing in
-    particular."""
+    ``release``: another final state; ``path``: another way or approach; ``slower``: the same at
+    less speed; ``any``: nothing in particular."""
     clause: str
     """Factor and cause: ``terminal.inside``."""
     bodies: tuple[str, ...] = ()
@@ -50,17 +60,29 @@ class Steer:
     """Whose grasp or release is meant; None: none in particular."""
     toward_m: tuple[float, float, float] | None = None
     """Where the tool was in the object's frame when a finger first touched it in the twin."""
+    miss: Miss | None = None
+    """How far beside the newest refused release the object came to lie, held in that grasp."""
+    lacking_m: float = 0.0
+    """How much farther apart the nearest bodies should have been."""
     refused: tuple[Tried, ...] = ()
+
+    def miss_with(self, grasp: Grasp) -> Miss | None:
+        """The miss that was measured with a grasp; None: with this one none was."""
+        newest = [tried for tried in self.refused if tried.object_id == grasp.object_id][-1:]
+        is_same = newest and alike(newest[0].T_object_tcp, grasp.T_object_tcp)
+        return self.miss if is_same else None
 
     def has_grasp_like(self, object_id: str, T_object_tcp: Pose) -> bool:
         """Whether a grasp was refused that is the same within 1 cm and 10 degrees."""
         mine = [tried for tried in self.refused if tried.object_id == object_id]
         return any(alike(tried.T_object_tcp, T_object_tcp) for tried in mine)
 
-    def has_release_like(self, object_id: str, T_base_tcp: Pose) -> bool:
-        """Whether a release was refused that is the same within 1 cm and 10 degrees."""
-        mine = [tried.T_base_release for tried in self.refused if tried.object_id == object_id]
-        return any(T is not None and alike(T, T_base_tcp) for T in mine)
+    def has_end_like(self, release: Release) -> bool:
+        """Whether a release was refused that leaves the object within 1 cm and 10 degrees of it."""
+        mine = [
+            tried.T_base_object for tried in self.refused if tried.object_id == release.object_id
+        ]
+        return any(T is not None and alike(T, release.T_base_object) for T in mine)
 
 
 def alike(T_first: Pose, T_second: Pose) -> bool:
@@ -70,32 +92,55 @@ def alike(T_first: Pose, T_second: Pose) -> bool:
     return near and bool(turned_rad < ALIKE_RAD)
 
 
-def steer_by(refusals: Sequence[Refusal], task: Task, fingers: Collection[str]) -> Steer:
-    """Let the first failing clause of the newest refusal choose what changes."""
-    verdict = refusals[-1].verdict
+def steer_by(refusals: Sequence[Refusal], problem: Problem) -> Steer:
+    """Let the first failing clause of the newest refusal choose what changes, and by how much."""
+    task, verdict = problem.scene.task, refusals[-1].verdict
     name = verdict.first_failing
     factor = Factor(value=None) if name is None else verdict.factors()[name]
     moved = [body for body in factor.bodies if body in task.manipulated]
     object_id = moved[0] if moved else None
-    change = _change(name, factor, verdict, task, fingers)
+    gripper = problem.robot.record.gripper
+    change = _change(name, factor, verdict, task, ("gripper", gripper.name, *gripper.links))
+    lacking_m = 0.0
+    if name == "clearance" and verdict.nearest is not None:
+        lacking_m = max(0.0, ReplayConfig().eps_col_m - float(verdict.nearest["distance_m"]))
     return Steer(
         change=change,
         clause=f"{name}.{factor.cause}" if factor.cause else name or "undecided",
         bodies=factor.bodies,
         object_id=object_id,
         toward_m=_touched_at(verdict, object_id) if change == "grasp_shift" else None,
+        miss=_miss_of(refusals[-1], object_id) if change == "release" else None,
+        lacking_m=lacking_m,
         refused=tuple(tried for refusal in refusals for tried in tried_in(refusal.plan)),
     )
+
+
+def _miss_of(refusal: Refusal, object_id: str | None) -> Miss | None:
+    """How far beside where it was let go an object lies in the end; None: it was not carried there.
+
+    Seen in the twin, or measured after an execution: a verdict keeps both alike.
+    """
+    tried = [each for each in tried_in(refusal.plan) if each.object_id == object_id][-1:]
+    T_meant = tried[0].T_base_object if tried else None
+    for item in refusal.verdict.grasps:
+        ended = item.get("T_base_object")
+        if T_meant is not None and item["object"] == object_id and item["held"] and ended:
+            miss = Miss.measured(T_meant, se3.pose_from_record(ended))
+            far_m = float(np.linalg.norm(miss.shift_m))
+            if far_m < MOST_MISS_M and abs(miss.turn_rad) < MOST_MISS_RAD:
+                return miss
+    return None
 
 
 def _change(
     name: str | None, factor: Factor, verdict: Verdict, task: Task, fingers: Collection[str]
 ) -> Change:
     cause = factor.cause or ""
+    if name == "limits" or cause == Cause.JOINT_SPEED:
+        return "slower"
     if name == "ik":
-        return "path" if cause == Cause.JOINT_SPEED else "grasp"  # which brings other postures
-    if name == "limits":
-        return "path"
+        return "grasp"  # which brings other postures
     if name in ("clearance", "audit"):
         return _change_of_contact(cause, factor.bodies, task, fingers)
     if name == "terminal":

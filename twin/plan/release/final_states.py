@@ -1,7 +1,7 @@
 """Final states of a carried object: solved for, perturbed, checked, ranked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -10,31 +10,45 @@ from bridge.geometry import se3
 from twin.plan.arrays import Numbers, Pose, Poses
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import SHOWN, Constraint
-from twin.plan.problem import Array, Grasp, Problem, Release, State
+from twin.plan.problem import Array, Grasp, Miss, Problem, Release, State
 from twin.plan.release.obstacles import allowed_with, hand_points, obstacles_of
 from twin.plan.release.resting import (
     NoFinalStateError,
     Target,
     resting_poses,
     sideways_sigma_m,
+    support_m,
     target_of,
 )
-from twin.plan.stage.objective import ANGLE_RAD, CostTerm, StageProblem, Zeta
-from twin.plan.stage.solver import SolveConfig, StageCandidate, distinct, solve
+from twin.plan.stage.solver import (
+    ANGLE_RAD,
+    CostTerm,
+    StageProblem,
+    StageState,
+    distinct,
+    solve,
+)
 from twin.robot.collision import hulls_of
 
 NEAR_M = 0.02
 """Margins above this are not told apart while a stage is solved."""
-
-
 TAU_P_M = 0.02
 """Bound of the shifts of Eq. 8, along each axis."""
 TAU_R_RAD = ANGLE_RAD
 """Bound of the turns of Eq. 9."""
+NUM_SAMPLES, NUM_NOMINAL = 2048, 4
+"""Poses that are drawn, around so many answers of the optimisation."""
+NUM_WAYS = 4
+"""Ways to rest that are tried, those nearest to how the object lies now first."""
+MAX_RELEASES = 16
+EPS_COL_M = 0.002
+"""Least distance between what may not touch, the paper's epsilon_col."""
+SIGMAS = 2.0
+"""Standard deviations of localisation that the object stays away from the edge of the area."""
 HAND_POINTS = 200
 DROP_M, MOST_DROP_M = 0.004, 0.03
 """Wanted between the underside and what the object will lie on; most of it, over a rim that the
-object may have to stay above."""
+object may have to stay above, where nothing is asked of the release itself."""
 MOST_TILT_RAD = float(np.deg2rad(12.0))
 """Most that the object may lean from how it will rest."""
 MOST_TOOL_TILT_RAD = float(np.deg2rad(60.0))
@@ -43,63 +57,35 @@ OPEN_MORE_M = 0.01
 """The hand opens at least this much wider than it held."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReleaseConfig:
-    """How final states are looked for."""
-
-    num_samples: int = 2048
-    num_nominal: int = 4
-    num_starts: int = 12
-    """Starts of the stage optimisation for each way to rest."""
-    num_ways: int = 4
-    """Ways to rest that are tried, those nearest to how the object lies now first."""
-    eps_col_m: float = 0.002
-    """Least distance between what may not touch, the paper's epsilon_col."""
-    sigmas: float = 2.0
-    """Standard deviations of localisation that the object stays away from the edge of the area."""
-    max_releases: int = 16
-
-    def solver(self) -> SolveConfig:
-        """How the stage problem of one way to rest is solved: from above, hardly leaning."""
-        return SolveConfig(
-            num_starts=self.num_starts,
-            iterations=20,
-            redraws=1,
-            only_above=True,
-            spread_rad=MOST_TILT_RAD,
-            max_candidates=self.max_releases,
-        )
-
-
 def final_states(
     problem: Problem,
     grasp: Grasp,
     *,
-    constraints: Sequence[Constraint] = (),
+    goals: Sequence[Constraint] = (),
+    wishes: Sequence[Constraint] = (),
     near: Sequence[Pose] | None = None,
-    config: ReleaseConfig | None = None,
+    miss: Miss | None = None,
     seed: int = 0,
 ) -> tuple[Release, ...]:
     """Find where a held object may be let go: distinct final states, the cheapest first.
 
     Args:
-        constraints: What must hold there besides (Eq. 7).
+        goals: What must hold where the object comes to lie, straight below (Eq. 7).
+        wishes: What must hold as it is let go; no other height is then asked for.
         near: Poses ``T_base_object`` to look around instead of what the success predicates ask
-            for; ``constraints`` then say what is wanted.
+            for; goals then say what is wanted.
+        miss: How far from there it is known to come to lie.
     """
-    config = ReleaseConfig() if config is None else config
-    search = ReleaseSearch(problem, grasp, constraints, config)
+    search = ReleaseSearch(problem, grasp, goals, wishes, miss or Miss())
     target = target_of(problem, grasp.object_id) if near is None else None
     if target is not None:
         search.check_size(target)
         ways = resting_poses(
             problem, grasp, target, drop_m=DROP_M, most_tilted_rad=MOST_TOOL_TILT_RAD
-        )[: config.num_ways]
+        )[:NUM_WAYS]
     else:
         ways = list(near or ())
-    stages = [search.stage(T, target) for T in ways]
-    rng = np.random.default_rng(seed)
-    return search.answer(stages, seed, rng)
+    return search.answer([search.stage(T, target) for T in ways], seed)
 
 
 class ReleaseSearch:
@@ -109,15 +95,15 @@ class ReleaseSearch:
         self,
         problem: Problem,
         grasp: Grasp,
-        constraints: Sequence[Constraint],
-        config: ReleaseConfig,
+        goals: Sequence[Constraint],
+        wishes: Sequence[Constraint],
+        miss: Miss,
     ) -> None:
         """Collect obstacles and points."""
-        self._problem, self._grasp, self._config = problem, grasp, config
-        self._constraints = constraints
+        self._problem, self._grasp = problem, grasp
+        self._goals, self._wishes, self._miss = goals, wishes, miss
         hulls = hulls_of(problem.robot)
         gripper = problem.robot.record.gripper
-        self._max_width_m = gripper.max_width_m
         self._width_m = min(max(grasp.open_m, grasp.width_m + OPEN_MORE_M), gripper.max_width_m)
         self._points_m = surface_points(problem, grasp.object_id)
         self._outline_m = self._points_m[ConvexHull(self._points_m).vertices]
@@ -150,44 +136,45 @@ class ReleaseSearch:
 
         Args:
             T_rest: Pose ``T_base_object`` a little above where it would lie.
-            target: What it is put into or onto; None: the constraints alone say it.
+            target: What it is put into or onto; None: goals alone say it.
         """
         name, scene = self._grasp.object_id, self._problem.scene
         terms = [
             CostTerm(name=f"{name} clear of what is around", violation=self._object_too_near),
             CostTerm(name="the open hand clear of what is around", violation=self._hand_too_near),
-            CostTerm(name="the hand opens", violation=self._not_open),
         ]
         if target is not None:
             terms += self._placed(T_rest, target)
-        terms += [CostTerm.of(constraint) for constraint in self._constraints]
+        terms += [CostTerm.of(goal, self._settled) for goal in self._goals]
+        terms += [CostTerm.of(wish) for wish in self._wishes]
         return StageProblem(
-            nominal_T_base_tcp=T_rest @ self._grasp.T_object_tcp,
-            nominal_width_m=self._width_m,
+            nominal_T_base_tcp=self._miss.undone(T_rest) @ self._grasp.T_object_tcp,
+            width_m=self._width_m,
             subgoal=tuple(terms),
             Ts_base_object={key: T for key, T in scene.Ts_base_object.items() if key != name},
             Ts_tcp_object={name: self._T_tcp_object},
-            max_width_m=self._max_width_m,
         )
 
+    def _settled(self, state: State) -> State:
+        """What comes of states in which the object is let go: it lies straight below."""
+        name = self._grasp.object_id
+        T = self._miss.applied(state.Ts_base_object[name])
+        low_m = (T[:, 2, :3] @ self._outline_m.T).min(axis=1) + T[:, 2, 3]
+        T[:, 2, 3] -= low_m - support_m(self._problem, name)
+        return replace(state, Ts_base_object={**state.Ts_base_object, name: T})
+
     def _object_too_near(self, state: State) -> Array:
-        T, keep_m = state.Ts_base_object[self._grasp.object_id], self._keep_m(self._allowed)
+        T, keep_m = state.Ts_base_object[self._grasp.object_id], _keep_m(self._allowed)
         return -self._obstacles.margins(self._points_m, T, keep_m, most_m=NEAR_M)
 
     def _hand_too_near(self, state: State) -> Array:
-        keep_m = self._keep_m(self._hand_allowed)
+        keep_m = _keep_m(self._hand_allowed)
         return -self._obstacles.margins(self._hand_m, state.T_base_tcp, keep_m, most_m=NEAR_M)
-
-    def _keep_m(self, allowed: Array) -> Numbers:
-        return np.asarray(self._config.eps_col_m * (1.0 - allowed))
-
-    def _not_open(self, state: State) -> Array:
-        return self._grasp.width_m + OPEN_MORE_M / 2 - state.width_m
 
     def _placed(self, T_rest: Pose, target: Target) -> list[CostTerm]:
         """Inside of the area, at a small height, level."""
-        config, name = self._config, self._grasp.object_id
-        margin = config.sigmas * float(np.hypot(target.sigma_m, self._sigma_m))
+        name = self._grasp.object_id
+        margin = SIGMAS * float(np.hypot(target.sigma_m, self._sigma_m))
         whole = target.relation == "inside"
         half = np.array(target.half_m)
         R_area = target.T_base[:2, :2]
@@ -201,7 +188,7 @@ class ReleaseSearch:
         outline = self._outline_m if whole else self._outline_m.mean(axis=0, keepdims=True)
 
         def beyond(state: State) -> Array:
-            T = state.Ts_base_object[name]
+            T = self._miss.applied(state.Ts_base_object[name])
             axes = (R_area.T @ T[:, :2, :3]).reshape(-1, 3) @ outline.T
             middle = ((T[:, :2, 3] - target.T_base[:2, 3]) @ R_area).reshape(-1, 1)
             reach = np.abs(axes + middle).max(axis=1).reshape(-1, 2)
@@ -210,7 +197,8 @@ class ReleaseSearch:
         def off_height(state: State) -> Array:
             T = state.Ts_base_object[name]
             over = (T[:, 2, :3] @ self._outline_m.T).min(axis=1) + T[:, 2, 3] - target.T_base[2, 3]
-            return np.maximum(over - MOST_DROP_M - target.rim_m, DROP_M / 2 - over)
+            most = np.inf if self._wishes else MOST_DROP_M + target.rim_m
+            return np.maximum(over - most, DROP_M / 2 - over)
 
         def leaning(state: State) -> Array:
             z = state.Ts_base_object[name][:, :3, :3] @ up
@@ -222,48 +210,30 @@ class ReleaseSearch:
             CostTerm(name=f"{name} level", violation=leaning, scale=ANGLE_RAD, unit="rad"),
         ]
 
-    def answer(
-        self, stages: Sequence[StageProblem], seed: int, rng: np.random.Generator
-    ) -> tuple[Release, ...]:
+    def answer(self, stages: Sequence[StageProblem], seed: int) -> tuple[Release, ...]:
         """Solve each way to rest, perturb the best, keep the distinct feasible ones."""
-        config = self._config
-        settings = config.solver()
-        solved: list[tuple[StageProblem, StageCandidate]] = []
-        nearest: list[tuple[StageProblem, StageCandidate]] = []
-        for stage in stages:
-            solution = solve(stage, settings, seed=seed)
-            solved += [(stage, candidate) for candidate in solution.candidates]
-            nearest.append((stage, solution.nearest))
+        rng = np.random.default_rng(seed)
+        found = [(stage, state) for stage in stages for state in solve(stage, seed=seed)]
+        solved = [each for each in found if each[1].is_feasible]
         if not solved:
-            raise self._nothing(*min(nearest, key=lambda pair: pair[1].cost))
+            raise self._nothing(*min(found, key=lambda pair: pair[1].cost))
         solved.sort(key=lambda pair: pair[1].cost)
-        Ts = [candidate.T_base_tcp[None] for _, candidate in solved]
-        costs = [np.array([candidate.cost]) for _, candidate in solved]
-        for stage, candidate in solved[: config.num_nominal]:
-            count = config.num_samples // min(config.num_nominal, len(solved))
-            drawn, cost = self._perturbed(stage, candidate, count, rng)
-            Ts.append(drawn)
-            costs.append(cost)
+        Ts = [state.T_base_tcp[None] for _, state in solved]
+        costs = [np.array([state.cost]) for _, state in solved]
+        for stage, state in solved[:NUM_NOMINAL]:
+            count = NUM_SAMPLES // min(NUM_NOMINAL, len(solved))
+            drawn = perturbed(
+                state.T_base_tcp, tau_p_m=TAU_P_M, tau_r_rad=TAU_R_RAD, count=count, rng=rng
+            )
+            violations, J = stage.judged(drawn)
+            free = (violations <= 0).all(axis=1)
+            Ts.append(drawn[free])
+            costs.append(J[free])
         return self._releases(np.concatenate(Ts), np.concatenate(costs))
-
-    def _perturbed(
-        self, stage: StageProblem, nominal: StageCandidate, count: int, rng: np.random.Generator
-    ) -> tuple[Poses, Numbers]:
-        """Draw poses around one and keep those that satisfy everything, with their J."""
-        T = perturbed(
-            nominal.T_base_tcp, tau_p_m=TAU_P_M, tau_r_rad=TAU_R_RAD, count=count, rng=rng
-        )
-        zeta = Zeta(T_base_tcp=T, width_m=np.full(count, nominal.width_m))
-        free = np.ones(count, dtype=np.bool_)
-        violations = stage.violations(zeta)
-        for parts in violations:
-            free &= np.all(parts <= 0, axis=1)
-        J = np.square(stage.residuals(zeta, violations)).sum(axis=1)
-        return T[free], J[free]
 
     def _releases(self, Ts: Poses, costs: Numbers) -> tuple[Release, ...]:
         order = np.argsort(costs, kind="stable")
-        chosen = distinct(Ts, order, self._config.max_releases)
+        chosen = distinct(Ts, order, MAX_RELEASES)
         Ts_object = Ts[chosen] @ self._T_tcp_object
         distances = self._obstacles.distances(self._points_m, Ts_object)
         counted = np.where(self._allowed > 0, np.inf, distances).min(axis=1, initial=np.inf)
@@ -278,7 +248,7 @@ class ReleaseSearch:
             for index, T_object, clearance in zip(chosen, Ts_object, counted, strict=True)
         )
 
-    def _nothing(self, stage: StageProblem, nearest: StageCandidate) -> NoFinalStateError:
+    def _nothing(self, stage: StageProblem, nearest: StageState) -> NoFinalStateError:
         """Say what was in the way where the least was."""
         told = "; ".join(
             f"{term.name}: by {f * SHOWN[term.unit][0]:.1f} {SHOWN[term.unit][1]}"
@@ -301,8 +271,12 @@ class ReleaseSearch:
         )
         short = np.zeros(len(self._obstacles.names), dtype=np.bool_)
         for points_m, T, allowed in bodies:
-            short |= self._obstacles.distances(points_m, T[None])[0] < self._keep_m(allowed)
+            short |= self._obstacles.distances(points_m, T[None])[0] < _keep_m(allowed)
         return [name for name, is_near in zip(self._obstacles.names, short, strict=True) if is_near]
+
+
+def _keep_m(allowed: Array) -> Numbers:
+    return np.asarray(EPS_COL_M * (1.0 - allowed))
 
 
 def perturbed(

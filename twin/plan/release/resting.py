@@ -7,11 +7,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
+from bridge.task.check import TABLE
 from bridge.task.task_file import ObjectModel
 from twin.errors import TwinError
 from twin.plan.arrays import Pose, RotationMatrix, Vector
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.problem import Grasp, Problem
+from twin.plan.problem import Grasp, Miss, Problem, Release
 
 QUARTER_TURNS = 4
 _SAME_RAD = 0.02
@@ -77,6 +78,22 @@ def target_of(problem: Problem, object_id: str) -> Target:
         rim_m=model.size_m[2] - model.wall_m if inside else 0.0,
         sigma_m=sideways_sigma_m(problem, name),
     )
+
+
+def lying_there(problem: Problem, release: Release, miss: Miss | None = None) -> Pose:
+    """Where an object lies that is let go a little above: straight below, or aside by a miss."""
+    T: Pose = (miss or Miss()).applied(release.T_base_object[None])[0]
+    points = se3.apply(T, surface_points(problem, release.object_id))
+    T[2, 3] -= float(points[:, 2].min()) - support_m(problem, release.object_id)
+    return T
+
+
+def support_m(problem: Problem, key: str) -> float:
+    """Height of what an object comes to lie on, base frame."""
+    goal = problem.scene.task.goal_of(key)
+    if goal is None or goal[0] not in ("inside", "on") or goal[1] == TABLE:
+        return problem.scene.table_height_m
+    return float(target_of(problem, key).T_base[2, 3])
 
 
 def sideways_sigma_m(problem: Problem, name: str) -> float:
