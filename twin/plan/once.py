@@ -26,7 +26,6 @@ from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.whole_file import write_whole
 from twin.errors import TwinError
-from twin.plan.arrays import Pose
 from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.ground.run_tasks import UnderstoodTask, names_task, shown_task_file, understand
@@ -35,7 +34,7 @@ from twin.plan.loop.propose import Attempt, NoPlanError, plan_and_verify
 from twin.plan.loop.steer import tried_in
 from twin.plan.loop.tau import goals_of
 from twin.plan.model_goals import Asked, ask_for_goals, client_of
-from twin.plan.problem import Problem, State
+from twin.plan.problem import Pose, Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
 from twin.replay.config import ReplayConfig

@@ -9,14 +9,27 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
-from twin.plan.arrays import Joints, Numbers, Points, Pose, Poses, Postures, RotationMatrix, Vector
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
 
+Pose = Float[np.ndarray, "4 4"]
+Poses = Float[np.ndarray, "_ 4 4"]
+RotationMatrix = Float[np.ndarray, "3 3"]
+Covariance = Float[np.ndarray, "6 6"]
+"""Of a pose: x, y, z [m] and rotation about them [rad], base frame."""
+Joints = Float[np.ndarray, " num_joints"]
+Postures = Float[np.ndarray, "_ num_joints"]
+Vector = Float[np.ndarray, "3"]
+Points = Float[np.ndarray, "_ 3"]
+Spheres = Float[np.ndarray, "_ 4"]
+"""Centre and radius [m]."""
+Numbers = Float[np.ndarray, " _"]
+Flags = Bool[np.ndarray, " _"]
+Ids = Int[np.ndarray, " _"]
 Array = Any
 """``np.ndarray``, or a number for all states."""
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from bridge.episode.run_folder import RunFolder
 from bridge.task.task_file import SCANNED, ObjectModel, Task
-from twin.plan.arrays import Covariance, Joints, Pose, Vector
-from twin.plan.problem import Problem, Shape
+from twin.plan.problem import Covariance, Joints, Pose, Problem, Shape, Vector
 from twin.replay.rebuilt_scene import MOST_OFF, read_rebuilt_scene
 from twin.robot.model import load_robot
 from twin.scene.shape.files import MESH, TASK_SHAPE

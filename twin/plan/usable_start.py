@@ -11,9 +11,8 @@ from bridge.episode.topics import JOINT_STATES
 from bridge.errors import BridgeError
 from bridge.robots.robot import Robot
 from bridge.task.check import TABLE
-from twin.plan.arrays import Joints, Vector
 from twin.plan.loop.propose import NoPlanError
-from twin.plan.problem import Problem
+from twin.plan.problem import Joints, Problem, Vector
 from twin.replay.rebuilt_scene import scene_of_other_robot
 from twin.replay.run_job import START_KNOWN_NS, recorded_start
 

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from bridge.geometry.mesh import sample_triangles
 from bridge.task.relations import AXES
 from bridge.task.task_file import ObjectModel
-from twin.plan.arrays import Numbers, Points, Vector
 from twin.plan.constrain.schema import BASE
-from twin.plan.problem import Array, Problem, State
+from twin.plan.problem import Array, Numbers, Points, Problem, State, Vector
 
 NUM_POINTS = 200
 """Of an object's surface; its corners first."""

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from twin.plan.arrays import Numbers, Points, Pose, Poses, Vector
-from twin.plan.problem import Problem
+from twin.plan.problem import Numbers, Points, Pose, Poses, Problem, Vector
 from twin.replay._clearance import (
     points_to_boxes,
     points_to_grid,

@@ -22,7 +22,6 @@ from bridge.task.relations import (
     footprint_gap_m,
 )
 from bridge.task.task_file import Task
-from twin.plan.arrays import Numbers
 from twin.plan.constrain.bodies import (
     Record,
     box_pose,
@@ -33,7 +32,7 @@ from twin.plan.constrain.bodies import (
     seen_from,
 )
 from twin.plan.constrain.constraint import Constraint, Term
-from twin.plan.problem import Array, Problem, State
+from twin.plan.problem import Array, Numbers, Problem, State
 
 
 def _on(record: Record, problem: Problem) -> Constraint:

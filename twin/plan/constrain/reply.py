@@ -16,7 +16,6 @@ import numpy as np
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.check import nearest
-from twin.plan.arrays import Vector
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.relations import PLACES
 from twin.plan.constrain.schema import (
@@ -33,7 +32,7 @@ from twin.plan.constrain.schema import (
     told,
     values_of,
 )
-from twin.plan.problem import Problem
+from twin.plan.problem import Problem, Vector
 
 VERSION = 2
 MAX_BYTES = 64 * 1024

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
-from twin.plan.arrays import Covariance, Flags, Ids, Numbers, Points, Pose, Poses
 from twin.plan.grasp.open_hand import OpenHand
 from twin.plan.grasp.pairs import SampledSurface
+from twin.plan.problem import Covariance, Flags, Ids, Numbers, Points, Pose, Poses
 
 SHIFTS_M = (0.002, 0.004, 0.006, 0.009, 0.012, 0.016, 0.020, 0.025, 0.030)
 """How far a closing line is shifted over the surface to see where the pads lose it."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from twin.plan.arrays import Flags, Numbers, Points, Poses, Vector
+from twin.plan.problem import Flags, Numbers, Points, Poses, Vector
 from twin.robot.collision import hulls_of
 from twin.robot.model import RobotModel
 

@@ -15,8 +15,7 @@ import open3d
 from scipy import sparse
 
 from bridge.geometry.mesh import sample_triangles
-from twin.plan.arrays import Flags, Ids, Numbers, Points, Vector
-from twin.plan.problem import Shape
+from twin.plan.problem import Flags, Ids, Numbers, Points, Shape, Vector
 from twin.scene.shape.mesh import face_normals
 
 _INSIDE_M = 1e-5

@@ -10,12 +10,11 @@ from scipy.spatial import ConvexHull, QhullError
 from bridge.geometry import se3
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
-from twin.plan.arrays import Covariance, Flags, Ids, Numbers, Points, Pose, Poses
 from twin.plan.grasp.margin import Doubt, Lines, margins, slacks
 from twin.plan.grasp.open_hand import OpenHand, has_fingers, open_hand
 from twin.plan.grasp.pairs import Pairs, SampledSurface, antipodal_pairs, thinned
 from twin.plan.grasp.reach import ArmReach, Reached, Reaches
-from twin.plan.problem import Grasp, Problem
+from twin.plan.problem import Covariance, Flags, Grasp, Ids, Numbers, Points, Pose, Poses, Problem
 from twin.replay.config import UNKNOWN_POSE_M, UNKNOWN_POSE_RAD
 
 CAUSES: Mapping[str, str] = {
@@ -91,7 +90,7 @@ class GraspConfig:
     """Between each pad and the object, and between the hand and anything else [m]."""
     least_margin: float = 1.0
     """Standard deviations that a grasp must bear."""
-    most: int = 100
+    most: int = 60
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,10 +14,9 @@ from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.palette import rgb
-from twin.plan.arrays import Flags, Points, Pose
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.reply import Keypoint
-from twin.plan.problem import Problem
+from twin.plan.problem import Flags, Points, Pose, Problem
 from twin.plan.release.obstacles import spread_points
 
 LONG_SIDE_PX = 1280

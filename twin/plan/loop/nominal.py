@@ -12,9 +12,9 @@ from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan, Waypoint
-from twin.plan.arrays import Joints, Pose, Vector
 from twin.plan.constrain.constraint import SHOWN, Constraint, flattened, violated, worst_along
 from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
 from twin.plan.loop.places import places_on_table
 from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
@@ -31,12 +31,11 @@ from twin.plan.loop.tau import (
     stages_of,
 )
 from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, NoPathError, PathConfig, plan_move
-from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
-from twin.plan.problem import Grasp, Miss, Problem, Release, State
+from twin.plan.path.transfer import LIFT_M, Leg, plan_transfer
+from twin.plan.problem import Grasp, Joints, Miss, Pose, Problem, Release, State, Vector
 from twin.plan.release.final_states import MAX_RELEASES, final_states
 from twin.plan.release.resting import NoFinalStateError, lying_there
 from twin.replay.clearance.bodies import SCENE
-from twin.robot.config import IkConfig
 
 PLANNER = "gst_planner"
 CLOSED_M = 0.0
@@ -341,7 +340,7 @@ class _Options:
         if self._steer is not None and self._steer.has_grasp_like(self._key, T):
             return []
         goal = self._problem.scene.Ts_base_object[self._key] @ T
-        joints = nearest_solutions(self._problem.robot, goal, grasp.joints_rad, IkConfig())
+        joints = nearest_solutions(self._problem.robot, goal, grasp.joints_rad)
         return [replace(grasp, T_object_tcp=T, joints_rad=joints[0])] if joints else []
 
     def pairs(self) -> Iterator[tuple[Grasp, Release]]:

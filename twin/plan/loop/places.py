@@ -5,12 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from bridge.geometry import se3
-from twin.plan.arrays import Pose, Poses
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import Constraint
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.constrain.schema import values_of
-from twin.plan.problem import Problem, State
+from twin.plan.problem import Pose, Poses, Problem, State
 from twin.plan.release.final_states import EPS_COL_M
 from twin.plan.release.resting import NoFinalStateError
 

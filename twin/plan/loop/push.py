@@ -13,11 +13,10 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Waypoint
-from twin.plan.arrays import Joints, Numbers, Pose
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.loop.tau import stages_of
 from twin.plan.path.planner import waypoint
-from twin.plan.problem import Problem
+from twin.plan.problem import Joints, Numbers, Pose, Problem
 from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 

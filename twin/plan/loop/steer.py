@@ -13,8 +13,7 @@ from bridge.task.plan import Plan, Waypoint
 from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
-from twin.plan.arrays import Pose
-from twin.plan.problem import Grasp, Miss, Problem, Release
+from twin.plan.problem import Grasp, Miss, Pose, Problem, Release
 from twin.replay.config import ReplayConfig
 
 Change = Literal["grasp", "grasp_shift", "release", "path", "slower", "any"]

@@ -7,9 +7,8 @@ import numpy as np
 
 from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Stage
-from twin.plan.arrays import Poses, Postures
 from twin.plan.path.world import Carried
-from twin.plan.problem import Problem, TimedPath
+from twin.plan.problem import Poses, Postures, Problem, TimedPath
 from twin.replay.clearance.bodies import own_links
 from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig

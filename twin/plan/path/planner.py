@@ -10,10 +10,9 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.plan import Waypoint
 from twin.errors import TwinError
-from twin.plan.arrays import Joints, Pose, Postures
 from twin.plan.path.decide import Decision, PathRefusal, decide
 from twin.plan.path.world import SPARE_M, Carried, World, build_world
-from twin.plan.problem import Problem, TimedPath
+from twin.plan.problem import Joints, Pose, Postures, Problem, TimedPath
 from twin.replay.clearance.monitor import Allowed
 from twin.replay.config import ReplayConfig
 from twin.robot.config import IkConfig

@@ -1,70 +1,31 @@
 """Spheres that together hold a convex piece: what the path search asks before it asks hulls."""
 
-import heapq
-from functools import lru_cache
-
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull
 
-from twin.plan.arrays import Points, Spheres, Vector
+from twin.plan.problem import Points, Spheres
 
 SPHERES = 16
 """For each hull of a link or box that is carried."""
-_GROWN = 1e-9
-"""Relative; so that rounding leaves no corner outside [1]."""
+_GROWN = 1 + 1e-9
+"""So that rounding leaves no corner outside."""
 _PROBES = 64
 
 
 def covering_spheres(corners_m: Points, count: int = SPHERES) -> Spheres:
-    """Cover the convex hull of points by spheres."""
-    heap = [_part(corners_m, 0)]
-    done: list[_Part] = []
-    number = 1
-    while heap and len(heap) + len(done) < count:
-        worst = heapq.heappop(heap)
-        halves = _halves(worst[2])
-        if halves is None:
-            done.append(worst)
-            continue
-        for half in halves:
-            heapq.heappush(heap, _part(half, number))
-            number += 1
-    parts = sorted([*heap, *done], key=lambda part: part[1])
-    return np.array([[*centre, radius] for *_, centre, radius in parts])
-
-
-_Part = tuple[float, int, Points, Vector, float]
-"""How little its sphere wastes, its number, its corners, centre and radius."""
-
-
-def _part(corners_m: Points, number: int) -> _Part:
-    centre = (corners_m.min(axis=0) + corners_m.max(axis=0)) / 2
-    radius = float(np.linalg.norm(corners_m - centre, axis=1).max()) * (1 + _GROWN)
-    # A long part wastes more than a round one of the same size.
-    spread = np.linalg.svd(corners_m - corners_m.mean(axis=0), full_matrices=False)[2]
-    thinnest = float(np.ptp(corners_m @ spread[2]))
-    return (thinnest / 2 - radius, number, corners_m, centre, radius)
-
-
-def _halves(corners_m: Points) -> list[Points] | None:
-    """Cut a convex part by the plane across the middle of its longest axis."""
-    try:
-        hull = ConvexHull(corners_m)
-    except QhullError:
-        return None
-    corners = corners_m[hull.vertices]
-    axis = np.linalg.svd(corners - corners.mean(axis=0), full_matrices=False)[2][0]
-    along = corners_m @ axis
-    height = along - (along[hull.vertices].min() + along[hull.vertices].max()) / 2
-    edges = np.concatenate([hull.simplices[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-    first, second = edges.T
-    crossing = height[first] * height[second] < 0
-    first, second = first[crossing], second[crossing]
-    share = (height[first] / (height[first] - height[second]))[:, None]
-    cut = corners_m[first] + share * (corners_m[second] - corners_m[first])
-    cut = np.unique(cut.round(12), axis=0)
-    above = height[hull.vertices] >= 0
-    return [np.concatenate([corners[side], cut]) for side in (above, ~above)]
+    """Cover a convex hull: the box along its axes, its longest cells halved, a sphere for each."""
+    middle = corners_m.mean(axis=0)
+    axes = np.linalg.svd(corners_m - middle, full_matrices=True)[2]
+    along = (corners_m - middle) @ axes.T
+    low, extents = along.min(axis=0), np.ptp(along, axis=0)
+    cells = np.ones(3, dtype=np.int64)
+    while 2 * cells.prod() <= count:
+        cells[int(np.argmax(extents / cells))] *= 2
+    size = extents / cells
+    numbers = np.stack(np.meshgrid(*map(np.arange, cells), indexing="ij"), axis=-1).reshape(-1, 3)
+    centres = middle + (low + (numbers + 0.5) * size) @ axes
+    radius = np.full((len(centres), 1), np.linalg.norm(size) / 2 * _GROWN)
+    return np.concatenate([centres, radius], axis=1)
 
 
 def excess_m(corners_m: Points, spheres_m: Spheres) -> float:
@@ -76,11 +37,3 @@ def excess_m(corners_m: Points, spheres_m: Spheres) -> float:
     tips = spheres_m[:, None, :3] + spheres_m[:, 3, None, None] * turns
     outside = (tips.reshape(-1, 3) @ normals.T + offsets).max(axis=1)
     return float(max(0.0, outside.max()))
-
-
-@lru_cache(maxsize=64)
-def box_spheres(size_m: tuple[float, float, float], count: int = SPHERES) -> Spheres:
-    """Cover a box around the origin; the same for all boxes of a size."""
-    half = np.array(size_m) / 2
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    return covering_spheres(signs * half, count)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bridge.geometry import se3
-from twin.plan.arrays import Joints, Pose
+from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.path.planner import (
     Movement,
     NoPathError,
@@ -17,19 +17,15 @@ from twin.plan.path.planner import (
     reversed_path,
 )
 from twin.plan.path.world import Carried
-from twin.plan.problem import Grasp, Problem, Release
+from twin.plan.problem import Grasp, Joints, Pose, Problem, Release
 from twin.replay.clearance.bodies import GRIPPER
 from twin.replay.clearance.monitor import Allowed
-from twin.robot.config import IkConfig
-from twin.robot.inverse import UrInverse, solutions
-from twin.robot.model import RobotModel
 
 LIFT_M = 0.06
 _LEAST_LIFT_M = 0.02
 _SAME_RAD = 0.001
 _LEAVE_MORE_M = (0.1, 0.05, 0.0)
 """Beyond the length of the approach, how far the hand goes straight back."""
-_TURN = 2 * np.pi
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +69,7 @@ def plan_transfer(
     taken = transfer.take(start_rad)
     lifted_rad = taken[-1].movement.path.joints_rad[-1]
     failure = NoPathError(reason="unreachable", detail="no joints reach the release pose")
-    for joints_rad in nearest_solutions(problem.robot, release.T_base_tcp, lifted_rad, IkConfig()):
+    for joints_rad in nearest_solutions(problem.robot, release.T_base_tcp, lifted_rad):
         try:
             return (*taken, *transfer.put(lifted_rad, joints_rad))
         except NoPathError as error:
@@ -220,21 +216,3 @@ def _along_z(way_m: float) -> Pose:
 
 def _backwards(movement: Movement) -> Movement:
     return replace(movement, path=reversed_path(movement.path))
-
-
-def nearest_solutions(
-    robot: RobotModel, T_base_tcp: Pose, near_rad: Joints, config: IkConfig
-) -> list[Joints]:
-    """Joints that reach a pose, each turned as near as its limits let it, nearest first."""
-    inverse = UrInverse.for_robot(robot)
-    if inverse is not None:
-        raw, valid, _ = inverse.solve(T_base_tcp[None])
-        found = list(raw[0, valid[0]])
-    else:
-        found = [item.joints_rad for item in solutions(robot, T_base_tcp, config) if item.reached]
-    turned = []
-    for joints in found:
-        wanted = joints + _TURN * np.rint((near_rad - joints) / _TURN)
-        inside = (wanted >= robot.lower_rad) & (wanted <= robot.upper_rad)
-        turned.append(np.where(inside, wanted, joints))
-    return sorted(turned, key=lambda joints: float(np.abs(joints - near_rad).sum()))

@@ -10,11 +10,10 @@ import pinocchio as pin
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
-from twin.plan.arrays import Flags, Numbers, Points, Pose, Poses, Spheres, Vector
 from twin.plan.constrain.distances import scene_grid
 from twin.plan.path._motion import Motion
-from twin.plan.path.spheres import box_spheres, covering_spheres, excess_m
-from twin.plan.problem import Problem
+from twin.plan.path.spheres import covering_spheres, excess_m
+from twin.plan.problem import Flags, Numbers, Points, Pose, Poses, Problem, Spheres, Vector
 from twin.replay.clearance.bodies import SCENE, TABLE, names_of, placed_panels
 from twin.replay.clearance.bounding_spheres import (
     ARM_FINE_M,
@@ -287,7 +286,7 @@ def _add_bodies(
         size = problem.model(carried.object_id).size_m
         corners = box_corners(np.array(size))
         T = chain.T_last_tcp @ carried.T_tcp_object
-        spheres = box_spheres(tuple(size))
+        spheres = covering_spheres(corners)
         roots, cover = (0, 0), 0.0
         if lookup is not None:
             tree = bounding_spheres_of(corners)

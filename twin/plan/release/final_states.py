@@ -7,10 +7,9 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from twin.plan.arrays import Numbers, Pose, Poses
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import SHOWN, Constraint
-from twin.plan.problem import Array, Grasp, Miss, Problem, Release, State
+from twin.plan.problem import Array, Grasp, Miss, Numbers, Pose, Poses, Problem, Release, State
 from twin.plan.release.obstacles import allowed_with, hand_points, obstacles_of
 from twin.plan.release.resting import (
     NoFinalStateError,

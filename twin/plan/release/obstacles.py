@@ -8,9 +8,8 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from twin.plan.arrays import Numbers, Points, Poses
 from twin.plan.constrain.distances import Boxes, grid_clearance, lower_by_grid, scene_grid
-from twin.plan.problem import Problem
+from twin.plan.problem import Numbers, Points, Poses, Problem
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.static_obstacles import PanelBox

@@ -10,9 +10,8 @@ from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.task_file import ObjectModel
 from twin.errors import TwinError
-from twin.plan.arrays import Pose, RotationMatrix, Vector
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.problem import Grasp, Miss, Problem, Release
+from twin.plan.problem import Grasp, Miss, Pose, Problem, Release, RotationMatrix, Vector
 
 QUARTER_TURNS = 4
 _SAME_RAD = 0.02

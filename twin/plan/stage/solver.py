@@ -16,9 +16,8 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from bridge.geometry import se3
-from twin.plan.arrays import Numbers, Pose, Poses
 from twin.plan.constrain.constraint import Constraint
-from twin.plan.problem import Array, State
+from twin.plan.problem import Array, Numbers, Pose, Poses, State
 
 LENGTH_M = 0.01
 """Unit of lengths in the regulariser and in steps."""
