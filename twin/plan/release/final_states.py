@@ -19,14 +19,7 @@ from twin.plan.release.resting import (
     support_m,
     target_of,
 )
-from twin.plan.stage.solver import (
-    ANGLE_RAD,
-    CostTerm,
-    StageProblem,
-    StageState,
-    distinct,
-    solve,
-)
+from twin.plan.stage.solver import ANGLE_RAD, CostTerm, StageProblem, StageState, distinct, solve
 from twin.robot.collision import hulls_of
 
 NEAR_M = 0.02
