@@ -99,7 +99,7 @@ def _reaching(robot: RobotModel, T_base_tcp: Pose, near_rad: Joints | None = Non
         raw, valid, _ = inverse.solve(T_base_tcp[None])
         return np.asarray(raw[0, valid[0]])
     if near_rad is None:
-        found = solutions(robot, T_base_tcp, IkConfig())
+        found = list(solutions(robot, T_base_tcp, IkConfig()))
     else:
         found = [solve_ik(robot, T_base_tcp, IkConfig(), warm_start_rad=near_rad)]
     rows = [item.joints_rad for item in found if item.reached]
