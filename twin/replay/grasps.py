@@ -26,8 +26,9 @@ def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict
         contact = result.finger_contact[name][first:end]
         p_object_m = None
         if contact.any():
-            when = first + int(contact.argmax())
-            T_object_base = se3.invert(result.Ts_base_object[name][when])
+            T_object_base = se3.invert(
+                result.Ts_base_object[name][when := first + contact.argmax()]
+            )
             tool_m = se3.apply(T_object_base, result.Ts_base_tcp[when][None, :3, 3])[0]
             p_object_m = tool_m.round(6).tolist()
         seen.append(

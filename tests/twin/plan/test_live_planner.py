@@ -170,9 +170,7 @@ def test_policy_model_keeps_what_the_model_adds_and_the_same_request_has_the_sam
     assert len(server.asked) == 1
 
 
-def test_live_replies_that_are_refused_and_what_no_plan_keeps_have_a_reason(
-    tmp_path: Path,
-) -> None:
+def test_live_replies_that_are_refused_and_what_no_plan_keeps_have_a_reason(tmp_path: Path) -> None:
     class KeepsNothing(PlanProposer):
         def propose(self, problem: Problem, **more: Any) -> Any:
             if any(stage.get("path") for stage in problem.scene.task.stages):

@@ -98,8 +98,7 @@ def test_a_refused_release_keeps_the_grasp(problem: Problem) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "task",
-    ["stack_two_cubes", "push_cube_to_mark", "sloth_into_basket", "slippery_block_into_box"],
+    "task", ["stack_two_cubes", "push_cube_to_mark", "sloth_into_basket", "slippery_block_into_box"]
 )
 def test_every_kind_of_task_has_a_plan(task: str) -> None:
     problem = drawn(task, 5)

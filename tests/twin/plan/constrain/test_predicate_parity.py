@@ -19,18 +19,12 @@ BOUNDARY = 1e-9
 """Metres or radians within which rounding may decide."""
 
 PREDICATES: dict[str, tuple[dict[str, Any], State]] = {
-    "on": (
-        {"kind": "on", "object": "cube", "support": "brick", "margin_m": 0.004},
-        ON_BRICK,
-    ),
+    "on": ({"kind": "on", "object": "cube", "support": "brick", "margin_m": 0.004}, ON_BRICK),
     "on the table": (
         {"kind": "on", "object": "cube", "support": "table", "tolerance_m": 0.02},
         START,
     ),
-    "outside": (
-        {"kind": "outside", "object": "cube", "container": "box", "margin_m": 0.01},
-        OUT,
-    ),
+    "outside": ({"kind": "outside", "object": "cube", "container": "box", "margin_m": 0.01}, OUT),
     "beside": ({"kind": "beside", "object": "cube", "reference": "brick"}, BESIDE),
     "beside, left": (
         {
@@ -99,10 +93,7 @@ def test_relations_between_bodies(name: str, count: int) -> None:
 @pytest.mark.parametrize(
     ("spec", "start"),
     [
-        (
-            {"kind": "inside", "object": "cube", "container": "box", "margin_m": 0.01},
-            IN_BOX,
-        ),
+        ({"kind": "inside", "object": "cube", "container": "box", "margin_m": 0.01}, IN_BOX),
         (
             {"kind": "moved", "object": "cube", "at_least_m": 0.16, "direction": [0.3, 1.0, 0.0]},
             ON_BRICK,

@@ -262,10 +262,7 @@ def test_constraints_alone_say_where() -> None:
     }
     constraint = compile_constraint(record, problem)
     found = final_states(
-        problem,
-        from_above(),
-        goals=[constraint],
-        near=[upright(0.5, 0.05, 0.024)],
+        problem, from_above(), goals=[constraint], near=[upright(0.5, 0.05, 0.024)]
     )
     violations = constraint.violation(every_pose(found, problem))
     assert (violations <= 0).all()
