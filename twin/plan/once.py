@@ -22,6 +22,7 @@ from bridge.robots.robot import read_robot, robot_of
 from bridge.task.check import nearest
 from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.whole_file import write_whole
@@ -33,6 +34,7 @@ from twin.plan.loop.nominal import NOMINAL, PlanProposer
 from twin.plan.loop.propose import Attempt, NoPlanError, plan_and_verify
 from twin.plan.loop.steer import tried_in
 from twin.plan.loop.tau import goals_of
+from twin.plan.missed import missed_before
 from twin.plan.model_goals import Asked, ask_for_goals, client_of
 from twin.plan.problem import Pose, Problem, State
 from twin.plan.shapes import problem_of
@@ -272,8 +274,12 @@ class Planned:
 def plan_once(
     run: RunFolder, begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig
 ) -> Planned:
-    """Propose, have the twin judge, steer, until a plan is accepted; write each with its replay."""
-    attempts = _attempts(begun, judge, config)
+    """Propose, have the twin judge, steer, until a plan is accepted; write each with its replay.
+
+    The first is steered by the newest trial of the task, if that failed.
+    """
+    before = missed_before(run, begun.start.problem.scene.task, begun.understood.file.sha256)
+    attempts = _attempts(begun, judge, config, before)
     paths = [_kept(run, begun.start, each) for each in attempts]
     path = paths[-1] if attempts[-1].verdict.accepted is True else None
     return Planned(begun=begun, attempts=attempts, path=path)
@@ -322,7 +328,12 @@ def _kept(run: RunFolder, start: Start, attempt: Attempt) -> Path:
     return path
 
 
-def _attempts(begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig) -> list[Attempt]:
+def _attempts(
+    begun: Begun,
+    judge: Callable[[Plan], Verdict],
+    config: PlanConfig,
+    before: Sequence[Refusal],
+) -> list[Attempt]:
     policy, answer = NOMINAL, ""
     if begun.asked is not None:
         policy = MODEL_POLICY
@@ -336,6 +347,7 @@ def _attempts(begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig
         plan_id=f"{name}.{start}.{policy}{answer}.{config.seed}",
         seed=config.seed,
         rounds=config.rounds,
+        refused=before,
         task_sha256=begun.understood.file.sha256,
         grounding_source="" if begun.asked is None else begun.asked.answered_by,
     )

@@ -47,8 +47,7 @@ def _carries(result: ReplayResult, name: str, first: int, end: int) -> bool:
     """Whether a finger touches the object as the hand leaves; a grasp that misses carries none."""
     tool_m = result.Ts_base_tcp[first:end, :3, 3]
     left = np.linalg.norm(tool_m - tool_m[0], axis=1) > LEAVES_M
-    touched = result.finger_contact[name][first + int(left.argmax())]
-    return bool(left.any() and touched)
+    return bool(left.any() and result.finger_contact[name][first + int(left.argmax())])
 
 
 def _closed(
@@ -57,8 +56,7 @@ def _closed(
     """First step and the one after the last of each stretch with the gripper told to be closed."""
     told: Bool[np.ndarray, " num_waypoints"] = np.array([w.g == 1 for w in plan.tau])
     index = np.searchsorted(path.width_times_ns, stamps, side="right") - 1
-    closed = (index >= 0) & told[np.clip(index, 0, len(told) - 1)]
-    return runs_of_true(closed)
+    return runs_of_true((index >= 0) & told[np.clip(index, 0, len(told) - 1)])
 
 
 def _grasped(plan: Plan, t_ns: int) -> str | None:

@@ -123,6 +123,7 @@ def plan_and_verify(
     plan_id: str,
     seed: int,
     rounds: int,
+    refused: Sequence[Refusal] = (),
     task_sha256: str = "",
     grounding_source: str = "",
 ) -> list[Attempt]:
@@ -132,7 +133,6 @@ def plan_and_verify(
     left, or after so many rounds.
     """
     attempts: list[Attempt] = []
-    refused: list[Refusal] = []
     for round_ in range(rounds):
         try:
             candidate = choose(
@@ -162,5 +162,5 @@ def plan_and_verify(
         attempts.append(Attempt(candidate=candidate, verdict=verdict))
         if verdict.accepted is not False:
             break
-        refused.append(Refusal(plan=plan, verdict=verdict))
+        refused = (*refused, Refusal(plan=plan, verdict=verdict))
     return attempts

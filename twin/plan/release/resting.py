@@ -117,7 +117,7 @@ def orientations(
 ) -> list[RotationMatrix]:
     """Rotations in which an object may come to rest, the one nearest to now first."""
     found: list[RotationMatrix] = []
-    for S in _same(model):
+    for S in same_turns(model):
         R = R_now @ S
         heading = (
             np.arctan2(R[1, 0], R[0, 0])
@@ -133,7 +133,7 @@ def orientations(
     return sorted(found, key=lambda R: round(float(se3.rotation_angle_rad(R_now.T @ R)), 6))
 
 
-def _same(model: ObjectModel) -> Float[np.ndarray, "num 3 3"]:
+def same_turns(model: ObjectModel) -> Float[np.ndarray, "num 3 3"]:
     """Turns that nobody could tell: of a cube 24, of others none."""
     is_cube = model.symmetry == "cube"
     return (
