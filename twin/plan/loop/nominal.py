@@ -50,7 +50,7 @@ MOST_TRIED = 16
 """Pairs of grasp and final state of one object that a way is sought for."""
 _PLACED = ("inside", "on")
 """Relations that final states are found for without a place to begin at."""
-_HOPELESS = ("nowhere_said", "not_localised", "container_too_small")
+_HOPELESS = ("nowhere_said", "not_localised")
 _OF_GRASP = ("approach", "around", "lift")
 
 

@@ -71,7 +71,6 @@ def final_states(
     search = ReleaseSearch(problem, grasp, goals, wishes, miss or Miss())
     target = target_of(problem, grasp.object_id) if near is None else None
     if target is not None:
-        search.check_size(target)
         ways = resting_poses(
             problem, grasp, target, drop_m=DROP_M, most_tilted_rad=MOST_TOOL_TILT_RAD
         )[:NUM_WAYS]
@@ -107,21 +106,6 @@ class ReleaseSearch:
         self._hand_allowed = allowed_with(gripper.name, pairs, names)
         self._T_tcp_object = se3.invert(grasp.T_object_tcp)
         self._sigma_m = sideways_sigma_m(problem, grasp.object_id)
-
-    def check_size(self, target: Target) -> None:
-        """Refuse what is too large for the area in every direction."""
-        if target.relation != "inside":
-            return
-        extents = np.sort(np.ptp(self._points_m, axis=0))
-        room = np.sort(2 * np.array(target.half_m))
-        if extents[0] > room[0] or extents[1] > room[1]:
-            message = (
-                f"{self._grasp.object_id} ({extents[0] * 1e3:.0f} x {extents[1] * 1e3:.0f} mm at "
-                f"its narrowest) does not fit into {target.name} "
-                f"({room[0] * 1e3:.0f} x {room[1] * 1e3:.0f} mm inside). "
-                "Name a larger one."
-            )
-            raise NoFinalStateError(cause="container_too_small", message=message)
 
     def stage(self, T_rest: Pose, target: Target | None) -> StageProblem:
         """Write one way to rest as a stage problem.
