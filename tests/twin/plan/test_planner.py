@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from planned_start import HOME, problem_of_test
+from verdicts import verdict_of
 
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.task.plan import Plan
 from bridge.task.plan_request import Refusal
 from bridge.task.task_file import load_task
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Factor
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.loop.nominal import PlanProposer
 from twin.plan.loop.places import places_on_table
@@ -41,12 +42,7 @@ def chosen(problem: Problem, round_: int, refused: tuple[Refusal, ...] = ()) -> 
 
 
 def refusal(plan: Plan, **factors: Factor) -> Refusal:
-    said = {"ik": Factor(value=True), "clearance": Factor(value=True)} | factors
-    verdict = Verdict(
-        plan_id=plan.id, trajectory="planned", mode="dynamic", engine="test", seed=0,
-        **{"terminal": Factor(value=True), **said},
-    )  # fmt: skip
-    return Refusal(plan=plan, verdict=verdict)
+    return Refusal(plan=plan, verdict=verdict_of(plan.id, **factors))
 
 
 def test_the_twin_accepts_the_first_plan(problem: Problem) -> None:

@@ -103,39 +103,38 @@ def beside(T: Poses, side: tuple[float, float] | None = None) -> float:
     return max(found, turned * 0.01 / np.radians(10))
 
 
+LINE = np.linspace(-0.5, 0.5, 21)
+SHELL = np.array([p for p in product(LINE, repeat=3) if max(map(abs, p)) == 0.5])
+"""Dense points of the faces of a cube of size 1."""
+
+
+def least(points: np.ndarray, half: np.ndarray) -> float:
+    """Signed distance of points to a box around the origin, or of their places to a rectangle."""
+    away = np.abs(points) - half
+    outside = np.linalg.norm(np.maximum(away, 0), axis=1) + np.minimum(away.max(axis=1), 0)
+    return float(outside.min())
+
+
 def clear_of_box(T: Poses) -> float:
-    """Dense points of the cube against the box's floor and walls, and the other way round."""
+    """Points of the cube against the box's floor and walls, and the other way round."""
     walls = [((0, 0, WALL / 2), (*SIZE["box"][:2], WALL))]
     for axis, sign in product((0, 1), (-1, 1)):
-        size, place = [*SIZE["box"][:2], SIZE["box"][2]], [0.0, 0.0, SIZE["box"][2] / 2]
+        size, place = [*SIZE["box"]], [0.0, 0.0, SIZE["box"][2] / 2]
         size[axis], place[axis] = WALL, sign * (SIZE["box"][axis] - WALL) / 2
         walls.append((tuple(place), tuple(size)))
-    line = np.linspace(-0.5, 0.5, 21)
-    shell = np.array([p for p in product(line, repeat=3) if max(map(abs, p)) == 0.5])
-
-    def least(points: np.ndarray, half: np.ndarray) -> float:
-        away = np.abs(points) - half
-        outside = np.linalg.norm(np.maximum(away, 0), axis=1) + np.minimum(away.max(axis=1), 0)
-        return float(outside.min())
-
+    T_cube = np.linalg.inv(T["box"]) @ T["cube"]
+    cube = SHELL * 0.04 @ T_cube[:3, :3].T + T_cube[:3, 3]
     found = []
-    T_box_cube = np.linalg.inv(T["box"]) @ T["cube"]
-    surface = shell * 0.04 @ T_box_cube[:3, :3].T + T_box_cube[:3, 3]
     for place, size in walls:
-        found.append(least(surface - place, np.array(size) / 2))
-        there = shell * size + place
-        local = (there - T_box_cube[:3, 3]) @ T_box_cube[:3, :3]
-        found.append(least(local, np.full(3, 0.02)))
+        found.append(least(cube - place, np.array(size) / 2))
+        wall = (SHELL * size + place - T_cube[:3, 3]) @ T_cube[:3, :3]
+        found.append(least(wall, np.full(3, 0.02)))
     return 0.02 - min(found)
 
 
 def over_box(T: Poses) -> float:
-    line = np.linspace(-0.5, 0.5, 21)
-    shell = np.array([p for p in product(line, repeat=3) if max(map(abs, p)) == 0.5]) * 0.04
-    p = shell @ T["cube"][:3, :3].T + T["cube"][:3, 3]
-    away = np.abs(((p - T["box"][:3, 3]) @ T["box"][:3, :3])[:, :2]) - 0.081
-    outside = np.linalg.norm(np.maximum(away, 0), axis=1) + np.minimum(away.max(axis=1), 0)
-    return float(0.01 - outside.min())
+    p = SHELL * 0.04 @ T["cube"][:3, :3].T + T["cube"][:3, 3] - T["box"][:3, 3]
+    return 0.01 - least((p @ T["box"][:3, :3])[:, :2], np.full(2, 0.081))
 
 
 def tilt(R: np.ndarray, *, is_cube: bool) -> float:

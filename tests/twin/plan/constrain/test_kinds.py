@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from block_scene import EXAMPLES, IN_BOX, START, around, blocks, state
+from block_scene import EXAMPLES, START, around, blocks, state
 
 from bridge.errors import UsageError
-from twin.plan.constrain.constraint import Constraint, violated, worst_along
+from twin.plan.constrain.constraint import Constraint, worst_along
 from twin.plan.constrain.kinds import KINDS, compile_constraint
 from twin.plan.problem import State
 
@@ -61,33 +61,6 @@ def test_along_a_path_the_worst_step_counts(name: str) -> None:
     constraint, states = made(name), paths(6, 5)
     each = np.stack([constraint.violation(at_step(states, step)) for step in range(5)], axis=1)
     np.testing.assert_allclose(worst_along(constraint, states), each.max(axis=1), atol=1e-15)
-
-
-def test_contradicting_constraints_are_both_named_at_the_best_compromise() -> None:
-    above, height = (
-        {
-            "kind": "above",
-            "a": {"obj": "cube", "anchor": "bottom"},
-            "b": {"obj": "box", "anchor": "opening"},
-            "height": 0.02,
-            "tol": 0.01,
-            "xy_tol": 0.03,
-        },
-        {"kind": "height", "a": {"obj": "cube", "anchor": "bottom"}, "min": 0.5, "max": 0.6},
-    )
-    constraints = [compile_constraint(record, blocks()) for record in (above, height)]
-    heights = np.linspace(0.0, 0.8, 801)
-    cube = np.tile(IN_BOX.Ts_base_object["cube"][0], (801, 1, 1))
-    cube[:, 2, 3] = heights
-    states = State(
-        Ts_base_object=IN_BOX.Ts_base_object | {"cube": cube},
-        T_base_tcp=np.repeat(IN_BOX.T_base_tcp, 801, axis=0),
-        width_m=np.zeros(801),
-    )
-    cost = sum(np.square(np.maximum(c.violation(states), 0) / c.scale) for c in constraints)
-    best = cube[int(np.argmin(cost))]
-    told = violated(constraints, state(cube=best))
-    assert [text.split()[0] for text in told] == ["above", "height"]
 
 
 def test_what_was_not_localised_cannot_be_planned_with() -> None:

@@ -14,7 +14,7 @@ from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.problem import Grasp, Miss, Problem, Release, Shape, State
 from twin.plan.release.final_states import EPS_COL_M, final_states, perturbed
-from twin.plan.release.obstacles import hand_points, obstacles_of, spread_points
+from twin.plan.release.obstacles import hand_points, obstacles_of
 from twin.plan.release.resting import NoFinalStateError, lying_there, orientations, target_of
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.scene import ReplayScene
@@ -307,16 +307,6 @@ def test_the_hand_is_as_wide_as_it_opens() -> None:
     tips = opened[opened[:, 2] > -0.01]
     assert np.abs(tips[:, 1]).min() >= 0.039
     assert opened[:, 2].max() == pytest.approx(0.01, abs=0.003)  # tips reach past the tool frame
-
-
-def test_spread_points_leave_no_large_gap() -> None:
-    points = np.random.default_rng(4).uniform(-1, 1, (3000, 3))
-    chosen = spread_points(points, 200)
-    assert len(chosen) == 200
-    gaps = np.linalg.norm(points[:, None] - chosen[None], axis=2).min(axis=1)
-    apart = np.linalg.norm(chosen[:, None] - chosen[None], axis=2) + 9 * np.eye(200)
-    assert gaps.max() <= apart.min() + 1e-12
-    assert len(spread_points(np.ones((5, 3)), 10)) <= 1
 
 
 def model_of(symmetry: str) -> ObjectModel:
