@@ -109,22 +109,35 @@ def steer_by(refusals: Sequence[Refusal], problem: Problem) -> Steer:
         bodies=factor.bodies,
         object_id=object_id,
         toward_m=_touched_at(verdict, object_id) if change == "grasp_shift" else None,
-        miss=_miss_of(refusals[-1], object_id) if change == "release" else None,
+        miss=_miss_of(refusals, object_id) if change == "release" else None,
         lacking_m=lacking_m,
         refused=tuple(tried for refusal in refusals for tried in tried_in(refusal.plan)),
     )
 
 
-def _miss_of(refusal: Refusal, object_id: str | None) -> Miss | None:
+def _miss_of(refusals: Sequence[Refusal], object_id: str | None) -> Miss | None:
     """How far beside where it was let go an object lies in the end; None: it was not carried there.
 
-    Seen in the twin, or measured after an execution: a verdict keeps both alike.
+    Of the last two plans with the newest grasp, half way: an object may leave either finger last.
+    Seen in the twin, or measured after an execution; a verdict keeps both alike.
     """
-    tried = [each for each in tried_in(refusal.plan) if each.object_id == object_id][-1:]
-    T_meant = tried[0].T_base_object if tried else None
-    for item in refusal.verdict.grasps:
+    found: list[tuple[Pose, Miss | None]] = []
+    for refusal in refusals:
+        for tried in tried_in(refusal.plan):
+            if tried.object_id == object_id:
+                found.append((tried.T_object_tcp, _measured(tried, refusal.verdict)))
+    if not found or found[-1][1] is None:
+        return None
+    same = [miss for T, miss in found if miss is not None and alike(T, found[-1][0])][-2:]
+    shift_m = np.mean([miss.shift_m for miss in same], axis=0)
+    return Miss(shift_m=shift_m, turn_rad=float(np.mean([miss.turn_rad for miss in same])))
+
+
+def _measured(tried: Tried, verdict: Verdict) -> Miss | None:
+    T_meant = tried.T_base_object
+    for item in verdict.grasps:
         ended = item.get("T_base_object")
-        if T_meant is not None and item["object"] == object_id and item["held"] and ended:
+        if T_meant is not None and item["object"] == tried.object_id and item["held"] and ended:
             miss = Miss.measured(T_meant, se3.pose_from_record(ended))
             far_m = float(np.linalg.norm(miss.shift_m))
             if far_m < MOST_MISS_M and abs(miss.turn_rad) < MOST_MISS_RAD:
