@@ -1,7 +1,6 @@
 """Each kind of constraint against its definition in docs/planning.md, written out anew in NumPy.
 
-Ten states each, for a cube (4 cm), a brick, an open box and a post; half of the states are near
-where the kind holds, so that both answers come up.
+Ten states each, half of them near where the kind holds, so that both answers come up.
 """
 
 from collections.abc import Callable
