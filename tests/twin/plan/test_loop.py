@@ -108,7 +108,12 @@ def test_the_loop_ends_at_the_first_yes_or_unknown_or_when_rounds_are_used_up(
     def attempts(answers: list[bool | None], rounds: int = 5) -> list[bool | None]:
         left = iter(answers)
         made = plan_and_verify(
-            listed, problem, lambda plan: said(plan, next(left)), plan_id="p", seed=3, rounds=rounds
+            listed,
+            problem,
+            lambda plan: said(plan, next(left)),
+            plan_id="p",
+            seed=3,
+            rounds=rounds,
         )
         ids = [each.candidate.plan.id for each in made]
         assert [each.candidate.plan.parent_id for each in made] == [None, *ids[:-1]]

@@ -16,7 +16,6 @@ from twin.plan.constrain.constraint import SHOWN, Constraint, flattened, violate
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
-from twin.plan.loop.places import places_on_table
 from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
 from twin.plan.loop.push import push_choices, pushed
 from twin.plan.loop.steer import Steer
@@ -33,7 +32,7 @@ from twin.plan.loop.tau import (
 from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, NoPathError, PathConfig, plan_move
 from twin.plan.path.transfer import LIFT_M, Leg, plan_transfer
 from twin.plan.problem import Grasp, Joints, Miss, Pose, Problem, Release, State, Vector
-from twin.plan.release.final_states import MAX_RELEASES, final_states
+from twin.plan.release.final_states import MAX_RELEASES, final_states, places_on_table
 from twin.plan.release.resting import NoFinalStateError, lying_there
 from twin.replay.clearance.bodies import SCENE
 

@@ -7,12 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
+from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from twin.plan.constrain.distances import scene_grid
 from twin.plan.path._motion import Motion
-from twin.plan.path.spheres import covering_spheres, excess_m
 from twin.plan.problem import Flags, Numbers, Points, Pose, Poses, Problem, Spheres, Vector
 from twin.replay.clearance.bodies import SCENE, TABLE, names_of, placed_panels
 from twin.replay.clearance.bounding_spheres import (
@@ -30,6 +30,12 @@ from twin.robot.model import RobotModel
 SPARE_M = 0.0003
 """A path keeps this much more than was asked: what the search may overlook is less."""
 BOX, PLANE, GRID, BODY = range(4)
+
+SPHERES = 16
+"""For each hull of a link or box that is carried."""
+_GROWN = 1 + 1e-9
+"""So that rounding leaves no corner outside."""
+_PROBES = 64
 
 Names = tuple[str, str]
 
@@ -90,6 +96,33 @@ def chain_of(hulls: RobotHulls, width_m: float) -> Chain:
         joint_of=tuple(joint_of),
         Ts_joint_hull=np.stack(Ts),
     )
+
+
+def covering_spheres(corners_m: Points, count: int = SPHERES) -> Spheres:
+    """Cover a convex hull: the box along its axes, its longest cells halved, a sphere for each."""
+    middle = corners_m.mean(axis=0)
+    axes = np.linalg.svd(corners_m - middle, full_matrices=True)[2]
+    along = (corners_m - middle) @ axes.T
+    low, extents = along.min(axis=0), np.ptp(along, axis=0)
+    cells = np.ones(3, dtype=np.int64)
+    while 2 * cells.prod() <= count:
+        cells[int(np.argmax(extents / cells))] *= 2
+    size = extents / cells
+    numbers = np.stack(np.meshgrid(*map(np.arange, cells), indexing="ij"), axis=-1).reshape(-1, 3)
+    centres = middle + (low + (numbers + 0.5) * size) @ axes
+    radius = np.full((len(centres), 1), np.linalg.norm(size) / 2 * _GROWN)
+    return np.concatenate([centres, radius], axis=1)
+
+
+def excess_m(corners_m: Points, spheres_m: Spheres) -> float:
+    """How far spheres stand out of the hull of points at most [m], looked at in some directions."""
+    equations = ConvexHull(corners_m).equations
+    normals, offsets = equations[:, :3], equations[:, 3]
+    turns = np.random.default_rng(0).normal(size=(_PROBES, 3))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    tips = spheres_m[:, None, :3] + spheres_m[:, 3, None, None] * turns
+    outside = (tips.reshape(-1, 3) @ normals.T + offsets).max(axis=1)
+    return float(max(0.0, outside.max()))
 
 
 @lru_cache(maxsize=4)

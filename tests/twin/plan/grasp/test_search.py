@@ -103,7 +103,9 @@ def test_there_are_many_grasps_and_none_is_wider_than_the_hand(name: str, key: s
     assert set(found.rejected) <= set(CAUSES)
 
 
-def test_the_arm_is_where_its_joints_put_the_hand(cube_search: tuple[Problem, GraspSearch]) -> None:
+def test_the_arm_is_where_its_joints_put_the_hand(
+    cube_search: tuple[Problem, GraspSearch],
+) -> None:
     given, search = cube_search
     for grasp in search.grasps:
         T = given.scene.Ts_base_object["cube"] @ grasp.T_object_tcp

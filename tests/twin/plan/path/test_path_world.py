@@ -11,8 +11,7 @@ from twin.plan.path._motion import Motion
 
 from bridge.robots.robot import read_robot
 from bridge.task.plan import Plan
-from twin.plan.path.spheres import covering_spheres
-from twin.plan.path.world import BOX, Carried, build_world
+from twin.plan.path.world import BOX, Carried, build_world, covering_spheres
 from twin.plan.problem import Problem
 from twin.replay.clearance.bodies import SCENE
 from twin.replay.clearance.monitor import ClearanceMonitor
