@@ -4,11 +4,11 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.episode import streams
 from bridge.episode.metadata import Derived
@@ -22,6 +22,7 @@ from bridge.robots.robot import read_robot, robot_of
 from bridge.task.check import nearest
 from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.whole_file import write_whole
@@ -31,8 +32,11 @@ from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.ground.run_tasks import UnderstoodTask, names_task, shown_task_file, understand
 from twin.plan.loop.nominal import NOMINAL, PlanProposer
 from twin.plan.loop.propose import Attempt, NoPlanError, plan_and_verify
+from twin.plan.loop.steer import tried_in
+from twin.plan.loop.tau import goals_of
+from twin.plan.missed import missed_before
 from twin.plan.model_goals import Asked, ask_for_goals, client_of
-from twin.plan.problem import Problem, State
+from twin.plan.problem import Pose, Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
 from twin.replay.config import ReplayConfig
@@ -128,11 +132,7 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
 
 
 def _start(
-    run: RunFolder,
-    episode: Episode,
-    task: Task,
-    found: Mapping[str, LocalisedObject],
-    robot: str,
+    run: RunFolder, episode: Episode, task: Task, found: Mapping[str, LocalisedObject], robot: str
 ) -> Start:
     urdf = streams.robot_description(episode)
     if robot:
@@ -274,8 +274,12 @@ class Planned:
 def plan_once(
     run: RunFolder, begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig
 ) -> Planned:
-    """Propose, have the twin judge, steer, until a plan is accepted; write each with its replay."""
-    attempts = _attempts(begun, judge, config)
+    """Propose, have the twin judge, steer, until a plan is accepted; write each with its replay.
+
+    The first is steered by the newest trial of the task, if that failed.
+    """
+    before = missed_before(run, begun.start.problem.scene.task, begun.understood.file.sha256)
+    attempts = _attempts(begun, judge, config, before)
     paths = [_kept(run, begun.start, each) for each in attempts]
     path = paths[-1] if attempts[-1].verdict.accepted is True else None
     return Planned(begun=begun, attempts=attempts, path=path)
@@ -324,7 +328,12 @@ def _kept(run: RunFolder, start: Start, attempt: Attempt) -> Path:
     return path
 
 
-def _attempts(begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig) -> list[Attempt]:
+def _attempts(
+    begun: Begun,
+    judge: Callable[[Plan], Verdict],
+    config: PlanConfig,
+    before: Sequence[Refusal],
+) -> list[Attempt]:
     policy, answer = NOMINAL, ""
     if begun.asked is not None:
         policy = MODEL_POLICY
@@ -338,6 +347,7 @@ def _attempts(begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig
         plan_id=f"{name}.{start}.{policy}{answer}.{config.seed}",
         seed=config.seed,
         rounds=config.rounds,
+        refused=before,
         task_sha256=begun.understood.file.sha256,
         grounding_source="" if begun.asked is None else begun.asked.answered_by,
     )
@@ -359,33 +369,42 @@ def _attempt_line(attempt: Attempt) -> str:
 
 
 def _explained(problem: Problem, plan: Plan, stage: Stage) -> list[str]:
-    """A stage with its constraints, now and where the plan leaves it."""
+    """A stage with its constraints: now, and at the instant that each of them speaks of."""
     told = [f"  {stage.id}: {stage.text}"]
-    for record in (*stage.subgoal, *stage.path):
+    goals = goals_of(problem.scene.task, str(stage.release or stage.push))
+    then = "as the hand closes" if stage.grasp else "as the hand opens" if stage.release else "then"
+    for number, record in enumerate((*stage.subgoal, *stage.path)):
         try:
             constraint = compile_constraint(record, problem)
         except (UsageError, TwinError) as error:
             told.append(f"    {record.get('kind')}: {error}")
             continue
-        told.append(f"    now:  {constraint.explain(_state(problem, plan, None))}")
-        told.append(f"    then: {constraint.explain(_state(problem, plan, stage))}")
+        if number >= len(stage.subgoal):
+            told.append(f"    kept on the way: {constraint.wanted}")
+            continue
+        at_rest = number < len(goals)
+        start = State.single(problem.scene.Ts_base_object, _tool(plan.tau[0]), 0.0)
+        told.append(f"    now: {constraint.explain(start)}")
+        state = _state(problem, plan, stage, at_rest=at_rest)
+        told.append(f"    {'at rest' if at_rest else then}: {constraint.explain(state)}")
     return told
 
 
-def _state(problem: Problem, plan: Plan, stage: Stage | None) -> State:
-    """The start, or what a plan predicts of the end of a stage."""
-    Ts: dict[str, Float[np.ndarray, "4 4"]] = dict(problem.scene.Ts_base_object)
-    at = plan.tau[0]
-    if stage is not None:
-        at = [w for w in plan.tau if w.t_ns <= stage.t_end_ns][-1]
-        for each in plan.stages[: plan.stages.index(stage) + 1]:
-            Ts |= {key: se3.pose_from_record(T) for key, T in each.predicted_objects.items()}
-            closed = [w for w in plan.tau if w.t_ns >= each.t_start_ns and w.g == 1]
-            if each.grasp is not None and closed:  # from here on it moves with the tool
-                T_tcp_object = se3.invert(_tool(closed[0])) @ Ts[each.grasp]
-                Ts[each.grasp] = _tool(at) @ T_tcp_object
+def _state(problem: Problem, plan: Plan, stage: Stage, *, at_rest: bool) -> State:
+    """What a plan predicts where the hand turns in a stage, else of its end; or at rest."""
+    Ts: dict[str, Pose] = dict(problem.scene.Ts_base_object)
+    until = plan.stages[: plan.stages.index(stage) + 1]
+    for each in until if at_rest else until[:-1]:
+        Ts |= {key: se3.pose_from_record(T) for key, T in each.predicted_objects.items()}
+    inside = [w for w in plan.tau if stage.t_start_ns <= w.t_ns <= stage.t_end_ns]
+    turned = [now for before, now in pairwise(inside) if before.g != now.g]
+    at = [*inside, *turned][-1]
+    held = [each.grasp for each in until if each.grasp is not None][-1:]
+    for tried in tried_in(plan):
+        if tried.object_id in held and not at_rest:  # it moves with the tool
+            Ts[tried.object_id] = _tool(at) @ se3.invert(tried.T_object_tcp)
     return State.single(Ts, _tool(at), at.width_m or 0.0)
 
 
-def _tool(at: Waypoint) -> Float[np.ndarray, "4 4"]:
+def _tool(at: Waypoint) -> Pose:
     return se3.transform_from(np.array(at.q_wxyz), np.array(at.p_m))

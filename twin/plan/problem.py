@@ -9,12 +9,27 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
 
+Pose = Float[np.ndarray, "4 4"]
+Poses = Float[np.ndarray, "_ 4 4"]
+RotationMatrix = Float[np.ndarray, "3 3"]
+Covariance = Float[np.ndarray, "6 6"]
+"""Of a pose: x, y, z [m] and rotation about them [rad], base frame."""
+Joints = Float[np.ndarray, " num_joints"]
+Postures = Float[np.ndarray, "_ num_joints"]
+Vector = Float[np.ndarray, "3"]
+Points = Float[np.ndarray, "_ 3"]
+Spheres = Float[np.ndarray, "_ 4"]
+"""Centre and radius [m]."""
+Numbers = Float[np.ndarray, " _"]
+Flags = Bool[np.ndarray, " _"]
+Ids = Int[np.ndarray, " _"]
 Array = Any
 """``np.ndarray``, or a number for all states."""
 
@@ -23,7 +38,7 @@ Array = Any
 class Shape:
     """The surface of one object, in its own frame."""
 
-    vertices_m: Float[np.ndarray, "num_vertices 3"]
+    vertices_m: Points
     triangles: Int[np.ndarray, "num_triangles 3"]
     """Counter-clockwise seen from outside."""
     source: str
@@ -72,11 +87,7 @@ class State:
     """``(num_states,)``, between the finger pads."""
 
     @staticmethod
-    def single(
-        Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
-        T_base_tcp: Float[np.ndarray, "4 4"],
-        width_m: float,
-    ) -> "State":
+    def single(Ts_base_object: Mapping[str, Pose], T_base_tcp: Pose, width_m: float) -> "State":
         """A batch of one."""
         return State(
             Ts_base_object={name: T[None] for name, T in Ts_base_object.items()},
@@ -90,7 +101,7 @@ class Grasp:
     """One way to take hold of an object."""
 
     object_id: str
-    T_object_tcp: Float[np.ndarray, "4 4"]
+    T_object_tcp: Pose
     """Tool at the grasp instant, in the object's frame (errata: Eq. 9)."""
     width_m: float
     """Distance between the two surfaces it closes on."""
@@ -98,10 +109,50 @@ class Grasp:
     """Opening of the hand on its way there."""
     margin: float
     """How many standard deviations of the object's pose it bears; greater is better."""
-    joints_rad: Float[np.ndarray, " num_joints"]
+    joints_rad: Joints
     """Arm at the grasp, from the base's side."""
     pregrasp_m: float
     """Length of the straight approach along the tool's z axis."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Miss:
+    """How far an object came to lie from straight below where it was let go.
+
+    The pads shift and turn it as they close. It moves with the object's frame, for the same grasp
+    does the same elsewhere.
+    """
+
+    shift_m: Vector = field(default_factory=lambda: np.zeros(3))
+    """In the object's frame."""
+    turn_rad: float = 0.0
+    """About the vertical."""
+
+    @staticmethod
+    def measured(T_meant: Pose, T_found: Pose) -> "Miss":
+        """What lies between two poses ``T_base_object``, seen from above."""
+        way = (T_found[:3, 3] - T_meant[:3, 3]) * (1.0, 1.0, 0.0)
+        R = T_found[:3, :3] @ T_meant[:3, :3].T
+        turn_rad = float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
+        return Miss(shift_m=T_meant[:3, :3].T @ way, turn_rad=turn_rad)
+
+    def applied(self, Ts: Poses) -> Poses:
+        """Where objects meant to be here come to lie, their height left as it is."""
+        found = Ts.copy()
+        found[:, :2, 3] += (Ts[:, :3, :3] @ self.shift_m)[:, :2]
+        found[:, :3, :3] = _about_z(self.turn_rad) @ Ts[:, :3, :3]
+        return found
+
+    def undone(self, T: Pose) -> Pose:
+        """The pose from which an object comes to lie here."""
+        found = T.copy()
+        found[:3, :3] = _about_z(-self.turn_rad) @ T[:3, :3]
+        found[:2, 3] -= (found[:3, :3] @ self.shift_m)[:2]
+        return found
+
+
+def _about_z(angle_rad: float) -> RotationMatrix:
+    return se3.rotation_from_vector(np.array([0.0, 0.0, angle_rad]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,8 +160,8 @@ class Release:
     """One final state of a carried object (Eq. 8 and 9)."""
 
     object_id: str
-    T_base_object: Float[np.ndarray, "4 4"]
-    T_base_tcp: Float[np.ndarray, "4 4"]
+    T_base_object: Pose
+    T_base_tcp: Pose
     """Tool at the release: ``T_base_object @ T_object_tcp`` of the grasp."""
     clearance_m: float
     """Least signed distance of the object's points to what stands still, allowed pairs left out."""
@@ -122,7 +173,7 @@ class Release:
 class TimedPath:
     """One collision-free movement with its times."""
 
-    times_s: Float[np.ndarray, " num_points"]
-    joints_rad: Float[np.ndarray, "num_points num_joints"]
+    times_s: Numbers
+    joints_rad: Postures
     work: Mapping[str, float] = field(default_factory=dict)
     """Counted steps: nodes, checks, halvings; never seconds."""

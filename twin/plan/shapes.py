@@ -6,11 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.episode.run_folder import RunFolder
 from bridge.task.task_file import SCANNED, ObjectModel, Task
-from twin.plan.problem import Problem, Shape
+from twin.plan.problem import Covariance, Joints, Pose, Problem, Shape, Vector
 from twin.replay.rebuilt_scene import MOST_OFF, read_rebuilt_scene
 from twin.robot.model import load_robot
 from twin.scene.shape.files import MESH, TASK_SHAPE
@@ -27,9 +26,9 @@ def problem_of(
     run: RunFolder,
     task: Task,
     urdf: str,
-    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
-    covariances: Mapping[str, Float[np.ndarray, "6 6"]],
-    start_rad: Float[np.ndarray, " num_joints"] | None,
+    Ts_base_object: Mapping[str, Pose],
+    covariances: Mapping[str, Covariance],
+    start_rad: Joints | None,
 ) -> Problem:
     """Put together what the planner knows when it plans; no joints where nobody knows them."""
     scene = read_rebuilt_scene(run, task).scene(task, urdf, Ts_base_object, covariances=covariances)
@@ -85,7 +84,7 @@ def _shape_of(folder: Path | None, model: ObjectModel) -> Shape:
     )
 
 
-def _extents(model: ObjectModel) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def _extents(model: ObjectModel) -> tuple[Vector, Vector]:
     """Lowest and highest corner of an object in its frame."""
     half = np.array(model.size_m) / 2
     middle = np.array([0.0, 0.0, 0.0 if model.origin_at_centre else half[2]])

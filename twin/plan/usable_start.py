@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
@@ -11,9 +10,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import JOINT_STATES
 from bridge.errors import BridgeError
 from bridge.robots.robot import Robot
-from bridge.task.check import TABLE
 from twin.plan.loop.propose import NoPlanError
-from twin.plan.problem import Problem
+from twin.plan.problem import Joints, Problem
 from twin.replay.rebuilt_scene import scene_of_other_robot
 from twin.replay.run_job import START_KNOWN_NS, recorded_start
 
@@ -44,12 +42,11 @@ def refuse_unusable(problem: Problem) -> None:
                 f"{MOST_UNCERTAIN_M * 1e3:.0f} mm are good enough",
                 "Localise it again, nearer or with more frames.",
             )
-    _refuse_far(problem)
 
 
 def start_posture(
     episode: Episode, stamp_ns: int, joints: Sequence[str]
-) -> tuple[Float[np.ndarray, " num_joints"] | None, str]:
+) -> tuple[Joints | None, str]:
     """Where the arm was recorded to stand at the start [rad], or why nobody knows."""
     found = recorded_start(episode, stamp_ns, joints)
     if found is not None:
@@ -103,50 +100,3 @@ def _refuse_posture(problem: Problem) -> None:
             f"beyond its limits of {robot.lower_rad[joint]:.2f} to {robot.upper_rad[joint]:.2f}",
             f"Move it back. {_AGAIN}",
         )
-
-
-def _refuse_far(problem: Problem) -> None:
-    """Refuse what is moved, what it is put into or onto, and marks, where the arm cannot be."""
-    scene, task = problem.scene, problem.scene.task
-    goals = (task.goal_of(key) for key in task.manipulated)
-    targets = [goal[1] for goal in goals if goal is not None and goal[1] != TABLE]
-    for name in dict.fromkeys([*task.manipulated, *targets]):
-        T = scene.Ts_base_object.get(name)
-        if T is not None:
-            _refuse_far_place(problem, name, name, T[:3, 3], f"Move it nearer. {_AGAIN}")
-    for name in task.manipulated:
-        mark = task.mark_of(name)
-        if mark is not None:
-            p = np.array([*mark, scene.table_height_m])
-            hint = f"Give task {task.name} another target_m."
-            _refuse_far_place(problem, f"the mark of {name}", name, p, hint)
-
-
-def _refuse_far_place(
-    problem: Problem, what: str, name: str, p_m: Float[np.ndarray, "3"], hint: str
-) -> None:
-    """Beyond what the links laid out straight reach, with the object's own size to spare."""
-    p_shoulder, length_m = _outer_reach(problem)
-    away_m = float(np.linalg.norm(p_m - p_shoulder))
-    if away_m - float(np.linalg.norm(problem.model(name).size_m)) > length_m:
-        x, y, z = p_m * 1e3
-        _refuse(
-            f"{what} at ({x:.0f}, {y:.0f}, {z:.0f}) mm is out of reach: {away_m:.2f} m from the "
-            f"first joint of {problem.robot.record.name}, which reaches {length_m:.2f} m",
-            hint,
-        )
-
-
-def _outer_reach(problem: Problem) -> tuple[Float[np.ndarray, "3"], float]:
-    """Where the arm's first joint is in the base frame, and the lengths of the links behind it [m].
-
-    The placements of the joints and the tool in the robot description, one behind the other.
-    """
-    model, tool = problem.robot.model, problem.robot.tcp_id
-    frame = model.frames[tool]
-    length = float(np.linalg.norm(frame.placement.translation))
-    joint = int(frame.parentJoint)
-    while int(model.parents[joint]):
-        length += float(np.linalg.norm(model.jointPlacements[joint].translation))
-        joint = int(model.parents[joint])
-    return np.array(model.jointPlacements[joint].translation), length

@@ -26,8 +26,9 @@ def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict
         contact = result.finger_contact[name][first:end]
         p_object_m = None
         if contact.any():
-            when = first + int(contact.argmax())
-            T_object_base = se3.invert(result.Ts_base_object[name][when])
+            T_object_base = se3.invert(
+                result.Ts_base_object[name][when := first + contact.argmax()]
+            )
             tool_m = se3.apply(T_object_base, result.Ts_base_tcp[when][None, :3, 3])[0]
             p_object_m = tool_m.round(6).tolist()
         seen.append(
@@ -36,6 +37,7 @@ def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict
                 "touched": bool(contact.any()),
                 "held": name in held,
                 "p_object_m": p_object_m,
+                "T_base_object": se3.pose_record(result.Ts_base_object[name][-1]),
             }
         )
     return tuple(seen)
@@ -45,8 +47,7 @@ def _carries(result: ReplayResult, name: str, first: int, end: int) -> bool:
     """Whether a finger touches the object as the hand leaves; a grasp that misses carries none."""
     tool_m = result.Ts_base_tcp[first:end, :3, 3]
     left = np.linalg.norm(tool_m - tool_m[0], axis=1) > LEAVES_M
-    touched = result.finger_contact[name][first + int(left.argmax())]
-    return bool(left.any() and touched)
+    return bool(left.any() and result.finger_contact[name][first + int(left.argmax())])
 
 
 def _closed(
@@ -55,8 +56,7 @@ def _closed(
     """First step and the one after the last of each stretch with the gripper told to be closed."""
     told: Bool[np.ndarray, " num_waypoints"] = np.array([w.g == 1 for w in plan.tau])
     index = np.searchsorted(path.width_times_ns, stamps, side="right") - 1
-    closed = (index >= 0) & told[np.clip(index, 0, len(told) - 1)]
-    return runs_of_true(closed)
+    return runs_of_true((index >= 0) & told[np.clip(index, 0, len(told) - 1)])
 
 
 def _grasped(plan: Plan, t_ns: int) -> str | None:

@@ -13,6 +13,7 @@ from hostile_replies import INSIDE
 from loopback import free_endpoint
 from scripted_plans import scene_of_test
 from test_model_client import Server, says, serving
+from verdicts import verdict_of
 
 import robot_gst
 from bridge.episode.run_folder import RunFolder
@@ -23,7 +24,7 @@ from bridge.robots.robot import read_robot
 from bridge.sources.standin.decisions import WirePlanner
 from bridge.task.find import chosen_task_file
 from bridge.task.plan_request import PlanRequest, Refusal
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Factor
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
@@ -87,16 +88,8 @@ def test_it_remembers_nothing(planner: LivePlanner) -> None:
     """Asked in any order, the same request has the same answer to the byte."""
     first = planner.answer(request().to_json())
     assert first.plan is not None
-    no = Verdict(
-        plan_id=first.plan.id,
-        trajectory="planned",
-        mode="dynamic",
-        ik=Factor(value=True),
-        clearance=Factor(value=True),
-        terminal=Factor(value=False, cause="exploded", bodies=("cube",)),
-        engine="test",
-        seed=0,
-    )
+    exploded = Factor(value=False, cause="exploded", bodies=("cube",))
+    no = verdict_of(first.plan.id, terminal=exploded)
     steered = request(round=1, refused=(Refusal(plan=first.plan, verdict=no),)).to_json()
     second = planner.answer(steered)
     assert second.plan is not None
@@ -170,9 +163,7 @@ def test_policy_model_keeps_what_the_model_adds_and_the_same_request_has_the_sam
     assert len(server.asked) == 1
 
 
-def test_live_replies_that_are_refused_and_what_no_plan_keeps_have_a_reason(
-    tmp_path: Path,
-) -> None:
+def test_live_replies_that_are_refused_and_what_no_plan_keeps_have_a_reason(tmp_path: Path) -> None:
     class KeepsNothing(PlanProposer):
         def propose(self, problem: Problem, **more: Any) -> Any:
             if any(stage.get("path") for stage in problem.scene.task.stages):

@@ -102,6 +102,7 @@ def test_the_view_shows_the_replay_of_a_plan(
 def test_where_plans_begin_is_said(steered: tuple[RunFolder, Planned]) -> None:
     _, done = steered
     assert "  arm: as recorded" in done.lines()
+    assert any(line.startswith("    at rest: inside holds") for line in done.explained())
     assert done.to_json()["start"]["arm"] == "as recorded"
     start = replace(done.begun.start, from_home="no joint states were recorded")
     home = replace(done, begun=replace(done.begun, start=start))

@@ -4,17 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planned_start import problem_of_test
 from scripted_plans import pick_and_place, scene_of_test
 from verdicts import verdict_of
 
 from bridge.geometry import se3
 from bridge.task.plan_request import Refusal
-from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
-from twin.plan.loop.steer import steer_by, tried_in
+from twin.plan.loop.steer import Steer, steer_by, tried_in
 
-TASK = load_task("cube_into_box")
-FINGERS = ("gripper", "gripper_left_finger")
+PROBLEM = problem_of_test()
 YES = Factor(value=True)
 
 
@@ -56,8 +55,8 @@ SLID = grasp(touched=True, held=False)
         (verdict("terminal", "allowed_contacts", "cube"), "path", "cube"),
         (verdict("ik", "unreachable"), "grasp", None),
         (verdict("ik", "self_collision", "forearm_link", "wrist_3_link"), "grasp", None),
-        (verdict("ik", "joint_speed"), "path", None),
-        (verdict("limits", "tool_speed"), "path", None),
+        (verdict("ik", "joint_speed"), "slower", None),
+        (verdict("limits", "tool_speed"), "slower", None),
         (verdict("start", "start_elsewhere", "elbow_joint"), "any", None),
     ],
 )
@@ -65,7 +64,7 @@ def test_the_failing_clause_chooses_the_change(
     refusal: Verdict, change: str, object_id: str | None
 ) -> None:
     plan = pick_and_place(scene_of_test())
-    steer = steer_by([Refusal(plan=plan, verdict=refusal)], TASK, FINGERS)
+    steer = steer_by([Refusal(plan=plan, verdict=refusal)], PROBLEM)
     assert (steer.change, steer.object_id) == (change, object_id)
     name = refusal.first_failing
     assert name is not None
@@ -97,7 +96,7 @@ def test_grasps_within_a_centimetre_and_ten_degrees_are_one(
     entities = {name: se3.pose_record(T) for name, T in scene.Ts_base_object.items()}
     plan = replace(pick_and_place(scene), entities=entities)
     no = verdict("terminal", "exploded", "cube")
-    steer = steer_by([Refusal(plan=plan, verdict=no)], TASK, FINGERS)
+    steer = steer_by([Refusal(plan=plan, verdict=no)], PROBLEM)
     T = tried_in(plan)[0].T_object_tcp.copy()
     half = np.radians(turn_deg) / 2
     R = se3.rotation_from_quaternion(np.array([np.cos(half), 0, 0, np.sin(half)]))
@@ -105,3 +104,33 @@ def test_grasps_within_a_centimetre_and_ten_degrees_are_one(
     T[0, 3] += shift_m
     assert steer.has_grasp_like("cube", T) is same
     assert steer.has_grasp_like("box", T) is False
+
+
+def test_the_measured_miss_is_what_brings_an_object_from_where_it_was_let_go_to_its_end() -> None:
+    """By 3 mm along the object's x and 20 degrees; the fall does not count, only as it was held."""
+    scene = scene_of_test()
+    entities = {name: se3.pose_record(T) for name, T in scene.Ts_base_object.items()}
+    plan = replace(pick_and_place(scene), entities=entities)
+    (tried,) = tried_in(plan)
+    T_meant = tried.T_base_object
+    assert T_meant is not None
+    half = np.radians(20.0) / 2
+    T_ended = T_meant @ se3.transform_from(
+        np.array([np.cos(half), 0, 0, np.sin(half)]), np.array([0.003, 0.0, 0.0])
+    )
+    T_ended[2, 3] -= 0.1
+
+    def steered(T: np.ndarray, *, held: bool = True) -> Steer:
+        seen = {**grasp(touched=True, held=held)[0], "T_base_object": se3.pose_record(T)}
+        no = verdict("terminal", "inside", "cube", "box", grasps=(seen,))
+        return steer_by([Refusal(plan=plan, verdict=no)], PROBLEM)
+
+    miss = steered(T_ended).miss
+    assert miss is not None
+    np.testing.assert_allclose(miss.shift_m, [0.003, 0.0, 0.0], atol=1e-9)
+    assert miss.turn_rad == pytest.approx(np.radians(20.0))
+    mended = miss.applied(miss.undone(T_meant)[None])[0]
+    np.testing.assert_allclose(mended, T_meant, atol=1e-12)
+    T_ended[0, 3] += 0.1
+    assert steered(T_ended).miss is None, "it fell elsewhere"
+    assert steered(T_meant, held=False).miss is None

@@ -46,14 +46,6 @@ def placed(name: str, *p_m: float, scale: float = 1.0) -> Change:
     return change
 
 
-def marked(x_m: float, y_m: float) -> Change:
-    def change(problem: Problem) -> Problem:
-        mark = {"kind": "moved", "object": "cube", "target_m": [x_m, y_m], "tolerance_m": 0.02}
-        return scene_with(task=replace(problem.scene.task, success=(mark,)))(problem)
-
-    return change
-
-
 def sized(name: str, x_m: float, y_m: float, z_m: float) -> Change:
     def change(problem: Problem) -> Problem:
         task = problem.scene.task
@@ -75,15 +67,14 @@ def problem() -> Problem:
         (placed("cube", np.nan, 0, 0.02), "pose of cube is not made of numbers", "Localise"),
         (placed("box", 0.5, np.inf, 0.0), "pose of box is not made of numbers", "Localise"),
         (placed("cube", 0.5, 0, 0.02, scale=2.0), "pose of cube has a rotation", "Localise"),
-        (placed("cube", 2.0, 0, 0.02), r"cube at \(2000, 0, 20\) mm is out of reach", "nearer"),
-        (placed("box", 0.5, 2.5, 0.0), r"box at \(500, 2500, 0\) mm is out of reach", "nearer"),
-        (marked(3.0, 0.0), r"the mark of cube at \(3000, 0, 0\) mm is out of reach", "target_m"),
+        (placed("cube", 2.0, 0, 0.02), "the arm reaches no grasp", "nearer"),
+        (placed("box", 0.5, 2.5, 0.0), "no joints reach the release pose", "nearer"),
         (scene_with(start_rad=HOME * np.nan), "joints at the start are not", "Record"),
         (scene_with(start_rad=HOME[:4]), "gives 4 joints, and ur5", "--robot"),
         (scene_with(start_rad=HOME + 20), "rad, beyond its limits", "Move it back"),
         (scene_with(covariances={"box": SURE * np.nan}), "covariance of box", "Localise"),
         (scene_with(covariances={"box": SURE * 900}), "box is known to 30 mm", "Localise"),
-        (sized("box", 0.05, 0.05, 0.056), r"does not fit into box \(38 x 38 mm", "larger"),
+        (sized("box", 0.05, 0.05, 0.056), "cube within box: by", "Clear"),
         (sized("cube", 0.2, 0.2, 0.2), "wider than the hand opens", "wider gripper"),
         (
             scene_with(start_rad=np.array([0, 0.6, 1.2, 0, 0, 0.0])),

@@ -10,7 +10,7 @@ from bridge.geometry.mesh import sample_triangles
 from bridge.task.relations import AXES
 from bridge.task.task_file import ObjectModel
 from twin.plan.constrain.schema import BASE
-from twin.plan.problem import Array, Problem, State
+from twin.plan.problem import Array, Numbers, Points, Problem, State, Vector
 
 NUM_POINTS = 200
 """Of an object's surface; its corners first."""
@@ -35,12 +35,12 @@ def pose_of(state: State, object_id: str) -> Array:
     return state.Ts_base_object[object_id]
 
 
-def half_extents_m(model: ObjectModel) -> Float[np.ndarray, "3"]:
+def half_extents_m(model: ObjectModel) -> Vector:
     """Of the box around an object."""
     return np.array(model.size_m) / 2
 
 
-def _middle_m(model: ObjectModel) -> Float[np.ndarray, "3"]:
+def _middle_m(model: ObjectModel) -> Vector:
     """Of the outer extents, in the object frame."""
     return np.array([0.0, 0.0, 0.0 if model.origin_at_centre else model.size_m[2] / 2])
 
@@ -63,7 +63,7 @@ def heights(state: State, object_id: str, problem: Problem) -> tuple[Array, Arra
     return T[:, 2, 3] - reach, T[:, 2, 3] + reach
 
 
-def _anchor_m(model: ObjectModel, anchor: str) -> Float[np.ndarray, "3"]:
+def _anchor_m(model: ObjectModel, anchor: str) -> Vector:
     """A named point of an object, in its frame."""
     up = np.array([0.0, 0.0, model.size_m[2] / 2])
     places: dict[str, Float[np.ndarray, 3]] = {
@@ -93,11 +93,11 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
     return lambda state: _at(pose_of(state, frame), p), f"the point {millimetres(p)} of {frame}"
 
 
-def _at(T: Array, p_m: Float[np.ndarray, "3"]) -> Array:
+def _at(T: Array, p_m: Vector) -> Array:
     return carried(T, p_m[None])[:, 0]
 
 
-def millimetres(p_m: Float[np.ndarray, " num"]) -> str:
+def millimetres(p_m: Numbers) -> str:
     """A point in words."""
     return "(" + ", ".join(f"{value * 1e3:.0f}" for value in p_m) + ") mm"
 
@@ -135,9 +135,7 @@ def directions_of(spec: Record, problem: Problem) -> tuple[Point, str]:
     return lambda state: axis[None, None], f"the base frame's {name} axis"
 
 
-def surface_points(
-    problem: Problem, object_id: str, count: int = NUM_POINTS
-) -> Float[np.ndarray, "num_points 3"]:
+def surface_points(problem: Problem, object_id: str, count: int = NUM_POINTS) -> Points:
     """Points of an object's surface in its frame: corners, and more spread evenly over it [m]."""
     shape = problem.shapes[object_id]
     corners = shape.vertices_m[np.unique(shape.triangles)]

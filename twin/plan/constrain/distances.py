@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from twin.plan.problem import Problem
+from twin.plan.problem import Numbers, Points, Pose, Poses, Problem, Vector
 from twin.replay._clearance import (
     points_to_boxes,
     points_to_grid,
@@ -19,11 +19,7 @@ from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_
 from twin.robot.collision import RobotHulls
 
 
-def grid_clearance(
-    lookup: GridLookup,
-    points_m: Float[np.ndarray, "num_points 3"],
-    Ts_grid_body: Float[np.ndarray, "num_candidates 4 4"],
-) -> Float[np.ndarray, " num_candidates"]:
+def grid_clearance(lookup: GridLookup, points_m: Points, Ts_grid_body: Poses) -> Numbers:
     """Smallest signed distance of a body's surface points to what a grid holds, for each pose."""
     nearest = np.empty(len(Ts_grid_body))
     grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
@@ -37,21 +33,19 @@ class Boxes:
 
     R: Float[np.ndarray, "num_boxes 3 3"]
     """Rotations ``R_base_box``."""
-    centres_m: Float[np.ndarray, "num_boxes 3"]
+    centres_m: Points
     """In the base frame."""
-    halves_m: Float[np.ndarray, "num_boxes 3"]
+    halves_m: Points
 
     @staticmethod
-    def of(boxes: Sequence[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]]) -> "Boxes":
+    def of(boxes: Sequence[tuple[Pose, Vector]]) -> "Boxes":
         """Lay them out: pose ``T_base_box`` of the middle, and extents [m]."""
         R, centres_m = _poses(np.array([T for T, _ in boxes]).reshape(-1, 4, 4))
         extents = np.array([extents for _, extents in boxes], dtype=np.float64)
         return Boxes(R=R, centres_m=centres_m, halves_m=extents.reshape(-1, 3) / 2)
 
     def candidate_clearance(
-        self,
-        points_m: Float[np.ndarray, "num_points 3"],
-        Ts_base_body: Float[np.ndarray, "num_candidates 4 4"],
+        self, points_m: Points, Ts_base_body: Poses
     ) -> Float[np.ndarray, "num_candidates num_boxes"]:
         """Smallest signed distance of a body's surface points to each box, for each pose [m]."""
         nearest = np.empty((len(Ts_base_body), len(self.R)))
@@ -62,9 +56,9 @@ class Boxes:
     def lower(
         self,
         margins_m: Float[np.ndarray, "num_candidates num_points"],
-        keep_m: Float[np.ndarray, " num_boxes"],
-        points_m: Float[np.ndarray, "num_points 3"],
-        Ts_base_body: Float[np.ndarray, "num_candidates 4 4"],
+        keep_m: Numbers,
+        points_m: Points,
+        Ts_base_body: Poses,
     ) -> None:
         """Lower each point's margin to its distance to the boxes less what is to be kept.
 
@@ -80,8 +74,8 @@ def lower_by_grid(
     lookup: GridLookup,
     margins_m: Float[np.ndarray, "num_candidates num_points"],
     keep_m: float,
-    points_m: Float[np.ndarray, "num_points 3"],
-    Ts_grid_body: Float[np.ndarray, "num_candidates 4 4"],
+    points_m: Points,
+    Ts_grid_body: Poses,
 ) -> None:
     """Lower each point's margin to its distance to a grid less what is to be kept."""
     grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
@@ -104,8 +98,6 @@ def scene_grid(problem: Problem, hulls: RobotHulls) -> GridLookup | None:
     return None if grid is None else GridLookup(grid)
 
 
-def _poses(
-    Ts: Float[np.ndarray, "num_poses 4 4"],
-) -> tuple[Float[np.ndarray, "num_poses 3 3"], Float[np.ndarray, "num_poses 3"]]:
+def _poses(Ts: Poses) -> tuple[Float[np.ndarray, "num_poses 3 3"], Points]:
     """Rotations and origins, each in one piece of memory."""
     return np.ascontiguousarray(Ts[:, :3, :3]), np.ascontiguousarray(Ts[:, :3, 3])

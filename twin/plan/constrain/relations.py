@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.errors import UsageError
 from bridge.task.check import TABLE
@@ -33,7 +32,7 @@ from twin.plan.constrain.bodies import (
     seen_from,
 )
 from twin.plan.constrain.constraint import Constraint, Term
-from twin.plan.problem import Array, Problem, State
+from twin.plan.problem import Array, Numbers, Problem, State
 
 
 def _on(record: Record, problem: Problem) -> Constraint:
@@ -217,7 +216,7 @@ def _moved(record: Record, problem: Problem) -> Constraint:
     return Constraint.of(record, *terms)
 
 
-def _near_point(obj: str, target: Float[np.ndarray, " num"], tol: float) -> Term:
+def _near_point(obj: str, target: Numbers, tol: float) -> Term:
     """An object's origin near a point of the base frame; near one of two numbers from above."""
 
     def off(state: State) -> Array:

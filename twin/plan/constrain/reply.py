@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
@@ -22,8 +21,6 @@ from twin.plan.constrain.relations import PLACES
 from twin.plan.constrain.schema import (
     MOST_PROBLEMS,
     Problems,
-    Repeated,
-    Unreadable,
     Vocabulary,
     Where,
     find_problems,
@@ -33,7 +30,7 @@ from twin.plan.constrain.schema import (
     told,
     values_of,
 )
-from twin.plan.problem import Problem
+from twin.plan.problem import Problem, Vector
 
 VERSION = 2
 MAX_BYTES = 64 * 1024
@@ -60,7 +57,7 @@ class Keypoint:
     """A named point of an object."""
 
     obj: str
-    p_object_m: Float[np.ndarray, "3"]
+    p_object_m: Vector
 
 
 Keypoints = Mapping[str, Keypoint]
@@ -159,6 +156,7 @@ def _limited(text: str | bytes) -> str:
     return plain
 
 
+_SURROGATE = re.compile("[\ud800-\udfff]")
 _BRACE = re.compile(r"{")
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*+(?:"|\Z|\\\Z)|[\[\]{}]', re.DOTALL)
 """Strings, so that brackets in them do not count, and brackets; never looks back."""
@@ -179,14 +177,10 @@ def _objects(plain: str) -> Iterator[tuple[int, int]]:
 
 
 def _parsed(text: str) -> Any:
-    """Parse JSON; odd numbers and repeated keys are kept to be named."""
+    """Parse JSON; a number that is none becomes text, a key that comes twice an unknown one."""
     try:
         return json.loads(
-            text,
-            parse_constant=Unreadable,
-            parse_float=_float,
-            parse_int=_int,
-            object_pairs_hook=_object,
+            text, parse_constant=str, parse_float=_float, parse_int=_int, object_pairs_hook=_object
         )
     except RecursionError:  # brackets that a quote in prose hid from the count
         _refuse(f"is nested more than {MAX_DEPTH} deep")
@@ -196,18 +190,24 @@ def _refuse(found: str) -> NoReturn:
     raise ReplyError(problems=(f"top level: {found}",))
 
 
-def _float(digits: str) -> float | Unreadable:
+def _float(digits: str) -> float | str:
     number = float(digits)
-    return number if math.isfinite(number) else Unreadable(digits)
+    return number if math.isfinite(number) else digits
 
 
-def _int(digits: str) -> int | Unreadable:
-    return int(digits) if len(digits) <= _MOST_DIGITS else Unreadable(digits)
+def _int(digits: str) -> int | str:
+    return int(digits) if len(digits) <= _MOST_DIGITS else digits
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    record = dict(pairs)
-    return record if len(record) == len(pairs) else Repeated(pairs)
+    """Text with half of a character becomes nothing."""
+    names = [key.encode(errors="backslashreplace").decode() for key, _ in pairs]
+    record = {
+        name: None if isinstance(value, str) and _SURROGATE.search(value) else value
+        for name, (_, value) in zip(names, pairs, strict=True)
+    }
+    twice = [name for name in record if names.count(name) > 1] if len(record) < len(pairs) else []
+    return record | {f"{name}, more than once": None for name in twice}
 
 
 def _keypoints(
@@ -232,7 +232,7 @@ def _keypoints(
     return known, odd
 
 
-def _metres(p_m: Float[np.ndarray, "3"]) -> str:
+def _metres(p_m: Vector) -> str:
     return "[" + ", ".join(f"{value:.3f}" for value in p_m) + "]"
 
 

@@ -7,7 +7,6 @@ it is, so that each finding names its own place.
 
 import copy
 import json
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -133,38 +132,8 @@ def check_constraint(record: Mapping[str, Any], vocabulary: Vocabulary) -> None:
 
 def find_problems(value: Any, name: str, vocabulary: Vocabulary) -> tuple[str, ...]:
     """List what does not fit a part of the schema, one line each, at most ``MOST_PROBLEMS``."""
-    if odd := told(_odd(value, ())):
-        return odd
     errors = vocabulary.validator(name).iter_errors(value)
     return told((tuple(error.instance_path), _what(error)) for error in errors)
-
-
-def _odd(value: Any, where: Where) -> Problems:
-    """What no schema can say: numbers that are none, keys that come twice, halves of characters."""
-    if isinstance(value, Unreadable):
-        yield where, f"{value.text[:MOST_SHOWN]} is not a number that can be used"
-    elif isinstance(value, float) and not math.isfinite(value):
-        yield where, f"{value} is not a number that can be used"
-    elif isinstance(value, str) and not value.isascii() and not _is_unicode(value):
-        yield where, "holds half of a character (a lone surrogate)"
-    elif isinstance(value, list | tuple):
-        for index, inner in enumerate(value):
-            yield from _odd(inner, (*where, index))
-    elif isinstance(value, dict):
-        for name in value.names if isinstance(value, Repeated) else ():
-            yield where, f"the key {shown(name)} is there more than once"
-        for name, inner in value.items():
-            if not _is_unicode(name):
-                yield where, "a key holds half of a character (a lone surrogate)"
-            yield from _odd(inner, (*where, name))
-
-
-def _is_unicode(value: str) -> bool:
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _what(error: Any) -> str:
@@ -210,23 +179,6 @@ def shown(value: Any) -> str:
     if isinstance(value, dict | list):
         return "an object" if isinstance(value, dict) else "a list"
     return f"{json.dumps(value):.60}"
-
-
-@dataclass(frozen=True)
-class Unreadable:
-    """A number that JSON text holds and no program should use."""
-
-    text: str
-
-
-class Repeated(dict[str, Any]):
-    """An object that says one key more than once."""
-
-    def __init__(self, pairs: list[tuple[str, Any]]) -> None:
-        """Keep the last of each key, and which keys came more than once."""
-        super().__init__(pairs)
-        names = [name for name, _ in pairs]
-        self.names = sorted({name for name in names if names.count(name) > 1})
 
 
 # What a schema cannot say of one constraint

@@ -9,11 +9,12 @@ of missing are added up, and their sum is told as the standard deviations of one
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from twin.plan.grasp.open_hand import OpenHand
 from twin.plan.grasp.pairs import SampledSurface
+from twin.plan.problem import Covariance, Flags, Ids, Numbers, Points, Pose, Poses
 
 SHIFTS_M = (0.002, 0.004, 0.006, 0.009, 0.012, 0.016, 0.020, 0.025, 0.030)
 """How far a closing line is shifted over the surface to see where the pads lose it."""
@@ -36,16 +37,14 @@ closing line under its own weight."""
 class Lines:
     """Closing lines with the hands on them, object frame."""
 
-    Ts_object_tcp: Float[np.ndarray, "num_grasps 4 4"]
-    middles_m: Float[np.ndarray, "num_grasps 3"]
+    Ts_object_tcp: Poses
+    middles_m: Points
     """Half way between the contacts."""
-    widths_m: Float[np.ndarray, " num_grasps"]
-    cosines: Float[np.ndarray, " num_grasps"]
+    widths_m: Numbers
+    cosines: Numbers
     """Of the larger angle between line and normal."""
 
-    def chosen(
-        self, which: Bool[np.ndarray, " num_grasps"] | Int[np.ndarray, " num_chosen"]
-    ) -> "Lines":
+    def chosen(self, which: Flags | Ids) -> "Lines":
         """Some of them."""
         return Lines(**{name: value[which] for name, value in vars(self).items()})
 
@@ -54,7 +53,7 @@ class Lines:
 class Doubt:
     """What is not known exactly."""
 
-    covariance: Float[np.ndarray, "6 6"]
+    covariance: Covariance
     """Of the object's pose: x, y, z and rotation about them, base frame."""
     other_m: float
     """Of robot and surface together, in every direction."""
@@ -64,12 +63,8 @@ class Doubt:
 
 
 def reaches_along(
-    surface: SampledSurface,
-    lines: Lines,
-    axis: int,
-    sign: float,
-    cone_rad: float,
-) -> Float[np.ndarray, " num_grasps"]:
+    surface: SampledSurface, lines: Lines, axis: int, sign: float, cone_rad: float
+) -> Numbers:
     """How far a closing line may be shifted until the surface leaves the friction cone [m]."""
     y = lines.Ts_object_tcp[:, :3, 1]
     along = sign * lines.Ts_object_tcp[:, :3, axis]
@@ -88,7 +83,7 @@ def reaches_along(
     return _first_lost(good.reshape(num, count))
 
 
-def _first_lost(good: Bool[np.ndarray, "num_grasps num_shifts"]) -> Float[np.ndarray, " num"]:
+def _first_lost(good: Bool[np.ndarray, "num_grasps num_shifts"]) -> Numbers:
     """The last shift before the first that fails."""
     kept = np.logical_and.accumulate(good, axis=1).sum(axis=1)
     return np.asarray(np.array([0.0, *SHIFTS_M])[kept])
@@ -100,7 +95,7 @@ def slacks(
     hand: OpenHand,
     points_m: Float[np.ndarray, "3 num_grasps num_points"],
     *,
-    over_table_m: Float[np.ndarray, " num_grasps"],
+    over_table_m: Numbers,
     cone_rad: float,
     lever_m: float,
 ) -> Float[np.ndarray, "num_grasps num_ways"]:
@@ -133,11 +128,8 @@ def slacks(
 
 
 def margins(
-    slack: Float[np.ndarray, "num_grasps num_ways"],
-    lines: Lines,
-    T_base_object: Float[np.ndarray, "4 4"],
-    doubt: Doubt,
-) -> Float[np.ndarray, " num_grasps"]:
+    slack: Float[np.ndarray, "num_grasps num_ways"], lines: Lines, T_base_object: Pose, doubt: Doubt
+) -> Numbers:
     """Standard deviations that grasps bear, all ways of missing together."""
     R = T_base_object[:3, :3] @ lines.Ts_object_tcp[:, :3, :3]
     arm = lines.middles_m @ T_base_object[:3, :3].T
@@ -154,19 +146,13 @@ def margins(
     return _together(slack / np.maximum(np.stack(sigma, axis=1), _LEAST_SIGMA_M))
 
 
-def _variance(
-    u: Float[np.ndarray, "num_grasps 3"],
-    arm_m: Float[np.ndarray, "num_grasps 3"],
-    covariance: Float[np.ndarray, "6 6"],
-) -> Float[np.ndarray, " num_grasps"]:
+def _variance(u: Points, arm_m: Points, covariance: Covariance) -> Numbers:
     """Of the place of a point of the object along directions."""
     row = np.concatenate([u, np.cross(arm_m, u)], axis=1)
     return np.asarray(np.einsum("ni,ij,nj->n", row, covariance, row))
 
 
-def _together(
-    each: Float[np.ndarray, "num_grasps num_ways"],
-) -> Float[np.ndarray, " num_grasps"]:
+def _together(each: Float[np.ndarray, "num_grasps num_ways"]) -> Numbers:
     """Add the chances of missing up."""
     missing_log = np.minimum(logsumexp(log_ndtr(-each), axis=1), 0.0)
     return np.asarray(-ndtri_exp(missing_log))

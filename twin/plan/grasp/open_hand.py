@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
+from twin.plan.problem import Flags, Numbers, Points, Poses, Vector
 from twin.robot.collision import hulls_of
 from twin.robot.model import RobotModel
 
@@ -26,13 +27,13 @@ class SweptPiece:
     link: str
     finger: bool
     """Whether it closes on objects; else it carries those that do."""
-    corners_m: Float[np.ndarray, "num_corners 3"]
+    corners_m: Points
     """Of the piece at the grasp, not swept."""
-    normals: Float[np.ndarray, "num_planes 3"]
+    normals: Points
     """Outward, of the swept piece."""
-    offsets_m: Float[np.ndarray, " num_planes"]
-    low_m: Float[np.ndarray, "3"]
-    high_m: Float[np.ndarray, "3"]
+    offsets_m: Numbers
+    low_m: Vector
+    high_m: Vector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,12 +53,10 @@ class OpenHand:
     closed_in: bool
     """Whether the fingers' hulls fill the space between the pads: then they say nothing of it."""
 
-    def passes(
-        self, centres_m: Float[np.ndarray, "num_poses 3"], radius_m: float, margin_m: float
-    ) -> Bool[np.ndarray, " num_poses"]:
+    def passes(self, centres_m: Points, radius_m: float, margin_m: float) -> Flags:
         """Which hands come near a ball; those that do not, ``hits`` nothing that is in it."""
         reach_m = radius_m + np.sqrt(3.0) * margin_m
-        near: Bool[np.ndarray, " num_poses"] = np.zeros(len(centres_m), dtype=bool)
+        near: Flags = np.zeros(len(centres_m), dtype=bool)
         for piece in self.pieces:
             beside = np.maximum(piece.low_m - centres_m, centres_m - piece.high_m)
             near |= np.linalg.norm(np.maximum(beside, 0.0), axis=1) <= reach_m
@@ -65,7 +64,7 @@ class OpenHand:
 
     def hits(
         self, points_m: Float[np.ndarray, "3 num_poses num_points"], margin_m: float
-    ) -> dict[str, Bool[np.ndarray, " num_poses"]]:
+    ) -> dict[str, Flags]:
         """Which hands have a point within reach of the fingers, and of what carries them.
 
         Args:
@@ -93,7 +92,7 @@ class OpenHand:
             found["fingers" if piece.finger else "palm"][poses[inside]] = True
         return found
 
-    def lowest_m(self, Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"]) -> Float[np.ndarray, " n"]:
+    def lowest_m(self, Ts_base_tcp: Poses) -> Numbers:
         """Height of each hand's lowest point at the grasp, base frame."""
         corners = np.concatenate([piece.corners_m for piece in self.pieces])
         heights = Ts_base_tcp[:, 2, :3] @ corners.T + Ts_base_tcp[:, 2, 3, None]
@@ -139,9 +138,7 @@ def open_hand(robot: RobotModel, open_m: float, pregrasp_m: float) -> OpenHand:
     )
 
 
-def _swept(
-    link: str, finger: bool, corners_m: Float[np.ndarray, "num_corners 3"], pregrasp_m: float
-) -> SweptPiece:
+def _swept(link: str, finger: bool, corners_m: Points, pregrasp_m: float) -> SweptPiece:
     corners = corners_m[ConvexHull(corners_m).vertices]
     swept = np.concatenate([corners, corners - [0.0, 0.0, pregrasp_m]])
     equations = np.unique(ConvexHull(swept).equations.round(9), axis=0)

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 import open3d
-from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from bridge.geometry.mesh import sample_triangles
-from twin.plan.problem import Shape
+from twin.plan.problem import Flags, Ids, Numbers, Points, Shape, Vector
 from twin.scene.shape.mesh import face_normals
 
 _INSIDE_M = 1e-5
@@ -39,7 +38,7 @@ class SampledSurface:
         self.shape = shape
 
     @cached_property
-    def ball(self) -> tuple[Float[np.ndarray, "3"], float]:
+    def ball(self) -> tuple[Vector, float]:
         """Middle and radius of a sphere that holds all of it, object frame."""
         vertices = self.shape.vertices_m
         middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -55,11 +54,11 @@ class SampledSurface:
         return rays
 
     @cached_property
-    def _facets(self) -> tuple[Float[np.ndarray, "num_faces 3"], Float[np.ndarray, " num_faces"]]:
+    def _facets(self) -> tuple[Points, Numbers]:
         return face_normals(self.shape.vertices_m, self.shape.triangles)
 
     @cached_property
-    def _normals(self) -> Float[np.ndarray, "num_faces 3"]:
+    def _normals(self) -> Points:
         """Normals of the triangles as a pad feels them."""
         normals, areas = self._facets
         if self.shape.error_m <= 0:
@@ -80,30 +79,22 @@ class SampledSurface:
             found *= (areas / np.maximum(np.linalg.norm(found, axis=1), 1e-12))[:, None]
         return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1), 1e-12)[:, None])
 
-    def samples(
-        self, count: int, seed: int
-    ) -> tuple[Float[np.ndarray, "num_samples 3"], Float[np.ndarray, "num_samples 3"]]:
+    def samples(self, count: int, seed: int) -> tuple[Points, Points]:
         """Points spread evenly over the surface, and their normals."""
         points, chosen = self._sampled(count, seed)
         return points, self._normals[chosen]
 
-    def points(self, count: int, seed: int) -> Float[np.ndarray, "num_samples 3"]:
+    def points(self, count: int, seed: int) -> Points:
         """The same points alone: of what is only kept clear of, nobody asks the normals."""
         return self._sampled(count, seed)[0]
 
-    def _sampled(
-        self, count: int, seed: int
-    ) -> tuple[Float[np.ndarray, "num_samples 3"], Int[np.ndarray, " num_samples"]]:
+    def _sampled(self, count: int, seed: int) -> tuple[Points, Ids]:
         shape, rng = self.shape, np.random.default_rng(seed)
         chosen, u, v = sample_triangles(self._facets[1], count, rng, in_order=True)
         a, b, c = (shape.vertices_m[shape.triangles[chosen, k]] for k in range(3))
         return a * (1 - u - v) + b * u + c * v, chosen
 
-    def leave(
-        self,
-        points_m: Float[np.ndarray, "num_rays 3"],
-        directions: Float[np.ndarray, "num_rays 3"],
-    ) -> tuple[Float[np.ndarray, " num_rays"], Float[np.ndarray, "num_rays 3"]]:
+    def leave(self, points_m: Points, directions: Points) -> tuple[Numbers, Points]:
         """Where rays meet the surface next: how far (infinite: nowhere), and the normal there."""
         rays = np.concatenate([points_m, directions], axis=1).astype("f4")
         found = self._rays.cast_rays(_tensor(rays), nthreads=1)
@@ -117,24 +108,22 @@ class SampledSurface:
 class Pairs:
     """Lines between two points of a surface, object frame."""
 
-    first_m: Float[np.ndarray, "num_pairs 3"]
-    axes: Float[np.ndarray, "num_pairs 3"]
+    first_m: Points
+    axes: Points
     """Unit vectors from the first to the second point."""
-    widths_m: Float[np.ndarray, " num_pairs"]
-    cosines: Float[np.ndarray, " num_pairs"]
+    widths_m: Numbers
+    cosines: Numbers
     """Of the larger angle between the line and the two normals."""
-    lowest_m: Float[np.ndarray, " num_pairs"]
-    downward: Float[np.ndarray, " num_pairs"]
+    lowest_m: Numbers
+    downward: Numbers
     """How far the normal that looks down more does so: the sine under the horizontal."""
 
     @property
-    def middles_m(self) -> Float[np.ndarray, "num_pairs 3"]:
+    def middles_m(self) -> Points:
         """Half way between the two points."""
         return np.asarray(self.first_m + self.axes * self.widths_m[:, None] / 2)
 
-    def chosen(
-        self, which: Bool[np.ndarray, " num_pairs"] | Int[np.ndarray, " num_chosen"]
-    ) -> "Pairs":
+    def chosen(self, which: Flags | Ids) -> "Pairs":
         """Some of them."""
         return Pairs(**{name: value[which] for name, value in vars(self).items()})
 
@@ -173,13 +162,7 @@ def antipodal_pairs(
     return pairs_along(surface, starts, starting, -outward)
 
 
-def _hinted(
-    surface: SampledSurface, hint_m: Float[np.ndarray, "3"]
-) -> tuple[
-    Float[np.ndarray, "num_rays 3"],
-    Float[np.ndarray, "num_rays 3"],
-    Float[np.ndarray, "num_rays 3"],
-]:
+def _hinted(surface: SampledSurface, hint_m: Vector) -> tuple[Points, Points, Points]:
     """Where a line along y through a point enters the object."""
     outside = hint_m + np.array([0.0, 1.0, 0.0])
     away, normal = surface.leave(outside[None], np.array([[0.0, -1.0, 0.0]]))
@@ -189,10 +172,7 @@ def _hinted(
 
 
 def pairs_along(
-    surface: SampledSurface,
-    points_m: Float[np.ndarray, "num_rays 3"],
-    normals: Float[np.ndarray, "num_rays 3"],
-    directions: Float[np.ndarray, "num_rays 3"],
+    surface: SampledSurface, points_m: Points, normals: Points, directions: Points
 ) -> Pairs:
     """Follow rays from points of the surface through the material to its other side."""
     away, others = surface.leave(points_m + directions * _INSIDE_M, directions)
@@ -213,7 +193,7 @@ def pairs_along(
     )
 
 
-def thinned(pairs: Pairs, *, cell_m: float, cell_rad: float) -> Int[np.ndarray, " num_kept"]:
+def thinned(pairs: Pairs, *, cell_m: float, cell_rad: float) -> Ids:
     """Number the pairs that differ: the best of each cell of middles and directions."""
     axes = pairs.axes * np.where(_first_sign(pairs.axes) < 0, -1.0, 1.0)[:, None]
     cells = np.concatenate(
@@ -224,6 +204,6 @@ def thinned(pairs: Pairs, *, cell_m: float, cell_rad: float) -> Int[np.ndarray, 
     return np.sort(order[first])
 
 
-def _first_sign(axes: Float[np.ndarray, "num_axes 3"]) -> Float[np.ndarray, " num_axes"]:
+def _first_sign(axes: Points) -> Numbers:
     """Sign of the largest component."""
     return np.asarray(np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)]))

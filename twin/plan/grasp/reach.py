@@ -3,16 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from twin.plan.grasp.open_hand import OpenHand
-from twin.plan.problem import Problem
+from twin.plan.problem import Joints, Pose, Poses, Postures, Problem
 from twin.replay.clearance.bodies import own_links
 from twin.replay.clearance.surroundings import Surroundings
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
 from twin.robot.config import IkConfig
 from twin.robot.inverse import UrInverse, solutions, solve_ik
+from twin.robot.model import RobotModel
 
 MOST_TURN_RAD = 0.8
 """Of any joint on the straight approach; more is another branch, or a wrist that flips."""
@@ -24,7 +24,7 @@ _TURN = 2 * np.pi
 class Reached:
     """How the arm stands at a grasp."""
 
-    joints_rad: Float[np.ndarray, " num_joints"]
+    joints_rad: Joints
     turned: bool
     """Whether with the hand turned half about its approach."""
 
@@ -42,7 +42,7 @@ class ArmReach:
         start = problem.scene.start_rad
         self.start_rad = self.robot.home_rad if start is None else start
 
-    def is_clear(self, joints_rad: Float[np.ndarray, " num_joints"], open_m: float) -> bool:
+    def is_clear(self, joints_rad: Joints, open_m: float) -> bool:
         """Whether arm and hand keep clear of the robot itself and of what stands still."""
         self.hulls.place(joints_rad, open_m)
         if self._links.touch():
@@ -54,94 +54,61 @@ class Reaches:
     """Solutions of many grasps, looked at one at a time."""
 
     def __init__(
-        self,
-        arm: ArmReach,
-        Ts_base_tcp: Float[np.ndarray, "num_grasps 4 4"],
-        hand: OpenHand,
-        pregrasp_m: float,
+        self, arm: ArmReach, Ts_base_tcp: Poses, hand: OpenHand, pregrasp_m: float
     ) -> None:
-        """Solve many grasps at once, where the arm has a closed form."""
-        self._arm, self._hand = arm, hand
-        turns = (1.0, -1.0) if hand.symmetric else (1.0,)
-        self._Ts = np.stack(
-            [Ts_base_tcp * np.array([sign, sign, 1.0, 1.0]) for sign in turns], axis=1
-        )
-        self._before = self._Ts.copy()
-        self._before[..., :3, 3] -= pregrasp_m * self._Ts[..., :3, 2]
-        self._inverse = UrInverse.for_robot(arm.robot)
-        if self._inverse is not None and len(Ts_base_tcp):
-            self._grasps, self._valid, _ = self._inverse.solve(self._Ts.reshape(-1, 4, 4))
-            self._starts, valid, _ = self._inverse.solve(self._before.reshape(-1, 4, 4))
-            self._both = self._valid & valid
+        """Remember the grasps and what comes before them."""
+        self._arm, self._hand, self._Ts = arm, hand, Ts_base_tcp
+        self._turns = (1.0, -1.0) if hand.symmetric else (1.0,)
+        self._back = np.eye(4)
+        self._back[2, 3] = -pregrasp_m
 
     def first(self, index: int) -> Reached | str:
         """The solution nearest to where the arm stands that keeps clear, or why there is none."""
-        if self._inverse is not None:
-            return self._of_branches(index)
-        return self._of_descents(index)
-
-    def _of_branches(self, index: int) -> Reached | str:
-        num = self._Ts.shape[1]
-        rows = slice(index * num, (index + 1) * num)
-        if not self._valid[rows].any():
-            return "reach"
-        turned, branch = np.nonzero(self._both[rows])
-        if not len(turned):
-            return "approach"
-        at, before = (
-            self._nearest(table[rows][turned, branch], self._arm.start_rad)
-            for table in (self._grasps, self._starts)
-        )
-        before = self._nearest(before, at)
-        smooth: Bool[np.ndarray, " n"] = np.abs(at - before).max(axis=1) <= MOST_TURN_RAD
-        if not smooth.any():
-            return "approach"
-        cost = np.abs(before - self._arm.start_rad).max(axis=1)
-        order = [i for i in np.argsort(cost, kind="stable").tolist() if smooth[i]]
-        for i in order[:_MOST_BRANCHES]:
-            if self._is_clear(at[i], before[i]):
-                return Reached(joints_rad=at[i], turned=bool(turned[i]))
-        return "arm"
-
-    def _nearest(
-        self,
-        joints_rad: Float[np.ndarray, "num_solutions num_joints"],
-        wanted_rad: Float[np.ndarray, "*batch num_joints"],
-    ) -> Float[np.ndarray, "num_solutions num_joints"]:
-        """The same postures by whole turns nearer to a wanted one, within the limits."""
-        robot = self._arm.robot
-        moved = joints_rad + _TURN * np.rint((wanted_rad - joints_rad) / _TURN)
-        inside = (moved >= robot.lower_rad) & (moved <= robot.upper_rad)
-        return np.where(inside, moved, joints_rad)
-
-    def _of_descents(self, index: int) -> Reached | str:
-        robot, config, why = self._arm.robot, IkConfig(), "reach"
-        for turned, T in enumerate(self._Ts[index]):
-            for found in solutions(robot, T, config):
-                if not found.reached:
-                    break
-                why = max(why, "approach", key=_PROGRESS.index)
-                before = solve_ik(
-                    robot,
-                    self._before[index, turned],
-                    config,
-                    warm_start_rad=found.joints_rad,
-                )
-                far = np.abs(before.joints_rad - found.joints_rad).max() > MOST_TURN_RAD
-                if not before.reached or far:
-                    continue
-                if self._is_clear(found.joints_rad, before.joints_rad):
-                    return Reached(joints_rad=found.joints_rad, turned=bool(turned))
-                why = "arm"
+        robot, start_rad, why = self._arm.robot, self._arm.start_rad, "reach"
+        found: list[tuple[float, Reached, Joints]] = []
+        for sign in self._turns:
+            T = self._Ts[index] * np.array([sign, sign, 1.0, 1.0])
+            reaching, before_T = _reaching(robot, T), T @ self._back
+            is_closed = UrInverse.for_robot(robot) is not None
+            known = _reaching(robot, before_T) if is_closed else None
+            why = "approach" if len(reaching) else why
+            for at in _turned(robot, reaching, start_rad):
+                rows = _reaching(robot, before_T, at) if known is None else known
+                befores = _turned(robot, rows, at)
+                befores = befores[np.abs(befores - at).max(axis=1) <= MOST_TURN_RAD]
+                for before in befores[:1]:
+                    way = Reached(joints_rad=at, turned=sign < 0)
+                    found.append((float(np.abs(before - start_rad).max()), way, before))
+        for _, way, before in sorted(found, key=lambda each: each[0])[:_MOST_BRANCHES]:
+            why = "arm"
+            # At the grasp and where its approach begins; the hand was looked at all the way.
+            if all(self._arm.is_clear(row, self._hand.open_m) for row in (way.joints_rad, before)):
+                return way
         return why
 
-    def _is_clear(
-        self,
-        at_rad: Float[np.ndarray, " num_joints"],
-        before_rad: Float[np.ndarray, " num_joints"],
-    ) -> bool:
-        """At the grasp and where its approach begins; the hand was looked at all the way."""
-        return all(self._arm.is_clear(row, self._hand.open_m) for row in (at_rad, before_rad))
+
+def nearest_solutions(robot: RobotModel, T_base_tcp: Pose, near_rad: Joints) -> list[Joints]:
+    """Joints that reach a pose, each turned as near as its limits let it, nearest first."""
+    return list(_turned(robot, _reaching(robot, T_base_tcp), near_rad))
 
 
-_PROGRESS = ("reach", "approach", "arm")
+def _reaching(robot: RobotModel, T_base_tcp: Pose, near_rad: Joints | None = None) -> Postures:
+    """Joints that reach a pose; without a closed form what is found, or what is near a posture."""
+    inverse = UrInverse.for_robot(robot)
+    if inverse is not None:
+        raw, valid, _ = inverse.solve(T_base_tcp[None])
+        return np.asarray(raw[0, valid[0]])
+    if near_rad is None:
+        found = list(solutions(robot, T_base_tcp, IkConfig()))
+    else:
+        found = [solve_ik(robot, T_base_tcp, IkConfig(), warm_start_rad=near_rad)]
+    rows = [item.joints_rad for item in found if item.reached]
+    return np.array(rows).reshape(-1, len(robot.joints))
+
+
+def _turned(robot: RobotModel, rows_rad: Postures, near_rad: Joints) -> Postures:
+    """The same postures by whole turns nearer to a wanted one, within the limits; nearest first."""
+    wanted = rows_rad + _TURN * np.rint((near_rad - rows_rad) / _TURN)
+    inside = (wanted >= robot.lower_rad) & (wanted <= robot.upper_rad)
+    found = np.where(inside, wanted, rows_rad)
+    return found[np.argsort(np.abs(found - near_rad).sum(axis=1), kind="stable")]

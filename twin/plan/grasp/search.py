@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from bridge.geometry import se3
@@ -14,7 +14,7 @@ from twin.plan.grasp.margin import Doubt, Lines, margins, slacks
 from twin.plan.grasp.open_hand import OpenHand, has_fingers, open_hand
 from twin.plan.grasp.pairs import Pairs, SampledSurface, antipodal_pairs, thinned
 from twin.plan.grasp.reach import ArmReach, Reached, Reaches
-from twin.plan.problem import Grasp, Problem
+from twin.plan.problem import Covariance, Flags, Grasp, Ids, Numbers, Points, Pose, Poses, Problem
 from twin.replay.config import UNKNOWN_POSE_M, UNKNOWN_POSE_RAD
 
 CAUSES: Mapping[str, str] = {
@@ -90,7 +90,7 @@ class GraspConfig:
     """Between each pad and the object, and between the hand and anything else [m]."""
     least_margin: float = 1.0
     """Standard deviations that a grasp must bear."""
-    most: int = 100
+    most: int = 60
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +110,7 @@ class _Candidates:
     lines: Lines
     rejected: dict[str, int] = field(default_factory=dict)
 
-    def keep(self, mask: Bool[np.ndarray, " num_candidates"], cause: str) -> None:
+    def keep(self, mask: Flags, cause: str) -> None:
         """Reject the others."""
         _count(self.rejected, cause, int((~mask).sum()))
         self.lines = self.lines.chosen(mask)
@@ -237,7 +237,7 @@ class GraspSearcher:
         given = self.problem.scene.task.grip_force_N
         return PhysicsConfig().grip_force_N if given is None else given
 
-    def _covariance(self, object_id: str) -> Float[np.ndarray, "6 6"]:
+    def _covariance(self, object_id: str) -> Covariance:
         known = self.problem.scene.covariances.get(object_id)
         if known is not None:
             return known
@@ -253,7 +253,7 @@ class GraspSearcher:
         """Closing lines that hold, fit between the pads, and are on what was seen."""
         config, shape = self.config, self.problem.shapes[object_id]
         rejected: dict[str, int] = {}
-        kept: Int[np.ndarray, " num_kept"] = np.zeros(0, dtype=np.int64)
+        kept: Ids = np.zeros(0, dtype=np.int64)
         pairs = antipodal_pairs(
             self._surface(object_id),
             count=config.samples,
@@ -262,7 +262,7 @@ class GraspSearcher:
             seed=SEED,
         )
 
-        def keep(pairs: Pairs, mask: Bool[np.ndarray, " num_pairs"], cause: str) -> Pairs:
+        def keep(pairs: Pairs, mask: Flags, cause: str) -> Pairs:
             _count(rejected, cause, int((~mask).sum()))
             return pairs.chosen(mask)
 
@@ -279,11 +279,7 @@ class GraspSearcher:
         return pairs.chosen(kept), rejected
 
     def _hands_on(
-        self,
-        pairs: Pairs,
-        T_base_object: Float[np.ndarray, "4 4"],
-        hand: OpenHand,
-        rejected: dict[str, int],
+        self, pairs: Pairs, T_base_object: Pose, hand: OpenHand, rejected: dict[str, int]
     ) -> _Candidates:
         """Put hands onto closing lines, from several directions and at several depths."""
         down = -T_base_object[2, :3]
@@ -291,7 +287,7 @@ class GraspSearcher:
         steep = down - y * (y @ down)[:, None]
         length = np.linalg.norm(steep, axis=1)
         z0 = steep / np.maximum(length, 1e-9)[:, None]
-        rows: list[tuple[Float[np.ndarray, "num_pairs 4 4"], Int[np.ndarray, " num_pairs"]]] = []
+        rows: list[tuple[Poses, Ids]] = []
         for turn in APPROACHES_RAD:
             z = np.cos(turn) * z0 + np.sin(turn) * np.cross(y, z0)
             R = np.stack([np.cross(y, z), y, z], axis=-1)
@@ -315,25 +311,19 @@ class GraspSearcher:
         found.keep(level, "tilt")
         return found
 
-    def _past_table(self, found: _Candidates, T: Float[np.ndarray, "4 4"], hand: OpenHand) -> None:
+    def _past_table(self, found: _Candidates, T: Pose, hand: OpenHand) -> None:
         low_m = hand.lowest_m(T @ found.lines.Ts_object_tcp)
         table_m = self.problem.scene.table_height_m + self.config.clearance_m
         found.keep(low_m >= table_m, "table")
 
-    def _past_object(
-        self, found: _Candidates, points_m: Float[np.ndarray, "num_points 3"], hand: OpenHand
-    ) -> None:
+    def _past_object(self, found: _Candidates, points_m: Points, hand: OpenHand) -> None:
         hits = hand.hits(in_tools(found.lines, points_m), self.config.clearance_m / 2)
         fingers = hits["fingers"][~hits["palm"]]
         found.keep(~hits["palm"], "palm")
         found.keep(~fingers, "fingers")
 
     def _past_neighbours(
-        self,
-        found: _Candidates,
-        object_id: str,
-        T_base_object: Float[np.ndarray, "4 4"],
-        hand: OpenHand,
+        self, found: _Candidates, object_id: str, T_base_object: Pose, hand: OpenHand
     ) -> None:
         """Reject hands that another object is in the way of, wherever it may be off to."""
         scene, T_object_base = self.problem.scene, se3.invert(T_base_object)
@@ -350,17 +340,13 @@ class GraspSearcher:
                 continue
             points = se3.apply(T_object_other, surface.points(_NEIGHBOUR_POINTS, SEED))
             hits = hand.hits(in_tools(found.lines.chosen(near), points), margin_m)
-            clear: Bool[np.ndarray, " num_candidates"] = np.ones(len(found), dtype=bool)
+            clear: Flags = np.ones(len(found), dtype=bool)
             clear[near] = ~(hits["fingers"] | hits["palm"])
             found.keep(clear, "neighbour")
 
     def _margins(
-        self,
-        found: _Candidates,
-        object_id: str,
-        points_m: Float[np.ndarray, "num_points 3"],
-        hand: OpenHand,
-    ) -> Float[np.ndarray, " num_candidates"]:
+        self, found: _Candidates, object_id: str, points_m: Points, hand: OpenHand
+    ) -> Numbers:
         """How much each grasp bears; those that bear too little are rejected."""
         config, model = self.config, self.problem.model(object_id)
         T = self.problem.scene.Ts_base_object[object_id]
@@ -389,11 +375,7 @@ class GraspSearcher:
         return margin[enough]
 
     def _choose(
-        self,
-        found: _Candidates,
-        margin: Float[np.ndarray, " num_candidates"],
-        object_id: str,
-        hand: OpenHand,
+        self, found: _Candidates, margin: Numbers, object_id: str, hand: OpenHand
     ) -> tuple[Grasp, ...]:
         """Take the surest that the arm reaches, leaving out what is like one that was taken."""
         config, lines = self.config, found.lines
@@ -460,14 +442,12 @@ class GraspSearcher:
         )
 
 
-def turned(Ts: Float[np.ndarray, "num_poses 4 4"]) -> Float[np.ndarray, "num_poses 4 4"]:
+def turned(Ts: Poses) -> Poses:
     """The same hands turned half about their approach."""
     return np.asarray(Ts * np.array([-1.0, -1.0, 1.0, 1.0]))
 
 
-def in_tools(
-    lines: Lines, points_m: Float[np.ndarray, "num_points 3"]
-) -> Float[np.ndarray, "3 num_grasps num_points"]:
+def in_tools(lines: Lines, points_m: Points) -> Float[np.ndarray, "3 num_grasps num_points"]:
     """Points of the object, in the tool frame of each grasp: all x, then y, then z."""
     R, p = lines.Ts_object_tcp[:, :3, :3], lines.Ts_object_tcp[:, :3, 3]
     # One product, not one for each grasp.

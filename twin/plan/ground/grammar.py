@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from bridge.task.relations import SIDES
-from twin.plan.constrain.schema import printable
 from twin.plan.ground.goals import PLACES, Goals, Grounding, ordered
 from twin.plan.ground.nouns import Memory, NounPhrase, Nouns, with_shared_noun
 from twin.plan.ground.vocabulary import GroundingError, Vocabulary
@@ -43,7 +42,8 @@ def ground(text: str, vocabulary: Vocabulary) -> Grounding:
     try:
         return _Reader(text, vocabulary).read()
     except GroundingError as error:
-        raise error.with_examples(vocabulary.examples()) from None
+        error.examples = tuple(vocabulary.examples())
+        raise
 
 
 class _Reader:
@@ -94,7 +94,7 @@ class _Reader:
             raise GroundingError("alternative", "'or' leaves open what is wanted. Say which.")
         no = [w for w in words if w in NEGATIONS or w.startswith("non-") or w.endswith("n't")]
         if no:
-            message = f"'{printable(no[0][:80])}' says what is not wanted. Say what is."
+            message = f"'{no[0]}' says what is not wanted. Say what is."
             raise GroundingError("negated", message)
 
     def _parts(self) -> list[_Part]:
@@ -135,17 +135,15 @@ class _Reader:
         first = not parts or parts[-1].letter in "ASTFP"
         if re.match(r".[tqbyincs]*[hc]", letters):
             if first:
-                raise GroundingError(
-                    "unsupported_verb", f"nobody here can '{printable(word[:80])}'."
-                )
-            message = f"the relation '{printable(word[:80])}' is not known."
+                raise GroundingError("unsupported_verb", f"nobody here can '{word}'.")
+            message = f"the relation '{word}' is not known."
             raise GroundingError("unsupported_relation", message)
         if first:
             raise self._unknown(at)
-        raise self._unknown(max(0, at - 5), f"is not understood from '{printable(word[:80])}' on")
+        raise self._unknown(max(0, at - 5), f"is not understood from '{word}' on")
 
     def _rest(self, start: int, count: int = 6) -> str:
-        return printable(" ".join(t.text for t in self.tokens[start : start + count])[:80])
+        return " ".join(t.text for t in self.tokens[start : start + count])
 
     def _unknown(self, start: int, what: str = "is not understood") -> GroundingError:
         return GroundingError("unknown_clause", f"'{self._rest(start)}' {what}.")
@@ -201,7 +199,7 @@ class _Reader:
             raise self._unknown(part.begin, what)
         if part.letter in "BL":
             raise self._unknown(part.begin, "says how far, and not from what or which way")
-        raise self._unknown(start, f"is not understood from '{printable(part.words[:80])}' on")
+        raise self._unknown(start, f"is not understood from '{part.words}' on")
 
     def _place(self, parts: list[_Part], themes: tuple[str, ...]) -> list[dict[str, Any]]:
         """One relation, movement or remark about the end, without what it is about."""

@@ -9,8 +9,7 @@ import numpy as np
 from bridge.task.check import TABLE, nearest
 from twin.naming.colours import COLOUR_NAMES
 from twin.naming.words import SAME_COLOURS, SAME_NOUNS, colour_of, singular
-from twin.plan.constrain.schema import printable
-from twin.plan.ground.vocabulary import GroundingError, Thing, Vocabulary
+from twin.plan.ground.vocabulary import GroundingError, Vocabulary
 from twin.plan.ground.words import CLOSED, NUMBERS, PRONOUNS, SIZES, TABLES, Token
 
 APART = 1.25
@@ -59,7 +58,6 @@ class Memory:
     themes: tuple[str, ...] = ()
     nouns: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Of the last phrase that had one, by its slot: what "one" stands for."""
-    chosen: list[str] = field(default_factory=list)
     choices: list[Choice] = field(default_factory=list)
     explanation: list[str] = field(default_factory=list)
 
@@ -72,7 +70,7 @@ class Nouns:
         self.vocabulary, self.memory = vocabulary, memory
         things = vocabulary.things.values()
         self._ids = {key.lower(): key for key in vocabulary.things}
-        self._nouns = {noun for thing in things for noun in (*thing.names, thing.shape)} - {""}
+        self._nouns = {noun for thing in things for noun in thing.names[2]}
 
     def letters(self, tokens: Sequence[Token]) -> str:
         """What each word may be in a noun phrase; a full stop ends one."""
@@ -122,7 +120,7 @@ class Nouns:
         every = found["lead"] == "e" or quantifier == "q"
         if not (colours or nouns or every):
             there = " ".join(token.text for token in tokens[max(at - 1, 0) : at + found.end() + 1])
-            message = f"'{printable(there[:80])}' names no object."
+            message = f"'{there}' names no object."
             raise GroundingError("unknown_clause", message, candidates=self._of(slot))
         first = 2 if found["lead"][:1] == "b" else number("count")
         count = first if first is not None else number("more")
@@ -142,7 +140,7 @@ class Nouns:
 
     def _refuse_unknown(self, word: str, slot: str) -> None:
         known = sorted(self._nouns | set(COLOUR_NAMES) | set(SAME_COLOURS) | set(SIZES))
-        message = f"'{printable(word[:80])}' is not known here.{nearest(word, known)}"
+        message = f"'{word}' is not known here.{nearest(word, known)}"
         raise GroundingError("unknown_object", message, candidates=self._of(slot))
 
     def is_table(self, phrase: NounPhrase) -> bool:
@@ -196,7 +194,11 @@ class Nouns:
         """What all words fit; a thing's own name comes before what else it may be called."""
         things = self.vocabulary.things
         for rank in range(3):  # its own name, its shape, what else it may be called
-            pool = [key for key in things if set(phrase.nouns) <= _names(things[key])[rank]]
+            pool = [
+                key
+                for key in things
+                if set(phrase.nouns) <= things[key].names[rank] | {key.lower()}
+            ]
             fitting = [key for key in pool if set(phrase.colours) <= {things[key].colour}]
             fitting = [key for key in fitting if self._has_sizes(key, phrase, pool)]
             if fitting or (pool and rank == 1):
@@ -207,14 +209,11 @@ class Nouns:
         """Whether a thing is the larger, or the smaller, beside others of its name."""
         sizes = {name: self.vocabulary.things[name].size_m for name in pool}
         volumes = {name: float(np.prod(size)) for name, size in sizes.items() if size is not None}
-        if not phrase.sizes:
-            return True
-        others = [volume for name, volume in volumes.items() if name != key]
-        if key not in volumes or not others:
-            return False
-        mine = volumes[key]
+        mine = volumes.pop(key, 0.0)
+        others = list(volumes.values()) if mine else []
         return all(
-            mine > APART * min(others) if SIZES[word] > 0 else APART * mine < max(others)
+            others
+            and (mine > APART * min(others) if SIZES[word] > 0 else APART * mine < max(others))
             for word in phrase.sizes
         )
 
@@ -244,9 +243,9 @@ class Nouns:
         if not phrase.loose or slot != "theme":
             message = f"'{phrase.text}' fits {many} objects: {told}. Say which is meant."
             raise GroundingError("ambiguous_object", message, candidates=fitting)
-        fresh = [key for key in fitting if key not in self.memory.chosen]
+        taken = [key for choice in self.memory.choices for key in choice.chosen]
+        fresh = [key for key in fitting if key not in taken]
         chosen = tuple((fresh if len(fresh) >= wanted else fitting)[:wanted])
-        self.memory.chosen += chosen
         self.memory.choices.append(Choice(count=wanted, among=fitting, chosen=chosen))
         return chosen
 
@@ -254,11 +253,6 @@ class Nouns:
 def _plain(word: str) -> str:
     single = singular(word)
     return SAME_NOUNS.get(single, single)
-
-
-def _names(thing: Thing) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
-    own = thing.own_names | {thing.id.lower()}
-    return own, own | {thing.shape}, own | {thing.shape} | thing.names
 
 
 def with_shared_noun(phrases: Sequence[NounPhrase]) -> Iterator[NounPhrase]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
@@ -16,7 +16,7 @@ from bridge.geometry.camera import Camera
 from bridge.media.palette import rgb
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.reply import Keypoint
-from twin.plan.problem import Problem
+from twin.plan.problem import Flags, Points, Pose, Problem
 from twin.plan.release.obstacles import spread_points
 
 LONG_SIDE_PX = 1280
@@ -43,7 +43,7 @@ class _Seen:
     """What one frame shows of one object."""
 
     outline_px: Float[np.ndarray, "num_corners 2"]
-    points_m: Float[np.ndarray, "num_marks 3"]
+    points_m: Points
     """In the object's frame."""
     points_px: Float[np.ndarray, "num_marks 2"]
 
@@ -86,14 +86,14 @@ def _views(problem: Problem, frame: RgbdFrame) -> dict[str, _Seen]:
 
 
 def _pixels(
-    camera: Camera, T_base_camera: Float[np.ndarray, "4 4"], p_base: Float[np.ndarray, "num 3"]
-) -> tuple[Float[np.ndarray, "num 2"], Bool[np.ndarray, " num"]]:
+    camera: Camera, T_base_camera: Pose, p_base: Points
+) -> tuple[Float[np.ndarray, "num 2"], Flags]:
     """Where points are in an image, and whether they are in it."""
     pixels, z = camera.project(se3.apply(se3.invert(T_base_camera), p_base))
     return pixels, (z > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
 
 
-def _measured(frame: RgbdFrame, p_base: Float[np.ndarray, "num 3"]) -> Bool[np.ndarray, " num"]:
+def _measured(frame: RgbdFrame, p_base: Points) -> Flags:
     """Whether the depth image measured something where each point is."""
     pixels, there = _pixels(frame.depth_camera, frame.T_base_depth, p_base)
     column, row = np.where(there, np.nan_to_num(pixels).T, 0).astype(int)

@@ -1,7 +1,8 @@
 """What an instruction can be about: the things of a scene, and what they are called."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,14 @@ from bridge.task.task_file import BASKET, ObjectModel, Task
 from twin.errors import TwinError
 from twin.naming.colours import colour_name
 from twin.naming.words import KIND_NAMES, colour_of, kind_of, label_of, spoken_name, words_of
+from twin.plan.constrain.schema import printable
 
 AT_FAULT = ("contradiction", "cyclic", "fixed_object")
 """Kinds whose candidates are at fault, and named by the message: there is nothing to choose."""
 UNREAD = ("empty", "unknown_clause", "unknown_object", "unsupported_relation", "unsupported_verb")
 """Kinds that are answered with examples of what is understood."""
+MOST_TOLD = 400
+"""Characters of a message with words of the instruction in it."""
 ANY_THING = ("object", "thing", "item")
 ALSO_CALLED = {"cube": ("block", "brick"), "block": ("cube", "brick"), "brick": ("block", "cube")}
 """Other nouns for the same, where nothing in the scene has that noun as its own. A bin is no mug:
@@ -28,20 +32,15 @@ class GroundingError(TwinError):
 
     def __init__(self, kind: str, message: str, *, candidates: Iterable[str] = ()) -> None:
         """Remember the kind, one of ``KINDS``, and ids of what could be meant, or is at fault."""
-        self.kind = kind
-        self.candidates = tuple(candidates)
+        self.kind, self.candidates, self.examples = kind, tuple(candidates), tuple[str, ...]()
         choices = () if kind in AT_FAULT else self.candidates
         listed = f" There is: {', '.join(choices)}." if choices else ""
-        super().__init__(f"{message}{listed}")
+        super().__init__(f"{printable(message)[:MOST_TOLD]}{listed}")
 
-    def with_examples(self, examples: Sequence[str]) -> "GroundingError":
-        """The same with what would be understood, where that helps."""
-        if self.kind not in UNREAD or not examples:
-            return self
-        told = " Understood is, for example: " + ", ".join(f"'{text}'" for text in examples) + "."
-        error = GroundingError(self.kind, str(self) + told)
-        error.candidates = self.candidates
-        return error
+    def __str__(self) -> str:
+        """With what would be understood, where that helps."""
+        told = ", ".join(f"'{text}'" for text in self.examples if self.kind in UNREAD)
+        return super().__str__() + (f" Understood is, for example: {told}." if told else "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,19 +57,16 @@ class Thing:
     """Outer extents, where known: small and large compare them."""
     shape: str = ""
     """``cube`` where it is one, whatever it is called."""
-    own_names: frozenset[str] = field(init=False)
-    names: frozenset[str] = field(init=False)
 
-    def __post_init__(self) -> None:
-        """Work out its names once."""
+    @cached_property
+    def names(self) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
+        """Its own; with that of its shape; with all that it may be called besides."""
         words = words_of(spoken_name(self.id)) + words_of(self.label)
-        own = {word for word in words if colour_of(word) is None}
-        names = own | set(ANY_THING) | set(KIND_NAMES[kind_of(self.label)])
-        names |= {other for word in own for other in ALSO_CALLED.get(word, ())}
-        object.__setattr__(self, "own_names", frozenset(own))
-        object.__setattr__(
-            self, "names", frozenset(names | ({"container"} if self.container else set()))
-        )
+        own = frozenset(word for word in words if colour_of(word) is None)
+        other = {name for word in own for name in ALSO_CALLED.get(word, ())}
+        other |= {*ANY_THING, *KIND_NAMES[kind_of(self.label)], *["container"] * self.container}
+        shaped = own | ({self.shape} - {""})
+        return own, shaped, shaped | other
 
     @property
     def called(self) -> str:
@@ -97,17 +93,18 @@ class Vocabulary:
         """Ids of what things can be put into."""
         return tuple(key for key, thing in self.things.items() if thing.container)
 
-    def called(self, key: str) -> str:
-        """What only this thing is called."""
-        name = self.things[key].called
-        return key if [each.called for each in self.things.values()].count(name) > 1 else name
-
     def examples(self) -> list[str]:
         """Three instructions about what is here."""
         if not self.movable():
             return []
-        first, *others = (f"the {self.called(key)}" for key in self.movable())
-        boxes = [f"the {self.called(key)}" for key in self.containers()]
+        all_called = [each.called for each in self.things.values()]
+
+        def the(key: str) -> str:
+            name = self.things[key].called
+            return f"the {key if all_called.count(name) > 1 else name}"
+
+        first, *others = map(the, self.movable())
+        boxes = [*map(the, self.containers())]
         found = [f"put {first} into {box}" for box in boxes[:1]]
         found += [f"stack {first} on {other}" for other in others[:1]]
         found += [f"put {first} left of {other}" for other in (others + boxes)[:1]]

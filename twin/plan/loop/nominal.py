@@ -7,7 +7,6 @@ from math import erfc, sqrt
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.task.check import TABLE
@@ -15,8 +14,8 @@ from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan, Waypoint
 from twin.plan.constrain.constraint import SHOWN, Constraint, flattened, violated, worst_along
 from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
-from twin.plan.loop.places import lying_there, places_on_table
 from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
 from twin.plan.loop.push import push_choices, pushed
 from twin.plan.loop.steer import Steer
@@ -31,12 +30,11 @@ from twin.plan.loop.tau import (
     stages_of,
 )
 from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, NoPathError, PathConfig, plan_move
-from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
-from twin.plan.problem import Grasp, Problem, Release, State
-from twin.plan.release.final_states import ReleaseConfig, final_states
-from twin.plan.release.resting import NoFinalStateError
+from twin.plan.path.transfer import LIFT_M, Leg, plan_transfer
+from twin.plan.problem import Grasp, Joints, Miss, Pose, Problem, Release, State, Vector
+from twin.plan.release.final_states import MAX_RELEASES, final_states, places_on_table
+from twin.plan.release.resting import NoFinalStateError, lying_there
 from twin.replay.clearance.bodies import SCENE
-from twin.robot.config import IkConfig
 
 PLANNER = "gst_planner"
 CLOSED_M = 0.0
@@ -44,12 +42,14 @@ CLOSED_M = 0.0
 GRASPS = 6
 WIDER_M = 0.003
 """Kept beyond what was asked for where a path was refused."""
+SLOWER = 0.7
+"""Share of speeds and accelerations that is kept where a limit was passed."""
 NOT_KEPT = "not kept on the way"
 MOST_TRIED = 16
 """Pairs of grasp and final state of one object that a way is sought for."""
 _PLACED = ("inside", "on")
 """Relations that final states are found for without a place to begin at."""
-_HOPELESS = ("nowhere_said", "not_localised", "container_too_small")
+_HOPELESS = ("nowhere_said", "not_localised")
 _OF_GRASP = ("approach", "around", "lift")
 
 
@@ -85,13 +85,13 @@ class Transfer:
     grasp: Grasp
     release: Release
     legs: tuple[Leg, ...]
-    T_base_lies: Float[np.ndarray, "4 4"]
+    T_base_lies: Pose
     cost: float
     """J of the final state, plus the chance that the grasp misses."""
     remarks: tuple[str, ...] = ()
 
     @property
-    def end_rad(self) -> Float[np.ndarray, " num_joints"]:
+    def end_rad(self) -> Joints:
         """Arm when it has let go and left."""
         return np.asarray(self.legs[-1].movement.path.joints_rad[-1])
 
@@ -214,7 +214,7 @@ class _Search:
         problem: Problem,
         grasp: Grasp,
         release: Release,
-        start_rad: Float[np.ndarray, " num_joints"],
+        start_rad: Joints,
         options: "_Options",
     ) -> Transfer:
         """The first way that keeps what holds on the way."""
@@ -224,9 +224,12 @@ class _Search:
         steer = self._mine(grasp.object_id)
         if steer is not None and steer.change == "path":
             ways = ways[2:]
-            eps_m = base.replay.eps_col_m + WIDER_M
+            eps_m = base.replay.eps_col_m + WIDER_M + steer.lacking_m
             base = replace(base, replay=replace(base.replay, eps_col_m=eps_m))
             base = replace(base, seed=len(steer.refused))
+        elif steer is not None and steer.change == "slower":
+            speed, acceleration = base.speed_share * SLOWER, base.acceleration_share * SLOWER
+            base = replace(base, speed_share=speed, acceleration_share=acceleration)
         failures: list[NoPathError] = []
         for way in ways:
             config = replace(base, seed=base.seed + self._seed % 2**31 + way.more_seed)
@@ -246,7 +249,7 @@ class _Search:
                 grasp=grasp,
                 release=release,
                 legs=legs,
-                T_base_lies=lying_there(problem, release),
+                T_base_lies=lying_there(problem, release, options.miss_with(grasp)),
                 cost=release.cost + erfc(grasp.margin / sqrt(2.0)) / 2,
                 remarks=options.remarks_of(grasp, release, legs),
             )
@@ -297,7 +300,8 @@ class _Options:
             compile_constraint(record, problem)
             for record in records
             if record["kind"] not in _PLACED or record.get("support") == TABLE
-        ] + _subgoals(problem, key, "release")
+        ]
+        self._wishes = _subgoals(problem, key, "release")
         self.why = ""
         self._given_up: list[Grasp] = []
 
@@ -320,15 +324,14 @@ class _Options:
         if steer.change == "grasp_shift" and steer.toward_m is not None:
             toward = np.array(steer.toward_m)
             near = sorted(
-                grasps,
-                key=lambda each: float(np.linalg.norm(each.T_object_tcp[:3, 3] - toward)),
+                grasps, key=lambda each: float(np.linalg.norm(each.T_object_tcp[:3, 3] - toward))
             )
             fresh = [grasp for grasp in near if not refused(grasp)]
             shifted = self._shifted(next((g for g in grasps if refused(g)), grasps[0]), toward)
             return [*shifted, *fresh]
         return sorted(grasps, key=lambda each: not refused(each))
 
-    def _shifted(self, grasp: Grasp, toward_m: Float[np.ndarray, "3"]) -> list[Grasp]:
+    def _shifted(self, grasp: Grasp, toward_m: Vector) -> list[Grasp]:
         """The refused grasp moved along its pads to where a finger met the object."""
         T = grasp.T_object_tcp.copy()
         way = toward_m - T[:3, 3]
@@ -336,13 +339,13 @@ class _Options:
         if self._steer is not None and self._steer.has_grasp_like(self._key, T):
             return []
         goal = self._problem.scene.Ts_base_object[self._key] @ T
-        joints = nearest_solutions(self._problem.robot, goal, grasp.joints_rad, IkConfig())
+        joints = nearest_solutions(self._problem.robot, goal, grasp.joints_rad)
         return [replace(grasp, T_object_tcp=T, joints_rad=joints[0])] if joints else []
 
     def pairs(self) -> Iterator[tuple[Grasp, Release]]:
         """Every grasp with its cheapest final state, then every grasp with the next, and so on."""
         states: dict[int, tuple[Release, ...]] = {}
-        for rank in range(ReleaseConfig().max_releases):
+        for rank in range(MAX_RELEASES):
             for number, grasp in enumerate(self.grasps):
                 if any(grasp is each for each in self._given_up):
                     continue
@@ -362,11 +365,13 @@ class _Options:
                 raise
             return ()
         steer = self._steer
-        if steer is not None and steer.change == "release":
-            releases = tuple(
-                each for each in releases if not steer.has_release_like(self._key, each.T_base_tcp)
-            )
-        return releases
+        if steer is None or steer.change != "release" or self.miss_with(grasp) is not None:
+            return releases  # a measured miss changes where they are
+        return tuple(each for each in releases if not steer.has_end_like(each))
+
+    def miss_with(self, grasp: Grasp) -> Miss | None:
+        """How far beside it is known to let the object go with a grasp."""
+        return None if self._steer is None else self._steer.miss_with(grasp)
 
     def _final_states(self, grasp: Grasp) -> tuple[Release, ...]:
         problem = self._problem
@@ -375,7 +380,10 @@ class _Options:
         near = None
         if not placed or (relation is None and problem.scene.task.mark_of(self._key) is None):
             near = places_on_table(problem, self._key, self._goals, seed=self._seed)
-        return final_states(problem, grasp, constraints=self._goals, near=near, seed=self._seed)
+        return final_states(
+            problem, grasp, goals=self._goals, wishes=self._wishes, near=near,
+            miss=self.miss_with(grasp), seed=self._seed,
+        )  # fmt: skip
 
     def remarks_of(self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]) -> tuple[str, ...]:
         """Where the numbers of a transfer come from, in words."""
@@ -501,7 +509,7 @@ def _written(
     plan_id: str,
     tau: tuple[Waypoint, ...],
     bounds: Bounds,
-    there: Mapping[str, Float[np.ndarray, "4 4"]],
+    there: Mapping[str, Pose],
 ) -> Plan:
     """A plan of a trajectory that leaves its objects there."""
     task, record = problem.scene.task, problem.robot.record

@@ -67,7 +67,7 @@ def choose(
                 "rounds, or begin from another start."
             )
         return named(ranked[round_], problem, seed=seed)
-    steer = steer_by(refused, problem.scene.task, fingers_of(problem))
+    steer = steer_by(refused, problem)
     known = [refusal.plan.tau for refusal in refused]
 
     def fresh_of(steer: Steer | None, counts: Sequence[int]) -> Candidate | None:
@@ -107,12 +107,6 @@ def named(
     return replace(candidate, plan=plan)
 
 
-def fingers_of(problem: Problem) -> tuple[str, ...]:
-    """Names by which failures call the hand."""
-    gripper = problem.robot.record.gripper
-    return ("gripper", gripper.name, *gripper.links)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
     """One candidate and what was said of it."""
@@ -129,6 +123,7 @@ def plan_and_verify(
     plan_id: str,
     seed: int,
     rounds: int,
+    refused: Sequence[Refusal] = (),
     task_sha256: str = "",
     grounding_source: str = "",
 ) -> list[Attempt]:
@@ -138,7 +133,6 @@ def plan_and_verify(
     left, or after so many rounds.
     """
     attempts: list[Attempt] = []
-    refused: list[Refusal] = []
     for round_ in range(rounds):
         try:
             candidate = choose(
@@ -168,5 +162,5 @@ def plan_and_verify(
         attempts.append(Attempt(candidate=candidate, verdict=verdict))
         if verdict.accepted is not False:
             break
-        refused.append(Refusal(plan=plan, verdict=verdict))
+        refused = (*refused, Refusal(plan=plan, verdict=verdict))
     return attempts

@@ -16,7 +16,7 @@ from bridge.task.plan import Waypoint
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.loop.tau import stages_of
 from twin.plan.path.planner import waypoint
-from twin.plan.problem import Problem
+from twin.plan.problem import Joints, Numbers, Pose, Problem
 from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 
@@ -36,8 +36,6 @@ ASIDE_M = (0.0, 0.012, -0.012)
 """Of the fingers, along the pads, from the middle of the object."""
 AHEAD_M = ((0.0, 0.0), (0.015, 0.0), (-0.015, 0.0), (0.0, 0.015), (0.0, -0.015))
 """Of the end from the mark."""
-
-Pose = Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +149,7 @@ def _tool_down(yaw_rad: float) -> Pose:
 
 
 def _followed(
-    problem: Problem, legs: Sequence[_Leg], start_rad: Float[np.ndarray, " num_joints"]
+    problem: Problem, legs: Sequence[_Leg], start_rad: Joints
 ) -> tuple[tuple[Waypoint, ...], dict[str, tuple[int, int]]]:
     """Waypoints along the legs, and when each stage begins and ends."""
     robot = problem.robot
@@ -186,7 +184,7 @@ def _followed(
     return tuple(tau), bounds
 
 
-def _law(T: Float[np.ndarray, "4 4"], leg: _Leg) -> tuple[float, Float[np.ndarray, " num_steps"]]:
+def _law(T: Pose, leg: _Leg) -> tuple[float, Numbers]:
     """How long a leg takes, and which share of its way is done after each step."""
     if leg.even_m_s is None:
         steps = max(1, round((leg.pause_s or _duration_s(T, leg.T_base_tcp)) / STEP_S))
@@ -202,7 +200,7 @@ def _law(T: Float[np.ndarray, "4 4"], leg: _Leg) -> tuple[float, Float[np.ndarra
     return seconds, done / (1 - ramp)
 
 
-def _duration_s(T: Float[np.ndarray, "4 4"], T_next: Float[np.ndarray, "4 4"]) -> float:
+def _duration_s(T: Pose, T_next: Pose) -> float:
     far_m = float(np.linalg.norm(T_next[:3, 3] - T[:3, 3]))
     turn_rad = float(se3.rotation_angle_rad(T[:3, :3].T @ T_next[:3, :3]))
     return max(SHORTEST_S, far_m / SPEED_M_S, turn_rad / TURN_RAD_S)

@@ -1,20 +1,20 @@
 """From movements to a gst plan: the trajectory tau, the stages it goes through, what they leave."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.task.plan import Stage, Waypoint
 from bridge.task.task_file import Task
 from twin.plan.constrain.relations import constraint_of
 from twin.plan.loop.propose import NoPlanError
-from twin.plan.path.planner import waypoints_of
+from twin.plan.path.planner import STEP_S, waypoints_of
 from twin.plan.path.transfer import Leg
-from twin.plan.problem import Grasp
+from twin.plan.problem import Grasp, Pose
 from twin.robot.model import RobotModel
 
 Bounds = Mapping[str, tuple[int, int]]
@@ -60,16 +60,35 @@ class Trajectory:
         self._ends(stage, begin_s, begin_s + float(leg.movement.path.times_s[-1]))
 
     def _pause(self, stage: str, seconds: float, *, g: int, width_m: float) -> None:
-        """Stand still; the command is given as soon as that begins."""
+        """Stand still while the hand goes to a width, as fast as its fingers may at most."""
         here, begin_s = self.tau[-1], self.end_s
-        for t_s in (begin_s + 0.02, begin_s + seconds):
-            self.tau.append(replace(here, t_ns=round(t_s * 1e9), g=g, width_m=width_m))
+        before_m = width_m if here.width_m is None else here.width_m
+        step_m = KEPT_SHARE * STEP_S * pads_speed_m_s(self.robot)
+        count = max(1, math.ceil(abs(width_m - before_m) / step_m))
+        seconds = max(seconds, (count + 1) * STEP_S)
+        widths = np.linspace(before_m, width_m, count + 1)[1:].tolist()
+        times_s = [STEP_S * number for number in range(1, count + 1)]
+        for after_s, width in zip((*times_s, seconds), (*widths, width_m), strict=True):
+            t_ns = round((begin_s + after_s) * 1e9)
+            self.tau.append(replace(here, t_ns=t_ns, g=g, width_m=width))
         self._ends(stage, begin_s, begin_s + seconds)
 
     def _ends(self, stage: str, begin_s: float, end_s: float) -> None:
         begin_ns = self.bounds.get(stage, (round(begin_s * 1e9), 0))[0]
         self.bounds[stage] = (begin_ns, round(end_s * 1e9))
         self.end_s = end_s
+
+
+def pads_speed_m_s(robot: RobotModel) -> float:
+    """How fast the distance between the pads may change, by the limits of the fingers' joints."""
+    gripper, model = robot.record.gripper, robot.model
+    limits = [
+        float(model.velocityLimit[model.joints[model.getJointId(finger.joint)].idx_v])
+        / max(abs(finger.slope(share * gripper.max_width_m)) for share in (0.0, 0.25, 0.5, 0.75, 1))
+        for finger in gripper.fingers
+        if model.existJointName(finger.joint)
+    ]
+    return min((limit for limit in limits if limit > 0), default=np.inf)
 
 
 def stages_of(task: Task, key: str) -> dict[str, str]:
@@ -124,10 +143,7 @@ def refuse_without_stages(task: Task) -> None:
 
 
 def plan_stage(
-    task: Task,
-    table: Mapping[str, Any],
-    bounds: Bounds,
-    there: Mapping[str, Float[np.ndarray, "4 4"]],
+    task: Task, table: Mapping[str, Any], bounds: Bounds, there: Mapping[str, Pose]
 ) -> Stage:
     """What a plan says of one stage of its task: when it is, what may touch, where it leads."""
     stage_id = str(table["id"])

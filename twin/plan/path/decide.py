@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Stage
 from twin.plan.path.world import Carried
-from twin.plan.problem import Problem, TimedPath
+from twin.plan.problem import Poses, Postures, Problem, TimedPath
 from twin.replay.clearance.bodies import own_links
 from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig
@@ -44,10 +43,8 @@ class Decision:
 
 
 def object_poses(
-    problem: Problem,
-    joints_rad: Float[np.ndarray, "num_points num_joints"],
-    carried: Carried | None,
-) -> dict[str, Float[np.ndarray, "num_points 4 4"]]:
+    problem: Problem, joints_rad: Postures, carried: Carried | None
+) -> dict[str, Poses]:
     """Where the movable objects are along a movement: at their start, or in the hand."""
     poses = {
         name: np.repeat(T[None], len(joints_rad), axis=0)

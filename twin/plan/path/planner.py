@@ -12,7 +12,7 @@ from bridge.task.plan import Waypoint
 from twin.errors import TwinError
 from twin.plan.path.decide import Decision, PathRefusal, decide
 from twin.plan.path.world import SPARE_M, Carried, World, build_world
-from twin.plan.problem import Problem, TimedPath
+from twin.plan.problem import Joints, Pose, Postures, Problem, TimedPath
 from twin.replay.clearance.monitor import Allowed
 from twin.replay.config import ReplayConfig
 from twin.robot.config import IkConfig
@@ -20,12 +20,7 @@ from twin.robot.follow import follow_poses
 from twin.robot.model import RobotModel
 
 START_TOUCHES, BUDGET_SPENT = "start touches", "budget spent"
-REASONS = {
-    1: START_TOUCHES,
-    2: "goal touches",
-    3: BUDGET_SPENT,
-    4: "outside the joint limits",
-}
+REASONS = {1: START_TOUCHES, 2: "goal touches", 3: BUDGET_SPENT, 4: "outside the joint limits"}
 """Why a search ends without a path, by the native search's number."""
 _WIDER_M = 0.001
 _STRAIGHT_M, _STRAIGHT_RAD = 0.005, 0.05
@@ -130,8 +125,8 @@ class _Asked:
 
 def plan_move(
     problem: Problem,
-    start_rad: Float[np.ndarray, " num_joints"],
-    goals_rad: Float[np.ndarray, "num_goals num_joints"],
+    start_rad: Joints,
+    goals_rad: Postures,
     config: PathConfig,
     *,
     width_m: float,
@@ -175,11 +170,7 @@ def _widen(wider: dict[frozenset[str], float], refusals: tuple[PathRefusal, ...]
         wider[pair] = wider.get(pair, 0.0) + max(refusal.lacking_m, 0.0) + _WIDER_M
 
 
-def _let_ends_be(
-    world: World,
-    ends_rad: Float[np.ndarray, "num_ends num_joints"],
-    wider_m: Mapping[frozenset[str], float],
-) -> None:
+def _let_ends_be(world: World, ends_rad: Postures, wider_m: Mapping[frozenset[str], float]) -> None:
     """Ask of a refused pair no more than it has at the ends, which nobody chooses here."""
     for number, names in enumerate(world.names):
         if frozenset(names) in wider_m:
@@ -191,13 +182,13 @@ def _let_ends_be(
 
 def _searched(
     world: World,
-    start_rad: Float[np.ndarray, " num_joints"],
-    goals_rad: Float[np.ndarray, "num_goals num_joints"],
+    start_rad: Joints,
+    goals_rad: Postures,
     config: PathConfig,
     turn: int,
     work: dict[str, float],
     refusals: tuple[PathRefusal, ...],
-) -> Float[np.ndarray, "num_knots num_joints"]:
+) -> Postures:
     """One native search; adds its work."""
     outcome, pair, _, knots, spent = world.motion.find(
         np.ascontiguousarray(start_rad, dtype=np.float64),
@@ -220,11 +211,7 @@ def _searched(
 
 
 def timed_path(
-    world: World,
-    knots_rad: Float[np.ndarray, "num_knots num_joints"],
-    config: PathConfig,
-    *,
-    tool_m_s: float | None = None,
+    world: World, knots_rad: Postures, config: PathConfig, *, tool_m_s: float | None = None
 ) -> TimedPath:
     """Give a path of straight lines its times: corners rounded where that is free."""
     speed, acceleration, limit_m_s = limits_of(world.robot, config)
@@ -247,9 +234,7 @@ def timed_path(
     return TimedPath(times_s=times, joints_rad=joints)
 
 
-def limits_of(
-    robot: RobotModel, config: PathConfig
-) -> tuple[Float[np.ndarray, " num_joints"], Float[np.ndarray, " num_joints"], float]:
+def limits_of(robot: RobotModel, config: PathConfig) -> tuple[Joints, Joints, float]:
     """Return the speeds and accelerations of joints and the tool's speed that are used."""
     record = robot.record
     most = record.acceleration_rad_s2 or (ACCELERATION_RAD_S2,) * len(robot.joints)
@@ -263,8 +248,8 @@ def limits_of(
 
 def plan_straight(
     problem: Problem,
-    start_rad: Float[np.ndarray, " num_joints"],
-    T_base_goal: Float[np.ndarray, "4 4"],
+    start_rad: Joints,
+    T_base_goal: Pose,
     config: PathConfig,
     *,
     width_m: float,
@@ -290,11 +275,8 @@ def plan_straight(
 
 
 def _straight_knots(
-    robot: RobotModel,
-    start_rad: Float[np.ndarray, " num_joints"],
-    T_base_goal: Float[np.ndarray, "4 4"],
-    config: PathConfig,
-) -> Float[np.ndarray, "num_knots num_joints"]:
+    robot: RobotModel, start_rad: Joints, T_base_goal: Pose, config: PathConfig
+) -> Postures:
     """Joints along a straight line of the tool, one branch all the way."""
     T_start = robot.T_base_tcp(start_rad)
     (q_start, p_start), (q_goal, p_goal) = se3.split(T_start), se3.split(T_base_goal)
@@ -343,12 +325,7 @@ def waypoints_of(
 
 
 def waypoint(
-    t_s: float,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    joints_rad: Float[np.ndarray, " num_joints"],
-    *,
-    g: int,
-    width_m: float | None = None,
+    t_s: float, T_base_tcp: Pose, joints_rad: Joints, *, g: int, width_m: float | None = None
 ) -> Waypoint:
     """One commanded instant."""
     q, p = se3.split(T_base_tcp)

@@ -5,9 +5,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.geometry import se3
+from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.path.planner import (
     Movement,
     NoPathError,
@@ -17,19 +17,15 @@ from twin.plan.path.planner import (
     reversed_path,
 )
 from twin.plan.path.world import Carried
-from twin.plan.problem import Grasp, Problem, Release
+from twin.plan.problem import Grasp, Joints, Pose, Problem, Release
 from twin.replay.clearance.bodies import GRIPPER
 from twin.replay.clearance.monitor import Allowed
-from twin.robot.config import IkConfig
-from twin.robot.inverse import UrInverse, solutions
-from twin.robot.model import RobotModel
 
 LIFT_M = 0.06
 _LEAST_LIFT_M = 0.02
 _SAME_RAD = 0.001
 _LEAVE_MORE_M = (0.1, 0.05, 0.0)
 """Beyond the length of the approach, how far the hand goes straight back."""
-_TURN = 2 * np.pi
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +43,7 @@ def plan_transfer(
     problem: Problem,
     grasp: Grasp,
     release: Release,
-    start_rad: Float[np.ndarray, " num_joints"],
+    start_rad: Joints,
     config: PathConfig,
     *,
     lift_m: float = LIFT_M,
@@ -73,7 +69,7 @@ def plan_transfer(
     taken = transfer.take(start_rad)
     lifted_rad = taken[-1].movement.path.joints_rad[-1]
     failure = NoPathError(reason="unreachable", detail="no joints reach the release pose")
-    for joints_rad in nearest_solutions(problem.robot, release.T_base_tcp, lifted_rad, IkConfig()):
+    for joints_rad in nearest_solutions(problem.robot, release.T_base_tcp, lifted_rad):
         try:
             return (*taken, *transfer.put(lifted_rad, joints_rad))
         except NoPathError as error:
@@ -96,7 +92,7 @@ class _Transfer:
     def _driven(self, leg: str) -> PathConfig:
         return replace(self.config, tool_m_s=self.tool_m_s.get(leg, 0.0))
 
-    def take(self, start_rad: Float[np.ndarray, " num_joints"]) -> tuple[Leg, Leg, Leg]:
+    def take(self, start_rad: Joints) -> tuple[Leg, Leg, Leg]:
         """From where the arm stands to the lifted object."""
         grasp = self.grasp
         taking = self._touching("grasp")
@@ -119,11 +115,7 @@ class _Transfer:
             Leg(name="lift", movement=lift, g=1),
         )
 
-    def put(
-        self,
-        lifted_rad: Float[np.ndarray, " num_joints"],
-        joints_rad: Float[np.ndarray, " num_joints"],
-    ) -> tuple[Leg, Leg, Leg]:
+    def put(self, lifted_rad: Joints, joints_rad: Joints) -> tuple[Leg, Leg, Leg]:
         """From the lifted object to where the arm has left, let go with these joints."""
         leaving = self._touching("release")
         with _named("lower"):
@@ -152,9 +144,7 @@ class _Transfer:
     def _touching(self, verb: str) -> Allowed:
         return self.problem.contacts_of(verb, self.grasp.object_id) | self._grip
 
-    def _straight_up(
-        self, joints_rad: Float[np.ndarray, " num_joints"], allowed: Allowed, config: PathConfig
-    ) -> Movement:
+    def _straight_up(self, joints_rad: Joints, allowed: Allowed, config: PathConfig) -> Movement:
         """Lift as far as is free and within reach, at least two centimetres."""
         rise_m = self.lift_m
         while True:
@@ -170,22 +160,14 @@ class _Transfer:
                     raise
             rise_m /= 2
 
-    def _carry(
-        self,
-        start_rad: Float[np.ndarray, " num_joints"],
-        goal_rad: Float[np.ndarray, " num_joints"],
-    ) -> Movement:
+    def _carry(self, start_rad: Joints, goal_rad: Joints) -> Movement:
         """Carry around whatever stands in between."""
         return plan_move(
             self.problem, start_rad, goal_rad[None], self._driven("carry"),
             width_m=self.grasp.width_m, carried=self._held, allowed=self._grip,
         )  # fmt: skip
 
-    def _carry_straight(
-        self,
-        start_rad: Float[np.ndarray, " num_joints"],
-        goal_rad: Float[np.ndarray, " num_joints"],
-    ) -> Movement:
+    def _carry_straight(self, start_rad: Joints, goal_rad: Joints) -> Movement:
         """Carry along a straight line that ends on the branch on which the object is let down."""
         goal = self.problem.robot.T_base_tcp(goal_rad)
         movement = plan_straight(
@@ -198,7 +180,7 @@ class _Transfer:
             raise NoPathError(reason="branch", detail=detail)
         return movement
 
-    def _leave(self, joints_rad: Float[np.ndarray, " num_joints"], allowed: Allowed) -> Movement:
+    def _leave(self, joints_rad: Joints, allowed: Allowed) -> Movement:
         """Straight back; the farther the better, for next to a rim nothing else may be planned."""
         scene, release = self.problem.scene, self.release
         poses = {**scene.Ts_base_object, self.grasp.object_id: release.T_base_object}
@@ -226,7 +208,7 @@ def _named(leg: str) -> Iterator[None]:
         raise
 
 
-def _along_z(way_m: float) -> Float[np.ndarray, "4 4"]:
+def _along_z(way_m: float) -> Pose:
     T = np.eye(4)
     T[2, 3] = way_m
     return T
@@ -234,24 +216,3 @@ def _along_z(way_m: float) -> Float[np.ndarray, "4 4"]:
 
 def _backwards(movement: Movement) -> Movement:
     return replace(movement, path=reversed_path(movement.path))
-
-
-def nearest_solutions(
-    robot: RobotModel,
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    near_rad: Float[np.ndarray, " num_joints"],
-    config: IkConfig,
-) -> list[Float[np.ndarray, " num_joints"]]:
-    """Joints that reach a pose, each turned as near as its limits let it, nearest first."""
-    inverse = UrInverse.for_robot(robot)
-    if inverse is not None:
-        raw, valid, _ = inverse.solve(T_base_tcp[None])
-        found = list(raw[0, valid[0]])
-    else:
-        found = [item.joints_rad for item in solutions(robot, T_base_tcp, config) if item.reached]
-    turned = []
-    for joints in found:
-        wanted = joints + _TURN * np.rint((near_rad - joints) / _TURN)
-        inside = (wanted >= robot.lower_rad) & (wanted <= robot.upper_rad)
-        turned.append(np.where(inside, wanted, joints))
-    return sorted(turned, key=lambda joints: float(np.abs(joints - near_rad).sum()))

@@ -7,14 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
-from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from twin.plan.constrain.distances import scene_grid
 from twin.plan.path._motion import Motion
-from twin.plan.path.spheres import box_spheres, covering_spheres, excess_m
-from twin.plan.problem import Problem
+from twin.plan.problem import Flags, Numbers, Points, Pose, Poses, Problem, Spheres, Vector
 from twin.replay.clearance.bodies import SCENE, TABLE, names_of, placed_panels
 from twin.replay.clearance.bounding_spheres import (
     ARM_FINE_M,
@@ -32,6 +31,12 @@ SPARE_M = 0.0003
 """A path keeps this much more than was asked: what the search may overlook is less."""
 BOX, PLANE, GRID, BODY = range(4)
 
+SPHERES = 16
+"""For each hull of a link or box that is carried."""
+_GROWN = 1 + 1e-9
+"""So that rounding leaves no corner outside."""
+_PROBES = 64
+
 Names = tuple[str, str]
 
 
@@ -40,21 +45,21 @@ class Carried:
     """An object in the hand."""
 
     object_id: str
-    T_tcp_object: Float[np.ndarray, "4 4"]
+    T_tcp_object: Pose
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
     """The arm's joints one after the other, and its hulls in their frames, at one gripper width."""
 
-    placements: Float[np.ndarray, "num_joints 4 4"]
+    placements: Poses
     """Each joint's frame in that of the one before, at 0."""
-    axes: Float[np.ndarray, "num_joints 3"]
-    slides: Bool[np.ndarray, " num_joints"]
-    T_last_tcp: Float[np.ndarray, "4 4"]
+    axes: Points
+    slides: Flags
+    T_last_tcp: Pose
     joint_of: tuple[int, ...]
     """For each hull: how many joints move it."""
-    Ts_joint_hull: Float[np.ndarray, "num_hulls 4 4"]
+    Ts_joint_hull: Poses
 
 
 def chain_of(hulls: RobotHulls, width_m: float) -> Chain:
@@ -93,8 +98,35 @@ def chain_of(hulls: RobotHulls, width_m: float) -> Chain:
     )
 
 
+def covering_spheres(corners_m: Points, count: int = SPHERES) -> Spheres:
+    """Cover a convex hull: the box along its axes, its longest cells halved, a sphere for each."""
+    middle = corners_m.mean(axis=0)
+    axes = np.linalg.svd(corners_m - middle, full_matrices=True)[2]
+    along = (corners_m - middle) @ axes.T
+    low, extents = along.min(axis=0), np.ptp(along, axis=0)
+    cells = np.ones(3, dtype=np.int64)
+    while 2 * cells.prod() <= count:
+        cells[int(np.argmax(extents / cells))] *= 2
+    size = extents / cells
+    numbers = np.stack(np.meshgrid(*map(np.arange, cells), indexing="ij"), axis=-1).reshape(-1, 3)
+    centres = middle + (low + (numbers + 0.5) * size) @ axes
+    radius = np.full((len(centres), 1), np.linalg.norm(size) / 2 * _GROWN)
+    return np.concatenate([centres, radius], axis=1)
+
+
+def excess_m(corners_m: Points, spheres_m: Spheres) -> float:
+    """How far spheres stand out of the hull of points at most [m], looked at in some directions."""
+    equations = ConvexHull(corners_m).equations
+    normals, offsets = equations[:, :3], equations[:, 3]
+    turns = np.random.default_rng(0).normal(size=(_PROBES, 3))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    tips = spheres_m[:, None, :3] + spheres_m[:, 3, None, None] * turns
+    outside = (tips.reshape(-1, 3) @ normals.T + offsets).max(axis=1)
+    return float(max(0.0, outside.max()))
+
+
 @lru_cache(maxsize=4)
-def _link_spheres(hulls: RobotHulls) -> list[tuple[Float[np.ndarray, "num_spheres 4"], float]]:
+def _link_spheres(hulls: RobotHulls) -> list[tuple[Spheres, float]]:
     """Spheres of each hull in its own frame, and how far they stand out; once for a robot."""
     fitted = [covering_spheres(hull.points_m) for hull in hulls.hulls]
     return [(s, excess_m(hull.points_m, s)) for hull, s in zip(hulls.hulls, fitted, strict=True)]
@@ -169,9 +201,7 @@ class _Builder:
         self.limits_m.append(limit_m)
 
 
-def _placed_spheres(
-    T: Float[np.ndarray, "4 4"], spheres_m: Float[np.ndarray, "num_spheres 4"]
-) -> Float[np.ndarray, "num_spheres 4"]:
+def _placed_spheres(T: Pose, spheres_m: Spheres) -> Spheres:
     return np.column_stack([se3.apply(T, spheres_m[:, :3]), spheres_m[:, 3]])
 
 
@@ -218,15 +248,10 @@ def build_world(
     builder.add_standing([name for name, *_ in obstacles], has_grid=lookup is not None)
     builder.add_own()
     motion.prepare()
-    return World(
-        motion=motion,
-        names=builder.names,
-        robot=robot,
-        limits_m=builder.limits_m,
-    )
+    return World(motion=motion, names=builder.names, robot=robot, limits_m=builder.limits_m)
 
 
-PlacedBox = tuple[str, Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]
+PlacedBox = tuple[str, Pose, Vector]
 """Its name, ``T_base_box`` and extents [m]."""
 
 
@@ -250,12 +275,12 @@ def _obstacles(problem: Problem, carried: Carried | None) -> list[PlacedBox]:
 class _Points:
     """Trees of points behind each other."""
 
-    points: list[Float[np.ndarray, "n 3"]] = field(default_factory=list)
-    radii: list[Float[np.ndarray, " n"]] = field(default_factory=list)
+    points: list[Points] = field(default_factory=list)
+    radii: list[Numbers] = field(default_factory=list)
     children: list[np.ndarray] = field(default_factory=list)
     count: int = 0
 
-    def add(self, tree: BoundingSphereTree, T: Float[np.ndarray, "4 4"]) -> tuple[int, int]:
+    def add(self, tree: BoundingSphereTree, T: Pose) -> tuple[int, int]:
         """Put a tree behind the others; where its roots begin and end."""
         begin = self.count
         self.points.append(se3.apply(T, tree.points_m))
@@ -294,7 +319,7 @@ def _add_bodies(
         size = problem.model(carried.object_id).size_m
         corners = box_corners(np.array(size))
         T = chain.T_last_tcp @ carried.T_tcp_object
-        spheres = box_spheres(tuple(size))
+        spheres = covering_spheres(corners)
         roots, cover = (0, 0), 0.0
         if lookup is not None:
             tree = bounding_spheres_of(corners)

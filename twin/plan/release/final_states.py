@@ -1,109 +1,93 @@
 """Final states of a carried object: solved for, perturbed, checked, ranked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import SHOWN, Constraint
-from twin.plan.problem import Array, Grasp, Problem, Release, State
+from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.constrain.schema import values_of
+from twin.plan.problem import Array, Grasp, Miss, Numbers, Pose, Poses, Problem, Release, State
 from twin.plan.release.obstacles import allowed_with, hand_points, obstacles_of
 from twin.plan.release.resting import (
     NoFinalStateError,
     Target,
     resting_poses,
     sideways_sigma_m,
+    support_m,
     target_of,
 )
-from twin.plan.stage.objective import ANGLE_RAD, CostTerm, StageProblem, Zeta
-from twin.plan.stage.solver import SolveConfig, StageCandidate, distinct, solve
+from twin.plan.stage.solver import ANGLE_RAD, CostTerm, StageProblem, StageState, distinct, solve
 from twin.robot.collision import hulls_of
 
 NEAR_M = 0.02
 """Margins above this are not told apart while a stage is solved."""
-
-
 TAU_P_M = 0.02
 """Bound of the shifts of Eq. 8, along each axis."""
 TAU_R_RAD = ANGLE_RAD
 """Bound of the turns of Eq. 9."""
+NUM_SAMPLES, NUM_NOMINAL = 2048, 4
+"""Poses that are drawn, around so many answers of the optimisation."""
+NUM_WAYS = 4
+"""Ways to rest that are tried, those nearest to how the object lies now first."""
+MAX_RELEASES = 16
+EPS_COL_M = 0.002
+"""Least distance between what may not touch, the paper's epsilon_col."""
+SIGMAS = 2.0
+"""Standard deviations of localisation that the object stays away from the edge of the area."""
 HAND_POINTS = 200
 DROP_M, MOST_DROP_M = 0.004, 0.03
 """Wanted between the underside and what the object will lie on; most of it, over a rim that the
-object may have to stay above."""
+object may have to stay above, where nothing is asked of the release itself."""
 MOST_TILT_RAD = float(np.deg2rad(12.0))
 """Most that the object may lean from how it will rest."""
 MOST_TOOL_TILT_RAD = float(np.deg2rad(60.0))
 """Most that the tool may lean from straight down where the object is let go."""
 OPEN_MORE_M = 0.01
 """The hand opens at least this much wider than it held."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReleaseConfig:
-    """How final states are looked for."""
-
-    num_samples: int = 2048
-    num_nominal: int = 4
-    num_starts: int = 12
-    """Starts of the stage optimisation for each way to rest."""
-    num_ways: int = 4
-    """Ways to rest that are tried, those nearest to how the object lies now first."""
-    eps_col_m: float = 0.002
-    """Least distance between what may not touch, the paper's epsilon_col."""
-    sigmas: float = 2.0
-    """Standard deviations of localisation that the object stays away from the edge of the area."""
-    max_releases: int = 16
-
-    def solver(self) -> SolveConfig:
-        """How the stage problem of one way to rest is solved: from above, hardly leaning."""
-        return SolveConfig(
-            num_starts=self.num_starts,
-            iterations=20,
-            redraws=1,
-            only_above=True,
-            spread_rad=MOST_TILT_RAD,
-            max_candidates=self.max_releases,
-        )
+_AREA_M = ((0.28, 0.68), (-0.36, 0.36))
+"""Where an arm at the origin reaches with the tool down, in its base frame."""
+_STEP_M = 0.02
+_LEAST_GAP_M = 0.012
+"""To what no goal names."""
+_NEARLY = 1.5
+"""Violations in sum, in units of 1 cm and 10 degrees, that an optimisation is trusted to mend."""
+_PLACES = 4
+_SPACING_M = 0.03
 
 
 def final_states(
     problem: Problem,
     grasp: Grasp,
     *,
-    constraints: Sequence[Constraint] = (),
-    near: Sequence[Float[np.ndarray, "4 4"]] | None = None,
-    config: ReleaseConfig | None = None,
+    goals: Sequence[Constraint] = (),
+    wishes: Sequence[Constraint] = (),
+    near: Sequence[Pose] | None = None,
+    miss: Miss | None = None,
     seed: int = 0,
 ) -> tuple[Release, ...]:
     """Find where a held object may be let go: distinct final states, the cheapest first.
 
     Args:
-        constraints: What must hold there besides (Eq. 7).
+        goals: What must hold where the object comes to lie, straight below (Eq. 7).
+        wishes: What must hold as it is let go; no other height is then asked for.
         near: Poses ``T_base_object`` to look around instead of what the success predicates ask
-            for; ``constraints`` then say what is wanted.
+            for; goals then say what is wanted.
+        miss: How far from there it is known to come to lie.
     """
-    config = ReleaseConfig() if config is None else config
-    search = ReleaseSearch(problem, grasp, constraints, config)
+    search = ReleaseSearch(problem, grasp, goals, wishes, miss or Miss())
     target = target_of(problem, grasp.object_id) if near is None else None
     if target is not None:
-        search.check_size(target)
         ways = resting_poses(
-            problem,
-            grasp,
-            target,
-            drop_m=DROP_M,
-            most_tilted_rad=MOST_TOOL_TILT_RAD,
-        )[: config.num_ways]
+            problem, grasp, target, drop_m=DROP_M, most_tilted_rad=MOST_TOOL_TILT_RAD
+        )[:NUM_WAYS]
     else:
         ways = list(near or ())
-    stages = [search.stage(T, target) for T in ways]
-    rng = np.random.default_rng(seed)
-    return search.answer(stages, seed, rng)
+    return search.answer([search.stage(T, target) for T in ways], seed)
 
 
 class ReleaseSearch:
@@ -113,15 +97,15 @@ class ReleaseSearch:
         self,
         problem: Problem,
         grasp: Grasp,
-        constraints: Sequence[Constraint],
-        config: ReleaseConfig,
+        goals: Sequence[Constraint],
+        wishes: Sequence[Constraint],
+        miss: Miss,
     ) -> None:
         """Collect obstacles and points."""
-        self._problem, self._grasp, self._config = problem, grasp, config
-        self._constraints = constraints
+        self._problem, self._grasp = problem, grasp
+        self._goals, self._wishes, self._miss = goals, wishes, miss
         hulls = hulls_of(problem.robot)
         gripper = problem.robot.record.gripper
-        self._max_width_m = gripper.max_width_m
         self._width_m = min(max(grasp.open_m, grasp.width_m + OPEN_MORE_M), gripper.max_width_m)
         self._points_m = surface_points(problem, grasp.object_id)
         self._outline_m = self._points_m[ConvexHull(self._points_m).vertices]
@@ -134,64 +118,50 @@ class ReleaseSearch:
         self._T_tcp_object = se3.invert(grasp.T_object_tcp)
         self._sigma_m = sideways_sigma_m(problem, grasp.object_id)
 
-    def check_size(self, target: Target) -> None:
-        """Refuse what is too large for the area in every direction."""
-        if target.relation != "inside":
-            return
-        extents = np.sort(np.ptp(self._points_m, axis=0))
-        room = np.sort(2 * np.array(target.half_m))
-        if extents[0] > room[0] or extents[1] > room[1]:
-            message = (
-                f"{self._grasp.object_id} ({extents[0] * 1e3:.0f} x {extents[1] * 1e3:.0f} mm at "
-                f"its narrowest) does not fit into {target.name} "
-                f"({room[0] * 1e3:.0f} x {room[1] * 1e3:.0f} mm inside). "
-                "Name a larger one."
-            )
-            raise NoFinalStateError(cause="container_too_small", message=message)
-
-    def stage(self, T_rest: Float[np.ndarray, "4 4"], target: Target | None) -> StageProblem:
+    def stage(self, T_rest: Pose, target: Target | None) -> StageProblem:
         """Write one way to rest as a stage problem.
 
         Args:
             T_rest: Pose ``T_base_object`` a little above where it would lie.
-            target: What it is put into or onto; None: the constraints alone say it.
+            target: What it is put into or onto; None: goals alone say it.
         """
         name, scene = self._grasp.object_id, self._problem.scene
         terms = [
             CostTerm(name=f"{name} clear of what is around", violation=self._object_too_near),
             CostTerm(name="the open hand clear of what is around", violation=self._hand_too_near),
-            CostTerm(name="the hand opens", violation=self._not_open),
         ]
         if target is not None:
             terms += self._placed(T_rest, target)
-        terms += [CostTerm.of(constraint) for constraint in self._constraints]
+        terms += [CostTerm.of(goal, self._settled) for goal in self._goals]
+        terms += [CostTerm.of(wish) for wish in self._wishes]
         return StageProblem(
-            nominal_T_base_tcp=T_rest @ self._grasp.T_object_tcp,
-            nominal_width_m=self._width_m,
+            nominal_T_base_tcp=self._miss.undone(T_rest) @ self._grasp.T_object_tcp,
+            width_m=self._width_m,
             subgoal=tuple(terms),
             Ts_base_object={key: T for key, T in scene.Ts_base_object.items() if key != name},
             Ts_tcp_object={name: self._T_tcp_object},
-            max_width_m=self._max_width_m,
         )
 
+    def _settled(self, state: State) -> State:
+        """What comes of states in which the object is let go: it lies straight below."""
+        name = self._grasp.object_id
+        T = self._miss.applied(state.Ts_base_object[name])
+        low_m = (T[:, 2, :3] @ self._outline_m.T).min(axis=1) + T[:, 2, 3]
+        T[:, 2, 3] -= low_m - support_m(self._problem, name)
+        return replace(state, Ts_base_object={**state.Ts_base_object, name: T})
+
     def _object_too_near(self, state: State) -> Array:
-        T, keep_m = state.Ts_base_object[self._grasp.object_id], self._keep_m(self._allowed)
+        T, keep_m = state.Ts_base_object[self._grasp.object_id], _keep_m(self._allowed)
         return -self._obstacles.margins(self._points_m, T, keep_m, most_m=NEAR_M)
 
     def _hand_too_near(self, state: State) -> Array:
-        keep_m = self._keep_m(self._hand_allowed)
+        keep_m = _keep_m(self._hand_allowed)
         return -self._obstacles.margins(self._hand_m, state.T_base_tcp, keep_m, most_m=NEAR_M)
 
-    def _keep_m(self, allowed: Array) -> Float[np.ndarray, " num_obstacles"]:
-        return np.asarray(self._config.eps_col_m * (1.0 - allowed))
-
-    def _not_open(self, state: State) -> Array:
-        return self._grasp.width_m + OPEN_MORE_M / 2 - state.width_m
-
-    def _placed(self, T_rest: Float[np.ndarray, "4 4"], target: Target) -> list[CostTerm]:
+    def _placed(self, T_rest: Pose, target: Target) -> list[CostTerm]:
         """Inside of the area, at a small height, level."""
-        config, name = self._config, self._grasp.object_id
-        margin = config.sigmas * float(np.hypot(target.sigma_m, self._sigma_m))
+        name = self._grasp.object_id
+        margin = SIGMAS * float(np.hypot(target.sigma_m, self._sigma_m))
         whole = target.relation == "inside"
         half = np.array(target.half_m)
         R_area = target.T_base[:2, :2]
@@ -205,7 +175,7 @@ class ReleaseSearch:
         outline = self._outline_m if whole else self._outline_m.mean(axis=0, keepdims=True)
 
         def beyond(state: State) -> Array:
-            T = state.Ts_base_object[name]
+            T = self._miss.applied(state.Ts_base_object[name])
             axes = (R_area.T @ T[:, :2, :3]).reshape(-1, 3) @ outline.T
             middle = ((T[:, :2, 3] - target.T_base[:2, 3]) @ R_area).reshape(-1, 1)
             reach = np.abs(axes + middle).max(axis=1).reshape(-1, 2)
@@ -214,7 +184,8 @@ class ReleaseSearch:
         def off_height(state: State) -> Array:
             T = state.Ts_base_object[name]
             over = (T[:, 2, :3] @ self._outline_m.T).min(axis=1) + T[:, 2, 3] - target.T_base[2, 3]
-            return np.maximum(over - MOST_DROP_M - target.rim_m, DROP_M / 2 - over)
+            most = np.inf if self._wishes else MOST_DROP_M + target.rim_m
+            return np.maximum(over - most, DROP_M / 2 - over)
 
         def leaning(state: State) -> Array:
             z = state.Ts_base_object[name][:, :3, :3] @ up
@@ -226,50 +197,30 @@ class ReleaseSearch:
             CostTerm(name=f"{name} level", violation=leaning, scale=ANGLE_RAD, unit="rad"),
         ]
 
-    def answer(
-        self, stages: Sequence[StageProblem], seed: int, rng: np.random.Generator
-    ) -> tuple[Release, ...]:
+    def answer(self, stages: Sequence[StageProblem], seed: int) -> tuple[Release, ...]:
         """Solve each way to rest, perturb the best, keep the distinct feasible ones."""
-        config = self._config
-        settings = config.solver()
-        solved: list[tuple[StageProblem, StageCandidate]] = []
-        nearest: list[tuple[StageProblem, StageCandidate]] = []
-        for stage in stages:
-            solution = solve(stage, settings, seed=seed)
-            solved += [(stage, candidate) for candidate in solution.candidates]
-            nearest.append((stage, solution.nearest))
+        rng = np.random.default_rng(seed)
+        found = [(stage, state) for stage in stages for state in solve(stage, seed=seed)]
+        solved = [each for each in found if each[1].is_feasible]
         if not solved:
-            raise self._nothing(*min(nearest, key=lambda pair: pair[1].cost))
+            raise self._nothing(*min(found, key=lambda pair: pair[1].cost))
         solved.sort(key=lambda pair: pair[1].cost)
-        Ts = [candidate.T_base_tcp[None] for _, candidate in solved]
-        costs = [np.array([candidate.cost]) for _, candidate in solved]
-        for stage, candidate in solved[: config.num_nominal]:
-            count = config.num_samples // min(config.num_nominal, len(solved))
-            drawn, cost = self._perturbed(stage, candidate, count, rng)
-            Ts.append(drawn)
-            costs.append(cost)
+        Ts = [state.T_base_tcp[None] for _, state in solved]
+        costs = [np.array([state.cost]) for _, state in solved]
+        for stage, state in solved[:NUM_NOMINAL]:
+            count = NUM_SAMPLES // min(NUM_NOMINAL, len(solved))
+            drawn = perturbed(
+                state.T_base_tcp, tau_p_m=TAU_P_M, tau_r_rad=TAU_R_RAD, count=count, rng=rng
+            )
+            violations, J = stage.judged(drawn)
+            free = (violations <= 0).all(axis=1)
+            Ts.append(drawn[free])
+            costs.append(J[free])
         return self._releases(np.concatenate(Ts), np.concatenate(costs))
 
-    def _perturbed(
-        self, stage: StageProblem, nominal: StageCandidate, count: int, rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, "num 4 4"], Float[np.ndarray, " num"]]:
-        """Draw poses around one and keep those that satisfy everything, with their J."""
-        T = perturbed(
-            nominal.T_base_tcp, tau_p_m=TAU_P_M, tau_r_rad=TAU_R_RAD, count=count, rng=rng
-        )
-        zeta = Zeta(T_base_tcp=T, width_m=np.full(count, nominal.width_m))
-        free = np.ones(count, dtype=np.bool_)
-        violations = stage.violations(zeta)
-        for parts in violations:
-            free &= np.all(parts <= 0, axis=1)
-        J = np.square(stage.residuals(zeta, violations)).sum(axis=1)
-        return T[free], J[free]
-
-    def _releases(
-        self, Ts: Float[np.ndarray, "num 4 4"], costs: Float[np.ndarray, " num"]
-    ) -> tuple[Release, ...]:
+    def _releases(self, Ts: Poses, costs: Numbers) -> tuple[Release, ...]:
         order = np.argsort(costs, kind="stable")
-        chosen = distinct(Ts, order, self._config.max_releases)
+        chosen = distinct(Ts, order, MAX_RELEASES)
         Ts_object = Ts[chosen] @ self._T_tcp_object
         distances = self._obstacles.distances(self._points_m, Ts_object)
         counted = np.where(self._allowed > 0, np.inf, distances).min(axis=1, initial=np.inf)
@@ -284,7 +235,7 @@ class ReleaseSearch:
             for index, T_object, clearance in zip(chosen, Ts_object, counted, strict=True)
         )
 
-    def _nothing(self, stage: StageProblem, nearest: StageCandidate) -> NoFinalStateError:
+    def _nothing(self, stage: StageProblem, nearest: StageState) -> NoFinalStateError:
         """Say what was in the way where the least was."""
         told = "; ".join(
             f"{term.name}: by {f * SHOWN[term.unit][0]:.1f} {SHOWN[term.unit][1]}"
@@ -299,7 +250,7 @@ class ReleaseSearch:
         )
         return NoFinalStateError(cause="no_free_pose", message=message)
 
-    def _in_the_way(self, T_base_tcp: Float[np.ndarray, "4 4"]) -> list[str]:
+    def _in_the_way(self, T_base_tcp: Pose) -> list[str]:
         """What the object or the open hand would be too near to."""
         bodies = (
             (self._points_m, T_base_tcp @ self._T_tcp_object, self._allowed),
@@ -307,18 +258,17 @@ class ReleaseSearch:
         )
         short = np.zeros(len(self._obstacles.names), dtype=np.bool_)
         for points_m, T, allowed in bodies:
-            short |= self._obstacles.distances(points_m, T[None])[0] < self._keep_m(allowed)
+            short |= self._obstacles.distances(points_m, T[None])[0] < _keep_m(allowed)
         return [name for name, is_near in zip(self._obstacles.names, short, strict=True) if is_near]
 
 
+def _keep_m(allowed: Array) -> Numbers:
+    return np.asarray(EPS_COL_M * (1.0 - allowed))
+
+
 def perturbed(
-    T_base_tcp: Float[np.ndarray, "4 4"],
-    *,
-    tau_p_m: float,
-    tau_r_rad: float,
-    count: int,
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "count 4 4"]:
+    T_base_tcp: Pose, *, tau_p_m: float, tau_r_rad: float, count: int, rng: np.random.Generator
+) -> Poses:
     """Draw end-effector poses around a nominal one, Eq. 8 and 9 of the paper.
 
     The position moves by a vector uniform in a box. The paper bounds the rotation vector and says
@@ -333,3 +283,75 @@ def perturbed(
     T[:, :3, :3] = T[:, :3, :3] @ se3.rotation_from_vector(turn)
     T[:, :3, 3] += shift
     return T
+
+
+def places_on_table(
+    problem: Problem, key: str, goals: Sequence[Constraint], *, seed: int
+) -> list[Pose]:
+    """Poses on the table, as the object lies now or along others, that nearly satisfy goals."""
+    T_now = problem.scene.Ts_base_object[key]
+    points = se3.apply(T_now, surface_points(problem, key))
+    Ts = _grid(problem, T_now, float(T_now[2, 3] - points[:, 2].min()), seed)
+    state = State(
+        Ts_base_object={
+            name: Ts if name == key else np.broadcast_to(T, Ts.shape)
+            for name, T in problem.scene.Ts_base_object.items()
+        },
+        T_base_tcp=Ts,
+        width_m=np.zeros(len(Ts)),
+    )
+    named = {name for goal in goals for name in values_of(goal.record, ("reference", "against"))}
+    gaps = [
+        compile_constraint(
+            {"kind": "clearance", "obj": key, "against": name, "min": gap_m}, problem
+        )
+        for name in problem.scene.Ts_base_object
+        if name != key
+        for gap_m in (EPS_COL_M if name in named else _LEAST_GAP_M,)
+    ]
+    excess = np.array([c.violation(state) / c.scale for c in (*goals, *gaps)])
+    total = np.maximum(excess, 0.0).sum(axis=0) if len(excess) else np.zeros(len(Ts))
+    if total.min() > _NEARLY:
+        best = int(total.argmin())
+        worst = (*goals, *gaps)[int(excess[:, best].argmax())]
+        one = State.single({k: T[best] for k, T in state.Ts_base_object.items()}, Ts[best], 0.0)
+        message = (
+            f"no free place on the table fits {key}. In the best one {worst.explain(one)}. Clear "
+            "the table there, or ask for less."
+        )
+        raise NoFinalStateError(cause="no_free_pose", message=message)
+    near = np.flatnonzero(total <= (0.0 if (total <= 0).any() else _NEARLY))
+    slack = np.minimum(-excess[:, near].max(axis=0), 1.0)
+    travel = np.linalg.norm(Ts[near, :2, 3] - T_now[:2, 3], axis=1)
+    return _spaced(Ts[near[np.argsort(travel + total[near] - 0.2 * slack, kind="stable")]])
+
+
+def _grid(problem: Problem, T_now: Pose, rest_m: float, seed: int) -> Poses:
+    """Places all over the table: turned as now, and along the sides of the other objects."""
+    shift = np.random.default_rng(seed).uniform(0.0, _STEP_M, 2)
+    axes = [np.arange(low, high, _STEP_M) for low, high in _AREA_M]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2) + shift
+    now = float(np.arctan2(T_now[1, 0], T_now[0, 0]))
+    yaws = [0.0]
+    for T in problem.scene.Ts_base_object.values():
+        turn = float(np.arctan2(T[1, 0], T[0, 0])) - now
+        yaws.append((turn + np.pi / 4) % (np.pi / 2) - np.pi / 4)
+    found = []
+    for yaw in dict.fromkeys(round(turn, 6) for turn in yaws):
+        Ts = np.tile(np.eye(4), (len(places), 1, 1))
+        Ts[:, :3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, yaw])) @ T_now[:3, :3]
+        Ts[:, :2, 3] = places
+        Ts[:, 2, 3] = problem.scene.table_height_m + rest_m + 0.003
+        found.append(Ts)
+    return np.concatenate(found)
+
+
+def _spaced(Ts: Poses) -> list[Pose]:
+    """The first few that are not next to each other."""
+    kept: list[Pose] = []
+    for T in Ts:
+        if all(np.linalg.norm(T[:2, 3] - other[:2, 3]) > _SPACING_M for other in kept):
+            kept.append(T)
+        if len(kept) == _PLACES:
+            break
+    return kept

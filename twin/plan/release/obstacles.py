@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from twin.plan.constrain.distances import Boxes, grid_clearance, lower_by_grid, scene_grid
-from twin.plan.problem import Problem
+from twin.plan.problem import Numbers, Points, Poses, Problem
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.static_obstacles import PanelBox
@@ -43,9 +43,7 @@ class Obstacles:
         self._error_m = np.array([obstacle.error_m for obstacle in self.all])
 
     def distances(
-        self,
-        points_m: Float[np.ndarray, "num_points 3"],
-        Ts_base_body: Float[np.ndarray, "num_poses 4 4"],
+        self, points_m: Points, Ts_base_body: Poses
     ) -> Float[np.ndarray, "num_poses num_obstacles"]:
         """Least signed distance of a body's points to each obstacle, its error taken off [m]."""
         found = np.empty((len(Ts_base_body), len(self.all)))
@@ -59,12 +57,7 @@ class Obstacles:
         return np.asarray(found - self._error_m)
 
     def margins(
-        self,
-        points_m: Float[np.ndarray, "num_points 3"],
-        Ts_base_body: Float[np.ndarray, "num_poses 4 4"],
-        keep_m: Float[np.ndarray, " num_obstacles"],
-        *,
-        most_m: float = np.inf,
+        self, points_m: Points, Ts_base_body: Poses, keep_m: Numbers, *, most_m: float = np.inf
     ) -> Float[np.ndarray, "num_poses num_points"]:
         """How much farther each point is from what is around than it must be [m]."""
         found = np.full((len(Ts_base_body), len(points_m)), most_m)
@@ -98,16 +91,12 @@ def _table(height_m: float) -> Obstacle:
     return Obstacle(name=TABLE, error_m=0.0, boxes=boxes)
 
 
-def allowed_with(
-    body: str, pairs: Collection[frozenset[str]], names: Sequence[str]
-) -> Float[np.ndarray, " num_obstacles"]:
+def allowed_with(body: str, pairs: Collection[frozenset[str]], names: Sequence[str]) -> Numbers:
     """Whether a stage allows a body to touch each obstacle, as 1 or 0."""
     return np.array([frozenset((body, name)) in pairs for name in names], dtype=np.float64)
 
 
-def hand_points(
-    hulls: RobotHulls, width_m: float, num_points: int
-) -> Float[np.ndarray, "num_points 3"]:
+def hand_points(hulls: RobotHulls, width_m: float, num_points: int) -> Points:
     """Points of the hand's hulls in the tool's frame, with this width between the pads [m]."""
     robot = hulls.robot
     hulls.place(robot.home_rad, width_m)
@@ -120,7 +109,7 @@ def hand_points(
     return spread_points(np.concatenate(found), num_points)
 
 
-def _dense(corners_m: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num_points 3"]:
+def _dense(corners_m: Points) -> Points:
     """Corners of a hull and points on its faces."""
     hull = ConvexHull(corners_m)
     a, b, c = (corners_m[hull.simplices[:, k]] for k in range(3))
@@ -128,9 +117,7 @@ def _dense(corners_m: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num_poin
     return np.concatenate([i * a + j * b + k * c for i, j, k in shares])
 
 
-def spread_points(
-    points_m: Float[np.ndarray, "num 3"], num_points: int
-) -> Float[np.ndarray, "num_points 3"]:
+def spread_points(points_m: Points, num_points: int) -> Points:
     """Choose points that are far from each other, each the farthest from those before it."""
     centre = points_m.mean(axis=0)
     index = int(np.argmax(np.linalg.norm(points_m - centre, axis=1)))

@@ -7,10 +7,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
+from bridge.task.check import TABLE
 from bridge.task.task_file import ObjectModel
 from twin.errors import TwinError
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.problem import Grasp, Problem
+from twin.plan.problem import Grasp, Miss, Pose, Problem, Release, RotationMatrix, Vector
 
 QUARTER_TURNS = 4
 _SAME_RAD = 0.02
@@ -32,7 +33,7 @@ class Target:
     relation: str
     """inside, on, or at: a mark on the table."""
     name: str
-    T_base: Float[np.ndarray, "4 4"]
+    T_base: Pose
     """Upright frame in the middle of the area, at the height on which the object comes to lie."""
     half_m: tuple[float, float]
     """Half the extents of the area, along its axes."""
@@ -78,6 +79,22 @@ def target_of(problem: Problem, object_id: str) -> Target:
     )
 
 
+def lying_there(problem: Problem, release: Release, miss: Miss | None = None) -> Pose:
+    """Where an object lies that is let go a little above: straight below, or aside by a miss."""
+    T: Pose = (miss or Miss()).applied(release.T_base_object[None])[0]
+    points = se3.apply(T, surface_points(problem, release.object_id))
+    T[2, 3] -= float(points[:, 2].min()) - support_m(problem, release.object_id)
+    return T
+
+
+def support_m(problem: Problem, key: str) -> float:
+    """Height of what an object comes to lie on, base frame."""
+    goal = problem.scene.task.goal_of(key)
+    if goal is None or goal[0] not in ("inside", "on") or goal[1] == TABLE:
+        return problem.scene.table_height_m
+    return float(target_of(problem, key).T_base[2, 3])
+
+
 def sideways_sigma_m(problem: Problem, name: str) -> float:
     """Standard deviation of an object's position in its worst horizontal direction [m]."""
     covariance = problem.scene.covariances.get(name)
@@ -86,9 +103,7 @@ def sideways_sigma_m(problem: Problem, name: str) -> float:
     return float(np.sqrt(max(np.linalg.eigvalsh(np.asarray(covariance)[:2, :2])[-1], 0.0)))
 
 
-def upright_frame(
-    T: Float[np.ndarray, "4 4"], p_m: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
+def upright_frame(T: Pose, p_m: Vector) -> Pose:
     """Frame at a point with z up and x along the heading of a pose."""
     yaw = np.arctan2(T[1, 0], T[0, 0])
     frame = np.eye(4)
@@ -98,11 +113,11 @@ def upright_frame(
 
 
 def orientations(
-    model: ObjectModel, R_now: Float[np.ndarray, "3 3"], R_target: Float[np.ndarray, "3 3"]
-) -> list[Float[np.ndarray, "3 3"]]:
+    model: ObjectModel, R_now: RotationMatrix, R_target: RotationMatrix
+) -> list[RotationMatrix]:
     """Rotations in which an object may come to rest, the one nearest to now first."""
-    found: list[Float[np.ndarray, "3 3"]] = []
-    for S in _same(model):
+    found: list[RotationMatrix] = []
+    for S in same_turns(model):
         R = R_now @ S
         heading = (
             np.arctan2(R[1, 0], R[0, 0])
@@ -118,7 +133,7 @@ def orientations(
     return sorted(found, key=lambda R: round(float(se3.rotation_angle_rad(R_now.T @ R)), 6))
 
 
-def _same(model: ObjectModel) -> Float[np.ndarray, "num 3 3"]:
+def same_turns(model: ObjectModel) -> Float[np.ndarray, "num 3 3"]:
     """Turns that nobody could tell: of a cube 24, of others none."""
     is_cube = model.symmetry == "cube"
     return (
@@ -128,7 +143,7 @@ def _same(model: ObjectModel) -> Float[np.ndarray, "num 3 3"]:
 
 def resting_poses(
     problem: Problem, grasp: Grasp, target: Target, *, drop_m: float, most_tilted_rad: float
-) -> list[Float[np.ndarray, "4 4"]]:
+) -> list[Pose]:
     """Poses ``T_base_object`` a little above where the object would lie, in the middle."""
     T_now = problem.scene.Ts_base_object.get(grasp.object_id)
     if T_now is None:

@@ -157,84 +157,45 @@ TILTED = state(
     brick=PLACES["brick"] @ se3.transform_from(np.array([0.9, 0.3, 0.2, 0.1]), np.zeros(3))
 )
 
-EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
-    "distance": (
-        {"kind": "distance", "a": {"ee": True}, "b": {"obj": "cube"}, "target": 0.2, "tol": 0.01},
-        START,
-        state(tcp=pose(0.5, 0.1, 0.3) @ LOOKING_DOWN),
-    ),
+TOOL, MIDDLE = {"ee": True}, {"obj": "cube"}
+FROM_BRICK = {"from": {"obj": "brick"}, "to": {"obj": "post"}}
+DOWN, ASKEW = {"a": {"ee": "approach"}, "b": {"world": "-z"}}, pose(0.5, -0.2, 0.02, 0.7)
+OVER = {"a": CUBE, "b": OPENING, "height": 0.02, "tol": 0.01, "xy_tol": 0.03}
+POINT = pose(0.5, 0.1, 0.1)
+RIGHT = state(cube=pose(0.45, -0.07, 0.02, 0.2))
+AWAY = state(tcp=pose(0.5, 0.1, 0.3) @ LOOKING_DOWN)
+_EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
+    "distance": ({"a": TOOL, "b": MIDDLE, "target": 0.2, "tol": 0.01}, START, AWAY),
     "distance at least": (
-        {"kind": "distance", "a": {"obj": "cube"}, "b": {"xyz": [0.5, 0.1, 0.1]}, "min": 0.1},
-        START,
-        state(cube=pose(0.5, 0.1, 0.1)),
+        {"a": MIDDLE, "b": {"xyz": [0.5, 0.1, 0.1]}, "min": 0.1}, START, state(cube=POINT),
     ),
-    "above": (
-        {"kind": "above", "a": CUBE, "b": OPENING, "height": 0.02, "tol": 0.01, "xy_tol": 0.03},
-        OVER_BOX,
-        START,
-    ),
-    "on": ({"kind": "on", "obj": "cube", "support": "brick"}, ON_BRICK, START),
-    "on table": ({"kind": "on", "obj": "cube", "support": "table"}, START, ON_BRICK),
-    "inside": ({"kind": "inside", "obj": "cube", "container": "box"}, IN_BOX, START),
-    "outside": ({"kind": "outside", "obj": "cube", "container": "box"}, OUT, IN_BOX),
-    "beside": ({"kind": "beside", "obj": "cube", "reference": "brick"}, BESIDE, ON_BRICK),
-    "beside left": (
-        {"kind": "beside", "obj": "cube", "reference": "brick", "direction": "left"},
-        BESIDE,
-        state(cube=pose(0.45, -0.07, 0.02, 0.2)),
-    ),
-    "align": (
-        {"kind": "align", "a": {"ee": "approach"}, "b": {"world": "-z"}, "max_deg": 10},
-        START,
-        state(tcp=np.eye(4)),
-    ),
+    "above": (OVER, OVER_BOX, START),
+    "on": ({"obj": "cube", "support": "brick"}, ON_BRICK, START),
+    "on table": ({"obj": "cube", "support": "table"}, START, ON_BRICK),
+    "inside": ({"obj": "cube", "container": "box"}, IN_BOX, START),
+    "outside": ({"obj": "cube", "container": "box"}, OUT, IN_BOX),
+    "beside": ({"obj": "cube", "reference": "brick"}, BESIDE, ON_BRICK),
+    "beside left": ({"obj": "cube", "reference": "brick", "direction": "left"}, BESIDE, RIGHT),
+    "align": ({**DOWN, "max_deg": 10}, START, state(tcp=np.eye(4))),
     "align bodies": (
-        {
-            "kind": "align",
-            "a": {"obj": "cube", "axis": "any"},
-            "b": {"from": {"obj": "brick"}, "to": {"obj": "post"}},
-            "max_deg": 20,
-        },
-        BETWEEN,
-        state(cube=pose(0.5, -0.2, 0.02, 0.7)),
+        {"a": {"obj": "cube", "axis": "any"}, "b": FROM_BRICK, "max_deg": 20},
+        BETWEEN, state(cube=ASKEW),
     ),
-    "upright": ({"kind": "upright", "obj": "brick", "max_deg": 10}, START, TILTED),
+    "upright": ({"obj": "brick", "max_deg": 10}, START, TILTED),
     "upright cube": (
-        {"kind": "upright", "obj": "cube", "max_deg": 10},
-        START,
-        state(cube=TILTED.Ts_base_object["brick"][0]),
+        {"obj": "cube", "max_deg": 10}, START, state(cube=TILTED.Ts_base_object["brick"][0]),
     ),
-    "clearance": (
-        {"kind": "clearance", "obj": "cube", "against": "box", "min": 0.02},
-        START,
-        IN_BOX,
-    ),
-    "clearance table": (
-        {"kind": "clearance", "obj": "cube", "against": "table", "min": 0.02},
-        ON_BRICK,
-        START,
-    ),
-    "keepout over": (
-        {"kind": "keepout", "obj": "cube", "region": {"over": "box"}, "margin": 0.01},
-        START,
-        OVER_BOX,
-    ),
-    "height": ({"kind": "height", "a": CUBE, "min": 0.04}, ON_BRICK, START),
-    "height of a body": ({"kind": "height", "obj": "cube", "max": 0.03}, START, ON_BRICK),
-    "moved": (
-        {"kind": "moved", "obj": "cube", "at_least": 0.05, "vector": [0.0, 1.0, 0.0]},
-        ON_BRICK,
-        START,
-    ),
-    "moved to": (
-        {"kind": "moved", "obj": "cube", "target": [0.45, 0.0], "tol": 0.03},
-        ON_BRICK,
-        START,
-    ),
-    "moved by": (
-        {"kind": "moved", "obj": "cube", "by": 0.16, "way": "left", "tol": 0.03},
-        ON_BRICK,
-        START,
-    ),
+    "clearance": ({"obj": "cube", "against": "box", "min": 0.02}, START, IN_BOX),
+    "clearance table": ({"obj": "cube", "against": "table", "min": 0.02}, ON_BRICK, START),
+    "keepout over": ({"obj": "cube", "region": {"over": "box"}, "margin": 0.01}, START, OVER_BOX),
+    "height": ({"a": CUBE, "min": 0.04}, ON_BRICK, START),
+    "height of a body": ({"obj": "cube", "max": 0.03}, START, ON_BRICK),
+    "moved": ({"obj": "cube", "at_least": 0.05, "vector": [0.0, 1.0, 0.0]}, ON_BRICK, START),
+    "moved to": ({"obj": "cube", "target": [0.45, 0.0], "tol": 0.03}, ON_BRICK, START),
+    "moved by": ({"obj": "cube", "by": 0.16, "way": "left", "tol": 0.03}, ON_BRICK, START),
+}  # fmt: skip
+EXAMPLES = {
+    name: ({"kind": name.split()[0], **record}, good, bad)
+    for name, (record, good, bad) in _EXAMPLES.items()
 }
 """A record of each kind, a state in which it holds, and one in which it does not."""

@@ -1,7 +1,6 @@
 """Paths around things: found, repeatable, checked, and clearly refused where there is none."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from path_scene import EPS_M, WIDTH_M, Pairs, at, joints_at, tool_down
 
 from twin.plan.path import planner
 from twin.plan.path.decide import PathRefusal, decide
-from twin.plan.path.planner import Movement, NoPathError, PathConfig, plan_move, waypoints_of
+from twin.plan.path.planner import Movement, NoPathError, PathConfig, plan_move
 from twin.plan.path.world import Carried, build_world
 from twin.plan.problem import Problem, TimedPath
 
@@ -192,15 +191,3 @@ def test_a_carried_object_is_taken_around_too(pairs: Pairs) -> None:
     outcome, *_, knots, _ = found(pairs, index)
     assert outcome == 0
     assert full.motion.blocked(knots) >= 0 or least > EPS_M
-
-
-def test_waypoints_carry_poses_gripper_and_joints(pairs: Pairs) -> None:
-    movement = moved(pairs, 0)
-    robot = pairs.problem.robot
-    tau = waypoints_of(robot, movement.path, g=1, width_m=0.03, begin_s=2.0)
-    assert len(tau) == len(movement.path.times_s)
-    assert tau[0].t_ns == 2_000_000_000
-    assert all(later.t_ns > earlier.t_ns for earlier, later in pairwise(tau))
-    last = tau[-1]
-    assert last.p_m == pytest.approx(robot.T_base_tcp(pairs.goals[0])[:3, 3])
-    assert (last.g, last.width_m, last.joints_rad) == (1, 0.03, tuple(pairs.goals[0].tolist()))

@@ -91,9 +91,3 @@ def test_a_corner_beside_an_obstacle_is_rounded_less(pairs: Pairs) -> None:
     for index in range(len(pairs.kinds)):
         path = timed_path(pairs.world, knots_of(pairs, index), CONFIG)
         assert pairs.world.motion.blocked(path.joints_rad) < 0
-
-
-def test_a_path_that_goes_nowhere_takes_no_time(pairs: Pairs) -> None:
-    path = timed_path(pairs.world, np.stack([pairs.starts[0]] * 2), CONFIG)
-    assert path.times_s.tolist() == [0.0]
-    assert np.array_equal(path.joints_rad[0], pairs.starts[0])

@@ -7,10 +7,10 @@ import pytest
 from path_scene import Pairs, at, joints_at, tool_down
 
 from bridge.geometry import se3
+from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.path import planner
-from twin.plan.path.transfer import nearest_solutions, plan_transfer
+from twin.plan.path.transfer import plan_transfer
 from twin.plan.problem import Grasp, Problem, Release
-from twin.robot.config import IkConfig
 
 CONFIG = planner.PathConfig()
 
@@ -105,7 +105,7 @@ def test_the_movement_that_does_not_exist_is_named(pairs: Pairs) -> None:
 def test_all_branches_come_nearest_first(pairs: Pairs) -> None:
     robot = pairs.problem.robot
     near = pairs.starts[0]
-    found = nearest_solutions(robot, robot.T_base_tcp(near), near, IkConfig())
+    found = nearest_solutions(robot, robot.T_base_tcp(near), near)
     assert len(found) > 2
     assert found[0] == pytest.approx(near, abs=1e-6)
     away = [np.abs(joints - near).sum() for joints in found]

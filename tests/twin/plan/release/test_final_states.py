@@ -12,10 +12,10 @@ from bridge.robots.default import ROBOT
 from bridge.task.task_file import ObjectModel, Task, load_task
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.kinds import compile_constraint
-from twin.plan.problem import Grasp, Problem, Release, Shape, State
-from twin.plan.release.final_states import ReleaseConfig, final_states, perturbed
-from twin.plan.release.obstacles import hand_points, obstacles_of, spread_points
-from twin.plan.release.resting import NoFinalStateError, orientations, target_of
+from twin.plan.problem import Grasp, Miss, Problem, Release, Shape, State
+from twin.plan.release.final_states import EPS_COL_M, final_states, perturbed
+from twin.plan.release.obstacles import hand_points, obstacles_of
+from twin.plan.release.resting import NoFinalStateError, lying_there, orientations, target_of
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of, signed_distance
@@ -25,7 +25,6 @@ from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 from twin.scene.shape.static import StaticSdf
 
 SURE = np.diag([1e-8] * 6)
-QUICK = ReleaseConfig(num_starts=6, num_ways=2, num_samples=256)
 
 
 def box_shape(size_m: tuple[float, float, float]) -> Shape:
@@ -66,7 +65,7 @@ def from_above(object_id: str = "cube", width_m: float = 0.04) -> Grasp:
 
 @pytest.fixture(scope="module")
 def found() -> tuple[Release, ...]:
-    return final_states(cube_problem(), from_above(), config=QUICK)
+    return final_states(cube_problem(), from_above())
 
 
 def test_shifts_and_turns_are_drawn_as_is_said() -> None:
@@ -193,10 +192,10 @@ def test_a_cube_is_let_go_inside_of_the_box_and_touches_nothing(found: tuple[Rel
 
 
 def test_the_same_seed_gives_the_same_bytes(found: tuple[Release, ...]) -> None:
-    again = final_states(cube_problem(), from_above(), config=QUICK)
+    again = final_states(cube_problem(), from_above())
     poses = [release.T_base_object.tobytes() for release in found]
     assert poses == [release.T_base_object.tobytes() for release in again]
-    other = final_states(cube_problem(), from_above(), config=QUICK, seed=1)
+    other = final_states(cube_problem(), from_above(), seed=1)
     assert poses != [release.T_base_object.tobytes() for release in other]
 
 
@@ -204,7 +203,7 @@ def test_the_less_sure_a_place_is_the_farther_the_edge() -> None:
     def farthest(sigma_m: float) -> float:
         covariance = np.diag([sigma_m**2] * 3 + [1e-6] * 3)
         problem = cube_problem(covariances={"box": covariance, "cube": SURE})
-        found = final_states(problem, from_above(), config=QUICK)
+        found = final_states(problem, from_above())
         local = [
             se3.apply(se3.invert(problem.scene.Ts_base_object["box"]), release.T_base_object[:3, 3])
             for release in found
@@ -224,14 +223,14 @@ def test_a_box_that_is_taken_is_shared_without_touching() -> None:
         "other": upright(0.5, 0.19, 0.026),
     }
     problem = problem_of(replace(task, objects=objects), poses)
-    found = final_states(problem, from_above(), config=QUICK)
+    found = final_states(problem, from_above())
     cube = coal.Box(0.04, 0.04, 0.04)
     other = coal.Transform3s(poses["other"][:3, :3], poses["other"][:3, 3])
     for release in found:
         T = release.T_base_object
         placed = coal.Transform3s(T[:3, :3], T[:3, 3])
         assert signed_distance(cube, placed, cube, other) > 0
-        assert release.clearance_m >= QUICK.eps_col_m
+        assert release.clearance_m >= EPS_COL_M
 
 
 def test_a_cube_is_put_on_a_cube() -> None:
@@ -242,7 +241,7 @@ def test_a_cube_is_put_on_a_cube() -> None:
     poses = {key: upright(0.4 + 0.1 * i, 0.1 * i, model.rest_height_m, 0.2 * i)
              for i, (key, model) in enumerate(task.objects.items())}  # fmt: skip
     problem = problem_of(task, poses)
-    found = final_states(problem, from_above(name), config=QUICK)
+    found = final_states(problem, from_above(name))
     T = found[0].T_base_object
     np.testing.assert_allclose(T[:2, 3], poses[support][:2, 3], atol=2e-3)
     heights = [task.objects[key].size_m[2] / 2 for key in (name, support)]
@@ -263,14 +262,42 @@ def test_constraints_alone_say_where() -> None:
     }
     constraint = compile_constraint(record, problem)
     found = final_states(
-        problem,
-        from_above(),
-        constraints=[constraint],
-        near=[upright(0.5, 0.05, 0.024)],
-        config=replace(QUICK, num_samples=512),
+        problem, from_above(), goals=[constraint], near=[upright(0.5, 0.05, 0.024)]
     )
     violations = constraint.violation(every_pose(found, problem))
     assert (violations <= 0).all()
+
+
+def test_a_height_asked_of_the_release_holds_there_whatever_the_usual_drop() -> None:
+    """Higher than 30 mm over the rim, which is the most where nothing is asked."""
+    problem = cube_problem()
+    record = {"kind": "height", "a": {"obj": "cube", "anchor": "bottom"}, "min": 0.13, "max": 0.14}
+    wish = compile_constraint(record, problem)
+    found = final_states(problem, from_above(), wishes=[wish])
+    assert (wish.violation(every_pose(found, problem)) <= 0).all()
+    assert found[0].T_base_object[2, 3] - 0.02 >= 0.13
+
+
+def test_a_known_miss_is_made_up_for() -> None:
+    """Where it will lie, not where it is let go, is in the gap of one millimetre."""
+    problem, miss = cube_problem(), Miss(shift_m=np.array([0.004, -0.003, 0.0]), turn_rad=0.1)
+    record = {
+        "kind": "beside",
+        "obj": "cube",
+        "reference": "box",
+        "min_gap": 0.02,
+        "max_gap": 0.021,
+    }
+    goal = compile_constraint(record, problem)
+    near = [upright(0.5, 0.05, 0.024)]
+    found = final_states(problem, from_above(), goals=[goal], near=near, miss=miss)
+    state = every_pose(found, problem)
+    Ts = {**state.Ts_base_object, "cube": miss.applied(state.Ts_base_object["cube"])}
+    assert (goal.violation(replace(state, Ts_base_object=Ts)) <= 0).all()
+    assert not (goal.violation(state) <= 0).all()
+    lies = lying_there(problem, found[0], miss)
+    assert lies[2, 3] == pytest.approx(0.006 + 0.02, abs=2e-3)
+    np.testing.assert_allclose(lies[:2, 3], Ts["cube"][0, :2, 3])
 
 
 def test_the_hand_is_as_wide_as_it_opens() -> None:
@@ -280,16 +307,6 @@ def test_the_hand_is_as_wide_as_it_opens() -> None:
     tips = opened[opened[:, 2] > -0.01]
     assert np.abs(tips[:, 1]).min() >= 0.039
     assert opened[:, 2].max() == pytest.approx(0.01, abs=0.003)  # tips reach past the tool frame
-
-
-def test_spread_points_leave_no_large_gap() -> None:
-    points = np.random.default_rng(4).uniform(-1, 1, (3000, 3))
-    chosen = spread_points(points, 200)
-    assert len(chosen) == 200
-    gaps = np.linalg.norm(points[:, None] - chosen[None], axis=2).min(axis=1)
-    apart = np.linalg.norm(chosen[:, None] - chosen[None], axis=2) + 9 * np.eye(200)
-    assert gaps.max() <= apart.min() + 1e-12
-    assert len(spread_points(np.ones((5, 3)), 10)) <= 1
 
 
 def model_of(symmetry: str) -> ObjectModel:
@@ -312,7 +329,6 @@ def test_ways_to_lie_are_as_many_as_the_symmetry_says(symmetry: str, count: int)
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
-        ("large", "container_too_small"),
         ("lost", "not_localised"),
         ("nowhere", "nowhere_said"),
         ("sideways", "tool_direction"),
@@ -324,10 +340,7 @@ def test_where_nothing_can_be_let_go_the_cause_is_named(
 ) -> None:
     problem, grasp = cube_problem(), from_above()
     task, poses = problem.scene.task, dict(problem.scene.Ts_base_object)
-    if change == "large":
-        big = replace(task.objects["cube"], size_m=(0.2, 0.2, 0.04))
-        problem = problem_of(replace(task, objects={**task.objects, "cube": big}), poses)
-    elif change == "lost":
+    if change == "lost":
         del poses["box"]
         problem = problem_of(task, poses)
     elif change == "nowhere":
@@ -344,12 +357,12 @@ def test_where_nothing_can_be_let_go_the_cause_is_named(
         problem = problem_of(replace(task, objects={**task.objects, "lid": lid}), poses)
     monkeypatch.setattr("twin.plan.release.final_states.MOST_DROP_M", 0.005)
     with pytest.raises(NoFinalStateError) as caught:
-        final_states(problem, grasp, config=QUICK)
+        final_states(problem, grasp)
     assert caught.value.cause == cause
     assert str(caught.value).endswith(".")
     if cause == "no_free_pose":
-        assert "clear of what is around: by 5.0 mm" in str(caught.value)
-        assert "cube level: by 1.9 degrees (too near: lid). Clear the place" in str(caught.value)
+        assert "cube clear of what is around: by " in str(caught.value)
+        assert "(too near: lid). Clear the place" in str(caught.value)
 
 
 def test_the_mark_of_a_pushed_object_is_a_target_too() -> None:

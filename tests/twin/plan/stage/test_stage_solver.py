@@ -8,8 +8,7 @@ from scipy.optimize import minimize
 
 from bridge.geometry import se3
 from twin.plan.problem import State
-from twin.plan.stage import objective
-from twin.plan.stage.solver import SolveConfig, distinct, draw_starts, solve
+from twin.plan.stage import solver
 
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 DOWN[:3, 3] = (0.5, 0.2, 0.12)
@@ -31,56 +30,47 @@ def leaning(state: State) -> object:
     return np.arctan2(flat, -z[:, 2]) - np.radians(5.0)
 
 
-def wide(state: State) -> object:
-    return 0.07 - state.width_m
-
-
 SUBGOAL = (
-    objective.CostTerm(name="height", violation=height),
-    objective.CostTerm(name="inside", violation=inside),
-    objective.CostTerm(name="leaning", violation=leaning, scale=objective.ANGLE_RAD),
-    objective.CostTerm(name="wide", violation=wide),
+    solver.CostTerm(name="height", violation=height),
+    solver.CostTerm(name="inside", violation=inside),
+    solver.CostTerm(name="leaning", violation=leaning, scale=solver.ANGLE_RAD),
 )
-STAGE = objective.StageProblem(nominal_T_base_tcp=DOWN, nominal_width_m=0.05, subgoal=SUBGOAL)
+STAGE = solver.StageProblem(nominal_T_base_tcp=DOWN, subgoal=SUBGOAL)
 
 
 def test_it_finds_what_slsqp_finds() -> None:
     """What is allowed lies beside the nominal pose, so there is one nearest point."""
 
     def cost(x: np.ndarray) -> float:
-        T = objective.moved(DOWN[None], x[None, :6])
-        return float(STAGE.cost(objective.Zeta(T_base_tcp=T, width_m=x[6:7]))[0])
+        return float(STAGE.judged(solver.moved(DOWN[None], x[None]))[1][0])
 
-    start = np.array([0.04, 0.0, -0.02, 0.0, 0.0, 0.0, 0.07])
+    start = np.array([0.04, 0.0, -0.02, 0.0, 0.0, 0.0])
     reference = minimize(cost, start, method="SLSQP", options={"ftol": 1e-14, "maxiter": 500})
-    solution = solve(STAGE)
-    assert solution.candidates[0].cost <= reference.fun * (1 + 1e-6)
-    assert solution.candidates[0].cost == pytest.approx(reference.fun, rel=1e-3)
-    assert solution.candidates[0].T_base_tcp[0, 3] == pytest.approx(0.53, abs=1e-3)
-    assert solution.feasible.sum() >= 28
+    best = solver.solve(STAGE)[0]
+    assert best.cost == pytest.approx(reference.fun, rel=1e-3)
+    assert best.T_base_tcp[0, 3] == pytest.approx(0.53, abs=1e-3)
 
 
-def test_answers_are_feasible_distinct_and_ordered() -> None:
-    solution = solve(STAGE)
-    assert len(solution.candidates) >= 5
-    costs = [candidate.cost for candidate in solution.candidates]
-    assert costs == sorted(costs)
-    for index, one in enumerate(solution.candidates):
-        assert max(one.violations) <= 0
-        zeta = objective.Zeta(T_base_tcp=one.T_base_tcp[None], width_m=np.array([one.width_m]))
-        assert all((parts <= 0).all() for parts in STAGE.violations(zeta))
-        assert STAGE.cost(zeta)[0] == pytest.approx(one.cost)
-        for other in solution.candidates[:index]:
+def test_answers_are_distinct_and_those_that_satisfy_everything_come_first() -> None:
+    found = solver.solve(STAGE)
+    assert found[0].is_feasible
+    ranks = [(not state.is_feasible, state.cost) for state in found]
+    assert ranks == sorted(ranks)
+    for index, one in enumerate(found):
+        violations, J = STAGE.judged(one.T_base_tcp[None])
+        np.testing.assert_allclose(violations[0], one.violations, atol=1e-12)
+        assert J[0] == pytest.approx(one.cost)
+        for other in found[:index]:
             away = np.linalg.norm(one.T_base_tcp[:3, 3] - other.T_base_tcp[:3, 3])
             R = one.T_base_tcp[:3, :3].T @ other.T_base_tcp[:3, :3]
-            assert away > objective.LENGTH_M or se3.rotation_angle_rad(R) > objective.ANGLE_RAD
+            assert away > solver.LENGTH_M or se3.rotation_angle_rad(R) > solver.ANGLE_RAD
 
 
 def test_the_same_seed_gives_the_same_bytes() -> None:
-    first, again, other = (solve(STAGE, seed=seed) for seed in (3, 3, 4))
-    poses = [c.T_base_tcp.tobytes() for c in first.candidates]
-    assert poses == [c.T_base_tcp.tobytes() for c in again.candidates]
-    assert poses != [c.T_base_tcp.tobytes() for c in other.candidates]
+    first, again, other = (solver.drawn_around(DOWN, 8, seed).tobytes() for seed in (3, 3, 4))
+    assert first == again != other
+    one, two = (solver.solve(STAGE, seed=3)[0].T_base_tcp.tobytes() for _ in range(2))
+    assert one == two
 
 
 def test_j_is_the_sum_of_the_paper() -> None:
@@ -88,57 +78,55 @@ def test_j_is_the_sum_of_the_paper() -> None:
     T = DOWN.copy()
     T[:3, 3] += (0.1, 0.0, 0.03)
     T[:3, :3] = T[:3, :3] @ se3.rotation_from_vector(np.array([0.0, 0.3, 0.0]))
-    zeta = objective.Zeta(T_base_tcp=T[None], width_m=np.array([0.04]))
-    f = [0.15 - 0.1 - 0.005, 0.6 - 0.56 - 0.03, 0.3 - np.radians(5.0), 0.07 - 0.04]
-    x = np.array(f) / (0.01, 0.01, objective.ANGLE_RAD, 0.01) + objective.MARGIN
-    omega = (0.1**2 + 0.03**2 + 0.01**2) / 0.01**2 + (0.3 / objective.ANGLE_RAD) ** 2
-    wanted = (np.clip(x, 0.0, None) ** 2).sum() + objective.LAMBDA_REG * omega
-    assert STAGE.cost(zeta)[0] == pytest.approx(wanted, rel=1e-5)
+    f = [0.15 - 0.1 - 0.005, 0.6 - 0.56 - 0.03, 0.3 - np.radians(5.0)]
+    x = np.array(f) / (0.01, 0.01, solver.ANGLE_RAD) + solver.MARGIN
+    omega = (0.1**2 + 0.03**2) / 0.01**2 + (0.3 / solver.ANGLE_RAD) ** 2
+    wanted = (np.clip(x, 0.0, None) ** 2).sum() + solver.LAMBDA_REG * omega
+    violations, J = STAGE.judged(T[None])
+    assert J[0] == pytest.approx(wanted, rel=1e-5)
+    np.testing.assert_allclose(violations[0], f, atol=1e-5)
 
 
 def test_what_contradicts_itself_has_no_answer_and_says_what_is_wrong() -> None:
-    high = objective.CostTerm(name="high", violation=lambda state: 0.2 - state.T_base_tcp[:, 2, 3])
-    solution = solve(replace(STAGE, subgoal=(*SUBGOAL, high)))
-    assert solution.candidates == ()
-    assert not solution.feasible.any()
-    terms = zip((*SUBGOAL, high), solution.nearest.violations, strict=True)
+    high = solver.CostTerm(name="high", violation=lambda state: 0.2 - state.T_base_tcp[:, 2, 3])
+    found = solver.solve(replace(STAGE, subgoal=(*SUBGOAL, high)))
+    assert not any(state.is_feasible for state in found)
+    terms = zip((*SUBGOAL, high), found[0].violations, strict=True)
     wrong = {term.name for term, f in terms if f > 0}
     assert wrong == {"height", "high"}
 
 
 def test_what_is_carried_moves_with_the_tool() -> None:
-    T_tcp_object = objective.moved(np.eye(4)[None], np.array([[0.01, 0.0, 0.03, 0.2, 0.0, 0.5]]))[0]
+    T_tcp_object = solver.moved(np.eye(4)[None], np.array([[0.01, 0.0, 0.03, 0.2, 0.0, 0.5]]))[0]
     seen = {}
 
     def look(state: State) -> object:
         seen.update(state.Ts_base_object)
         return state.T_base_tcp[:, 0, 3] - 1.0
 
-    problem = objective.StageProblem(
+    problem = solver.StageProblem(
         nominal_T_base_tcp=DOWN,
-        nominal_width_m=0.05,
-        subgoal=(objective.CostTerm(name="look", violation=look),),
+        subgoal=(solver.CostTerm(name="look", violation=look),),
         Ts_base_object={"box": np.eye(4)},
         Ts_tcp_object={"cube": T_tcp_object},
     )
-    zeta = draw_starts(problem, SolveConfig(), 0)
-    problem.violations(zeta)
-    np.testing.assert_allclose(seen["cube"], zeta.T_base_tcp @ T_tcp_object)
+    Ts = solver.drawn_around(DOWN, 32, 0)
+    problem.violations(Ts)
+    np.testing.assert_allclose(seen["cube"], Ts @ T_tcp_object)
     assert seen["box"].shape == (32, 4, 4)
 
 
-def test_starts_come_from_above_where_that_is_asked() -> None:
-    config = SolveConfig(only_above=True, num_starts=200)
-    starts = draw_starts(STAGE, config, 0)
-    assert (starts.T_base_tcp[:, 2, 3] >= DOWN[2, 3]).all()
-    np.testing.assert_array_equal(starts.T_base_tcp[0], DOWN)
-    assert np.ptp(draw_starts(STAGE, SolveConfig(), 0).T_base_tcp[:, 2, 3]) > 0.06
+def test_states_are_drawn_from_above_and_hardly_lean() -> None:
+    Ts = solver.drawn_around(DOWN, 200, 0)
+    assert (Ts[:, 2, 3] >= DOWN[2, 3]).all()
+    assert (Ts[:, 2, 2] <= -np.cos(solver.SPREAD_RAD) + 1e-9).all()
+    np.testing.assert_array_equal(Ts[0], DOWN)
 
 
 def test_the_first_of_those_that_are_alike_is_kept() -> None:
     Ts = np.repeat(np.eye(4)[None], 4, axis=0)
     Ts[1, 0, 3], Ts[2, 0, 3] = 0.009, 0.011
     Ts[3, :3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, np.radians(11.0)]))
-    assert distinct(Ts, np.array([0, 1, 2, 3]), 16) == [0, 2, 3]
-    assert distinct(Ts, np.array([1, 0, 2, 3]), 16) == [1, 3]
-    assert distinct(Ts, np.array([1, 3]), 1) == [1]
+    assert solver.distinct(Ts, np.array([0, 1, 2, 3]), 16) == [0, 2, 3]
+    assert solver.distinct(Ts, np.array([1, 0, 2, 3]), 16) == [1, 3]
+    assert solver.distinct(Ts, np.array([1, 3]), 1) == [1]
