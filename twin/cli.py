@@ -170,13 +170,9 @@ def calibrate(
         )
         return 0
     if config.physics:
-        from twin.calibrate.physics.push_fit import calibrate_pushes, describe_pushes
+        from twin.calibrate.physics.arm_motion import calibrate_imported
 
-        physics, calibration_id = calibrate_pushes(run_folder, config, output)
-        output.result(
-            {**physics, "calibration_id": calibration_id},
-            describe_pushes(physics, calibration_id),
-        )
+        output.result(*calibrate_imported(run_folder, config, output))
         return 0
     from twin.calibrate.cameras import calibrate_cameras, describe_cameras
 

@@ -36,7 +36,7 @@ from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.replay.scene import ReplayScene, localised_starts
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
-from twin.scene.store.calibration import Calibration, read_calibration, write_posterior
+from twin.scene.store.calibration import Calibration, read_calibration, write_part
 from twin.scene.store.folder import scene_hash_of
 
 FRICTION = (0.05, 1.2)
@@ -371,7 +371,7 @@ def calibrate_posterior(
         "skipped": found.skipped,
     }
     record["id"] = provenance.hash_settings(record)
-    return record, str(write_posterior(run, record)["calibration_id"])
+    return record, str(write_part(run, "posterior", record)["calibration_id"])
 
 
 def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:

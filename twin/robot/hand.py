@@ -47,7 +47,8 @@ class Hand:
         if not self._model.existFrame(hand_link):
             names = ", ".join(link.get("name", "") for link in root.findall("link"))
             raise RobotDescriptionError(found=f"lacks {hand_link!r}", hint=f"It has: {names}.")
-        self._ids = [self._model.joints[self._model.getJointId(name)].idx_q for name in joints]
+        arms = [self._model.joints[self._model.getJointId(name)] for name in joints]
+        self._ids, self._velocity_ids = [j.idx_q for j in arms], [j.idx_v for j in arms]
         self._frame = self._model.getFrameId(hand_link)
         links = _behind(root, hand_link)
         self._pieces = [
@@ -67,6 +68,15 @@ class Hand:
         q[self._ids] = joints_rad
         pin.framesForwardKinematics(self._model, self._data, q)
         return np.array(self._data.oMf[self._frame].homogeneous)
+
+    def gravity_nm(
+        self, joints_rad: Float[np.ndarray, " num_joints"]
+    ) -> Float[np.ndarray, " num_joints"]:
+        """Torque with which each joint holds the arm."""
+        q = pin.neutral(self._model)
+        q[self._ids] = joints_rad
+        torque = pin.computeGeneralizedGravity(self._model, self._data, q)
+        return np.array(torque)[self._velocity_ids]
 
     def hulls_m(self, finger_rad: float = 0.0) -> list[Float[np.ndarray, "num_points 3"]]:
         """Convex pieces of the hand link and of all links behind it: corners in its frame [m]."""

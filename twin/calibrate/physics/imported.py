@@ -20,6 +20,8 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import GstError
 from bridge.process_pool import Failed
 from bridge.terminal import Output
+from twin.calibrate.motion import Motion
+from twin.calibrate.physics.arm_motion import PART, motion_for
 from twin.calibrate.physics.push_fit import METHOD, load_push
 from twin.calibrate.physics.pushes import Push, PushResult, Trajectory, motion_of, replay_push
 from twin.physics.config import PhysicsConfig
@@ -45,8 +47,10 @@ class MotionReplay:
     physics: PhysicsConfig
     finger_rad: float
     fitted_to: tuple[str, ...]
-    """Recordings from which friction was identified."""
+    """Recordings from which friction or the arm's motion was identified."""
     calibration_id: str | None
+    motion: Motion | None = None
+    """Of the arm that follows the schedule, where held-out recordings confirmed it."""
     force: bool = False
 
     def settings(self) -> dict[str, Any]:
@@ -57,6 +61,7 @@ class MotionReplay:
             "physics": asdict(self.physics),
             "finger_rad": self.finger_rad,
             "fitted_to": list(self.fitted_to),
+            "motion": None if self.motion is None else self.motion.to_record(),
         }
 
     def cost(self) -> float:
@@ -79,34 +84,40 @@ def motion_replays(
 ) -> tuple[list[MotionReplay], dict[str, str]]:
     """List what can be replayed of imported recordings, and why others cannot."""
     calibration = read_calibration(run)
-    fit = _fit_of(calibration)
+    fit, arm = _fit_of(calibration), {} if calibration is None else calibration.record.get(PART, {})
     with_boxes = calibrated(config, calibration, None).physics
     items: list[MotionReplay] = []
     skipped: dict[str, str] = {}
     for name in names:
         try:
-            motion = motion_of(Episode.open(run.episodes_dir / f"{name}.mcap"))
+            episode = Episode.open(run.episodes_dir / f"{name}.mcap")
+            motion = motion_of(episode)
         except GstError as error:
             skipped[name] = str(error)
             continue
         if motion is None:
             continue
-        trajectories: tuple[Trajectory, ...] = ("planned", "executed")
         used = fit if motion.boxes else {}  # a tool alone meets no friction
         angle = used.get("parameters", {}).get("finger_rad", {}).get("value", 0.0)
-        items += [
-            MotionReplay(
-                run_path=run.path.resolve(),
-                episode_id=name,
-                trajectory=trajectory,
-                physics=with_boxes if motion.boxes else config.physics,
-                finger_rad=float(angle),
-                fitted_to=tuple(used.get("fitted_to", ())),
-                calibration_id=calibration.calibration_id if calibration and used else None,
-                force=force,
+        moved = motion_for(arm, episode.info.task)
+        trajectories: dict[Trajectory, Motion | None] = {"planned": moved, "executed": None}
+        for trajectory, known in trajectories.items():
+            if trajectory == "executed" and not motion.boxes:
+                continue
+            fitted = {*used.get("fitted_to", ()), *(arm["fitted_to"] if known else ())}
+            items.append(
+                MotionReplay(
+                    run_path=run.path.resolve(),
+                    episode_id=name,
+                    trajectory=trajectory,
+                    physics=with_boxes if motion.boxes else config.physics,
+                    finger_rad=float(angle),
+                    fitted_to=tuple(sorted(fitted)),
+                    calibration_id=calibration.calibration_id if calibration and fitted else None,
+                    motion=known,
+                    force=force,
+                )
             )
-            for trajectory in (trajectories if motion.boxes else trajectories[:1])
-        ]
     return items, skipped
 
 
@@ -129,7 +140,7 @@ def run_motion_replay(item: MotionReplay) -> dict[str, Any]:
     if kept:
         path.touch()  # the newest replay of a trajectory is the one that counts
     else:
-        result = replay_push(push, item.trajectory, item.physics, item.finger_rad)
+        result = replay_push(push, item.trajectory, item.physics, item.finger_rad, item.motion)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         _write(path, item, push, result)

@@ -175,8 +175,9 @@ def calibrate_pushes(
     return record, str(write_physics(run, record)["calibration_id"])
 
 
-def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
-    found: dict[str, Push] = {}
+def recordings(run: RunFolder) -> tuple[list[Push], dict[str, str]]:
+    """Imported recordings with a script, in name order, and why others cannot be replayed."""
+    found: list[Push] = []
     skipped: dict[str, str] = {}
     for path in run.episodes():
         try:
@@ -184,8 +185,13 @@ def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
         except GstError as error:
             skipped[path.stem] = str(error)
             continue
-        if push is not None and push.T_world_box is not None:
-            found[path.stem] = push
+        found += [] if push is None else [push]
+    return found, skipped
+
+
+def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
+    every, skipped = recordings(run)
+    found = {push.episode: push for push in every if push.T_world_box is not None}
     tasks = sorted({push.task for push in found.values()})
     if len(tasks) > 1:
         message = (

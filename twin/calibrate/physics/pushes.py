@@ -21,6 +21,7 @@ from bridge.episode.topics import TCP_POSE
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.scripted_motion import RECORD_NAME, ScriptedMotion
+from twin.calibrate.motion import Arm, Motion, Seen
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.physics.push import PushWorld
@@ -104,7 +105,7 @@ def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Ha
     if len(motion.boxes) > 1:
         message = f"{name} in {run.path}: {len(motion.boxes)} boxes; one can be replayed."
         raise UnusablePushError(message)
-    T_world_hand = _world_hand(motion, hand, np.zeros(len(motion.joints)))
+    T_world_hand = T_world_base(motion) @ hand.T_base_hand(np.zeros(len(motion.joints)))
     push = Push(
         episode=name,
         sha256=episode.sha256(),
@@ -144,39 +145,78 @@ def rest_pose(track: PoseTrajectory) -> Float[np.ndarray, "4 4"]:
     return T
 
 
+def T_world_base(motion: ScriptedMotion) -> Float[np.ndarray, "4 4"]:
+    """Where the description has the base."""
+    T = np.eye(4)
+    T[:3, 3] = motion.base_m
+    return T
+
+
+def arm_of(push: Push) -> Arm:
+    """What the description says of a recording's arm."""
+    return Arm(push.motion.joints, push.hand.T_base_hand, push.hand.gravity_nm)
+
+
+def seen_of(push: Push) -> Seen:
+    """Schedule and measured tool, both from the start of the recording."""
+    times_s, joints_rad = push.motion.joint_path_rad()
+    return Seen(
+        name=push.episode,
+        times_s=times_s,
+        joints_rad=joints_rad,
+        seen_s=(push.tool.stamps_ns - push.tool.stamps_ns[0]) / NS_PER_S,
+        Ts_frame_tool=push.tool.transforms(),
+    )
+
+
+def described(push: Push) -> Motion:
+    """The arm as it is described, with the tool as it is held at the start."""
+    nothing = np.zeros(len(push.motion.joints))
+    return Motion(
+        T_frame_base=T_world_base(push.motion),
+        T_hand_tool=push.T_hand_tool,
+        zeros_rad=nothing,
+        compliance_rad_nm=nothing,
+        delay_s=0.0,
+    )
+
+
 def replay_push(
     push: Push,
     trajectory: Trajectory,
     config: PhysicsConfig,
     finger_rad: float = 0.0,
+    motion: Motion | None = None,
 ) -> PushResult:
     """Let the hand follow a trajectory and the box go where it is pushed.
 
     Args:
         trajectory: ``executed``: the measured tool; ``planned``: the joint schedule.
+        motion: The arm that follows the schedule; as described where None.
     """
-    stamps_ns, Ts_world_hand = hand_path(push, trajectory, config.rate_hz)
+    known = described(push) if motion is None or trajectory == "executed" else motion
+    stamps_ns, Ts_world_hand = hand_path(push, trajectory, config.rate_hz, known)
     Ts_world_box = None
     if push.T_world_box is not None:
         Ts_world_box = _push_box(push, Ts_world_hand, config, push.hand.hulls_m(finger_rad))
     kept = np.unique(np.append(np.arange(0, len(stamps_ns), STATE_EVERY), len(stamps_ns) - 1))
     return PushResult(
         stamps_ns=stamps_ns[kept],
-        Ts_world_tool=Ts_world_hand[kept] @ push.T_hand_tool,
+        Ts_world_tool=Ts_world_hand[kept] @ known.T_hand_tool,
         Ts_world_box=None if Ts_world_box is None else Ts_world_box[kept],
     )
 
 
 def hand_path(
-    push: Push, trajectory: Trajectory, rate_hz: int
+    push: Push, trajectory: Trajectory, rate_hz: int, known: Motion
 ) -> tuple[Int[np.ndarray, " num_steps"], Float[np.ndarray, "num_steps 4 4"]]:
     """Where the hand link is at every physics step, world frame."""
     first_ns = int(push.tool.stamps_ns[0])
     if trajectory == "planned":
-        times_s, joints_rad = push.motion.joint_path_rad()
-        at_s = np.arange(round(times_s[-1] * rate_hz) + 1) / rate_hz
-        path = np.stack([np.interp(at_s, times_s, column) for column in joints_rad.T], axis=1)
-        Ts = np.stack([_world_hand(push.motion, push.hand, row) for row in path])
+        told = seen_of(push)
+        whole_s = told.times_s[-1] + max(0.0, known.delay_s)
+        at_s = np.arange(round(whole_s * rate_hz) + 1) / rate_hz
+        Ts = known.Ts_frame_hand(arm_of(push), told.joints_at(at_s, known.delay_s))
         return first_ns + np.rint(at_s * NS_PER_S).astype(np.int64), Ts
     last_ns = int(push.tool.stamps_ns[-1])
     count = round((last_ns - first_ns) / NS_PER_S * rate_hz)
@@ -189,14 +229,6 @@ def hand_path(
     p = gaussian_filter1d(track.p_m, sigma, axis=0, mode="nearest")
     Ts_world_tool = se3.transform_from(q / np.linalg.norm(q, axis=1, keepdims=True), p)
     return stamps_ns, np.asarray(Ts_world_tool @ se3.invert(push.T_hand_tool))
-
-
-def _world_hand(
-    motion: ScriptedMotion, hand: Hand, joints_rad: Float[np.ndarray, " num_joints"]
-) -> Float[np.ndarray, "4 4"]:
-    T = hand.T_base_hand(joints_rad)
-    T[:3, 3] += motion.base_m
-    return T
 
 
 def _push_box(
