@@ -467,8 +467,7 @@ class Gate:
 
     def _frames(self) -> Any:
         return self._perception.frames(
-            max_age_ns=round(MAX_FRAME_AGE_S * 1e9),
-            max_per_camera=FRAMES,
+            max_age_ns=round(MAX_FRAME_AGE_S * 1e9), max_per_camera=FRAMES
         )
 
     def _likely(self, verdict: Verdict) -> Verdict:

@@ -46,11 +46,7 @@ from twin.errors import TwinError
 from twin.robot.posture import PostureTrack, check_joints
 from twin.scene.frames.camera_poses import CameraPoses, rooted_in_base
 from twin.scene.frames.selection import with_true_depth
-from twin.scene.localise.stationary_frames import (
-    STATIONARY_WINDOW_NS,
-    common_root,
-    is_stationary,
-)
+from twin.scene.localise.stationary_frames import STATIONARY_WINDOW_NS, common_root, is_stationary
 from twin.scene.store.calibration import Calibration, MountedCamera, mounted_tree, unknown_postures
 
 KEPT_IMAGES = 6

@@ -128,11 +128,7 @@ def _request(payload: bytes) -> dict[str, Any]:
     return request
 
 
-def watch_cell(
-    session: Any,
-    cell: str,
-    take: Callable[[str, bytes, int, str], None],
-) -> None:
+def watch_cell(session: Any, cell: str, take: Callable[[str, bytes, int, str], None]) -> None:
     """Hand the cell's images, joints, transforms, description and events to ``take``."""
 
     def on_sample(sample: Any) -> None:

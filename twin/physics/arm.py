@@ -53,10 +53,7 @@ def _tiny_inertial() -> ET.Element:
 
 
 def _replace_meshes(
-    link: ET.Element,
-    hulls: Sequence[Float[np.ndarray, "num_points 3"]],
-    folder: Path,
-    stem: str,
+    link: ET.Element, hulls: Sequence[Float[np.ndarray, "num_points 3"]], folder: Path, stem: str
 ) -> None:
     for collision in link.findall("collision"):
         if collision.find("geometry/mesh") is not None:

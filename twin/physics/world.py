@@ -209,12 +209,7 @@ class World:
         )
 
     def _set_friction(self, body: int, friction: float) -> None:
-        pybullet.changeDynamics(
-            body,
-            -1,
-            lateralFriction=friction,
-            physicsClientId=self._client,
-        )
+        pybullet.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=self._client)
 
     def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
         """Put the robot into a posture at rest, without simulating."""

@@ -191,10 +191,7 @@ def _varied_model(
 
 
 def _root(
-    T: Float[np.ndarray, "4 4"],
-    model: ObjectModel,
-    scene: ReplayScene,
-    name: str,
+    T: Float[np.ndarray, "4 4"], model: ObjectModel, scene: ReplayScene, name: str
 ) -> Float[np.ndarray, "6 6"]:
     """Symmetric square root of what is unsure of a pose."""
     covariance = scene.covariances.get(name)
@@ -271,12 +268,7 @@ class Sample:
 
 
 def replay_samples(
-    replay: Replay,
-    scene: ReplayScene,
-    config: ReplayConfig,
-    *,
-    plan_id: str,
-    identity: str,
+    replay: Replay, scene: ReplayScene, config: ReplayConfig, *, plan_id: str, identity: str
 ) -> tuple[Sample, ...]:
     """Run ``config.samples`` varied replays; UsageError if kinematic, which moves no objects."""
     if config.samples and config.mode != "dynamic":

@@ -344,9 +344,7 @@ def ur_geometry(robot: RobotModel) -> UrGeometry | None:
     return None if geometry is None else _checked(geometry, robot)
 
 
-def _axes(
-    robot: RobotModel,
-) -> tuple[Float[np.ndarray, "6 3"], Float[np.ndarray, "6 3"]] | None:
+def _axes(robot: RobotModel) -> tuple[Float[np.ndarray, "6 3"], Float[np.ndarray, "6 3"]] | None:
     """Direction of each joint axis at zero and the point on it nearest the base's origin."""
     if len(robot.arm_ids) != 6:
         return None

@@ -129,9 +129,7 @@ class PosedSurface:
         )
 
     def depth_along(
-        self,
-        rays_camera: Float[np.ndarray, "*shape 3"],
-        T_base_camera: Float[np.ndarray, "4 4"],
+        self, rays_camera: Float[np.ndarray, "*shape 3"], T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "*shape"]:
         """Depth at which rays with z = 1 in the camera meet the robot; infinite where they miss."""
         turned = rays_camera @ T_base_camera[:3, :3].T

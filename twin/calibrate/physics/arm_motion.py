@@ -75,10 +75,7 @@ def calibrate_motion(run: RunFolder) -> tuple[dict[str, Any], str]:
         "rms_m": found.rms_m,
         "rms_rad": found.rms_rad,
         "fitted_to": fitted,
-        "held_out": {
-            "nominal_m": errors[""],
-            "calibrated_m": errors["calibrated"],
-        },
+        "held_out": {"nominal_m": errors[""], "calibrated_m": errors["calibrated"]},
         "sources": {push.episode: push.sha256 for push in pushes},
         "skipped": skipped,
     }

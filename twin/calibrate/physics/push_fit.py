@@ -21,13 +21,7 @@ from bridge.errors import GstError
 from bridge.process_pool import Failed, Runner, runner_of
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
-from twin.calibrate.physics.pushes import (
-    Push,
-    UnusablePushError,
-    motion_of,
-    read_push,
-    replay_push,
-)
+from twin.calibrate.physics.pushes import Push, UnusablePushError, motion_of, read_push, replay_push
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
 from twin.robot.hand import Hand
