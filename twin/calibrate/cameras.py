@@ -5,7 +5,7 @@ in its depth images.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -277,8 +277,8 @@ def target_record(found: TargetCamera, pairs: PosePairs, link: str, base: str) -
         "T_base_target" if in_hand else "T_effector_target": se3.pose_record(
             solution.Z if in_hand else solution.X
         ),
-        "residual_m": solution.residual_m.to_record(),
-        "residual_rad": solution.residual_rad.to_record(),
+        "residual_m": asdict(solution.residual_m),
+        "residual_rad": asdict(solution.residual_rad),
         "sigma_m": solution.x_sigma_m,
         "sigma_rad": solution.x_sigma_rad,
         "num_pairs": solution.num_pairs,
@@ -332,7 +332,7 @@ def _describe(item: Mapping[str, Any]) -> str:
         turn = {key: float(np.degrees(value)) for key, value in item["residual_rad"].items()}
         text += f" and {turn['value']:.3f} [{turn['low']:.3f}, {turn['high']:.3f}] degrees"
         text += f", {item['num_pairs']} pairs, {item['num_outliers']} outliers"
-        return f"{text}; position known to {item['sigma_m'] * 1e3:.2f} mm (bootstrap)"
+        return f"{text}; position known to {item['sigma_m'] * 1e3:.2f} mm"
     text += f", robot seen in {item['num_postures']} postures, fitness {item['fitness']:.2f}"
     text += f", depth scale {item['depth_scale']:.4f}"
     if "correction_m" in item:

@@ -83,7 +83,7 @@ def test_wrong_pairs_are_counted_and_have_no_say() -> None:
     assert distance(dirty.X, X) < 2 * distance(clean.X, X) + 3e-4
 
 
-def test_the_bootstrap_knows_how_wrong_the_position_is() -> None:
+def test_it_knows_how_wrong_the_position_is() -> None:
     found, missed = [], []
     for seed in range(12):
         Ts_a, Ts_b, X, _ = made_pairs(seed + 50, 20, metres=2e-3, radians=2e-3)

@@ -105,7 +105,8 @@ def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Ha
     if len(motion.boxes) > 1:
         message = f"{name} in {run.path}: {len(motion.boxes)} boxes; one can be replayed."
         raise UnusablePushError(message)
-    T_world_hand = T_world_base(motion) @ hand.T_base_hand(np.zeros(len(motion.joints)))
+    T_world_hand = hand.T_base_hand(np.zeros(len(motion.joints)))
+    T_world_hand[:3, 3] += motion.base_m
     push = Push(
         episode=name,
         sha256=episode.sha256(),
@@ -145,13 +146,6 @@ def rest_pose(track: PoseTrajectory) -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def T_world_base(motion: ScriptedMotion) -> Float[np.ndarray, "4 4"]:
-    """Where the description has the base."""
-    T = np.eye(4)
-    T[:3, 3] = motion.base_m
-    return T
-
-
 def arm_of(push: Push) -> Arm:
     """What the description says of a recording's arm."""
     return Arm(push.motion.joints, push.hand.T_base_hand, push.hand.gravity_nm)
@@ -159,21 +153,16 @@ def arm_of(push: Push) -> Arm:
 
 def seen_of(push: Push) -> Seen:
     """Schedule and measured tool, both from the start of the recording."""
-    times_s, joints_rad = push.motion.joint_path_rad()
-    return Seen(
-        name=push.episode,
-        times_s=times_s,
-        joints_rad=joints_rad,
-        seen_s=(push.tool.stamps_ns - push.tool.stamps_ns[0]) / NS_PER_S,
-        Ts_frame_tool=push.tool.transforms(),
-    )
+    seen_s = (push.tool.stamps_ns - push.tool.stamps_ns[0]) / NS_PER_S
+    return Seen(push.episode, *push.motion.joint_path_rad(), seen_s, push.tool.transforms())
 
 
 def described(push: Push) -> Motion:
     """The arm as it is described, with the tool as it is held at the start."""
-    nothing = np.zeros(len(push.motion.joints))
+    nothing, base = np.zeros(len(push.motion.joints)), np.eye(4)
+    base[:3, 3] = push.motion.base_m
     return Motion(
-        T_frame_base=T_world_base(push.motion),
+        T_frame_base=base,
         T_hand_tool=push.T_hand_tool,
         zeros_rad=nothing,
         compliance_rad_nm=nothing,
