@@ -27,7 +27,7 @@ KINOVA = DATA / "robot_realitygap_kinova_real_vs_sim"
 TWIN = "twin-pybullet"
 RULE = "no physics: mean of the identifying runs"
 EXECUTED = f"{TWIN} executed calibrated"
-PLANNED_TOOL = f"{TWIN} planned"
+PLANNED_TOOL = f"{TWIN} planned calibrated"
 
 
 def gst(*words: str) -> None:
@@ -48,17 +48,18 @@ def make(run: Path) -> None:
 
 
 def errors_of(
-    results: Mapping[str, Any], task: str, body: str, column: str
+    results: Mapping[str, Any], task: str, body: str, column: str, runs: Sequence[str] = ()
 ) -> dict[str, dict[str, float]]:
-    """Error of each recorded run by engine [mm]."""
+    """Error of each recorded run, or of some, by engine [mm]."""
     found: dict[str, dict[str, float]] = {}
     for table in results["tables"]:
         if not table["id"].startswith("runs_of_end_points"):
             continue
         for values in table["rows"]:
             row = dict(zip(table["columns"], values, strict=True))
-            if row["body"] == body and str(row["recorded run"]).startswith(f"{task}_"):
-                found.setdefault(row["engine"], {})[row["recorded run"]] = row[column]
+            name = str(row["recorded run"])
+            if row["body"] == body and name.startswith(f"{task}_") and name in (runs or [name]):
+                found.setdefault(row["engine"], {})[name] = row[column]
     return found
 
 
@@ -94,8 +95,9 @@ def print_table(
     results: Mapping[str, Any],
     held_out: Sequence[str],
     rule: Mapping[str, Mapping[str, float]],
+    tools: Mapping[str, Mapping[str, float]],
 ) -> None:
-    """Print every engine's medians over held-out runs, best first, and the tool's means."""
+    """Print every engine's medians over held-out runs, best first; the tool's means and worst."""
     ends = errors_of(results, "cubeexp", "cube", "end-point error (mm)")
     ways = errors_of(results, "cubeexp", "cube", "displacement error (mm)")
     ends[RULE], ways[RULE] = dict(rule["end"]), dict(rule["way"])
@@ -104,10 +106,10 @@ def print_table(
     for engine in sorted(ends, key=lambda name: median([ends[name][run] for run in held_out])):
         cells = (summary([errors[engine][run] for run in held_out]) for errors in (ends, ways))
         print(f"| {engine} | {' | '.join(cells)} |")
-    tools = errors_of(results, "single", "tool", "end-point error (mm)")
-    print("\n| tool, Experiment 1 | end point, mean over pairs (mm) |\n|---|---|")
+    print("\n| tool, Experiment 1, held out | mean (mm) | worst (mm) |\n|---|---|---|")
     for engine in sorted(tools, key=lambda name: mean(tools[name].values())):
-        print(f"| {engine} | {mean(tools[engine].values()):.2f} |")
+        values = tools[engine].values()
+        print(f"| {engine} | {mean(values):.2f} | {max(values):.2f} |")
 
 
 def main() -> None:
@@ -119,17 +121,17 @@ def main() -> None:
     run = Path(sys.argv[1]) if len(sys.argv) > 1 else work / "real_push"
     make(run)
     results = json.loads((run / "results" / "results.json").read_text())
-    physics = json.loads((run / "scene" / "calibration.json").read_text())["physics"]
+    calibration = json.loads((run / "scene" / "calibration.json").read_text())
+    physics, motion = calibration["physics"], calibration["motion"]
     held_out = physics["held_out"]["episodes"]
     rule = without_physics(run, physics["fitted_to"], held_out)
-    print_table(results, held_out, rule)
+    others = motion["held_out"]["episodes"]
+    found = errors_of(results, "single", "tool", "end-point error (mm)", others)
+    print_table(results, held_out, rule, found)
     ends = errors_of(results, "cubeexp", "cube", "end-point error (mm)")
     medians = {name: median([each[run] for run in held_out]) for name, each in ends.items()}
     best = min((value, name) for name, value in medians.items() if not name.startswith(TWIN))
-    tools = {
-        name: mean(each.values())
-        for name, each in errors_of(results, "single", "tool", "end-point error (mm)").items()
-    }
+    tools = {name: mean(each.values()) for name, each in found.items()}
     tool = min((value, name) for name, value in tools.items() if not name.startswith(TWIN))
     report_targets(
         "replay_real_push",
@@ -148,9 +150,9 @@ def main() -> None:
                 reference=best[1],
             ),
             Target(
-                what="tool of Experiment 1, schedule",
+                what="tool of Experiment 1, schedule, held out",
                 measured=tools[PLANNED_TOOL],
-                limit=tool[0] + 1.0,
+                limit=min(6.0, tool[0]),
                 unit="mm",
                 reference=f"{tool[1]} {tool[0]:.2f} mm",
             ),

@@ -194,10 +194,12 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     """
     episodes = _readable(run, output)
     where = placement(episodes)
-    base = _base_frame(episodes)
+    described = [item for item in episodes if streams.robot_description(item) is not None]
+    base = next(map(streams.recorded_robot, described), robot_of("")).base_frame
     found: dict[str, Any] = {}
     reasons: dict[str, str] = {}
-    for camera_id in _wanted(episodes, where, config):
+    seen = sorted({*where, *target_cameras(episodes)})
+    for camera_id in [config.camera] if config.camera else seen:
         try:
             place = where.get(camera_id, NO_DEPTH)
             found[camera_id] = _camera(episodes, camera_id, place, config, base)
@@ -222,25 +224,13 @@ def _readable(run: RunFolder, output: Output) -> list[Episode]:
     return episodes
 
 
-def _base_frame(episodes: Sequence[Episode]) -> str:
-    """The base of the robot that was recorded."""
-    described = [item for item in episodes if streams.robot_description(item) is not None]
-    return next((streams.recorded_robot(item) for item in described), robot_of("")).base_frame
-
-
-def _wanted(
-    episodes: Sequence[Episode], where: Mapping[str, str], config: CalibrateConfig
-) -> list[str]:
-    if config.camera:
-        return [config.camera]
-    return sorted({*where, *target_cameras(episodes)})
-
-
 def _camera(
     episodes: Sequence[Episode], camera_id: str, where: str, config: CalibrateConfig, base: str
 ) -> dict[str, Any]:
     if camera_id in target_cameras(episodes):
-        return _from_target(recorded_pairs(episodes, camera_id, config.link), config, base)
+        pairs = recorded_pairs(episodes, camera_id, config.link)
+        found = find_camera(pairs, config.mount, seed=config.seed)
+        return target_record(found, pairs, config.link, base)
     topic = f"...{CAMERAS}{camera_id}{TARGET_POSE}"
     if where == NO_DEPTH:
         message = (
@@ -255,13 +245,7 @@ def _camera(
         )
         raise NothingToCalibrateError(message)
     with_depth = [episode for episode in episodes if camera_id in depth_cameras(episode)]
-    found = find_fixed_camera(with_depth, camera_id, seed=config.seed)
-    return fixed_record(found, base)
-
-
-def _from_target(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[str, Any]:
-    found = find_camera(pairs, config.mount, seed=config.seed)
-    return target_record(found, pairs, config.link, base)
+    return fixed_record(find_fixed_camera(with_depth, camera_id, seed=config.seed), base)
 
 
 def target_record(found: TargetCamera, pairs: PosePairs, link: str, base: str) -> dict[str, Any]:

@@ -254,10 +254,14 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> TargetCamer
         UndeterminedCameraError: Too few pairs, rotations about one axis only, pairs that fit
             neither mounting, or that fit the other one than was asked for.
     """
-    found = {name: _solve(pairs, name, seed) for name in ("hand", "fixed")}
+    seen = pairs.Ts_camera_target
+    each: dict[Mount, np.ndarray] = {"hand": se3.invert(seen), "fixed": seen}
+    found = {
+        name: TargetCamera(solution=solve(pairs.Ts_base_effector, Ts, seed=seed), mount=name)
+        for name, Ts in each.items()
+    }
     size = {name: item.solution.residual_m.value for name, item in found.items()}
-    best = "hand" if size["hand"] <= size["fixed"] else "fixed"
-    other = "fixed" if best == "hand" else "hand"
+    best, other = sorted(each, key=lambda name: size[name])
     if mount == "auto" and size[other] < CLEARLY * size[best]:
         message = (
             f"the {len(pairs)} pose pairs of {pairs.source} fit a camera in the hand to "
@@ -274,12 +278,6 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> TargetCamer
         )
         raise UndeterminedCameraError(message)
     return _believable(found[chosen], pairs)
-
-
-def _solve(pairs: PosePairs, mount: Mount, seed: int) -> TargetCamera:
-    seen = pairs.Ts_camera_target
-    Ts_b = se3.invert(seen) if mount == "hand" else seen
-    return TargetCamera(solution=solve(pairs.Ts_base_effector, Ts_b, seed=seed), mount=mount)
 
 
 def _believable(found: TargetCamera, pairs: PosePairs) -> TargetCamera:

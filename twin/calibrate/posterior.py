@@ -36,7 +36,7 @@ from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.replay.scene import ReplayScene, localised_starts
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
-from twin.scene.store.calibration import Calibration, read_calibration, write_part
+from twin.scene.store.calibration import read_calibration, write_part
 from twin.scene.store.folder import scene_hash_of
 
 FRICTION = (0.05, 1.2)
@@ -212,7 +212,11 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     scene = read_rebuilt_scene(run, task).scene(task, urdf, start.Ts_base_object)
     if scene.missing():
         raise UsageError(f"at its start {scene.describe_missing()}")
-    config = for_task(ReplayConfig(), _without_posterior(run), task)
+    known = read_calibration(run)
+    if known is not None:  # all but what is made anew
+        record = {key: value for key, value in known.record.items() if key != "posterior"}
+        known = replace(known, record=record)
+    config = for_task(ReplayConfig(), known, task)
     return Trial(
         episode=episode.info.id,
         sha256=episode.sha256(),
@@ -226,16 +230,6 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
         cell=episode.info.cell,
         task_sha256=episode.info.task_sha256,
         start_seed=episode.info.start_seed,
-    )
-
-
-def _without_posterior(run: RunFolder) -> Calibration | None:
-    """Of the run's calibration, all but what is made anew."""
-    known = read_calibration(run)
-    if known is None:
-        return None
-    return replace(
-        known, record={key: known.record[key] for key in known.record if key != "posterior"}
     )
 
 

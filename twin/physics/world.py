@@ -178,13 +178,10 @@ class World(Bodies):
         body = self.add_static([(centre, extents)], np.eye(4))[0]
         # The robot stands on the table: its base touches it by construction.
         for link in (-1, *self.robot.base_links):
-            self._ignore(body, link)
+            pybullet.setCollisionFilterPair(
+                self.robot.id, body, link, -1, 0, physicsClientId=self._client
+            )
         return body
-
-    def _ignore(self, body: int, link: int) -> None:
-        pybullet.setCollisionFilterPair(
-            self.robot.id, body, link, -1, 0, physicsClientId=self._client
-        )
 
     def add_free(
         self,

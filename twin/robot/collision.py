@@ -59,7 +59,7 @@ def link_hulls(robot: RobotModel) -> list[LinkHull]:
     for item in geometry.geometryObjects:
         frame = robot.model.frames[item.parentFrame]
         T_link_shape = frame.placement.inverse() * item.placement
-        points = _points(item) @ T_link_shape.rotation.T + T_link_shape.translation
+        points = points_of(item) @ T_link_shape.rotation.T + T_link_shape.translation
         if not _has_volume(points):
             raise RobotDescriptionError(
                 found=f"has a collision shape without volume at the link {frame.name!r}",
@@ -85,7 +85,8 @@ def _has_volume(points_m: Float[np.ndarray, "num_points 3"]) -> bool:
     return bool(spread[2] > _THINNEST_M)
 
 
-def _points(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
+def points_of(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
+    """Points whose hull contains a shape, in its own frame [m]."""
     shape = item.geometry
     if isinstance(shape, coal.BVHModelBase):
         return np.array(shape.vertices())

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from twin.robot.collision import convex_hull
+from twin.robot.collision import convex_hull, points_of
 from twin.robot.model import RobotDescriptionError, parse_description
 
 _PACKAGE = "package://"
@@ -52,7 +52,7 @@ class Hand:
         self._frame = self._model.getFrameId(hand_link)
         links = _behind(root, hand_link)
         self._pieces = [
-            (item.parentJoint, item.placement, np.array(convex_hull(_corners(item)).points()))
+            (item.parentJoint, item.placement, np.array(convex_hull(points_of(item)).points()))
             for item in geometry.geometryObjects
             if self._model.frames[item.parentFrame].name in links
         ]
@@ -89,16 +89,6 @@ class Hand:
             T = (T_hand_base * self._data.oMi[joint] * placement).homogeneous
             hulls.append(corners @ T[:3, :3].T + T[:3, 3])
         return hulls
-
-
-def _corners(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
-    try:
-        return np.array(item.geometry.vertices())
-    except AttributeError:
-        raise RobotDescriptionError(
-            found=f"has a collision shape at {item.name} that is not a mesh",
-            hint="Links that push boxes need collision meshes.",
-        ) from None
 
 
 def _with_local_meshes(root: ET.Element, folder: Path) -> None:
