@@ -129,7 +129,9 @@ def solve(
     """
     turn = check_motions(Ts_a)
     X = solve_hand_eye(Ts_a, Ts_b)
-    Z, J = _middle(Ts_a @ X @ se3.invert(Ts_b)), np.zeros((0, 12))
+    each, J = Ts_a @ X @ se3.invert(Ts_b), np.zeros((0, 12))
+    gaps = np.linalg.norm(each[:, None, :3, 3] - each[None, :, :3, 3], axis=-1)
+    Z = each[int(np.argmin(np.median(gaps, axis=1)))]  # the one nearest to all others
     for _ in range(ROUNDS):
         X, Z, J = _refined(Ts_a, Ts_b, X, Z)
     left = misfits(Ts_a, Ts_b, X, Z)
@@ -188,12 +190,6 @@ def misfits(
     """
     E = se3.invert(Z @ Ts_b) @ Ts_a @ X
     return np.concatenate([E[:, :3, 3], se3.vector_from_rotation(E[:, :3, :3])], axis=1)
-
-
-def _middle(Ts: Float[np.ndarray, "num_pairs 4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The one of several estimates of a pose that lies nearest to all others."""
-    gap = np.linalg.norm(Ts[:, None, :3, 3] - Ts[None, :, :3, 3], axis=-1)
-    return np.asarray(Ts[int(np.argmin(np.median(gap, axis=1)))])
 
 
 def _refined(

@@ -281,7 +281,10 @@ class Gate:
         silent_ns = self._now_ns() - max(self._perception.heard_ns(), self._contact_ns)
         try:
             task = self._tasks.find(task_name, task_sha256)
-            self._refuse_to_look(silent_ns)
+            running = self._perception.executing()
+            if running is not None:
+                raise UndecidedError(f"{running} is being executed; objects are localised at rest")
+            self._refuse_silence(silent_ns)
             found = self._look(task, self._wait_for_frames(), ends_s)
             missing = _missing(found)
             return Located(
@@ -292,12 +295,6 @@ class Gate:
         finally:
             self._contact_ns = self._now_ns() - silent_ns
             self._turn.release()
-
-    def _refuse_to_look(self, silent_ns: int) -> None:
-        running = self._perception.executing()
-        if running is not None:
-            raise UndecidedError(f"{running} is being executed; objects are localised at rest")
-        self._refuse_silence(silent_ns)
 
     def _refuse_silence(self, silent_ns: int) -> None:
         if silent_ns > MAX_SILENCE_S * 1e9:

@@ -248,7 +248,7 @@ class LiveView:
             return
         try:
             with self._lock:
-                if topic == self._joint_topic:
+                if topic == cell_topic(self._cell, JOINT_STATES):
                     self._take_joints(data, received_ns)
                 else:
                     self._take(topic, data, type_name or type_of_topic(topic) or "")
@@ -340,10 +340,6 @@ class LiveView:
             self._newest_ns = max(self._newest_ns, camera.colors[-1].stamp_ns)
         elif kind == "image" and stream == "depth":
             camera.depths.append(DepthImage.from_message(type_name, data))
-
-    @property
-    def _joint_topic(self) -> str:
-        return cell_topic(self._cell, JOINT_STATES)
 
     def cameras_from(self) -> str:
         """By what the cameras are posed, in words."""

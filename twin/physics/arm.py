@@ -60,14 +60,10 @@ def _replace_meshes(
             link.remove(collision)
     for index, points in enumerate(hulls):
         path = folder / f"{stem}_{index}.obj"
-        path.write_text(_obj(points))
+        path.write_text(_obj_of(np.asarray(points, dtype=np.float64).tobytes()))
         collision = ET.SubElement(link, "collision")
         geometry = ET.SubElement(collision, "geometry")
         ET.SubElement(geometry, "mesh", filename=str(path))
-
-
-def _obj(points_m: Float[np.ndarray, "num_points 3"]) -> str:
-    return _obj_of(np.asarray(points_m, dtype=np.float64).tobytes())
 
 
 @lru_cache(maxsize=64)

@@ -50,11 +50,11 @@ class Hand:
         arms = [self._model.joints[self._model.getJointId(name)] for name in joints]
         self._ids, self._velocity_ids = [j.idx_q for j in arms], [j.idx_v for j in arms]
         self._frame = self._model.getFrameId(hand_link)
-        links = _behind(root, hand_link)
+        behind = self._model.subtrees[self._model.frames[self._frame].parentJoint]
         self._pieces = [
             (item.parentJoint, item.placement, np.array(convex_hull(points_of(item)).points()))
             for item in geometry.geometryObjects
-            if self._model.frames[item.parentFrame].name in links
+            if item.parentJoint in behind
         ]
         arm = {self._model.getJointId(name) for name in joints}
         self._finger_ids = [
@@ -111,17 +111,3 @@ def _with_local_meshes(root: ET.Element, folder: Path) -> None:
                     hint="Put it there, or import the data set again with its robot folder.",
                 )
             mesh.set("filename", str(path))
-
-
-def _behind(root: ET.Element, link: str) -> set[str]:
-    """A link and all that hangs on it."""
-    found, todo = set(), [link]
-    while todo:
-        parent = todo.pop()
-        found.add(parent)
-        for joint in root.findall("joint"):
-            ends = (joint.find("parent"), joint.find("child"))
-            names = [end.get("link", "") if end is not None else "" for end in ends]
-            if names[0] == parent and names[1] not in found:
-                todo.append(names[1])
-    return found

@@ -4,7 +4,6 @@
 no plan and so no verdict: what comes out is an episode that ``evaluate`` lays over the recording.
 """
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from twin.physics.engine import ENGINE_VERSION
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.rebuilt_scene import calibrated
 from twin.replay.runner import chosen_episodes, runner_for
-from twin.scene.store.calibration import Calibration, read_calibration
+from twin.scene.store.calibration import read_calibration
 
 ENGINE = "twin-pybullet"
 """Beside simulators of others, which may have used PyBullet too."""
@@ -84,7 +83,10 @@ def motion_replays(
 ) -> tuple[list[MotionReplay], dict[str, str]]:
     """List what can be replayed of imported recordings, and why others cannot."""
     calibration = read_calibration(run)
-    fit, arm = _fit_of(calibration), {} if calibration is None else calibration.record.get(PART, {})
+    known_parts = {} if calibration is None else calibration.record
+    arm, fit = known_parts.get(PART) or {}, known_parts.get("physics") or {}
+    if fit.get("method") != METHOD or not fit.get("promoted"):
+        fit = {}
     with_boxes = calibrated(config, calibration, None).physics
     items: list[MotionReplay] = []
     skipped: dict[str, str] = {}
@@ -119,14 +121,6 @@ def motion_replays(
                 )
             )
     return items, skipped
-
-
-def _fit_of(calibration: Calibration | None) -> Mapping[str, Any]:
-    """The physics part of a calibration, where pushes made it and held-out ones confirmed it."""
-    record = None if calibration is None else calibration.record.get("physics")
-    if not isinstance(record, Mapping) or record.get("method") != METHOD:
-        return {}
-    return record if record.get("promoted") else {}
 
 
 def run_motion_replay(item: MotionReplay) -> dict[str, Any]:
