@@ -40,10 +40,6 @@ Row = Float[np.ndarray, " num_joints"]
 Numbers = Float[np.ndarray, " num_unknowns"]
 
 
-class StillMotionError(UsageError):
-    """Nothing moves, so nothing can be learned from its motion."""
-
-
 @dataclass(frozen=True)
 class Arm:
     """What a description says: pose of the hand, and the torque with which each joint holds."""
@@ -284,7 +280,7 @@ def delay_of_turning(arm: Arm, run: Seen) -> float:
     seen_s, seen = turning(run.Ts_frame_tool, run.seen_s)
     if told[1].max() < 1e-2:
         message = f"{run.name}: nothing turns. Move the arm by 20 degrees or more."
-        raise StillMotionError(message)
+        raise UsageError(message)
     delays = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S, 0.02)
     told_there = [np.interp(seen_s - d, *told, left=0.0, right=0.0) for d in delays]
     return float(delays[int(np.argmin(((np.array(told_there) - seen) ** 2).mean(axis=1)))])

@@ -23,7 +23,7 @@ from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
-from bridge.process_pool import Failed, ProcessPool, default_size
+from bridge.process_pool import Failed, runner_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
 from bridge.task.task_file import Task
@@ -306,35 +306,26 @@ def weighed(
     pieces = [(number, trial, draw) for number, draw in enumerate(draws) for trial in trials]
     logs = np.log([draw.weight for draw in draws])
     counts = np.zeros((len(draws), 2, 2), dtype=int)
-    with output.progress("replays", len(pieces)) as advance:
-        for done, ((number, trial, _), ended) in enumerate(_answers(pieces, workers), start=1):
+    with runner_of(workers) as runner, output.progress("replays", len(pieces)) as advance:
+        answers = runner.run(_ended, pieces, lambda piece: piece[1].plan.tau[-1].t_ns)
+        for done, ((number, trial, _), ended) in enumerate(answers, start=1):
+            if isinstance(ended, Failed):
+                raise RuntimeError(ended.trace or ended.message)
             logs[number] += log_nearness(trial, ended)
             counts[number, int(ended.success), int(ended.success == trial.success)] += 1
             advance(done, trial.episode)
-    answers = [
+    records = [
         [Record(right=int(right), wrong=int(wrong)) for wrong, right in rows] for rows in counts
     ]
-    logs += [no.log_likelihood + yes.log_likelihood for no, yes in answers]
+    logs += [no.log_likelihood + yes.log_likelihood for no, yes in records]
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     return [
         replace(
             draw, weight=float(w), wrong_yes=yes.probability_wrong, wrong_no=no.probability_wrong
         )
-        for draw, w, (no, yes) in zip(draws, weights, answers, strict=True)
+        for draw, w, (no, yes) in zip(draws, weights, records, strict=True)
     ]
-
-
-def _answers(pieces: Sequence[Piece], workers: int | None) -> Any:
-    workers = workers or default_size()
-    if workers == 1:
-        yield from ((piece, _ended(piece)) for piece in pieces)
-        return
-    with ProcessPool(workers) as pool:
-        for piece, answer in pool.run(_ended, pieces, lambda piece: piece[1].plan.tau[-1].t_ns):
-            if isinstance(answer, Failed):
-                raise RuntimeError(answer.trace or answer.message)
-            yield piece, answer
 
 
 def effective(draws: Sequence[PosteriorDraw]) -> float:

@@ -118,15 +118,6 @@ MAX_PLAN_BYTES, MAX_WAYPOINTS = 10_000_000, 20_000
 class PlanTooLargeError(TwinError):
     """A payload is too large to be read as a plan."""
 
-    def __init__(self, *, num_bytes: int, num_waypoints: int) -> None:
-        """Remember the size."""
-        self.num_bytes, self.num_waypoints = num_bytes, num_waypoints
-        super().__init__(
-            f"a payload of {num_bytes / 1e6:.0f} MB with {num_waypoints} waypoints is not read as "
-            f"a plan; at most {MAX_PLAN_BYTES / 1e6:.0f} MB and {MAX_WAYPOINTS} are. Send fewer "
-            "waypoints, or split the plan."
-        )
-
 
 class UndecidedError(TwinError):
     """There is no basis for a verdict; the message says what is missing."""
@@ -189,11 +180,6 @@ class JudgedTasks:
             )
         return task
 
-    @property
-    def words(self) -> str:
-        """For a person."""
-        return "any task" if self.only is None else self.only.task().name
-
 
 Localise = Callable[[Any, Task, float], Mapping[str, Any]]
 """Frames, the task and when to be done, on the monotonic clock [s]; objects as localised."""
@@ -254,7 +240,11 @@ class Gate:
         arrived_ns = self._now_ns()
         count = payload.count(b'"t_ns"')  # to look at each would take longer than to judge few
         if len(payload) > MAX_PLAN_BYTES or count > MAX_WAYPOINTS:
-            raise PlanTooLargeError(num_bytes=len(payload), num_waypoints=count)
+            raise PlanTooLargeError(
+                f"a payload of {len(payload) / 1e6:.0f} MB with {count} waypoints is not read as "
+                f"a plan; at most {MAX_PLAN_BYTES / 1e6:.0f} MB and {MAX_WAYPOINTS} are. Send "
+                "fewer waypoints, or split the plan."
+            )
         plan = Plan.from_json(payload)
         with self._counting:
             if self._inside > self._config.waiting:

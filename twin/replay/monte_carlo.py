@@ -7,7 +7,7 @@ order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -79,7 +79,7 @@ class Variation:
                 name: model.mass_kg for name, model in self.objects.items() if not model.fixed
             },
             "young_pa": {name: material.young_pa for name, material in soft.items()},
-            "unseen": {name: unseen.to_record() for name, unseen in sorted(self.unseen.items())},
+            "unseen": {name: asdict(unseen) for name, unseen in sorted(self.unseen.items())},
         }
 
 

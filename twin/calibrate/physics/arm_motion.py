@@ -4,7 +4,7 @@ Of the runs of each task in the order of their numbers the first, third, fifth .
 tasks together; the others are held out and say whether *planned* comes nearer.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from statistics import median
 from typing import Any
@@ -16,19 +16,13 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
-from twin.calibrate.motion import Found, Motion, find_motion
+from twin.calibrate.motion import Motion, find_motion
 from twin.calibrate.physics.push_fit import calibrate_pushes, describe_pushes, recordings, split
 from twin.calibrate.physics.pushes import Push, UnusablePushError, arm_of, described, seen_of
 from twin.scene.store.calibration import write_part
 
 PART = "motion"
 """Of ``calibration.json``."""
-
-
-def motion_of_pushes(pushes: Sequence[Push]) -> Found:
-    """Fit one arm to recordings of it."""
-    base = described(pushes[0]).T_frame_base
-    return find_motion(arm_of(pushes[0]), [seen_of(push) for push in pushes], base)
 
 
 def calibrate_motion(run: RunFolder) -> tuple[dict[str, Any], str]:
@@ -44,7 +38,8 @@ def calibrate_motion(run: RunFolder) -> tuple[dict[str, Any], str]:
     tasks = sorted({push.task for push in pushes})
     first = {task: split([p.episode for p in pushes if p.task == task])[0] for task in tasks}
     fitted = [name for names in first.values() for name in names]
-    found = motion_of_pushes([push for push in pushes if push.episode in fitted])
+    seen = [seen_of(push) for push in pushes if push.episode in fitted]
+    found = find_motion(arm_of(pushes[0]), seen, described(pushes[0]).T_frame_base)
     delays = {task: median(found.delays_s[name] for name in first[task]) for task in tasks}
     rows = {
         push.episode: (
