@@ -130,8 +130,7 @@ def main() -> None:
     others = [name for name in motion["held_out"]["episodes"] if name.startswith("single")]
     found = errors_of(run, "single", "tool", others)
     print_table(cubes, found)
-    medians = {name: median(end for end, _ in each.values()) for name, each in cubes.items()}
-    medians.pop(RULE)
+    medians = {n: median(e for e, _ in v.values()) for n, v in cubes.items() if n != RULE}
     best = min((value, name) for name, value in medians.items() if not name.startswith(TWIN))
     tools = {name: mean(end for end, _ in each.values()) for name, each in found.items()}
     tool = min((value, name) for name, value in tools.items() if not name.startswith(TWIN))

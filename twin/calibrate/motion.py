@@ -7,7 +7,7 @@ motion does not show stays there, and its interval says so.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -69,8 +69,7 @@ class Seen:
         """At most ``RATE_HZ`` poses a second."""
         wanted = np.arange(self.seen_s[0], self.seen_s[-1], 1 / RATE_HZ)
         ids = np.unique(np.searchsorted(self.seen_s, wanted))
-        seen_s, Ts = self.seen_s[ids], self.Ts_frame_tool[ids]
-        return Seen(self.name, self.times_s, self.joints_rad, seen_s, Ts)
+        return replace(self, seen_s=self.seen_s[ids], Ts_frame_tool=self.Ts_frame_tool[ids])
 
 
 @dataclass(frozen=True, kw_only=True)

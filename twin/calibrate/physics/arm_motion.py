@@ -26,11 +26,7 @@ PART = "motion"
 
 
 def calibrate_motion(run: RunFolder) -> tuple[dict[str, Any], str]:
-    """Find the arm's motion from half of a run's recordings, score it on the others, write it.
-
-    Returns:
-        The record, and the id of the calibration that holds now.
-    """
+    """Fit half of a run's recordings, score the others, write it; record and calibration's id."""
     pushes, skipped = recordings(run)
     if len({(push.motion.robot, push.motion.hand_link) for push in pushes}) != 1:
         message = f"{run.path} holds no imported recordings, or those of several arms."
@@ -57,11 +53,14 @@ def calibrate_motion(run: RunFolder) -> tuple[dict[str, Any], str]:
         "parameters": found.parameters,
         "rms_m": found.rms_m,
         "fitted_to": fitted,
-        "held_out": {"episodes": list(rows), "nominal_m": nominal.tolist()},
+        "held_out": {
+            "episodes": list(rows),
+            "nominal_m": nominal.tolist(),
+            "calibrated_m": calibrated.tolist(),
+        },
         "sources": {push.episode: push.sha256 for push in pushes},
         "skipped": skipped,
     }
-    record["held_out"]["calibrated_m"] = calibrated.tolist()
     record["id"] = provenance.hash_settings(record)
     return record, str(write_part(run, PART, record)["calibration_id"])
 
@@ -102,11 +101,7 @@ def describe_motion(record: Mapping[str, Any], calibration_id: str) -> str:
 def calibrate_imported(
     run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[dict[str, Any], str]:
-    """Find the arm's motion and the friction of its pushes, as far as a run holds them.
-
-    Returns:
-        What was found by ``motion`` and ``physics``, and the same in words.
-    """
+    """Find the arm's motion and its pushes' friction where a run has them; record and words."""
     record: dict[str, Any] = {}
     words = []
     try:
