@@ -31,7 +31,7 @@ FIRST = (0.005,) * 3 + (0.01,) * 3
 """Spread of residuals in the first of them [m, rad]."""
 LEAST = 1e-5
 FAR, SAME, TOGETHER = 3.0, 0.95, 0.3
-"""A number farther off than so many standard deviations beforehand is not believed; one that is
+"""A number farther off than so many standard deviations beforehand is not trusted; one that is
 known no better than this share of them was not seen; correlation from which another is named."""
 Z_95 = 1.96
 Poses = Float[np.ndarray, "num_poses 4 4"]
@@ -236,9 +236,9 @@ class _Problem:
             square = np.concatenate([(each[:, part] ** 2).mean(axis=1) for each in left])
             speed = np.concatenate([each[k] for each in self._speeds])
             slow = speed <= np.quantile(speed, 0.25)
-            still = np.median(square[slow]) + LEAST**2
+            rest = np.median(square[slow]) + LEAST**2
             late = np.median(square[~slow] / (speed[~slow] ** 2 + LEAST**2))
-            parts.append([np.sqrt(still + late * each[k] ** 2) for each in self._speeds])
+            parts.append([np.sqrt(rest + late * each[k] ** 2) for each in self._speeds])
         return [np.repeat(np.stack(pair, axis=1), 3, axis=1) for pair in zip(*parts, strict=True)]
 
     def weighed(

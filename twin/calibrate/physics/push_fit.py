@@ -199,12 +199,11 @@ def _score(
     pushes: Mapping[str, Push], names: Sequence[str], config: PhysicsConfig, finger_rad: float
 ) -> dict[str, Any]:
     errors = {name: end_point_error_m(pushes[name], config, finger_rad) for name in names}
-    values = list(errors.values())
     return {
-        "n": len(values),
-        "end_point_error_median_m": float(np.median(values)),
-        "least_m": min(values),
-        "most_m": max(values),
+        "n": len(errors),
+        "end_point_error_median_m": float(np.median(list(errors.values()))),
+        "least_m": min(errors.values()),
+        "most_m": max(errors.values()),
         "by_episode_m": errors,
     }
 

@@ -187,7 +187,8 @@ def replay_push(
     stamps_ns, Ts_world_hand = hand_path(push, trajectory, config.rate_hz, known)
     Ts_world_box = None
     if push.T_world_box is not None:
-        Ts_world_box = _push_box(push, Ts_world_hand, config, push.hand.hulls_m(finger_rad))
+        hulls_m, T_start = push.hand.hulls_m(finger_rad), push.T_world_box
+        Ts_world_box = _push_box(push, T_start, Ts_world_hand, config, hulls_m)
     kept = np.unique(np.append(np.arange(0, len(stamps_ns), STATE_EVERY), len(stamps_ns) - 1))
     return PushResult(
         stamps_ns=stamps_ns[kept],
@@ -222,15 +223,12 @@ def hand_path(
 
 def _push_box(
     push: Push,
+    T_start: Float[np.ndarray, "4 4"],
     Ts_world_hand: Float[np.ndarray, "num_steps 4 4"],
     config: PhysicsConfig,
     hulls_m: list[Float[np.ndarray, "num_points 3"]],
 ) -> Float[np.ndarray, "num_steps 4 4"]:
     box = push.motion.boxes[push.box]
-    T_start = push.T_world_box
-    if T_start is None:  # for the type checker: there is a box
-        message = f"{push.episode}: no box."
-        raise UnusablePushError(message)
     size_m = np.array(box.size_m)
     velocity = np.diff(Ts_world_hand[:, :3, 3], axis=0) * config.rate_hz
     R = Ts_world_hand[:, :3, :3]
