@@ -124,9 +124,7 @@ def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Outp
 
     run_folder = RunFolder.open(run)
     if config.cameras + config.physics + config.posterior != 1:
-        message = (
-            "say what to calibrate: robot-gst calibrate RUN --cameras, --physics or --posterior."
-        )
+        message = "say what to calibrate: RUN with --cameras, --physics or --posterior."
         raise UsageError(message)
     if config.posterior:
         from twin.calibrate.posterior import calibrate_posterior, describe_posterior
@@ -134,10 +132,8 @@ def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Outp
         posterior, calibration_id = calibrate_posterior(
             run_folder, num_draws=config.draws, workers=config.workers, output=output
         )
-        output.result(
-            {**posterior, "calibration_id": calibration_id},
-            describe_posterior(posterior, calibration_id),
-        )
+        record = {**posterior, "calibration_id": calibration_id}
+        output.result(record, describe_posterior(posterior, calibration_id))
         return 0
     if config.physics:
         from twin.calibrate.physics.arm_motion import calibrate_imported
