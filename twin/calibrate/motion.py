@@ -278,8 +278,7 @@ def delay_of_turning(arm: Arm, run: Seen) -> float:
     told = turning(np.array([arm.T_base_hand(q) for q in run.joints_rad]), run.times_s)
     seen_s, seen = turning(run.Ts_frame_tool, run.seen_s)
     if told[1].max() < 1e-2:
-        message = f"{run.name}: nothing turns. Move the arm by 20 degrees or more."
-        raise UsageError(message)
+        raise UsageError(f"{run.name}: nothing turns. Move the arm by 20 degrees or more.")
     delays = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S, 0.02)
     told_there = [np.interp(seen_s - d, *told, left=0.0, right=0.0) for d in delays]
     return float(delays[int(np.argmin(((np.array(told_there) - seen) ** 2).mean(axis=1)))])

@@ -29,8 +29,9 @@ def calibrate_motion(run: RunFolder) -> tuple[dict[str, Any], str]:
     """Fit half of a run's recordings, score the others, write it; record and calibration's id."""
     pushes, skipped = recordings(run)
     if len({(push.motion.robot, push.motion.hand_link) for push in pushes}) != 1:
-        message = f"{run.path} holds no imported recordings, or those of several arms."
-        raise UnusablePushError(message)
+        raise UnusablePushError(
+            f"{run.path} holds no imported recordings, or those of several arms."
+        )
     tasks = sorted({push.task for push in pushes})
     first = {task: split([p.episode for p in pushes if p.task == task])[0] for task in tasks}
     fitted = [name for names in first.values() for name in names]

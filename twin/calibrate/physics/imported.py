@@ -127,8 +127,7 @@ def run_motion_replay(item: MotionReplay) -> dict[str, Any]:
     """Replay, write the episode, and return its row."""
     push = load_push(item.run_path, item.episode_id)
     if push is None:  # the list was made of others
-        message = f"{item.episode_id} is not an imported recording with a script."
-        raise GstError(message)
+        raise GstError(f"{item.episode_id} is not an imported recording with a script.")
     path = item.path(push.sha256)
     kept = path.is_file() and not item.force
     if kept:

@@ -68,8 +68,7 @@ def end_point_error_m(push: Push, config: PhysicsConfig, finger_rad: float) -> f
     """Distance of recorded and replayed end of the box."""
     result = replay_push(push, "executed", config, finger_rad)
     if result.Ts_world_box is None or push.box_track is None:
-        message = f"{push.episode} has no box."
-        raise UnusablePushError(message)
+        raise UnusablePushError(f"{push.episode} has no box.")
     return float(np.linalg.norm(result.Ts_world_box[-1, :3, 3] - push.box_track.p_m[-1]))
 
 
@@ -82,8 +81,7 @@ def errors_of(item: Item) -> list[float]:
     run_path, episode, finger_rad, surface = item
     push = load_push(run_path, episode)
     if push is None:
-        message = f"{episode} is not an imported push."
-        raise UnusablePushError(message)
+        raise UnusablePushError(f"{episode} is not an imported push.")
     configs = [frictions(surface, hand, PhysicsConfig()) for hand in HAND.tolist()]
     return [end_point_error_m(push, config, finger_rad) for config in configs]
 

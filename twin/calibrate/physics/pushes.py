@@ -95,16 +95,17 @@ def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Ha
         topic for topic in episode.topics_of_type(schema.POSE_STAMPED) if topic.endswith(TCP_POSE)
     ]
     if not topics:
-        message = f"{name} in {run.path}: no tool poses (a topic ending with {TCP_POSE})."
-        raise UnusablePushError(message)
+        raise UnusablePushError(
+            f"{name} in {run.path}: no tool poses (a topic ending with {TCP_POSE})."
+        )
     tool = pose_track(episode, topics[0])
     gap_s = float(np.diff(tool.stamps_ns).max(initial=0)) / NS_PER_S
     if gap_s > LONGEST_GAP_S:
-        message = f"{name} in {run.path}: the tool is lost for {gap_s:.2f} s."
-        raise UnusablePushError(message)
+        raise UnusablePushError(f"{name} in {run.path}: the tool is lost for {gap_s:.2f} s.")
     if len(motion.boxes) > 1:
-        message = f"{name} in {run.path}: {len(motion.boxes)} boxes; one can be replayed."
-        raise UnusablePushError(message)
+        raise UnusablePushError(
+            f"{name} in {run.path}: {len(motion.boxes)} boxes; one can be replayed."
+        )
     T_world_hand = hand.T_base_hand(np.zeros(len(motion.joints)))
     T_world_hand[:3, 3] += motion.base_m
     push = Push(
@@ -123,8 +124,7 @@ def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Ha
 def _with_box(push: Push, episode: Episode, box: str) -> Push:
     topic = object_pose_topics(episode).get(box)
     if topic is None:
-        message = f"{push.episode}: no poses of {box!r} were recorded."
-        raise UnusablePushError(message)
+        raise UnusablePushError(f"{push.episode}: no poses of {box!r} were recorded.")
     track = pose_track(episode, topic)
     T = rest_pose(track)
     heading = np.arctan2(T[1, 0], T[0, 0])
@@ -137,8 +137,9 @@ def rest_pose(track: PoseTrajectory) -> Float[np.ndarray, "4 4"]:
     t_s = (track.stamps_ns - track.stamps_ns[0]) / NS_PER_S
     there = (t_s >= REST_S[0]) & (t_s <= REST_S[1])
     if not there.any():
-        message = f"no pose from {REST_S[0]} s to {REST_S[1]} s after the start of a recording."
-        raise UnusablePushError(message)
+        raise UnusablePushError(
+            f"no pose from {REST_S[0]} s to {REST_S[1]} s after the start of a recording."
+        )
     Ts = track.transforms()[there]
     T = np.eye(4)
     T[:3, 3] = np.median(Ts[:, :3, 3], axis=0)
