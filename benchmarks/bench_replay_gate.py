@@ -113,9 +113,8 @@ def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[
     """Let the gate see what came before the plan, and judge it."""
     from bridge.episode import streams
     from bridge.task.find import chosen_task_file
-    from twin.gate.gate import JudgedTasks
+    from twin.gate.gate import Gate, JudgedTasks
     from twin.gate.live import LiveView
-    from twin.gate.service import make_gate
 
     ((stamp_ns, plan),) = streams.plans(episode)
     perception = LiveView(config.cell, calibration)
@@ -128,7 +127,8 @@ def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[
         if watched and not is_truth(message.topic):
             perception.take(message.topic, message.data, message.log_time_ns, message.type_name)
     tasks = JudgedTasks(only=chosen_task_file(config.task))
-    gate = make_gate(tasks, config, perception, lambda: stamp_ns, twin)
+    calls = {"localise": twin.localise, "replay": twin.replay, "now_ns": lambda: stamp_ns}
+    gate = Gate(tasks=tasks, config=config, perception=perception, **calls)
     before = time.monotonic()
     return gate.judge(plan.to_json()), time.monotonic() - before
 

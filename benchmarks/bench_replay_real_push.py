@@ -12,7 +12,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean, median
-from typing import Any
 
 import numpy as np
 from measure import ROOT, Target, report_targets
@@ -27,7 +26,7 @@ KINOVA = DATA / "robot_realitygap_kinova_real_vs_sim"
 TWIN = "twin-pybullet"
 RULE = "no physics: mean of the identifying runs"
 EXECUTED = f"{TWIN} executed calibrated"
-PLANNED_TOOL = f"{TWIN} planned"
+PLANNED_TOOL = f"{TWIN} planned calibrated"
 
 
 def gst(*words: str) -> None:
@@ -36,7 +35,7 @@ def gst(*words: str) -> None:
 
 
 def make(run: Path) -> None:
-    """Import, replay at nominal friction, identify friction, replay again, evaluate."""
+    """Import, replay at nominal friction, calibrate, replay again."""
     calibration = run / "scene" / "calibration.json"
     script = ROOT / "datasets" / "kinova" / "make_episodes.py"
     subprocess.run([sys.executable, script, KINOVA, run], check=True)
@@ -44,41 +43,52 @@ def make(run: Path) -> None:
         gst("replay", str(run), "--workers", "1")
         gst("calibrate", str(run), "--physics")
     gst("replay", str(run), "--workers", "1")
-    gst("evaluate", str(run))
 
 
-def errors_of(
-    results: Mapping[str, Any], task: str, body: str, column: str
-) -> dict[str, dict[str, float]]:
-    """Error of each recorded run by engine [mm]."""
-    found: dict[str, dict[str, float]] = {}
-    for table in results["tables"]:
-        if not table["id"].startswith("runs_of_end_points"):
-            continue
-        for values in table["rows"]:
-            row = dict(zip(table["columns"], values, strict=True))
-            if row["body"] == body and str(row["recorded run"]).startswith(f"{task}_"):
-                found.setdefault(row["engine"], {})[row["recorded run"]] = row[column]
-    return found
+Ends = Mapping[str, Mapping[str, tuple[float, float]]]
+"""By engine and recorded run: how far end and displacement are off [mm]."""
+
+
+def errors_of(run: Path, task: str, body: str, names: Sequence[str]) -> Ends:
+    """Compare the ends of a body with those of some recorded runs; of several files the mean."""
+    tracks, found = {}, {}
+    for name in names:
+        tracks[name] = _ends(Episode.open(run / "episodes" / f"{name}.mcap"), body)
+    for path in sorted((run / "derived").glob(f"{task}*.mcap"), key=lambda p: p.stat().st_mtime):
+        episode = Episode.open(path)
+        derived, (start, end) = episode.derived, _ends(episode, body)
+        engine = derived.engine
+        if engine == TWIN:
+            engine += f" {derived.trajectory}" + " calibrated" * (
+                derived.calibration_id is not None
+            )
+        source = derived.source_episode
+        for name in tracks.keys() & ({source} if source else tracks.keys()):
+            off = end - tracks[name][1]
+            pair = (np.linalg.norm(off), np.linalg.norm(off - start + tracks[name][0]))
+            rows = found.setdefault(engine, {}).setdefault(name, [])
+            rows[:] = [pair] if source else [*rows, pair]  # the newest replay counts
+    return {
+        engine: {name: tuple(np.mean(rows, axis=0).tolist()) for name, rows in each.items()}
+        for engine, each in found.items()
+    }
+
+
+def _ends(episode: Episode, body: str) -> tuple[np.ndarray, np.ndarray]:
+    topic = object_pose_topics(episode)[body] if body != "tool" else "/kinova/tcp/pose"
+    p_mm = 1e3 * pose_track(episode, topic).p_m
+    return p_mm[0], p_mm[-1]
 
 
 def without_physics(
     run: Path, fitted: Sequence[str], held_out: Sequence[str]
-) -> dict[str, dict[str, float]]:
+) -> dict[str, tuple[float, float]]:
     """What saying the mean of the identifying runs gives: end and displacement errors [mm]."""
-    cubes = {}
-    for name in (*fitted, *held_out):
-        episode = Episode.open(run / "episodes" / f"{name}.mcap")
-        cubes[name] = 1e3 * pose_track(episode, object_pose_topics(episode)["cube"]).p_m
-    ends = {name: p[-1] for name, p in cubes.items()}
-    ways = {name: p[-1] - p[0] for name, p in cubes.items()}
-    return {
-        what: {
-            name: float(np.linalg.norm(each[name] - np.mean([each[f] for f in fitted], axis=0)))
-            for name in held_out
-        }
-        for what, each in (("end", ends), ("way", ways))
-    }
+    names = (*fitted, *held_out)
+    ends = {n: _ends(Episode.open(run / "episodes" / f"{n}.mcap"), "cube") for n in names}
+    both = {name: np.stack([end, end - start]) for name, (start, end) in ends.items()}
+    mean_mm = np.mean([both[name] for name in fitted], axis=0)
+    return {n: tuple(np.linalg.norm(both[n] - mean_mm, axis=1).tolist()) for n in held_out}
 
 
 def summary(values: Sequence[float]) -> str:
@@ -90,24 +100,18 @@ def summary(values: Sequence[float]) -> str:
     return f"{median(values):.1f} [{interval.low:.1f}, {interval.high:.1f}]"
 
 
-def print_table(
-    results: Mapping[str, Any],
-    held_out: Sequence[str],
-    rule: Mapping[str, Mapping[str, float]],
-) -> None:
-    """Print every engine's medians over held-out runs, best first, and the tool's means."""
-    ends = errors_of(results, "cubeexp", "cube", "end-point error (mm)")
-    ways = errors_of(results, "cubeexp", "cube", "displacement error (mm)")
-    ends[RULE], ways[RULE] = dict(rule["end"]), dict(rule["way"])
-    print(f"| cube, {len(held_out)} held-out runs | end point (mm) | displacement (mm) |")
-    print("|---|---|---|")
-    for engine in sorted(ends, key=lambda name: median([ends[name][run] for run in held_out])):
-        cells = (summary([errors[engine][run] for run in held_out]) for errors in (ends, ways))
+def print_table(cubes: Ends, tools: Ends) -> None:
+    """Print every engine's medians over held-out runs, best first; the tool's means and worst."""
+    print("| cube, held out | end point (mm) | displacement (mm) |\n|---|---|---|")
+    for engine in sorted(cubes, key=lambda name: median(e for e, _ in cubes[name].values())):
+        cells = (summary(column) for column in zip(*cubes[engine].values(), strict=True))
         print(f"| {engine} | {' | '.join(cells)} |")
-    tools = errors_of(results, "single", "tool", "end-point error (mm)")
-    print("\n| tool, Experiment 1 | end point, mean over pairs (mm) |\n|---|---|")
-    for engine in sorted(tools, key=lambda name: mean(tools[name].values())):
-        print(f"| {engine} | {mean(tools[engine].values()):.2f} |")
+    print(
+        "\n| tool, Experiment 1, held out | mean (mm) | worst | displacement |\n|---|---|---|---|"
+    )
+    for engine in sorted(tools, key=lambda name: mean(e for e, _ in tools[name].values())):
+        ends, ways = zip(*tools[engine].values(), strict=True)
+        print(f"| {engine} | {mean(ends):.2f} | {max(ends):.2f} | {mean(ways):.2f} |")
 
 
 def main() -> None:
@@ -118,18 +122,17 @@ def main() -> None:
     work = Path(os.environ.get("GST_BENCH_WORK", ROOT / "benchmarks" / "work"))
     run = Path(sys.argv[1]) if len(sys.argv) > 1 else work / "real_push"
     make(run)
-    results = json.loads((run / "results" / "results.json").read_text())
-    physics = json.loads((run / "scene" / "calibration.json").read_text())["physics"]
+    calibration = json.loads((run / "scene" / "calibration.json").read_text())
+    physics, motion = calibration["physics"], calibration["motion"]
     held_out = physics["held_out"]["episodes"]
     rule = without_physics(run, physics["fitted_to"], held_out)
-    print_table(results, held_out, rule)
-    ends = errors_of(results, "cubeexp", "cube", "end-point error (mm)")
-    medians = {name: median([each[run] for run in held_out]) for name, each in ends.items()}
+    cubes = {**errors_of(run, "cubeexp", "cube", held_out), RULE: rule}
+    others = [name for name in motion["held_out"]["episodes"] if name.startswith("single")]
+    found = errors_of(run, "single", "tool", others)
+    print_table(cubes, found)
+    medians = {n: median(e for e, _ in v.values()) for n, v in cubes.items() if n != RULE}
     best = min((value, name) for name, value in medians.items() if not name.startswith(TWIN))
-    tools = {
-        name: mean(each.values())
-        for name, each in errors_of(results, "single", "tool", "end-point error (mm)").items()
-    }
+    tools = {name: mean(end for end, _ in each.values()) for name, each in found.items()}
     tool = min((value, name) for name, value in tools.items() if not name.startswith(TWIN))
     report_targets(
         "replay_real_push",
@@ -148,16 +151,16 @@ def main() -> None:
                 reference=best[1],
             ),
             Target(
-                what="tool of Experiment 1, schedule",
+                what="tool of Experiment 1, schedule, held out",
                 measured=tools[PLANNED_TOOL],
-                limit=tool[0] + 1.0,
+                limit=min(6.0, tool[0]),
                 unit="mm",
                 reference=f"{tool[1]} {tool[0]:.2f} mm",
             ),
         ],
         note=f"{len(held_out)} held-out runs; simulators as published, driven by the schedule",
         medians_mm=medians,
-        without_physics_mm=median(rule["end"].values()),
+        without_physics_mm=median(end for end, _ in rule.values()),
         tool_mm=tools,
         physics={name: physics[name] for name in ("parameters", "held_out", "fitted")},
     )

@@ -44,17 +44,14 @@ def randomised(rng: np.random.Generator) -> tuple[object, object, object]:
     model = replace(scene.task.objects["cube"], mass_kg=float(rng.uniform(0.03, 0.1)))
     task = replace(scene.task, objects={**scene.task.objects, "cube": model})
     scene = replace(
-        scene,
-        task=task,
-        Ts_base_object={**scene.Ts_base_object, "cube": se3.transform_from(q, p)},
+        scene, task=task, Ts_base_object={**scene.Ts_base_object, "cube": se3.transform_from(q, p)}
     )
     offset = (*rng.uniform(-0.004, 0.004, 2).tolist(), 0.0)
     plan = pick_and_place(scene, grasp_offset_m=offset, pace=1.0)
     turn = downward(yaw + float(rng.uniform(-0.08, 0.08)))
     tau = tuple(replace(w, q_wxyz=turn) if w.t_ns <= 4_600_000_000 else w for w in plan.tau)
     physics = PhysicsConfig(
-        object_friction=float(rng.uniform(0.5, 1.0)),
-        grip_force_N=float(rng.uniform(8.0, 30.0)),
+        object_friction=float(rng.uniform(0.5, 1.0)), grip_force_N=float(rng.uniform(8.0, 30.0))
     )
     return scene, replace(plan, tau=tau), replace(ReplayConfig(), physics=physics)
 

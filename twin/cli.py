@@ -15,13 +15,7 @@ RENDER = RenderConfig()
 CALIBRATE = CalibrateConfig()
 
 
-def replay(
-    run: Path,
-    /,
-    *,
-    config: ReplayRunConfig = REPLAY,
-    output: Output = OUTPUT,
-) -> int:
+def replay(run: Path, /, *, config: ReplayRunConfig = REPLAY, output: Output = OUTPUT) -> int:
     """Replay every plan and every execution of a run, and judge each: I(tau).
 
     A trial needs joint states and a task; a plan is not needed. Exit code 2 where an episode has
@@ -63,13 +57,7 @@ def gate(
     return run_gate(run, config, output)
 
 
-def rebuild(
-    run: Path,
-    /,
-    *,
-    config: RebuildConfig = REBUILD,
-    output: Output = OUTPUT,
-) -> int:
+def rebuild(run: Path, /, *, config: RebuildConfig = REBUILD, output: Output = OUTPUT) -> int:
     """Rebuild the static scene as Gaussians, and render the held-out views.
 
     Example: robot-gst rebuild runs/monday --budget 60s
@@ -86,13 +74,7 @@ def rebuild(
     return 0
 
 
-def render(
-    run: Path,
-    /,
-    *,
-    config: RenderConfig = RENDER,
-    output: Output = OUTPUT,
-) -> int:
+def render(run: Path, /, *, config: RenderConfig = RENDER, output: Output = OUTPUT) -> int:
     """Draw the rebuilt scene: one image in any state, or a whole trial as a video.
 
     Example: robot-gst render runs/monday --camera wrist --at-s 3 --object cube=0.5,-0.1,0.02
@@ -110,13 +92,7 @@ def render(
     return 0
 
 
-def robot_check(
-    robot: str,
-    /,
-    *,
-    urdf_out: Path | None = None,
-    output: Output = OUTPUT,
-) -> int:
+def robot_check(robot: str, /, *, urdf_out: Path | None = None, output: Output = OUTPUT) -> int:
     """Look at a robot file: its joints, limits, frames and gripper, and what is unsupported.
 
     Example: robot-gst robot check mine.toml --urdf-out mine.urdf
@@ -132,13 +108,7 @@ def robot_check(
     return 0
 
 
-def calibrate(
-    run: Path,
-    /,
-    *,
-    config: CalibrateConfig = CALIBRATE,
-    output: Output = OUTPUT,
-) -> int:
+def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Output = OUTPUT) -> int:
     """Find out from recorded episodes where the cameras are, or how contact works.
 
     Writes scene/calibration.json.
@@ -154,9 +124,7 @@ def calibrate(
 
     run_folder = RunFolder.open(run)
     if config.cameras + config.physics + config.posterior != 1:
-        message = (
-            "say what to calibrate: robot-gst calibrate RUN --cameras, --physics or --posterior."
-        )
+        message = "say what to calibrate: RUN with --cameras, --physics or --posterior."
         raise UsageError(message)
     if config.posterior:
         from twin.calibrate.posterior import calibrate_posterior, describe_posterior
@@ -164,19 +132,13 @@ def calibrate(
         posterior, calibration_id = calibrate_posterior(
             run_folder, num_draws=config.draws, workers=config.workers, output=output
         )
-        output.result(
-            {**posterior, "calibration_id": calibration_id},
-            describe_posterior(posterior, calibration_id),
-        )
+        record = {**posterior, "calibration_id": calibration_id}
+        output.result(record, describe_posterior(posterior, calibration_id))
         return 0
     if config.physics:
-        from twin.calibrate.physics.push_fit import calibrate_pushes, describe_pushes
+        from twin.calibrate.physics.arm_motion import calibrate_imported
 
-        physics, calibration_id = calibrate_pushes(run_folder, config, output)
-        output.result(
-            {**physics, "calibration_id": calibration_id},
-            describe_pushes(physics, calibration_id),
-        )
+        output.result(*calibrate_imported(run_folder, config, output))
         return 0
     from twin.calibrate.cameras import calibrate_cameras, describe_cameras
 

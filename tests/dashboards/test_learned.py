@@ -15,7 +15,7 @@ from bridge.terminal import Output
 from dashboards.learned import Learned, learned_in
 from dashboards.standin_settings import TrialsConfig
 from dashboards.trials import jobs_of, keep_protocol, protocol_of, run_trials
-from twin.scene.store.calibration import write_physics, write_posterior
+from twin.scene.store.calibration import write_part, write_physics
 
 SESSION = 9000
 STUDY = TrialsConfig(task=("cube_into_box", "cube_on_block"), trials=3, seed=SESSION)
@@ -46,7 +46,7 @@ def learning(
         }
         for name, some in sources.items()
     }
-    write_posterior(run, {"tasks": tasks, "without_trials": [], "skipped": {}, **others})
+    write_part(run, "posterior", {"tasks": tasks, "without_trials": [], "skipped": {}, **others})
     return run
 
 
@@ -117,7 +117,7 @@ def test_what_learned_nothing_of_a_task_or_not_by_task_is_refused(tmp_path: Path
     with pytest.raises(UsageError, match="no usable trial of cube_on_block"):
         learned_in(learning(tmp_path / "part", sources), PROTOCOL)
     old = RunFolder.create(tmp_path / "old")
-    write_posterior(old, {"draws": [], "sources": {}})
+    write_part(old, "posterior", {"draws": [], "sources": {}})
     with pytest.raises(UsageError, match="all tasks together"):
         learned_in(old, PROTOCOL)
     fitted = learning(tmp_path / "fitted", of_other_starts())

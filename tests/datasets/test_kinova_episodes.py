@@ -179,8 +179,7 @@ def spread_deg(Ts_world_sim: np.ndarray, Ts_world_real: np.ndarray) -> float:
 
 @needs_data
 @pytest.mark.parametrize(
-    "engine",
-    ["PyBullet", "Mujoco", "VRepBullet278", "VRepBullet283", "VRepNewton", "VRepVortex"],
+    "engine", ["PyBullet", "Mujoco", "VRepBullet278", "VRepBullet283", "VRepNewton", "VRepVortex"]
 )
 def test_the_quaternion_order_is_the_one_that_agrees_with_the_real_robot(engine: str) -> None:
     real = read_real_run(FOLDER / "real" / "Experiment1" / "Single0001_6D.tsv")

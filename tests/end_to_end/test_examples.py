@@ -74,10 +74,7 @@ def write_trial(path: Path) -> None:
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id=path.stem, kind="trial", task=plan.task))
         writer.attach(
-            "robot.urdf",
-            ROBOT.urdf_text().encode(),
-            media_type="application/xml",
-            log_time_ns=1,
+            "robot.urdf", ROBOT.urdf_text().encode(), media_type="application/xml", log_time_ns=1
         )
         writer.write("/lab/plan", plan.to_json(), type_name=schema.PLAN, log_time_ns=1)
 

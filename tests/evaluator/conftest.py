@@ -145,9 +145,7 @@ class RunMaker:
         source = self.run.episodes_dir / f"{name}.mcap"
         path = self.run.derived_dir / f"{name}.localised.noscene.mcap"
         derived = Derived(
-            kind="localised",
-            source_episode=name,
-            source_sha256=source_sha256 or hash_file(source),
+            kind="localised", source_episode=name, source_sha256=source_sha256 or hash_file(source)
         )
         with EpisodeWriter(path) as writer:
             writer.describe(EpisodeInfo(id=name, kind="trial"), derived=derived)

@@ -4,12 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from evaluator.compare.baselines import (
-    GEOMETRIC_RULE,
-    RuleSummary,
-    baseline_results,
-    with_rule,
-)
+from evaluator.compare.baselines import GEOMETRIC_RULE, RuleSummary, baseline_results, with_rule
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITHOUT
 from evaluator.result import Measurement

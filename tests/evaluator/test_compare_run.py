@@ -170,9 +170,7 @@ def test_tool_error_is_measured_at_matching_instants(maker: Any, start_ns: int) 
     assert distance_over_time(recorded, planned, str(row.plan_id)) is None
 
 
-def test_an_episode_with_metadata_of_another_program_is_left_out_and_named(
-    six_trials: Any,
-) -> None:
+def test_an_episode_with_metadata_of_another_program_is_left_out_and_named(six_trials: Any) -> None:
     with EpisodeWriter(six_trials.run.episodes_dir / "foreign.mcap") as writer:
         writer.add_metadata("episode", {"id": "null", "kind": "7"})
     comparison = compare_run(six_trials.run)

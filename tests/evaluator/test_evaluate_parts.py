@@ -37,18 +37,13 @@ def line(
 
 def test_a_run_without_data_for_a_part_says_no_data(six_trials: Any) -> None:
     missing = " | ".join(compare_run(six_trials.run).missing)
-    parts = (
-        "stage funnel",
-        "final states",
-    )
+    parts = ("stage funnel", "final states")
     for part in parts:
         assert f"{part}" in missing
     assert missing.count("no data") == len(parts)
 
 
-def test_the_gate_is_judged_where_it_was_not_obeyed(
-    write_table: Callable[[str], Path],
-) -> None:
+def test_the_gate_is_judged_where_it_was_not_obeyed(write_table: Callable[[str], Path]) -> None:
     lines = [line(i, True, True, verdict="accepted") for i in range(6)]
     lines += [line(10 + i, False, False, verdict="refused") for i in range(4)]
     lines += [line(20 + i, True, False, verdict="refused") for i in range(2)]

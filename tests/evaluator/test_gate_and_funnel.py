@@ -4,10 +4,7 @@ import pytest
 
 from evaluator.compare.stages import funnel
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.gate import (
-    Confusion,
-    kappa,
-)
+from evaluator.statistics.gate import Confusion, kappa
 
 
 def table(tp: int, fp: int, fn: int, tn: int) -> Confusion:

@@ -128,11 +128,7 @@ def test_motions_without_poses_or_instants_in_common_are_refused() -> None:
     empty = Tracks(tool=None, started_ns=START_NS, ended_ns=None)
     with pytest.raises(UndefinedStatisticError, match="no tool poses"):
         compare_tracks(tracks(), empty)
-    later = Tracks(
-        tool=tracks().tool,
-        started_ns=START_NS + 10**12,
-        ended_ns=START_NS + 2 * 10**12,
-    )
+    later = Tracks(tool=tracks().tool, started_ns=START_NS + 10**12, ended_ns=START_NS + 2 * 10**12)
     with pytest.raises(UndefinedStatisticError, match="no tool poses"):
         compare_tracks(later, tracks())
 
@@ -187,9 +183,7 @@ def test_samples_outside_the_execution_do_not_count(tmp_path: Path) -> None:
     recorded = tracks()
     assert recorded.tool is not None
     waiting = Tracks(
-        tool=recorded.tool,
-        started_ns=START_NS + 50 * STEP_NS,
-        ended_ns=START_NS + 100 * STEP_NS,
+        tool=recorded.tool, started_ns=START_NS + 50 * STEP_NS, ended_ns=START_NS + 100 * STEP_NS
     )
     late = tracks()
     assert late.tool is not None

@@ -79,9 +79,7 @@ def test_a_copy_of_an_episode_counts_no_trial_twice(six_trials: Any, copy: str) 
     assert "a1 once more, which a1.mcap is" in reasons(comparison, copy)
 
 
-def test_a_label_given_afterwards_belongs_to_the_file_named_as_the_episode(
-    six_trials: Any,
-) -> None:
+def test_a_label_given_afterwards_belongs_to_the_file_named_as_the_episode(six_trials: Any) -> None:
     episodes = six_trials.run.episodes_dir
     shutil.copyfile(episodes / "a1.mcap", episodes / "a1 (1).mcap")  # it comes first by name
     label_episode(six_trials.run, "a1", Outcome(result="failure"))

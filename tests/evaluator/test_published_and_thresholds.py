@@ -223,9 +223,7 @@ def test_a_published_table_that_says_a_cell_twice_or_a_side_wrongly_is_refused(
         check_published(write_table(HEAD + lines))
 
 
-def test_a_rate_that_several_counts_give_accuses_nobody(
-    write_table: Callable[[str], Path],
-) -> None:
+def test_a_rate_that_several_counts_give_accuses_nobody(write_table: Callable[[str], Path]) -> None:
     check = check_published(write_table(f"{HEAD}a,c,sim,trial,150,67,,\na,c,real,trial,10,46,,\n"))
     found = {finding.row: finding for finding in check.findings}
     assert found[2].verdict == "ambiguous"

@@ -104,9 +104,7 @@ def kept(folder: Path, rows: dict[str, tuple[Everything, ...]]) -> list[Any]:
     return [SummaryCache(folder).find(Everything, key) for key in rows]
 
 
-@given(
-    rows=st.dictionaries(names, st.lists(everything, max_size=3).map(tuple), max_size=4),
-)
+@given(rows=st.dictionaries(names, st.lists(everything, max_size=3).map(tuple), max_size=4))
 def test_what_is_written_is_read_back_as_it_was(
     tmp_path_factory: pytest.TempPathFactory, rows: dict[str, tuple[Everything, ...]]
 ) -> None:

@@ -87,11 +87,7 @@ def write_views(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             ),
         )
         white = np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255
-        images = {
-            "recorded/image": recorded,
-            "rendered/image": rendered,
-            "mask/objects": white,
-        }
+        images = {"recorded/image": recorded, "rendered/image": rendered, "mask/objects": white}
         for tail, image in images.items():
             color = CompressedColor(stamp_ns=STAMP, frame_id="c", format="png", data=png(image))
             writer.write(

@@ -118,8 +118,7 @@ WORDS = {
         under=("evaluator",),
     ),
     "ledger": Word(
-        use="dropped (logged), drop log",
-        text=r"\bdeclared (lost|loss|losses)\b|\bledger",
+        use="dropped (logged), drop log", text=r"\bdeclared (lost|loss|losses)\b|\bledger"
     ),
     "cell": Word(
         use="group (task x policy x condition); a cell is the robot cell",
@@ -148,10 +147,7 @@ WORDS = {
         text=r"\bspeaks? on the wire\b|whether an episode is whole",
     ),
     "room": Word(
-        use="package, module",
-        files="rooms?",
-        names="rooms",
-        text=r"\brooms\b|\b(of|in) the room\b",
+        use="package, module", files="rooms?", names="rooms", text=r"\brooms\b|\b(of|in) the room\b"
     ),
 }
 

@@ -5,7 +5,7 @@ in its depth images.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -194,10 +194,12 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     """
     episodes = _readable(run, output)
     where = placement(episodes)
-    base = _base_frame(episodes)
+    described = [item for item in episodes if streams.robot_description(item) is not None]
+    base = next(map(streams.recorded_robot, described), robot_of("")).base_frame
     found: dict[str, Any] = {}
     reasons: dict[str, str] = {}
-    for camera_id in _wanted(episodes, where, config):
+    seen = sorted({*where, *target_cameras(episodes)})
+    for camera_id in [config.camera] if config.camera else seen:
         try:
             place = where.get(camera_id, NO_DEPTH)
             found[camera_id] = _camera(episodes, camera_id, place, config, base)
@@ -222,25 +224,13 @@ def _readable(run: RunFolder, output: Output) -> list[Episode]:
     return episodes
 
 
-def _base_frame(episodes: Sequence[Episode]) -> str:
-    """The base of the robot that was recorded."""
-    described = [item for item in episodes if streams.robot_description(item) is not None]
-    return next((streams.recorded_robot(item) for item in described), robot_of("")).base_frame
-
-
-def _wanted(
-    episodes: Sequence[Episode], where: Mapping[str, str], config: CalibrateConfig
-) -> list[str]:
-    if config.camera:
-        return [config.camera]
-    return sorted({*where, *target_cameras(episodes)})
-
-
 def _camera(
     episodes: Sequence[Episode], camera_id: str, where: str, config: CalibrateConfig, base: str
 ) -> dict[str, Any]:
     if camera_id in target_cameras(episodes):
-        return _from_target(recorded_pairs(episodes, camera_id, config.link), config, base)
+        pairs = recorded_pairs(episodes, camera_id, config.link)
+        found = find_camera(pairs, config.mount, seed=config.seed)
+        return target_record(found, pairs, config.link, base)
     topic = f"...{CAMERAS}{camera_id}{TARGET_POSE}"
     if where == NO_DEPTH:
         message = (
@@ -255,13 +245,7 @@ def _camera(
         )
         raise NothingToCalibrateError(message)
     with_depth = [episode for episode in episodes if camera_id in depth_cameras(episode)]
-    found = find_fixed_camera(with_depth, camera_id, seed=config.seed)
-    return fixed_record(found, base)
-
-
-def _from_target(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[str, Any]:
-    found = find_camera(pairs, config.mount, seed=config.seed)
-    return target_record(found, pairs, config.link, base)
+    return fixed_record(find_fixed_camera(with_depth, camera_id, seed=config.seed), base)
 
 
 def target_record(found: TargetCamera, pairs: PosePairs, link: str, base: str) -> dict[str, Any]:
@@ -277,8 +261,8 @@ def target_record(found: TargetCamera, pairs: PosePairs, link: str, base: str) -
         "T_base_target" if in_hand else "T_effector_target": se3.pose_record(
             solution.Z if in_hand else solution.X
         ),
-        "residual_m": solution.residual_m.to_record(),
-        "residual_rad": solution.residual_rad.to_record(),
+        "residual_m": asdict(solution.residual_m),
+        "residual_rad": asdict(solution.residual_rad),
         "sigma_m": solution.x_sigma_m,
         "sigma_rad": solution.x_sigma_rad,
         "num_pairs": solution.num_pairs,
@@ -332,7 +316,7 @@ def _describe(item: Mapping[str, Any]) -> str:
         turn = {key: float(np.degrees(value)) for key, value in item["residual_rad"].items()}
         text += f" and {turn['value']:.3f} [{turn['low']:.3f}, {turn['high']:.3f}] degrees"
         text += f", {item['num_pairs']} pairs, {item['num_outliers']} outliers"
-        return f"{text}; position known to {item['sigma_m'] * 1e3:.2f} mm (bootstrap)"
+        return f"{text}; position known to {item['sigma_m'] * 1e3:.2f} mm"
     text += f", robot seen in {item['num_postures']} postures, fitness {item['fitness']:.2f}"
     text += f", depth scale {item['depth_scale']:.4f}"
     if "correction_m" in item:

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import least_squares
 
 from bridge.geometry import se3
 from twin.calibrate.config import Mount
+from twin.calibrate.motion import small_motion
 from twin.calibrate.pairs import PosePairs
 from twin.errors import TwinError
 
@@ -59,12 +61,8 @@ def solve_hand_eye(
     left = P[:, :3, :3] - np.eye(3)
     right = Q[:, :3, 3] @ R.T - P[:, :3, 3]
     t, *_ = np.linalg.lstsq(left.reshape(-1, 3), right.reshape(-1), rcond=None)
-    return _transform(R, t)
-
-
-def _transform(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> np.ndarray:
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t_m
+    T[:3, :3], T[:3, 3] = R, t
     return T
 
 
@@ -72,11 +70,10 @@ MIN_PAIRS = 4
 """Three determine both unknowns and leave nothing to judge them by."""
 MIN_TURN_RAD = 0.05
 """Root mean square turn about the second axis of rotation, below which one axis is all there is."""
-OUTLIER = 5.0
-"""Misfits far beyond this many standard deviations lose their say (Geman and McClure's loss)."""
-REFUSED_WEIGHT = 0.05
-RESCALED = 8
-"""Iterations after which the scales of the misfits stay, so that the others converge."""
+OUTLIER_SQUARE = 87.0
+"""Pairs whose misfits in standard deviations have a larger sum of squares contradict the others."""
+ROUNDS = 5
+"""Fits, each with the scales of the misfits that the one before left."""
 NUM_RESAMPLES = 200
 MEDIAN_OF_THREE = 1.538
 """Median length of three standard normal numbers."""
@@ -88,17 +85,13 @@ class UndeterminedCameraError(TwinError):
     """The recorded poses do not determine where the camera is."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Interval:
     """A number with its 95 % bootstrap interval."""
 
     value: float
     low: float
     high: float
-
-    def to_record(self) -> dict[str, float]:
-        """Return plain numbers."""
-        return {"value": self.value, "low": self.low, "high": self.high}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +108,7 @@ class RobotWorld:
     residual_rad: Interval
     """The same for the angle."""
     x_sigma_m: float
-    """Standard deviation of the position of X over bootstrap resamples, all axes together."""
+    """Standard deviation of the position of X, all axes together."""
     x_sigma_rad: float
     second_turn_rad: float
     """Root mean square turn about the second axis; what determines the translation of X."""
@@ -129,31 +122,34 @@ def solve(
 ) -> RobotWorld:
     """Find X and Z with A X = Z B.
 
-    Starts from the closed form and minimises Geman and McClure's loss of the
-    misfits by Gauss-Newton. Intervals come from resampled pairs (Efron, 1979), each solved by one
-    more step.
+    Starts from the closed form and minimises Cauchy's loss of the misfits.
 
     Raises:
         UndeterminedCameraError: Too few pairs, or rotations about one axis only.
     """
     turn = check_motions(Ts_a)
-    X, Z = _refined(Ts_a, Ts_b, *_start(Ts_a, Ts_b), iterations=30)
-    scales = _scales(misfits(Ts_a, Ts_b, X, Z))
-    distance, angle = _lengths(misfits(Ts_a, Ts_b, X, Z))
-    outliers = int((_weights(misfits(Ts_a, Ts_b, X, Z), scales) < REFUSED_WEIGHT).sum())
+    X = solve_hand_eye(Ts_a, Ts_b)
+    each, J = Ts_a @ X @ se3.invert(Ts_b), np.zeros((0, 12))
+    gaps = np.linalg.norm(each[:, None, :3, 3] - each[None, :, :3, 3], axis=-1)
+    Z = each[int(np.argmin(np.median(gaps, axis=1)))]  # the one nearest to all others
+    for _ in range(ROUNDS):
+        X, Z, J = _refined(Ts_a, Ts_b, X, Z)
+    left = misfits(Ts_a, Ts_b, X, Z)
+    distance, angle = _lengths(left)
+    far = (distance / _scales(left)[0]) ** 2 + (angle / _scales(left)[1]) ** 2
     drawn = np.random.default_rng(seed).integers(len(Ts_a), size=(NUM_RESAMPLES, len(Ts_a)))
     medians = np.stack([np.median(values[drawn], axis=1) for values in (distance, angle)])
     low, high = np.quantile(medians, [0.025, 0.975], axis=1)
-    steps = _steps(Ts_a, Ts_b, X, Z, scales, drawn)
+    variance = np.diag(np.linalg.pinv(J.T @ J))
     return RobotWorld(
         X=X,
         Z=Z,
         num_pairs=len(Ts_a),
-        num_outliers=outliers,
-        residual_m=_interval(distance, low[0], high[0]),
-        residual_rad=_interval(angle, low[1], high[1]),
-        x_sigma_m=_spread(steps[:, :3]),
-        x_sigma_rad=_spread(steps[:, 3:6]),
+        num_outliers=int((far > OUTLIER_SQUARE).sum()),
+        residual_m=Interval(float(np.median(distance)), float(low[0]), float(high[0])),
+        residual_rad=Interval(float(np.median(angle)), float(low[1]), float(high[1])),
+        x_sigma_m=float(np.sqrt(variance[3:6].sum())),
+        x_sigma_rad=float(np.sqrt(variance[:3].sum())),
         second_turn_rad=turn,
     )
 
@@ -196,86 +192,19 @@ def misfits(
     return np.concatenate([E[:, :3, 3], se3.vector_from_rotation(E[:, :3, :3])], axis=1)
 
 
-def _start(Ts_a: np.ndarray, Ts_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The closed form."""
-    X = solve_hand_eye(Ts_a, Ts_b)
-    return X, _middle(Ts_a @ X @ se3.invert(Ts_b))
-
-
-def _middle(Ts: Float[np.ndarray, "num_pairs 4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The one of several estimates of a pose that lies nearest to all others."""
-    gap = np.linalg.norm(Ts[:, None, :3, 3] - Ts[None, :, :3, 3], axis=-1)
-    return np.asarray(Ts[int(np.argmin(np.median(gap, axis=1)))])
-
-
 def _refined(
-    Ts_a: np.ndarray, Ts_b: np.ndarray, X: np.ndarray, Z: np.ndarray, *, iterations: int
-) -> tuple[np.ndarray, np.ndarray]:
-    scales = (FLOOR, FLOOR)
-    for iteration in range(iterations):
-        if iteration < RESCALED:
-            scales = _scales(misfits(Ts_a, Ts_b, X, Z))
-        H, g = _equations(Ts_a, Ts_b, X, Z, scales)
-        step, *_ = np.linalg.lstsq(H.sum(axis=0), -g.sum(axis=0), rcond=1e-12)
-        X, Z = X @ _moved(step[:6]), Z @ _moved(step[6:])
-        if np.abs(step).max() < 1e-10:
-            break
-    return X, Z
+    Ts_a: np.ndarray, Ts_b: np.ndarray, X: np.ndarray, Z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Float[np.ndarray, "num_residuals 12"]]:
+    """X, Z and the derivatives of the misfits, in units of their standard deviations."""
+    inverse = np.repeat(1.0 / np.array(_scales(misfits(Ts_a, Ts_b, X, Z))), 3)
 
+    def left(step: Float[np.ndarray, "12"]) -> Float[np.ndarray, " num_residuals"]:
+        moved = X @ small_motion(step[:6]), Z @ small_motion(step[6:])
+        return np.asarray((misfits(Ts_a, Ts_b, *moved) * inverse).ravel())
 
-def _equations(
-    Ts_a: np.ndarray, Ts_b: np.ndarray, X: np.ndarray, Z: np.ndarray, scales: tuple[float, float]
-) -> tuple[Float[np.ndarray, "num_pairs 12 12"], Float[np.ndarray, "num_pairs 12"]]:
-    """Weighted normal equations of each pair, in units of the standard deviations."""
-    r = misfits(Ts_a, Ts_b, X, Z)
-    inverse = np.repeat(1.0 / np.array(scales), 3)
-    J = _jacobian(Ts_b, r) * inverse[:, None]
-    weighted = np.swapaxes(J, 1, 2) * _weights(r, scales)[:, None, None]
-    return weighted @ J, (weighted @ (r * inverse)[..., None])[..., 0]
-
-
-def _steps(
-    Ts_a: np.ndarray,
-    Ts_b: np.ndarray,
-    X: np.ndarray,
-    Z: np.ndarray,
-    scales: tuple[float, float],
-    drawn: np.ndarray,
-) -> Float[np.ndarray, "num_resamples 12"]:
-    """How far each resample pulls the solution: one Gauss-Newton step of its own equations."""
-    H, g = _equations(Ts_a, Ts_b, X, Z, scales)
-    counts = np.stack([np.bincount(ids, minlength=len(H)) for ids in drawn]).astype(np.float64)
-    left = np.einsum("sn,nij->sij", counts, H)
-    # A resample of few distinct pairs may determine nothing; a thousandth of all pairs holds it.
-    left += 1e-3 * H.sum(axis=0)
-    return np.asarray(-np.linalg.solve(left, (counts @ g)[..., None])[..., 0])
-
-
-def _jacobian(Ts_b: np.ndarray, r: np.ndarray) -> Float[np.ndarray, "num_pairs 6 12"]:
-    """Derivatives of the misfits with respect to X exp(x) and Z exp(z), for small misfits."""
-    J = np.zeros((len(r), 6, 12))
-    R_e, R_bt = se3.rotation_from_vector(r[:, 3:]), np.swapaxes(Ts_b[:, :3, :3], 1, 2)
-    J[:, :3, 0:3] = R_e
-    J[:, 3:, 3:6] = np.eye(3)
-    J[:, :3, 6:9] = -R_bt
-    J[:, :3, 9:12] = R_bt @ _cross(Ts_b[:, :3, 3]) + _cross(r[:, :3]) @ R_bt
-    J[:, 3:, 9:12] = -R_bt
-    return J
-
-
-def _cross(v: np.ndarray) -> np.ndarray:
-    """Matrices [v]x with [v]x w = v x w."""
-    x, y, z = v.T
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.moveaxis(np.array(rows), 2, 0)
-
-
-def _moved(step: np.ndarray) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = se3.rotation_from_vector(step[3:])
-    T[:3, 3] = step[:3]
-    return T
+    exact = {"ftol": 1e-13, "xtol": 1e-13, "gtol": 1e-13}
+    fit = least_squares(left, np.zeros(12), jac="3-point", loss="cauchy", **exact)
+    return X @ small_motion(fit.x[:6]), Z @ small_motion(fit.x[6:]), fit.jac
 
 
 def _lengths(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -289,20 +218,6 @@ def _scales(r: np.ndarray) -> tuple[float, float]:
         max(float(np.median(distance)) / MEDIAN_OF_THREE, FLOOR),
         max(float(np.median(angle)) / MEDIAN_OF_THREE, FLOOR),
     )
-
-
-def _weights(r: np.ndarray, scales: tuple[float, float]) -> np.ndarray:
-    distance, angle = _lengths(r)
-    square = (distance / scales[0]) ** 2 + (angle / scales[1]) ** 2
-    return np.asarray(1.0 / (1.0 + square / OUTLIER**2) ** 2)
-
-
-def _interval(values: np.ndarray, low: float, high: float) -> Interval:
-    return Interval(value=float(np.median(values)), low=float(low), high=float(high))
-
-
-def _spread(rows: np.ndarray) -> float:
-    return float(np.sqrt(rows.var(axis=0).sum()))
 
 
 CLEARLY = 3.0
@@ -335,10 +250,14 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> TargetCamer
         UndeterminedCameraError: Too few pairs, rotations about one axis only, pairs that fit
             neither mounting, or that fit the other one than was asked for.
     """
-    found = {name: _solve(pairs, name, seed) for name in ("hand", "fixed")}
+    seen = pairs.Ts_camera_target
+    each: dict[Mount, np.ndarray] = {"hand": se3.invert(seen), "fixed": seen}
+    found = {
+        name: TargetCamera(solution=solve(pairs.Ts_base_effector, Ts, seed=seed), mount=name)
+        for name, Ts in each.items()
+    }
     size = {name: item.solution.residual_m.value for name, item in found.items()}
-    best = "hand" if size["hand"] <= size["fixed"] else "fixed"
-    other = "fixed" if best == "hand" else "hand"
+    best, other = sorted(each, key=lambda name: size[name])
     if mount == "auto" and size[other] < CLEARLY * size[best]:
         message = (
             f"the {len(pairs)} pose pairs of {pairs.source} fit a camera in the hand to "
@@ -355,12 +274,6 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> TargetCamer
         )
         raise UndeterminedCameraError(message)
     return _believable(found[chosen], pairs)
-
-
-def _solve(pairs: PosePairs, mount: Mount, seed: int) -> TargetCamera:
-    seen = pairs.Ts_camera_target
-    Ts_b = se3.invert(seen) if mount == "hand" else seen
-    return TargetCamera(solution=solve(pairs.Ts_base_effector, Ts_b, seed=seed), mount=mount)
 
 
 def _believable(found: TargetCamera, pairs: PosePairs) -> TargetCamera:

@@ -96,12 +96,7 @@ def _stops(
             groups[-1][1].append(sample.T_frame_body)
         else:
             groups.append((joints, [sample.T_frame_body]))
-    return [(robot.T_base_link(link, joints), _mean(np.array(Ts))) for joints, Ts in groups]
-
-
-def _mean(Ts: Float[np.ndarray, "num_samples 4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Mean of nearby poses: positions, and the chordal mean of rotations."""
-    T = np.eye(4)
-    T[:3, :3] = se3.nearest_rotation(Ts[:, :3, :3].sum(axis=0))
-    T[:3, 3] = Ts[:, :3, 3].mean(axis=0)
-    return T
+    means = [np.mean(Ts, axis=0) for _, Ts in groups]
+    for T in means:
+        T[:3, :3] = se3.nearest_rotation(T[:3, :3])  # the chordal mean
+    return [(robot.T_base_link(link, q), T) for (q, _), T in zip(groups, means, strict=True)]

@@ -23,7 +23,7 @@ from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
-from bridge.process_pool import Failed, ProcessPool, default_size
+from bridge.process_pool import Failed, runner_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
 from bridge.task.task_file import Task
@@ -36,7 +36,7 @@ from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.replay.scene import ReplayScene, localised_starts
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
-from twin.scene.store.calibration import Calibration, read_calibration, write_posterior
+from twin.scene.store.calibration import read_calibration, write_part
 from twin.scene.store.folder import scene_hash_of
 
 FRICTION = (0.05, 1.2)
@@ -212,7 +212,11 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     scene = read_rebuilt_scene(run, task).scene(task, urdf, start.Ts_base_object)
     if scene.missing():
         raise UsageError(f"at its start {scene.describe_missing()}")
-    config = for_task(ReplayConfig(), _without_posterior(run), task)
+    known = read_calibration(run)
+    if known is not None:  # all but what is made anew
+        record = {key: value for key, value in known.record.items() if key != "posterior"}
+        known = replace(known, record=record)
+    config = for_task(ReplayConfig(), known, task)
     return Trial(
         episode=episode.info.id,
         sha256=episode.sha256(),
@@ -226,16 +230,6 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
         cell=episode.info.cell,
         task_sha256=episode.info.task_sha256,
         start_seed=episode.info.start_seed,
-    )
-
-
-def _without_posterior(run: RunFolder) -> Calibration | None:
-    """Of the run's calibration, all but what is made anew."""
-    known = read_calibration(run)
-    if known is None:
-        return None
-    return replace(
-        known, record={key: known.record[key] for key in known.record if key != "posterior"}
     )
 
 
@@ -312,35 +306,26 @@ def weighed(
     pieces = [(number, trial, draw) for number, draw in enumerate(draws) for trial in trials]
     logs = np.log([draw.weight for draw in draws])
     counts = np.zeros((len(draws), 2, 2), dtype=int)
-    with output.progress("replays", len(pieces)) as advance:
-        for done, ((number, trial, _), ended) in enumerate(_answers(pieces, workers), start=1):
+    with runner_of(workers) as runner, output.progress("replays", len(pieces)) as advance:
+        answers = runner.run(_ended, pieces, lambda piece: piece[1].plan.tau[-1].t_ns)
+        for done, ((number, trial, _), ended) in enumerate(answers, start=1):
+            if isinstance(ended, Failed):
+                raise RuntimeError(ended.trace or ended.message)
             logs[number] += log_nearness(trial, ended)
             counts[number, int(ended.success), int(ended.success == trial.success)] += 1
             advance(done, trial.episode)
-    answers = [
+    records = [
         [Record(right=int(right), wrong=int(wrong)) for wrong, right in rows] for rows in counts
     ]
-    logs += [no.log_likelihood + yes.log_likelihood for no, yes in answers]
+    logs += [no.log_likelihood + yes.log_likelihood for no, yes in records]
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     return [
         replace(
             draw, weight=float(w), wrong_yes=yes.probability_wrong, wrong_no=no.probability_wrong
         )
-        for draw, w, (no, yes) in zip(draws, weights, answers, strict=True)
+        for draw, w, (no, yes) in zip(draws, weights, records, strict=True)
     ]
-
-
-def _answers(pieces: Sequence[Piece], workers: int | None) -> Any:
-    workers = workers or default_size()
-    if workers == 1:
-        yield from ((piece, _ended(piece)) for piece in pieces)
-        return
-    with ProcessPool(workers) as pool:
-        for piece, answer in pool.run(_ended, pieces, lambda piece: piece[1].plan.tau[-1].t_ns):
-            if isinstance(answer, Failed):
-                raise RuntimeError(answer.trace or answer.message)
-            yield piece, answer
 
 
 def effective(draws: Sequence[PosteriorDraw]) -> float:
@@ -371,7 +356,7 @@ def calibrate_posterior(
         "skipped": found.skipped,
     }
     record["id"] = provenance.hash_settings(record)
-    return record, str(write_posterior(run, record)["calibration_id"])
+    return record, str(write_part(run, "posterior", record)["calibration_id"])
 
 
 def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:

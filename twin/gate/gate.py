@@ -118,15 +118,6 @@ MAX_PLAN_BYTES, MAX_WAYPOINTS = 10_000_000, 20_000
 class PlanTooLargeError(TwinError):
     """A payload is too large to be read as a plan."""
 
-    def __init__(self, *, num_bytes: int, num_waypoints: int) -> None:
-        """Remember the size."""
-        self.num_bytes, self.num_waypoints = num_bytes, num_waypoints
-        super().__init__(
-            f"a payload of {num_bytes / 1e6:.0f} MB with {num_waypoints} waypoints is not read as "
-            f"a plan; at most {MAX_PLAN_BYTES / 1e6:.0f} MB and {MAX_WAYPOINTS} are. Send fewer "
-            "waypoints, or split the plan."
-        )
-
 
 class UndecidedError(TwinError):
     """There is no basis for a verdict; the message says what is missing."""
@@ -189,11 +180,6 @@ class JudgedTasks:
             )
         return task
 
-    @property
-    def words(self) -> str:
-        """For a person."""
-        return "any task" if self.only is None else self.only.task().name
-
 
 Localise = Callable[[Any, Task, float], Mapping[str, Any]]
 """Frames, the task and when to be done, on the monotonic clock [s]; objects as localised."""
@@ -254,7 +240,11 @@ class Gate:
         arrived_ns = self._now_ns()
         count = payload.count(b'"t_ns"')  # to look at each would take longer than to judge few
         if len(payload) > MAX_PLAN_BYTES or count > MAX_WAYPOINTS:
-            raise PlanTooLargeError(num_bytes=len(payload), num_waypoints=count)
+            raise PlanTooLargeError(
+                f"a payload of {len(payload) / 1e6:.0f} MB with {count} waypoints is not read as "
+                f"a plan; at most {MAX_PLAN_BYTES / 1e6:.0f} MB and {MAX_WAYPOINTS} are. Send "
+                "fewer waypoints, or split the plan."
+            )
         plan = Plan.from_json(payload)
         with self._counting:
             if self._inside > self._config.waiting:
@@ -281,7 +271,10 @@ class Gate:
         silent_ns = self._now_ns() - max(self._perception.heard_ns(), self._contact_ns)
         try:
             task = self._tasks.find(task_name, task_sha256)
-            self._refuse_to_look(silent_ns)
+            running = self._perception.executing()
+            if running is not None:
+                raise UndecidedError(f"{running} is being executed; objects are localised at rest")
+            self._refuse_silence(silent_ns)
             found = self._look(task, self._wait_for_frames(), ends_s)
             missing = _missing(found)
             return Located(
@@ -292,12 +285,6 @@ class Gate:
         finally:
             self._contact_ns = self._now_ns() - silent_ns
             self._turn.release()
-
-    def _refuse_to_look(self, silent_ns: int) -> None:
-        running = self._perception.executing()
-        if running is not None:
-            raise UndecidedError(f"{running} is being executed; objects are localised at rest")
-        self._refuse_silence(silent_ns)
 
     def _refuse_silence(self, silent_ns: int) -> None:
         if silent_ns > MAX_SILENCE_S * 1e9:
@@ -467,8 +454,7 @@ class Gate:
 
     def _frames(self) -> Any:
         return self._perception.frames(
-            max_age_ns=round(MAX_FRAME_AGE_S * 1e9),
-            max_per_camera=FRAMES,
+            max_age_ns=round(MAX_FRAME_AGE_S * 1e9), max_per_camera=FRAMES
         )
 
     def _likely(self, verdict: Verdict) -> Verdict:

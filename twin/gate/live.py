@@ -46,11 +46,7 @@ from twin.errors import TwinError
 from twin.robot.posture import PostureTrack, check_joints
 from twin.scene.frames.camera_poses import CameraPoses, rooted_in_base
 from twin.scene.frames.selection import with_true_depth
-from twin.scene.localise.stationary_frames import (
-    STATIONARY_WINDOW_NS,
-    common_root,
-    is_stationary,
-)
+from twin.scene.localise.stationary_frames import STATIONARY_WINDOW_NS, common_root, is_stationary
 from twin.scene.store.calibration import Calibration, MountedCamera, mounted_tree, unknown_postures
 
 KEPT_IMAGES = 6
@@ -252,7 +248,7 @@ class LiveView:
             return
         try:
             with self._lock:
-                if topic == self._joint_topic:
+                if topic == cell_topic(self._cell, JOINT_STATES):
                     self._take_joints(data, received_ns)
                 else:
                     self._take(topic, data, type_name or type_of_topic(topic) or "")
@@ -344,10 +340,6 @@ class LiveView:
             self._newest_ns = max(self._newest_ns, camera.colors[-1].stamp_ns)
         elif kind == "image" and stream == "depth":
             camera.depths.append(DepthImage.from_message(type_name, data))
-
-    @property
-    def _joint_topic(self) -> str:
-        return cell_topic(self._cell, JOINT_STATES)
 
     def cameras_from(self) -> str:
         """By what the cameras are posed, in words."""

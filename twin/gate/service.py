@@ -4,7 +4,7 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,26 +39,6 @@ VERDICT_WORDS = {True: "accepted", False: "rejected", None: "no verdict"}
 
 class GateError(TwinError):
     """The gate cannot be set up as asked."""
-
-
-def make_gate(
-    tasks: JudgedTasks,
-    config: GateConfig,
-    perception: Perception,
-    now_ns: Callable[[], int],  # the clock on which messages arrive
-    twin: TwinProcess,
-    judged_in: Callable[[], Mapping[str, str | None]] = dict,  # hashes of the run as it is now
-) -> Gate:
-    """Put the real localisation and replay behind the gate."""
-    return Gate(
-        tasks=tasks,
-        config=config,
-        perception=perception,
-        localise=twin.localise,
-        replay=twin.replay,
-        now_ns=now_ns,
-        judged_in=judged_in,
-    )
 
 
 def serve_gate(
@@ -128,11 +108,7 @@ def _request(payload: bytes) -> dict[str, Any]:
     return request
 
 
-def watch_cell(
-    session: Any,
-    cell: str,
-    take: Callable[[str, bytes, int, str], None],
-) -> None:
+def watch_cell(session: Any, cell: str, take: Callable[[str, bytes, int, str], None]) -> None:
     """Hand the cell's images, joints, transforms, description and events to ``take``."""
 
     def on_sample(sample: Any) -> None:
@@ -197,11 +173,20 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     ):
         claim_gate(session, config.cell)
         watch_cell(session, config.cell, perception.take)
-        gate = make_gate(tasks, config, perception, session.now_ns, twin, judged_in)
+        gate = Gate(
+            tasks=tasks,
+            config=config,
+            perception=perception,
+            localise=twin.localise,
+            replay=twin.replay,
+            now_ns=session.now_ns,
+            judged_in=judged_in,
+        )
         serve_gate(session, gate, perception, config, output)
         serve_localisation(session, gate, perception, config, output)
+        only = "any task" if tasks.only is None else tasks.only.task().name
         output.say(
-            f"gate ready: {tasks.words} of cell {config.cell}, service {config.cell}{GATE}, "
+            f"gate ready: {only} of cell {config.cell}, service {config.cell}{GATE}, "
             f"{perception.cameras_from()}. Stop with Ctrl-C."
         )
         while not stopped.wait(0.2):

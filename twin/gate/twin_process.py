@@ -25,16 +25,6 @@ from twin.replay.scene import ReplayScene
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look:
-    """Frames in which a task's objects are to be found."""
-
-    run_path: Path
-    """Run folder whose scene knows the shapes of scanned objects, where it has been rebuilt."""
-    frames: Any
-    task: Task
-
-
-@dataclass(frozen=True, kw_only=True)
 class Question:
     """A plan, and everything its replay needs."""
 
@@ -62,14 +52,14 @@ def get_ready(_: None) -> None:
     import twin.scene.localise.mesh_fit  # noqa: F401, PLC0415
 
 
-def look(item: Look) -> dict[str, Any]:
-    """Find the objects."""
+def look(item: tuple[Path, Any, Task]) -> dict[str, Any]:
+    """Find a task's objects in frames; the run's scene knows the shapes of those scanned."""
     from twin.scene.localise.mesh_fit import scanned_surfaces  # noqa: PLC0415
     from twin.scene.localise.objects import localise_objects  # noqa: PLC0415
 
-    scanned = scanned_surfaces(RunFolder.open(item.run_path), item.task)
-    found = localise_objects(item.frames, item.task, surfaces=scanned.surfaces)
-    return dict(found)
+    run_path, frames, task = item
+    scanned = scanned_surfaces(RunFolder.open(run_path), task)
+    return dict(localise_objects(frames, task, surfaces=scanned.surfaces))
 
 
 def answer(question: Question) -> Verdict:
@@ -119,7 +109,11 @@ def answer(question: Question) -> Verdict:
         plan_id=plan.id,
         identity=plan.start_id or plan.id,
     )
-    return _with_notes(with_probability(verdict, samples), notes)
+    verdict = with_probability(verdict, samples)
+    if not notes:
+        return verdict
+    warnings = (*verdict.warnings, *notes)  # a yes that knows less than it might says so first
+    return replace(verdict, warnings=warnings, reason=verdict.reason or warnings[0])
 
 
 def _scene_of(question: Question, run: RunFolder) -> tuple[ReplayScene, tuple[str, ...]]:
@@ -188,14 +182,6 @@ def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
     return judge
 
 
-def _with_notes(verdict: Verdict, notes: tuple[str, ...]) -> Verdict:
-    """Say what the scene could not tell; a yes that knows less than it might says so first."""
-    if not notes:
-        return verdict
-    warnings = (*verdict.warnings, *notes)
-    return replace(verdict, warnings=warnings, reason=verdict.reason or warnings[0])
-
-
 class TwinProcess:
     """Localises and replays for a gate. A context manager; for one caller at a time."""
 
@@ -224,7 +210,7 @@ class TwinProcess:
 
     def localise(self, frames: Any, task: Task, ends_s: float) -> Mapping[str, Any]:
         """Find a task's objects."""
-        item = Look(run_path=self._run_path, frames=frames, task=task)
+        item = (self._run_path, frames, task)
         found: Mapping[str, Any] = self._do("localisation", look, item, ends_s)
         return found
 

@@ -53,24 +53,17 @@ def _tiny_inertial() -> ET.Element:
 
 
 def _replace_meshes(
-    link: ET.Element,
-    hulls: Sequence[Float[np.ndarray, "num_points 3"]],
-    folder: Path,
-    stem: str,
+    link: ET.Element, hulls: Sequence[Float[np.ndarray, "num_points 3"]], folder: Path, stem: str
 ) -> None:
     for collision in link.findall("collision"):
         if collision.find("geometry/mesh") is not None:
             link.remove(collision)
     for index, points in enumerate(hulls):
         path = folder / f"{stem}_{index}.obj"
-        path.write_text(_obj(points))
+        path.write_text(_obj_of(np.asarray(points, dtype=np.float64).tobytes()))
         collision = ET.SubElement(link, "collision")
         geometry = ET.SubElement(collision, "geometry")
         ET.SubElement(geometry, "mesh", filename=str(path))
-
-
-def _obj(points_m: Float[np.ndarray, "num_points 3"]) -> str:
-    return _obj_of(np.asarray(points_m, dtype=np.float64).tobytes())
 
 
 @lru_cache(maxsize=64)
@@ -359,20 +352,11 @@ class Arm:
 
     def joints_rad(self) -> Float[np.ndarray, " num_joints"]:
         """Where the arm is."""
-        states = pybullet.getJointStates(self.id, self._arm, physicsClientId=self._client)
-        return np.array([state[0] for state in states])
+        return self.posture()[0]
 
     def width_m(self) -> float:
-        """Distance between the finger pads."""
-        states = pybullet.getJointStates(self.id, self._fingers, physicsClientId=self._client)
-        return self._width_m([state[0] for state in states])
-
-    def _width_m(self, values: Sequence[float]) -> float:
-        """The distance between the pads, mean of what each finger says; 0 of a fixed tool."""
-        if not values:
-            return 0.0
-        widths = [drive.width_m(value) for drive, value in zip(self._drives, values, strict=True)]
-        return float(sum(widths)) / len(widths)
+        """Distance between the finger pads, mean of what each finger says; 0 of a fixed tool."""
+        return self.posture()[1]
 
     def posture(self) -> tuple[Float[np.ndarray, " num_joints"], float]:
         """Where the arm is, and the distance between the finger pads; one question for both."""
@@ -381,7 +365,9 @@ class Arm:
         )
         places = [state[0] for state in states]
         count = len(self._arm)
-        return np.array(places[:count]), self._width_m(places[count:])
+        pairs = zip(self._drives, places[count:], strict=True)
+        widths = [drive.width_m(value) for drive, value in pairs]
+        return np.array(places[:count]), float(sum(widths)) / len(widths) if widths else 0.0
 
     def link_poses(self, links: Sequence[int]) -> list[LinkPose]:
         """Position [m] and quaternion xyzw of the frames of links, base frame."""

@@ -109,9 +109,7 @@ def coarse_lattice(
 ) -> tuple[Lattice, float] | None:
     """Fill a lattice's solid with larger cells in one piece, spacing [m]; None: none are larger."""
     return _coarse_lattice(
-        np.ascontiguousarray(nodes_m).tobytes(),
-        np.ascontiguousarray(tets).tobytes(),
-        cell_m,
+        np.ascontiguousarray(nodes_m).tobytes(), np.ascontiguousarray(tets).tobytes(), cell_m
     )
 
 

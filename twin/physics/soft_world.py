@@ -74,11 +74,7 @@ def _dot(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 
 
 def _cross(a: tuple[float, ...], b: tuple[float, ...]) -> Three:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def _sum(a: tuple[float, ...], b: tuple[float, ...]) -> Three:
@@ -242,11 +238,7 @@ class SoftWorld:
         rest = model.nodes_m.astype(np.float64)
         friction = self._config.object_friction if model.friction is None else model.friction
         index, _ = add_body(
-            self._begun(),
-            model,
-            T_base_object,
-            young_pa=model.young_pa,
-            friction=friction,
+            self._begun(), model, T_base_object, young_pa=model.young_pa, friction=friction
         )
         skin, points = None, rest
         if model.skin_m is not None:

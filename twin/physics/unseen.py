@@ -5,7 +5,6 @@ with edges as published 37 do, with centres of mass as published 29 (docs/planni
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -29,10 +28,6 @@ class Unseen:
         return [
             np.maximum(size - 2 * self.edge_m * (np.arange(3) != axis), least) for axis in range(3)
         ]
-
-    def to_record(self) -> dict[str, Any]:
-        """Return plain numbers."""
-        return {"edge_m": self.edge_m, "centre_of_mass_m": list(self.centre_of_mass_m)}
 
 
 EVEN = Unseen()

@@ -10,7 +10,7 @@ same bits on every run.
 from collections.abc import Callable, Sequence
 from math import cos
 from operator import methodcaller
-from types import TracebackType
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -82,16 +82,72 @@ Box = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 """Centre and extents in the owner's frame [m]."""
 
 
-class World:
-    """One simulated cell. A context manager: its client goes away at the end."""
+_World = TypeVar("_World")
+
+
+class Bodies:
+    """An empty world of PyBullet. A context manager: its client goes away at the end."""
+
+    def __init__(self, config: PhysicsConfig) -> None:
+        """Take a client."""
+        self.config = config
+        self._client = open_client(config)
+        self._anchors = FrictionAnchors(self._client)
+
+    def _box(
+        self, size_m: Float[np.ndarray, "3"], mass_kg: float, T: Float[np.ndarray, "4 4"]
+    ) -> int:
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_BOX, halfExtents=(size_m / 2).tolist(), physicsClientId=self._client
+        )
+        return self._body(shape, mass_kg, T)
+
+    def _body(self, shape: int, mass_kg: float, T: Float[np.ndarray, "4 4"]) -> int:
+        q, p = se3.split(T)
+        return int(
+            pybullet.createMultiBody(
+                baseMass=mass_kg,
+                baseCollisionShapeIndex=shape,
+                basePosition=p.tolist(),
+                baseOrientation=[q[1], q[2], q[3], q[0]],
+                # What never moves needs no articulated body: the same bits for less.
+                useMaximalCoordinates=mass_kg == 0.0,
+                physicsClientId=self._client,
+            )
+        )
+
+    def _undamp(self, body: int) -> None:
+        """Nothing slows down in the air; the engine would take 3 s for 83 % of a spin's energy."""
+        pybullet.changeDynamics(
+            body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client
+        )
+
+    def _set_friction(self, body: int, friction: float) -> None:
+        pybullet.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=self._client)
+
+    def close(self) -> None:
+        """Give the client back; a second call does nothing."""
+        if self._client >= 0:
+            give_client_back(self._client)
+            self._client = -1
+
+    def __enter__(self: _World) -> _World:
+        """Use as a context manager."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+
+class World(Bodies):
+    """One simulated cell."""
 
     def __init__(self, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
         """Load the robot with its base at the origin."""
-        self.config = config
-        self._client = open_client(config)
+        super().__init__(config)
         self.free_ids: dict[str, int] = {}
         self._centres_m: dict[str, Float[np.ndarray, 3]] = {}
-        self._anchors = FrictionAnchors(self._client)
         try:
             self.robot = Arm(self._client, urdf, mesh_hulls_m, config)
         except PhysicsError:
@@ -122,13 +178,10 @@ class World:
         body = self.add_static([(centre, extents)], np.eye(4))[0]
         # The robot stands on the table: its base touches it by construction.
         for link in (-1, *self.robot.base_links):
-            self._ignore(body, link)
+            pybullet.setCollisionFilterPair(
+                self.robot.id, body, link, -1, 0, physicsClientId=self._client
+            )
         return body
-
-    def _ignore(self, body: int, link: int) -> None:
-        pybullet.setCollisionFilterPair(
-            self.robot.id, body, link, -1, 0, physicsClientId=self._client
-        )
 
     def add_free(
         self,
@@ -149,25 +202,6 @@ class World:
         self._anchors.add(body)
         self._meet(methodcaller("add_free", body, size_m, mass_kg, T_base_object, unseen))
         self.free_ids[object_id] = body
-
-    def _box(
-        self, size_m: Float[np.ndarray, "3"], mass_kg: float, T: Float[np.ndarray, "4 4"]
-    ) -> int:
-        q, p = se3.split(T)
-        shape = pybullet.createCollisionShape(
-            pybullet.GEOM_BOX, halfExtents=(size_m / 2).tolist(), physicsClientId=self._client
-        )
-        return int(
-            pybullet.createMultiBody(
-                baseMass=mass_kg,
-                baseCollisionShapeIndex=shape,
-                basePosition=p.tolist(),
-                baseOrientation=[q[1], q[2], q[3], q[0]],
-                # What never moves needs no articulated body: the same bits for less.
-                useMaximalCoordinates=mass_kg == 0.0,
-                physicsClientId=self._client,
-            )
-        )
 
     def _uneven_box(
         self,
@@ -201,20 +235,6 @@ class World:
             physicsClientId=self._client,
         )
         return body
-
-    def _undamp(self, body: int) -> None:
-        """Nothing slows down in the air; the engine would take 3 s for 83 % of a spin's energy."""
-        pybullet.changeDynamics(
-            body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client
-        )
-
-    def _set_friction(self, body: int, friction: float) -> None:
-        pybullet.changeDynamics(
-            body,
-            -1,
-            lateralFriction=friction,
-            physicsClientId=self._client,
-        )
 
     def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
         """Put the robot into a posture at rest, without simulating."""
@@ -314,22 +334,3 @@ class World:
     def client(self) -> int:
         """PyBullet's number of this world."""
         return self._client
-
-    def close(self) -> None:
-        """Give the client back; a second call does nothing."""
-        if self._client >= 0:
-            give_client_back(self._client)
-            self._client = -1
-
-    def __enter__(self) -> "World":
-        """Use as a context manager."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close."""
-        self.close()

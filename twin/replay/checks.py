@@ -21,10 +21,7 @@ from twin.robot.model import RobotModel
 
 
 def start_failures(
-    plan: Plan,
-    path: JointPath,
-    measured_rad: Float[np.ndarray, " num_joints"],
-    robot: RobotModel,
+    plan: Plan, path: JointPath, measured_rad: Float[np.ndarray, " num_joints"], robot: RobotModel
 ) -> list[Failure]:
     """Say how far a plan's first waypoint is from where the robot stands."""
     off_rad = np.abs(path.joints_rad[0] - measured_rad)

@@ -307,9 +307,7 @@ def free_start(scene: ReplayScene, soft: Mapping[str, SoftShape]) -> ReplayScene
 
 
 def _separate(
-    solids: list[_Solid],
-    fixed: list[_Solid],
-    moved: dict[str, Float[np.ndarray, "4 4"]],
+    solids: list[_Solid], fixed: list[_Solid], moved: dict[str, Float[np.ndarray, "4 4"]]
 ) -> bool:
     """One round; says whether anything had to be moved."""
     anything = False

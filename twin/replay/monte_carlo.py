@@ -7,7 +7,7 @@ order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -79,7 +79,7 @@ class Variation:
                 name: model.mass_kg for name, model in self.objects.items() if not model.fixed
             },
             "young_pa": {name: material.young_pa for name, material in soft.items()},
-            "unseen": {name: unseen.to_record() for name, unseen in sorted(self.unseen.items())},
+            "unseen": {name: asdict(unseen) for name, unseen in sorted(self.unseen.items())},
         }
 
 
@@ -191,10 +191,7 @@ def _varied_model(
 
 
 def _root(
-    T: Float[np.ndarray, "4 4"],
-    model: ObjectModel,
-    scene: ReplayScene,
-    name: str,
+    T: Float[np.ndarray, "4 4"], model: ObjectModel, scene: ReplayScene, name: str
 ) -> Float[np.ndarray, "6 6"]:
     """Symmetric square root of what is unsure of a pose."""
     covariance = scene.covariances.get(name)
@@ -271,12 +268,7 @@ class Sample:
 
 
 def replay_samples(
-    replay: Replay,
-    scene: ReplayScene,
-    config: ReplayConfig,
-    *,
-    plan_id: str,
-    identity: str,
+    replay: Replay, scene: ReplayScene, config: ReplayConfig, *, plan_id: str, identity: str
 ) -> tuple[Sample, ...]:
     """Run ``config.samples`` varied replays; UsageError if kinematic, which moves no objects."""
     if config.samples and config.mode != "dynamic":

@@ -37,9 +37,7 @@ from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import RebuiltScene, read_rebuilt_scene
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
-from twin.replay.trace import (
-    Recording,
-)
+from twin.replay.trace import Recording
 from twin.replay.verdict import replay_joints, replay_plan
 from twin.robot.model import load_robot
 from twin.robot.posture import check_clock, width_track

@@ -338,11 +338,7 @@ def _replay_trajectories(
 
 
 def _all_jobs(
-    run: RunFolder,
-    scene_hash: str | None,
-    config: ReplayRunConfig,
-    runner: Runner,
-    output: Output,
+    run: RunFolder, scene_hash: str | None, config: ReplayRunConfig, runner: Runner, output: Output
 ) -> tuple[list[ReplayJob], dict[str, str], dict[str, Prepared]]:
     """List what is to be replayed, what cannot be read, and what there is of each other episode."""
     names = chosen_episodes(run, config)

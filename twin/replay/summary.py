@@ -294,10 +294,7 @@ def _motion_lines(rows: Rows) -> list[str]:
         counts[row["trajectory"]] = counts.get(row["trajectory"], 0) + 1
     lines = [
         f"imported recordings, {trajectory} ({words}): {counts[trajectory]} replays"
-        for trajectory, words in (
-            ("planned", "joint schedule"),
-            ("executed", "measured tool"),
-        )
+        for trajectory, words in (("planned", "joint schedule"), ("executed", "measured tool"))
         if trajectory in counts
     ]
     return [*lines, "Compare: robot-gst evaluate RUN"] if lines else []

@@ -193,12 +193,7 @@ def replay_plan(
 
 
 def replay_joints(
-    track: JointTrack,
-    widths: JointTrack,
-    scene: ReplayScene,
-    config: ReplayConfig,
-    *,
-    plan: Plan,
+    track: JointTrack, widths: JointTrack, scene: ReplayScene, config: ReplayConfig, *, plan: Plan
 ) -> ReplayResult:
     """Replay what the joint encoders and the gripper said during an execution."""
     path = path_of_execution(track, widths, plan, config, robot_of(scene.urdf))

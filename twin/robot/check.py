@@ -32,6 +32,9 @@ def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
     except GstError as error:
         more = [f"\n  {level}: {told}" for level, told in _in_text(record, text)] if text else []
         raise UsageError(f"{record.name}: {error}{''.join(more)}") from error
+    rng = np.random.default_rng(_SEED)  # of poses that some posture reaches
+    postures = rng.uniform(robot.lower_rad, robot.upper_rad, (_POSES, len(robot.joints)))
+    reached = sum(solve_ik(robot, robot.T_base_tcp(q), IkConfig()).reached for q in postures)
     if urdf_out is not None:
         urdf_out.parent.mkdir(parents=True, exist_ok=True)
         urdf_out.write_text(text)
@@ -59,7 +62,7 @@ def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
         "payload_kg": record.payload_kg,
         "hulls": len(hulls.hulls),
         "inverse": "closed form" if UrInverse.for_robot(robot) is not None else "iteration",
-        "reached": f"{_reached(robot)} of {_POSES} random poses",
+        "reached": f"{reached} of {_POSES} random poses",
         "limits": _limits_of_use(robot, hulls),
         "findings": [
             {"level": level, "found": found} for level, found in _findings(robot, hulls, text)
@@ -79,13 +82,6 @@ def _widths(gripper: Gripper) -> dict[str, Any] | None:
             for finger in gripper.fingers
         },
     }
-
-
-def _reached(robot: RobotModel) -> int:
-    """Of random poses that some posture reaches, those that the solver finds one for."""
-    rng = np.random.default_rng(_SEED)
-    postures = rng.uniform(robot.lower_rad, robot.upper_rad, (_POSES, len(robot.joints)))
-    return sum(solve_ik(robot, robot.T_base_tcp(row), IkConfig()).reached for row in postures)
 
 
 def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:

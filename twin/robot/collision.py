@@ -269,11 +269,14 @@ class RobotHulls:
         """
         fingers = set(self.robot.record.gripper.finger_links)
         joints = [self.robot.model.frames[frame_id].parentJoint for frame_id in self._frame_ids]
+        parents = self.robot.model.parents
         candidates = [
             (first, second)
             for first in range(len(self.hulls))
             for second in range(first + 1, len(self.hulls))
-            if not self._neighbours(joints[first], joints[second])
+            if joints[first] != joints[second]
+            and parents[joints[second]] != joints[first]
+            and parents[joints[first]] != joints[second]
             and not {self.hulls[first].link, self.hulls[second].link} <= fingers
         ]
         robot = self.robot
@@ -326,10 +329,6 @@ class RobotHulls:
     def _listed(self, first: int, second: int) -> bool:
         links = {self.hulls[first].link, self.hulls[second].link}
         return any(links == set(pair) for pair in self.robot.record.may_overlap)
-
-    def _neighbours(self, first: int, second: int) -> bool:
-        parents = self.robot.model.parents
-        return first == second or parents[second] == first or parents[first] == second
 
 
 @lru_cache(maxsize=4)

@@ -214,21 +214,12 @@ class _Tree:
             if fewest <= most:
                 path[:, joint] = column + _TURN * np.clip(0.0, fewest, most)
             else:
-                path[:, joint] = _kept_inside(column, low, high)
-                breaks += 1
+                turns, breaks = 0.0, breaks + 1
+                for index, value in enumerate(column.tolist()):  # wound back where it would pass
+                    turns = max(turns, np.ceil((low - value) / _TURN))
+                    turns = min(turns, np.floor((high - value) / _TURN))
+                    path[index, joint] = value + _TURN * turns
         return path, breaks
-
-
-def _kept_inside(
-    unwound: Float[np.ndarray, " num_poses"], low: float, high: float
-) -> Float[np.ndarray, " num_poses"]:
-    """Follow a joint and wind it back by whole turns whenever it would pass a limit."""
-    inside = np.empty_like(unwound)
-    turns = 0.0
-    for index, value in enumerate(unwound):
-        turns = min(max(turns, np.ceil((low - value) / _TURN)), np.floor((high - value) / _TURN))
-        inside[index] = value + _TURN * turns
-    return inside
 
 
 def _step_costs(

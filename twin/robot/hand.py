@@ -42,13 +42,14 @@ class Hand:
         if not self._model.existFrame(hand_link):
             names = ", ".join(link.get("name", "") for link in root.findall("link"))
             raise RobotDescriptionError(found=f"lacks {hand_link!r}", hint=f"It has: {names}.")
-        self._ids = [self._model.joints[self._model.getJointId(name)].idx_q for name in joints]
+        arms = [self._model.joints[self._model.getJointId(name)] for name in joints]
+        self._ids, self._velocity_ids = [j.idx_q for j in arms], [j.idx_v for j in arms]
         self._frame = self._model.getFrameId(hand_link)
-        links = _behind(root, hand_link)
+        behind = self._model.subtrees[self._model.frames[self._frame].parentJoint]
         self._pieces = [
             (item.parentJoint, item.placement, np.array(convex_hull(corners_of(item)).points()))
             for item in geometry.geometryObjects
-            if self._model.frames[item.parentFrame].name in links
+            if item.parentJoint in behind
         ]
         arm = {self._model.getJointId(name) for name in joints}
         self._finger_ids = [
@@ -62,6 +63,15 @@ class Hand:
         q[self._ids] = joints_rad
         pin.framesForwardKinematics(self._model, self._data, q)
         return np.array(self._data.oMf[self._frame].homogeneous)
+
+    def gravity_nm(
+        self, joints_rad: Float[np.ndarray, " num_joints"]
+    ) -> Float[np.ndarray, " num_joints"]:
+        """Torque with which each joint holds the arm."""
+        q = pin.neutral(self._model)
+        q[self._ids] = joints_rad
+        torque = pin.computeGeneralizedGravity(self._model, self._data, q)
+        return np.array(torque)[self._velocity_ids]
 
     def hulls_m(self, finger_rad: float = 0.0) -> list[Float[np.ndarray, "num_points 3"]]:
         """Convex pieces of the hand link and of all links behind it: corners in its frame [m]."""
@@ -96,17 +106,3 @@ def _with_local_meshes(root: ET.Element, folder: Path) -> None:
                     hint="Put it there, or import the data set again with its robot folder.",
                 )
             mesh.set("filename", str(path))
-
-
-def _behind(root: ET.Element, link: str) -> set[str]:
-    """A link and all that hangs on it."""
-    found, todo = set(), [link]
-    while todo:
-        parent = todo.pop()
-        found.add(parent)
-        for joint in root.findall("joint"):
-            ends = (joint.find("parent"), joint.find("child"))
-            names = [end.get("link", "") if end is not None else "" for end in ends]
-            if names[0] == parent and names[1] not in found:
-                todo.append(names[1])
-    return found

@@ -33,15 +33,12 @@ class Loads:
         """Take the arm alone, and once more with each load."""
         self._robot, self._held = robot, held
         self._elbow = robot.model.getJointId(robot.joints[(len(robot.joints) - 1) // 2])
-        masses = {item.mass_kg for item in held if item.mass_kg > 0}
-        self._arms = {0.0: robot.model, **{mass_kg: self._loaded(mass_kg) for mass_kg in masses}}
+        self._arms, tool = {0.0: robot.model}, robot.model.frames[robot.tcp_id]
+        for mass_kg in {item.mass_kg for item in held if item.mass_kg > 0}:
+            self._arms[mass_kg] = robot.model.copy()
+            ball = pin.Inertia.FromSphere(mass_kg, 0.03)
+            self._arms[mass_kg].appendBodyToJoint(tool.parentJoint, ball, tool.placement)
         self._data = {mass: model.createData() for mass, model in self._arms.items()}
-
-    def _loaded(self, mass_kg: float) -> Any:
-        model, tool = self._robot.model.copy(), self._robot.model.frames[self._robot.tcp_id]
-        ball = pin.Inertia.FromSphere(mass_kg, 0.03)
-        model.appendBodyToJoint(tool.parentJoint, ball, tool.placement)
-        return model
 
     def along(
         self, times_s: Times, joints: Rows, speeds: Rows, accelerations: Rows

@@ -5,11 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.media.image_quality import (
-    PADDINGS,
-    ImageShapeError,
-    ssim_maps,
-)
+from bridge.media.image_quality import PADDINGS, ImageShapeError, ssim_maps
 from evaluator.metrics.image import METRICS, RAW, SwappedColourError, refuse_swapped, score_pair
 
 PLAIN_METRICS = [metric for metric in METRICS.values() if not metric.id.startswith("lpips")]

@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 
-from bridge.media.image_quality import (
-    BORDER,
-    C1,
-    C2,
-    PADDINGS,
-    SIGMA,
-    WINDOW,
-    ssim_maps,
-)
+from bridge.media.image_quality import BORDER, C1, C2, PADDINGS, SIGMA, WINDOW, ssim_maps
 
 SIZES = [(11, 11), (11, 40), (43, 12), (26, 27), (37, 101), (64, 48)]
 

@@ -12,12 +12,7 @@ from own_process import printed
 from bridge.episode.run_folder import RunFolder
 from bridge.exchange.trials_csv import TrialRecord, read_trials
 from evaluator.compare import compare_run
-from evaluator.report.parquet import (
-    OF_MEASUREMENTS,
-    OF_TRIALS,
-    write_measurements,
-    write_trials,
-)
+from evaluator.report.parquet import OF_MEASUREMENTS, OF_TRIALS, write_measurements, write_trials
 from evaluator.report.write import Written, summary_text, write_report
 from evaluator.result import load_results
 

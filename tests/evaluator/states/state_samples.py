@@ -125,11 +125,7 @@ def localised_episode(path: Path, seen: Seen) -> Episode:
     return Episode.open(path)
 
 
-def replay_episode(
-    path: Path,
-    plan: Plan,
-    moved: dict[str, list[np.ndarray]],
-) -> Episode:
+def replay_episode(path: Path, plan: Plan, moved: dict[str, list[np.ndarray]]) -> Episode:
     """A replay: each object at the given poses, one for the end of each second from 0 on."""
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id=path.stem, kind="trial"))
@@ -142,13 +138,7 @@ def replay_episode(
 
 
 def _event(writer: EpisodeWriter, kind: str, stamp_ns: int, **fields: str) -> None:
-    record = {
-        "schema_version": 1,
-        "stamp_ns": stamp_ns,
-        "type": kind,
-        "plan_id": PLAN_ID,
-        **fields,
-    }
+    record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": PLAN_ID, **fields}
     writer.write_json("/cell/event", record, type_name=schema.EVENT, log_time_ns=stamp_ns)
 
 
@@ -164,8 +154,5 @@ def _localisation(writer: EpisodeWriter, record: dict[str, Any]) -> None:
 def _pose(writer: EpisodeWriter, name: str, T: np.ndarray, stamp_ns: int) -> None:
     sample = PoseSample(stamp_ns=stamp_ns, frame_id="base_link", T_frame_body=T)
     writer.write(
-        f"/cell/{name}/pose",
-        sample.to_cdr(),
-        type_name=schema.POSE_STAMPED,
-        log_time_ns=stamp_ns,
+        f"/cell/{name}/pose", sample.to_cdr(), type_name=schema.POSE_STAMPED, log_time_ns=stamp_ns
     )

@@ -77,20 +77,12 @@ def cube(tmp_path: Path) -> Made:
     """Two stages of a cube: the plan, two replays and the localisation all differ a little."""
 
     def make(
-        *,
-        seen: Seen | None = None,
-        task: str = "cube_into_box",
-        live: bool = False,
+        *, seen: Seen | None = None, task: str = "cube_into_box", live: bool = False
     ) -> tuple[StateSummary, ...]:
         plan = plan_of({"grasp": {"cube": posed(LIFTED_M)}, "place": {"cube": posed(IN_BOX_M)}})
         start = posed((0.45, -0.1, 0.02))
         moved = {
-            "planned": [
-                start,
-                posed(LIFTED_M),
-                in_box(0.01),
-                in_box(),
-            ],
+            "planned": [start, posed(LIFTED_M), in_box(0.01), in_box()],
             "executed": [start, posed(LIFTED_M, 0.1), in_box(0.0, 0.02, np.pi / 2)],
         }
         found = Seen().add("cube", in_box(0.003, 0.004, 0.2))

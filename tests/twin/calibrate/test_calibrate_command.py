@@ -153,9 +153,7 @@ def test_a_detection_that_is_no_number_is_left_out(run: RunFolder) -> None:
     assert np.isfinite(pairs.Ts_camera_target).all()
 
 
-def test_detections_of_one_stop_are_averaged_and_those_on_the_move_left_out(
-    run: RunFolder,
-) -> None:
+def test_detections_of_one_stop_are_averaged_and_those_on_the_move_left_out(run: RunFolder) -> None:
     record_targets(run, count=5)
     pairs = recorded_pairs([Episode.open(path) for path in run.episodes()], "wrist", "tool0")
     assert len(pairs) == 5
@@ -296,8 +294,7 @@ def test_a_later_calibration_keeps_what_it_did_not_look_at(run: RunFolder) -> No
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["{", "[]", '{"schema_version": 9}', '{"schema_version": 1, "cameras": {"a": {}}}'],
+    "text", ["{", "[]", '{"schema_version": 9}', '{"schema_version": 1, "cameras": {"a": {}}}']
 )
 def test_a_damaged_calibration_is_refused(run: RunFolder, text: str) -> None:
     run.scene_dir.mkdir(parents=True)

@@ -36,7 +36,7 @@ from twin.calibrate.posterior import (
 from twin.replay import monte_carlo, rebuilt_scene
 from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
 from twin.replay.scene import ReplayScene
-from twin.scene.store.calibration import Calibration, read_calibration, write_posterior
+from twin.scene.store.calibration import Calibration, read_calibration, write_part
 
 QUIET = Output(quiet=True)
 TASK = load_task("slippery_block_into_box")
@@ -242,7 +242,7 @@ def record_of(tasks: Mapping[str, Sequence[PosteriorDraw]]) -> dict[str, object]
 def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
     run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
     record = record_of({TASK.name: draws})
-    before = write_posterior(run, record)["calibration_id"]
+    before = write_part(run, "posterior", record)["calibration_id"]
     known = read_calibration(run)
     assert known is not None
     assert rebuilt_scene.calibrated(ReplayConfig(), known, TASK).variation.posterior == tuple(draws)
@@ -250,7 +250,7 @@ def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
     assert f"{TASK.name}: 4 draws weighed by 1 trials, 1 of which succeeded" in told
     assert "cube_into_box: no trial of it can be used" in told
     assert "trial_0002 not used" in told
-    write_posterior(run, record_of({TASK.name: draws[:2]}))
+    write_part(run, "posterior", record_of({TASK.name: draws[:2]}))
     again = read_calibration(run)
     assert again is not None
     assert again.calibration_id != before
@@ -262,7 +262,7 @@ def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
 def test_a_task_takes_its_own_draws_and_never_silently_anothers(tmp_path: Path) -> None:
     run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
     other = load_task("heavy_block_into_box")
-    write_posterior(run, record_of({TASK.name: draws[:1], other.name: draws[1:]}))
+    write_part(run, "posterior", record_of({TASK.name: draws[:1], other.name: draws[1:]}))
     known = read_calibration(run)
     assert known is not None
     assert rebuilt_scene.posterior_of(known, TASK) == tuple(draws[:1])
@@ -275,7 +275,7 @@ def test_a_task_takes_its_own_draws_and_never_silently_anothers(tmp_path: Path) 
 
 def test_a_file_older_than_draws_of_each_task_is_read_and_says_what_it_is(tmp_path: Path) -> None:
     run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(2)
-    write_posterior(run, {**of_one_task(draws), "skipped": {}})
+    write_part(run, "posterior", {**of_one_task(draws), "skipped": {}})
     known = read_calibration(run)
     assert known is not None
     assert rebuilt_scene.posterior_of(known, TASK) == tuple(draws)

@@ -27,12 +27,7 @@ from bridge.task.task_file import Task, load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate import gate as gate_module
-from twin.gate.gate import (
-    JudgedTasks,
-    PlanTooLargeError,
-    no_verdict,
-    of_another_scene,
-)
+from twin.gate.gate import JudgedTasks, PlanTooLargeError, no_verdict, of_another_scene
 
 
 def arm(**changes: Any) -> Any:

@@ -195,10 +195,7 @@ def test_cameras_of_two_trees_are_not_mixed(tmp_path: Path) -> None:
             view.take(f"/standin/cam/alone/{kind}/{part}", data, 0)
     items = [
         FrameTransform(
-            stamp_ns=0,
-            parent="camera_link",
-            child=f"alone_{kind}",
-            T_parent_child=np.eye(4),
+            stamp_ns=0, parent="camera_link", child=f"alone_{kind}", T_parent_child=np.eye(4)
         )
         for kind in ("color", "depth")
     ]

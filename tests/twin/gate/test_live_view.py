@@ -8,12 +8,7 @@ from live_cell import IMAGE, S, calibrate, event, look, place, shoot
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import depth_to_compact
-from bridge.episode.cdr.messages import (
-    CompressedColor,
-    DepthImage,
-    PoseSample,
-    string_to_cdr,
-)
+from bridge.episode.cdr.messages import CompressedColor, DepthImage, PoseSample, string_to_cdr
 from twin.gate.live import KEPT_IMAGES, SET_BACK_SAMPLES, LiveView
 
 

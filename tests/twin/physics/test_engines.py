@@ -14,9 +14,7 @@ from bridge.errors import MissingDependencyError, UsageError
 from bridge.robots.robot import read_robot
 from twin.physics.arm import PhysicsError
 from twin.physics.config import PhysicsConfig, require_engine
-from twin.physics.engines import (
-    open_world,
-)
+from twin.physics.engines import open_world
 from twin.replay.config import ReplayConfig
 from twin.replay.dynamics import mesh_hulls
 from twin.robot.collision import hulls_of

@@ -57,12 +57,7 @@ def test_what_flies_turns_about_its_centre_of_mass(engine: str) -> None:
 @each_engine
 @pytest.mark.parametrize(
     ("edge_m", "off_m", "stays"),
-    [
-        (0.0, 0.009, True),
-        (0.0, 0.015, False),
-        (0.004, 0.007, True),
-        (0.004, 0.011, False),
-    ],
+    [(0.0, 0.009, True), (0.0, 0.015, False), (0.004, 0.007, True), (0.004, 0.011, False)],
 )
 def test_a_stack_stays_while_the_weight_is_over_the_lower_face(
     engine: str, edge_m: float, off_m: float, stays: bool

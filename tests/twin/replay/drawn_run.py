@@ -66,10 +66,7 @@ def write_scene(run: RunFolder, scene: ReplayScene, movable: str, points_m: np.n
         place = run.scene_dir / "objects" / name
         place.mkdir(parents=True)
         write_ply(place / "gaussians.ply", cloud(points, color))
-        pose = {
-            "p_m": [0.1, 0.5, 0.3],
-            "q_wxyz": [1.0, 0.0, 0.0, 0.0],
-        }
+        pose = {"p_m": [0.1, 0.5, 0.3], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
         (place / "object.json").write_text(json.dumps({"T_base_object": pose}))
     links = write_links(run, {"tool0": cloud(block(), BLUE)})
     record = {"schema_version": 1, "key": "k", "scene_hash": background_hash(run),

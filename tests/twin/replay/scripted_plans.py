@@ -44,11 +44,7 @@ def joints_over(scene: ReplayScene, x: float, y: float, z: float) -> np.ndarray:
 def downward(yaw_rad: float) -> tuple[float, float, float, float]:
     """The tool looks down; its fingers open along the direction of the yaw."""
     R = np.array(
-        [
-            [np.cos(yaw_rad), -np.sin(yaw_rad), 0],
-            [np.sin(yaw_rad), np.cos(yaw_rad), 0],
-            [0, 0, 1.0],
-        ]
+        [[np.cos(yaw_rad), -np.sin(yaw_rad), 0], [np.sin(yaw_rad), np.cos(yaw_rad), 0], [0, 0, 1.0]]
     ) @ np.diag([1.0, -1.0, -1.0])
     w, x, y, z = se3.quaternion_from_rotation(R).tolist()
     return w, x, y, z

@@ -74,12 +74,7 @@ def frame(index: int, count: int) -> RgbdFrame:
 
 
 def write_episode(
-    path: Path,
-    *,
-    num_frames: int,
-    kind: str = "scan",
-    still: bool = False,
-    sent_late_ns: int = 0,
+    path: Path, *, num_frames: int, kind: str = "scan", still: bool = False, sent_late_ns: int = 0
 ) -> None:
     """Write an episode as a recorder would; one that knows only when images were sent is late."""
     names = ("wrist_color_optical", "wrist_depth_optical")

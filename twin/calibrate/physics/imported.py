@@ -4,7 +4,6 @@
 no plan and so no verdict: what comes out is an episode that ``evaluate`` lays over the recording.
 """
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import GstError
 from bridge.process_pool import Failed
 from bridge.terminal import Output
+from twin.calibrate.motion import Motion
+from twin.calibrate.physics.arm_motion import PART, motion_for
 from twin.calibrate.physics.push_fit import METHOD, load_push
 from twin.calibrate.physics.pushes import Push, PushResult, Trajectory, motion_of, replay_push
 from twin.physics.config import PhysicsConfig
@@ -27,7 +28,7 @@ from twin.physics.engine import ENGINE_VERSION
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.rebuilt_scene import calibrated
 from twin.replay.runner import chosen_episodes, runner_for
-from twin.scene.store.calibration import Calibration, read_calibration
+from twin.scene.store.calibration import read_calibration
 
 ENGINE = "twin-pybullet"
 """Beside simulators of others, which may have used PyBullet too."""
@@ -45,8 +46,10 @@ class MotionReplay:
     physics: PhysicsConfig
     finger_rad: float
     fitted_to: tuple[str, ...]
-    """Recordings from which friction was identified."""
+    """Recordings from which friction or the arm's motion was identified."""
     calibration_id: str | None
+    motion: Motion | None = None
+    """Of the arm that follows the schedule, where held-out recordings confirmed it."""
     force: bool = False
 
     def settings(self) -> dict[str, Any]:
@@ -57,6 +60,7 @@ class MotionReplay:
             "physics": asdict(self.physics),
             "finger_rad": self.finger_rad,
             "fitted_to": list(self.fitted_to),
+            "motion": None if self.motion is None else self.motion.to_record(),
         }
 
     def cost(self) -> float:
@@ -79,57 +83,57 @@ def motion_replays(
 ) -> tuple[list[MotionReplay], dict[str, str]]:
     """List what can be replayed of imported recordings, and why others cannot."""
     calibration = read_calibration(run)
-    fit = _fit_of(calibration)
+    known_parts = {} if calibration is None else calibration.record
+    arm, fit = known_parts.get(PART) or {}, known_parts.get("physics") or {}
+    if fit.get("method") != METHOD or not fit.get("promoted"):
+        fit = {}
     with_boxes = calibrated(config, calibration, None).physics
     items: list[MotionReplay] = []
     skipped: dict[str, str] = {}
     for name in names:
         try:
-            motion = motion_of(Episode.open(run.episodes_dir / f"{name}.mcap"))
+            episode = Episode.open(run.episodes_dir / f"{name}.mcap")
+            motion = motion_of(episode)
         except GstError as error:
             skipped[name] = str(error)
             continue
         if motion is None:
             continue
-        trajectories: tuple[Trajectory, ...] = ("planned", "executed")
         used = fit if motion.boxes else {}  # a tool alone meets no friction
         angle = used.get("parameters", {}).get("finger_rad", {}).get("value", 0.0)
-        items += [
-            MotionReplay(
-                run_path=run.path.resolve(),
-                episode_id=name,
-                trajectory=trajectory,
-                physics=with_boxes if motion.boxes else config.physics,
-                finger_rad=float(angle),
-                fitted_to=tuple(used.get("fitted_to", ())),
-                calibration_id=calibration.calibration_id if calibration and used else None,
-                force=force,
+        moved = motion_for(arm, episode.info.task)
+        trajectories: dict[Trajectory, Motion | None] = {"planned": moved, "executed": None}
+        for trajectory, known in trajectories.items():
+            if trajectory == "executed" and not motion.boxes:
+                continue
+            fitted = {*used.get("fitted_to", ()), *(arm["fitted_to"] if known else ())}
+            items.append(
+                MotionReplay(
+                    run_path=run.path.resolve(),
+                    episode_id=name,
+                    trajectory=trajectory,
+                    physics=with_boxes if motion.boxes else config.physics,
+                    finger_rad=float(angle),
+                    fitted_to=tuple(sorted(fitted)),
+                    calibration_id=calibration.calibration_id if calibration and fitted else None,
+                    motion=known,
+                    force=force,
+                )
             )
-            for trajectory in (trajectories if motion.boxes else trajectories[:1])
-        ]
     return items, skipped
-
-
-def _fit_of(calibration: Calibration | None) -> Mapping[str, Any]:
-    """The physics part of a calibration, where pushes made it and held-out ones confirmed it."""
-    record = None if calibration is None else calibration.record.get("physics")
-    if not isinstance(record, Mapping) or record.get("method") != METHOD:
-        return {}
-    return record if record.get("promoted") else {}
 
 
 def run_motion_replay(item: MotionReplay) -> dict[str, Any]:
     """Replay, write the episode, and return its row."""
     push = load_push(item.run_path, item.episode_id)
     if push is None:  # the list was made of others
-        message = f"{item.episode_id} is not an imported recording with a script."
-        raise GstError(message)
+        raise GstError(f"{item.episode_id} is not an imported recording with a script.")
     path = item.path(push.sha256)
     kept = path.is_file() and not item.force
     if kept:
         path.touch()  # the newest replay of a trajectory is the one that counts
     else:
-        result = replay_push(push, item.trajectory, item.physics, item.finger_rad)
+        result = replay_push(push, item.trajectory, item.physics, item.finger_rad, item.motion)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         _write(path, item, push, result)

@@ -6,8 +6,9 @@ third, fifth ... identify, the others are held out. docs/real_number.md gives th
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,7 @@ from bridge.errors import GstError
 from bridge.process_pool import Failed, Runner, runner_of
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
-from twin.calibrate.physics.pushes import (
-    Push,
-    UnusablePushError,
-    motion_of,
-    read_push,
-    replay_push,
-)
+from twin.calibrate.physics.pushes import Push, UnusablePushError, motion_of, read_push, replay_push
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
 from twin.robot.hand import Hand
@@ -48,9 +43,7 @@ FEWEST = 3
 LOG_95 = 2 * 1.96
 
 
-@lru_cache(maxsize=4)
-def _hand(urdf: Path, joints: tuple[str, ...], hand_link: str) -> Hand:
-    return Hand(urdf, joints, hand_link)
+_hand = lru_cache(maxsize=4)(Hand)
 
 
 @lru_cache(maxsize=32)
@@ -71,44 +64,26 @@ def frictions(surface: float, hand: float, config: PhysicsConfig) -> PhysicsConf
     return replace(config, surface_friction=surface / own, finger_friction=hand / own)
 
 
-def end_point_error_m(
-    push: Push, config: PhysicsConfig, finger_rad: float
-) -> tuple[float, Float[np.ndarray, "3"]]:
-    """Distance of recorded and replayed end of the box, and the replayed end [m]."""
+def end_point_error_m(push: Push, config: PhysicsConfig, finger_rad: float) -> float:
+    """Distance of recorded and replayed end of the box."""
     result = replay_push(push, "executed", config, finger_rad)
     if result.Ts_world_box is None or push.box_track is None:
-        message = f"{push.episode} has no box."
-        raise UnusablePushError(message)
-    end_m = result.Ts_world_box[-1, :3, 3]
-    return float(np.linalg.norm(end_m - push.box_track.p_m[-1])), end_m
+        raise UnusablePushError(f"{push.episode} has no box.")
+    return float(np.linalg.norm(result.Ts_world_box[-1, :3, 3] - push.box_track.p_m[-1]))
 
 
-@dataclass(frozen=True, kw_only=True)
-class GridRow:
-    """Simulations of one recording that differ in the friction of the hand."""
-
-    run_path: Path
-    episode: str
-    finger_rad: float
-    surface: float
-    hand: tuple[float, ...]
-
-    def cost(self) -> float:
-        """All take about as long."""
-        return 1.0
+Item = tuple[Path, str, float, float]
+"""Run folder, recording, angle of the fingers and friction of the table of a row of the grid."""
 
 
-def errors_of(item: GridRow) -> list[float]:
+def errors_of(item: Item) -> list[float]:
     """End point errors [m], one for each friction of the hand."""
-    push = load_push(item.run_path, item.episode)
+    run_path, episode, finger_rad, surface = item
+    push = load_push(run_path, episode)
     if push is None:
-        message = f"{item.episode} is not an imported push."
-        raise UnusablePushError(message)
-    nominal = PhysicsConfig()
-    return [
-        end_point_error_m(push, frictions(item.surface, hand, nominal), item.finger_rad)[0]
-        for hand in item.hand
-    ]
+        raise UnusablePushError(f"{episode} is not an imported push.")
+    configs = [frictions(surface, hand, PhysicsConfig()) for hand in HAND.tolist()]
+    return [end_point_error_m(push, config, finger_rad) for config in configs]
 
 
 def split(episodes: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -154,19 +129,16 @@ def calibrate_pushes(
     with runner_of(config.workers) as runner:
         grid = _simulate(run, fitted, runner, output)
     best = least(grid, range(len(fitted)))
-    straight = least(grid[:, :1], range(len(fitted)))
     again = resampled(grid, config.seed)
     scores = {
         "nominal": _score(pushes, held_out, PhysicsConfig(), 0.0),
         "calibrated": _score(pushes, held_out, *_point(best)),
-        "fingers_at_zero": _score(pushes, held_out, *_point(straight)),
     }
     record = _record(best, again, scores)
     record |= {
         "fitted_to": fitted,
         "held_out": {"episodes": held_out, **scores},
         "fitted": _score(pushes, fitted, *_point(best)),
-        "fingers_at_zero": _values(straight),
         "sources": {name: {"kind": "push", "sha256": pushes[name].sha256} for name in pushes},
         "skipped": skipped,
         "num_evaluations": int(grid.size),
@@ -175,8 +147,9 @@ def calibrate_pushes(
     return record, str(write_physics(run, record)["calibration_id"])
 
 
-def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
-    found: dict[str, Push] = {}
+def recordings(run: RunFolder) -> tuple[list[Push], dict[str, str]]:
+    """Imported recordings with a script, in name order, and why others cannot be replayed."""
+    found: list[Push] = []
     skipped: dict[str, str] = {}
     for path in run.episodes():
         try:
@@ -184,8 +157,13 @@ def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
         except GstError as error:
             skipped[path.stem] = str(error)
             continue
-        if push is not None and push.T_world_box is not None:
-            found[path.stem] = push
+        found += [] if push is None else [push]
+    return found, skipped
+
+
+def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
+    every, skipped = recordings(run)
+    found = {push.episode: push for push in every if push.T_world_box is not None}
     tasks = sorted({push.task for push in found.values()})
     if len(tasks) > 1:
         message = (
@@ -196,53 +174,34 @@ def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
 
 
 def _simulate(run: RunFolder, fitted: Sequence[str], runner: Runner, output: Output) -> Grid:
-    items = [
-        GridRow(
-            run_path=run.path.resolve(),
-            episode=name,
-            finger_rad=float(finger),
-            surface=float(surface),
-            hand=tuple(HAND.tolist()),
-        )
-        for name in fitted
-        for finger in FINGERS_RAD
-        for surface in SURFACE
-    ]
-    errors: dict[GridRow, list[float]] = {}
+    there = run.path.resolve()
+    items = [(there, *point) for point in product(fitted, FINGERS_RAD.tolist(), SURFACE.tolist())]
+    errors: dict[Item, list[float]] = {}
     with output.progress("physics", len(items)) as advance:
-        for done, (item, answer) in enumerate(runner.run(errors_of, items, GridRow.cost), start=1):
+        answers = runner.run(errors_of, items, lambda _: 1.0)
+        for done, (item, answer) in enumerate(answers, start=1):
             if isinstance(answer, Failed):
                 raise UnusablePushError(answer.message)
             errors[item] = answer
-            advance(done, item.episode)
+            advance(done, item[1])
     shape = (len(fitted), len(FINGERS_RAD), len(SURFACE), len(HAND))
     return np.array([errors[item] for item in items]).reshape(shape)
 
 
-def _values(point: tuple[int, int, int]) -> dict[str, float]:
-    return {
-        "finger_rad": float(FINGERS_RAD[point[0]]),
-        SURFACE_FRICTION: float(SURFACE[point[1]]),
-        FINGER_FRICTION: float(HAND[point[2]]),
-    }
-
-
 def _point(point: tuple[int, int, int]) -> tuple[PhysicsConfig, float]:
-    values = _values(point)
-    config = frictions(values[SURFACE_FRICTION], values[FINGER_FRICTION], PhysicsConfig())
-    return config, values["finger_rad"]
+    config = frictions(float(SURFACE[point[1]]), float(HAND[point[2]]), PhysicsConfig())
+    return config, float(FINGERS_RAD[point[0]])
 
 
 def _score(
     pushes: Mapping[str, Push], names: Sequence[str], config: PhysicsConfig, finger_rad: float
 ) -> dict[str, Any]:
-    errors = {name: end_point_error_m(pushes[name], config, finger_rad)[0] for name in names}
-    values = list(errors.values())
+    errors = {name: end_point_error_m(pushes[name], config, finger_rad) for name in names}
     return {
-        "n": len(values),
-        "end_point_error_median_m": float(np.median(values)),
-        "least_m": min(values),
-        "most_m": max(values),
+        "n": len(errors),
+        "end_point_error_median_m": float(np.median(list(errors.values()))),
+        "least_m": min(errors.values()),
+        "most_m": max(errors.values()),
         "by_episode_m": errors,
     }
 
@@ -305,8 +264,7 @@ def describe_pushes(record: Mapping[str, Any], calibration_id: str) -> str:
     held = record["held_out"]
     rows = [("identifying runs, calibrated", record["fitted"])]
     rows += [
-        (f"held out, {name.replace('_', ' ')}", held[name])
-        for name in ("nominal", "calibrated", "fingers_at_zero")
+        (f"held out, {name.replace('_', ' ')}", held[name]) for name in ("nominal", "calibrated")
     ]
     for label, item in rows:
         lines.append(

@@ -21,6 +21,7 @@ from bridge.episode.topics import TCP_POSE
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.scripted_motion import RECORD_NAME, ScriptedMotion
+from twin.calibrate.motion import Arm, Motion, Seen
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.physics.push import PushWorld
@@ -94,17 +95,19 @@ def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Ha
         topic for topic in episode.topics_of_type(schema.POSE_STAMPED) if topic.endswith(TCP_POSE)
     ]
     if not topics:
-        message = f"{name} in {run.path}: no tool poses (a topic ending with {TCP_POSE})."
-        raise UnusablePushError(message)
+        raise UnusablePushError(
+            f"{name} in {run.path}: no tool poses (a topic ending with {TCP_POSE})."
+        )
     tool = pose_track(episode, topics[0])
     gap_s = float(np.diff(tool.stamps_ns).max(initial=0)) / NS_PER_S
     if gap_s > LONGEST_GAP_S:
-        message = f"{name} in {run.path}: the tool is lost for {gap_s:.2f} s."
-        raise UnusablePushError(message)
+        raise UnusablePushError(f"{name} in {run.path}: the tool is lost for {gap_s:.2f} s.")
     if len(motion.boxes) > 1:
-        message = f"{name} in {run.path}: {len(motion.boxes)} boxes; one can be replayed."
-        raise UnusablePushError(message)
-    T_world_hand = _world_hand(motion, hand, np.zeros(len(motion.joints)))
+        raise UnusablePushError(
+            f"{name} in {run.path}: {len(motion.boxes)} boxes; one can be replayed."
+        )
+    T_world_hand = hand.T_base_hand(np.zeros(len(motion.joints)))
+    T_world_hand[:3, 3] += motion.base_m
     push = Push(
         episode=name,
         sha256=episode.sha256(),
@@ -121,8 +124,7 @@ def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Ha
 def _with_box(push: Push, episode: Episode, box: str) -> Push:
     topic = object_pose_topics(episode).get(box)
     if topic is None:
-        message = f"{push.episode}: no poses of {box!r} were recorded."
-        raise UnusablePushError(message)
+        raise UnusablePushError(f"{push.episode}: no poses of {box!r} were recorded.")
     track = pose_track(episode, topic)
     T = rest_pose(track)
     heading = np.arctan2(T[1, 0], T[0, 0])
@@ -135,8 +137,9 @@ def rest_pose(track: PoseTrajectory) -> Float[np.ndarray, "4 4"]:
     t_s = (track.stamps_ns - track.stamps_ns[0]) / NS_PER_S
     there = (t_s >= REST_S[0]) & (t_s <= REST_S[1])
     if not there.any():
-        message = f"no pose from {REST_S[0]} s to {REST_S[1]} s after the start of a recording."
-        raise UnusablePushError(message)
+        raise UnusablePushError(
+            f"no pose from {REST_S[0]} s to {REST_S[1]} s after the start of a recording."
+        )
     Ts = track.transforms()[there]
     T = np.eye(4)
     T[:3, 3] = np.median(Ts[:, :3, 3], axis=0)
@@ -144,39 +147,67 @@ def rest_pose(track: PoseTrajectory) -> Float[np.ndarray, "4 4"]:
     return T
 
 
+def arm_of(push: Push) -> Arm:
+    """What the description says of a recording's arm."""
+    return Arm(push.motion.joints, push.hand.T_base_hand, push.hand.gravity_nm)
+
+
+def seen_of(push: Push) -> Seen:
+    """Schedule and measured tool, both from the start of the recording."""
+    seen_s = (push.tool.stamps_ns - push.tool.stamps_ns[0]) / NS_PER_S
+    return Seen(push.episode, *push.motion.joint_path_rad(), seen_s, push.tool.transforms())
+
+
+def described(push: Push) -> Motion:
+    """The arm as it is described, with the tool as it is held at the start."""
+    nothing, base = np.zeros(len(push.motion.joints)), np.eye(4)
+    base[:3, 3] = push.motion.base_m
+    return Motion(
+        T_frame_base=base,
+        T_hand_tool=push.T_hand_tool,
+        zeros_rad=nothing,
+        compliance_rad_nm=nothing,
+        delay_s=0.0,
+    )
+
+
 def replay_push(
     push: Push,
     trajectory: Trajectory,
     config: PhysicsConfig,
     finger_rad: float = 0.0,
+    motion: Motion | None = None,
 ) -> PushResult:
     """Let the hand follow a trajectory and the box go where it is pushed.
 
     Args:
         trajectory: ``executed``: the measured tool; ``planned``: the joint schedule.
+        motion: The arm that follows the schedule; as described where None.
     """
-    stamps_ns, Ts_world_hand = hand_path(push, trajectory, config.rate_hz)
+    known = described(push) if motion is None or trajectory == "executed" else motion
+    stamps_ns, Ts_world_hand = hand_path(push, trajectory, config.rate_hz, known)
     Ts_world_box = None
     if push.T_world_box is not None:
-        Ts_world_box = _push_box(push, Ts_world_hand, config, push.hand.hulls_m(finger_rad))
+        hulls_m, T_start = push.hand.hulls_m(finger_rad), push.T_world_box
+        Ts_world_box = _push_box(push, T_start, Ts_world_hand, config, hulls_m)
     kept = np.unique(np.append(np.arange(0, len(stamps_ns), STATE_EVERY), len(stamps_ns) - 1))
     return PushResult(
         stamps_ns=stamps_ns[kept],
-        Ts_world_tool=Ts_world_hand[kept] @ push.T_hand_tool,
+        Ts_world_tool=Ts_world_hand[kept] @ known.T_hand_tool,
         Ts_world_box=None if Ts_world_box is None else Ts_world_box[kept],
     )
 
 
 def hand_path(
-    push: Push, trajectory: Trajectory, rate_hz: int
+    push: Push, trajectory: Trajectory, rate_hz: int, known: Motion
 ) -> tuple[Int[np.ndarray, " num_steps"], Float[np.ndarray, "num_steps 4 4"]]:
     """Where the hand link is at every physics step, world frame."""
     first_ns = int(push.tool.stamps_ns[0])
     if trajectory == "planned":
-        times_s, joints_rad = push.motion.joint_path_rad()
-        at_s = np.arange(round(times_s[-1] * rate_hz) + 1) / rate_hz
-        path = np.stack([np.interp(at_s, times_s, column) for column in joints_rad.T], axis=1)
-        Ts = np.stack([_world_hand(push.motion, push.hand, row) for row in path])
+        told = seen_of(push)
+        whole_s = told.times_s[-1] + max(0.0, known.delay_s)
+        at_s = np.arange(round(whole_s * rate_hz) + 1) / rate_hz
+        Ts = known.Ts_frame_hand(arm_of(push), told.joints_at(at_s, known.delay_s))
         return first_ns + np.rint(at_s * NS_PER_S).astype(np.int64), Ts
     last_ns = int(push.tool.stamps_ns[-1])
     count = round((last_ns - first_ns) / NS_PER_S * rate_hz)
@@ -191,25 +222,14 @@ def hand_path(
     return stamps_ns, np.asarray(Ts_world_tool @ se3.invert(push.T_hand_tool))
 
 
-def _world_hand(
-    motion: ScriptedMotion, hand: Hand, joints_rad: Float[np.ndarray, " num_joints"]
-) -> Float[np.ndarray, "4 4"]:
-    T = hand.T_base_hand(joints_rad)
-    T[:3, 3] += motion.base_m
-    return T
-
-
 def _push_box(
     push: Push,
+    T_start: Float[np.ndarray, "4 4"],
     Ts_world_hand: Float[np.ndarray, "num_steps 4 4"],
     config: PhysicsConfig,
     hulls_m: list[Float[np.ndarray, "num_points 3"]],
 ) -> Float[np.ndarray, "num_steps 4 4"]:
     box = push.motion.boxes[push.box]
-    T_start = push.T_world_box
-    if T_start is None:  # for the type checker: there is a box
-        message = f"{push.episode}: no box."
-        raise UnusablePushError(message)
     size_m = np.array(box.size_m)
     velocity = np.diff(Ts_world_hand[:, :3, 3], axis=0) * config.rate_hz
     R = Ts_world_hand[:, :3, :3]

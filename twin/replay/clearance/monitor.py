@@ -471,11 +471,7 @@ class ClearanceMonitor:
             start, least = t_ns, distance
         stretches.append(
             Contact(
-                start_ns=start,
-                end_ns=t_ns,
-                bodies=bodies,
-                allowed=may_touch,
-                min_distance_m=least,
+                start_ns=start, end_ns=t_ns, bodies=bodies, allowed=may_touch, min_distance_m=least
             )
         )
 

@@ -123,9 +123,7 @@ def _window(
     low = np.floor((T[:3, 3] - reach - grid.origin_m) / grid.voxel_m).astype(int)
     high = np.ceil((T[:3, 3] + reach - grid.origin_m) / grid.voxel_m).astype(int) + 1
     ends = zip(
-        np.maximum(low, 0).tolist(),
-        np.clip(high, 0, grid.values_m.shape).tolist(),
-        strict=True,
+        np.maximum(low, 0).tolist(), np.clip(high, 0, grid.values_m.shape).tolist(), strict=True
     )
     x, y, z = (slice(a, max(a, b)) for a, b in ends)
     return x, y, z

@@ -138,9 +138,9 @@ def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
     return _store(run, {**kept, "physics": current, "physics_history": history})
 
 
-def write_posterior(run: RunFolder, posterior: Mapping[str, Any]) -> dict[str, Any]:
-    """Write what the run's trials say of what nobody measured; an earlier posterior is replaced."""
-    return _store(run, {**_kept(run), "posterior": posterior})
+def write_part(run: RunFolder, name: str, part: Mapping[str, Any]) -> dict[str, Any]:
+    """Write the ``posterior`` of trials or the ``motion`` of an arm; an earlier one is replaced."""
+    return _store(run, {**_kept(run), name: part})
 
 
 def _kept(run: RunFolder) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """A made arm with a palm and a finger, and recordings of boxes that it pushes."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,19 +82,26 @@ def write_recording(
     motion: ScriptedMotion | None = MOTION,
 ) -> Path:
     """The tracked tool, and a box that is at its start and, in the end, at its end."""
-    t_s, x = hand_x_m(speed_m_s)
-    stamps = np.rint(t_s * 1e9).astype(np.int64)
+    _, x = hand_x_m(speed_m_s)
     tool = np.tile(np.eye(4), (len(x), 1, 1))
     tool[:, :3, 3] = np.stack([x, 0 * x, 0 * x + 0.03], axis=1) + MARKER_M
     cube = np.tile(np.eye(4), (len(x), 1, 1))
     cube[:, :3, 3] = [BOX_X_M, 0.0, 0.03]
     cube[-1, 0, 3] = box_end_x_m
+    tracks = {"/lab/tcp/pose": tool} | ({"/lab/object/cube/pose": cube} if box else {})
+    return write_tracks(run, name, tracks, motion)
+
+
+def write_tracks(
+    run: RunFolder, name: str, tracks: dict[str, np.ndarray], motion: ScriptedMotion | None
+) -> Path:
+    """Poses at 100 Hz as an imported episode."""
     path = run.episodes_dir / f"{name}.mcap"
     path.unlink(missing_ok=True)
-    tracks = {"/lab/tcp/pose": tool} | ({"/lab/object/cube/pose": cube} if box else {})
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id=name, kind="imported", task="push", cell="lab"))
         for topic, Ts in tracks.items():
+            stamps = np.arange(len(Ts)) * 10_000_000
             for stamp_ns, data in zip(
                 stamps.tolist(), pose_messages(stamps, "world", Ts), strict=True
             ):
@@ -101,6 +109,27 @@ def write_recording(
         if motion is not None:
             writer.add_metadata(RECORD_NAME, motion.to_record())
     return path
+
+
+TURNING = replace(MOTION, targets=(JointTarget(t_s=0.0, joints_rad={"turn": 0.9}),), boxes={})
+DELAY_S, TIP_RAD = 0.45, 0.04
+BASE_M = np.array([0.02, -0.015, 0.01])
+
+
+def write_turning(run: RunFolder, name: str, seed: int) -> None:
+    """The hand turns late about an axis that stands askew, 27 mm off; seen with noise of 0.3 mm."""
+    at_s = np.arange(250) / 100
+    turns = np.clip(0.5 * (at_s - DELAY_S), 0.0, 0.9)  # as the speed's limit has it
+    c, s, one = np.cos(turns), np.sin(turns), np.ones_like(turns)
+    tool = np.tile(np.eye(4), (len(turns), 1, 1))
+    tool[:, :2, :2] = np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0)
+    x, y, z = MARKER_M
+    tool[:, :3, 3] = np.stack([c * x - s * y - 0.3, s * x + c * y, (0.03 + z) * one], axis=1)
+    askew = np.eye(4)
+    askew[:3, :3], askew[:3, 3] = turned_about_y(TIP_RAD), BASE_M
+    tool = askew @ tool
+    tool[:, :3, 3] += np.random.default_rng(seed).normal(scale=3e-4, size=(len(turns), 3))
+    write_tracks(run, name, {"/lab/tcp/pose": tool}, TURNING)
 
 
 def turned_about_y(rad: float) -> Float[np.ndarray, "3 3"]:

@@ -1,9 +1,11 @@
 """Replays of imported recordings that have no plan: files, provenance, what is skipped."""
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bridge.episode.reader import Episode
@@ -11,6 +13,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import pose_track
 from bridge.terminal import Output
 from evaluator.compare import compare_run
+from twin.calibrate.config import CalibrateConfig
+from twin.calibrate.physics.arm_motion import calibrate_imported
 from twin.calibrate.physics.imported import ENGINE, replay_imported
 from twin.calibrate.physics.push_fit import METHOD, frictions, load_push
 from twin.physics.config import PhysicsConfig
@@ -23,6 +27,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import pushed_boxes
 
 QUIET = Output(quiet=True)
+TOOL = "/lab/tcp/pose"
 
 
 @pytest.fixture
@@ -105,6 +110,31 @@ def test_a_calibration_by_pushes_is_used_and_its_runs_do_not_count(run: RunFolde
     nominal = comparison.results().get(f"body.push.{ENGINE}_executed.cube.end_point_median_m")
     assert nominal.n == 2
     assert [e.episode for e in comparison.exclusions if "fitted" in e.reason] == ["push_0001"] * 2
+
+
+def test_planned_replays_follow_the_arm_as_it_was_seen_to_move(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    pushed_boxes.write_robot(run)
+    for number in range(1, 5):
+        pushed_boxes.write_turning(run, f"turn_{number}", number)
+    nominal = [Path(row["path"]) for row in replay(run)["imported"]]
+    record, words = calibrate_imported(run, CalibrateConfig(physics=True), QUIET)
+    assert record["motion"]["delay_s"]["push"] == pytest.approx(pushed_boxes.DELAY_S, abs=0.02)
+    assert "physics" not in record
+    assert "friction: 0 pushes" in words
+    assert re.search(r"zero of turn .* not determined: only together with (base|tool)", words)
+    rows = replay(run)["imported"]
+    for row, before in zip(rows, nominal, strict=True):
+        recorded = pose_track(Episode.open(run.episodes_dir / f"{row['episode']}.mcap"), TOOL)
+        ends = [
+            float(np.linalg.norm(pose_track(Episode.open(path), TOOL).p_m[-1] - recorded.p_m[-1]))
+            for path in (before, Path(row["path"]))
+        ]
+        assert ends[0] > 0.004  # though its tool is laid over the recorded one at the start
+        assert ends[1] < 0.0015
+    derived = Episode.open(Path(rows[1]["path"])).derived
+    assert derived.settings["fitted_to"] == ["turn_1", "turn_3"]
+    assert derived.calibration_id == record["calibration_id"]
 
 
 def test_a_robot_that_is_gone_is_named_and_the_rest_goes_on(run: RunFolder) -> None:

@@ -22,7 +22,12 @@ from twin.calibrate.physics.push_fit import (
     resampled,
     split,
 )
-from twin.calibrate.physics.pushes import UnusablePushError, hand_path, replay_push
+from twin.calibrate.physics.pushes import (
+    UnusablePushError,
+    described,
+    hand_path,
+    replay_push,
+)
 from twin.physics.config import PhysicsConfig
 from twin.physics.push import PushWorld
 from twin.robot.hand import Hand
@@ -107,12 +112,12 @@ def test_the_marker_is_where_it_was_at_the_start(run: RunFolder) -> None:
     pushed_boxes.write_recording(run, "push_0001", 0.3)
     push = load(run)
     np.testing.assert_allclose(push.T_hand_tool[:3, 3], pushed_boxes.MARKER_M, atol=1e-9)
-    stamps, Ts = hand_path(push, "executed", 240)
+    stamps, Ts = hand_path(push, "executed", 240, described(push))
     t_s, x = pushed_boxes.hand_x_m(0.3)
     # Smoothing by 20 ms rounds the corners of the way and nothing else.
     np.testing.assert_allclose(Ts[:, 0, 3], np.interp(stamps * 1e-9, t_s, x), atol=0.003)
     np.testing.assert_allclose(Ts[:, 1:3, 3], [[0.0, 0.03]] * len(Ts), atol=1e-9)
-    _, planned = hand_path(push, "planned", 240)
+    _, planned = hand_path(push, "planned", 240, described(push))
     np.testing.assert_allclose(planned[:, :3, :3], [np.eye(3)] * len(planned), atol=1e-12)
     np.testing.assert_allclose(planned[:, :3, 3], [[-0.3, 0.0, 0.03]] * len(planned), atol=1e-12)
 

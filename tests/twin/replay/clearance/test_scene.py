@@ -48,10 +48,7 @@ def static_of(*boxes: Box, table_m: float | None = 0.0, left_m: float = 0.3) -> 
     grid = SdfGrid(
         values_m=distances_of_solid(solid, VOXEL_M), origin_m=origin, voxel_m=VOXEL_M, closed=False
     )
-    return StaticSdf(
-        conservative=grid,
-        observed=grid,
-    )
+    return StaticSdf(conservative=grid, observed=grid)
 
 
 POST: Box = ((0.62, -0.3, 0.16), (0.048, 0.048, 0.32))
@@ -143,9 +140,7 @@ def test_taking_a_container_out_leaves_distances_that_are_never_too_large() -> N
     assert np.abs(local.values_m - full.values_m)[close & (full.values_m > 0)].max() < 2 * VOXEL_M
 
 
-def test_no_point_of_a_hull_is_farther_from_its_tree_than_is_subtracted(
-    hulls: RobotHulls,
-) -> None:
+def test_no_point_of_a_hull_is_farther_from_its_tree_than_is_subtracted(hulls: RobotHulls) -> None:
     from scipy.spatial import ConvexHull, cKDTree
 
     rng = np.random.default_rng(5)

@@ -13,12 +13,7 @@ from bridge.robots.default import ROBOT, ROBOT_NAME
 from bridge.task.plan import Plan, Waypoint
 from twin.replay.config import ReplayConfig
 from twin.replay.motion import motion_failures
-from twin.replay.path import (
-    UnusablePlanError,
-    check_path,
-    check_usable,
-    path_of_plan,
-)
+from twin.replay.path import UnusablePlanError, check_path, check_usable, path_of_plan
 from twin.replay.verdict import replay_plan
 from twin.robot.collision import RobotHulls, hulls_of
 from twin.robot.model import RobotDescriptionError, RobotModel, load_robot

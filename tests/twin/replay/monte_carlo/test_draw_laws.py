@@ -49,9 +49,7 @@ def test_correlated_errors_are_drawn_with_their_correlation(script: SimpleNamesp
     root = np.random.default_rng(1).normal(size=(6, 6)) * 1e-2
     covariance = root @ root.T
     scene = replace(
-        scene,
-        Ts_base_object={**scene.Ts_base_object, "cube": T},
-        covariances={"cube": covariance},
+        scene, Ts_base_object={**scene.Ts_base_object, "cube": T}, covariances={"cube": covariance}
     )
     steps = []
     for draw in draws(scene, 2000):

@@ -121,9 +121,7 @@ def test_without_a_covariance_the_prior_says_how_unsure_a_pose_is(script: Simple
     assert np.std(moved[:, 0, 3]) == pytest.approx(UNKNOWN_POSE_M, rel=0.2)
 
 
-def test_physics_is_log_normal_around_what_the_nominal_replay_uses(
-    script: SimpleNamespace,
-) -> None:
+def test_physics_is_log_normal_around_what_the_nominal_replay_uses(script: SimpleNamespace) -> None:
     scene = scene_with(script)
     found = draws(scene, 600)
     frictions = np.log([draw.physics.object_friction / 0.8 for draw in found])
@@ -238,9 +236,7 @@ def test_a_variation_that_cannot_be_replayed_costs_only_itself(script: SimpleNam
     assert samples[1].reason == "the cube lies inside the box"
 
 
-def test_a_late_gripper_lags_behind_the_arm(
-    script: SimpleNamespace,
-) -> None:
+def test_a_late_gripper_lags_behind_the_arm(script: SimpleNamespace) -> None:
     scene = script.scene()
     path, _, _ = path_of_plan(script.plan(scene), load_robot(scene.urdf))
     late = path.with_late_gripper(0.2)

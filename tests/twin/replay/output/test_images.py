@@ -80,13 +80,7 @@ def pictures(
     """Images by camera and stamp, 0..1."""
     found: dict[str, dict[int, np.ndarray]] = {}
     for camera_id, image in render_replay(
-        run,
-        episode,
-        result,
-        scene,
-        start_ns=T0,
-        executed=executed,
-        planned=planned,
+        run, episode, result, scene, start_ns=T0, executed=executed, planned=planned
     ):
         found.setdefault(camera_id, {})[image.stamp_ns - T0] = decode_color(image.data) / 255.0
     return found

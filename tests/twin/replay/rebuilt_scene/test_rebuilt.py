@@ -95,10 +95,9 @@ def write_distances(run: RunFolder, observed_m: float) -> None:
     grid = SdfGrid(values_m=values, origin_m=np.zeros(3), voxel_m=0.1, closed=False)
     observed = values.copy()
     observed[1, 1, 1] = observed_m
-    StaticSdf(
-        conservative=grid,
-        observed=replace(grid, values_m=observed),
-    ).save(run.scene_dir / "sdf.npz")
+    StaticSdf(conservative=grid, observed=replace(grid, values_m=observed)).save(
+        run.scene_dir / "sdf.npz"
+    )
 
 
 def test_distances_that_cannot_be_read_are_no_free_way(run: RunFolder) -> None:

@@ -41,11 +41,7 @@ LABELS = {"a": "success", "b": "failure", "c": "unknown"}
 
 
 def summary() -> dict[str, Any]:
-    return {
-        "rows": ROWS,
-        "counts": count_verdicts(ROWS),
-        "executions": executions_of(ROWS, LABELS),
-    }
+    return {"rows": ROWS, "counts": count_verdicts(ROWS), "executions": executions_of(ROWS, LABELS)}
 
 
 def test_an_executed_plan_has_one_line_with_every_side() -> None:

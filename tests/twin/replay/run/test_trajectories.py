@@ -235,9 +235,7 @@ def test_what_the_scene_lacks_is_said_once_for_all_replays(
     assert said.count("cube_into_box: the scene has no sdf.npz: only the table") == 1
 
 
-def test_distances_that_cannot_be_read_leave_everything_not_evaluated(
-    run: RunFolder,
-) -> None:
+def test_distances_that_cannot_be_read_leave_everything_not_evaluated(run: RunFolder) -> None:
     write_scene(run)
     (run.scene_dir / "sdf.npz").write_bytes(b"no arrays")
     summary = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)

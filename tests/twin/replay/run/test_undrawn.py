@@ -23,9 +23,7 @@ def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(tmp_pa
         replay_run(run, ReplayRunConfig(render=True), Output(quiet=True))
 
 
-def test_what_was_not_scanned_and_a_missing_robot_are_named_with_the_reason(
-    tmp_path: Path,
-) -> None:
+def test_what_was_not_scanned_and_a_missing_robot_are_named_with_the_reason(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
     run.scene_dir.mkdir()
     record = {

@@ -123,10 +123,7 @@ def test_what_was_executed_is_replayed_and_nothing_is_said_to_be_planned(
     summary = replay_run(folder, QUICK, QUIET)
     assert {
         (row["plan"], row["trajectory"], row["mode"]): row["accepted"] for row in summary["rows"]
-    } == {
-        (NO_PLAN, "executed", "dynamic"): True,
-        (NO_PLAN, "executed", "kinematic"): None,
-    }
+    } == {(NO_PLAN, "executed", "dynamic"): True, (NO_PLAN, "executed", "kinematic"): None}
     assert summary["against_recorded"]["cube_into_box"]["agreement"]["executed in twin"] == {
         "k": 1,
         "n": 1,

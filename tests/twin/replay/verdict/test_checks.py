@@ -9,11 +9,7 @@ import pytest
 from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.task.plan import Plan, Stage
 from bridge.task.verdict import Factor, Verdict
-from twin.replay.checks import (
-    limited_to_task,
-    simulated_limit_failures,
-    task_failures,
-)
+from twin.replay.checks import limited_to_task, simulated_limit_failures, task_failures
 from twin.replay.config import ReplayConfig
 from twin.replay.dynamics import States
 from twin.replay.motion import motion_failures

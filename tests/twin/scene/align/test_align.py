@@ -10,11 +10,7 @@ from bridge.geometry import se3
 from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface, sample_surface
 from twin.scene.align import align
-from twin.scene.align.align import (
-    RobotNotAlignedError,
-    align_robot,
-    depth_errors,
-)
+from twin.scene.align.align import RobotNotAlignedError, align_robot, depth_errors
 from twin.scene.align.refine import FINE, ScenePose, refine
 from twin.scene.align.view import RobotView, find_planes
 

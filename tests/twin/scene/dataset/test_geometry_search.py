@@ -9,11 +9,7 @@ import textured_room
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
-from twin.scene.dataset.geometry_search import (
-    WrongGeometryError,
-    check_geometry,
-    search_geometry,
-)
+from twin.scene.dataset.geometry_search import WrongGeometryError, check_geometry, search_geometry
 from twin.scene.dataset.scan_check import CameraCheck, check_scan
 from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
 from twin.scene.frames.selection import FrameChoice, choose_frames, find_sources, load

@@ -107,8 +107,7 @@ def test_what_a_mask_hides_does_not_matter(room: Room) -> None:
     )
     np.testing.assert_array_equal(clean.colors, other.colors)
     np.testing.assert_array_equal(
-        solve_gains(cloud, observations, rasteriser()),
-        solve_gains(cloud, spoilt, rasteriser()),
+        solve_gains(cloud, observations, rasteriser()), solve_gains(cloud, spoilt, rasteriser())
     )
 
 

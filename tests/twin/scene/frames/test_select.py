@@ -41,13 +41,7 @@ def test_the_sharpest_of_the_still_frames_of_a_stretch_is_taken() -> None:
 def test_a_frame_much_blurrier_than_its_neighbours_is_left_out() -> None:
     stamps = np.arange(12)
     values = {int(s): 1.0 if s == 5 else 10.0 for s in stamps}
-    picked = selection.pick(
-        stamps,
-        np.linspace(0, 1, 12),
-        np.zeros(12),
-        20,
-        rated(values),
-    )
+    picked = selection.pick(stamps, np.linspace(0, 1, 12), np.zeros(12), 20, rated(values))
     assert picked.tolist() == [s for s in range(12) if s != 5]
 
 

@@ -8,12 +8,7 @@ from hypothesis import strategies as st
 
 from bridge.task.task_file import load_task
 from twin.scene.localise.objects import fit_table
-from twin.scene.localise.points import (
-    clusters,
-    likeness,
-    linear_image,
-    voxel_mean,
-)
+from twin.scene.localise.points import clusters, likeness, linear_image, voxel_mean
 from twin.scene.shape.known import pose_of, rectangle_yaw_rad, surface_distances
 
 TASK = load_task("cube_into_box")

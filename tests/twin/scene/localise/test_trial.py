@@ -27,10 +27,7 @@ POSES = {
     "block": pose_of(np.array([0.50, 0.10, 0.025, 0.2])),
 }
 CAMERA = Camera(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
-EYES = (
-    ("side", (1.1, -0.4, 0.6), (0.45, 0.0, 0.0)),
-    ("wrist", (0.3, 0.0, 0.6), (0.5, 0.02, 0.0)),
-)
+EYES = (("side", (1.1, -0.4, 0.6), (0.45, 0.0, 0.0)), ("wrist", (0.3, 0.0, 0.6), (0.5, 0.02, 0.0)))
 
 
 def cloud_of(points: np.ndarray, color: tuple[float, float, float]) -> GaussianCloud:

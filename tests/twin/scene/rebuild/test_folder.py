@@ -146,9 +146,7 @@ def test_objects_are_not_cut_out_of_a_scene_in_a_frame_of_its_own(
     assert not apart.by_episode
 
 
-def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(
-    tmp_path: Path,
-) -> None:
+def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(tmp_path: Path) -> None:
     """Other recorders put the time of receiving where ours puts the source's."""
     run = RunFolder.create(tmp_path / "run")
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9, sent_late_ns=7_000)

@@ -98,11 +98,7 @@ def box(
     mesh = open3d.geometry.TriangleMesh.create_box(*size)
     vertices = np.asarray(mesh.vertices) - np.array(size) / 2
     turn = np.array(
-        [
-            [np.cos(yaw_rad), -np.sin(yaw_rad), 0],
-            [np.sin(yaw_rad), np.cos(yaw_rad), 0],
-            [0, 0, 1],
-        ]
+        [[np.cos(yaw_rad), -np.sin(yaw_rad), 0], [np.sin(yaw_rad), np.cos(yaw_rad), 0], [0, 0, 1]]
     )
     faces = np.asarray(mesh.triangles)
     return Piece(instance, part, color, vertices @ turn.T + np.array(centre), faces)

@@ -74,10 +74,7 @@ def test_names_say_what_parts_to_look_for(
 def scene(tabletop: World) -> SemanticScene:
     truth = tabletop.true_instances()
     number = {name: key for key, name in tabletop.names.items()}
-    known = {
-        "tub": truth == number["blue open container"],
-        "cube_7": truth == number["red cube"],
-    }
+    known = {"tub": truth == number["blue open container"], "cube_7": truth == number["red cube"]}
     return scene_by_default(
         tabletop.cloud,
         [shot.viewpoint for shot in tabletop.train[:2]],

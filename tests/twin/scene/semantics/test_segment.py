@@ -8,11 +8,7 @@ from twin.scene.semantics import segment as segmenter
 from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.describe import scene_by_default
 from twin.scene.semantics.lift import render_labels
-from twin.scene.semantics.segment import (
-    Segmentation,
-    points_of,
-    segment,
-)
+from twin.scene.semantics.segment import Segmentation, points_of, segment
 
 
 def segmented(pieces: list[table_scene.Piece], num: int = 8) -> tuple[World, Segmentation]:
