@@ -107,10 +107,9 @@ def _environment() -> Environment:
         wording.answer_tone,
         wording.length_text,
         wording.breakable,
-        minus,
     ):
         environment.filters[function.__name__] = function
-    environment.filters["quoted"] = lambda path: shlex.quote(str(path))
+    environment.filters |= {"minus": minus, "quoted": lambda path: shlex.quote(str(path))}
     environment.globals["link"] = link
     environment.globals["share"] = share_link
     environment.globals["SHOW"] = SHOW

@@ -38,12 +38,7 @@ def trial_lanes(
     failure_t_s: float | None,
     failed: Collection[str] = (),
 ) -> StageChart | None:
-    """Draw stages, touches and divergences, and marks for failure, replanning and divergence.
-
-    Args:
-        failure_t_s: Page time of the first failure in the twin [s]; None marks none.
-        failed: Stages that failed as recorded.
-    """
+    """Draw stages, touches, divergences; marks at replanning and the twin's failure (page time)."""
     marks = [(each.t_s, f"replan: {each.reason}", "replan") for each in replans(recording, clock)]
     if failure_t_s is not None:
         marks.append((failure_t_s, "first failure in the twin", "failure"))
@@ -164,8 +159,8 @@ def _recorded_stages(recording: Recording, clock: PageClock, failed: Collection[
             begun[stage_id] = clock.seconds(event["stamp_ns"])
         elif event["type"] == "stage_ended" and stage_id in begun:
             start, end = begun.pop(stage_id), clock.seconds(event["stamp_ns"])
-            style, label = f"stage-{order.get(stage_id, 0) % 4}", stage_id
+            label, style = stage_id, f"stage-{order.get(stage_id, 0) % 4}"
             if stage_id in failed:
-                style, label = "apart", f"✗ {stage_id}"
+                label, style = f"✗ {stage_id}", "apart"
             spans.append(Span(start_s=start, end_s=end, label=label, style=style))
     return spans

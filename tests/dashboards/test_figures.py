@@ -83,15 +83,9 @@ def rate(value: float, side: str) -> Measurement:
 
 def group(replayed: float, recorded: float) -> figures.RateGroup:
     return figures.RateGroup(
-        label="a",
-        series="a",
-        task="a",
-        condition="with_replanning",
-        policy="",
-        filled=True,
-        replayed=rate(replayed, "sim_planned"),
-        recorded=rate(recorded, "recorded"),
-    )
+        label="a", series="a", task="a", condition="with_replanning", policy="", filled=True,
+        replayed=rate(replayed, "sim_planned"), recorded=rate(recorded, "recorded"),
+    )  # fmt: skip
 
 
 def test_groups_in_agreement_lie_on_the_identity_line_also_two_alike() -> None:

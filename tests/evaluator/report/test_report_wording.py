@@ -23,15 +23,9 @@ def measurement(name: str, value: float, unit: str, low: float, high: float) -> 
     interval = Interval(low=low, high=high, level=0.95, method="wilson")
     k, n = (5, 6) if unit == "1" else (None, 6)
     return Measurement(
-        id=name,
-        value=value,
-        unit=unit,
-        definition="d",
-        interval=interval,
-        k=k,
-        n=n,
+        id=name, value=value, unit=unit, definition="d", interval=interval, k=k, n=n,
         counted="group",
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,6 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     sessions: tuple[WireSession, WireSession],
 ) -> None:
     router, cell = sessions
-    perception, config = LiveView("lab"), GateConfig(cell="lab", frame_wait_s=3.0, deadline_s=10.0)
     seen: dict[str, Any] = {}
 
     def localise(frames: Any, task: Any, ends_s: float) -> dict[str, Any]:
@@ -121,16 +120,7 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     def replay(plan: Plan, *_: Any) -> Verdict:
         return replace(accept(plan), terminal=Factor(value=False, cause="inside"))
 
-    gate = Gate(
-        tasks=JUDGED,
-        config=config,
-        perception=perception,
-        localise=localise,
-        replay=replay,
-        now_ns=router.now_ns,
-    )
-    watch_cell(router, "lab", perception.take)
-    serve_gate(router, gate, perception, config, Output(quiet=True))
+    a_gate(router, LiveView("lab"), replay, localise)
     published: list[Any] = []
     cell.subscribe("lab/verdict", published.append)
     publish_one_frame(cell)
@@ -160,13 +150,9 @@ def a_gate(
     """Serve a gate whose cell has shown itself."""
     config = GateConfig(**{"cell": "lab", "frame_wait_s": 3.0, "deadline_s": 10.0, **settings})
     gate = Gate(
-        tasks=JUDGED,
-        config=config,
-        perception=perception,
-        localise=found,
-        replay=replay,
+        tasks=JUDGED, config=config, perception=perception, localise=found, replay=replay,
         now_ns=router.now_ns,
-    )
+    )  # fmt: skip
     watch_cell(router, "lab", perception.take)
     serve_gate(router, gate, perception, config, Output(quiet=True))
 
