@@ -41,7 +41,7 @@ POLL_S = 0.02
 """The writer looks for messages this often rather than being woken by each."""
 IDLE_POLL_S = 0.1
 BARRIER_POLL_S = 0.002
-SECOND_S = 1.0
+SECOND_S, LOOK_S = 1.0, 0.1  # LOOK_S: how often the free space is asked for
 MAX_NEWS = 1000
 LAST_IMAGES_S = 2.0
 """How long a failed disk waits for images in the encoders, to count them."""
@@ -85,7 +85,7 @@ class Recorder:
             run, self.config, self.input_queue, self._life, now_ns, self.presence.status
         )
         self._steps = StepWatch(now_ns, wall_ns=wall_ns)
-        self._next_second_s = 0.0
+        self._next_second_s = self._next_look_s = 0.0
         if self._life.is_quiet:
             self.input_queue.be_quiet(0)
         self._thread = threading.Thread(target=self._work, name="episode writer", daemon=True)
@@ -418,12 +418,11 @@ class Recorder:
                 told = news.data
                 if "topics" not in told or not self.clocks.has_named(told["topics"], told["by_ns"]):
                     self.note(news)
-            if not self._life.may_ask_disk:
-                return
-            if happened := self._life.look_at_file():
+            if self._life.may_ask_disk and (happened := self._life.look_at_file()):
                 self.note(News(text=happened, data={"kind": "file_removed"}))
-            cause = self._life.look_at_disk()
-            if cause and not self._status.failing:
+        if now_s >= self._next_look_s and self._life.may_ask_disk:
+            self._next_look_s = now_s + LOOK_S
+            if (cause := self._life.look_at_disk()) and not self._status.failing:
                 self._end_because(cause)
 
     def _end_because(self, cause: str) -> None:

@@ -47,7 +47,7 @@ def read(folder: Path, text: str, urdf: str = URDF) -> Robot:
         (ARM + "position_rad = [[1.0, -1.0]]\n", "position_rad must hold"),
         (ARM + "may_overlap = [['a']]\n", "array. of length 2, got 1"),
         (ARM.replace('"j6"', '"j6", "j7", "j8"'), "joints lists 8"),
-        (ARM.replace(', "j6"', ""), "joints lists 5"),
+        (ARM.replace(', "j5", "j6"', ""), "joints lists 4"),
         (ARM.replace('"j6"', "6"), "Expected .str., got .int."),
         (ARM + GRIPPER.replace("max_width_m = 0.1", "fingers = [{ joint = 'a' }]"), "max_width_m"),
         (ARM + GRIPPER + "fingers = [{ joint = 'j2' }]\n", "named twice: j2"),

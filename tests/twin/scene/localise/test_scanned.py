@@ -14,7 +14,7 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task, load_task
-from twin.gate.twin_process import Look, look
+from twin.gate.twin_process import look
 from twin.scene.localise.mesh_fit import mesh_surface, scanned_surfaces
 from twin.scene.localise.objects import localise_objects
 from twin.scene.localise.result import BOX_METHOD, MESH_METHOD
@@ -112,12 +112,12 @@ def test_what_the_scene_does_not_list_was_not_scanned_whatever_lies_about(
 def test_the_gate_lays_out_scanned_objects_by_the_scene_s_mesh(
     run: RunFolder, scanned_task: Task, frames: list[Any]
 ) -> None:
-    found = look(Look(run_path=run.path, frames=frames, task=scanned_task))["thing"]
+    found = look((run.path, frames, scanned_task))["thing"]
     assert found.found, found.reason
     assert found.method == MESH_METHOD
     assert np.linalg.norm(found.T_base_object[:3, 3] - POSE[:3, 3]) < 0.003
     (run.scene_dir / "objects" / "thing" / "object.json").unlink()
-    unknown = look(Look(run_path=run.path, frames=frames, task=scanned_task))["thing"]
+    unknown = look((run.path, frames, scanned_task))["thing"]
     assert unknown.method == BOX_METHOD
 
 
