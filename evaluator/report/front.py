@@ -130,6 +130,8 @@ def _compared(results: Results) -> list[str]:
         f"{text[0].upper() if text.startswith(heads) else text[0]}{text[1:]}."
         for text in sentences[: SHOWN_ANSWERS - len(standing) - SHOWN_ANSWERS * len(split)]
     ]
+    if len({row["task"] for row in rows}) > 1 and found:
+        found[0] = f"Over all tasks together: {found[0]}"
     cannot = _all_alike(results)[0]
     if not rows and any(NO_N in text for text in results.missing):
         cannot = f"Cannot be told: {NO_TRIALS}."
@@ -143,7 +145,8 @@ def _regret(results: Results) -> list[str]:
         return []
     name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
     if round(regret.value) == 0:
-        return [f"The twin ranks {name} first, and so do the recorded rates."]
+        words = "and so do the recorded rates, which may be chance"
+        return [f"The twin ranks {name} first, {words}."]
     taken = "one of them by chance" if " or " in name else "its recorded rate"
     words = f"The twin ranks {name} first; {taken} is {_points(regret.value)}"
     return [f"{words}{_ends(regret, '.0f')} below the best over all tasks."]
@@ -260,9 +263,11 @@ def next_trials(results: Results) -> str:
         whom = "them" if len(names) == 2 else "even two of them"
         words = f"each may be best, and to tell {whom} apart would take about {2 * more} more"
         first = " (most successes)" if won else ""
-        return f"{TAKE}{names[0]}{first} or {' or '.join(names[1:])}: {words} trials in all."
+        words = f"{words} trials over all tasks, which is seldom worth it."
+        return f"{TAKE}{names[0]}{first} or {' or '.join(names[1:])}: {words}"
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
-    return f"{_more_trials(more, pair, tasks)}; that would likely tell these two apart."
+    rest = f"; {len(wanted) - 1} more stay open" if len(wanted) > 1 else ""
+    return f"{_more_trials(more, pair, tasks)}; that would likely tell these two apart{rest}."
 
 
 def _more_trials(more: int, pair: tuple[str, str], tasks: Sequence[str]) -> str:
@@ -295,7 +300,7 @@ def _again(results: Results, step: str) -> tuple[tuple[str, str], ...]:
     if results.source == "run":
         name = shlex.quote(str(results.provenance.get("folder", results.run)))
         then = f"robot-gst replay {name} && robot-gst evaluate {name}"
-        return ("Record that with", f"robot-gst record {name}"), (", then type", then)
+        return ("Record them with", f"robot-gst record {name}"), (", then type", then)
     files = shlex.join(results.provenance.get("files", ())) or shlex.quote(results.run)
     what = "counts" if results.source == "rates" else "outcomes"
     first = "Then type" if step == GIVE_N else f"Add the {what} to the table, then type"
@@ -320,7 +325,7 @@ def _trust(results: Results) -> list[str]:
     yes += f"it follows from group to group (r at least {low:.2f}), and no group looks blind"
     told = "No" if against else "Not yet" if found else "Yes"
     why = "; ".join(against or [words for _, words in found] or [yes])
-    return [f"{told}. {why[0].upper()}{why[1:]}.{USE if found else ''}"]
+    return [f"{told}. {why[0].upper()}{why[1:]}.{USE if found and not results.stand_in else ''}"]
 
 
 Against = Iterator[tuple[bool, str]]
@@ -340,7 +345,7 @@ def _followed(r: Measurement, num_groups: int) -> Against:
         why = str(r.reason_if_undefined or r.reason_without_interval).replace(";", ",")
         if num_groups < GROUPS_FOR_R:
             there = "there is 1" if num_groups == 1 else f"there are {num_groups}"
-            why = f"it takes {GROUPS_FOR_R} groups (policies times tasks) or more, and {there}"
+            why = f"it takes {GROUPS_FOR_R} groups (policies times tasks) at least, and {there}"
         why = NO_TRIALS if why.startswith(NO_N) else why
         yield False, f"whether its rates follow the recorded ones cannot be told: {why}"
     elif r.interval.high < FOLLOWS_R:
@@ -432,7 +437,7 @@ def _by_chance(results: Results, num_trials: int) -> str:
     if known != 1:  # or older results, which miss some
         return ""
     by_chance = num_trials * (yes * succeeded + (1 - yes) * (1 - succeeded))
-    return f"; {100 * by_chance / num_trials:.0f} % by chance"
+    return f"; by chance {100 * by_chance / num_trials:.0f} %"
 
 
 def _all_alike(results: Results) -> tuple[str, str]:
@@ -444,9 +449,10 @@ def _all_alike(results: Results) -> tuple[str, str]:
     word, task = ("Nothing", "an easier") if k == 0 else ("Everything", "a harder")
     ends = wilson(k, n)
     told = f"{word.lower()} succeeded, {k} of {n} recorded {noun('trial', n)}; the rate over all "
-    told = f"Cannot be told: {told}lies between {100 * ends.low:.0f} and {100 * ends.high:.0f} %."
-    each = f"record {SAYS_LITTLE} trials or more of each policy"
-    few = f"{each}; to judge the twin, in {GROUPS_FOR_R} pairs of policy and task or more."
+    cannot = "Nothing to compare" if len(rates) == 1 else "Cannot be told"
+    told = f"{cannot}: {told}lies between {100 * ends.low:.0f} and {100 * ends.high:.0f} %."
+    each = f"record {SAYS_LITTLE} trials or more of each policy on each task"
+    few = f"{each}; to judge the twin, of {GROUPS_FOR_R} such pairs or more."
     why = "while all trials end alike, no policy can be shown to be better"
     alike = f"check how success is scored, then {each} on {task} task: {why}."
     return told, few if n < SAYS_LITTLE else alike

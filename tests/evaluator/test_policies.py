@@ -192,7 +192,7 @@ def test_regret_is_what_taking_the_twins_first_costs() -> None:
     assert measurements({"A": (9, 9)}) == {}
     named = tuple(measurements({"A (v2)": (9, 9), "B": (6, 7)}).values())
     told = front(Results(run="r", source="trials", stand_in=None, measurements=named)).sentences
-    assert "The twin ranks A (v2) first, and so do the recorded rates." in " ".join(told)
+    assert "The twin ranks A (v2) first, and so do the recorded rates" in " ".join(told)
 
 
 def test_rates_with_n_are_compared_without_their_trials() -> None:
