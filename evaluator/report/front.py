@@ -266,7 +266,7 @@ def next_trials(results: Results) -> str:
         words = f"{words} trials over all tasks, which is seldom worth it."
         return f"{TAKE}{names[0]}{first} or {' or '.join(names[1:])}: {words}"
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
-    rest = f"; {len(wanted) - 1} more stay open" if len(wanted) > 1 else ""
+    rest = f"; still open then: {len(wanted) - 1} more" if len(wanted) > 1 else ""
     return f"{_more_trials(more, pair, tasks)}; that would likely tell these two apart{rest}."
 
 

@@ -121,8 +121,8 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     ]
     table = Table(id="comparisons", title="t", columns=columns, rows=tuple(rows))
     results = Results(run="r", source="trials", stand_in=None, tables=(table,))
-    words = "make 1 more trial of C and 1 of B; that would likely tell these two apart; 1 more stay"
-    assert next_trials(results) == f"{words} open."
+    words = "make 1 more trial of C and 1 of B; that would likely tell these two apart; still"
+    assert next_trials(results) == f"{words} open then: 1 more."
     made = Measurement(id="rate.recorded.a", value=0.5, unit="1", definition="d", k=1, n=2)
     few = replace(table, rows=(compared(ALL_TASKS, "A", "no", 4),))
     told = next_trials(replace(results, tables=(few,), measurements=(made,)))
