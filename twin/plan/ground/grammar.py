@@ -143,16 +143,15 @@ class _Reader:
             return parts[slice(*found.span(name))]
 
         start = parts[found.end("between")].begin
-        said = "".join(part.words for part in of("verb"))
-        verb = "put" if found["ends"] else VERBS.get(said, last_verb)
-        if said in CARRIED:
-            self.nouns.explanation.append(f"'{said}': it is carried there and let go")
+        by = "".join(part.words for part in of("verb"))
+        verb = "put" if found["ends"] else VERBS.get(by, last_verb)
+        if by in CARRIED:
+            self.nouns.explanation.append(f"'{by}': it is carried there and let go")
         phrases = [part.phrase for part in of("themes") if part.phrase is not None]
         if not verb or not phrases:
             raise self._unknown(start)
         meant = [self.nouns.resolve(each, "theme") for each in with_shared_noun(phrases)]
-        themes = tuple(dict.fromkeys(key for ids in meant for key in ids))
-        self.nouns.themes = themes
+        themes = self.nouns.themes = tuple(dict.fromkeys(key for ids in meant for key in ids))
         goals: list[dict[str, Any]] = []
         for place in _PLACES.finditer("".join(part.letter for part in of("places"))):
             goals += self._place(of("places")[slice(*place.span())], themes)

@@ -60,7 +60,7 @@ class Nouns:
         self._ids = {key.lower() for key in vocabulary.things}
         self._nouns = {noun for each in vocabulary.things.values() for noun in each.names[2]}
         self.themes: Ids = ()
-        self.said: dict[str, Ids] = {}
+        self.last: dict[str, Ids] = {}
         """Nouns of the last phrase that had one, by its slot: what "one" stands for."""
         self.choices: list[Choice] = []
         self.explanation: list[str] = []
@@ -104,7 +104,7 @@ class Nouns:
         head, quantifier = part("head"), found["quantifier"]
         nouns = tuple(w if w in self._ids else _plain(w) for w in head)
         if found["head"] == "w":
-            nouns = self.said.get(slot) or self.said.get("theme", ())
+            nouns = self.last.get(slot) or self.last.get("theme", ())
         if found["number"] and nouns:
             nouns = (*nouns[:-1], f"{nouns[-1]}_{number('number')}")  # duck 2
         colours = tuple(filter(None, map(colour_of, part("adjectives"))))
@@ -154,7 +154,7 @@ class Nouns:
         if not fitting:
             refuse("unknown_object", f"there is no '{phrase.text}' here.", self._of(slot))
         if phrase.nouns and phrase.nouns != ("object",):
-            self.said[slot] = phrase.nouns
+            self.last[slot] = phrase.nouns
         boxes = self.vocabulary.containers() if slot == "support" else ()
         for good in (set(fitting) - set(besides), set(self._of(slot)) - set(boxes)):
             fitting = tuple(key for key in fitting if key in good) or fitting
@@ -162,8 +162,7 @@ class Nouns:
         why = "the only one that fits" if len(chosen) == 1 else "all that fit"
         if len(chosen) < len(fitting):
             why = f"any {len(chosen)} of {', '.join(fitting)}: the first ones, the planner's choice"
-        told = self.vocabulary.describe(chosen)
-        self.explanation.append(f"'{phrase.text}' is {told}: {why}")
+        self.explanation.append(f"'{phrase.text}' is {self.vocabulary.describe(chosen)}: {why}")
         return chosen
 
     def fitting(self, phrase: NounPhrase) -> Ids:
@@ -180,8 +179,9 @@ class Nouns:
 
     def _has_sizes(self, key: str, phrase: NounPhrase, pool: Sequence[str]) -> bool:
         """Whether a thing is the larger, or the smaller, beside others of its name."""
-        things = self.vocabulary.things
-        volumes = {name: float(np.prod(things[name].size_m or 0.0)) for name in pool}
+        volumes = {
+            name: float(np.prod(self.vocabulary.things[name].size_m or 0.0)) for name in pool
+        }
         mine = volumes.pop(key, 0.0)
         others = [each for each in volumes.values() if mine and each]
         return all(
@@ -216,6 +216,5 @@ def with_shared_noun(phrases: Sequence[NounPhrase]) -> Iterator[NounPhrase]:
     """The red and the green cubes: the noun at the end belongs to all."""
     last = phrases[-1]
     for each in phrases:
-        is_whole = each.nouns or each.pronoun or not last.nouns
         shared = replace(each, nouns=last.nouns, every=each.every or last.every)
-        yield each if is_whole else shared
+        yield each if each.nouns or each.pronoun or not last.nouns else shared
