@@ -179,9 +179,8 @@ class Nouns:
 
     def _has_sizes(self, key: str, phrase: NounPhrase, pool: Sequence[str]) -> bool:
         """Whether a thing is the larger, or the smaller, beside others of its name."""
-        volumes = {
-            name: float(np.prod(self.vocabulary.things[name].size_m or 0.0)) for name in pool
-        }
+        things = self.vocabulary.things
+        volumes = {name: float(np.prod(things[name].size_m or 0.0)) for name in pool}
         mine = volumes.pop(key, 0.0)
         others = [each for each in volumes.values() if mine and each]
         return all(

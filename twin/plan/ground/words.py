@@ -42,16 +42,12 @@ VERBS |= dict.fromkeys(("move", "push", "slide"), "move")
 VERBS |= dict.fromkeys(("take", "remove", "grab", "pick up"), "take")
 CARRIED = ("push", "slide", "throw", "drop")
 """Verbs whose manner is not kept, which is said."""
+_BESIDE = [f"{way}{{}}{end} of" for way in ("", "to the ", "on the ") for end in ("", " side")]
 RELATIONS = {
     **dict.fromkeys(("in", "into", "in to", "inside"), "inside"),
     **dict.fromkeys(("on", "onto", "on to", "on top of", "atop"), "on"),
     **dict.fromkeys(("beside", "next to"), "beside"),
-    **{
-        f"{before}{side}{behind} of": side
-        for side in ("left", "right")
-        for before in ("", "to the ", "on the ")
-        for behind in ("", " side")
-    },
+    **{words.format(side): side for side in ("left", "right") for words in _BESIDE},
     "in front of": "in_front",
     "behind": "behind",
     **dict.fromkeys(("out of", "from"), "outside"),
