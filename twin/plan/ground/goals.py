@@ -7,7 +7,7 @@ from typing import Any
 from bridge.task.check import REFERENCES, TABLE
 from bridge.task.summary import describe_predicate
 from twin.plan.ground.nouns import Choice
-from twin.plan.ground.vocabulary import GroundingError, Vocabulary
+from twin.plan.ground.vocabulary import Vocabulary, refuse
 
 PLACES = {"inside": "container", "on": "support"}
 """Relations of which an object can have only one, with the key of what it is in or on."""
@@ -78,8 +78,7 @@ class Goals:
         told = self.vocabulary.describe([object_id])
         others = [goal[key] for key in REFERENCES[1:] if key in goal]
         if object_id in others or len(set(others)) < len(others):
-            message = f"{told} cannot stand in a relation to itself."
-            raise GroundingError("impossible", message, candidates=[object_id])
+            refuse("impossible", f"{told} cannot stand in a relation to itself.", [object_id])
         container = goal.get("container")
         if container is not None and not things[container].container:
             open_ones = self.vocabulary.containers()
@@ -87,14 +86,14 @@ class Goals:
                 f"{self.vocabulary.describe([container])} has no inside: nothing can be put in it "
                 "or taken out of it."
             )
-            raise GroundingError("impossible", message, candidates=open_ones or [container])
+            refuse("impossible", message, open_ones or [container])
         support = goal.get("support", TABLE)
         if support != TABLE and things[support].container:
             message = (
                 f"{self.vocabulary.describe([support])} is open above; what is put there is "
                 "inside it, not on it. Say 'into'."
             )
-            raise GroundingError("impossible", message, candidates=[support])
+            refuse("impossible", message, [support])
         self.refuse_fixed([object_id])
 
     def refuse_fixed(self, ids: Iterable[str]) -> None:
@@ -103,8 +102,7 @@ class Goals:
             if not self.vocabulary.things[key].movable:
                 movable = ", ".join(self.vocabulary.movable()) or "nothing here"
                 told = f"{self.vocabulary.describe([key])} is fixed: nothing can move it."
-                message = f"{told} What can be moved: {movable}."
-                raise GroundingError("fixed_object", message, candidates=[key])
+                refuse("fixed_object", f"{told} What can be moved: {movable}.", [key])
 
     def checked(self) -> list[dict[str, Any]]:
         """All goals, none of which rules out another."""
@@ -135,7 +133,7 @@ class Goals:
         ):
             told = "; ".join(describe_predicate(goal) for goal in goals)
             message = f"{key} cannot end as asked, all at once: {told}. Leave one of them out."
-            raise GroundingError("contradiction", message, candidates=[key])
+            refuse("contradiction", message, [key])
 
 
 def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
@@ -156,7 +154,7 @@ def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]
             f"{', '.join(circle)} each wait for another to be in place first. Let one of them stay "
             "where it is."
         )
-        raise GroundingError("cyclic", message, candidates=circle)
+        refuse("cyclic", message, circle)
     for first, second in goals.edges:
         for later in goals.steps[second]:
             before[later] |= set(goals.steps[first]) - {later}
@@ -166,7 +164,7 @@ def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]
             f"the order asked for cannot be: one of {', '.join(circle)} would be moved after "
             "something was put on it or beside it. Say it the other way round."
         )
-        raise GroundingError("contradiction", message, candidates=circle)
+        refuse("contradiction", message, circle)
     return tuple(order)
 
 

@@ -10,13 +10,15 @@ from typing import Any
 
 from bridge.task.relations import SIDES
 from twin.plan.ground.goals import PLACES, Goals, Grounding, ordered
-from twin.plan.ground.nouns import Memory, NounPhrase, Nouns, with_shared_noun
-from twin.plan.ground.vocabulary import GroundingError, Vocabulary
+from twin.plan.ground.nouns import NounPhrase, Nouns, with_shared_noun
+from twin.plan.ground.vocabulary import GroundingError, Ids, Vocabulary, refuse
 from twin.plan.ground.words import CARRIED, NEGATIONS, PHRASES, RELATIONS, VERBS, WAYS, tokens_of
 
 GAP_TOLERANCE_M = 0.005
 """Of a gap that is given by one number."""
 MOST_M = 1.5
+DIRECTIONS = "directions are as the robot sees them: forwards is away from its base"
+NOT_WHICH_WAY = "says how far, and not from what or which way"
 _SLOTS = {"inside": "container", "outside": "container", "on": "support"}
 _PLACE = r"(?:B?L)?RN(?:GL)?|B?LW|WB?L|U"
 _CLAUSE = re.compile(
@@ -26,15 +28,15 @@ _CLAUSE = re.compile(
 _PLACES = re.compile(_PLACE)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Part:
     """Some words that belong together."""
 
     letter: str
     begin: int
     words: str
-    phrase: NounPhrase | None = None
-    length_m: tuple[float, float] = (0.0, 0.0)
+    phrase: NounPhrase | None
+    length_m: tuple[float, float] | None
 
 
 def ground(text: str, vocabulary: Vocabulary) -> Grounding:
@@ -51,8 +53,7 @@ class _Reader:
 
     def __init__(self, text: str, vocabulary: Vocabulary) -> None:
         self.text, self.tokens, self.vocabulary = text, tokens_of(text), vocabulary
-        self.memory = Memory()
-        self.nouns, self.goals = Nouns(vocabulary, self.memory), Goals(vocabulary)
+        self.nouns, self.goals = Nouns(vocabulary), Goals(vocabulary)
         self.held: dict[str, str] = {}
         """What was taken and has not been put anywhere, with the words that said so."""
 
@@ -74,57 +75,45 @@ class _Reader:
             at = found.end()
         for key, words in self.held.items():
             message = f"'{words}': say where {key} is to go; holding it is no end."
-            raise GroundingError("unsupported_verb", message)
+            refuse("unsupported_verb", message)
         goals = self.goals.checked()
         if not goals:
-            raise GroundingError("empty", "the instruction asks for nothing.")
+            refuse("empty", "the instruction asks for nothing.")
         return Grounding(
             text=self.text,
             goals=tuple(goals),
             order=ordered(self.goals, goals),
             is_order_given=self.goals.is_order_given,
-            choices=tuple(self.memory.choices),
-            explanation=tuple(dict.fromkeys(self.memory.explanation)),
+            choices=tuple(self.nouns.choices),
+            explanation=tuple(dict.fromkeys(self.nouns.explanation)),
         )
 
     def _refuse_words(self) -> None:
         """Words that turn what is said round; whatever they stand beside, it is not read."""
         words = [token.text for token in self.tokens]
         if "or" in words:
-            raise GroundingError("alternative", "'or' leaves open what is wanted. Say which.")
+            refuse("alternative", "'or' leaves open what is wanted. Say which.")
         no = [w for w in words if w in NEGATIONS or w.startswith("non-") or w.endswith("n't")]
         if no:
-            message = f"'{no[0]}' says what is not wanted. Say what is."
-            raise GroundingError("negated", message)
+            refuse("negated", f"'{no[0]}' says what is not wanted. Say what is.")
 
     def _parts(self) -> list[_Part]:
         """Cut the words into parts; one that is in none is an error that names it."""
         parts: list[_Part] = []
         at, slot = 0, "theme"
         while at < len(self.tokens):
-            begin, token, phrase, letter = at, self.tokens[at], None, ""
-            for length in (5, 4, 3, 2, 1):
-                words = " ".join(each.text for each in self.tokens[at : at + length])
-                if letter := PHRASES.get(words, ""):
-                    at += min(length, len(self.tokens) - at)
-                    break
-            if not letter and token.length_m is not None:
-                letter, at = "L", at + 1
-            elif not letter:
+            begin, token, phrase = at, self.tokens[at], None
+            lengths = range(min(5, len(self.tokens) - at), 0, -1)
+            fixed = next((n for n in lengths if self._rest(at, n) in PHRASES), 0)
+            if fixed or token.length_m is not None:
+                letter, at = PHRASES.get(self._rest(at, fixed), "L"), at + (fixed or 1)
+            else:
                 self._refuse_unread(at, parts)
                 phrase, at = self.nouns.read(self.tokens, at, slot)
                 letter = "N"
-            words = " ".join(each.text for each in self.tokens[begin:at])
+            words = self._rest(begin, at - begin)
             slot = _SLOTS.get(RELATIONS[words], "reference") if letter == "R" else "theme"
-            parts.append(
-                _Part(
-                    letter=letter,
-                    begin=begin,
-                    words=words,
-                    phrase=phrase,
-                    length_m=token.length_m or (0.0, 0.0),
-                )
-            )
+            parts.append(_Part(letter, begin, words, phrase, token.length_m))
         return parts
 
     def _refuse_unread(self, at: int, parts: list[_Part]) -> None:
@@ -135,9 +124,8 @@ class _Reader:
         first = not parts or parts[-1].letter in "ASTFP"
         if re.match(r".[tqbyincs]*[hc]", letters):
             if first:
-                raise GroundingError("unsupported_verb", f"nobody here can '{word}'.")
-            message = f"the relation '{word}' is not known."
-            raise GroundingError("unsupported_relation", message)
+                refuse("unsupported_verb", f"nobody here can '{word}'.")
+            refuse("unsupported_relation", f"the relation '{word}' is not known.")
         if first:
             raise self._unknown(at)
         raise self._unknown(max(0, at - 5), f"is not understood from '{word}' on")
@@ -155,21 +143,20 @@ class _Reader:
             return parts[slice(*found.span(name))]
 
         start = parts[found.end("between")].begin
-        verb = last_verb
-        for part in of("verb"):
-            verb = VERBS[part.words]
-            if part.words in CARRIED:
-                self.memory.explanation.append(f"'{part.words}': it is carried there and let go")
-        verb = "put" if found["ends"] else verb
+        by = "".join(part.words for part in of("verb"))
+        verb = "put" if found["ends"] else VERBS.get(by, last_verb)
+        if by in CARRIED:
+            self.nouns.explanation.append(f"'{by}': it is carried there and let go")
         phrases = [part.phrase for part in of("themes") if part.phrase is not None]
         if not verb or not phrases:
             raise self._unknown(start)
         meant = [self.nouns.resolve(each, "theme") for each in with_shared_noun(phrases)]
-        themes = tuple(dict.fromkeys(key for ids in meant for key in ids))
-        self.memory.themes = themes
+        themes = self.nouns.themes = tuple(dict.fromkeys(key for ids in meant for key in ids))
         goals: list[dict[str, Any]] = []
         for place in _PLACES.finditer("".join(part.letter for part in of("places"))):
             goals += self._place(of("places")[slice(*place.span())], themes)
+            if goals and goals[-1].get("direction"):
+                self.nouns.explanation.append(DIRECTIONS)
         behind = parts[found.end() : found.end() + 1]
         if behind and behind[0].letter not in "ASTFP":
             self._refuse_place(behind[0], parts[found.end() + 1 :], start, themes)
@@ -177,7 +164,7 @@ class _Reader:
             goals = self._without_place(verb, themes, start)
         if verb == "stack" and len(themes) > 1:
             message = f"which of {', '.join(themes)} is to be below? Say one by one."
-            raise GroundingError("ambiguous_relation", message, candidates=themes)
+            refuse("ambiguous_relation", message, themes)
         if goals:
             goals = [{"kind": goal["kind"], "object": k, **goal} for goal in goals for k in themes]
             self.goals.add_clause(goals)
@@ -185,67 +172,55 @@ class _Reader:
             self.held = {key: words for key, words in self.held.items() if key not in themes}
         return verb
 
-    def _refuse_place(
-        self, part: _Part, behind: list[_Part], start: int, themes: tuple[str, ...]
-    ) -> None:
+    def _refuse_place(self, part: _Part, behind: list[_Part], start: int, themes: Ids) -> None:
         """Say what is wrong where a clause does not go on as any does."""
         if part.letter == "O" and behind:
             message = f"'{self._rest(part.begin, 4)}': into, onto or next to it?"
-            candidates = ("into", "onto", "next to")
-            raise GroundingError("ambiguous_relation", message, candidates=candidates)
+            refuse("ambiguous_relation", message, ("into", "onto", "next to"))
         if part.letter == "W":
             self.goals.refuse_fixed(themes)
-            what = "does not say how far: for example '10 cm to the left'"
-            raise self._unknown(part.begin, what)
+            raise self._unknown(part.begin, "does not say how far: for example '10 cm to the left'")
         if part.letter in "BL":
-            raise self._unknown(part.begin, "says how far, and not from what or which way")
+            raise self._unknown(part.begin, NOT_WHICH_WAY)
         raise self._unknown(start, f"is not understood from '{part.words}' on")
 
-    def _place(self, parts: list[_Part], themes: tuple[str, ...]) -> list[dict[str, Any]]:
+    def _place(self, parts: list[_Part], themes: Ids) -> list[dict[str, Any]]:
         """One relation, movement or remark about the end, without what it is about."""
         of = {part.letter: part for part in parts}
         if "U" in of:
             return [{"kind": "upright"}]
         length_m = of["L"].length_m if "L" in of else None
         if "W" in of and length_m is not None:
-            self._say_directions()
             low, high = (round(each, 6) for each in length_m)
             if high > MOST_M:
                 message = f"{high:g} m is no distance that the arm can move something."
-                raise GroundingError("impossible", message, candidates=themes)
+                refuse("impossible", message, themes)
             far = {"by_m": low} if low == high else {"at_least_m": low, "at_most_m": high}
             return [{"kind": "moved", **far, "direction": WAYS[of["W"].words]}]
         relation, phrase = RELATIONS[of["R"].words], of["N"].phrase
         assert phrase is not None  # noqa: S101  # every N has one
         slot = _SLOTS.get(relation, "reference")
         if slot != "reference" and length_m is not None:
-            raise self._unknown(parts[0].begin, "says how far, and not from what or which way")
+            raise self._unknown(parts[0].begin, NOT_WHICH_WAY)
         if of["R"].words == "from" and self.nouns.is_table(phrase):
             return []  # where it lies now
         ids = self.nouns.resolve(phrase, slot, besides=themes)
         if len(ids) != 1:
             told = self.vocabulary.describe(ids)
             message = f"'{phrase.text}' is more than one thing: {told}. Name one."
-            raise GroundingError("ambiguous_object", message, candidates=ids)
+            refuse("ambiguous_object", message, ids)
         if slot != "reference":
             return [{"kind": relation, slot: ids[0]}]
         about: dict[str, Any] = {"kind": "beside", "reference": ids[0]}
         if relation in SIDES:
             about["direction"] = relation
-            self._say_directions()
         if length_m is not None:
             low, high = length_m
             slack = GAP_TOLERANCE_M if low == high else 0.0
             about["gap_m"] = [round(max(0.0, low - slack), 6), round(high + slack, 6)]
         return [about]
 
-    def _say_directions(self) -> None:
-        told = "directions are as the robot sees them: forwards is away from its base"
-        self.memory.explanation.append(told)
-
-    def _without_place(
-        self, verb: str, themes: tuple[str, ...], start: int
-    ) -> list[dict[str, Any]]:
+    def _without_place(self, verb: str, themes: Ids, start: int) -> list[dict[str, Any]]:
         """What a clause asks for that says no place."""
         if verb == "take":
             self.held |= dict.fromkeys(themes, self._rest(start))
@@ -256,7 +231,7 @@ class _Reader:
         where = self.vocabulary.containers()
         if len(where) != 1:
             kind = "ambiguous_object" if where else "unknown_object"
-            raise GroundingError(kind, f"'{self._rest(start)}': into what?", candidates=where)
+            refuse(kind, f"'{self._rest(start)}': into what?", where)
         told = self.vocabulary.describe(where)
-        self.memory.explanation.append(f"packed into {told}: nothing else here can be packed into")
+        self.nouns.explanation.append(f"packed into {told}: nothing else here can be packed into")
         return [{"kind": "inside", "container": where[0]}]

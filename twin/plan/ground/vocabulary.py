@@ -3,11 +3,11 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
-from bridge.task.task_file import BASKET, ObjectModel, Task
+from bridge.task.task_file import BASKET, Task
 from twin.errors import TwinError
 from twin.naming.colours import colour_name
 from twin.naming.words import KIND_NAMES, colour_of, kind_of, label_of, spoken_name, words_of
@@ -17,8 +17,11 @@ AT_FAULT = ("contradiction", "cyclic", "fixed_object")
 """Kinds whose candidates are at fault, and named by the message: there is nothing to choose."""
 UNREAD = ("empty", "unknown_clause", "unknown_object", "unsupported_relation", "unsupported_verb")
 """Kinds that are answered with examples of what is understood."""
+ALIKE = 1.15
+"""A box whose sides differ by less is a cube."""
 MOST_TOLD = 400
 """Characters of a message with words of the instruction in it."""
+Ids = tuple[str, ...]
 ANY_THING = ("object", "thing", "item")
 ALSO_CALLED = {"cube": ("block", "brick"), "block": ("cube", "brick"), "brick": ("block", "cube")}
 """Other nouns for the same, where nothing in the scene has that noun as its own. A bin is no mug:
@@ -41,6 +44,11 @@ class GroundingError(TwinError):
         """With what would be understood, where that helps."""
         told = ", ".join(f"'{text}'" for text in self.examples if self.kind in UNREAD)
         return super().__str__() + (f" Understood is, for example: {told}." if told else "")
+
+
+def refuse(kind: str, message: str, candidates: Iterable[str] = ()) -> NoReturn:
+    """Raise what is wrong with an instruction."""
+    raise GroundingError(kind, message, candidates=candidates)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,11 +93,11 @@ class Vocabulary:
 
     things: Mapping[str, Thing]
 
-    def movable(self) -> tuple[str, ...]:
+    def movable(self) -> Ids:
         """Ids of what the robot can move."""
         return tuple(key for key, thing in self.things.items() if thing.movable)
 
-    def containers(self) -> tuple[str, ...]:
+    def containers(self) -> Ids:
         """Ids of what things can be put into."""
         return tuple(key for key, thing in self.things.items() if thing.container)
 
@@ -97,14 +105,13 @@ class Vocabulary:
         """Three instructions about what is here."""
         if not self.movable():
             return []
-        all_called = [each.called for each in self.things.values()]
-
-        def the(key: str) -> str:
-            name = self.things[key].called
-            return f"the {key if all_called.count(name) > 1 else name}"
-
-        first, *others = map(the, self.movable())
-        boxes = [*map(the, self.containers())]
+        names = [each.called for each in self.things.values()]
+        the = {
+            key: f"the {key if names.count(each.called) > 1 else each.called}"
+            for key, each in self.things.items()
+        }
+        first, *others = (the[key] for key in self.movable())
+        boxes = [the[key] for key in self.containers()]
         found = [f"put {first} into {box}" for box in boxes[:1]]
         found += [f"stack {first} on {other}" for other in others[:1]]
         found += [f"put {first} left of {other}" for other in (others + boxes)[:1]]
@@ -125,7 +132,9 @@ def vocabulary_of(task: Task, instances: Sequence[Mapping[str, Any]] = ()) -> Vo
     for key, model in task.objects.items():
         is_container = model.shape == "open_box" or model.mesh == BASKET
         colour = colour_name(np.array(model.color_srgb) / 255)
-        shape = _shape_word(model)
+        shape = ""
+        if model.shape == "box" and model.size_m is not None:
+            shape = "cube" if max(model.size_m) < ALIKE * min(model.size_m) else "box"
         by_task = label_of(key, colour, is_open=is_container, shape=shape)
         label = str(seen.get(key, {}).get("label") or by_task)
         spoken = next(filter(None, map(colour_of, words_of(label))), None)
@@ -139,14 +148,3 @@ def vocabulary_of(task: Task, instances: Sequence[Mapping[str, Any]] = ()) -> Vo
             shape=shape if shape == "cube" else "",
         )
     return Vocabulary(things=things)
-
-
-ALIKE = 1.15
-"""A box whose sides differ by less is a cube."""
-
-
-def _shape_word(model: ObjectModel) -> str:
-    """What the shape of a task's box is called; nothing for what has no such name."""
-    if model.shape != "box" or model.size_m is None:
-        return ""
-    return "cube" if max(model.size_m) < ALIKE * min(model.size_m) else "box"

@@ -7,13 +7,7 @@ import re
 import unicodedata
 from dataclasses import dataclass
 
-from twin.plan.ground.vocabulary import GroundingError
-
-
-def word_set(text: str) -> frozenset[str]:
-    """The words of a text, to ask whether one is among them."""
-    return frozenset(text.split())
-
+from twin.plan.ground.vocabulary import refuse
 
 MAX_CHARACTERS = 2000
 
@@ -29,7 +23,6 @@ class Token:
     """Least and greatest; equal where one number is given."""
 
 
-SIGNS = (",", ".", ";", ":", "!", "?")
 _COUNTED = "one two three four five six seven eight nine ten eleven twelve"
 NUMBERS = {word: number for number, word in enumerate(_COUNTED.split(), start=1)}
 UNITS_M = {"mm": 1e-3, "mi": 1e-3, "cm": 1e-2, "ce": 1e-2, "m": 1.0, "me": 1.0}
@@ -43,34 +36,21 @@ _TOKEN = re.compile(
     r"|(?P<other>.)"
 )
 
-VERBS = {
-    **dict.fromkeys(
-        word_set(
-            "put place set lay drop throw bring insert arrange leave get keep pop position store"
-        ),
-        "put",
-    ),
-    **dict.fromkeys(("move", "push", "slide"), "move"),
-    **dict.fromkeys(("take", "remove", "grab", "pick up"), "take"),
-    "pack": "pack",
-    "stack": "stack",
-}
+_PUT = "put place set lay drop throw bring insert arrange leave get keep pop position store"
+VERBS = {"pack": "pack", "stack": "stack"} | dict.fromkeys(_PUT.split(), "put")
+VERBS |= dict.fromkeys(("move", "push", "slide"), "move")
+VERBS |= dict.fromkeys(("take", "remove", "grab", "pick up"), "take")
 CARRIED = ("push", "slide", "throw", "drop")
 """Verbs whose manner is not kept, which is said."""
+_BESIDE = [f"{way}{{}}{end} of" for way in ("", "to the ", "on the ") for end in ("", " side")]
 RELATIONS = {
     **dict.fromkeys(("in", "into", "in to", "inside"), "inside"),
     **dict.fromkeys(("on", "onto", "on to", "on top of", "atop"), "on"),
     **dict.fromkeys(("beside", "next to"), "beside"),
-    **{
-        f"{before}{side}{behind} of": side
-        for side in ("left", "right")
-        for before in ("", "to the ", "on the ")
-        for behind in ("", " side")
-    },
+    **{words.format(side): side for side in ("left", "right") for words in _BESIDE},
     "in front of": "in_front",
     "behind": "behind",
-    "out of": "outside",
-    "from": "outside",
+    **dict.fromkeys(("out of", "from"), "outside"),
 }
 """Where something belongs, by the words before what it is relative to."""
 WAYS = {
@@ -84,7 +64,7 @@ PHRASES = {
         "T": ("then", "after that", "afterwards", "finally"), "F": ("first",), "B": ("by",),
         "P": ("please", "could you", "can you", "would you", "i want"),
         "E": ("goes", "go", "belongs", "belong"), "G": ("with a gap of", "with gaps of"),
-        "S": SIGNS,
+        "S": ",.;:!?",
     }.items()
     for phrase in phrases
 }  # fmt: skip
@@ -92,7 +72,7 @@ PHRASES = {
 PRONOUNS = ("it", "them")
 SIZES = {"small": -1, "little": -1, "tiny": -1, "large": 1, "big": 1}
 TABLES = ("table", "desk")
-NEGATIONS = word_set("no not never don't dont without except nothing neither nor")
+NEGATIONS = ("no", "not", "never", "dont", "without", "except", "nothing", "neither", "nor")
 CLOSED = frozenset(word for phrase in PHRASES for word in phrase.split())
 """Words that end a noun phrase."""
 
@@ -101,18 +81,14 @@ def tokens_of(text: str) -> list[Token]:
     """Cut an instruction into tokens."""
     if len(text) > MAX_CHARACTERS:
         message = f"the instruction has {len(text)} characters; {MAX_CHARACTERS} is the most."
-        raise GroundingError("too_long", message)
+        refuse("too_long", message)
     plain = unicodedata.normalize("NFKC", text).replace("’", "'").lower()
     return [_token(match) for match in _TOKEN.finditer(plain) if match.lastgroup != "space"]
 
 
 def _token(match: re.Match[str]) -> Token:
-    text = match[0]
     if match["unit"]:
         scale = UNITS_M[match["unit"][:2]]
-        low = float(match["low"]) * scale
-        high = float(match["high"]) * scale if match["high"] else low
-        return Token(text, length_m=(low, high))
-    if match["number"]:
-        return Token(text, number=int(text))
-    return Token(text)
+        low, high = (float(match[name] or match["low"]) * scale for name in ("low", "high"))
+        return Token(match[0], length_m=(low, high))
+    return Token(match[0], number=int(match[0]) if match["number"] else NUMBERS.get(match[0]))
