@@ -41,7 +41,7 @@ POLL_S = 0.02
 """The writer looks for messages this often rather than being woken by each."""
 IDLE_POLL_S = 0.1
 BARRIER_POLL_S = 0.002
-SECOND_S, LOOK_S = 1.0, 0.1  # LOOK_S: how often the free space is asked for
+SECOND_S, LOOK_S = 1.0, 0.1  # LOOK_S: how often file and free space are looked at
 MAX_NEWS = 1000
 LAST_IMAGES_S = 2.0
 """How long a failed disk waits for images in the encoders, to count them."""
@@ -418,10 +418,10 @@ class Recorder:
                 told = news.data
                 if "topics" not in told or not self.clocks.has_named(told["topics"], told["by_ns"]):
                     self.note(news)
-            if self._life.may_ask_disk and (happened := self._life.look_at_file()):
-                self.note(News(text=happened, data={"kind": "file_removed"}))
         if now_s >= self._next_look_s and self._life.may_ask_disk:
             self._next_look_s = now_s + LOOK_S
+            if happened := self._life.look_at_file():
+                self.note(News(text=happened, data={"kind": "file_removed"}))
             if (cause := self._life.look_at_disk()) and not self._status.failing:
                 self._end_because(cause)
 
