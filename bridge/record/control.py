@@ -90,7 +90,8 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         if who_acts:
             told = info.instruction or (task.task().instruction if task else "")
             about = {"episode": info.id, "instruction": told, "start_seed": info.start_seed}
-            begun.extend([info] if _ask_policy(session, info, about) else [])
+            if _ask_policy(session, info, about):
+                begun.append(info)
         return answer
 
     def stop(request: dict[str, Any]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from evaluator.statistics.intervals import wilson
 SHOWN_TASKS = 8
 """Tasks with a line; the table holds the others."""
 SAYS_LITTLE = 10
-"""Fewer trials that all end alike say little of anything."""
+"""Fewer trials say little of anything."""
 SHOWN_ANSWERS = 3
 LONGEST = 260
 """Characters of a note; the whole stands further down."""
@@ -133,9 +133,13 @@ def _compared(results: Results) -> list[str]:
     if len({row["task"] for row in rows}) > 1 and found:
         found[0] = f"Over all tasks together: {found[0]}"
     cannot = _all_alike(results)[0]
-    if not rows and any(NO_N in text for text in results.missing):
+    if not rows and _lacks_n(results):
         cannot = f"Cannot be told: {NO_TRIALS}."
     return [cannot] if cannot else [*split, *found]
+
+
+def _lacks_n(results: Results) -> bool:
+    return any(NO_N in text for text in results.missing)
 
 
 def _regret(results: Results) -> list[str]:
@@ -247,14 +251,12 @@ def next_trials(results: Results) -> str:
         if isinstance(more := row["more trials of each"], int) and more > 0
     ]
     standing = rows_of(results, "standing")
-    settled = "" if wanted else _settled([row for row, _ in of_all], standing)
-    if settled:
-        return settled
+    if not wanted and (best := _settled([row for row, _ in of_all], standing)):
+        return best
     if _by_task(results):
         return f"{TAKE}for each task one that was not beaten there; none is best on all tasks."
     if not wanted:
-        without = any(NO_N in text for text in results.missing)
-        return GIVE_N if without else ""
+        return GIVE_N if _lacks_n(results) else ""
     more, pair = min(wanted)
     made = sum(m.n or 0 for m in results.measurements if m.id.startswith("rate.recorded."))
     if len({name for _, each in asked for name in each}) * more > TOO_MANY * made > 0:
@@ -349,8 +351,7 @@ def _followed(r: Measurement, num_groups: int) -> Against:
         why = NO_TRIALS if why.startswith(NO_N) else why
         yield False, f"whether its rates follow the recorded ones cannot be told: {why}"
     elif r.interval.high < FOLLOWS_R:
-        high = r.interval.high
-        yield True, f"its rates hardly follow the recorded ones (r at most {high:.2f})"
+        yield True, f"its rates hardly follow the recorded ones (r at most {r.interval.high:.2f})"
     elif r.interval.low <= 0:
         yield False, "its correlation with the recorded rates is too uncertain to use"
 
@@ -428,7 +429,7 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
 
 
 def _by_chance(results: Results, num_trials: int) -> str:
-    """Say in how many trials outcomes would agree that have the same rates and else nothing."""
+    """Say how often outcomes would agree that have the same rates and else nothing."""
     rows = rows_of(results, "conclusions")
     yes, succeeded, known = (
         sum(n for row in rows if isinstance(n := row.get(name), int)) / num_trials
@@ -436,8 +437,7 @@ def _by_chance(results: Results, num_trials: int) -> str:
     )
     if known != 1:  # or older results, which miss some
         return ""
-    by_chance = num_trials * (yes * succeeded + (1 - yes) * (1 - succeeded))
-    return f"; by chance {100 * by_chance / num_trials:.0f} %"
+    return f"; by chance {100 * (yes * succeeded + (1 - yes) * (1 - succeeded)):.0f} %"
 
 
 def _all_alike(results: Results) -> tuple[str, str]:

@@ -136,7 +136,7 @@ def solve(
         X, Z, J = _refined(Ts_a, Ts_b, X, Z)
     left = misfits(Ts_a, Ts_b, X, Z)
     distance, angle = _lengths(left)
-    far = (distance / _scales(left)[0]) ** 2 + (angle / _scales(left)[1]) ** 2
+    far = np.square(np.stack([distance, angle], axis=1) / _scales(left)).sum(axis=1)
     drawn = np.random.default_rng(seed).integers(len(Ts_a), size=(NUM_RESAMPLES, len(Ts_a)))
     medians = np.stack([np.median(values[drawn], axis=1) for values in (distance, angle)])
     low, high = np.quantile(medians, [0.025, 0.975], axis=1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -17,6 +18,7 @@ from twin.plan.release.resting import (
     NoFinalStateError,
     Target,
     resting_poses,
+    settled,
     sideways_sigma_m,
     support_m,
     target_of,
@@ -142,12 +144,15 @@ class ReleaseSearch:
             Ts_tcp_object={name: self._T_tcp_object},
         )
 
+    @cached_property
+    def _support_m(self) -> float:
+        return support_m(self._problem, self._grasp.object_id)
+
     def _settled(self, state: State) -> State:
         """What comes of states in which the object is let go: it lies straight below."""
         name = self._grasp.object_id
-        T = self._miss.applied(state.Ts_base_object[name])
-        low_m = (T[:, 2, :3] @ self._outline_m.T).min(axis=1) + T[:, 2, 3]
-        T[:, 2, 3] -= low_m - support_m(self._problem, name)
+        T = state.Ts_base_object[name]
+        T = settled(T, self._outline_m, self._support_m, self._miss)
         return replace(state, Ts_base_object={**state.Ts_base_object, name: T})
 
     def _object_too_near(self, state: State) -> Array:

@@ -11,7 +11,17 @@ from bridge.task.check import TABLE
 from bridge.task.task_file import ObjectModel
 from twin.errors import TwinError
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.problem import Grasp, Miss, Pose, Problem, Release, RotationMatrix, Vector
+from twin.plan.problem import (
+    Grasp,
+    Miss,
+    Points,
+    Pose,
+    Poses,
+    Problem,
+    Release,
+    RotationMatrix,
+    Vector,
+)
 
 QUARTER_TURNS = 4
 _SAME_RAD = 0.02
@@ -80,11 +90,19 @@ def target_of(problem: Problem, object_id: str) -> Target:
 
 
 def lying_there(problem: Problem, release: Release, miss: Miss | None = None) -> Pose:
-    """Where an object lies that is let go a little above: straight below, or aside by a miss."""
-    T: Pose = (miss or Miss()).applied(release.T_base_object[None])[0]
-    points = se3.apply(T, surface_points(problem, release.object_id))
-    T[2, 3] -= float(points[:, 2].min()) - support_m(problem, release.object_id)
+    """Where an object lies that is let go a little above."""
+    points_m = surface_points(problem, release.object_id)
+    height_m = support_m(problem, release.object_id)
+    T: Pose = settled(release.T_base_object[None], points_m, height_m, miss or Miss())[0]
     return T
+
+
+def settled(Ts: Poses, points_m: Points, height_m: float, miss: Miss) -> Poses:
+    """Where an object of some points lies on something: straight below, or aside by a miss."""
+    found = miss.applied(Ts)
+    low_m = (found[:, 2, :3] @ points_m.T).min(axis=1) + found[:, 2, 3]
+    found[:, 2, 3] -= low_m - height_m
+    return found
 
 
 def support_m(problem: Problem, key: str) -> float:
