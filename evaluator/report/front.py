@@ -148,7 +148,7 @@ def _regret(results: Results) -> list[str]:
     if regret is None or regret.value is None or _all_alike(results)[0]:
         return []
     name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
-    if round(regret.value) == 0:
+    if regret.value == 0:
         words = "and so do the recorded rates, which may be chance"
         return [f"The twin ranks {name} first, {words}."]
     taken = "one of them by chance" if " or " in name else "its recorded rate"

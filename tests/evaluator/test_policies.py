@@ -186,13 +186,14 @@ def test_regret_is_what_taking_the_twins_first_costs() -> None:
     assert regret.interval.low <= 30 <= regret.interval.high
     assert found["decision.wrong_pairs"].value == pytest.approx(1 / 3)
     assert found["decision.wrong_pairs_pp"].value == pytest.approx(30)
-    right = measurements({"A": (9, 9), "B": (6, 7)})
+    right = measurements({"A (v2)": (9, 9), "B": (6, 7)})
     assert right["decision.regret_pp"].value == 0
     assert right["decision.wrong_pairs_pp"].value is None
     assert measurements({"A": (9, 9)}) == {}
-    named = tuple(measurements({"A (v2)": (9, 9), "B": (6, 7)}).values())
-    told = front(Results(run="r", source="trials", stand_in=None, measurements=named)).sentences
-    assert "The twin ranks A (v2) first, and so do the recorded rates" in " ".join(told)
+    for pp, end in ((0.0, ", and so do the recorded rates"), (0.3, "; its recorded rate is 0")):
+        measured = (replace(right["decision.regret_pp"], value=pp),)
+        found = Results(run="r", source="trials", stand_in=None, measurements=measured)
+        assert f"The twin ranks A (v2) first{end}" in " ".join(front(found).sentences)
 
 
 def test_rates_with_n_are_compared_without_their_trials() -> None:
