@@ -66,8 +66,10 @@ packed = msgspec.msgpack.Encoder(enc_hook=np.generic.item).encode
 _rows_of = msgspec.msgpack.Decoder(Rows).decode
 
 
-def _digest(body: bytes) -> bytes:
-    return hashlib.sha256(code_version() + body).digest()
+def _digest(body: bytes | memoryview) -> bytes:
+    digest = hashlib.sha256(code_version())
+    digest.update(body)
+    return digest.digest()
 
 
 def write_rows(path: Path, rows: Rows) -> None:
@@ -79,7 +81,7 @@ def write_rows(path: Path, rows: Rows) -> None:
 
 def read_rows(path: Path) -> Rows:
     """Read the summaries of a file."""
-    data = path.read_bytes()
+    data = memoryview(path.read_bytes())
     head, body = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
     if head != _digest(body):
         raise ValueError(f"{path.name} is damaged, or another version of this program wrote it")

@@ -25,7 +25,7 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.trajectory import find_lag_s, position_errors
 from evaluator.motion_measurements import BODY_DISTANCES
 from evaluator.result import Cell, Exclusion, Measurement, Table
-from evaluator.run_reader.episodes import DerivedFile
+from evaluator.run_reader.episodes import FITTED_TO, DerivedFile
 
 TOOL_BODY = "tool"
 MOVED_M = 0.01
@@ -168,10 +168,6 @@ def compare_end_points(
         "not count.",
     )
     return Part(measurements=tuple(measurements), tables=(table,), exclusions=tuple(left_out))
-
-
-FITTED_TO = "fitted_to"
-"""Setting of a replay: ids of the recorded runs from which something was identified."""
 
 
 def compare_imported(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> Part:

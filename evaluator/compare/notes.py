@@ -14,7 +14,7 @@ from evaluator.compare.trial import Trial
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import BLIND_GROUP
 from evaluator.result import Measurement, Table
-from evaluator.run_reader.episodes import DerivedFile
+from evaluator.run_reader.episodes import MADE_BY, DerivedFile
 from evaluator.statistics.agreement import within_and_between
 
 Note = tuple[str, str]
@@ -94,7 +94,6 @@ def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list
 ABOUT = "replays"
 CHANGES_NO_VERDICT = ("mode", "samples", "seed")
 """Settings that one evaluation may well find in several values."""
-MADE_BY = ("replay_version", "calibration_id")
 NO_SCENE = "no scene"
 HASH_DIGITS = 12
 

@@ -24,6 +24,12 @@ from bridge.task.record import parse_record
 from bridge.task.verdict import STAND_IN_ENGINE, Verdict
 from evaluator.errors import EvaluatorError
 
+FITTED_TO = "fitted_to"
+"""Setting of a replay: ids of the recorded runs from which something was identified."""
+MADE_BY = ("replay_version", "calibration_id")
+COMPARED = (*MADE_BY, "config", FITTED_TO, metadata.SECOND_ENGINE_KEY, metadata.ROLLOUT)
+"""Settings of a replay that somebody reads here; tasks and poses are most of the bytes."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunFile:
@@ -369,7 +375,7 @@ def read_derived(path: Path) -> DerivedFacts:
     derived = episode.derived
     if derived is None:
         raise EvaluatorError("no 'derived' metadata: it does not say what it was made from")
-    info, derived = episode.info, _without_seed(derived)
+    info, derived = episode.info, _as_compared(derived)
     try:
         if _is_dynamic(derived):
             mine = [each for _, each in verdicts(episode) if each.plan_id == derived.plan_id]
@@ -385,13 +391,14 @@ def read_derived(path: Path) -> DerivedFacts:
     return DerivedFacts(info=info, derived=derived)
 
 
-def _without_seed(derived: metadata.Derived) -> metadata.Derived:
-    """Leave the seed out of the settings: it stands beside them, and they are alike without it."""
-    config = derived.settings.get("config")
-    if not isinstance(config, dict) or "seed" not in config:
+def _as_compared(derived: metadata.Derived) -> metadata.Derived:
+    """Keep the settings of a replay that are compared; the seed stands beside them."""
+    if derived.kind == "views":
         return derived
-    kept = {name: value for name, value in config.items() if name != "seed"}
-    return replace(derived, settings={**derived.settings, "config": kept})
+    kept = {name: derived.settings[name] for name in COMPARED if name in derived.settings}
+    if isinstance(config := kept.get("config"), dict):
+        kept["config"] = {name: value for name, value in config.items() if name != "seed"}
+    return replace(derived, settings=kept)
 
 
 def rollout_of(file: DerivedFile) -> Mapping[str, Any]:
