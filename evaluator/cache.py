@@ -67,9 +67,7 @@ _rows_of = msgspec.msgpack.Decoder(Rows).decode
 
 
 def _digest(body: bytes | memoryview) -> bytes:
-    digest = hashlib.sha256(code_version())
-    digest.update(body)
-    return digest.digest()
+    return hashlib.blake2b(body, key=code_version(), digest_size=DIGEST_BYTES).digest()
 
 
 def write_rows(path: Path, rows: Rows) -> None:

@@ -91,10 +91,8 @@ def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list
     return [("agreement.pearson_r", text)]
 
 
-ABOUT = "replays"
 CHANGES_NO_VERDICT = ("mode", "samples", "seed")
 """Settings that one evaluation may well find in several values."""
-NO_SCENE = "no scene"
 HASH_DIGITS = 12
 
 
@@ -104,7 +102,7 @@ def check_settings(trials: Sequence[Trial], derived: Sequence[DerivedFile]) -> l
     passed_over = Counter(file.why_not_counted for file in derived if file.derived.kind == "replay")
     found = [f"{count} that never count were {why}" for why, count in passed_over.items() if why]
     found += [text for text in (_scenes(used, derived), _settings(used)) if text]
-    return [(ABOUT, text) for text in found]
+    return [("replays", text) for text in found]
 
 
 def _scenes(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> str:
@@ -128,7 +126,7 @@ def _scenes(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> str:
 
 
 def _scene(scene_hash: str | None) -> str:
-    return f"scene {scene_hash[:HASH_DIGITS]}" if scene_hash else NO_SCENE
+    return f"scene {scene_hash[:HASH_DIGITS]}" if scene_hash else "no scene"
 
 
 def _settings(used: Sequence[DerivedFile]) -> str:
