@@ -61,10 +61,10 @@ def _copula(recorded: Curve, sim: Curve, rho: float) -> Draw:
 
 
 def with_blind(
-    said: Curve, share: float, rng: np.random.Generator, shape: tuple[int, int]
+    said: Curve, share: float, rng: np.random.Generator, shape: tuple[int, int], crossed: bool
 ) -> tuple[Rates, Rates, Bool[np.ndarray, "studies groups"]]:
     """A twin that follows closely, but in some groups says something else; and in which."""
-    x = _beta(1.2, 1.2)(rng.random(shape))
+    x = CROSSED_RATES(rng, *shape)[0] if crossed else _beta(1.2, 1.2)(rng.random(shape))
     noise = 0.3 + 0.4 * rng.standard_normal(shape)
     y = expit(logit(np.clip(x, 0.002, 0.998)) + noise)
     blind = rng.random(shape) < share
@@ -72,7 +72,7 @@ def with_blind(
 
 
 def _blind(said: Curve) -> Draw:
-    return lambda rng, studies, groups: with_blind(said, BLIND, rng, (studies, groups))[:2]
+    return lambda rng, studies, groups: with_blind(said, BLIND, rng, (studies, groups), False)[:2]
 
 
 def _crossed(of_tasks: float, of_policies: float, of_cells: float) -> Draw:
@@ -94,12 +94,12 @@ def _same(rng: np.random.Generator, studies: int, groups: int) -> Sides:
     return x, x
 
 
+CROSSED_RATES = _crossed(0.7, 0.7, 0.3)
 SAID: dict[str, Curve] = {
     "yes": lambda u: 0.85 + 0.15 * u,
     "no": lambda u: 0.1 * u,
     "anything": lambda u: u,
 }
-"""What a blind twin says."""
 MIDDLING = (_beta(2, 2), _beta(2.5, 2))
 TRUTHS: dict[str, Draw] = {
     "middling, rho 0": _copula(*MIDDLING, 0.0),
@@ -110,7 +110,7 @@ TRUTHS: dict[str, Draw] = {
     "full of zeros": _copula(_zeros(0.4), _zeros(0.3), 0.6),
     "two levels": _copula(_levels(0.8), _levels(0.9), 0.6),
     **{f"blind fifth says {words}": _blind(said) for words, said in SAID.items()},
-    "tasks x policies": _crossed(0.7, 0.7, 0.3),
+    "tasks x policies": CROSSED_RATES,
     "tasks x policies, opposed": _crossed(0.9, -0.3, 0.0),
     "ceiling": _copula(_beta(8, 1.5), _beta(9, 1.2), 0.6),
     "all alike": _copula(lambda u: 0.46 + 0.08 * u, lambda u: 0.5 + 0.1 * u, 0.6),

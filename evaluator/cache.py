@@ -8,6 +8,7 @@ may be killed at any instant, and the folder may be deleted at any time. Nothing
 it raises. ``docs/decisions/0008-caches-and-processes.md`` says why.
 """
 
+import contextlib
 import hashlib
 import time
 from collections.abc import Callable
@@ -202,11 +203,9 @@ class SummaryCache:
         """Delete what killed evaluations left half-written, and files of editions before."""
         for ending in ("part", "parquet", "sqlite") if self._folder is not None else ():
             for path in (self._folder or Path()).glob(f"*.{ending}"):
-                try:
+                with contextlib.suppress(OSError):  # its writer has just finished it
                     if time.time() - path.stat().st_mtime > ABANDONED_S:
                         path.unlink()
-                except OSError:  # its writer has just finished it
-                    continue
 
     def __enter__(self) -> "SummaryCache":
         """Use as a context manager."""

@@ -83,7 +83,7 @@ BLIND_SHARE = _bad(
 )
 BLIND_GROUP = _bad(
     "agreement.blind.{task}.{condition}.{policy}",
-    "probability that the twin says nothing of what is recorded in this group, where it is above 1/2",
+    "probability that the twin says nothing of what is recorded in this group, where it is 0.6 or more",
 )
 REGRET = _bad_pp(
     "decision.regret_pp",

@@ -20,7 +20,7 @@ MODEL_FROM = 4
 """Groups from which r and the bias have an interval."""
 SAYS_NOTHING = 1.5
 """Width of an interval of r, of 2, from which on it says nothing."""
-LIKELY_BLIND = 0.5
+LIKELY_BLIND = 0.6
 
 
 def usable_groups(groups: Sequence[RateGroup]) -> list[RateGroup]:

@@ -11,6 +11,8 @@ from evaluator.statistics.sequential import Stratum
 
 MOST_TASKS = 200
 """Tasks that get a line of their own; more are a sample, and the model speaks of it."""
+CLOSE_PP = 10.0
+"""A bias smaller than this does not change what one does with a rate [percentage points]."""
 
 
 def conclusions_table(
@@ -33,7 +35,7 @@ def conclusions_table(
 
 def _line(task: str, members: Sequence[RateGroup], rows: Sequence[TrialRow]) -> dict[str, Cell]:
     bias = 100 * sum(float(group.gap or 0) for group in members) / len(members)
-    known, interval = [each for each in map(_counted, members) if each is not None], None
+    known, interval = [each for each in map(counted, members) if each is not None], None
     if len(known) == len(members):
         bias, interval = points_of(known)
     judged = [r for r in rows if r.task == task and None not in (r.sim_planned, r.recorded)]
@@ -51,8 +53,8 @@ def _line(task: str, members: Sequence[RateGroup], rows: Sequence[TrialRow]) -> 
     }
 
 
-def _counted(group: RateGroup) -> Stratum | None:
-    """The twin's trials against the recorded ones: pairs where each trial has both sides."""
+def counted(group: RateGroup) -> Stratum | None:
+    """Lay the twin's trials beside the recorded ones, as pairs where each trial has both sides."""
     if group.trial_table is not None and any(group.trial_table):
         _, only_sim, only_recorded, _ = group.trial_table
         return Stratum(improved=only_sim, worsened=only_recorded, pairs=sum(group.trial_table))

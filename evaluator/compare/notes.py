@@ -7,6 +7,7 @@ from typing import Any
 
 from evaluator.cache import packed
 from evaluator.compare.agreement import sides, usable_groups
+from evaluator.compare.conclusions import CLOSE_PP, counted
 from evaluator.compare.measure import grouped
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.success import of_group
@@ -16,22 +17,36 @@ from evaluator.measurements import BLIND_GROUP
 from evaluator.result import Measurement, Table
 from evaluator.run_reader.episodes import MADE_BY, DerivedFile
 from evaluator.statistics.agreement import within_and_between
+from evaluator.statistics.intervals import LEVEL, normal_quantile
+from evaluator.statistics.sequential import Evidence
 
 Note = tuple[str, str]
 """About what, and the sentence."""
-BLIND_HERE = "blind: the twin's rate says nothing of the recorded one here"
+FAR_HERE = "the twin's rate is far from the recorded one here"
 
 
 def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> list[Note]:
     """Collect what follows from the groups and the numbers alone."""
     by_id = {measurement.id: measurement for measurement in measurements}
-    blind = [
-        (group.label, f"{BLIND_HERE} (probability {m.value:.2f})")
-        for group in groups
-        if (m := by_id.get(of_group(BLIND_GROUP, (group.task, group.condition, group.policy)).id))
-        if m.value is not None
-    ]
-    return [*_opposed(groups, by_id), *_units(groups), *blind]
+    z = normal_quantile(1 - (1 - LEVEL) / (2 * max(1, len(groups))))  # one error in all of them
+    why = {group.label: _points_off(group, z) or _blind(group, by_id) for group in groups}
+    far = [(label, f"{FAR_HERE}: {words}") for label, words in why.items() if words]
+    return [*_opposed(groups, by_id), *_units(groups), *far]
+
+
+def _blind(group: RateGroup, by_id: Mapping[str, Measurement]) -> str:
+    m = by_id.get(of_group(BLIND_GROUP, (group.task, group.condition, group.policy)).id)
+    return "" if m is None or m.value is None else f"blind with probability {m.value:.2f}"
+
+
+def _points_off(group: RateGroup, z: float) -> str:
+    """Say how far off, where it is surely more than ``CLOSE_PP``."""
+    stratum, sim, recorded = counted(group), group.sim_rate, group.recorded_rate
+    if stratum is None or group.unit != "trial" or sim is None or recorded is None:
+        return ""
+    found = Evidence(strata=(stratum,)).interval(z)
+    shown = f"{100 * float(sim):.0f} against {100 * float(recorded):.0f} %"
+    return shown if 100 * max(found.low, -found.high) > CLOSE_PP else ""
 
 
 def notes_table(found: Iterable[Note]) -> tuple[Table, ...]:

@@ -503,9 +503,7 @@ def compare_counts(groups: Sequence[RateGroup]) -> list[Answer]:
             parts += [(question, task, [own]) for task, own in zip(tasks, strata, strict=True)]
     found = []
     for cases in (asked, parts):
-        readings = with_holm(
-            cases, Plan(), lambda plan, case: read(plan, Evidence(strata=tuple(case[2])))
-        )
+        readings = with_holm(cases, Plan(), lambda plan, c: read(plan, Evidence(strata=(*c[2],))))
         for (question, task, strata), reading in zip(cases, readings, strict=True):
             counts = _sum(s.first for s in strata), _sum(s.second for s in strata)
             found.append(Answer(question=question, task=task, counts=counts, reading=reading))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from textwrap import shorten
 
 from evaluator.compare.agreement import says_nothing
-from evaluator.compare.conclusions import direction
-from evaluator.compare.notes import BLIND_HERE
+from evaluator.compare.conclusions import CLOSE_PP, direction
+from evaluator.compare.notes import FAR_HERE
 from evaluator.compare.policies import ALL_TASKS
 from evaluator.quantity import noun
 from evaluator.report.sections import HEADLINES
@@ -22,8 +22,6 @@ SAYS_LITTLE = 10
 SHOWN_ANSWERS = 3
 LONGEST = 260
 """Characters of a note; the whole stands further down."""
-CLOSE_PP = 10.0
-"""A bias smaller than this does not change what one does with a rate [percentage points]."""
 GROUPS_FOR_R = 4
 """Fewer say nothing of whether the twin's rates follow."""
 FOLLOWS_R = 0.5
@@ -42,10 +40,10 @@ TOO_MANY = 3
 """More trials than so many times those that were made are no advice."""
 IF_THAT_STAYS = "; if that stays"
 """What an open comparison goes on with; the first page says under "Next" what to do."""
-GIVE_N = "add the number of trials behind each rate: a column n, or 7/10 where 70 % stands."
+GIVE_N = "add the number of trials behind each rate: a column n, or 7/10 where 70 % stands; where "
+GIVE_N += "nobody knows it, this table cannot show which policy is better."
 NO_N, NO_INTERVAL = "rates without n", ", without an interval"
 NO_TRIALS = "the table gives no numbers of trials"
-"""Of rates without n the first page says once that they have no interval."""
 FIGURES = ("scatter", "success")
 """The picture beside the sentences: the first that was drawn."""
 Row = Mapping[str, Cell]
@@ -67,11 +65,6 @@ class Front:
     notes: Sequence[tuple[str, str]]
     """What must be known before a number is used."""
 
-    @property
-    def sentences(self) -> list[str]:
-        """The answers, one after the other."""
-        return [f"{asked}: {text}" for asked, text in self.answers]
-
 
 def front(results: Results) -> Front:
     """Write the first page of some results."""
@@ -85,25 +78,21 @@ def front(results: Results) -> Front:
         "Trust the twin": trust,
         IN_NUMBERS: [*told, *(f"{text}." for text in opposed)],
     }
-    told_once = (NO_INTERVAL, "") if NO_TRIALS in " ".join(trust) else ("", "")
     about = [
         (name, text)
         for name, text in about
-        if text not in opposed and BLIND_HERE not in text
+        if text not in opposed and FAR_HERE not in text
         if not (SAYS_NOTHING in text and SAYS_NOTHING in " ".join(told))
     ]
     return Front(
-        answers=[(n, " ".join(s).replace(*told_once)) for n, s in answers.items() if s],
+        answers=[(n, " ".join(s)) for n, s in answers.items() if s],
         next_step=(step := next_trials(results)),
         commands=_again(results, step) if step and not step.startswith(TAKE) else (),
-        tasks=[(str(row["task"]), sentence(row).replace(*told_once)) for row in rows[:SHOWN_TASKS]],
+        tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[
-            (
-                HEADLINES.get(name, name.replace("_", " ")),
-                shorten(text, LONGEST, placeholder=" ..."),
-            )
-            for name, text in about[:2]
+            (HEADLINES.get(n, n.replace("_", " ")), shorten(text, LONGEST, placeholder=" ..."))
+            for n, text in about[:2]
         ],
     )
 
@@ -112,7 +101,7 @@ def _compared(results: Results) -> list[str]:
     """Say which candidate is better, of the questions over all tasks."""
     rows = rows_of(results, "comparisons")
     sentences = [
-        str(row["answer"]).partition(IF_THAT_STAYS)[0].removesuffix("; stop here")
+        _with_shared(row).partition(IF_THAT_STAYS)[0].removesuffix("; stop here")
         for row in rows
         if row["task"] == ALL_TASKS
     ]
@@ -138,6 +127,13 @@ def _compared(results: Results) -> list[str]:
     return [cannot] if cannot else [*split, *found]
 
 
+def _with_shared(row: Row) -> str:
+    """Say of an open comparison what both candidates have in common, too."""
+    shared = _differing((str(row.get("first", "")), str(row.get("second", ""))))[1]
+    more = f" ({shared})" if shared else ""
+    return str(row["answer"]).replace("undecided", f"undecided{more}")
+
+
 def _lacks_n(results: Results) -> bool:
     return any(NO_N in text for text in results.missing)
 
@@ -149,8 +145,7 @@ def _regret(results: Results) -> list[str]:
         return []
     name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
     if regret.value == 0:
-        words = "and so do the recorded rates, which may be chance"
-        return [f"The twin ranks {name} first, {words}."]
+        return [f"The twin and the recorded rates both rank {name} first, which may be by chance."]
     taken = "one of them by chance" if " or " in name else "its recorded rate"
     words = f"The twin ranks {name} first; {taken} is {_points(regret.value)}"
     return [f"{words}{_ends(regret, '.0f')} below the best over all tasks."]
@@ -195,7 +190,9 @@ def _standing(results: Results) -> tuple[list[str], list[str]]:
     name, of = best[0]["candidate"], f"({best[0]['k']} of {best[0]['n']})"
     over_all = all(f", {name}, " in f", {row['beaten by']}, " for row in rows if row not in best)
     why = "it is better than each of the others" if over_all else "only it lost no comparison"
-    return [f"{name} {of} is the best of {len(rows)} candidates: {why}."], beaten
+    second = max((row for row in rows if row not in best), key=lambda row: _number(row["k"]) or 0.0)
+    then = f"; next {second['candidate']} ({second['k']} of {second['n']})"
+    return [f"{name} {of} is the best of {len(rows)} candidates: {why}{then}."], beaten
 
 
 def rows_of(results: Results, table_id: str) -> list[Row]:
@@ -263,13 +260,14 @@ def next_trials(results: Results) -> str:
         won = {str(row["candidate"]): _number(row["k"]) or 0.0 for row in standing}
         names = sorted({n for _, each in wanted for n in each}, key=lambda n: (-won.get(n, 0), n))
         whom = "them" if len(names) == 2 else "even two of them"
-        words = f"each may be best, and to tell {whom} apart would take about {2 * more} more"
+        words = f"each may be best; if what was seen stays, to tell {whom} apart takes about"
         first = " (most successes)" if won else ""
-        words = f"{words} trials over all tasks, which is seldom worth it."
+        words = f"{words} {2 * more} more trials in all, which is seldom worth it."
         return f"{TAKE}{names[0]}{first} or {' or '.join(names[1:])}: {words}"
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
     rest = f"; still open then: {len(wanted) - 1} more" if len(wanted) > 1 else ""
-    return f"{_more_trials(more, pair, tasks)}; that would likely tell these two apart{rest}."
+    likely = "if what was seen stays, that is likely to tell these two apart"
+    return f"{_more_trials(more, pair, tasks)}; {likely}{rest}."
 
 
 def _more_trials(more: int, pair: tuple[str, str], tasks: Sequence[str]) -> str:
@@ -278,8 +276,8 @@ def _more_trials(more: int, pair: tuple[str, str], tasks: Sequence[str]) -> str:
     sides = [n if n.startswith("with") else f"of {n}" for n in (first, second)]
     where = f": {', '.join(tasks)}" if len(tasks) <= SHOWN_TASKS else ""
     in_all = f" on each of {len(tasks)} tasks{where} ({2 * one * len(tasks)} trials in all)"
-    alone = f"{shared}, " if shared else ""
-    words = f"{alone}make {one} more {noun('trial', one)} {sides[0]} and {one} {sides[1]}"
+    alone = f", all {shared}{',' * (len(tasks) > 1)}" if shared else ""
+    words = f"make {one} more {noun('trial', one)} {sides[0]} and {one} {sides[1]}{alone}"
     return f"{words}{in_all if len(tasks) > 1 else ''}"
 
 
@@ -320,14 +318,15 @@ def _trust(results: Results) -> list[str]:
         return []
     found = [*_blind(results, bias.n), *_followed(r, bias.n), *_near(results, bias)]
     if results.stand_in:
-        found.insert(0, (False, "what was recorded is a simulation itself"))
+        found.insert(0, (False, "the recorded side is a simulation, too"))
     against = [words for is_sure, words in found if is_sure]
     low = 0.0 if r.interval is None else r.interval.low
     yes = f"in each of these tasks its rate is within {CLOSE_PP:.0f} points of the recorded one, "
     yes += f"it follows from group to group (r at least {low:.2f}), and no group looks blind"
     told = "No" if against else "Not yet" if found else "Yes"
     why = "; ".join(against or [words for _, words in found] or [yes])
-    return [f"{told}. {why[0].upper()}{why[1:]}.{USE if found and not results.stand_in else ''}"]
+    use = USE if found and not results.stand_in and not _all_alike(results)[0] else ""
+    return [f"{told}. {why[0].upper()}{why[1:]}.{use}"]
 
 
 Against = Iterator[tuple[bool, str]]
@@ -336,10 +335,14 @@ Against = Iterator[tuple[bool, str]]
 
 def _blind(results: Results, num_groups: int) -> Against:
     notes = rows_of(results, "notes")
-    if blind := [str(row["about"]) for row in notes if BLIND_HERE in str(row["note"])]:
-        named = [*blind[:SHOWN_TASKS], *["..."] * (len(blind) > SHOWN_TASKS)]
-        words = f"in {len(blind)} of {num_groups} groups its rate is far from the recorded one"
-        yield True, f"{words}, unlike in the others ({' / '.join(named)})"
+    if far := [
+        str(row["note"]).replace(FAR_HERE, str(row["about"]))
+        for row in notes
+        if FAR_HERE in str(row["note"])
+    ]:
+        named = [*far[:SHOWN_ANSWERS], *["..."] * (len(far) > SHOWN_ANSWERS)]
+        words = f"in {len(far)} of {num_groups} groups its rate is far from the recorded one"
+        yield True, f"{words}, unlike in the others ({'; '.join(named)})"
 
 
 def _followed(r: Measurement, num_groups: int) -> Against:
@@ -353,7 +356,7 @@ def _followed(r: Measurement, num_groups: int) -> Against:
     elif r.interval.high < FOLLOWS_R:
         yield True, f"its rates hardly follow the recorded ones (r at most {r.interval.high:.2f})"
     elif r.interval.low <= 0:
-        yield False, "its correlation with the recorded rates is too uncertain to use"
+        yield False, f"how its rates follow the recorded ones is too uncertain (r{_ends(r, '.2f')})"
 
 
 def _near(results: Results, bias: Measurement) -> Against:
@@ -370,7 +373,7 @@ def _near(results: Results, bias: Measurement) -> Against:
         yield 2 * off > many, f"{_of_tasks(off, many)}its rate is {which}{named}"
     if open_ or not many:
         where = _of_tasks(open_, many)
-        yield False, f"{where}an error above {CLOSE_PP:.0f} points cannot be ruled out"
+        yield False, f"{where}it may be off by more than {CLOSE_PP:.0f} points"
 
 
 def _of_tasks(some: int, many: int) -> str:
@@ -446,16 +449,16 @@ def _all_alike(results: Results) -> tuple[str, str]:
     k, n = sum(m.k or 0 for m in rates), sum(m.n or 0 for m in rates)
     if not n or any(m.k is None for m in rates) or 0 < k < n:
         return "", ""
-    word, task = ("Nothing", "an easier") if k == 0 else ("Everything", "a harder")
-    ends = wilson(k, n)
-    told = f"{word.lower()} succeeded, {k} of {n} recorded {noun('trial', n)}; the rate over all "
-    cannot = "Nothing to compare" if len(rates) == 1 else "Cannot be told"
-    told = f"{cannot}: {told}lies between {100 * ends.low:.0f} and {100 * ends.high:.0f} %."
-    each = f"record {SAYS_LITTLE} trials or more of each policy on each task"
-    few = f"{each}; to judge the twin, of {GROUPS_FOR_R} such pairs or more."
-    why = "while all trials end alike, no policy can be shown to be better"
-    alike = f"check how success is scored, then {each} on {task} task: {why}."
-    return told, few if n < SAYS_LITTLE else alike
+    words, task = ("nothing", "an easier") if k == 0 else ("everything", "a harder")
+    each, ends = f"record {SAYS_LITTLE} trials or more of each policy on", wilson(k, n)
+    told = f"{words} succeeded, {k} of {n} recorded {noun('trial', n)}; the rate lies between "
+    told = f"{told}{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
+    cannot = "Nothing to compare: there is one policy on one task; " if len(rates) == 1 else ""
+    few = f"{each} each task; to compare, of two policies or more; to judge the twin, of "
+    few = f"{few}{GROUPS_FOR_R} groups (policies times tasks) or more."
+    why = f"while {words} succeeds, no policy can be shown to be better"
+    alike = f"check how success is scored; if that is right, {each} {task} task: {why}."
+    return (cannot or "Cannot be told: ") + told, few if n < SAYS_LITTLE else alike
 
 
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:

@@ -15,6 +15,7 @@ from bridge.exchange.trials_csv import trials_text
 from bridge.whole_file import write_whole
 from evaluator import review_index
 from evaluator.cache import FOLDER, SummaryCache
+from evaluator.compare.conclusions import CLOSE_PP
 from evaluator.compare.failures import failure_kind, start_regions
 from evaluator.compare.measure import refuse_alike
 from evaluator.compare.motion import MotionSummary
@@ -24,7 +25,7 @@ from evaluator.compare.spreadsheet import record_from_row
 from evaluator.compare.stages import first_failed_stage
 from evaluator.memory import without_collecting
 from evaluator.quantity import slug
-from evaluator.report.front import CLOSE_PP, IN_NUMBERS, answer, front, rows_of, sentence
+from evaluator.report.front import IN_NUMBERS, answer, front, rows_of, sentence
 from evaluator.report.page import grid
 from evaluator.report.wording import cell_text
 from evaluator.result import Results, Table, load_results

@@ -194,22 +194,16 @@ class GapModel:
             reason = "a group has no trial on one side"
         if reason:
             raise UndefinedStatisticError(statistic="model of agreement", reason=reason)
-        there = self.populations
+        there = drawn()
         odds = common_log_odds(self.groups)
         seeing, blind = chances_in(there, [_likelihood(group, odds) for group in self.groups])
         share = there.share[:, None]
         chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
-        logs = np.log(chance).sum(axis=1) / self.design_effect
-        weights = _flattened(logs)
-        object.__setattr__(self, "weights", weights)
+        logs = np.log(chance).sum(axis=1)
+        object.__setattr__(self, "weights", _flattened(logs / self.design_effect))
         # Flat weights would see scatter in place of groups that lie apart from the others.
         sharp = _flattened(logs, few=1.0)
         object.__setattr__(self, "blind_groups", sharp @ (share * blind / chance))
-
-    @property
-    def populations(self) -> Populations:
-        """The populations that are weighed."""
-        return drawn()
 
     @cached_property
     def design_effect(self) -> float:
@@ -224,7 +218,7 @@ class GapModel:
     @cached_property
     def r(self) -> Interval:
         """Correlation of true rates over all groups of this kind."""
-        above = float(self.weights @ (self.populations.r > 0))
+        above = float(self.weights @ (drawn().r > 0))
         below, beyond = (BEYOND + (TOWARD_0 - BEYOND) * sure**3 for sure in (above, 1 - above))
         found = self._interval("r", below, beyond)
         low = -1.0 if found.low < AT_END - 1 else found.low
@@ -238,11 +232,11 @@ class GapModel:
     @property
     def blind_share(self) -> tuple[float, Interval]:
         """Share of groups of this kind in which the twin is blind: mean and interval."""
-        return float(self.weights @ self.populations.share), self._interval("share")
+        return float(self.weights @ drawn().share), self._interval("share")
 
     def _interval(self, what: str, below: float = TAIL, beyond: float = TAIL) -> Interval:
-        order = self.populations.orders[what]
-        values = getattr(self.populations, what)
+        order = drawn().orders[what]
+        values = getattr(drawn(), what)
         middle = np.cumsum(self.weights[order]) - self.weights[order] / 2
         low, high = np.interp([below, 1 - beyond], middle, values[order])
         return Interval(low=float(low), high=float(high), level=LEVEL, method=METHOD)

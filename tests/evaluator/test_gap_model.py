@@ -49,6 +49,9 @@ def test_groups_that_share_a_task_count_as_fewer() -> None:
     )
     assert shared.design_effect > 2
     assert shared.r.high - shared.r.low > alone.r.high - alone.r.low
+    assert shared.blind_groups == pytest.approx(alone.blind_groups), (
+        "of these groups, not of others"
+    )
 
 
 def test_paired_trials_that_agree_by_their_start_say_less_than_others() -> None:

@@ -82,4 +82,6 @@ def test_trials_of_either_side_of_two_policies_have_a_bias_with_its_interval(
     sides = ("sim_planned", "verdict", "sim_executed")
     assert not any(text.startswith(sides) for text in found.missing)
     said = front(found.results())
-    assert "without an interval" not in " ".join([*said.sentences, said.tasks[0][1]])
+    assert "without an interval" not in " ".join(
+        [*(text for _, text in said.answers), said.tasks[0][1]]
+    )

@@ -55,7 +55,7 @@ def test_the_first_page_says_what_it_means_in_few_words() -> None:
     for path in (PAPER, published):
         results = compare_csv(path).results()
         first = front(results)
-        assert first.sentences
+        assert first.answers
         assert first.tasks
         text = re.sub(r"<nav.*?</nav>|<style.*?</style>", " ", page(results), flags=re.S)
         while "<details" in text:
@@ -121,12 +121,14 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     ]
     table = Table(id="comparisons", title="t", columns=columns, rows=tuple(rows))
     results = Results(run="r", source="trials", stand_in=None, tables=(table,))
-    words = "make 1 more trial of C and 1 of B; that would likely tell these two apart; still"
-    assert next_trials(results) == f"{words} open then: 1 more."
+    words = (
+        "make 1 more trial of C and 1 of B; if what was seen stays, that is likely to tell these "
+    )
+    assert next_trials(results) == f"{words}two apart; still open then: 1 more."
     made = Measurement(id="rate.recorded.a", value=0.5, unit="1", definition="d", k=1, n=2)
     few = replace(table, rows=(compared(ALL_TASKS, "A", "no", 4),))
     told = next_trials(replace(results, tables=(few,), measurements=(made,)))
-    assert told.startswith("take A or B: each may be best, and to tell them apart")
+    assert told.startswith("take A or B: each may be best; if what was seen stays, to tell them")
     assert "about 8 more trials" in told
     in_tasks = replace(
         table, rows=(rows[0], *(compared(t, "A", "no", 9) for t in ("pour", "stir")))
@@ -138,7 +140,7 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
         replace(results, tables=(opposed,))
     )
     assert "Not beaten: B on x; A on y." in " ".join(
-        front(replace(results, tables=(opposed,))).sentences
+        map(": ".join, front(replace(results, tables=(opposed,))).answers)
     )
     decided = replace(table, rows=tuple(rows[2:]))
     assert next_trials(replace(results, tables=(decided,))) == ""
@@ -155,7 +157,9 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     pair = [compared(ALL_TASKS, "A, without replanning", "no", 9)]
     pair[0] = (*pair[0][:3], "A, with replanning", *pair[0][4:])
     next_step = next_trials(replace(results, tables=(replace(table, rows=tuple(pair)),)))
-    assert next_step.startswith("A, make 9 more trials without replanning and 9 with replanning;")
+    assert next_step.startswith(
+        "make 9 more trials without replanning and 9 with replanning, all A;"
+    )
 
 
 def shown(tmp_path: Path, text: str) -> tuple[str, str]:
@@ -163,7 +167,7 @@ def shown(tmp_path: Path, text: str) -> tuple[str, str]:
     path = tmp_path / "table.csv"
     path.write_text(text)
     written = write_report(compare_csv(path), tmp_path / "out")
-    told = [*front(written.content).sentences, *written.content.missing]
+    told = [*map(": ".join, front(written.content).answers), *written.content.missing]
     return " ".join(told), summary_text(written.content, written)
 
 
@@ -183,6 +187,7 @@ def test_a_twin_is_trusted_only_where_the_numbers_say_so(tmp_path: Path) -> None
     assert trusted(tmp_path, right[::-1], 100).startswith("No. ")
     blind = trusted(tmp_path, (9, *right[1:]), 100)  # in one task it says success throughout
     assert blind.startswith("No. In 2 of 20 groups its rate is far from")
+    assert "(t0, p0: 90 against 0 %; t0, p1: 90 against 0 %)" in blind
 
 
 def test_rates_without_n_ask_for_it_and_claim_no_interval(tmp_path: Path) -> None:
