@@ -70,14 +70,6 @@ class CameraNotReadyError(TwinError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PosedFrames:
-    """Frames of one camera, and the frame their poses are in."""
-
-    root: str
-    frames: list[RgbdFrame]
-
-
-@dataclass(frozen=True, kw_only=True)
 class LiveCell:
     """What is known at one moment of where things are."""
 
@@ -126,8 +118,11 @@ class LiveCell:
 
 def frames_of(
     camera_id: str, camera: LiveCamera, cell: LiveCell, quiet_since_ns: int, max_frames: int
-) -> PosedFrames:
-    """One camera's newest frames at rest, later than the last execution (cell's clock)."""
+) -> tuple[str, list[RgbdFrame]]:
+    """The frame that poses are in, and one camera's newest frames at rest.
+
+    They are later than the last execution (cell's clock).
+    """
     missing = [f"{name}/info" for name in ("color", "depth") if name not in camera.infos]
     if missing:
         raise CameraNotReadyError(f"no calibration on {' and '.join(missing)}")
@@ -153,7 +148,7 @@ def frames_of(
         for color, depth in pairs[-max_frames:]
         if color.stamp_ns >= oldest_ns
     ]
-    return PosedFrames(root=poses.tree.root_of(frame_id), frames=frames)
+    return poses.tree.root_of(frame_id), frames
 
 
 def _pairs(camera: LiveCamera) -> list[tuple[CompressedColor | RawColor, DepthImage]]:
@@ -401,7 +396,7 @@ class LiveView:
             joints=joints,
             urdf=urdf,
         )
-        found: dict[str, PosedFrames] = {}
+        found: dict[str, tuple[str, list[RgbdFrame]]] = {}
         reasons: list[str] = []
         for camera_id, camera in cameras.items():
             age_ns = newest_ns - max((image.stamp_ns for image in camera.colors), default=newest_ns)
@@ -414,11 +409,11 @@ class LiveView:
                 )
             except GstError as error:
                 reasons.append(f"{camera_id}: {error}")
-        root = common_root([item.root for item in found.values()], base_frame)
+        root = common_root([own for own, _ in found.values()], base_frame)
         reasons += [
-            f"{camera_id}: its poses are in frame {item.root!r}, not in {root!r}"
-            for camera_id, item in found.items()
-            if item.root != root
+            f"{camera_id}: its poses are in frame {own!r}, not in {root!r}"
+            for camera_id, (own, _) in found.items()
+            if own != root
         ]
-        frames = [f for item in found.values() if item.root == root for f in item.frames]
+        frames = [frame for own, some in found.values() if own == root for frame in some]
         return LiveFrames(frames=frames, reasons=reasons)

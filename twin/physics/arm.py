@@ -21,8 +21,10 @@ from twin.physics.engine import pybullet
 # PyBullet gives links without ``<inertial>`` a mass of 1 kg, massless frames included, and makes
 # its own hulls of meshes; both are settled here so that it simulates the robot that was described.
 
-_TINY_MASS_KG = 1e-3
-_TINY_INERTIA_KG_M2 = 1e-6
+_TINY_INERTIAL = (
+    '<inertial><mass value="0.001"/>'
+    '<inertia ixy="0" ixz="0" iyz="0" ixx="1e-06" iyy="1e-06" izz="1e-06"/></inertial>'
+)
 
 Hulls = Mapping[str, Sequence[Float[np.ndarray, "num_points 3"]]]
 
@@ -34,22 +36,13 @@ def write_description(urdf: str, mesh_hulls_m: Hulls, folder: Path) -> Path:
         for visual in link.findall("visual"):
             link.remove(visual)
         if link.find("inertial") is None:
-            link.append(_tiny_inertial())
+            link.append(ET.fromstring(_TINY_INERTIAL))
         hulls = mesh_hulls_m.get(link.get("name", ""), ())
         if hulls:  # by number: a name may hold a slash
             _replace_meshes(link, hulls, folder, f"link_{number}")
     path = folder / "robot.urdf"
     path.write_text(ET.tostring(root, encoding="unicode"))
     return path
-
-
-def _tiny_inertial() -> ET.Element:
-    inertial = ET.Element("inertial")
-    ET.SubElement(inertial, "mass", value=str(_TINY_MASS_KG))
-    inertia = ET.SubElement(inertial, "inertia", ixy="0", ixz="0", iyz="0")
-    for axis in ("ixx", "iyy", "izz"):
-        inertia.set(axis, str(_TINY_INERTIA_KG_M2))
-    return inertial
 
 
 def _replace_meshes(
@@ -399,12 +392,9 @@ def _numbers(joints: Joints) -> list[float]:
     return joints if isinstance(joints, list) else joints.tolist()
 
 
-# Fingers that press on what does not yield get their force in fewer iterations of the solver.
-# The solver begins each step with fingers that press by nothing, and each of its iterations adds
-# what stops a finger at the speed it is driven with. At the usual speed 20 N take 45 iterations;
-# all else takes 10. Fingers that stand still although they are told to close are therefore driven
-# faster. Their force is the same. What they hold may give way: then they are at the usual speed
-# again before they have gone far. docs/decisions/0017-contact-physics.md.
+# Stalled fingers are driven faster: the same force in fewer iterations of the solver. What they
+# hold may give way: then they are at the usual speed again before they have gone far.
+# docs/decisions/0017-contact-physics.md.
 
 PRESS_M_S = 0.8
 """Speed with which stalled fingers are driven; until somebody looks they go 7 mm at most."""
@@ -434,13 +424,11 @@ class Press:
             self._found = 0
             self._arm.press(None)
         elif self._arm.closing and self._steps % EVERY_STEPS == 0:
-            self._found = self._found + 1 if self._stalled() else 0
+            stalled = bool(self._arm.finger_links) and all(
+                short_m > SHORT_M and abs(speed_m_s) < STALLED_M_S
+                for short_m, speed_m_s in self._arm.fingers()
+            )
+            self._found = self._found + 1 if stalled else 0
             self._arm.press(PRESS_M_S if self._found >= PATIENCE else None)
         elif not self._arm.closing:
             self._found = 0
-
-    def _stalled(self) -> bool:
-        return bool(self._arm.finger_links) and all(
-            short_m > SHORT_M and abs(speed_m_s) < STALLED_M_S
-            for short_m, speed_m_s in self._arm.fingers()
-        )

@@ -322,15 +322,6 @@ class UrGeometry:
         return np.asarray(T @ self.T_6_tcp)
 
 
-def ur_geometry(robot: RobotModel) -> UrGeometry | None:
-    """Read the geometry off the joint axes; None when the arm has another one."""
-    axes = _axes(robot)
-    if axes is None:
-        return None
-    geometry = _through(*axes, robot.T_base_tcp(np.zeros(6)))
-    return None if geometry is None else _checked(geometry, robot)
-
-
 def _axes(robot: RobotModel) -> tuple[Float[np.ndarray, "6 3"], Float[np.ndarray, "6 3"]] | None:
     """Direction of each joint axis at zero and the point on it nearest the base's origin."""
     if len(robot.arm_ids) != 6:
@@ -449,7 +440,9 @@ class UrInverse:
     @lru_cache(maxsize=4)
     def for_robot(robot: RobotModel) -> "UrInverse | None":
         """Return the inverse of a robot's arm, None when its geometry is not that of a UR."""
-        geometry = ur_geometry(robot)
+        axes = _axes(robot)
+        laid = None if axes is None else _through(*axes, robot.T_base_tcp(np.zeros(6)))
+        geometry = None if laid is None else _checked(laid, robot)
         if geometry is None:
             return None
         return UrInverse(geometry=geometry, lower_rad=robot.lower_rad, upper_rad=robot.upper_rad)
