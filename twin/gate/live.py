@@ -143,12 +143,22 @@ def frames_of(
     if not pairs:
         raise CameraNotReadyError("no colour and depth pair taken at rest since the last motion")
     oldest_ns = pairs[-1][0].stamp_ns - MAX_SPAN_NS
+    tree, lenses = poses.tree, {name: info.camera for name, info in camera.infos.items()}
     frames = [
-        with_true_depth(_frame(camera_id, camera.infos, poses.tree, color, depth), poses)
+        RgbdFrame(
+            camera_id=camera_id,
+            stamp_ns=color.stamp_ns,
+            image_u8=color.image_u8(),
+            depth_m=depth.depth_m(),
+            color_camera=lenses["color"],
+            depth_camera=lenses["depth"],
+            T_base_color=tree.T_root_frame(frame_id, color.stamp_ns),
+            T_base_depth=tree.T_root_frame(camera.infos["depth"].frame_id, depth.stamp_ns),
+        )
         for color, depth in pairs[-max_frames:]
         if color.stamp_ns >= oldest_ns
     ]
-    return poses.tree.root_of(frame_id), frames
+    return tree.root_of(frame_id), [with_true_depth(frame, poses) for frame in frames]
 
 
 def _pairs(camera: LiveCamera) -> list[tuple[CompressedColor | RawColor, DepthImage]]:
@@ -158,25 +168,6 @@ def _pairs(camera: LiveCamera) -> list[tuple[CompressedColor | RawColor, DepthIm
         if gaps_ns and min(gaps_ns) <= PAIRING_TOLERANCE_NS:
             pairs.append((color, camera.depths[gaps_ns.index(min(gaps_ns))]))
     return pairs
-
-
-def _frame(
-    camera_id: str,
-    infos: dict[str, CameraInfo],
-    tree: TransformTree,
-    color: CompressedColor | RawColor,
-    depth: DepthImage,
-) -> RgbdFrame:
-    return RgbdFrame(
-        camera_id=camera_id,
-        stamp_ns=color.stamp_ns,
-        image_u8=color.image_u8(),
-        depth_m=depth.depth_m(),
-        color_camera=infos["color"].camera,
-        depth_camera=infos["depth"].camera,
-        T_base_color=tree.T_root_frame(infos["color"].frame_id, color.stamp_ns),
-        T_base_depth=tree.T_root_frame(infos["depth"].frame_id, depth.stamp_ns),
-    )
 
 
 KEPT_TRANSFORMS = 1000

@@ -2,7 +2,7 @@
 
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -108,6 +108,19 @@ class _Drive:
         return self.multiplier * self.finger.slope(width_m)
 
 
+def require_parts(record: Robot, joints: Collection[str], links: Collection[str]) -> None:
+    """Refuse (PhysicsError) a description that lacks a part of the robot's arm or fingers."""
+    missing = [name for name in (*record.joints, *record.finger_joints) if name not in joints]
+    tool = (record.tool_frame, *record.gripper.finger_links)
+    missing += [name for name in tool if name not in links]
+    if missing:
+        message = (
+            f"the robot description lacks {', '.join(missing)}; it has the joints "
+            f"{', '.join(joints)}. Physics needs the arm and the fingers of {record.name!r}."
+        )
+        raise PhysicsError(message)
+
+
 class Arm:
     """One robot with its base at the origin of a PyBullet client."""
 
@@ -166,17 +179,7 @@ class Arm:
                 fixed.add(index)
         self.base_links = tuple(sorted(fixed - {-1}))
         """What no joint moves."""
-        wanted = (*record.joints, *record.finger_joints)
-        missing = [name for name in wanted if name not in self._joints] + [
-            name for name in (record.tool_frame, *gripper.finger_links) if name not in self.links
-        ]
-        if missing:
-            message = (
-                f"the robot description lacks {', '.join(missing)}; it has the joints "
-                f"{', '.join(self._joints)}. Physics needs the arm and the fingers of "
-                f"{record.name!r}."
-            )
-            raise PhysicsError(message)
+        require_parts(record, self._joints, self.links)
         self._arm = [self._joints[name] for name in record.joints]
         self._drives = self._driven(mimics)
         self._fingers = [drive.index for drive in self._drives]
