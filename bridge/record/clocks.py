@@ -1,4 +1,4 @@
-"""Asks every source for its clock, once a second, and says which clock was set.
+"""Asks every source for its clock, once a second, and at the end how many messages it has sent.
 
 The readings go into the open episode on ``/recorder/clocks``; ``bridge.episode.clocks`` fits them.
 """
@@ -17,11 +17,13 @@ from bridge.episode.clocks import (
     told_jump,
 )
 from bridge.record.presence import News
-from bridge.wire.clocks import ClockAnswer, ask_clocks
+from bridge.wire.clocks import ClockAnswer, Sent, ask_clocks, hear_last_words
 from bridge.wire.errors import WireError
 from bridge.wire.session import WireSession
 
 PERIOD_S = 1.0
+SETTLE_S = 1.0
+"""A stop waits no longer for those who do not answer."""
 MAX_SOURCES = 200
 KEPT = 600
 EARLIER = 60
@@ -46,7 +48,9 @@ class ClockBook:
         self._clocks: dict[tuple[str, str], SourceClock] = {}
 
     def take(self, answer: ClockAnswer) -> None:
-        """Enter what a source answered."""
+        """Enter what a source answered of its clock."""
+        if answer.reading is None:
+            return
         key = (answer.source, answer.identity)
         with self._lock:
             clock = self._clocks.get(key)
@@ -110,10 +114,12 @@ def _best(readings: list[Reading]) -> list[Reading]:
 class ClockAsker:
     """Asks all sources on a thread of its own."""
 
-    def __init__(self, session: WireSession, book: ClockBook) -> None:
-        """Begin to ask."""
+    def __init__(self, session: WireSession, book: ClockBook, told: Callable[[Sent], None]) -> None:
+        """Begin to ask; ``told`` hears of what ends how many messages it has sent."""
         self._session = session
         self._book = book
+        self._told = told
+        self._last = hear_last_words(session, told)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._ask, name="clocks", daemon=True)
         self._thread.start()
@@ -125,9 +131,16 @@ class ClockAsker:
                     self._book.take(answer)
             self._ended.wait(PERIOD_S)
 
+    def settle(self) -> None:
+        """Ask everybody how many messages they have sent by now."""
+        with contextlib.suppress(WireError):  # the session is closing
+            for answer in ask_clocks(self._session, timeout_s=SETTLE_S, is_last=True):
+                self._told(answer.sent)
+
     def close(self) -> None:
         """Stop."""
         self._ended.set()
+        self._last.close()
         self._thread.join(timeout=2 * PERIOD_S)
 
 

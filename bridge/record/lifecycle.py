@@ -381,7 +381,7 @@ class Lifecycle:
         self.is_finishing = False
         answer = {"ok": True, "episode": take.info.id, "discarded": discard}
         answer["duration_s"] = s_from_ns(end_ns - take.start_ns)
-        return {**answer, **counts(take)}
+        return {**answer, **counts(take), "uncounted_tails": take.ledger.uncounted_tails()}
 
     def event(
         self, kind: str, command: Command, text: str, outcome: metadata.Outcome | None

@@ -29,7 +29,7 @@ from bridge.record.recorder import Recorder
 from bridge.record.ros2 import Ros2Graph
 from bridge.task.task_file import TaskFile
 from bridge.wire import rmw
-from bridge.wire.clocks import ALIVE
+from bridge.wire.clocks import ALIVE, Sent
 from bridge.wire.errors import WireError
 from bridge.wire.publisher import WirePublisher
 from bridge.wire.qos import Qos
@@ -227,7 +227,8 @@ class LiveRecorder:
         core.also_tell("last_receive_error", lambda: session.last_receive_error)
         self._links = session.watch_links(self._on_link)
         self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
-        self._clocks = ClockAsker(session, core.clocks)
+        self._clocks = ClockAsker(session, core.clocks, self._told)
+        core.settle = self._clocks.settle
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
         self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
@@ -238,6 +239,9 @@ class LiveRecorder:
     def _take(self, sample: WireSample) -> None:
         if not sample.topic.startswith(CONTROL_PREFIX):
             self.core.receive(sample)
+
+    def _told(self, sent: Sent) -> None:
+        self.core.input_queue.told(sent, self.session.now_ns())
 
     def _on_link(self, is_open: bool) -> None:
         if not is_open:
@@ -262,6 +266,9 @@ class LiveRecorder:
 
     def close(self) -> dict[str, Any] | None:
         """Finish the open episode, then leave the network; returns the answer to that stop."""
+        if self.core.recording:  # while it still listens
+            self.core.settle()
+        self.core.settle = lambda: None
         self._ended.set()
         self.core.news_arrived.set()
         self._heartbeat.close()

@@ -2,7 +2,7 @@
 
 A number that is skipped is booked as lost at once, and taken back when its message arrives late:
 what remains booked is what never came. What came before the first number of a stream, and after
-its last, is unknown and not claimed.
+its last where its publisher does not say how many it has sent, is unknown and not claimed.
 """
 
 import sys
@@ -79,6 +79,18 @@ class SequenceTracker:
                 return step
         self._begin(sample)
         return _NEXT
+
+    def told(self, topic: str, gid: bytes, sent: int, ticket: int) -> int | None:
+        """Book what a publisher has sent and nobody has seen; None of one that nobody has seen."""
+        stream = self._streams.get((topic, gid))
+        if stream is None:
+            return None
+        gap = _unwrapped(sent, stream) - stream.next
+        if not 0 < gap <= MAX_JUMP:
+            return 0
+        self._remember(stream, _Hole(stream.next, stream.next + gap, ticket))
+        stream.next += gap
+        return gap
 
     def _begin(self, sample: WireSample) -> None:
         key = (sample.topic, sample.source_gid or b"")

@@ -215,8 +215,9 @@ class WireSession:
         self._clock = AnchoredClock()
         self._services: list[Service] = []
         self._alive: list[Subscriber] = []
+        self._last_words: list[tuple[Any, Callable[[bytes], bytes]]] = []
         self._definitions: dict[tuple[str, str], schema.Schema] = {}
-        self.topics: set[str] = set()
+        self._publishers: list[tuple[str, WirePublisher]] = []
         self._pool = SharedPool(shared_memory_mb * BYTES_PER_MB) if shared_memory_mb else None
 
     @property
@@ -252,8 +253,16 @@ class WireSession:
             )
         except zenoh.ZError as error:
             raise BadTopicError(topic=topic, found=cause_of(error)) from error
-        self.topics.add(topic)
-        return WirePublisher(inner, self._pool if qos.shared_memory else None)
+        made = WirePublisher(inner, self._pool if qos.shared_memory else None)
+        self._publishers.append((topic, made))
+        return made
+
+    def sent(self) -> dict[str, dict[str, int]]:
+        """By topic and publisher id in hex, the messages so far, those that zenoh dropped too."""
+        counts: dict[str, dict[str, int]] = {}
+        for topic, made in list(self._publishers):
+            counts.setdefault(topic, {})[made.gid.hex()] = made.sent
+        return counts
 
     def subscribe(
         self,
@@ -356,6 +365,21 @@ class WireSession:
         self._services.append(service)
         return service
 
+    def say_last(self, key: str, words: Callable[[bytes], bytes]) -> None:
+        """Ask on a key once more before the session closes, and wait for who listens there.
+
+        The request comes behind all that was published: what was heard of it by then was all.
+        """
+        querier = self._inner.declare_querier(
+            key,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            priority=zenoh.Priority.BACKGROUND,
+            allowed_destination=zenoh.Locality.REMOTE,
+            timeout=CLOSE_S,
+        )
+        self._last_words.append((querier, words))
+
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask and wait for the answer."""
         try:
@@ -372,13 +396,14 @@ class WireSession:
         raise RemoteError(refusal)
 
     def query_all(
-        self, key_expression: str, *, timeout_s: float, max_mb: int = 64
+        self, key_expression: str, *, timeout_s: float, max_mb: int = 64, is_last: bool = False
     ) -> list[WireSample]:
         """Ask everybody and return every good answer, in the order they came.
 
         Used for what caches keep: the last messages of a topic whose publisher spoke before we
         listened. Whoever has not answered in time is left out, and so is what comes after
-        ``max_mb`` [MB], for nobody knows what a cache holds.
+        ``max_mb`` [MB], for nobody knows what a cache holds. ``is_last``: no answer overtakes what
+        its sender has published before.
         """
         answers: list[WireSample] = []
         left = max_mb * BYTES_PER_MB
@@ -389,6 +414,7 @@ class WireSession:
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
+                priority=zenoh.Priority.BACKGROUND if is_last else zenoh.Priority.DATA,
             )
             for reply in replies:
                 if reply.ok is None:
@@ -434,10 +460,15 @@ class WireSession:
         return Subscriber(declared)
 
     def close(self) -> None:
-        """Finish answering, then leave the network."""
+        """Finish answering, say the last words, then leave the network."""
         for service in self._services:
             service.close()
         self._services.clear()
+        with contextlib.suppress(zenoh.ZError):  # closed already
+            for querier, words in self._last_words:
+                if querier.matching_status.matching:
+                    list(querier.get(payload=words(b"")))
+        self._last_words.clear()
         for token in self._alive:
             token.close()
         self._alive.clear()

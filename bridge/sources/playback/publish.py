@@ -23,6 +23,7 @@ from bridge.episode.topics import OF_RECORDER, TF_STATIC, is_latched
 from bridge.errors import UsageError
 from bridge.sources.playback.config import PlaybackConfig, choose_topics
 from bridge.terminal import Output
+from bridge.wire.clocks import announce
 from bridge.wire.errors import BadTopicError
 from bridge.wire.keys import key_from_topic
 from bridge.wire.qos import Qos
@@ -120,8 +121,8 @@ class EpisodeSource:
         """
         for path in self.episode.missing_parts:
             output.say(f"{path.name} is missing; what it held is not played")
-        for cell in sorted({name.split("/")[1] for name in self.topics if name.count("/") > 1}):
-            session.declare_alive(f"{cell}/alive")
+        if cells := sorted({name.split("/")[1] for name in self.topics if name.count("/") > 1}):
+            announce(session, *cells, has_clock=False)
         publishers = self._publishers(session)
         sent = dict.fromkeys(self.topics, 0)
         late_s = array("d")

@@ -105,8 +105,9 @@ class StandinSource:
 
     def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
         """Record as the configuration says, or until stopped; see ``run_session``."""
-        # Without an answer to @clock: the stamps are simulated time, not that of this host.
-        session.declare_alive(f"{self.config.cell}/alive")
+        from bridge.wire.clocks import announce  # noqa: PLC0415  # zenoh only when live
+
+        announce(session, self.config.cell, has_clock=False)  # the stamps are simulated time
         return run_session(session, self.config, output, should_stop=stop.is_set)
 
 
