@@ -227,7 +227,7 @@ class LiveRecorder:
         core.also_tell("last_receive_error", lambda: session.last_receive_error)
         self._links = session.watch_links(self._on_link)
         self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
-        self._clocks = ClockAsker(session, core.clocks, self._told)
+        self._clocks = ClockAsker(session, core.clocks, self._told, core.input_queue.seen)
         core.settle = self._clocks.settle
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"

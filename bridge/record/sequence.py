@@ -81,16 +81,15 @@ class SequenceTracker:
         return _NEXT
 
     def told(self, topic: str, gid: bytes, sent: int, ticket: int) -> int | None:
-        """Book what a publisher has sent and nobody has seen; None of one that nobody has seen."""
+        """Book what a publisher has sent and nobody has seen; None where that cannot be."""
         stream = self._streams.get((topic, gid))
-        if stream is None:
+        gap = MAX_JUMP + 1 if stream is None else _unwrapped(sent, stream) - stream.next
+        if stream is None or gap > MAX_JUMP:
             return None
-        gap = _unwrapped(sent, stream) - stream.next
-        if not 0 < gap <= MAX_JUMP:
-            return 0
-        self._remember(stream, _Hole(stream.next, stream.next + gap, ticket))
-        stream.next += gap
-        return gap
+        if gap > 0:
+            self._remember(stream, _Hole(stream.next, stream.next + gap, ticket))
+            stream.next += gap
+        return max(0, gap)
 
     def _begin(self, sample: WireSample) -> None:
         key = (sample.topic, sample.source_gid or b"")

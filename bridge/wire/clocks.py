@@ -118,4 +118,6 @@ def _counts(record: Any) -> Sent:
             if len(key[1]) != GID_BYTES or type(count) is not int or not 0 <= count < 2**63:
                 raise ValueError(count)
             counts[key] = count
+            if len(counts) > MAX_TOPICS:
+                raise ValueError(len(counts))
     return counts

@@ -154,7 +154,7 @@ def test_what_was_measured_before_begins_an_episode_in_few_records() -> None:
     book = ClockBook()
     for k in range(1000):
         reading = Reading(k * NS_PER_S, 5, 100 + k % 7)
-        book.take(ClockAnswer("lab", "1", "pc", frozenset(("/lab/a",)), reading))
+        book.take(ClockAnswer("lab", "1", "pc", frozenset(("/lab/a",)), reading, {}))
     (record,) = book.earlier()
     assert len(record["readings"]) <= record_clocks.EARLIER
     assert {reading[2] for reading in record["readings"]} == {100}
@@ -164,7 +164,7 @@ def test_a_jump_that_answers_have_shown_is_not_told_again_for_its_stamps() -> No
     book = ClockBook()
     for at_s, offset_ns in ((0, 0), (1, 60 * NS_PER_S)):
         reading = Reading(at_s * NS_PER_S, offset_ns, 100)
-        book.take(ClockAnswer("lab", "1", "pc", frozenset(("/lab/a", "/tf")), reading))
+        book.take(ClockAnswer("lab", "1", "pc", frozenset(("/lab/a", "/tf")), reading, {}))
     assert book.has_named(["/lab/a"], 60 * NS_PER_S + 1000)
     assert not book.has_named(["/lab/a"], -60 * NS_PER_S)
     assert not book.has_named(["/lab/a", "/lab/b"], 60 * NS_PER_S)
