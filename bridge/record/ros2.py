@@ -9,9 +9,9 @@ import contextlib
 import queue
 import threading
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
 
 from bridge.errors import GstError, MissingDependencyError
+from bridge.record.recorder import Recorder
 from bridge.wire import keys, rmw
 from bridge.wire.rmw import is_known_definition, type_hash_of
 from bridge.wire.session import WireSample, WireSession
@@ -21,22 +21,14 @@ MAX_ENDPOINTS = 10_000
 MAX_WARNINGS = 1_000
 
 
-@runtime_checkable
-class Receiver(Protocol):
-    """What takes messages; ``bridge.record.recorder.Recorder`` is one."""
-
-    def receive(self, sample: WireSample) -> None:
-        """Take a message; never waits."""
-
-    def declare_latched(self, topic: str) -> None:
-        """Learn that the last message of a topic stays true; never waits."""
-
-
 class Ros2Graph:
-    """The ROS 2 endpoints on the network, followed from their liveliness tokens until ``close``."""
+    """The ROS 2 publishers on the network, followed from their liveliness tokens until ``close``.
+
+    With the last one of a topic go that topic's latched messages.
+    """
 
     def __init__(
-        self, session: WireSession, recorder: Receiver, msg_folder: Path | None = None
+        self, session: WireSession, recorder: Recorder, msg_folder: Path | None = None
     ) -> None:
         """Begin to follow.
 
@@ -46,30 +38,13 @@ class Ros2Graph:
         self._session = session
         self._recorder = recorder
         self._msg_folder = msg_folder
-        self._endpoints: dict[str, rmw.RosEndpoint] = {}
+        self._publishers: dict[str, str] = {}
         self._warnings: dict[str, None] = {}
         self._lock = threading.Lock()
         self._arrived: queue.SimpleQueue[rmw.RosEndpoint | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="ros2 history", daemon=True)
         self._thread.start()
         self._watching = session.watch_alive(rmw.TOKENS, self._on_token)
-
-    def endpoints(self) -> list[dict[str, Any]]:
-        """Everybody who is there, as JSON records, by topic."""
-        with self._lock:
-            found = sorted(self._endpoints.values(), key=lambda each: (each.topic, each.node))
-        return [
-            {
-                "kind": each.kind.name.lower(),
-                "node": each.node,
-                "domain": each.domain,
-                "topic": each.topic,
-                "type": each.type_name,
-                "type_hash": each.type_hash,
-                "qos": each.qos._asdict(),
-            }
-            for each in found
-        ]
 
     def warnings(self) -> list[str]:
         """What a person should know, oldest first, each once."""
@@ -85,23 +60,24 @@ class Ros2Graph:
     def _on_token(self, key: str, alive: bool) -> None:
         """Note who came or went, on the network thread; nothing here may wait."""
         endpoint = rmw.parse_token(key)
-        if endpoint is None:
+        if endpoint is None or endpoint.kind is not rmw.EntityKind.PUBLISHER:
             return
+        topic = endpoint.topic
         with self._lock:
-            if not alive:
-                known = self._endpoints.pop(key, None)
-            elif len(self._endpoints) >= MAX_ENDPOINTS:
-                known = None
-            else:
-                known, self._endpoints[key] = endpoint, endpoint
-        if known is None or known.kind is not rmw.EntityKind.PUBLISHER:
-            return
+            was_there = self._publishers.pop(key, None) is not None
+            if alive and len(self._publishers) < MAX_ENDPOINTS:
+                self._publishers[key] = topic
+            is_last = topic not in self._publishers.values()
         if alive:
-            if known.qos.transient_local:
-                self._recorder.declare_latched(known.topic)
+            if endpoint.qos.transient_local:
+                self._recorder.declare_latched(topic)
+            self._recorder.presence.publisher(topic, is_there=True)
             self._arrived.put(endpoint)
-        else:
-            self._warn(f"{known.topic}: the publisher in {known.node} left")
+        elif was_there:
+            self._warn(f"{topic}: the publisher in {endpoint.node} left")
+            if is_last:
+                self._recorder.presence.publisher(topic, is_there=False)
+                self._recorder.forget(topic)
 
     def _warn(self, text: str) -> None:
         with self._lock:
