@@ -28,7 +28,7 @@ from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import Ros2Graph
 from bridge.task.task_file import TaskFile
-from bridge.wire.clocks import ALIVE, Sent
+from bridge.wire.clocks import ALIVE
 from bridge.wire.errors import WireError
 from bridge.wire.publisher import WirePublisher
 from bridge.wire.qos import Qos
@@ -201,7 +201,10 @@ class LiveRecorder:
         core.also_tell("last_receive_error", lambda: session.last_receive_error)
         self._links = session.watch_links(self._on_link)
         self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
-        self._clocks = ClockAsker(session, core.clocks, self._told, core.input_queue.seen)
+        queue = core.input_queue
+        self._clocks = ClockAsker(
+            session, core.clocks, lambda sent: queue.told(sent, session.now_ns()), queue.seen
+        )
         core.settle = self._clocks.settle
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
@@ -214,9 +217,6 @@ class LiveRecorder:
         if not sample.topic.startswith(CONTROL_PREFIX):
             self.core.receive(sample)
 
-    def _told(self, sent: Sent) -> None:
-        self.core.input_queue.told(sent, self.session.now_ns())
-
     def _on_link(self, is_open: bool) -> None:
         if not is_open:
             self.core.presence.link_closed()
@@ -227,10 +227,9 @@ class LiveRecorder:
             self.core.news_arrived.clear()
             if self._ended.is_set():
                 return
+            queue = self.core.input_queue
             with contextlib.suppress(WireError):  # the session is closing
-                self.core.input_queue.watched = self._previews.look(
-                    self.core.input_queue.image_topics()
-                )
+                queue.watched = self._previews.look(queue.image_topics())
                 self._say_status()
 
     def _say_status(self) -> None:

@@ -109,11 +109,6 @@ class Recorder:
         take = self._life.take
         return None if take is None else take.info.id
 
-    @property
-    def last_episode(self) -> str | None:
-        """Id of the episode that was finished last."""
-        return self._life.last_episode
-
     def receive(self, sample: WireSample) -> None:
         """Take a message from the network; never waits."""
         self.input_queue.put(sample)

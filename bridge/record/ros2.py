@@ -41,7 +41,7 @@ class Ros2Graph:
         self._publishers: dict[str, str] = {}
         self._warnings: dict[str, None] = {}
         self._lock = threading.Lock()
-        self._arrived: queue.SimpleQueue[rmw.RosEndpoint | None] = queue.SimpleQueue()
+        self._arrived: queue.SimpleQueue[rmw.RosPublisher | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="ros2 history", daemon=True)
         self._thread.start()
         self._watching = session.watch_alive(rmw.TOKENS, self._on_token)
@@ -60,7 +60,7 @@ class Ros2Graph:
     def _on_token(self, key: str, alive: bool) -> None:
         """Note who came or went, on the network thread; nothing here may wait."""
         endpoint = rmw.parse_token(key)
-        if endpoint is None or endpoint.kind is not rmw.EntityKind.PUBLISHER:
+        if endpoint is None:
             return
         topic = endpoint.topic
         with self._lock:
@@ -69,7 +69,7 @@ class Ros2Graph:
                 self._publishers[key] = topic
             is_last = topic not in self._publishers.values()
         if alive:
-            if endpoint.qos.transient_local:
+            if endpoint.transient_local:
                 self._recorder.declare_latched(topic)
             self._recorder.presence.publisher(topic, is_there=True)
             self._arrived.put(endpoint)
@@ -86,12 +86,12 @@ class Ros2Graph:
 
     def _work(self) -> None:
         while (endpoint := self._arrived.get()) is not None:
-            if endpoint.qos.transient_local:
+            if endpoint.transient_local:
                 with contextlib.suppress(GstError):  # the session is closing, or the key is no key
                     self._fetch_history(endpoint)
             self._check_type(endpoint)
 
-    def _fetch_history(self, endpoint: rmw.RosEndpoint) -> None:
+    def _fetch_history(self, endpoint: rmw.RosPublisher) -> None:
         """Hand over what the publisher sent before we listened, and nothing twice."""
         live: set[tuple[object, ...]] = set()
         listening = self._session.subscribe(endpoint.key, lambda each: live.add(_identity(each)))
@@ -108,7 +108,7 @@ class Ros2Graph:
                 live.add(_identity(sample))
                 self._recorder.receive(sample)
 
-    def _check_type(self, endpoint: rmw.RosEndpoint) -> None:
+    def _check_type(self, endpoint: rmw.RosPublisher) -> None:
         name, type_hash = endpoint.type_name, endpoint.type_hash
         try:
             newest = type_hash_of(name, folder=self._msg_folder)
@@ -128,7 +128,7 @@ class Ros2Graph:
             self._warn(str(error))
 
 
-def _cache_keys(endpoint: rmw.RosEndpoint) -> tuple[str, str]:
+def _cache_keys(endpoint: rmw.RosPublisher) -> tuple[str, str]:
     """Where a transient-local publisher answers for its past.
 
     The first is the cache of an AdvancedPublisher, the second the PublicationCache that

@@ -93,13 +93,12 @@ class SequenceTracker:
 
     def _begin(self, sample: WireSample) -> None:
         key = (sample.topic, sample.source_gid or b"")
-        if key not in self._streams and len(self._streams) >= MAX_STREAMS:
-            oldest = self._streams.pop(next(iter(self._streams)))
-            self._num_holes -= len(oldest.holes)
-        number = sample.sequence or 0
-        before = self._streams.get(key)
+        before = self._streams.pop(key, None)
+        if before is None and len(self._streams) >= MAX_STREAMS:
+            before = self._streams.pop(next(iter(self._streams)))
         if before is not None:
             self._num_holes -= len(before.holes)
+        number = sample.sequence or 0
         self._streams[key] = _Stream(number, number + 1, sample.source_ns or 0)
 
     def _odd(self, stream: _Stream, sample: WireSample, ticket: int) -> Step | None:
