@@ -6,7 +6,7 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -36,6 +36,16 @@ class UnreadableImageError(BridgeError):
         super().__init__(f"unreadable image: {found}. Expected {expected}.")
 
 
+def _simplejpeg(what: str) -> Any:
+    try:
+        import simplejpeg  # noqa: PLC0415  # the extra [record] brings it; reading PNG needs none
+    except ImportError as error:
+        raise MissingDependencyError(
+            package="simplejpeg", extra="record", purpose=f"JPEG {what}"
+        ) from error
+    return simplejpeg
+
+
 def encode_jpeg(
     image_u8: UInt8[np.ndarray, "height width channels"],
     quality: int = JPEG_QUALITY,
@@ -48,14 +58,8 @@ def encode_jpeg(
     Raises:
         ValueError: The image is larger than JPEG allows (65500), or empty.
     """
-    try:
-        import simplejpeg  # noqa: PLC0415  # the extra [record] brings it; reading PNG needs none
-    except ImportError as error:
-        raise MissingDependencyError(
-            package="simplejpeg", extra="record", purpose="JPEG encoding"
-        ) from error
     return bytes(
-        simplejpeg.encode_jpeg(
+        _simplejpeg("encoding").encode_jpeg(
             np.ascontiguousarray(image_u8),
             quality=quality,
             colorspace=layout,
@@ -105,12 +109,7 @@ def open_image(data: bytes) -> Iterator["Image"]:
 
 
 def _decode_jpeg(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
-    try:
-        import simplejpeg  # noqa: PLC0415
-    except ImportError as error:
-        raise MissingDependencyError(
-            package="simplejpeg", extra="record", purpose="JPEG decoding"
-        ) from error
+    simplejpeg = _simplejpeg("decoding")
     try:
         height, width, _, _ = simplejpeg.decode_jpeg_header(data)
         if width * height > MAX_PIXELS:

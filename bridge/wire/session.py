@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import TracebackType
@@ -243,13 +243,14 @@ class WireSession:
             message_encoding = known.message_encoding if known else "cdr"
         encoding = keys.encoding_of(type_name, message_encoding)
         control = zenoh.CongestionControl
+        locality = zenoh.Locality.REMOTE if qos.is_remote else zenoh.Locality.ANY
         try:
             inner = self._inner.declare_publisher(
                 keys.key_from_topic(topic),
                 encoding=encoding,
                 congestion_control=control.BLOCK if qos.block else control.DROP,
                 priority=getattr(zenoh.Priority, qos.priority.upper()),
-                allowed_destination=zenoh.Locality.REMOTE if qos.is_remote else zenoh.Locality.ANY,
+                allowed_destination=locality,
             )
         except zenoh.ZError as error:
             raise BadTopicError(topic=topic, found=cause_of(error)) from error
@@ -284,11 +285,8 @@ class WireSession:
                 self.last_receive_error = f"{type(error).__name__}: {error}"
 
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
-        try:
+        with _naming(WireConfigError, f"cannot subscribe to {key_expression!r}"):
             return Subscriber(self._inner.declare_subscriber(key_expression, handler))
-        except zenoh.ZError as error:
-            message = f"cannot subscribe to {key_expression!r}: {cause_of(error)}."
-            raise WireConfigError(message) from error
 
     def define(self, record: schema.Schema) -> None:
         """Tell what a type is that nobody knows, now and to whoever asks later.
@@ -382,10 +380,8 @@ class WireSession:
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask and wait for the answer."""
-        try:
+        with _naming(WireError, f"cannot ask {key}"):
             replies = list(self._inner.get(key, payload=payload, timeout=timeout_s))
-        except zenoh.ZError as error:
-            raise WireError(f"cannot ask {key}: {cause_of(error)}.") from error
         refusal = None
         for reply in replies:
             if reply.ok is not None:
@@ -407,7 +403,7 @@ class WireSession:
         """
         answers: list[WireSample] = []
         left = max_mb * BYTES_PER_MB
-        try:
+        with _naming(WireError, f"cannot ask {key_expression}"):
             replies = self._inner.get(
                 key_expression,
                 timeout=timeout_s,
@@ -423,26 +419,20 @@ class WireSession:
                 if left < 0:
                     break
                 answers.append(copy_sample(reply.ok, self._clock.now_ns()))
-        except zenoh.ZError as error:
-            raise WireError(f"cannot ask {key_expression}: {cause_of(error)}.") from error
         return answers
 
     def declare_alive(self, key: str) -> Subscriber:
         """Let everybody see that this session is there, until it closes or its process ends."""
-        try:
+        with _naming(WireConfigError, f"cannot be seen as {key!r}"):
             token = Subscriber(self._inner.liveliness().declare_token(key))
-        except zenoh.ZError as error:
-            raise WireConfigError(f"cannot be seen as {key!r}: {cause_of(error)}.") from error
         self._alive.append(token)  # zenoh withdraws a token that nobody holds
         return token
 
     def query_alive(self, key_expression: str, *, timeout_s: float = 5.0) -> list[str]:
         """Return the keys of everybody who is there now."""
-        try:
+        with _naming(WireError, f"cannot ask {key_expression}"):
             replies = self._inner.liveliness().get(key_expression, timeout=timeout_s)
             return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
-        except zenoh.ZError as error:
-            raise WireError(f"cannot ask {key_expression}: {cause_of(error)}.") from error
 
     def watch_alive(self, key_expression: str, callback: Callable[[str, bool], None]) -> Subscriber:
         """Hear who is there, comes and goes, on the network thread."""
@@ -451,13 +441,9 @@ class WireSession:
             callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
-        try:
-            declared = self._inner.liveliness().declare_subscriber(
-                key_expression, handler, history=True
-            )
-        except zenoh.ZError as error:
-            raise WireConfigError(f"cannot watch {key_expression!r}: {cause_of(error)}.") from error
-        return Subscriber(declared)
+        with _naming(WireConfigError, f"cannot watch {key_expression!r}"):
+            alive = self._inner.liveliness()
+            return Subscriber(alive.declare_subscriber(key_expression, handler, history=True))
 
     def close(self) -> None:
         """Finish answering, say the last words, then leave the network."""
@@ -487,6 +473,15 @@ class WireSession:
     ) -> None:
         """Close."""
         self.close()
+
+
+@contextlib.contextmanager
+def _naming(kind: type[GstError], what: str) -> Iterator[None]:
+    """Say what could not be done where zenoh refuses it."""
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise kind(f"{what}: {cause_of(error)}.") from error
 
 
 def open_session(config: WireConfig) -> WireSession:

@@ -5,7 +5,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bridge.clock import AnchoredClock
 from bridge.episode import topics
@@ -18,9 +18,6 @@ from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import TRUTH_PARAMETERS, Session, Streams
 from bridge.task.find import chosen_task_file
 from bridge.terminal import Output
-
-if TYPE_CHECKING:
-    from bridge.wire.session import WireSession
 
 
 def run_session(
@@ -103,7 +100,7 @@ class StandinSource:
             topics.ROBOT_DESCRIPTION,
         )
 
-    def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
+    def run(self, session: Any, stop: threading.Event, output: Output) -> dict[str, Any]:
         """Record as the configuration says, or until stopped; see ``run_session``."""
         from bridge.wire.clocks import announce  # noqa: PLC0415  # zenoh only when live
 
