@@ -41,8 +41,8 @@ from bridge.wire.zenoh_config import zenoh, zenoh_config
 
 MAX_WAITING = 32
 """Requests that wait for one service; each may hold a whole plan."""
-CLOSE_S = 5.0
-"""How long a request in work may take when the service stops."""
+CLOSE_S, UNHEARD_S = 5.0, 0.5
+"""How long a request in work may take when the service stops; one that perhaps nobody hears."""
 
 
 class Service:
@@ -368,15 +368,7 @@ class WireSession:
 
         The request comes behind all that was published: what was heard of it by then was all.
         """
-        querier = self._inner.declare_querier(
-            key,
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            priority=zenoh.Priority.BACKGROUND,
-            allowed_destination=zenoh.Locality.REMOTE,
-            timeout=CLOSE_S,
-        )
-        self._last_words.append((querier, words))
+        self._last_words.append((self._inner.declare_querier(key), words))
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask and wait for the answer."""
@@ -397,9 +389,9 @@ class WireSession:
         """Ask everybody and return every good answer, in the order they came.
 
         Used for what caches keep: the last messages of a topic whose publisher spoke before we
-        listened. Whoever has not answered in time is left out, and so is what comes after
-        ``max_mb`` [MB], for nobody knows what a cache holds. ``is_last``: no answer overtakes what
-        its sender has published before.
+        listened. Whoever has not answered in time is left out, and so is what does not fit
+        into ``max_mb`` [MB], for nobody knows what a cache holds. ``is_last``: no answer overtakes
+        what its sender has published before.
         """
         answers: list[WireSample] = []
         left = max_mb * BYTES_PER_MB
@@ -413,11 +405,9 @@ class WireSession:
                 priority=zenoh.Priority.BACKGROUND if is_last else zenoh.Priority.DATA,
             )
             for reply in replies:
-                if reply.ok is None:
+                if reply.ok is None or len(reply.ok.payload) > left:
                     continue
                 left -= len(reply.ok.payload)
-                if left < 0:
-                    break
                 answers.append(copy_sample(reply.ok, self._clock.now_ns()))
         return answers
 
@@ -452,8 +442,16 @@ class WireSession:
         self._services.clear()
         with contextlib.suppress(zenoh.ZError):  # closed already
             for querier, words in self._last_words:
-                if querier.matching_status.matching:
-                    list(querier.get(payload=words(b"")))
+                is_heard = querier.matching_status.matching  # or not yet known
+                replies = self._inner.get(
+                    querier.key_expr,
+                    payload=words(b""),
+                    target=zenoh.QueryTarget.ALL,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    priority=zenoh.Priority.BACKGROUND,
+                    timeout=CLOSE_S if is_heard else UNHEARD_S,
+                )
+                list(replies)
         self._last_words.clear()
         for token in self._alive:
             token.close()

@@ -16,7 +16,6 @@ from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.record.config import DiskConfig, RecorderConfig
-from bridge.record.encoders import ImageEncoder
 from bridge.record.queue import Command, Item, Merge
 from bridge.record.recorder import Recorder
 from bridge.record.sequence import Step
@@ -139,15 +138,3 @@ def test_what_a_barrier_has_not_let_through_yet_is_given_up_with_the_rest(
     assert isinstance(next(ready), Command)
     assert list(ready) == list(items)[6:]
     assert merge.images_out == 8
-
-
-def test_the_encoder_itself_flags_what_it_cannot_read(raw: MakeSample) -> None:
-    from bridge.record.queue import LoadShedding
-
-    encoder = ImageEncoder(RecorderConfig(), lambda: LoadShedding.NOTHING)
-    sample = replace(raw(), data=b"\0\1\0\0short")
-    item = Item(sample, Step(), 0, schema.IMAGE, 9, is_bulk=True)
-    encoder.encode(item)
-    assert item.finding is not None
-    assert item.finding.value == "undecodable"
-    assert item.sample is sample

@@ -12,7 +12,7 @@ from loopback import free_endpoint
 
 from bridge.episode.check import check_episode
 from bridge.record import clocks as record_clocks
-from bridge.wire.clocks import announce
+from bridge.wire.clocks import announce, ask_clocks
 from bridge.wire.config import WireConfig
 from bridge.wire.publisher import WirePublisher
 from bridge.wire.session import WireSession, open_session
@@ -101,9 +101,14 @@ def test_answers_of_wrong_shape_count_nothing_and_end_nothing(
         )
         words = [json.dumps({"sent": table}).encode() for table in tables]
         words += [b"", b"[]", b"[" * 100_000, b'{"sent": {"a": ' * 9, b"\xff"]
+        words += [b'{"received_ns":"x","sent_ns":1}', b'{"received_ns":1}']
+        words += [b'{"received_ns": 1, "sent_ns": 2}']
         for number, text in enumerate(words):
             source.serve(f"@clock/s{number}", lambda request, text=text: text)
             source.query(f"@sent/s{number}", text, timeout_s=20.0)
+        answers = ask_clocks(recorder.session, timeout_s=20.0)
+        found = [(each.source, each.reading is not None, each.topics) for each in answers]
+        assert sorted(found) == [("s11", False, frozenset()), ("s20", True, frozenset())]
         mute = threading.Event()
         source.serve("@clock/mute", lambda request: b"{}" if mute.wait(20.0) else b"")
         try:
