@@ -286,7 +286,11 @@ class Lifecycle:
         self.is_paused = False
         self._write_held(self.take, held)
         self.ring.empty()
-        return {"ok": True, "episode": info.id, **self._preroll(held, command.received_ns)}
+        answer: Answer = {"ok": True, "episode": info.id}
+        if self.ring.is_on:
+            first_ns = min([entry.received_ns for entry in held], default=command.received_ns)
+            answer["preroll_s"] = s_from_ns(command.received_ns - first_ns)
+        return answer
 
     def snapshot(
         self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
@@ -349,12 +353,6 @@ class Lifecycle:
                 self._write(take, entry)
             else:
                 take.ledger.count_dropped(entry)
-
-    def _preroll(self, held: list[Item | Dropped], now_ns: int) -> Answer:
-        if not self.ring.is_on:
-            return {}
-        first_ns = min([entry.received_ns for entry in held], default=now_ns)
-        return {"preroll_s": s_from_ns(now_ns - first_ns)}
 
     def _open_take(self) -> EpisodeRecording:
         if self.take is None:

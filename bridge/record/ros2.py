@@ -93,13 +93,15 @@ class Ros2Graph:
 
     def _fetch_history(self, endpoint: rmw.RosPublisher) -> None:
         """Hand over what the publisher sent before we listened, and nothing twice."""
+        # The cache of an AdvancedPublisher, and that of rmw_zenoh's first releases.
+        caches = (f"{endpoint.key}/@adv/**", f"{endpoint.session}/{endpoint.key}")
         live: set[tuple[object, ...]] = set()
         listening = self._session.subscribe(endpoint.key, lambda each: live.add(_identity(each)))
         try:
             found = [
                 sample
-                for caches in _cache_keys(endpoint)
-                for sample in self._session.query_all(caches, timeout_s=HISTORY_TIMEOUT_S)
+                for cache in caches
+                for sample in self._session.query_all(cache, timeout_s=HISTORY_TIMEOUT_S)
             ]
         finally:
             listening.close()
@@ -126,15 +128,6 @@ class Ros2Graph:
                 )
         except MissingDependencyError as error:
             self._warn(str(error))
-
-
-def _cache_keys(endpoint: rmw.RosPublisher) -> tuple[str, str]:
-    """Where a transient-local publisher answers for its past.
-
-    The first is the cache of an AdvancedPublisher, the second the PublicationCache that
-    rmw_zenoh's first releases made.
-    """
-    return f"{endpoint.key}/@adv/**", f"{endpoint.session}/{endpoint.key}"
 
 
 def _identity(sample: WireSample) -> tuple[object, ...]:

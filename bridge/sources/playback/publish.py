@@ -78,7 +78,10 @@ class EpisodeSource:
         there = [topic for topic in counts if topic not in OF_RECORDER]
         self.topics = tuple(choose_topics(config.topics, there))
         for topic in self.topics:
-            _check_name(path, topic)
+            try:
+                key_from_topic(topic)
+            except BadTopicError as error:
+                raise UsageError(f"{path}: {error} Choose others with --topics.") from error
         self.num_messages = sum(counts[topic] for topic in self.topics)
         if not self.num_messages:
             listed = ", ".join(self.topics) or "it has no topics"
@@ -179,13 +182,6 @@ class EpisodeSource:
             )
             with contextlib.suppress(BadTopicError):  # then only its name is recorded again
                 session.define(made)
-
-
-def _check_name(path: Path, name: str) -> None:
-    try:
-        key_from_topic(name)
-    except BadTopicError as error:
-        raise UsageError(f"{path}: {error} Choose others with --topics.") from error
 
 
 def _lateness_ms(late_s: "array[float]") -> dict[str, float]:
