@@ -15,6 +15,7 @@ from bridge.clock import AnchoredClock
 from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
+from bridge.record import encoders
 from bridge.record.config import DiskConfig, RecorderConfig
 from bridge.record.queue import Command, Item, Merge
 from bridge.record.recorder import Recorder
@@ -52,7 +53,7 @@ def test_an_encoder_that_raises_costs_no_image(
 
     recorder.start(INFO)
     with monkeypatch.context() as patch:
-        patch.setattr("bridge.record.encoders.image_to_jpeg", fail)
+        patch.setattr(encoders, "image_to_jpeg", fail)
         for number in range(3):
             recorder.receive(raw(sequence=number))
         answer = recorder.stop()
@@ -74,7 +75,7 @@ def test_depth_that_cannot_be_compacted_is_kept_raw(
     recorder.start(INFO)
     sent = image(depth_mm(8, 8), "16UC1")
     with monkeypatch.context() as patch:
-        patch.setattr("bridge.record.encoders.depth_to_compact", lambda data: None)
+        patch.setattr(encoders, "depth_to_compact", lambda data: None)
         recorder.receive(
             make_sample(topic="/cell/cam/a/depth/image", type_name=schema.IMAGE, data=sent)
         )
