@@ -65,21 +65,13 @@ class StepWatch:
         self._wall_ns = wall_ns
         self._apart_ns = wall_ns() - now_ns()
 
-    def _read(self) -> int | None:
-        """How far the clocks are apart; None when something came between reading them."""
-        before_ns = self._now_ns()
-        wall_ns = self._wall_ns()
-        if self._now_ns() - before_ns > STEP_NS // 10:
-            return None
-        return wall_ns - before_ns
-
     def step_ns(self) -> int:
         """Return the step since the last call [ns], or 0 where there was none.
 
         Forward is positive. Trimming (NTP slewing) stays far below ``STEP_NS`` from call to call.
         """
-        apart_ns = self._read()
-        if apart_ns is None:
+        before_ns, wall_ns = self._now_ns(), self._wall_ns()
+        if self._now_ns() - before_ns > STEP_NS // 10:  # something came between the two
             return 0
-        moved_ns, self._apart_ns = apart_ns - self._apart_ns, apart_ns
+        moved_ns, self._apart_ns = wall_ns - before_ns - self._apart_ns, wall_ns - before_ns
         return moved_ns if abs(moved_ns) > STEP_NS else 0

@@ -82,7 +82,10 @@ def examine() -> list[InstallCheck]:
     """Look at packages, the native extensions, system libraries and programs; import nothing."""
     findings = [_package(name, extra) for extra in EXTRAS for name in EXTRAS[extra].packages]
     findings.extend(_native(*each) for each in NATIVE)
-    findings.append(_program("chromium", "needed only to test the dashboard: apt install chromium"))
+    has = shutil.which("chromium") is not None
+    advice = "" if has else "needed only to test the dashboard: apt install chromium"
+    found = "present" if has else "missing"
+    findings.append(InstallCheck(what="chromium", found=found, ok=True, advice=advice))
     findings.extend(_system_libraries())
     return findings
 
@@ -108,13 +111,6 @@ def _native(what: str, module: str, without: str) -> InstallCheck:
         return InstallCheck(what=what, found="built", ok=True)
     advice = "run make, or pip install . with a C++17 compiler present"
     return InstallCheck(what=what, found=f"not built: {without}", ok=False, advice=advice)
-
-
-def _program(name: str, advice: str) -> InstallCheck:
-    found = shutil.which(name)
-    return InstallCheck(
-        what=name, found="present" if found else "missing", ok=True, advice="" if found else advice
-    )
 
 
 def _system_libraries() -> list[InstallCheck]:

@@ -421,7 +421,7 @@ class ProcessPool:
         at = 0
         with suppress(NoProcessError):
             numbered, job = list(enumerate(chunks)), partial(_do_chunk, work)
-            for (number, _), answer in self.run(job, numbered, _first, PATIENCE_S):
+            for (number, _), answer in self.run(job, numbered, lambda c: -c[0], PATIENCE_S):
                 found[number] = answer
                 while at in found:
                     yield from _results(work, chunks[at], found.pop(at))
@@ -439,11 +439,6 @@ class ProcessPool:
             worker.process.kill()
         for worker in list(self.workers):
             self._lose(worker)
-
-
-def _first(chunk: tuple[int, Any]) -> float:
-    """Let chunks be begun in their order."""
-    return float(-chunk[0])
 
 
 def _do_chunk(work: Callable[[Item], Result], chunk: tuple[int, Sequence[Item]]) -> list[Result]:

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bridge.episode.run_folder import part_paths
 from record.cell import CellSpec
 from record.children import Publisher, children
 from record.recorders import OurRecorder, ReferenceRecorder
@@ -90,7 +89,7 @@ def record_ours(
             message = f"the recorder ended with {recorder.process.returncode}: {recorder.log}"
             raise RuntimeError(message)
     first = recorder.run_path / "episodes" / f"{EPISODE}.mcap"
-    return _compared(found, part_paths(first), publisher.account_path, spec, folder)
+    return _compared(found, [first], publisher.account_path, spec, folder)
 
 
 def record_reference(spec: CellSpec, seconds: float, folder: Path) -> Recording:

@@ -265,6 +265,9 @@ def _judge_topics(
             report.findings.append(drops_logged(topic, lost))
     report.declared_losses = sum(decoder.drop_log.values())
     report.notes += unseen_losses(decoder.unnumbered)
+    if isinstance(tails := records.get("drops", {}).get("uncounted_tails"), list) and tails:
+        names = ", ".join(map(str, tails))
+        report.notes.append(f"tail not known, nobody said how many were sent: {names}")
     unused = ", ".join(f"{topic} ({what})" for topic, what in sorted(decoder.unused.items()))
     report.notes += [f"kept, and no command reads them: {unused}"] if unused else []
     for text in decoder.size_faults():

@@ -33,14 +33,6 @@ def part_name(episode_id: str, index: int) -> str:
     return f"{episode_id}.mcap" if index == 1 else f"{episode_id}.{index}.mcap"
 
 
-def _part_of(name: str) -> tuple[str, int]:
-    """Return the episode a file name belongs to, and its number; another program's is whole."""
-    found = _LATER_PART.fullmatch(name)
-    if found is None or found[2] == "1":
-        return name.removesuffix(".mcap"), 1
-    return found[1], int(found[2])
-
-
 def grouped_parts(names: Collection[str]) -> dict[str, list[str]]:
     """Return all parts of each episode among some file names, by the first of them.
 
@@ -49,7 +41,11 @@ def grouped_parts(names: Collection[str]) -> dict[str, list[str]]:
     """
     episodes: dict[str, list[tuple[int, str]]] = {}
     for name in sorted(set(names)):
-        episode_id, index = _part_of(name)
+        found = _LATER_PART.fullmatch(name)  # another program's is whole
+        is_later = found is not None and found[2] != "1"
+        episode_id, index = (
+            (found[1], int(found[2])) if found and is_later else (name.removesuffix(".mcap"), 1)
+        )
         episodes.setdefault(episode_id, []).append((index, name))
     groups = [[name for _, name in sorted(parts)] for parts in episodes.values()]
     return {group[0]: group for group in sorted(groups)}
@@ -62,20 +58,6 @@ def file_names(folder: Path, ending: str = SUFFIX) -> list[str]:
     except OSError:  # not there, or not ours to read
         return []
     return sorted(name for name in found if name.endswith(ending))
-
-
-def _later_parts(path: Path) -> list[tuple[int, Path]]:
-    episode_id, _ = _part_of(path.name)
-    if not EPISODE_ID.fullmatch(episode_id):  # a name with dots is another program's, and whole
-        return []
-    found = [(_part_of(each.name)[1], each) for each in path.parent.glob(f"{episode_id}.*.mcap")]
-    return sorted((index, each) for index, each in found if index > 1)
-
-
-def part_paths(path: Path) -> list[Path]:
-    """Return an episode file and the parts behind it, in order; some may be missing between."""
-    index = _part_of(path.name)[1]
-    return [path, *(later for number, later in _later_parts(path) if number > index)]
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,6 @@ _VERDICT = {
     "scene_hash": "the scene it was judged in",
     "reason": "why nothing could be decided",
 }
-_DROPS_COUNTS = ("received", "gaps", "queue_drops", "shed", "undecodable", "bytes")
 _DROPS = {
     "of_topic": "the topic that is counted",
     "second": "which second of the recording",
@@ -95,7 +94,7 @@ _DROPS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TableKind:
     """One CSV file: its columns and how a message becomes its rows."""
 
@@ -137,17 +136,10 @@ def _events(message: RawMessage) -> Rows:
     record = parse_record(message.data, name="event", package="bridge.episode")
     outcome = record.get("outcome") or {}
     data = record.get("data")
-    yield (
-        int(record["stamp_ns"]),
-        [
-            record["type"],
-            record.get("plan_id"),
-            record.get("stage_id"),
-            record.get("text"),
-            *(outcome.get(name) for name in ("result", "k", "n")),
-            None if data is None else json.dumps(data, sort_keys=True, separators=(",", ":")),
-        ],
-    )
+    values = [record["type"], *(record.get(name) for name in ("plan_id", "stage_id", "text"))]
+    values += [outcome.get(name) for name in ("result", "k", "n")]
+    told = None if data is None else json.dumps(data, sort_keys=True, separators=(",", ":"))
+    yield int(record["stamp_ns"]), [*values, told]
 
 
 def _verdicts(message: RawMessage) -> Rows:
@@ -164,29 +156,17 @@ def _verdicts(message: RawMessage) -> Rows:
 
 def _drops(message: RawMessage) -> Rows:
     record = parse_record(message.data, name="drops", package="bridge.episode")
-    counts = [record.get(name) for name in _DROPS_COUNTS]
+    counts = [record.get(name) for name in tuple(_DROPS)[2:]]
     yield message.publish_time_ns, [record["topic"], record["second"], *counts]
 
 
 TABLES = (
-    TableKind(
-        name="joints",
-        type_name=schema.JOINT_STATE,
-        columns=_JOINT,
-        rows=_joints,
-        not_ending=(GRIPPER_STATE,),
-    ),
-    TableKind(
-        name="gripper",
-        type_name=schema.JOINT_STATE,
-        columns=_JOINT,
-        rows=_joints,
-        ending=GRIPPER_STATE,
-    ),
-    TableKind(name="poses", type_name=schema.POSE_STAMPED, columns=_POSE, rows=_poses),
-    TableKind(name="events", type_name=schema.EVENT, columns=_EVENT, rows=_events),
-    TableKind(name="verdicts", type_name=schema.VERDICT, columns=_VERDICT, rows=_verdicts),
-    TableKind(name="drops", type_name=schema.DROPS, columns=_DROPS, rows=_drops),
+    TableKind("joints", schema.JOINT_STATE, _JOINT, _joints, not_ending=(GRIPPER_STATE,)),
+    TableKind("gripper", schema.JOINT_STATE, _JOINT, _joints, ending=GRIPPER_STATE),
+    TableKind("poses", schema.POSE_STAMPED, _POSE, _poses),
+    TableKind("events", schema.EVENT, _EVENT, _events),
+    TableKind("verdicts", schema.VERDICT, _VERDICT, _verdicts),
+    TableKind("drops", schema.DROPS, _DROPS, _drops),
 )
 
 
@@ -199,11 +179,9 @@ def seconds_text(stamp_ns: int) -> str:
 
 def field_text(value: Value) -> str:
     """One field: empty for unknown, true or false, shortest exact decimals for numbers."""
-    if value is None:
-        return ""
     if isinstance(value, bool):
         return "true" if value else "false"
-    return repr(value) if isinstance(value, float) else str(value)
+    return repr(value) if isinstance(value, float) else "" if value is None else str(value)
 
 
 EPISODE_COLUMNS = {
@@ -290,18 +268,11 @@ def export_csv(
                 _write_messages(name, episode, sheets)
                 advance(done, name)
         rows = {f"{name}.csv": sheet.rows for name, sheet in sheets.items() if sheet.rows}
-        columns = {
-            f"{kind.name}.csv": {**COMMON, **kind.columns}
-            for kind in TABLES
-            if sheets[kind.name].rows
-        }
+        written = [kind for kind in TABLES if sheets[kind.name].rows]
+        columns = {f"{kind.name}.csv": {**COMMON, **kind.columns} for kind in written}
         columns["episodes.csv"] = dict(EPISODE_COLUMNS)
-        write_note(
-            folder,
-            made_by="export csv",
-            sources=files,
-            choices={"columns": columns, "stand_in_truth": "left out", "clock": clock},
-        )
+        choices = {"columns": columns, "stand_in_truth": "left out", "clock": clock}
+        write_note(folder, made_by="export csv", sources=files, choices=choices)
     return rows
 
 
@@ -338,11 +309,6 @@ def _episode_cells(name: str, episode: Episode, run: RunFolder | None) -> list[s
     outcome = episode.outcome if run is None else outcome_of(run, episode)
     counted = [None] * 3 if outcome is None else [outcome.result, outcome.k, outcome.n]
     messages = sum(summary.count for summary in episode.topics().values())
-    values = [
-        *(getattr(info, field) for field in _INFO),
-        *counted,
-        episode.start_ns,
-        episode.end_ns,
-        messages,
-    ]
+    span = (episode.start_ns, episode.end_ns)
+    values = [*(getattr(info, field) for field in _INFO), *counted, *span, messages]
     return [name, *map(field_text, values)]

@@ -68,7 +68,9 @@ def new_folder(out: Path, *, force: bool) -> Iterator[Path]:
         message = f"cannot write into {out.parent}: {error.strerror}. Choose another place."
         raise BridgeError(message) from error
     try:
-        part.chmod(0o777 & ~_umask())
+        mask = os.umask(0)
+        os.umask(mask)
+        part.chmod(0o777 & ~mask)
         yield part
         _sync(part)
         if out.is_dir():
@@ -92,12 +94,6 @@ def _refuse_strangers(out: Path, *, force: bool) -> None:
         f"{out} exists and was not written by an export, so it is not replaced. "
         "Choose another folder, or move it away."
     )
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _sync(folder: Path) -> None:

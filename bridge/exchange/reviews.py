@@ -61,13 +61,10 @@ class Review:
         """Keep the label in a run; an earlier one of the same rater is replaced."""
         path = _path(run_path, self.trial_id, self.rater)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, self._to_json())
-        return path
-
-    def _to_json(self) -> bytes:
         record = {"schema_version": SCHEMA_VERSION, **asdict(self)}
         check_record(record, name="review")
-        return (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode()
+        write_whole(path, (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode())
+        return path
 
 
 COLUMNS = tuple(field.name for field in fields(Review))
@@ -117,7 +114,8 @@ def save_review(
     with _one_at_a_time(path.parent) as folder:
         saved = saved_review(run_path, trial_id, rater)
         if saved.version != seen:
-            if _says(saved.review) == _says(review):
+            now = saved.review
+            if (now.says if now else None) == (review.says if review else None):
                 return saved
             raise ReviewConflictError(saved=saved)
         if review is None:
@@ -126,10 +124,6 @@ def save_review(
             review.write(run_path)
         os.fsync(folder)  # the name in the folder, too
         return saved_review(run_path, trial_id, rater)
-
-
-def _says(review: Review | None) -> tuple[str, str, str, bool] | None:
-    return None if review is None else review.says
 
 
 @contextmanager

@@ -28,12 +28,12 @@ from bridge.episode.schema import StampedMessage
 from bridge.episode.streams import camera_ids, camera_info, find_camera_topic, transform_tree
 from bridge.episode.transforms import TransformTree
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import EpisodeError, MissingDependencyError
+from bridge.errors import EpisodeError
 from bridge.exchange.csv_export import seconds_text
 from bridge.exchange.output import message_named, new_folder, safe_names, write_note
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.media.color import JPEG_MAGIC
+from bridge.media.color import JPEG_MAGIC, encode_png
 from bridge.terminal import Advance
 
 STORED_PER_MM = 5
@@ -139,7 +139,7 @@ def _write_color(place: Path, image: CompressedColor | RawColor, color: ColorFor
         (place / name).write_bytes(data)
     else:
         name = f"{stem}.png"
-        _save_png(place / name, image.image_u8())
+        (place / name).write_bytes(encode_png(image.image_u8(), level=1))
     return Stamped(image.stamp_ns, name)
 
 
@@ -147,18 +147,8 @@ def _write_depth(place: Path, depth: DepthImage) -> tuple[Stamped, int]:
     too_far = depth.depth_mm > MAX_MM
     stored = np.where(too_far, 0, depth.depth_mm.astype(np.uint32) * STORED_PER_MM)
     name = f"depth/{seconds_text(depth.stamp_ns)}.png"
-    _save_png(place / name, stored.astype(np.uint16))
+    (place / name).write_bytes(encode_png(stored.astype(np.uint16), level=1))
     return Stamped(depth.stamp_ns, name), int(too_far.sum())
-
-
-def _save_png(path: Path, pixels: np.ndarray) -> None:
-    try:
-        from PIL import Image  # noqa: PLC0415  # heavy, and only an extra brings it
-    except ImportError as error:
-        raise MissingDependencyError(
-            package="pillow", extra="record", purpose="writing PNG"
-        ) from error
-    Image.fromarray(pixels).save(path, "PNG", compress_level=1)
 
 
 def _write_list(path: Path, what: str, items: list[Stamped]) -> None:

@@ -63,8 +63,8 @@ def find_files(source: Path) -> list[Path]:
     """Return the files of a bag in their order; a single file is its own bag."""
     if source.is_file():
         return [source]
+    hint = "Give a file of the bag, or the folder that holds metadata.yaml."
     if not source.is_dir():
-        hint = "Give a file of the bag, or the folder that holds metadata.yaml."
         raise PathNotFoundError(path=source, what="bag", hint=hint)
     about = source / METADATA_FILE
     if about.is_file():
@@ -72,7 +72,6 @@ def find_files(source: Path) -> list[Path]:
     for pattern in ("*.mcap", "*.db3", "*.mcap.zstd", "*.db3.zstd"):
         if files := sorted(source.glob(pattern)):
             return files
-    hint = "Give a file of the bag, or the folder that holds metadata.yaml."
     raise PathNotFoundError(path=source / "*.mcap", what="bag file", hint=hint)
 
 
@@ -369,9 +368,8 @@ def _silent(files: list[McapFile]) -> set[str]:
     """Topics that were announced but never carried a message."""
     announced, spoken = set(), set()
     for file in files:
-        counts = file.summary.statistics.channel_message_counts if file.summary.statistics else {}
-        for channel in file.summary.channels.values():
-            announced.add(channel.topic)
-            if counts.get(channel.id):
-                spoken.add(channel.topic)
+        channels, about = file.summary.channels, file.summary.statistics
+        announced |= {channel.topic for channel in channels.values()}
+        counts = about.channel_message_counts if about else {}
+        spoken |= {each.topic for number, each in channels.items() if counts.get(number)}
     return announced - spoken

@@ -84,12 +84,8 @@ def export_bag(
         report.messages = sum(report.topics.values())
         about = "\n".join(_metadata(name, bag)) + "\n"
         (folder / "metadata.yaml").write_text(about, encoding="utf-8")
-        write_note(
-            folder,
-            made_by="robot-gst export rosbag2",
-            sources=list(episode.parts),
-            choices={"left_out": report.left_out},
-        )
+        made_by, choices = "robot-gst export rosbag2", {"left_out": report.left_out}
+        write_note(folder, made_by=made_by, sources=list(episode.parts), choices=choices)
     return report
 
 

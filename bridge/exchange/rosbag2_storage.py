@@ -12,7 +12,7 @@ from typing import NamedTuple
 import zstandard
 
 from bridge.episode import schema
-from bridge.errors import BridgeError, EpisodeError, MissingDependencyError
+from bridge.errors import EpisodeError, MissingDependencyError
 from bridge.wire.rmw import ros_schema
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -23,13 +23,8 @@ MAX_UNPACKED_BYTES = 1 << 30
 _WINDOW_BYTES = 1 << 31
 
 
-class BagFormatError(BridgeError):
+class BagFormatError(EpisodeError):
     """A bag is not what this import reads."""
-
-    def __init__(self, *, path: Path, found: str, hint: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(f"{path}: {found}. {hint}")
 
 
 def unpack_file(path: Path, folder: Path) -> Path:
@@ -95,9 +90,8 @@ class SqliteBag:
         """Open it."""
         self.path = path
         try:
-            self._database = sqlite3.connect(
-                f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True
-            )
+            place = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+            self._database = sqlite3.connect(place, uri=True)
             self.topics = self._read_topics()
         except sqlite3.DatabaseError as error:
             raise _no_database(path, error) from error
@@ -141,15 +135,9 @@ class SqliteBag:
                 if topic is None or not isinstance(data, bytes) or not 0 <= stamp_ns < 1 << 63:
                     found = f"a message of topic {topic_id} at {stamp_ns} makes no sense"
                     raise _damaged(self.path, found)
-                yield BagMessage(
-                    topic.name,
-                    topic.record,
-                    topic.record.message_encoding,
-                    stamp_ns,
-                    stamp_ns,
-                    None,
-                    unpack_message(self.path, data),
-                )
+                encoding, plain = topic.record.message_encoding, unpack_message(self.path, data)
+                times = (stamp_ns, stamp_ns)
+                yield BagMessage(topic.name, topic.record, encoding, *times, None, plain)
         except sqlite3.DatabaseError as error:
             raise _no_database(self.path, error) from error
 

@@ -110,9 +110,9 @@ class SourceRow:
         """Return a field without the blanks around it; empty when the column is not there."""
         return (self.values.get(name) or "").strip()
 
-    def refuse(self, found: str, hint: str) -> TableError:
+    def refuse(self, found: str, hint: str, kind: type[TableError] = TableError) -> TableError:
         """Build the error that names this row."""
-        return TableError(path=self.path, row=self.row, found=found, hint=hint)
+        return kind(path=self.path, row=self.row, found=found, hint=hint)
 
     def whole(self, name: str) -> int | None:
         """Read a whole number from 0 to ``MOST``."""
@@ -214,12 +214,12 @@ class TableText:
         width = len(self.header)
         if len(cells) > width and not any(cells[width:]):
             return cells[:width]
-        raise TableError(
-            path=self.path,
-            row=number,
-            found=f"{len(cells)} fields where the header has {width}",
-            hint=f"Quote fields that contain {DELIMITERS.get(self.delimiter, 'the delimiter')}",
-        )
+        hint = f"Quote fields that contain {DELIMITERS.get(self.delimiter, 'the delimiter')}"
+        raise self.refuse(f"{len(cells)} fields where the header has {width}", hint, row=number)
+
+    def refuse(self, found: str, hint: str, *, row: int | None = None) -> TableError:
+        """Build the error that names a row, else that of the header."""
+        return TableError(path=self.path, row=row or self.header_row, found=found, hint=hint)
 
     def row(self, number: int, cells: Sequence[str]) -> SourceRow:
         """Name the fields of one row."""
@@ -255,13 +255,6 @@ def open_table(
     mapped = options.mapped
     theirs = {plain_name(name): ours for ours, name in mapped.items()}
     absent = [name for name in mapped.values() if plain_name(name) not in map(plain_name, names)]
-    if absent:
-        raise TableError(
-            path=path,
-            row=row,
-            found=f"no column {absent[0]!r}",
-            hint=f"Columns: {', '.join(names)}",
-        )
     header: list[str] = []
     renamed, left = [], []
     for name in names:
@@ -283,6 +276,8 @@ def open_table(
         left=tuple(left),
         grid=grid,
     )
+    if absent:
+        raise table.refuse(f"no column {absent[0]!r}", f"Columns: {', '.join(names)}")
     if near:
         _refuse_doubled(table)
         _refuse_slips(table, known)
@@ -402,8 +397,7 @@ def _refuse_doubled(table: TableText) -> None:
     doubled = sorted({name for name in table.header if name and table.header.count(name) > 1})
     if doubled:
         listed = ", ".join(map(repr, doubled))
-        hint = "Rename one of them, or say which with --map"
-        raise TableError(path=table.path, row=table.header_row, found=f"two of {listed}", hint=hint)
+        raise table.refuse(f"two of {listed}", "Rename one of them, or say which with --map")
 
 
 def _refuse_slips(table: TableText, known: Sequence[str]) -> None:
@@ -412,12 +406,8 @@ def _refuse_slips(table: TableText, known: Sequence[str]) -> None:
     for name in table.left:
         likely = difflib.get_close_matches(plain_name(name), free, n=1, cutoff=NEAR)
         if likely:
-            raise TableError(
-                path=table.path,
-                row=table.header_row,
-                found=f"unknown column {name!r}",
-                hint=f'Is it {likely[0]!r}? Rename it, or say --map "{likely[0]}={name}"',
-            )
+            hint = f'Is it {likely[0]!r}? Rename it, or say --map "{likely[0]}={name}"'
+            raise table.refuse(f"unknown column {name!r}", hint)
 
 
 def require(table: TableText, required: Sequence[str], known: Sequence[str]) -> TableText:
@@ -427,13 +417,11 @@ def require(table: TableText, required: Sequence[str], known: Sequence[str]) -> 
         raise TableError(path=table.path, row=None, found="empty", hint=hint)
     absent = [name for name in required if name not in table.header]
     if absent:
-        raise TableError(
-            path=table.path,
-            row=table.header_row,
-            found=f"no column {', '.join(map(repr, absent))}",
-            hint=f"Columns: {', '.join(known)}; needed: {', '.join(required)}. There are: "
-            f'{", ".join(filter(None, table.header))}; --map "{absent[0]}=THEIRS" names one',
+        hint = (
+            f"Columns: {', '.join(known)}; needed: {', '.join(required)}. There are: "
+            f'{", ".join(filter(None, table.header))}; --map "{absent[0]}=THEIRS" names one'
         )
+        raise table.refuse(f"no column {', '.join(map(repr, absent))}", hint)
     return table
 
 

@@ -83,10 +83,8 @@ def trials_of(rows: Sequence[SourceRow]) -> list[TrialRecord]:
     seen: dict[tuple[str, ...], int] = {}
     units: dict[str, tuple[str, int]] = {}
     trials = [read_trial(row) for row in rows]
-    if not all(trial.condition for trial in trials):  # one that is missing may be any of them
-        keys = [_group_and_id(replace(trial, condition="")) for trial in trials]
-    else:
-        keys = [_group_and_id(trial) for trial in trials]
+    is_told = all(trial.condition for trial in trials)  # one that is missing may be any of them
+    keys = [_group_and_id(each if is_told else replace(each, condition="")) for each in trials]
     for row, trial, key in zip(rows, trials, keys, strict=True):
         if key in seen:
             raise row.refuse(
@@ -97,10 +95,8 @@ def trials_of(rows: Sequence[SourceRow]) -> list[TrialRecord]:
         seen[key] = row.row
         check_unit(row, trial, units)
     if len({trial.trial_id for trial in trials}) < len(trials):
-        trials = [
-            replace(trial, trial_id="/".join(filter(None, _group_and_id(trial))))
-            for trial in trials
-        ]
+        named = ["/".join(filter(None, _group_and_id(trial))) for trial in trials]
+        trials = [replace(each, trial_id=name) for each, name in zip(trials, named, strict=True)]
     return trials
 
 
@@ -147,6 +143,8 @@ def read_trial(row: SourceRow) -> TrialRecord:
             )
         if recorded is None and unit == "trial" and not row.text("recorded"):
             recorded = k == 1
+    ended = row.text("recorded").lower()
+    ended = ended.replace("_", " ") if ended in ENDED else ""
     return TrialRecord(
         trial_id=row.text("trial_id") or f"row_{row.row}",
         task=row.text("task"),
@@ -163,16 +161,11 @@ def read_trial(row: SourceRow) -> TrialRecord:
         p_success=row.fraction("p_success"),
         cell=row.text("cell"),
         stand_in=row.answer("stand_in"),
-        why_unknown=row.text("why_unknown") or _how_it_ended(row),
+        why_unknown=row.text("why_unknown") or ended,
         checkpoint=row.text("checkpoint"),
         progress=row.fraction("progress"),
         time_s=row.seconds("time_s"),
     )
-
-
-def _how_it_ended(row: SourceRow) -> str:
-    text = row.text("recorded").lower()
-    return text.replace("_", " ") if text in ENDED else ""
 
 
 def write_trials(path: Path, trials: Iterable[TrialRecord]) -> Path:

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
-from pathlib import Path
 
-from bridge.exchange.table_text import AS_SAVED, SourceRow, TableError, TableOptions, read_rows
+from bridge.exchange.table_text import SourceRow, TableError
 from bridge.exchange.trials_csv import SIDES, UNITS
 
 COLUMNS = ("task", "condition", "policy", "side", "unit", "k", "n", "rate", "rate_percent")
@@ -48,11 +47,6 @@ class RateRecord:
     """How far the true rate may lie from the printed one; 0 where a count says it exactly."""
 
 
-def read_rates(path: Path, options: TableOptions = AS_SAVED) -> list[RateRecord]:
-    """Read and check a rates CSV."""
-    return rates_of(read_rows(path, ("task", "side"), COLUMNS, options))
-
-
 def rates_of(rows: Sequence[SourceRow]) -> list[RateRecord]:
     """Check the rows of a table of rates, each alone and beside the others."""
     records: list[RateRecord] = []
@@ -73,16 +67,11 @@ def check_beside(row: SourceRow, record: RateRecord, earlier: Sequence[RateRecor
                 "One task is counted in one unit; mixing them changes what a rate means",
             )
         if _key(other) == _key(record):
-            raise row.refuse(
-                f"{record.side} of {' '.join(repr(part) for part in _cell(record))} stands in row "
-                f"{other.row} already",
-                "Give each cell once",
+            parts = (record.task, record.condition, *filter(None, [record.policy]))
+            found = (
+                f"{record.side} of {' '.join(map(repr, parts))} stands in row {other.row} already"
             )
-
-
-def _cell(record: RateRecord) -> tuple[str, ...]:
-    parts = (record.task, record.condition)
-    return (*parts, record.policy) if record.policy else parts
+            raise row.refuse(found, "Give each cell once")
 
 
 def _key(record: RateRecord) -> tuple[str, str, str, str]:
@@ -170,29 +159,18 @@ def _count(row: SourceRow, printed: tuple[Fraction, Fraction], n: int, k: int | 
     fewest, most = max(0, math.ceil((rate - half) * n)), min(n, math.floor((rate + half) * n))
     if k is not None:
         if not fewest <= k <= most:
-            raise ImpossibleRateError(
-                path=row.path,
-                row=row.row,
-                found=f"the rate {float(rate):.6g} is not {k}/{n} = {k / n:.6g}",
-                hint="Correct one of them",
-            )
+            found = f"the rate {float(rate):.6g} is not {k}/{n} = {k / n:.6g}"
+            raise row.refuse(found, "Correct one of them", ImpossibleRateError)
         return k
     if fewest > most:
         below = int(rate * n)
-        raise ImpossibleRateError(
-            path=row.path,
-            row=row.row,
-            found=f"{float(rate):.6g} x {n} = {float(rate * n):.6g} is no whole number of "
-            "successes",
-            hint=f"{below}/{n} = {below / n:.6g} and {below + 1}/{n} = {(below + 1) / n:.6g} are "
-            "the possible rates. Was another unit counted? 0.46 fits 23 of 50 objects, not 10 "
-            "trials",
+        found = f"{float(rate):.6g} x {n} = {float(rate * n):.6g} is no whole number of successes"
+        hint = (
+            f"{below}/{n} = {below / n:.6g} and {below + 1}/{n} = {(below + 1) / n:.6g} are the "
+            "possible rates. Was another unit counted? 0.46 fits 23 of 50 objects, not 10 trials"
         )
+        raise row.refuse(found, hint, ImpossibleRateError)
     if fewest < most and Fraction(nearest, n) != rate:
-        raise AmbiguousRateError(
-            path=row.path,
-            row=row.row,
-            found=f"{most - fewest + 1} counts of {n} round to {float(rate):.6g}",
-            hint="Give k as well",
-        )
+        found = f"{most - fewest + 1} counts of {n} round to {float(rate):.6g}"
+        raise row.refuse(found, "Give k as well", AmbiguousRateError)
     return nearest

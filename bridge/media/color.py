@@ -6,7 +6,8 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -36,6 +37,14 @@ class UnreadableImageError(BridgeError):
         super().__init__(f"unreadable image: {found}. Expected {expected}.")
 
 
+def _brought(module: str, package: str, purpose: str) -> Any:
+    """Import what the extra [record] brings, and only some images need."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise MissingDependencyError(package=package, extra="record", purpose=purpose) from error
+
+
 def encode_jpeg(
     image_u8: UInt8[np.ndarray, "height width channels"],
     quality: int = JPEG_QUALITY,
@@ -48,14 +57,8 @@ def encode_jpeg(
     Raises:
         ValueError: The image is larger than JPEG allows (65500), or empty.
     """
-    try:
-        import simplejpeg  # noqa: PLC0415  # the extra [record] brings it; reading PNG needs none
-    except ImportError as error:
-        raise MissingDependencyError(
-            package="simplejpeg", extra="record", purpose="JPEG encoding"
-        ) from error
     return bytes(
-        simplejpeg.encode_jpeg(
+        _brought("simplejpeg", "simplejpeg", "JPEG encoding").encode_jpeg(
             np.ascontiguousarray(image_u8),
             quality=quality,
             colorspace=layout,
@@ -64,12 +67,10 @@ def encode_jpeg(
     )
 
 
-def encode_png(image: np.ndarray) -> bytes:
+def encode_png(image: np.ndarray, level: int = 3) -> bytes:
     """Compress an 8-bit sRGB or a 16-bit grey image without loss."""
-    from PIL import Image as pillow  # noqa: PLC0415  # heavy, only for PNG
-
-    buffer = io.BytesIO()
-    pillow.fromarray(image).save(buffer, format="png", compress_level=3)
+    buffer, pillow = io.BytesIO(), _brought("PIL.Image", "pillow", "writing PNG")
+    pillow.fromarray(image).save(buffer, format="png", compress_level=level)
     return buffer.getvalue()
 
 
@@ -105,12 +106,7 @@ def open_image(data: bytes) -> Iterator["Image"]:
 
 
 def _decode_jpeg(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
-    try:
-        import simplejpeg  # noqa: PLC0415
-    except ImportError as error:
-        raise MissingDependencyError(
-            package="simplejpeg", extra="record", purpose="JPEG decoding"
-        ) from error
+    simplejpeg = _brought("simplejpeg", "simplejpeg", "JPEG decoding")
     try:
         height, width, _, _ = simplejpeg.decode_jpeg_header(data)
         if width * height > MAX_PIXELS:

@@ -1,10 +1,11 @@
-"""Asks every source for its clock, once a second, and says which clock was set.
+"""Asks every source for its clock, once a second, and at the end how many messages it has sent.
 
 The readings go into the open episode on ``/recorder/clocks``; ``bridge.episode.clocks`` fits them.
 """
 
 import contextlib
 import threading
+import time
 from collections.abc import Callable, Collection
 from typing import Any
 
@@ -17,11 +18,13 @@ from bridge.episode.clocks import (
     told_jump,
 )
 from bridge.record.presence import News
-from bridge.wire.clocks import ClockAnswer, ask_clocks
+from bridge.wire.clocks import ClockAnswer, Sent, ask_clocks, hear_last_words
 from bridge.wire.errors import WireError
 from bridge.wire.session import WireSession
 
 PERIOD_S = 1.0
+SETTLE_S, MOST_ASKS = 1.0, 5
+"""A stop waits no longer for those who do not answer, and asks no more often."""
 MAX_SOURCES = 200
 KEPT = 600
 EARLIER = 60
@@ -46,7 +49,9 @@ class ClockBook:
         self._clocks: dict[tuple[str, str], SourceClock] = {}
 
     def take(self, answer: ClockAnswer) -> None:
-        """Enter what a source answered."""
+        """Enter what a source answered of its clock."""
+        if answer.reading is None:
+            return
         key = (answer.source, answer.identity)
         with self._lock:
             clock = self._clocks.get(key)
@@ -81,6 +86,13 @@ class ClockBook:
                 for jump in clock.jumps[-1:]
             )
 
+    def topics_of_others(self, answers: list[ClockAnswer]) -> set[str]:
+        """What those publish who have answered before and are not among these."""
+        here = {(answer.source, answer.identity) for answer in answers}
+        with self._lock:
+            others = [clock.topics for key, clock in self._clocks.items() if key not in here]
+        return set().union(*others)
+
     def status(self) -> list[Record]:
         """What goes into the recorder's status, by source."""
         told = []
@@ -110,10 +122,18 @@ def _best(readings: list[Reading]) -> list[Reading]:
 class ClockAsker:
     """Asks all sources on a thread of its own."""
 
-    def __init__(self, session: WireSession, book: ClockBook) -> None:
-        """Begin to ask."""
+    def __init__(
+        self,
+        session: WireSession,
+        book: ClockBook,
+        told: Callable[[Sent], None],
+        seen: Callable[[], dict[str, int]],
+    ) -> None:
+        """Begin to ask; ``told`` hears how many messages publishers have sent."""
         self._session = session
         self._book = book
+        self._told, self._seen = told, seen
+        self._last = hear_last_words(session, told)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._ask, name="clocks", daemon=True)
         self._thread.start()
@@ -125,9 +145,26 @@ class ClockAsker:
                     self._book.take(answer)
             self._ended.wait(PERIOD_S)
 
+    def settle(self) -> None:
+        """Ask everybody how many messages they have sent by now.
+
+        An answer comes behind the messages: while those of a source still come, it is asked again.
+        """
+        for _ in range(MOST_ASKS):
+            asked_s, seen, answers = time.monotonic(), self._seen(), []
+            with contextlib.suppress(WireError):  # the session is closing
+                answers = ask_clocks(self._session, timeout_s=SETTLE_S, is_last=True)
+            for answer in answers:
+                self._told(answer.sent)
+            is_answered = time.monotonic() < asked_s + SETTLE_S
+            late, now = self._book.topics_of_others(answers), self._seen()
+            if is_answered or all(now.get(topic) == seen.get(topic) for topic in late):
+                return
+
     def close(self) -> None:
         """Stop."""
         self._ended.set()
+        self._last.close()
         self._thread.join(timeout=2 * PERIOD_S)
 
 

@@ -79,7 +79,6 @@ class DiskError(BridgeError):
     def __init__(self, *, path: Path, cause: str, is_finished: bool) -> None:
         """Remember the file, and whether it could be finished."""
         self.path = path
-        self.is_finished = is_finished
         kept = (
             "The episode was finished with all that was written until then"
             if is_finished

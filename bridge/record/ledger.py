@@ -6,6 +6,7 @@ sent = received - repeated + gaps + queue_drops + shed.
 
 import json
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 from bridge.episode.contract import Presence
 from bridge.record.inspection import GOOD, MessageState
 from bridge.record.queue import MAX_WARNINGS, Dropped, Item, second_of
+from bridge.record.sequence import MAX_STREAMS
 
 OTHER_TOPICS = "(further topics)"
 """The account of topics beyond those an episode may have."""
@@ -85,8 +87,8 @@ class Ledger:
         self._max_topics = max_topics
         self._totals: dict[str, Tally] = {}
         self._open: dict[tuple[int, str], Tally] = {}
-        self._first_gid: dict[str, bytes] = {}
-        self._shared: set[str] = set()
+        self._streams: set[tuple[str, bytes]] = set()
+        self._told: set[tuple[str, bytes]] = set()
         self._closing = threading.Lock()
         self._spans: list[tuple[int, int | None]] = [(0, None)]
 
@@ -137,8 +139,8 @@ class Ledger:
         tally.unnumbered += sample.sequence is None
         tally.reduced += item.reduced
         gid = sample.source_gid
-        if gid is not None and self._first_gid.setdefault(sample.topic, gid) != gid:
-            self._shared.add(sample.topic)
+        if gid is not None and len(self._streams) < MAX_STREAMS:
+            self._streams.add((sample.topic, gid))
         presence = self.presences.get(sample.topic)
         if presence is None and len(self.presences) < self._max_topics:
             presence = self.presences[sample.topic] = Presence()
@@ -163,6 +165,7 @@ class Ledger:
             tally.queue_drops += count.messages
             tally.shed += count.shed
             tally.gaps += count.gaps - sum(map(self._was_booked, count.fills))
+        self._told |= dropped.told
         for text in dropped.warnings:
             self.warn(text)
 
@@ -197,14 +200,21 @@ class Ledger:
         totals = self.totals()
         return {topic: tally.unnumbered for topic, tally in totals.items() if tally.unnumbered}
 
+    def uncounted_tails(self) -> list[str]:
+        """Topics of which not every publisher said how many messages it had sent."""
+        return sorted({topic for topic, _ in self._streams - self._told})
+
     def to_metadata(self) -> dict[str, str]:
         """The ``drops`` metadata record: totals, counts by topic, and warnings.
 
         ``several_publishers`` lists the topics whose numbers are no single row.
         """
-        record = {name: json.dumps(value) for name, value in self.total().to_record().items()}
-        by_topic = {topic: tally.to_record() for topic, tally in self.totals().items()}
-        warnings = json.dumps(self.warnings)
-        shared = json.dumps(sorted(self._shared))
-        topics = json.dumps(by_topic)
-        return {**record, "topics": topics, "warnings": warnings, "several_publishers": shared}
+        publishers = Counter(topic for topic, _ in self._streams)
+        record = {
+            **self.total().to_record(),
+            "topics": {topic: tally.to_record() for topic, tally in self.totals().items()},
+            "warnings": self.warnings,
+            "several_publishers": sorted(topic for topic, n in publishers.items() if n > 1),
+            "uncounted_tails": self.uncounted_tails(),
+        }
+        return {name: json.dumps(value) for name, value in record.items()}

@@ -230,7 +230,6 @@ class Lifecycle:
                 self._unwritable.add(item.sample.topic)
                 traceback.print_exc()
             take.ledger.count_refused(item)
-            return
 
     def tick(self, now_ns: int) -> None:
         """Do what time asks for: flush, close seconds. Raises OSError for the disk."""
@@ -259,15 +258,16 @@ class Lifecycle:
 
     def look_at_disk(self) -> str:
         """Return why the open episode must end now, or ""."""
-        self.free_bytes = free_bytes(self._run.path) + self._reserve.held_bytes
-        if self.take is None or self.free_bytes >= self._min_free_bytes:
+        lacks, free_mb, min_mb = self._space()
+        if self.take is None or not lacks:
             return ""
-        free_mb, min_mb = self.free_bytes // BYTES_PER_MB, self._config.disk.min_free_mb
         return f"only {free_mb} MB are free, and {min_mb} MB must be left"
 
-    @property
-    def _min_free_bytes(self) -> int:
-        return self._config.disk.min_free_mb * BYTES_PER_MB
+    def _space(self) -> tuple[bool, int, int]:
+        """Whether too little space is free, how much is, and how much must be left [MB]."""
+        self.free_bytes = free_bytes(self._run.path) + self._reserve.held_bytes
+        min_mb = self._config.disk.min_free_mb
+        return self.free_bytes < min_mb * BYTES_PER_MB, self.free_bytes // BYTES_PER_MB, min_mb
 
     def note_clock_step(self, step_ns: int, now_ns: int) -> None:
         """Write down that the system clock has jumped."""
@@ -286,7 +286,11 @@ class Lifecycle:
         self.is_paused = False
         self._write_held(self.take, held)
         self.ring.empty()
-        return {"ok": True, "episode": info.id, **self._preroll(held, command.received_ns)}
+        answer: Answer = {"ok": True, "episode": info.id}
+        if self.ring.is_on:
+            first_ns = min([entry.received_ns for entry in held], default=command.received_ns)
+            answer["preroll_s"] = s_from_ns(command.received_ns - first_ns)
+        return answer
 
     def snapshot(
         self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
@@ -316,13 +320,9 @@ class Lifecycle:
         later = next(self._run.episodes_dir.glob(f"{episode_id}.[0-9]*.mcap"), None)
         if later is not None:
             raise UsageError(f"{later} exists already. Choose another episode id.")
-        self.free_bytes = free_bytes(self._run.path) + self._reserve.held_bytes
-        if self.free_bytes < self._min_free_bytes:
-            raise NoSpaceError(
-                folder=self._run.path,
-                free_mb=self.free_bytes // BYTES_PER_MB,
-                wanted_mb=self._config.disk.min_free_mb,
-            )
+        lacks, free_mb, min_mb = self._space()
+        if lacks:
+            raise NoSpaceError(folder=self._run.path, free_mb=free_mb, wanted_mb=min_mb)
 
     def _open(
         self,
@@ -354,12 +354,6 @@ class Lifecycle:
             else:
                 take.ledger.count_dropped(entry)
 
-    def _preroll(self, held: list[Item | Dropped], now_ns: int) -> Answer:
-        if not self.ring.is_on:
-            return {}
-        first_ns = min([entry.received_ns for entry in held], default=now_ns)
-        return {"preroll_s": s_from_ns(now_ns - first_ns)}
-
     def _open_take(self) -> EpisodeRecording:
         if self.take is None:
             raise LifecycleError("nothing is being recorded. Start an episode first.")
@@ -381,7 +375,7 @@ class Lifecycle:
         self.is_finishing = False
         answer = {"ok": True, "episode": take.info.id, "discarded": discard}
         answer["duration_s"] = s_from_ns(end_ns - take.start_ns)
-        return {**answer, **counts(take)}
+        return {**answer, **counts(take), "uncounted_tails": take.ledger.uncounted_tails()}
 
     def event(
         self, kind: str, command: Command, text: str, outcome: metadata.Outcome | None

@@ -23,18 +23,17 @@ from bridge.record.clocks import ClockAsker
 from bridge.record.config import RecorderConfig
 from bridge.record.control import serve_control
 from bridge.record.errors import FolderTakenError
-from bridge.record.presence import Heartbeat, PresenceMonitor
+from bridge.record.presence import Heartbeat
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import Ros2Graph
 from bridge.task.task_file import TaskFile
-from bridge.wire import rmw
 from bridge.wire.clocks import ALIVE
 from bridge.wire.errors import WireError
 from bridge.wire.publisher import WirePublisher
 from bridge.wire.qos import Qos
 from bridge.wire.rmw import read_definitions
-from bridge.wire.session import Subscriber, WireSample, WireSession
+from bridge.wire.session import WireSample, WireSession
 
 WIDTH = 320
 QUALITY = 70
@@ -122,8 +121,8 @@ def small_picture(sample: WireSample) -> CompressedColor | None:
 # Publishers that left are noticed, so that nothing they said is repeated in later episodes. A
 # source of ours declares ``<prefix>/alive``; with it go the latched messages under ``/<prefix>/``,
 # but not those of a longer prefix that is still there: the cameras of an arm that left.
-# A ROS 2 publisher has a token; with the last one of a topic go that topic's latched messages. What
-# a source without either has said is remembered until the recorder ends.
+# Of ROS 2 publishers see Ros2Graph. What a source without a token has said is remembered until the
+# recorder ends.
 
 
 class PublisherLiveliness:
@@ -132,19 +131,9 @@ class PublisherLiveliness:
     def __init__(self, session: WireSession, recorder: Recorder) -> None:
         """Begin to watch."""
         self._recorder = recorder
-        self._presence: PresenceMonitor = recorder.presence
         self._lock = threading.Lock()
-        self._tokens: dict[str, str] = {}
         self._prefixes: set[str] = set()
-        self._watching: list[Subscriber] = [
-            session.watch_alive(f"**{ALIVE}", self._on_source),
-            session.watch_alive(rmw.TOKENS, self._on_ros),
-        ]
-
-    def close(self) -> None:
-        """Stop watching."""
-        for subscriber in self._watching:
-            subscriber.close()
+        self.close = session.watch_alive(f"**{ALIVE}", self._on_source).close
 
     def _on_source(self, key: str, alive: bool) -> None:
         if key.startswith("rec/"):
@@ -153,24 +142,9 @@ class PublisherLiveliness:
         with self._lock:
             (self._prefixes.add if alive else self._prefixes.discard)(prefix)
             others = tuple(each for each in self._prefixes if each.startswith(prefix))
-        self._presence.publisher(prefix, is_there=alive, others=others)
+        self._recorder.presence.publisher(prefix, is_there=alive, others=others)
         if not alive:
             self._recorder.forget(prefix, others)
-
-    def _on_ros(self, key: str, alive: bool) -> None:
-        endpoint = rmw.parse_token(key)
-        if endpoint is None or endpoint.kind is not rmw.EntityKind.PUBLISHER:
-            return
-        with self._lock:
-            if alive:
-                self._tokens[key] = endpoint.topic
-                self._presence.publisher(endpoint.topic, is_there=True)
-                return
-            was_there = self._tokens.pop(key, None) is not None
-            is_last = endpoint.topic not in self._tokens.values()
-        if was_there and is_last:
-            self._presence.publisher(endpoint.topic, is_there=False)
-            self._recorder.forget(endpoint.topic)
 
 
 STATUS_PERIOD_S = 1.0
@@ -227,7 +201,11 @@ class LiveRecorder:
         core.also_tell("last_receive_error", lambda: session.last_receive_error)
         self._links = session.watch_links(self._on_link)
         self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
-        self._clocks = ClockAsker(session, core.clocks)
+        queue = core.input_queue
+        self._clocks = ClockAsker(
+            session, core.clocks, lambda sent: queue.told(sent, session.now_ns()), queue.seen
+        )
+        core.settle = self._clocks.settle
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
         self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
@@ -249,10 +227,9 @@ class LiveRecorder:
             self.core.news_arrived.clear()
             if self._ended.is_set():
                 return
+            queue = self.core.input_queue
             with contextlib.suppress(WireError):  # the session is closing
-                self.core.input_queue.watched = self._previews.look(
-                    self.core.input_queue.image_topics()
-                )
+                queue.watched = self._previews.look(queue.image_topics())
                 self._say_status()
 
     def _say_status(self) -> None:
@@ -262,6 +239,9 @@ class LiveRecorder:
 
     def close(self) -> dict[str, Any] | None:
         """Finish the open episode, then leave the network; returns the answer to that stop."""
+        if self.core.recording:  # while it still listens
+            self.core.settle()
+        self.core.settle = lambda: None
         self._ended.set()
         self.core.news_arrived.set()
         self._heartbeat.close()

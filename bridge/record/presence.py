@@ -15,7 +15,7 @@ from bridge.episode.contract import Contract, TopicRule
 from bridge.episode.topics import is_latched
 from bridge.wire.errors import WireError
 from bridge.wire.qos import Qos
-from bridge.wire.session import WireSample, WireSession
+from bridge.wire.session import WireSession
 
 BEAT_S = 0.1
 MAX_STEP_S = 1.5 * BEAT_S
@@ -304,7 +304,7 @@ class Heartbeat:
         self._ended = threading.Event()
         self._loopback: WireSession | None = None
         key = f"rec/{recorder}/heartbeat"
-        self._subscriber = session.subscribe(key, self._hear)
+        self._subscriber = session.subscribe(key, lambda sample: monitor.heard())
         try:
             self._loopback = session.open_loopback()
             self._publisher = self._loopback.publisher(f"/{key}", "", qos=Qos.CONTROL)
@@ -312,9 +312,6 @@ class Heartbeat:
             say(f"note: the recorder cannot watch its own hearing: {error}")
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
         self._thread.start()
-
-    def _hear(self, sample: WireSample) -> None:
-        self._monitor.heard()
 
     def _beat(self) -> None:
         while not self._ended.wait(BEAT_S):

@@ -21,6 +21,7 @@ from bridge.episode.writer import LARGE_BYTES
 from bridge.record.config import BYTES_PER_MB, QueueConfig
 from bridge.record.inspection import MessageState, resolve_type
 from bridge.record.sequence import SequenceTracker, Step
+from bridge.wire.clocks import Sent
 from bridge.wire.session import WireSample
 
 MAX_LATCHED = 1000
@@ -189,6 +190,12 @@ class Dropped:
     counts: dict[tuple[str, int], DropCount] = field(default_factory=dict)
     """By (topic, second of reception)."""
     warnings: dict[str, None] = field(default_factory=dict)
+    told: set[tuple[str, bytes]] = field(default_factory=set)
+    """Publishers that said how many messages they had sent; what is missing is counted."""
+
+    def count(self, topic: str, received_ns: int) -> DropCount:
+        """Where to count what was not taken in at this instant."""
+        return self.counts.setdefault((topic, second_of(received_ns)), DropCount())
 
     def warn(self, text: str) -> None:
         """Remember a remark, once."""
@@ -381,13 +388,8 @@ class InputQueue:
         Args:
             limit: The limit it broke, "" for want of space, None for shedding.
         """
-        if self._dropped is None:
-            self._dropped = Dropped(ticket=self._ticket - 1, received_ns=sample.received_ns)
-            self._entries.append(self._dropped)
-        key = (sample.topic, second_of(sample.received_ns))
-        count = self._dropped.counts.get(key)
-        if count is None:
-            count = self._dropped.counts[key] = DropCount()
+        dropped = self._open_drops(sample.received_ns)
+        count = dropped.count(sample.topic, sample.received_ns)
         count.gaps += step.gap
         if step.fills is not None:
             count.fills.append(step.fills)
@@ -398,7 +400,25 @@ class InputQueue:
         else:
             count.messages += 1
         if limit:
-            self._dropped.warn(f"{sample.topic}: {limit} are dropped")
+            dropped.warn(f"{sample.topic}: {limit} are dropped")
+
+    def _open_drops(self, now_ns: int) -> Dropped:
+        if self._dropped is None:
+            self._dropped = Dropped(ticket=self._ticket - 1, received_ns=now_ns)
+            self._entries.append(self._dropped)
+        return self._dropped
+
+    def told(self, sent: Sent, now_ns: int) -> None:
+        """Take what publishers say they have sent by now: what of it has not come is lost."""
+        with self._lock:
+            self._ticket += 1
+            for (topic, gid), count in sent.items():
+                gap = self._tracker.told(topic, gid, count, self._ticket - 1)
+                if gap is not None and not self._is_quiet:
+                    dropped = self._open_drops(now_ns)
+                    dropped.told.add((topic, gid))
+                    if gap:
+                        dropped.count(topic, now_ns).gaps += gap
 
     def put_image(self, item: Item, saved: int) -> None:
         """Take an image back from its encoder."""

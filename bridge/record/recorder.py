@@ -76,6 +76,8 @@ class Recorder:
         self.presence = PresenceMonitor(self.input_queue.seen, tell=self.note)
         self.clocks = ClockBook(tell=self.note, write=self._write_clock)
         self._life.earlier_clocks = self.clocks.earlier
+        self.settle: Callable[[], None] = lambda: None
+        """Asks publishers how many messages they have sent; what has not come is counted."""
         self.news: deque[str] = deque(maxlen=MAX_NEWS)
         """What a person should hear of at once, for one reader who takes it out."""
         self.news_arrived = threading.Event()
@@ -106,11 +108,6 @@ class Recorder:
         """Id of the episode that is being recorded."""
         take = self._life.take
         return None if take is None else take.info.id
-
-    @property
-    def last_episode(self) -> str | None:
-        """Id of the episode that was finished last."""
-        return self._life.last_episode
 
     def receive(self, sample: WireSample) -> None:
         """Take a message from the network; never waits."""
@@ -225,6 +222,8 @@ class Recorder:
         reason: str = "command",
     ) -> Answer:
         """Finish the episode, or throw it away, after everything received so far."""
+        if self._life.take is not None and not discard:
+            self.settle()
 
         def act(command: Command) -> Answer:
             self.presence.end()
@@ -260,6 +259,7 @@ class Recorder:
         check_episode_id(info.id)
         task = self._task_of(info) if task is None else task
         info = described_by(info, task)
+        self.settle()
         answer = self._command(lambda command: self._life.snapshot(info, command, task))
         return {**answer, **self._keep(task)}
 

@@ -9,9 +9,9 @@ import contextlib
 import queue
 import threading
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
 
 from bridge.errors import GstError, MissingDependencyError
+from bridge.record.recorder import Recorder
 from bridge.wire import keys, rmw
 from bridge.wire.rmw import is_known_definition, type_hash_of
 from bridge.wire.session import WireSample, WireSession
@@ -21,22 +21,14 @@ MAX_ENDPOINTS = 10_000
 MAX_WARNINGS = 1_000
 
 
-@runtime_checkable
-class Receiver(Protocol):
-    """What takes messages; ``bridge.record.recorder.Recorder`` is one."""
-
-    def receive(self, sample: WireSample) -> None:
-        """Take a message; never waits."""
-
-    def declare_latched(self, topic: str) -> None:
-        """Learn that the last message of a topic stays true; never waits."""
-
-
 class Ros2Graph:
-    """The ROS 2 endpoints on the network, followed from their liveliness tokens until ``close``."""
+    """The ROS 2 publishers on the network, followed from their liveliness tokens until ``close``.
+
+    With the last one of a topic go that topic's latched messages.
+    """
 
     def __init__(
-        self, session: WireSession, recorder: Receiver, msg_folder: Path | None = None
+        self, session: WireSession, recorder: Recorder, msg_folder: Path | None = None
     ) -> None:
         """Begin to follow.
 
@@ -46,30 +38,13 @@ class Ros2Graph:
         self._session = session
         self._recorder = recorder
         self._msg_folder = msg_folder
-        self._endpoints: dict[str, rmw.RosEndpoint] = {}
+        self._publishers: dict[str, str] = {}
         self._warnings: dict[str, None] = {}
         self._lock = threading.Lock()
-        self._arrived: queue.SimpleQueue[rmw.RosEndpoint | None] = queue.SimpleQueue()
+        self._arrived: queue.SimpleQueue[rmw.RosPublisher | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="ros2 history", daemon=True)
         self._thread.start()
         self._watching = session.watch_alive(rmw.TOKENS, self._on_token)
-
-    def endpoints(self) -> list[dict[str, Any]]:
-        """Everybody who is there, as JSON records, by topic."""
-        with self._lock:
-            found = sorted(self._endpoints.values(), key=lambda each: (each.topic, each.node))
-        return [
-            {
-                "kind": each.kind.name.lower(),
-                "node": each.node,
-                "domain": each.domain,
-                "topic": each.topic,
-                "type": each.type_name,
-                "type_hash": each.type_hash,
-                "qos": each.qos._asdict(),
-            }
-            for each in found
-        ]
 
     def warnings(self) -> list[str]:
         """What a person should know, oldest first, each once."""
@@ -87,21 +62,22 @@ class Ros2Graph:
         endpoint = rmw.parse_token(key)
         if endpoint is None:
             return
+        topic = endpoint.topic
         with self._lock:
-            if not alive:
-                known = self._endpoints.pop(key, None)
-            elif len(self._endpoints) >= MAX_ENDPOINTS:
-                known = None
-            else:
-                known, self._endpoints[key] = endpoint, endpoint
-        if known is None or known.kind is not rmw.EntityKind.PUBLISHER:
-            return
+            was_there = self._publishers.pop(key, None) is not None
+            if alive and len(self._publishers) < MAX_ENDPOINTS:
+                self._publishers[key] = topic
+            is_last = topic not in self._publishers.values()
         if alive:
-            if known.qos.transient_local:
-                self._recorder.declare_latched(known.topic)
+            if endpoint.transient_local:
+                self._recorder.declare_latched(topic)
+            self._recorder.presence.publisher(topic, is_there=True)
             self._arrived.put(endpoint)
-        else:
-            self._warn(f"{known.topic}: the publisher in {known.node} left")
+        elif was_there:
+            self._warn(f"{topic}: the publisher in {endpoint.node} left")
+            if is_last:
+                self._recorder.presence.publisher(topic, is_there=False)
+                self._recorder.forget(topic)
 
     def _warn(self, text: str) -> None:
         with self._lock:
@@ -110,20 +86,22 @@ class Ros2Graph:
 
     def _work(self) -> None:
         while (endpoint := self._arrived.get()) is not None:
-            if endpoint.qos.transient_local:
+            if endpoint.transient_local:
                 with contextlib.suppress(GstError):  # the session is closing, or the key is no key
                     self._fetch_history(endpoint)
             self._check_type(endpoint)
 
-    def _fetch_history(self, endpoint: rmw.RosEndpoint) -> None:
+    def _fetch_history(self, endpoint: rmw.RosPublisher) -> None:
         """Hand over what the publisher sent before we listened, and nothing twice."""
+        # The cache of an AdvancedPublisher, and that of rmw_zenoh's first releases.
+        caches = (f"{endpoint.key}/@adv/**", f"{endpoint.session}/{endpoint.key}")
         live: set[tuple[object, ...]] = set()
         listening = self._session.subscribe(endpoint.key, lambda each: live.add(_identity(each)))
         try:
             found = [
                 sample
-                for caches in _cache_keys(endpoint)
-                for sample in self._session.query_all(caches, timeout_s=HISTORY_TIMEOUT_S)
+                for cache in caches
+                for sample in self._session.query_all(cache, timeout_s=HISTORY_TIMEOUT_S)
             ]
         finally:
             listening.close()
@@ -132,7 +110,7 @@ class Ros2Graph:
                 live.add(_identity(sample))
                 self._recorder.receive(sample)
 
-    def _check_type(self, endpoint: rmw.RosEndpoint) -> None:
+    def _check_type(self, endpoint: rmw.RosPublisher) -> None:
         name, type_hash = endpoint.type_name, endpoint.type_hash
         try:
             newest = type_hash_of(name, folder=self._msg_folder)
@@ -150,15 +128,6 @@ class Ros2Graph:
                 )
         except MissingDependencyError as error:
             self._warn(str(error))
-
-
-def _cache_keys(endpoint: rmw.RosEndpoint) -> tuple[str, str]:
-    """Where a transient-local publisher answers for its past.
-
-    The first is the cache of an AdvancedPublisher, the second the PublicationCache that
-    rmw_zenoh's first releases made.
-    """
-    return f"{endpoint.key}/@adv/**", f"{endpoint.session}/{endpoint.key}"
 
 
 def _identity(sample: WireSample) -> tuple[object, ...]:

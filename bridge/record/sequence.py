@@ -2,7 +2,7 @@
 
 A number that is skipped is booked as lost at once, and taken back when its message arrives late:
 what remains booked is what never came. What came before the first number of a stream, and after
-its last, is unknown and not claimed.
+its last where its publisher does not say how many it has sent, is unknown and not claimed.
 """
 
 import sys
@@ -80,15 +80,25 @@ class SequenceTracker:
         self._begin(sample)
         return _NEXT
 
+    def told(self, topic: str, gid: bytes, sent: int, ticket: int) -> int | None:
+        """Book what a publisher has sent and nobody has seen; None where that cannot be."""
+        stream = self._streams.get((topic, gid))
+        gap = MAX_JUMP + 1 if stream is None else _unwrapped(sent, stream) - stream.next
+        if stream is None or gap > MAX_JUMP:
+            return None
+        if gap > 0:
+            self._remember(stream, _Hole(stream.next, stream.next + gap, ticket))
+            stream.next += gap
+        return max(0, gap)
+
     def _begin(self, sample: WireSample) -> None:
         key = (sample.topic, sample.source_gid or b"")
-        if key not in self._streams and len(self._streams) >= MAX_STREAMS:
-            oldest = self._streams.pop(next(iter(self._streams)))
-            self._num_holes -= len(oldest.holes)
-        number = sample.sequence or 0
-        before = self._streams.get(key)
+        before = self._streams.pop(key, None)
+        if before is None and len(self._streams) >= MAX_STREAMS:
+            before = self._streams.pop(next(iter(self._streams)))
         if before is not None:
             self._num_holes -= len(before.holes)
+        number = sample.sequence or 0
         self._streams[key] = _Stream(number, number + 1, sample.source_ns or 0)
 
     def _odd(self, stream: _Stream, sample: WireSample, ticket: int) -> Step | None:

@@ -2,13 +2,14 @@
 
 import statistics
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.topics import type_of_topic
-from bridge.record.inspection import GOOD, MessageState, inspector, resolve_type, stamp_reader
+from bridge.record.inspection import MessageState, inspector, resolve_type, stamp_reader
 from bridge.record.sequence import SequenceTracker
 from bridge.wire import rmw
 from bridge.wire.clocks import ALIVE
@@ -21,16 +22,13 @@ FAR_NS = NS_PER_S
 MAX_OFFSETS = 10_000
 _UNITS = {"microseconds": 10**3, "milliseconds": 10**6, "seconds": 10**9}
 
-Kind = Literal["wrong", "missing"]
 
-
-@dataclass(frozen=True, kw_only=True)
-class Breach:
+class Breach(NamedTuple):
     """One thing that a publisher does not do as the contract says."""
 
     about: str
     """encoding, attachment, sequence, time, payload, liveliness or rate."""
-    kind: Kind
+    kind: Literal["wrong", "missing"]
     text: str
 
 
@@ -79,7 +77,7 @@ class TopicHeard:
             "rate_hz": self.rate_hz,
             "publishers": len(self.last_numbers),
             "lost": self.lost,
-            "findings": [vars(finding) for finding in self.findings],
+            "findings": [finding._asdict() for finding in self.findings],
         }
 
     def lines(self) -> list[str]:
@@ -91,8 +89,7 @@ class TopicHeard:
             f"messages, {self.rate_hz:.1f} Hz, publishers: {publishers}"
         ]
         faulty = {finding.about for finding in self.findings}
-        right = [name for name in ASPECTS if name not in faulty]
-        if right:
+        if right := [name for name in ASPECTS if name not in faulty]:
             lines.append(f"  ok       {', '.join(right)}")
         return lines + [f"  {each.kind:<8} {each.about}: {each.text}" for each in self.findings]
 
@@ -152,8 +149,7 @@ class WireListener:
         if source_ns is None:
             heard.unstamped += 1
             known = schema.schema_for(resolve_type(sample.topic, sample.type_name))
-            read = stamp_reader(known)
-            if read is not None:
+            if (read := stamp_reader(known)) is not None:
                 source_ns = read(sample.data)
                 heard.unset_headers += source_ns is None
         if source_ns is None:
@@ -183,16 +179,14 @@ class WireListener:
         return heard
 
 
-def _of_encoding(heard: TopicHeard) -> list[Breach]:
-    found = []
+def _of_encoding(heard: TopicHeard) -> Iterator[Breach]:
     if not heard.message_encoding:
         text = "none that is known; send application/cdr;TYPE (or json, protobuf ...)"
-        found.append(Breach(about="encoding", kind="missing", text=text))
+        yield Breach("encoding", "missing", text)
     if not heard.type_name:
         guessed = type_of_topic(heard.topic)
-        text = "it names no type" + (f"; {guessed} is taken from the topic" if guessed else "")
-        found.append(Breach(about="encoding", kind="missing", text=text))
-    return found
+        text = f"; {guessed} is taken from the topic" if guessed else ""
+        yield Breach("encoding", "missing", f"it names no type{text}")
 
 
 _STATES = {
@@ -201,51 +195,44 @@ _STATES = {
 }
 
 
-def _of_payload(heard: TopicHeard) -> list[Breach]:
-    return [
-        Breach(about="payload", kind="wrong", text=f"{count} of {heard.messages} messages {text}")
-        for state, text in _STATES.items()
-        if state is not GOOD and (count := heard.states.get(state, 0))
-    ]
+def _of_payload(heard: TopicHeard) -> Iterator[Breach]:
+    for state, text in _STATES.items():
+        if count := heard.states.get(state, 0):
+            yield Breach("payload", "wrong", f"{count} of {heard.messages} messages {text}")
 
 
-def _of_attachment(heard: TopicHeard) -> list[Breach]:
-    found = []
+def _of_attachment(heard: TopicHeard) -> Iterator[Breach]:
     if heard.odd_attachments:
         sizes = ", ".join(map(str, sorted(heard.odd_attachments)))
         text = f"{sizes} bytes; it has 33 (or 77): sequence, time, 16, publisher id"
-        found.append(Breach(about="attachment", kind="wrong", text=text))
+        yield Breach("attachment", "wrong", text)
     elif heard.unnumbered:
         text = f"none on {heard.unnumbered} of {heard.messages} messages"
-        found.append(Breach(about="attachment", kind="missing", text=text))
+        yield Breach("attachment", "missing", text)
     if heard.unnumbered:
         text = "messages without a number: their losses cannot be seen"
-        found.append(Breach(about="sequence", kind="missing", text=text))
+        yield Breach("sequence", "missing", text)
     if heard.lost > 0:
         text = f"{heard.lost} of {heard.messages + heard.lost} numbers were skipped: lost messages"
-        found.append(Breach(about="sequence", kind="wrong", text=text))
+        yield Breach("sequence", "wrong", text)
     if heard.not_counted:
         text = f"{heard.not_counted} numbers do not count on; each message gets the next one"
-        found.append(Breach(about="sequence", kind="wrong", text=text))
-    return found
+        yield Breach("sequence", "wrong", text)
 
 
-def _of_time(heard: TopicHeard) -> list[Breach]:
-    found = []
+def _of_time(heard: TopicHeard) -> Iterator[Breach]:
     if heard.unstamped and heard.unset_headers:
         text = "neither an attachment nor header.stamp says when a message was made"
-        found.append(Breach(about="time", kind="missing", text=text))
+        yield Breach("time", "missing", text)
     elif heard.unstamped and not heard.offsets_ns:
         text = "nothing says when a message was made; its arrival counts instead"
-        found.append(Breach(about="time", kind="missing", text=text))
+        yield Breach("time", "missing", text)
     if heard.stamped_back:
         text = f"{heard.stamped_back} messages are stamped before the one that came before them"
-        found.append(Breach(about="time", kind="wrong", text=text))
-    if heard.offsets_ns:
-        offset_ns = round(statistics.median(heard.offsets_ns))
-        if abs(offset_ns) > FAR_NS:
-            found.append(Breach(about="time", kind="wrong", text=_far(heard, offset_ns)))
-    return found
+        yield Breach("time", "wrong", text)
+    offset_ns = round(statistics.median(heard.offsets_ns or [0]))
+    if abs(offset_ns) > FAR_NS:
+        yield Breach("time", "wrong", _far(heard, offset_ns))
 
 
 def _far(heard: TopicHeard, offset_ns: int) -> str:
@@ -257,23 +244,19 @@ def _far(heard: TopicHeard, offset_ns: int) -> str:
     return f"stamps are {abs(offset_ns) / NS_PER_S:.3g} s {side} this computer's clock"
 
 
-def _of_liveliness(heard: TopicHeard, tokens: frozenset[str]) -> list[Breach]:
+def _of_liveliness(heard: TopicHeard, tokens: frozenset[str]) -> Iterator[Breach]:
     parts = heard.topic.strip("/").split("/")
     prefixes = {"/".join(parts[:count]) + ALIVE for count in range(1, len(parts) + 1)}
-    if prefixes & tokens:
-        return []
-    endpoints = [rmw.parse_token(token) for token in tokens]
-    if any(each is not None and each.topic == heard.topic for each in endpoints):
-        return []
-    text = f"no token {parts[0]}{ALIVE}: nobody notices when this publisher is gone"
-    return [Breach(about="liveliness", kind="missing", text=text)]
+    of_ros = {each.topic for token in tokens if (each := rmw.parse_token(token)) is not None}
+    if not prefixes & tokens and heard.topic not in of_ros:
+        text = f"no token {parts[0]}{ALIVE}: nobody notices when this publisher is gone"
+        yield Breach("liveliness", "missing", text)
 
 
-def _of_rate(heard: TopicHeard, rate_hz: float | None) -> list[Breach]:
-    if rate_hz is None or abs(heard.rate_hz - rate_hz) <= RATE_TOLERANCE * rate_hz:
-        return []
-    text = f"{heard.rate_hz:.1f} Hz, expected {rate_hz:g} Hz within {RATE_TOLERANCE:.0%}"
-    return [Breach(about="rate", kind="wrong", text=text)]
+def _of_rate(heard: TopicHeard, rate_hz: float | None) -> Iterator[Breach]:
+    if rate_hz is not None and abs(heard.rate_hz - rate_hz) > RATE_TOLERANCE * rate_hz:
+        text = f"{heard.rate_hz:.1f} Hz, expected {rate_hz:g} Hz within {RATE_TOLERANCE:.0%}"
+        yield Breach("rate", "wrong", text)
 
 
 def describe_heard(key: str, heard: list[TopicHeard]) -> str:

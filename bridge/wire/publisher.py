@@ -105,6 +105,8 @@ class WirePublisher:
         self._inner = inner
         self._pool = pool
         self._sequence = 0
+        self.sent = 0
+        """Numbers used and handed to the network: whoever hears of them hears it behind them."""
         self.gid = uuid.uuid4().bytes
         self.not_shared = 0
         """Messages that found the shared memory full and went over the network instead."""
@@ -124,6 +126,8 @@ class WirePublisher:
             self._inner.put(payload, attachment=encode(note))
         except zenoh.ZError as error:
             raise WireError(f"cannot publish: {cause_of(error)}. Is the session open?") from error
+        finally:
+            self.sent += 1
 
     def skip(self, count: int) -> None:
         """Leave out numbers: messages that were lost before they got here, on the device's side.
@@ -131,6 +135,7 @@ class WirePublisher:
         Receivers count them as they count any other gap.
         """
         self._sequence += count
+        self.sent += count
 
     def has_subscribers(self) -> bool:
         """Say whether anybody would get a message; costly ones need not be made otherwise."""

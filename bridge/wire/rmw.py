@@ -12,10 +12,9 @@ says which definition a publisher was built with. Releases are searched newest f
 
 import re
 from dataclasses import dataclass
-from enum import Enum
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from bridge.episode.schema import Schema
 from bridge.errors import MissingDependencyError, UsageError
@@ -120,49 +119,25 @@ def _typesys() -> Any:
 TOKENS = "@ros2_lv/**"
 """Key expression of all tokens of all domains."""
 _PREFIX = "@ros2_lv"
-_NODE_PARTS, _TOPIC_PARTS = 9, 13
-_QOS_FIELDS = 3
+_PARTS, _PUBLISHER, _QOS_FIELDS = 13, "MP", 3
 _NUMBER = "[0-9]{0,9}"
 
 
-class EntityKind(Enum):
-    """What a token stands for."""
-
-    NODE = "NN"
-    PUBLISHER = "MP"
-    SUBSCRIPTION = "MS"
-    SERVICE = "SS"
-    CLIENT = "SC"
-
-
-class RosQos(NamedTuple):
-    """The part of an endpoint's quality of service that matters to a recorder."""
-
-    transient_local: bool = False
-    """Late subscribers get the last messages: /tf_static, /robot_description, maps."""
-    depth: int = 42
-    """How many; 42 is rmw_zenoh's default."""
-
-
-DEFAULT_QOS = RosQos()
-
-
 @dataclass(frozen=True, kw_only=True)
-class RosEndpoint:
-    """A node, publisher, subscription, service or client of a ROS 2 graph."""
+class RosPublisher:
+    """A publisher of a ROS 2 graph."""
 
-    kind: EntityKind
     domain: int
     session: str
     node: str
     """With its namespace, as ROS prints it: ``/arm/driver``."""
-    topic: str = ""
-    """Topic or service, with its leading slash; "" for a node."""
-    dds_type: str = ""
+    topic: str
+    dds_type: str
     """As in keys: ``std_msgs::msg::dds_::String_``."""
-    type_hash: str = ""
+    type_hash: str
     """RIHS01 hash, or TypeHashNotSupported from older releases."""
-    qos: RosQos = DEFAULT_QOS
+    transient_local: bool
+    """Late subscribers get the last messages: /tf_static, /robot_description, maps."""
 
     @property
     def type_name(self) -> str:
@@ -175,45 +150,32 @@ class RosEndpoint:
         return f"{self.domain}{self.topic}/{self.dds_type}/{self.type_hash}"
 
 
-def parse_token(key: str) -> RosEndpoint | None:
-    """Read the key of a liveliness token; None for anything that is not one of rmw_zenoh."""
+def parse_token(key: str) -> RosPublisher | None:
+    """Read the liveliness token of a publisher; None for anything that is not one of rmw_zenoh."""
     parts = key.split("/")
-    if len(parts) < _NODE_PARTS or parts[0] != _PREFIX or "" in parts:
+    if len(parts) < _PARTS or parts[0] != _PREFIX or "" in parts:
         return None
     if any(sign in key for sign in "*$?#"):  # would widen the questions asked about it
         return None
-    _, domain, session, _, _, kind_name, _, namespace, node = parts[:_NODE_PARTS]
-    kinds = {kind.value: kind for kind in EntityKind}
-    kind = kinds.get(kind_name)
-    if kind is None or not (domain.isascii() and domain.isdigit()):
+    _, domain, session, _, _, kind, _, *rest = parts[:_PARTS]
+    namespace, node, topic = (each.replace("%", "/") for each in rest[:3])
+    is_latched = is_transient_local(rest[5])
+    is_one = kind == _PUBLISHER and domain.isascii() and domain.isdigit() and topic[0] == "/"
+    if not is_one or is_latched is None:
         return None
-    full_name = f"{_name(namespace).rstrip('/')}/{_name(node)}"
-    if kind is EntityKind.NODE:
-        return RosEndpoint(kind=kind, domain=int(domain), session=session, node=full_name)
-    if len(parts) < _TOPIC_PARTS:
-        return None
-    topic, dds_type, type_hash, qos_text = parts[_NODE_PARTS:_TOPIC_PARTS]
-    qos = parse_qos(qos_text)
-    if qos is None or not _name(topic).startswith("/"):
-        return None
-    return RosEndpoint(
-        kind=kind,
+    return RosPublisher(
         domain=int(domain),
         session=session,
-        node=full_name,
-        topic=_name(topic),
-        dds_type=dds_type,
-        type_hash=type_hash,
-        qos=qos,
+        node=f"{namespace.rstrip('/')}/{node}",
+        topic=topic,
+        dds_type=rest[3],
+        type_hash=rest[4],
+        transient_local=is_latched,
     )
 
 
-def _name(mangled: str) -> str:
-    return mangled.replace("%", "/")
-
-
-def parse_qos(text: str) -> RosQos | None:
-    """Read ``<reliability>:<durability>:<history>,<depth>:...``; an empty field is the default.
+def is_transient_local(text: str) -> bool | None:
+    """Read ``<reliability>:<durability>:<history>,<depth>:...``; None of what is not that.
 
     The numbers are those of ``rmw/types.h``: durability 1 is transient local.
     """
@@ -222,6 +184,4 @@ def parse_qos(text: str) -> RosQos | None:
         return None
     history, _, depth = fields[2].partition(",")
     numbers = [fields[0], fields[1], history, depth]
-    if not all(re.fullmatch(_NUMBER, each) for each in numbers):
-        return None
-    return RosQos(fields[1] == "1", int(depth) if depth else DEFAULT_QOS.depth)
+    return fields[1] == "1" if all(re.fullmatch(_NUMBER, each) for each in numbers) else None

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import TracebackType
@@ -41,8 +41,8 @@ from bridge.wire.zenoh_config import zenoh, zenoh_config
 
 MAX_WAITING = 32
 """Requests that wait for one service; each may hold a whole plan."""
-CLOSE_S = 5.0
-"""How long a request in work may take when the service stops."""
+CLOSE_S, UNHEARD_S = 5.0, 0.5
+"""How long a request in work may take when the service stops; one that perhaps nobody hears."""
 
 
 class Service:
@@ -215,8 +215,9 @@ class WireSession:
         self._clock = AnchoredClock()
         self._services: list[Service] = []
         self._alive: list[Subscriber] = []
+        self._last_words: list[tuple[Any, Callable[[bytes], bytes]]] = []
         self._definitions: dict[tuple[str, str], schema.Schema] = {}
-        self.topics: set[str] = set()
+        self._publishers: list[tuple[str, WirePublisher]] = []
         self._pool = SharedPool(shared_memory_mb * BYTES_PER_MB) if shared_memory_mb else None
 
     @property
@@ -242,18 +243,27 @@ class WireSession:
             message_encoding = known.message_encoding if known else "cdr"
         encoding = keys.encoding_of(type_name, message_encoding)
         control = zenoh.CongestionControl
+        locality = zenoh.Locality.REMOTE if qos.is_remote else zenoh.Locality.ANY
         try:
             inner = self._inner.declare_publisher(
                 keys.key_from_topic(topic),
                 encoding=encoding,
                 congestion_control=control.BLOCK if qos.block else control.DROP,
                 priority=getattr(zenoh.Priority, qos.priority.upper()),
-                allowed_destination=zenoh.Locality.REMOTE if qos.is_remote else zenoh.Locality.ANY,
+                allowed_destination=locality,
             )
         except zenoh.ZError as error:
             raise BadTopicError(topic=topic, found=cause_of(error)) from error
-        self.topics.add(topic)
-        return WirePublisher(inner, self._pool if qos.shared_memory else None)
+        made = WirePublisher(inner, self._pool if qos.shared_memory else None)
+        self._publishers.append((topic, made))
+        return made
+
+    def sent(self) -> dict[str, dict[str, int]]:
+        """By topic and publisher id in hex, the messages so far, those that zenoh dropped too."""
+        counts: dict[str, dict[str, int]] = {}
+        for topic, made in list(self._publishers):
+            counts.setdefault(topic, {})[made.gid.hex()] = made.sent
+        return counts
 
     def subscribe(
         self,
@@ -275,11 +285,8 @@ class WireSession:
                 self.last_receive_error = f"{type(error).__name__}: {error}"
 
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
-        try:
+        with _naming(WireConfigError, f"cannot subscribe to {key_expression!r}"):
             return Subscriber(self._inner.declare_subscriber(key_expression, handler))
-        except zenoh.ZError as error:
-            message = f"cannot subscribe to {key_expression!r}: {cause_of(error)}."
-            raise WireConfigError(message) from error
 
     def define(self, record: schema.Schema) -> None:
         """Tell what a type is that nobody knows, now and to whoever asks later.
@@ -356,12 +363,17 @@ class WireSession:
         self._services.append(service)
         return service
 
+    def say_last(self, key: str, words: Callable[[bytes], bytes]) -> None:
+        """Ask on a key once more before the session closes, and wait for who listens there.
+
+        The request comes behind all that was published: what was heard of it by then was all.
+        """
+        self._last_words.append((self._inner.declare_querier(key), words))
+
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask and wait for the answer."""
-        try:
+        with _naming(WireError, f"cannot ask {key}"):
             replies = list(self._inner.get(key, payload=payload, timeout=timeout_s))
-        except zenoh.ZError as error:
-            raise WireError(f"cannot ask {key}: {cause_of(error)}.") from error
         refusal = None
         for reply in replies:
             if reply.ok is not None:
@@ -372,51 +384,45 @@ class WireSession:
         raise RemoteError(refusal)
 
     def query_all(
-        self, key_expression: str, *, timeout_s: float, max_mb: int = 64
+        self, key_expression: str, *, timeout_s: float, max_mb: int = 64, is_last: bool = False
     ) -> list[WireSample]:
         """Ask everybody and return every good answer, in the order they came.
 
         Used for what caches keep: the last messages of a topic whose publisher spoke before we
-        listened. Whoever has not answered in time is left out, and so is what comes after
-        ``max_mb`` [MB], for nobody knows what a cache holds.
+        listened. Whoever has not answered in time is left out, and so is what does not fit
+        into ``max_mb`` [MB], for nobody knows what a cache holds. ``is_last``: no answer overtakes
+        what its sender has published before.
         """
         answers: list[WireSample] = []
         left = max_mb * BYTES_PER_MB
-        try:
+        with _naming(WireError, f"cannot ask {key_expression}"):
             replies = self._inner.get(
                 key_expression,
                 timeout=timeout_s,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
+                priority=zenoh.Priority.BACKGROUND if is_last else zenoh.Priority.DATA,
             )
             for reply in replies:
-                if reply.ok is None:
+                if reply.ok is None or len(reply.ok.payload) > left:
                     continue
                 left -= len(reply.ok.payload)
-                if left < 0:
-                    break
                 answers.append(copy_sample(reply.ok, self._clock.now_ns()))
-        except zenoh.ZError as error:
-            raise WireError(f"cannot ask {key_expression}: {cause_of(error)}.") from error
         return answers
 
     def declare_alive(self, key: str) -> Subscriber:
         """Let everybody see that this session is there, until it closes or its process ends."""
-        try:
+        with _naming(WireConfigError, f"cannot be seen as {key!r}"):
             token = Subscriber(self._inner.liveliness().declare_token(key))
-        except zenoh.ZError as error:
-            raise WireConfigError(f"cannot be seen as {key!r}: {cause_of(error)}.") from error
         self._alive.append(token)  # zenoh withdraws a token that nobody holds
         return token
 
     def query_alive(self, key_expression: str, *, timeout_s: float = 5.0) -> list[str]:
         """Return the keys of everybody who is there now."""
-        try:
+        with _naming(WireError, f"cannot ask {key_expression}"):
             replies = self._inner.liveliness().get(key_expression, timeout=timeout_s)
             return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
-        except zenoh.ZError as error:
-            raise WireError(f"cannot ask {key_expression}: {cause_of(error)}.") from error
 
     def watch_alive(self, key_expression: str, callback: Callable[[str, bool], None]) -> Subscriber:
         """Hear who is there, comes and goes, on the network thread."""
@@ -425,19 +431,28 @@ class WireSession:
             callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
-        try:
-            declared = self._inner.liveliness().declare_subscriber(
-                key_expression, handler, history=True
-            )
-        except zenoh.ZError as error:
-            raise WireConfigError(f"cannot watch {key_expression!r}: {cause_of(error)}.") from error
-        return Subscriber(declared)
+        with _naming(WireConfigError, f"cannot watch {key_expression!r}"):
+            alive = self._inner.liveliness()
+            return Subscriber(alive.declare_subscriber(key_expression, handler, history=True))
 
     def close(self) -> None:
-        """Finish answering, then leave the network."""
+        """Finish answering, say the last words, then leave the network."""
         for service in self._services:
             service.close()
         self._services.clear()
+        with contextlib.suppress(zenoh.ZError):  # closed already
+            for querier, words in self._last_words:
+                is_heard = querier.matching_status.matching  # or not yet known
+                replies = self._inner.get(
+                    querier.key_expr,
+                    payload=words(b""),
+                    target=zenoh.QueryTarget.ALL,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    priority=zenoh.Priority.BACKGROUND,
+                    timeout=CLOSE_S if is_heard else UNHEARD_S,
+                )
+                list(replies)
+        self._last_words.clear()
         for token in self._alive:
             token.close()
         self._alive.clear()
@@ -456,6 +471,15 @@ class WireSession:
     ) -> None:
         """Close."""
         self.close()
+
+
+@contextlib.contextmanager
+def _naming(kind: type[GstError], what: str) -> Iterator[None]:
+    """Say what could not be done where zenoh refuses it."""
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise kind(f"{what}: {cause_of(error)}.") from error
 
 
 def open_session(config: WireConfig) -> WireSession:

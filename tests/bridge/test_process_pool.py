@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import wait_until
 
 from bridge import process_pool
 from bridge.process_pool import (
@@ -158,10 +159,7 @@ def test_processes_end_with_their_owner_also_when_it_is_killed() -> None:
         assert _alive(pid)
         owner.kill()
         owner.wait(10)
-        ends = time.monotonic() + 10
-        while _alive(pid) and time.monotonic() < ends:
-            time.sleep(0.02)
-        assert not _alive(pid)
+        wait_until(lambda: not _alive(pid))
 
 
 def _alive(pid: int) -> bool:

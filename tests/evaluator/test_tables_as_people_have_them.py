@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from bridge.errors import BridgeError, UsageError
-from bridge.exchange.table_text import TableOptions
-from bridge.exchange.trials_rates import read_rates
+from bridge.exchange import trials_rates
+from bridge.exchange.table_text import TableOptions, read_rows
 from evaluator.cli import evaluate
 from evaluator.compare.intake import Taken, take
 from evaluator.compare.table_words import DoubtfulTableError
@@ -476,7 +476,8 @@ def test_every_rate_of_up_to_forty_trials_is_counted_at_full_precision(tmp_path:
     ):
         lines = [f"{i},real,{n},{write_rate(k, n)}" for i, (k, n) in enumerate(cells)]
         path = write(tmp_path, "\n".join(["task,side,n,rate,rate_percent", *lines]) + "\n")
-        assert [(r.k, r.n) for r in read_rates(path)] == cells
+        rates = trials_rates.rates_of(read_rows(path, ("task", "side"), trials_rates.COLUMNS))
+        assert [(r.k, r.n) for r in rates] == cells
 
 
 def test_what_was_understood_stands_in_one_line(tmp_path: Path) -> None:

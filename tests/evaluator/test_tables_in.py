@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.errors import PathNotFoundError, UsageError
-from bridge.exchange.table_text import TableError
+from bridge.exchange import trials_rates
+from bridge.exchange.table_text import TableError, read_rows
 from bridge.exchange.trials_csv import TrialRecord, read_trials, write_trials
-from bridge.exchange.trials_rates import read_rates
 from evaluator.compare import compare_csv, compare_run
 from evaluator.compare.spreadsheet import record_from_row, row_from_record
 
@@ -129,10 +129,10 @@ def test_rates_that_cannot_be_are_refused(
 ) -> None:
     path = write_table(text)
     if message is None:
-        assert read_rates(path)
+        assert trials_rates.rates_of(read_rows(path, ("task", "side"), trials_rates.COLUMNS))
         return
     with pytest.raises(TableError, match=message):
-        read_rates(path)
+        trials_rates.rates_of(read_rows(path, ("task", "side"), trials_rates.COLUMNS))
 
 
 def test_a_table_that_is_neither_is_refused(

@@ -155,7 +155,8 @@ def folder_messages(
     for number, (frame, stamps) in enumerate(zip(index.frames, times, strict=False), start=1):
         color = read_color(frame.color_path)
         if color_camera is None:
-            color_camera = _color_camera(index, color.image_u8.shape)
+            shown = color.image_u8.shape[1] / index.depth_camera.width
+            color_camera = index.color_camera or index.depth_camera.scaled(shown)
         check_size(frame.color_path, color.image_u8.shape[:2], color_camera)
         messages = []
         if min(stamps) >= next_info_ns:
@@ -189,7 +190,7 @@ def _pose_messages(
             child=f"{config.camera}_depth_optical",
             T_parent_child=T_world_depth,
         )
-        yield _message(TF, schema.TF_MESSAGE, transforms_to_cdr([pose]), stamp_ns)
+        yield stamped(TF, schema.TF_MESSAGE, transforms_to_cdr([pose]), stamp_ns)
 
 
 def _images(
@@ -213,8 +214,8 @@ def _images(
     )
     prefix = camera_topic(config.cell, config.camera)
     return [
-        _message(f"{prefix}{DEPTH_IMAGE}", schema.IMAGE, depth.to_cdr(), depth_ns),
-        _message(f"{prefix}{COLOR_IMAGE}", schema.COMPRESSED_IMAGE, image.to_cdr(), color_ns),
+        stamped(f"{prefix}{DEPTH_IMAGE}", schema.IMAGE, depth.to_cdr(), depth_ns),
+        stamped(f"{prefix}{COLOR_IMAGE}", schema.COMPRESSED_IMAGE, image.to_cdr(), color_ns),
     ]
 
 
@@ -226,26 +227,20 @@ def _calibration(
         frame_id = f"{config.camera}_{stream}_optical"
         info = CameraInfo(stamp_ns=stamp_ns, frame_id=frame_id, camera=camera)
         topic = camera_topic(config.cell, config.camera, f"/{stream}/info")
-        messages.append(_message(topic, schema.CAMERA_INFO, info.to_cdr(), stamp_ns))
+        messages.append(stamped(topic, schema.CAMERA_INFO, info.to_cdr(), stamp_ns))
     between = FrameTransform(
         stamp_ns=stamp_ns,
         parent=f"{config.camera}_depth_optical",
         child=f"{config.camera}_color_optical",
         T_parent_child=index.T_depth_color,
     )
-    messages.append(_message(TF_STATIC, schema.TF_MESSAGE, transforms_to_cdr([between]), stamp_ns))
+    messages.append(stamped(TF_STATIC, schema.TF_MESSAGE, transforms_to_cdr([between]), stamp_ns))
     return messages
 
 
-def _message(topic: str, type_name: str, data: bytes, stamp_ns: int) -> StampedMessage:
+def stamped(topic: str, type_name: str, data: bytes, stamp_ns: int) -> StampedMessage:
+    """Name what a message is."""
     return StampedMessage(topic=topic, type_name=type_name, data=data, stamp_ns=stamp_ns)
-
-
-def _color_camera(index: FolderIndex, shape: tuple[int, ...]) -> Camera:
-    """The camera of the colour images; registered ones may be a resized depth camera's."""
-    if index.color_camera is not None:
-        return index.color_camera
-    return index.depth_camera.scaled(shape[1] / index.depth_camera.width)
 
 
 def _read_depth(index: FolderIndex, frame: FolderFrame) -> UInt16[np.ndarray, "height width"]:

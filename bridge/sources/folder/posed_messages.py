@@ -20,8 +20,8 @@ from bridge.episode.topics import COLOR_IMAGE, COLOR_INFO, TF, camera_topic
 from bridge.geometry.camera import Camera
 from bridge.sources.folder.config import PosedConfig
 from bridge.sources.folder.frames import check_size, read_color
-from bridge.sources.folder.messages import WORLD
-from bridge.sources.folder.posed_index import PosedImage, PosedIndex
+from bridge.sources.folder.messages import WORLD, stamped
+from bridge.sources.folder.posed_index import PosedIndex
 
 TYPICAL_DISTANCE_M = 1.0
 """Poses without a scale are scaled so that what the cameras look at is this far away."""
@@ -65,11 +65,13 @@ def posed_messages(index: PosedIndex, config: PosedConfig) -> Iterator[list[Stam
         T = image.T_world_camera.copy()
         T[:3, 3] *= scale
         messages.append(_pose(name, T, stamp_ns))
+        read = read_color(image.path)
+        check_size(image.path, read.image_u8.shape[:2], camera)
         color = CompressedColor(
-            stamp_ns=stamp_ns, frame_id=frame_of(name), format="jpeg", data=_jpeg(image, camera)
+            stamp_ns=stamp_ns, frame_id=frame_of(name), format="jpeg", data=read.as_jpeg()
         )
         topic = camera_topic(config.cell, name, COLOR_IMAGE)
-        messages.append(_message(topic, schema.COMPRESSED_IMAGE, color.to_cdr(), stamp_ns))
+        messages.append(stamped(topic, schema.COMPRESSED_IMAGE, color.to_cdr(), stamp_ns))
         yield messages
 
 
@@ -83,24 +85,14 @@ def frame_of(camera: str) -> str:
     return f"{camera}_color_optical"
 
 
-def _jpeg(image: PosedImage, camera: Camera) -> bytes:
-    color = read_color(image.path)
-    check_size(image.path, color.image_u8.shape[:2], camera)
-    return color.as_jpeg()
-
-
 def _pose(camera: str, T_world_camera: Float[np.ndarray, "4 4"], stamp_ns: int) -> StampedMessage:
     pose = FrameTransform(
         stamp_ns=stamp_ns, parent=WORLD, child=frame_of(camera), T_parent_child=T_world_camera
     )
-    return _message(TF, schema.TF_MESSAGE, transforms_to_cdr([pose]), stamp_ns)
+    return stamped(TF, schema.TF_MESSAGE, transforms_to_cdr([pose]), stamp_ns)
 
 
 def _info(config: PosedConfig, name: str, camera: Camera, stamp_ns: int) -> StampedMessage:
     info = CameraInfo(stamp_ns=stamp_ns, frame_id=frame_of(name), camera=camera)
     topic = camera_topic(config.cell, name, COLOR_INFO)
-    return _message(topic, schema.CAMERA_INFO, info.to_cdr(), stamp_ns)
-
-
-def _message(topic: str, type_name: str, data: bytes, stamp_ns: int) -> StampedMessage:
-    return StampedMessage(topic=topic, type_name=type_name, data=data, stamp_ns=stamp_ns)
+    return stamped(topic, schema.CAMERA_INFO, info.to_cdr(), stamp_ns)

@@ -35,15 +35,11 @@ def choose_topics(patterns: Sequence[str], there: Sequence[str]) -> list[str]:
         matches = topic_pattern(pattern).fullmatch
         found = {topic for topic in there if matches(topic)}
         if not found:
-            raise UsageError(f"--topics {pattern!r} names no topic of the episode. {_hint(there)}")
+            more = f" and {len(there) - SHOWN} more" if len(there) > SHOWN else ""
+            listed = f"There are: {', '.join(there[:SHOWN])}{more}."
+            raise UsageError(f"--topics {pattern!r} names no topic of the episode. {listed}")
         chosen |= found
     return [topic for topic in there if topic in chosen]
-
-
-def _hint(there: Sequence[str]) -> str:
-    shown = ", ".join(there[:SHOWN])
-    more = len(there) - SHOWN
-    return f"There are: {shown}" + (f" and {more} more." if more > 0 else ".")
 
 
 SHOWN = 30

@@ -23,6 +23,7 @@ from bridge.episode.topics import OF_RECORDER, TF_STATIC, is_latched
 from bridge.errors import UsageError
 from bridge.sources.playback.config import PlaybackConfig, choose_topics
 from bridge.terminal import Output
+from bridge.wire.clocks import announce
 from bridge.wire.errors import BadTopicError
 from bridge.wire.keys import key_from_topic
 from bridge.wire.qos import Qos
@@ -77,7 +78,10 @@ class EpisodeSource:
         there = [topic for topic in counts if topic not in OF_RECORDER]
         self.topics = tuple(choose_topics(config.topics, there))
         for topic in self.topics:
-            _check_name(path, topic)
+            try:
+                key_from_topic(topic)
+            except BadTopicError as error:
+                raise UsageError(f"{path}: {error} Choose others with --topics.") from error
         self.num_messages = sum(counts[topic] for topic in self.topics)
         if not self.num_messages:
             listed = ", ".join(self.topics) or "it has no topics"
@@ -120,8 +124,8 @@ class EpisodeSource:
         """
         for path in self.episode.missing_parts:
             output.say(f"{path.name} is missing; what it held is not played")
-        for cell in sorted({name.split("/")[1] for name in self.topics if name.count("/") > 1}):
-            session.declare_alive(f"{cell}/alive")
+        if cells := sorted({name.split("/")[1] for name in self.topics if name.count("/") > 1}):
+            announce(session, *cells, has_clock=False)
         publishers = self._publishers(session)
         sent = dict.fromkeys(self.topics, 0)
         late_s = array("d")
@@ -178,13 +182,6 @@ class EpisodeSource:
             )
             with contextlib.suppress(BadTopicError):  # then only its name is recorded again
                 session.define(made)
-
-
-def _check_name(path: Path, name: str) -> None:
-    try:
-        key_from_topic(name)
-    except BadTopicError as error:
-        raise UsageError(f"{path}: {error} Choose others with --topics.") from error
 
 
 def _lateness_ms(late_s: "array[float]") -> dict[str, float]:

@@ -5,7 +5,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bridge.clock import AnchoredClock
 from bridge.episode import topics
@@ -18,9 +18,6 @@ from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import TRUTH_PARAMETERS, Session, Streams
 from bridge.task.find import chosen_task_file
 from bridge.terminal import Output
-
-if TYPE_CHECKING:
-    from bridge.wire.session import WireSession
 
 
 def run_session(
@@ -103,10 +100,11 @@ class StandinSource:
             topics.ROBOT_DESCRIPTION,
         )
 
-    def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
+    def run(self, session: Any, stop: threading.Event, output: Output) -> dict[str, Any]:
         """Record as the configuration says, or until stopped; see ``run_session``."""
-        # Without an answer to @clock: the stamps are simulated time, not that of this host.
-        session.declare_alive(f"{self.config.cell}/alive")
+        from bridge.wire.clocks import announce  # noqa: PLC0415  # zenoh only when live
+
+        announce(session, self.config.cell, has_clock=False)  # the stamps are simulated time
         return run_session(session, self.config, output, should_stop=stop.is_set)
 
 

@@ -22,17 +22,11 @@ def listed(run: run_folder.RunFolder) -> list[str]:
 
 def test_a_split_episode_is_listed_once_and_all_its_parts_are_found(tmp_path: Path) -> None:
     names = [run_folder.part_name("t1", index) for index in range(1, 12)]
-    run = run_with(tmp_path, *reversed(names), "t2.mcap")
-    assert listed(run) == ["t1.mcap", "t2.mcap"]
-    assert [path.name for path in run_folder.part_paths(run.episodes()[0])] == names
-    assert run_folder.part_paths(run.episodes()[1]) == [run.episodes()[1]]
-
-
-def test_parts_behind_a_missing_one_go_with_their_episode(tmp_path: Path) -> None:
-    run = run_with(tmp_path, "t1.mcap", "t1.3.mcap", "t1.4.mcap", "t2.10.mcap", "t2.2.mcap")
-    assert listed(run) == ["t1.mcap", "t2.2.mcap"]
-    found = [[path.name for path in run_folder.part_paths(first)] for first in run.episodes()]
-    assert found == [["t1.mcap", "t1.3.mcap", "t1.4.mcap"], ["t2.2.mcap", "t2.10.mcap"]]
+    behind_a_gap = ["t3.mcap", "t3.3.mcap", "t3.4.mcap"]
+    run = run_with(tmp_path, *reversed(names), "t2.mcap", *behind_a_gap, "t4.10.mcap", "t4.2.mcap")
+    assert listed(run) == ["t1.mcap", "t2.mcap", "t3.mcap", "t4.2.mcap"]
+    groups = [names, ["t2.mcap"], behind_a_gap, ["t4.2.mcap", "t4.10.mcap"]]
+    assert [*run_folder.grouped_parts(run_folder.file_names(run.episodes_dir)).values()] == groups
 
 
 @pytest.mark.parametrize(
@@ -41,8 +35,8 @@ def test_parts_behind_a_missing_one_go_with_their_episode(tmp_path: Path) -> Non
 def test_a_name_that_only_looks_like_a_part_stands_for_itself(tmp_path: Path, name: str) -> None:
     run = run_with(tmp_path, "t1.mcap", "a.b.mcap", name)
     assert name in listed(run)
-    parts = [part.name for path in run.episodes() for part in run_folder.part_paths(path)]
-    assert parts == listed(run)
+    groups = run_folder.grouped_parts(run_folder.file_names(run.episodes_dir))
+    assert [[first] for first in listed(run)] == [*groups.values()]
 
 
 def test_files_of_takes_still_open_are_no_episodes(tmp_path: Path) -> None:
@@ -72,7 +66,3 @@ def test_every_file_belongs_to_exactly_one_episode(indices: set[int]) -> None:
     assert list(run_folder.grouped_parts(names[::-1]).items()) == [
         (name, names) for name in names[:1]
     ]
-
-
-def test_parts_of_a_file_that_is_not_there_are_the_file_alone(tmp_path: Path) -> None:
-    assert run_folder.part_paths(tmp_path / "t9.mcap") == [tmp_path / "t9.mcap"]

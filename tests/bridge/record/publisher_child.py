@@ -10,6 +10,7 @@ import numpy as np
 from bridge.episode import schema
 from bridge.episode.cdr.messages import DepthImage, JointSample
 from bridge.record.control import RecorderClient
+from bridge.wire.clocks import announce
 from bridge.wire.config import WireConfig
 from bridge.wire.session import open_session
 
@@ -21,6 +22,7 @@ def main() -> None:
         open_session(WireConfig(connect=(endpoint,))) as session,
         Path(account_path).open("w") as account,
     ):
+        announce(session, "child")
         client = RecorderClient(session)
         if len(sys.argv) > 5:
             client.start(sys.argv[5], {"kind": "trial", "cell": "child"})

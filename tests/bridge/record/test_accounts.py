@@ -41,18 +41,27 @@ def item_of(sample: WireSample, step: Step, ticket: int = 0) -> Item:
     return Item(sample, step, ticket, sample.type_name, len(sample.data), False)
 
 
-@given(st.permutations(range(30)), st.sets(st.integers(0, 29)), st.integers(0, 2**64))
+@given(
+    st.permutations(range(30)), st.sets(st.integers(0, 29)), st.integers(0, 2**64), st.integers(0)
+)
 def test_reported_lost_is_truly_lost_whatever_the_order(
-    order: list[int], never: set[int], start: int
+    order: list[int], never: set[int], start: int, told_at: int
 ) -> None:
     """Law: after the first number, whatever comes late is taken back; the rest is the loss."""
     tracker, ledger = SequenceTracker(), Ledger()
-    arriving = [*(number for number in order if number not in never), 30]
+    arriving = [number for number in order if number not in never] or [0]
+    told_at %= len(arriving)  # what its publisher has sent may be heard of at any time
     for ticket, number in enumerate(arriving):
         sample = numbered(start + number)
         ledger.count_received(item_of(sample, tracker.observe(sample, ticket), ticket), GOOD)
+        if ticket == told_at:
+            gap = tracker.told("/t", b"g" * 16, start + 30, 99)
+            assert tracker.told("/t", b"g" * 16, start + 29, 100) == 0
+            counts = {("/t", 0): DropCount(gaps=gap or 0)}
+            ledger.count_dropped(Dropped(ticket=99, received_ns=0, counts=counts))
     total = ledger.total()
-    assert total.gaps == sum(number > arriving[0] for number in never)  # before it: not claimed
+    missing = set(range(30)) - set(arriving)
+    assert total.gaps == sum(number > arriving[0] for number in missing)  # before: not claimed
     assert (total.received, total.repeated) == (len(arriving), 0)
 
 

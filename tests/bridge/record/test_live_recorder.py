@@ -45,30 +45,6 @@ def client(live: LiveRecorder, endpoint: str) -> Iterator[WireSession]:
         yield session
 
 
-def test_recording_from_python(tmp_path: Path, wire: WireConfig, endpoint: str) -> None:
-    with open_recorder(tmp_path / "run", wire=wire) as recorder:
-        recorder.start("t1", task="cube", operator="ada", tags=("x",), cell="lab")
-        with open_session(WireConfig(connect=(endpoint,))) as session:
-            publisher = session.publisher("/lab/note", "odd/Type")
-            publisher.put(b"1", source_ns=1)
-            wait_until(lambda: recorder.status()["messages"] == 1)
-        recorder.core.mark("here")
-        recorder.core.pause()
-        recorder.core.resume()
-        answer = recorder.stop(result="success", detail="well done")
-        assert (answer["messages"], answer["lost"]) == (1, 0)
-        recorder.label("failure", episode="t1")
-        with pytest.raises(UsageError, match="info does not know taks"):
-            recorder.start("t2", taks="typo")
-        recorder.start("t2")
-    run = RunFolder.open(tmp_path / "run")
-    assert [path.name for path in run.episodes()] == ["t1.mcap", "t2.mcap"]  # t2 was finished
-    episode = Episode.open(run.episodes()[0])
-    assert (episode.info.operator, episode.info.tags) == ("ada", ("x",))
-    assert episode.outcome is not None
-    assert episode.outcome.detail == "well done"
-
-
 def test_the_status_is_published_and_fits_its_schema(
     live: LiveRecorder, client: WireSession
 ) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from patience import wait_until
 
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
@@ -164,10 +165,7 @@ def test_small_messages_do_not_wait_for_an_encoder(
     recorder.receive(sample_of(COLOR, raw_image(smooth(), "rgb8")))
     for _ in range(10):
         recorder.receive(make_sample())
-    end_s = time.monotonic() + 10.0
-    while recorder.status()["messages"] < 10 and time.monotonic() < end_s:
-        time.sleep(0.01)
-    assert recorder.status()["messages"] == 10
+    wait_until(lambda: recorder.status()["messages"] == 10)
     assert recorder.mark("while it hangs")["ok"]
     gate.set()
     assert recorder.stop()["messages"] == 11

@@ -17,6 +17,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import Ros2Graph
+from bridge.wire import keys
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSample, WireSession, open_session
 
@@ -57,16 +58,11 @@ class Cell:
         self.robots: list[Robot] = []
         self.graph: Ros2Graph | None = None
 
-    def receive(self, sample: WireSample) -> None:
-        self.got.append(sample)
-        self.recorder.receive(sample)
-
-    def declare_latched(self, topic: str) -> None:
-        self.recorder.declare_latched(topic)
-
     def listen(self) -> Ros2Graph:
-        self.session.subscribe("**", self.receive)
-        self.graph = Ros2Graph(self.session, self)
+        take = self.recorder.receive
+        self.recorder.receive = lambda each: (self.got.append(each), take(each))  # type: ignore[method-assign]
+        self.session.subscribe("**", self.recorder.receive)
+        self.graph = Ros2Graph(self.session, self.recorder)
         return self.graph
 
     def robot(self, *arguments: str) -> Robot:
@@ -104,7 +100,7 @@ def test_a_topic_is_recorded_so_that_others_can_decode_it(cell: Cell, form: str)
     robot = cell.robot(form, "20")
     robot.speak()
     wait_until(lambda: len(cell.got) == 20, "the messages")
-    wait_until(lambda: bool(graph.endpoints()), "the token")
+    wait_until(lambda: bool(graph._publishers), "the token")
     answer = cell.recorder.stop()
     found = read(cell.run.episodes_dir / "t1.mcap")
     assert (len(found), answer["lost"]) == (20, 0)
@@ -118,20 +114,9 @@ def test_a_topic_is_recorded_so_that_others_can_decode_it(cell: Cell, form: str)
     if form != "0":
         assert [each.sequence for _, _, each in found] == list(range(20))
         assert [each.publish_time for _, _, each in found] == [1_000 + n for n in range(20)]
-    assert graph.endpoints() == [
-        {
-            "kind": "publisher",
-            "node": "/talker",
-            "domain": 0,
-            "topic": "/chatter",
-            "type": STRING,
-            "type_hash": get_typestore(Stores.ROS2_JAZZY).hash_rihs01(STRING),
-            "qos": {"transient_local": False, "depth": 20},
-        }
-    ]
     assert graph.warnings() == []
     robot.leave()
-    wait_until(lambda: graph.endpoints() == [], "the end of the token")
+    wait_until(lambda: not graph._publishers, "the end of the token")
     assert graph.warnings() == ["/chatter: the publisher in /talker left"]
 
 
@@ -209,10 +194,10 @@ def test_an_unknown_type_is_recorded_by_its_name_and_flagged(cell: Cell) -> None
 def test_a_killed_robot_is_noticed(cell: Cell) -> None:
     graph = cell.listen()
     robot = cell.robot("33", "1")
-    wait_until(lambda: bool(graph.endpoints()), "the token")
+    wait_until(lambda: bool(graph._publishers), "the token")
     robot.process.kill()
     wait_until(lambda: bool(graph.warnings()), "the end of the token")
-    assert graph.endpoints() == []
+    assert not graph._publishers
 
 
 def test_hostile_tokens_change_nothing(cell: Cell) -> None:
@@ -220,7 +205,10 @@ def test_hostile_tokens_change_nothing(cell: Cell) -> None:
     with open_session(WireConfig(connect=(cell.endpoint,))) as other:
         other.declare_alive("@ros2_lv/0/z/0/1/MP/%/%/n/%$*/a::msg::B_/RIHS01_x/:1:,1")
         other.declare_alive("@ros2_lv/nonsense")
-        other.declare_alive("@ros2_lv/0/z/0/1/NN/%/%/" + "n" * 10_000)
-        wait_until(lambda: bool(graph.endpoints()), "the long name")
-    wait_until(lambda: not graph.endpoints(), "its end")
-    assert graph.warnings() == []
+        node = "n" * 10_000
+        other.declare_alive(
+            f"@ros2_lv/0/z/0/1/MP/%/%/{node}/%a/std_msgs::msg::dds_::String_/{keys.NO_HASH}/:1:,1"
+        )
+        wait_until(lambda: [*graph._publishers.values()] == ["/a"], "the long name")
+    wait_until(lambda: not graph._publishers, "its end")
+    assert graph.warnings() == [f"/a: the publisher in /{node} left"]

@@ -123,10 +123,7 @@ def test_the_example_is_recorded_clean_and_its_losses_are_seen_exactly(
     publisher = spawn(str(PYTHON), endpoint, "demo", "60", "1000", *map(str, left_out))
     _, said = publisher.communicate(timeout=WAIT_S)
     assert publisher.returncode == 0, said
-    end_s = time.monotonic() + WAIT_S
-    while recorder.input_queue.seen().get(JOINTS, 0) < 60 - len(left_out):
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
+    wait_until(lambda: recorder.input_queue.seen().get(JOINTS, 0) == 60 - len(left_out))
     answer = recorder.stop()
     recorder.close()
     assert (answer["messages"], answer["lost"]) == (60 - len(left_out), len(left_out))

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.wire import keys
-from bridge.wire.rmw import EntityKind, RosQos, parse_qos, parse_token
+from bridge.wire.rmw import is_transient_local, parse_token
 
 STRING = "std_msgs::msg::dds_::String_"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -18,25 +18,17 @@ TALKER = (
 def test_a_publisher_is_read() -> None:
     found = parse_token(TALKER)
     assert found is not None
-    assert (found.kind, found.domain, found.node) == (EntityKind.PUBLISHER, 2, "/talker")
+    assert (found.domain, found.node) == (2, "/talker")
     assert (found.topic, found.type_name) == ("/chatter", "std_msgs/msg/String")
     assert found.session == "8b20917502ee955ac4476e0266340d5c"
-    assert found.qos == RosQos(transient_local=False, depth=7)
+    assert not found.transient_local
     assert found.key == f"2/chatter/{STRING}/{STRING_HASH}"
     assert keys.read_key(found.key) == ("/chatter", "std_msgs/msg/String", STRING_HASH)
 
 
-def test_a_node_is_read() -> None:
-    found = parse_token("@ros2_lv/0/aac3/0/0/NN/%/%arm%left/driver")
-    assert found is not None
-    assert (found.kind, found.node, found.topic) == (EntityKind.NODE, "/arm/left/driver", "")
-
-
-@pytest.mark.parametrize("kind", ["MP", "MS", "SS", "SC"])
-def test_every_kind_is_read(kind: str) -> None:
-    found = parse_token(TALKER.replace("/MP/", f"/{kind}/"))
-    assert found is not None
-    assert found.kind.value == kind
+@pytest.mark.parametrize("kind", ["NN", "MS", "SS", "SC"])
+def test_who_publishes_nothing_is_none(kind: str) -> None:
+    assert parse_token(TALKER.replace("/MP/", f"/{kind}/")) is None
 
 
 def test_names_with_slashes_and_later_parts_are_read() -> None:
@@ -49,21 +41,21 @@ def test_names_with_slashes_and_later_parts_are_read() -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("::,10:,:,:,,", RosQos(depth=10)),
-        (":1:,1:,:,:,,", RosQos(transient_local=True, depth=1)),
-        ("2::,5:,:,:,,", RosQos(depth=5)),
-        ("1:1:2,10", RosQos(transient_local=True, depth=10)),
-        ("::,", RosQos()),
+        ("::,10:,:,:,,", False),
+        (":1:,1:,:,:,,", True),
+        ("2::,5:,:,:,,", False),
+        ("1:1:2,10", True),
+        ("::,", False),
         ("", None),
-        ("::", RosQos()),
+        ("::", False),
         (":x:,1", None),
         ("::,-1", None),
         ("::,99999999999999999999", None),
         ("::,١", None),
     ],
 )
-def test_qualities_of_service(text: str, expected: RosQos | None) -> None:
-    assert parse_qos(text) == expected
+def test_qualities_of_service(text: str, expected: bool | None) -> None:
+    assert is_transient_local(text) is expected
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from fault_cell import FaultCell, PublisherChild, Sent
 from mcap.reader import make_reader
 
 import robot_gst
-from bridge.episode.topics import DROPS
+from bridge.episode.topics import CLOCKS, DROPS
 
 LOSSES = ("gaps", "queue_drops", "shed")
 
@@ -42,7 +42,7 @@ def read(path: Path) -> list[Found]:
             for kind, channel, message in make_reader(stream, validate_crcs=True).iter_messages(
                 log_time_order=False
             )
-            if channel.topic != DROPS and not channel.topic.endswith("/event")
+            if channel.topic not in (CLOCKS, DROPS) and not channel.topic.endswith("/event")
         ]
 
 

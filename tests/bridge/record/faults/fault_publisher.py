@@ -11,6 +11,7 @@ from typing import Any
 import zenoh
 from fault_messages import NUMBER, STAMP, streams
 
+from bridge.wire.clocks import announce
 from bridge.wire.config import WireConfig
 from bridge.wire.qos import Qos
 from bridge.wire.session import WireSession, open_session
@@ -88,6 +89,7 @@ def main() -> None:
     endpoint, account_path = sys.argv[1:3]
     account = os.open(account_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     with open_session(WireConfig(connect=(endpoint,))) as session:
+        announce(session, "faults")
         publisher = Publisher(session, account)
         print(json.dumps("ready"), flush=True)
         for line in sys.stdin:

@@ -15,8 +15,8 @@ from bridge.clock import AnchoredClock
 from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
+from bridge.record import encoders
 from bridge.record.config import DiskConfig, RecorderConfig
-from bridge.record.encoders import ImageEncoder
 from bridge.record.queue import Command, Item, Merge
 from bridge.record.recorder import Recorder
 from bridge.record.sequence import Step
@@ -53,7 +53,7 @@ def test_an_encoder_that_raises_costs_no_image(
 
     recorder.start(INFO)
     with monkeypatch.context() as patch:
-        patch.setattr("bridge.record.encoders.image_to_jpeg", fail)
+        patch.setattr(encoders, "image_to_jpeg", fail)
         for number in range(3):
             recorder.receive(raw(sequence=number))
         answer = recorder.stop()
@@ -75,7 +75,7 @@ def test_depth_that_cannot_be_compacted_is_kept_raw(
     recorder.start(INFO)
     sent = image(depth_mm(8, 8), "16UC1")
     with monkeypatch.context() as patch:
-        patch.setattr("bridge.record.encoders.depth_to_compact", lambda data: None)
+        patch.setattr(encoders, "depth_to_compact", lambda data: None)
         recorder.receive(
             make_sample(topic="/cell/cam/a/depth/image", type_name=schema.IMAGE, data=sent)
         )
@@ -139,15 +139,3 @@ def test_what_a_barrier_has_not_let_through_yet_is_given_up_with_the_rest(
     assert isinstance(next(ready), Command)
     assert list(ready) == list(items)[6:]
     assert merge.images_out == 8
-
-
-def test_the_encoder_itself_flags_what_it_cannot_read(raw: MakeSample) -> None:
-    from bridge.record.queue import LoadShedding
-
-    encoder = ImageEncoder(RecorderConfig(), lambda: LoadShedding.NOTHING)
-    sample = replace(raw(), data=b"\0\1\0\0short")
-    item = Item(sample, Step(), 0, schema.IMAGE, 9, is_bulk=True)
-    encoder.encode(item)
-    assert item.finding is not None
-    assert item.finding.value == "undecodable"
-    assert item.sample is sample
