@@ -87,16 +87,14 @@ def moved_camera(
                 break
             T, found = T @ step.T_target_source, True
         if found:
-            vectors.append(np.concatenate([T[:3, 3], se3.vector_from_rotation(T[:3, :3])]))
+            vectors.append(np.concatenate([se3.vector_from_rotation(T[:3, :3]), T[:3, 3]]))
     if not vectors:
         return MovedCamera(T_posed_true=None) if is_lost else None
     middle = np.median(vectors, axis=0)
-    shift_m, turn_rad = (float(np.linalg.norm(part)) for part in (middle[:3], middle[3:]))
+    turn_rad, shift_m = (float(np.linalg.norm(part)) for part in (middle[:3], middle[3:]))
     if shift_m < MOVED_M and turn_rad < MOVED_RAD:
         return None
-    T_posed_true = np.eye(4)
-    T_posed_true[:3, :3], T_posed_true[:3, 3] = se3.rotation_from_vector(middle[3:]), middle[:3]
-    return MovedCamera(T_posed_true=T_posed_true)
+    return MovedCamera(T_posed_true=se3.small_motion(middle))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -168,10 +168,6 @@ def _stepped(
     else:
         H[6], H[:, 6], g[6], H[6, 6] = 0.0, 0.0, 0.0, 1.0
     step = -np.linalg.lstsq(H, g, rcond=1e-12)[0]
-    T = np.eye(4)
-    T[:3, :3] = se3.rotation_from_vector(step[3:6])
-    T[:3, 3] = step[:3]
-    moved = ScenePose(
-        T_base_source=T @ pose.T_base_source, depth_scale=float(pose.depth_scale + step[6])
-    )
-    return moved, step
+    T = se3.small_motion(np.concatenate([step[3:6], step[:3]]))
+    depth_scale = float(pose.depth_scale + step[6])
+    return ScenePose(T_base_source=T @ pose.T_base_source, depth_scale=depth_scale), step

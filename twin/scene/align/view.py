@@ -132,10 +132,8 @@ def _level(
     aside = np.eye(3)[int(np.argmin(np.abs(normal)))]
     x = np.cross(aside, normal)
     x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(normal, x), normal])
-    foot = eye - normal * (normal @ eye - offset)
-    T[:3, 3] = -T[:3, :3] @ foot
+    R = np.stack([x, np.cross(normal, x), normal])
+    T = se3.from_rotation(R, -R @ (eye - normal * (normal @ eye - offset)))
     xy = se3.apply(T, p)[:, :2]
     low, high = np.quantile(xy, [0.02, 0.98], axis=0)
     return LevelPlane(T_level_source=T, low_m=low, high_m=high, share=share)
