@@ -81,19 +81,17 @@ class InitialiseConfig:
 
     max_splats: int = 60_000
     """Budget of the whole fit."""
-    growth: Annotated[float, RARE] = 0.5
-    """Share of the budget left to the fit, which splits Gaussians where the error is large;
-    voxels grow until the first Gaussians fit in the others."""
-    completion: Annotated[float, RARE] = 0.1
-    """Share of ``max_splats`` that may be added for what was seen in colour but never measured;
-    0: such holes stay black."""
     flying_fraction: Annotated[float, RARE] = 0.03
     """A pixel whose depth differs from a neighbour's by more than this share is dropped."""
 
     def __post_init__(self) -> None:
-        """Refuse an empty budget and a growth of everything."""
-        refuse_outside(self, {"max_splats": (1, math.inf), "growth": (0.0, 0.99)})
-        refuse_outside(self, {"completion": (0.0, 1.0), "flying_fraction": (1e-3, 10.0)})
+        """Refuse an empty budget."""
+        refuse_outside(self, {"max_splats": (1, math.inf), "flying_fraction": (1e-3, 10.0)})
+
+    @property
+    def first_splats(self) -> int:
+        """Most of the first Gaussians: half; the fit splits them where the error is large."""
+        return max(round(self.max_splats / 2), 1)
 
 
 @Parameter(name="*", group="Fit")
@@ -142,14 +140,8 @@ class ModelConfig:
     """What the segmenter looks for, once for each; default: the names of the task's objects."""
     clip: str = ""
     """Folder of CLIP: find --clip then finds by meaning, not by the words of the lexicon."""
-    model_frames: Annotated[int, RARE] = 12
-    """Training frames the models look at, spread evenly."""
     device: str = "auto"
     """Where they run: cpu, cuda, cuda:1; auto takes a GPU if there is one."""
-
-    def __post_init__(self) -> None:
-        """Refuse to look at nothing."""
-        refuse_outside(self, {"model_frames": (1, math.inf)})
 
     @property
     def any_named(self) -> bool:

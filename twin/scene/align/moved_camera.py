@@ -18,7 +18,7 @@ from twin.errors import TwinError
 from twin.scene.frames.odometry import MIN_AGREEMENT, MIN_OVERLAP, Aligner, Look
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.raster.rasteriser import Rasteriser
 
 MOVED_M, MOVED_RAD = 0.005, np.radians(0.5)
 """From here on a camera was moved; less is the scatter of poses and of this comparison."""
@@ -65,15 +65,13 @@ class MovedCamera:
         )
 
 
-def moved_camera(
-    frames: Sequence[RgbdFrame], background: GaussianCloud, threads: int = 0
-) -> MovedCamera | None:
+def moved_camera(frames: Sequence[RgbdFrame], background: GaussianCloud) -> MovedCamera | None:
     """Compare frames of one camera with the scene; None where it is as its poses say.
 
     Args:
         frames: Taken while camera, robot and objects stood still.
     """
-    rasteriser, aligner = Rasteriser(RasterConfig(threads=threads)), Aligner(LIMITS.max_depth_m)
+    rasteriser, aligner = Rasteriser(), Aligner(LIMITS.max_depth_m)
     vectors, is_lost = [], False
     for frame in frames:
         T, found = np.eye(4), False
