@@ -188,14 +188,6 @@ class RenderConfig:
     """Stand here instead, in metres in the scene's frame; needs --target."""
     target: tuple[float, float, float] | None = None
     """Look at this point, in metres in the scene's frame."""
-    joints: tuple[float, ...] | None = None
-    """Put the arm into this posture, one angle in rad for each joint from base to flange; a camera
-    in its hand comes along. Default: as recorded at --at-s."""
-    width_m: float | None = None
-    """Opening of the gripper in metres; default: as recorded, closed with --joints."""
-    object: tuple[str, ...] = ()
-    """Put an object elsewhere: ID=x,y,z or ID=x,y,z,qw,qx,qy,qz in the scene's frame; once for
-    each object."""
     depth: bool = False
     """Write two more images: the depth in millimetres, and, white, what was measured in the scan;
     black is what was completed or never seen."""
@@ -207,7 +199,7 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers that are none."""
-        refuse_outside(self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0)})
+        refuse_outside(self, {"at_s": (0.0, MOST_S)})
         if self.out is not None and self.out.suffix.lower() == ".ply":
             message = (
                 f"--out {self.out}: render writes images. The scene's Gaussians are "
@@ -224,5 +216,4 @@ class RenderConfig:
         """Whether a whole episode is drawn, and not one image."""
         if self.out is not None and self.out.suffix.lower() == ".png":
             return False
-        one = self.at_s is not None or self.joints is not None
-        return not one and bool(self.episode)
+        return self.at_s is None and bool(self.episode)

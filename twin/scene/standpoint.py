@@ -107,11 +107,6 @@ def camera_places(
     episode = trial.recorded
     tree = poses_in_scene(run, scene, episode, camera_id, stamps_ns)
     frame_id = streams.camera_info(episode, camera_id).frame_id
-    is_base = tree.root_of(frame_id) == streams.recorded_robot(episode).base_frame
-    if config.joints is not None and is_base:
-        T_carried = carried_camera(episode, frame_id, np.array(config.joints), tree)
-        if T_carried is not None:
-            return [trial.registered(camera_id, T_carried)] * len(stamps_ns)
     unknown = unknown_mask(tree, [frame_id], stamps_ns)
     return [
         None if is_unknown else trial.registered(camera_id, tree.T_root_frame(frame_id, stamp_ns))
