@@ -118,7 +118,7 @@ def carried_camera(
     episode: Episode,
     frame_id: str,
     joints_rad: Float[np.ndarray, " num_joints"],
-    tree: TransformTree | None = None,
+    tree: TransformTree,
 ) -> Float[np.ndarray, "4 4"] | None:
     """Where a camera in the robot's hand would be in a posture, ``T_base_camera``.
 
@@ -129,7 +129,6 @@ def carried_camera(
         track = posture_track(episode)
     except GstError:
         return None
-    tree = base_tree(episode) if tree is None else tree
     robot = load_robot(track.urdf)
     # By the source's clock, which may have little to do with when messages arrived; and where the
     # camera's pose was stated, because in a fast motion what lies between may be off by much.

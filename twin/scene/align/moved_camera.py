@@ -24,7 +24,7 @@ MOVED_M, MOVED_RAD = 0.005, np.radians(0.5)
 """From here on a camera was moved; less is the scatter of poses and of this comparison."""
 BEYOND_M = (0.06, 0.02)
 """Depths that differ by more, in the first and in the second round, show another thing."""
-LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.03)
+LIMITS = DepthLimits(max_depth_m=5.0)
 
 
 class MovedCameraError(TwinError):

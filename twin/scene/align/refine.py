@@ -27,20 +27,9 @@ STOP = 5e-6
 """Metres, radians and share of the depth: steps below change nothing that can be measured."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class AnnealingStep:
-    """One annealing step of Tukey's loss."""
-
-    gate_m: float
-    iterations: int
-
-
-COARSE = (AnnealingStep(gate_m=0.08, iterations=10), AnnealingStep(gate_m=0.03, iterations=6))
-FINE = (
-    AnnealingStep(gate_m=0.03, iterations=6),
-    AnnealingStep(gate_m=0.02, iterations=6),
-    AnnealingStep(gate_m=0.012, iterations=12),
-)
+COARSE = ((0.08, 10), (0.03, 6))
+FINE = ((0.03, 6), (0.02, 6), (0.012, 12))
+"""Annealing of Tukey's loss: gate [m] and iterations of each stage."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +57,7 @@ def refine(
     surfaces: Sequence[PosedSurface],
     start: ScenePose,
     *,
-    stages: Sequence[AnnealingStep],
+    stages: Sequence[tuple[float, int]],
     num_points: int,
     with_scale: bool = True,
     seed: int = 0,
@@ -82,13 +71,13 @@ def refine(
     rng = np.random.default_rng(seed)
     pose = start
     equations = None
-    for stage in stages:
+    for gate_m, iterations in stages:
         clouds = [
-            _choose(view, surface, pose, stage.gate_m, num_points // len(views), rng)
+            _choose(view, surface, pose, gate_m, num_points // len(views), rng)
             for view, surface in zip(views, surfaces, strict=True)
         ]
-        for _ in range(stage.iterations):
-            equations = _equations(views, clouds, surfaces, pose, stage.gate_m)
+        for _ in range(iterations):
+            equations = _equations(views, clouds, surfaces, pose, gate_m)
             pose, step = _stepped(pose, equations, with_scale)
             if np.abs(step).max() < STOP:
                 break

@@ -28,8 +28,7 @@ class RobotView:
     def cloud(self) -> "ViewCloud":
         """Points and normals of the trusted pixels; computed once."""
         p = np.moveaxis(self.camera.unproject(self.depth_m.astype(np.float64)), -1, 0)
-        limits = DepthLimits(max_depth_m=6.0, flying_fraction=0.03)
-        trusted = trusted_depth_mask(self.depth_m, limits)
+        trusted = trusted_depth_mask(self.depth_m, DepthLimits(max_depth_m=6.0))
         row, column, normals = oriented(p, trusted, trusted)
         return ViewCloud(p_m=p[:, row, column].T, normals=normals.T)
 
