@@ -71,7 +71,7 @@ class LevelPlane:
     """Part of all points that lie on it."""
 
 
-def find_planes(views: Sequence[RobotView], *, seed: int = 0) -> list[LevelPlane]:
+def find_planes(views: Sequence[RobotView]) -> list[LevelPlane]:
     """Find the largest planes that can be level, largest first (Fischler and Bolles, 1981).
 
     Gravity is not known: a wall that faces the camera is told from a table by the camera's upper
@@ -86,7 +86,7 @@ def find_planes(views: Sequence[RobotView], *, seed: int = 0) -> list[LevelPlane
     up = -np.mean([view.T_source_camera[:3, 1] for view in views], axis=0)
     back = -np.mean([view.T_source_camera[:3, 2] for view in views], axis=0)
     eye = np.mean([view.T_source_camera[:3, 3] for view in views], axis=0)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     planes: list[LevelPlane] = []
     left = np.ones(len(p), dtype=bool)
     for _ in range(2 * MAX_PLANES):
