@@ -119,7 +119,7 @@ def rows_of(name: str, frames: Frames) -> list[Target]:
 
     begun = time.process_time()
     config = InitialiseConfig(max_splats=frames.max_splats)
-    first = fuse(frames.points, config, frames.views)
+    first = fuse(frames.points, config.first_splats, frames.views)
     fused_s = time.process_time() - begun
     begun = time.process_time()
     fitted: FitResult = fit(

@@ -81,7 +81,7 @@ def work() -> None:
     from twin.scene.fit.initialise import fuse
     from twin.scene.fit.optimise import fit
     from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
-    from twin.scene.settings import FitConfig, InitialiseConfig
+    from twin.scene.settings import FitConfig
 
     limits = DepthLimits(max_depth_m=MAX_DEPTH_M, flying_fraction=0.03)
     stride = max(1, round((NUM_FRAMES * 640 * 480 / MAX_POINTS) ** 0.5))
@@ -91,8 +91,7 @@ def work() -> None:
         points.append(surface.points(stride))
         views.append(training_view(surface))
     start = time.process_time()
-    config = InitialiseConfig(max_splats=NUM_SPLATS, growth=0.0)
-    cloud = fuse(points, config, views)
+    cloud = fuse(points, NUM_SPLATS, views)
     seconds = time.process_time() - start
     points.clear()
     steps = FitConfig(iterations=11)

@@ -65,7 +65,7 @@ def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = 
     surfaces = [FrameSurface(f, LIMITS) for f in [*map(without_gripper, wrist), *others]]
     views = [training_view(surface) for surface in surfaces]
     config = InitialiseConfig()
-    cloud = fuse([surface.points(STRIDE) for surface in surfaces], config)
+    cloud = fuse([surface.points(STRIDE) for surface in surfaces], config.first_splats)
     if iterations:
         settings = FitConfig(iterations=iterations, threads=1)
         cloud = fit(cloud, views, settings, lambda *_: None, max_splats=config.max_splats).cloud

@@ -57,7 +57,7 @@ def rebuild(
     pixels = len(frames) * frames[0].depth_m.size
     stride = max(1, round(float(np.sqrt(pixels / MAX_POINTS))))
     views = [training_view(surface) for surface in surfaces]
-    first = fuse([surface.points(stride) for surface in surfaces], initialise, views)
+    first = fuse([surface.points(stride) for surface in surfaces], initialise.first_splats, views)
     left = budget_s - (seconds() - start)
     result = fit(
         first,

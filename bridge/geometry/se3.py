@@ -4,6 +4,7 @@ Quaternions are ``wxyz``, scalar first, with w >= 0. Storage is quaternion plus 
 matrices exist only in memory.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -44,36 +45,22 @@ def quaternion_from_rotation(
     R: Float[np.ndarray, "*batch 3 3"],
 ) -> Float[np.ndarray, "*batch 4"]:
     """Turn rotation matrices into unit quaternions with w >= 0 (Shepperd's method)."""
-    trace = np.trace(R, axis1=-2, axis2=-1)
-    pivots = np.stack([trace, R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]], axis=-1)
-    best = np.argmax(pivots, axis=-1)
-    q = np.empty((*R.shape[:-2], 4), dtype=R.dtype)
-    # Four candidates, one per dominant component; each is exact where its pivot is largest.
-    for dominant in range(4):
-        mask = best == dominant
-        if mask.any():
-            q[mask] = _by_dominant(dominant, R[mask], trace[mask])
+    r, trace = np.moveaxis(R, (-2, -1), (0, 1)), np.trace(R, axis1=-2, axis2=-1)
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+    # Four quaternions of any length, each exact where its pivot is largest.
+    candidates = (
+        (1 + trace, x, y, z),
+        (x, 1 + r[0, 0] - r[1, 1] - r[2, 2], xy, xz),
+        (y, xy, 1 - r[0, 0] + r[1, 1] - r[2, 2], yz),
+        (z, xz, yz, 1 - r[0, 0] - r[1, 1] + r[2, 2]),
+    )
+    pivots = np.stack([trace, r[0, 0], r[1, 1], r[2, 2]], axis=-1)
+    best = np.argmax(pivots, axis=-1)[..., None, None]
+    each = np.stack([np.stack(parts, axis=-1) for parts in candidates], axis=-2)
+    q = np.take_along_axis(each, best, axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.asarray(np.where(q[..., :1] < 0, -q, q))
-
-
-def _by_dominant(
-    dominant: int, R: Float[np.ndarray, "num 3 3"], trace: Float[np.ndarray, " num"]
-) -> Float[np.ndarray, "num 4"]:
-    """Return quaternions of any length, exact where this component, 0 for w, is the largest."""
-    r = [[R[:, i, j] for j in range(3)] for i in range(3)]
-    if dominant == 0:
-        parts = 1 + trace, r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]
-    elif dominant == 1:
-        x = 1 + r[0][0] - r[1][1] - r[2][2]
-        parts = r[2][1] - r[1][2], x, r[0][1] + r[1][0], r[0][2] + r[2][0]
-    elif dominant == 2:
-        y = 1 - r[0][0] + r[1][1] - r[2][2]
-        parts = r[0][2] - r[2][0], r[0][1] + r[1][0], y, r[1][2] + r[2][1]
-    else:
-        z = 1 - r[0][0] - r[1][1] + r[2][2]
-        parts = r[1][0] - r[0][1], r[0][2] + r[2][0], r[1][2] + r[2][1], z
-    return np.stack(parts, axis=-1)
 
 
 def split(
@@ -148,10 +135,21 @@ def look_at(
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, up_world)
     right = right / np.linalg.norm(right)
+    return from_rotation(np.stack([right, np.cross(forward, right), forward], axis=1), p_world_eye)
+
+
+def from_rotation(
+    R: Float[np.ndarray, "3 3"], p_m: Float[np.ndarray, "3"] | Sequence[float]
+) -> Float[np.ndarray, "4 4"]:
+    """Build ``T_a_b`` from ``R_a_b`` and the origin ``p_a_b`` [m]."""
     T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:3, 3] = p_world_eye
+    T[:3, :3], T[:3, 3] = R, p_m
     return T
+
+
+def small_motion(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+    """A turn (rotation vector [rad]), then a shift [m]."""
+    return from_rotation(rotation_from_vector(numbers[:3]), numbers[3:])
 
 
 def rotation_from_vector(
@@ -203,10 +201,8 @@ def align_rigid(
         share = weights / weights.sum()
         source, target = share @ p_source_m, share @ p_target_m
         cross = ((p_target_m - target) * share[:, None]).T @ (p_source_m - source)
-    T = np.eye(4)
-    T[:3, :3] = nearest_rotation(cross)
-    T[:3, 3] = target - T[:3, :3] @ source
-    return T
+    R = nearest_rotation(cross)
+    return from_rotation(R, target - R @ source)
 
 
 def pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:

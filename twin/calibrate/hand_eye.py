@@ -15,7 +15,6 @@ from scipy.optimize import least_squares
 
 from bridge.geometry import se3
 from twin.calibrate.config import Mount
-from twin.calibrate.motion import small_motion
 from twin.calibrate.pairs import PosePairs
 from twin.errors import TwinError
 
@@ -61,9 +60,7 @@ def solve_hand_eye(
     left = P[:, :3, :3] - np.eye(3)
     right = Q[:, :3, 3] @ R.T - P[:, :3, 3]
     t, *_ = np.linalg.lstsq(left.reshape(-1, 3), right.reshape(-1), rcond=None)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T
+    return se3.from_rotation(R, t)
 
 
 MIN_PAIRS = 4
@@ -191,12 +188,12 @@ def _refined(
     inverse = np.repeat(1.0 / np.array(_scales(misfits(Ts_a, Ts_b, X, Z))), 3)
 
     def left(step: Float[np.ndarray, "12"]) -> Float[np.ndarray, " num_residuals"]:
-        moved = X @ small_motion(step[:6]), Z @ small_motion(step[6:])
+        moved = X @ se3.small_motion(step[:6]), Z @ se3.small_motion(step[6:])
         return np.asarray((misfits(Ts_a, Ts_b, *moved) * inverse).ravel())
 
     exact = {"ftol": 1e-13, "xtol": 1e-13, "gtol": 1e-13}
     fit = least_squares(left, np.zeros(12), jac="3-point", loss="cauchy", **exact)
-    return X @ small_motion(fit.x[:6]), Z @ small_motion(fit.x[6:]), fit.jac
+    return X @ se3.small_motion(fit.x[:6]), Z @ se3.small_motion(fit.x[6:]), fit.jac
 
 
 def _lengths(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -206,8 +206,8 @@ class _Problem:
     def motion(self, x: Numbers, delay_s: float) -> Motion:
         zeros, compliance = np.split(x, self._parts)[1:3]
         return Motion(
-            T_frame_base=self._T_frame_base @ small_motion(x[:6]),
-            T_hand_tool=self._T_hand_tool @ small_motion(x[6:12]),
+            T_frame_base=self._T_frame_base @ se3.small_motion(x[:6]),
+            T_hand_tool=self._T_hand_tool @ se3.small_motion(x[6:12]),
             zeros_rad=zeros,
             compliance_rad_nm=compliance,
             delay_s=delay_s,
@@ -222,7 +222,7 @@ class _Problem:
         """Of each run: shift [m] and turn [rad] from where the tool should be, in its frame."""
         numbers, left = x[12 : self._parts[2]].tobytes(), []
         T = self._T_frame_base
-        base, tool = T @ small_motion(x[:6]) @ se3.invert(T), small_motion(x[6:12])
+        base, tool = T @ se3.small_motion(x[:6]) @ se3.invert(T), se3.small_motion(x[6:12])
         for index, (run, delay_s) in enumerate(zip(self._runs, self.delays(x), strict=True)):
             hands = self._hands(index, numbers, float(delay_s))
             T = se3.invert(base @ hands @ self._T_hand_tool @ tool) @ run.Ts_frame_tool
@@ -289,10 +289,3 @@ def turning(Ts: Poses, stamps_s: Float[np.ndarray, " num_poses"]) -> tuple[np.nd
     R = np.swapaxes(Ts[:-1, :3, :3], 1, 2) @ Ts[1:, :3, :3]
     speed = se3.rotation_angle_rad(R) / np.diff(stamps_s)
     return (stamps_s[1:] + stamps_s[:-1]) / 2, speed
-
-
-def small_motion(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
-    """A turn (rotation vector [rad]), then a shift [m]."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = se3.rotation_from_vector(numbers[:3]), numbers[3:]
-    return T

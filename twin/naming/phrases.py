@@ -159,7 +159,7 @@ class Asker:
             return [], f"not known here: {', '.join(unknown)}; there is {labels}"
         for pool in self._called({word for word in nouns if word not in ANY_THING}):
             sized = [item for item in pool if all(self._has_size(item, w, pool) for w in sizes)]
-            exact = [item for item in sized if wanted <= _colours(item)]
+            exact = [item for item in sized if wanted <= set(map(colour_of, words_of(item.label)))]
             near = [
                 replace(item, score=NEARLY * item.score)
                 for item in sized
@@ -234,8 +234,3 @@ def _in_box(a: Instance, b: Instance) -> Float[np.ndarray, "3"]:
     """Where the centre of one is in the frame of the other's box."""
     center = a.T_base_instance[None, :3, 3]
     return np.asarray(se3.apply(se3.invert(b.T_base_instance), center)[0])
-
-
-def _colours(item: Instance) -> set[str]:
-    """The colours it is called by."""
-    return {colour for word in words_of(item.label) if (colour := colour_of(word))}

@@ -82,11 +82,8 @@ def _about(item: Instance, rows: Mapping[str, int]) -> dict[str, Any]:
 
 def _object_of(item: Instance, rows: Mapping[str, int]) -> str | None:
     """The object most of an instance's Gaussians belong to; None for the background."""
-    first, counts = 0, {}
-    for key, num in rows.items():
-        counts[key] = int(item.mask[first : first + num].sum())
-        first += num
-    most = max(counts, key=lambda key: counts[key])
+    parts = np.split(item.mask, np.cumsum(list(rows.values()))[:-1])
+    most = list(rows)[int(np.argmax([part.sum() for part in parts]))]
     return None if most == BACKGROUND_KEY else most
 
 

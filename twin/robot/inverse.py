@@ -354,9 +354,7 @@ def _through(
     turned_rad = float(np.arctan2(w[4] @ x1, -w[4] @ y1))
     x4 = np.cos(turned_rad) * x1 + np.sin(turned_rad) * y1
     bent_rad = float(np.arctan2(-w[5] @ x4, w[5] @ z1))
-    T_base_0 = np.eye(4)
-    T_base_0[:3, :3] = np.stack([x1, -z1, w[0]], axis=1)
-    T_base_0[:3, 3] = origin
+    T_base_0 = se3.from_rotation(np.stack([x1, -z1, w[0]], axis=1), origin)
     chain = UrGeometry(
         a2_m=a2,
         a3_m=a3,

@@ -22,7 +22,7 @@ from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack
-from twin.scene.shape.known import yaw_period_rad
+from twin.scene.shape.known import turned_alike
 
 BETWEEN_M = 0.03
 """An object this near to the tool, beside half its largest side, is between the fingers."""
@@ -297,7 +297,7 @@ def _put(
     """Pose ``T_base_object`` when the fingers opened: as found later, if it is near enough."""
     if after is None:
         return grasp.T_base_put
-    found = _turned_alike(after, grasp.T_base_put, model)
+    found = turned_alike(after, grasp.T_base_put, model)
     is_there = np.linalg.norm(found[:3, 3] - grasp.T_base_put[:3, 3]) < FELL_M
     return found if is_there else grasp.T_base_put
 
@@ -352,26 +352,6 @@ def _between_pads(
         if abs(np.abs(R[1]) @ np.array(model.size_m) - width_m) <= PAD_M:
             T[:3, :3] = R
             break
-    return T
-
-
-def _turned_alike(
-    T_base_object: Float[np.ndarray, "4 4"],
-    T_base_expected: Float[np.ndarray, "4 4"],
-    model: ObjectModel,
-) -> Float[np.ndarray, "4 4"]:
-    """Of the poses in which an object looks the same, the one turned nearest to another."""
-    period = yaw_period_rad(model)
-    turns = [
-        se3.rotation_from_vector(np.array([0.0, 0.0, k * period]))
-        for k in range(round(2 * np.pi / period))
-    ]
-    best = min(
-        (T_base_object[:3, :3] @ turn for turn in turns),
-        key=lambda R: float(se3.rotation_angle_rad(R.T @ T_base_expected[:3, :3])),
-    )
-    T = T_base_object.copy()
-    T[:3, :3] = best
     return T
 
 

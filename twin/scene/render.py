@@ -4,7 +4,7 @@ One process draws all frames. The scene is read once; for each frame the links a
 moved rigidly, and background, objects and robot are drawn together.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,14 +15,12 @@ from bridge.episode import streams
 from bridge.episode.cdr.messages import CompressedColor, RawColor, color_from_message
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.errors import UsageError
-from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
 from bridge.media.depth import from_metres
 from bridge.media.image_quality import as_float
-from twin.robot.model import RobotDescriptionError, load_robot
+from twin.robot.model import load_robot
 from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface
 from twin.scene.frames.pairing import name_of
@@ -42,75 +40,14 @@ OTHER_FILES = (".avi", ".gif", ".h264", ".jpeg", ".jpg", ".mkv", ".mov", ".webm"
 """Files that somebody may ask for and that are not written."""
 
 
-def posture_of(
-    trial: TrialInScene, stamp_ns: int, config: RenderConfig
-) -> tuple[Posture | None, str, str]:
+def posture_of(trial: TrialInScene, stamp_ns: int) -> tuple[Posture | None, str, str]:
     """How the robot stands: posture or None, its URDF, and where that comes from or why not."""
-    if config.joints is not None:
-        if not trial.parts.links:
-            message = f"--joints cannot be followed: {trial.robot.removeprefix('not drawn: ')}."
-            raise UsageError(message)
-        return _given_posture(trial.recorded, config.joints, config.width_m)
     track, of = trial.postures, trial.recorded.info.id
     if track is None or not trial.parts.links:
         return None, "", trial.robot
     if not track.covers(stamp_ns):
         return None, "", f"not drawn: {of} has no joints at that time: choose another --at-s."
-    recorded = track.at(stamp_ns)
-    width_m = recorded.width_m if config.width_m is None else config.width_m
-    posture = Posture(joints_rad=recorded.joints_rad, width_m=width_m)
-    return posture, track.urdf, trial.robot
-
-
-def _given_posture(
-    episode: Episode, given: Sequence[float], width_m: float | None
-) -> tuple[Posture, str, str]:
-    joints = np.array(given, dtype=np.float64)
-    names = streams.recorded_robot(episode).joints
-    if len(joints) != len(names) or not np.isfinite(joints).all():
-        message = f"--joints takes {len(names)} angles in rad: {', '.join(names)}."
-        raise UsageError(message)
-    urdf = streams.robot_description(episode)
-    if urdf is None:
-        raise RobotDescriptionError(
-            found=f"is missing in episode {episode.info.id}",
-            hint=f"Choose an --episode that has {ROBOT_DESCRIPTION}.",
-        )
-    return Posture(joints_rad=joints, width_m=width_m or 0.0), urdf, "joints given"
-
-
-def object_places(
-    texts: Sequence[str], known: Sequence[str]
-) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Read ``ID=x,y,z`` or ``ID=x,y,z,qw,qx,qy,qz``: where objects are to be, in the scene's frame.
-
-    Args:
-        texts: One per object; the last word on an object counts.
-    """
-    places = {}
-    for text in texts:
-        object_id, _, listed = text.partition("=")
-        if object_id not in known:
-            there = ", ".join(known) or "none"
-            message = f"--object {text!r}: the scene has no object {object_id!r}. It has: {there}."
-            raise UsageError(message)
-        places[object_id] = _pose_from(text, listed)
-    return places
-
-
-def _pose_from(text: str, listed: str) -> Float[np.ndarray, "4 4"]:
-    try:
-        numbers = np.array([float(word) for word in listed.split(",")])
-    except ValueError:
-        numbers = np.zeros(0)
-    if len(numbers) == 3:
-        numbers = np.concatenate([numbers, [1.0, 0.0, 0.0, 0.0]])
-    if len(numbers) != 7 or not np.isfinite(numbers).all() or not numbers[3:].any():
-        message = (
-            f"--object {text!r} is not a pose: write ID=x,y,z or ID=x,y,z,qw,qx,qy,qz, in metres."
-        )
-        raise UsageError(message)
-    return se3.transform_from(numbers[3:] / np.linalg.norm(numbers[3:]), numbers[:3])
+    return track.at(stamp_ns), track.urdf, trial.robot
 
 
 def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
@@ -126,8 +63,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     episode, camera_id = trial.recorded, camera_of(trial.recorded, config.camera)
     camera = sized_camera(streams.camera_info(episode, camera_id).camera, config.size)
     stamps = _stamps(trial, camera_id, config)
-    first = posture_of(trial, int(stamps[0]), config)
-    frames = _frames(run, scene, trial, camera_id, stamps, config, first)
+    frames = _frames(run, scene, trial, camera_id, stamps, config)
     agreement = ImageAgreement() if config.compare and config.is_sequence else None
     meshes = {} if agreement is None else trial.meshes(run)
     recorded = recorded_images(episode, camera_id)
@@ -153,7 +89,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
         "scene_hash": scene.scene_hash,
         "episode": episode.info.id,
         "camera": camera_id,
-        "robot": first[2],
+        "robot": posture_of(trial, int(stamps[0]))[2],
         "frames": len(frames),
         "frames_without_pose": len(stamps) - len(frames),
         "notes": list(trial.notes),
@@ -206,25 +142,18 @@ def _frames(
     camera_id: str,
     stamps_ns: Int[np.ndarray, " num_stamps"],
     config: RenderConfig,
-    first: tuple[Posture | None, str, str],
 ) -> list[Frame]:
-    """The instants that can be drawn, in the order of time; at least one.
-
-    Args:
-        first: How the robot stands at the first; with ``--joints`` at all of them.
-    """
-    moved = object_places(config.object, list(trial.parts.objects))
+    """The instants that can be drawn, in the order of time; at least one."""
     cameras = camera_places(run, scene, trial, camera_id, stamps_ns, config)
     frames = []
     for stamp_ns, T_base_camera in zip(stamps_ns.tolist(), cameras, strict=True):
         if T_base_camera is not None:
-            given = config.joints is not None
-            posture, urdf, _ = first if given else posture_of(trial, stamp_ns, config)
+            posture, urdf, _ = posture_of(trial, stamp_ns)
             frames.append(
                 Frame(
                     stamp_ns=stamp_ns,
                     T_base_camera=T_base_camera,
-                    Ts_base_object=trial.places(stamp_ns) | moved,
+                    Ts_base_object=trial.places(stamp_ns),
                     posture=posture,
                     urdf=urdf,
                 )

@@ -81,19 +81,17 @@ class InitialiseConfig:
 
     max_splats: int = 60_000
     """Budget of the whole fit."""
-    growth: Annotated[float, RARE] = 0.5
-    """Share of the budget left to the fit, which splits Gaussians where the error is large;
-    voxels grow until the first Gaussians fit in the others."""
-    completion: Annotated[float, RARE] = 0.1
-    """Share of ``max_splats`` that may be added for what was seen in colour but never measured;
-    0: such holes stay black."""
     flying_fraction: Annotated[float, RARE] = 0.03
     """A pixel whose depth differs from a neighbour's by more than this share is dropped."""
 
     def __post_init__(self) -> None:
-        """Refuse an empty budget and a growth of everything."""
-        refuse_outside(self, {"max_splats": (1, math.inf), "growth": (0.0, 0.99)})
-        refuse_outside(self, {"completion": (0.0, 1.0), "flying_fraction": (1e-3, 10.0)})
+        """Refuse an empty budget."""
+        refuse_outside(self, {"max_splats": (1, math.inf), "flying_fraction": (1e-3, 10.0)})
+
+    @property
+    def first_splats(self) -> int:
+        """Most of the first Gaussians: half; the fit splits them where the error is large."""
+        return max(round(self.max_splats / 2), 1)
 
 
 @Parameter(name="*", group="Fit")
@@ -142,14 +140,8 @@ class ModelConfig:
     """What the segmenter looks for, once for each; default: the names of the task's objects."""
     clip: str = ""
     """Folder of CLIP: find --clip then finds by meaning, not by the words of the lexicon."""
-    model_frames: Annotated[int, RARE] = 12
-    """Training frames the models look at, spread evenly."""
     device: str = "auto"
     """Where they run: cpu, cuda, cuda:1; auto takes a GPU if there is one."""
-
-    def __post_init__(self) -> None:
-        """Refuse to look at nothing."""
-        refuse_outside(self, {"model_frames": (1, math.inf)})
 
     @property
     def any_named(self) -> bool:
@@ -196,14 +188,6 @@ class RenderConfig:
     """Stand here instead, in metres in the scene's frame; needs --target."""
     target: tuple[float, float, float] | None = None
     """Look at this point, in metres in the scene's frame."""
-    joints: tuple[float, ...] | None = None
-    """Put the arm into this posture, one angle in rad for each joint from base to flange; a camera
-    in its hand comes along. Default: as recorded at --at-s."""
-    width_m: float | None = None
-    """Opening of the gripper in metres; default: as recorded, closed with --joints."""
-    object: tuple[str, ...] = ()
-    """Put an object elsewhere: ID=x,y,z or ID=x,y,z,qw,qx,qy,qz in the scene's frame; once for
-    each object."""
     depth: bool = False
     """Write two more images: the depth in millimetres, and, white, what was measured in the scan;
     black is what was completed or never seen."""
@@ -215,7 +199,7 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers that are none."""
-        refuse_outside(self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0)})
+        refuse_outside(self, {"at_s": (0.0, MOST_S)})
         if self.out is not None and self.out.suffix.lower() == ".ply":
             message = (
                 f"--out {self.out}: render writes images. The scene's Gaussians are "
@@ -232,5 +216,4 @@ class RenderConfig:
         """Whether a whole episode is drawn, and not one image."""
         if self.out is not None and self.out.suffix.lower() == ".png":
             return False
-        one = self.at_s is not None or self.joints is not None
-        return not one and bool(self.episode)
+        return self.at_s is None and bool(self.episode)

@@ -93,14 +93,11 @@ def pose_cloud(
     A, shift, turn = blended[:, :9].reshape(-1, 3, 3), blended[:, 9:12], blended[:, 12:]
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     means = np.einsum("nij,nj->ni", A, cloud.means_m.astype(np.float64)) + shift
-    harmonics = cloud.harmonics
-    if cloud.num_harmonics:
-        harmonics = turned_harmonics(harmonics, se3.rotation_from_quaternion(turn))
     return replace(
         cloud,
         means_m=as_float32(means),
         quats_wxyz=as_float32(turned_quats(turn, cloud.quats_wxyz)),
-        harmonics=harmonics,
+        harmonics=turned_harmonics(cloud.harmonics, se3.rotation_from_quaternion(turn)),
     )
 
 

@@ -107,11 +107,6 @@ def camera_places(
     episode = trial.recorded
     tree = poses_in_scene(run, scene, episode, camera_id, stamps_ns)
     frame_id = streams.camera_info(episode, camera_id).frame_id
-    is_base = tree.root_of(frame_id) == streams.recorded_robot(episode).base_frame
-    if config.joints is not None and is_base:
-        T_carried = carried_camera(episode, frame_id, np.array(config.joints), tree)
-        if T_carried is not None:
-            return [trial.registered(camera_id, T_carried)] * len(stamps_ns)
     unknown = unknown_mask(tree, [frame_id], stamps_ns)
     return [
         None if is_unknown else trial.registered(camera_id, tree.T_root_frame(frame_id, stamp_ns))
@@ -123,7 +118,7 @@ def carried_camera(
     episode: Episode,
     frame_id: str,
     joints_rad: Float[np.ndarray, " num_joints"],
-    tree: TransformTree | None = None,
+    tree: TransformTree,
 ) -> Float[np.ndarray, "4 4"] | None:
     """Where a camera in the robot's hand would be in a posture, ``T_base_camera``.
 
@@ -134,7 +129,6 @@ def carried_camera(
         track = posture_track(episode)
     except GstError:
         return None
-    tree = base_tree(episode) if tree is None else tree
     robot = load_robot(track.urdf)
     # By the source's clock, which may have little to do with when messages arrived; and where the
     # camera's pose was stated, because in a fast motion what lies between may be off by much.

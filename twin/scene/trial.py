@@ -34,7 +34,7 @@ from twin.scene.movable_scene import MovableScene, read_movable_scene
 from twin.scene.object_tracks import ObjectTracks, localised_tracks
 from twin.scene.objects.closing import closed_object
 from twin.scene.objects.decompose import ObjectSplats
-from twin.scene.settings import FrameConfig, InitialiseConfig
+from twin.scene.settings import FrameConfig
 from twin.scene.shape.files import MESH
 from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import Mesh, read_mesh
@@ -183,9 +183,7 @@ def _from_task(
     lighting: Lighting,
 ) -> dict[str, ObjectSplats]:
     """Objects in the task's shape and in the colours that they had before the first motion."""
-    limits = DepthLimits(
-        max_depth_m=FrameConfig().max_depth_m, flying_fraction=InitialiseConfig().flying_fraction
-    )
+    limits = DepthLimits(max_depth_m=FrameConfig().max_depth_m)
     before_ns = first_execution_ns(episode)
     frames = stationary_frames(episode, FIRST_FRAMES, before_ns=before_ns, poses=poses)
     views = [training_view(FrameSurface(frame, limits)) for frame in frames]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from bridge.errors import MissingDependencyError
+from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.depth import to_millimetres
 from bridge.sources.device_samples import HostClock
@@ -337,7 +338,5 @@ def _camera_of(profile: Any) -> Camera:
 
 def _transform_of(extrinsics: Any) -> Float[np.ndarray, "4 4"]:
     """The library keeps rotations column by column."""
-    T = np.eye(4)
-    T[:3, :3] = np.array(extrinsics.rotation).reshape(3, 3).T
-    T[:3, 3] = extrinsics.translation
-    return T
+    R = np.array(extrinsics.rotation).reshape(3, 3).T
+    return se3.from_rotation(R, extrinsics.translation)

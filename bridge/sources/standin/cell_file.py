@@ -232,12 +232,9 @@ def _mount_pose(table: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     if "eye_m" in table:
         up = np.array([0.0, 0.0, 1.0])
         return se3.look_at(np.array(table["eye_m"]), np.array(table["target_m"]), up)
-    T = np.eye(4)
     c, s = np.cos(table["tilt_rad"]), np.sin(table["tilt_rad"])
     tilt = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    T[:3, :3] = np.array(table["R_columns"]).T @ tilt
-    T[:3, 3] = table["p_m"]
-    return T
+    return se3.from_rotation(np.array(table["R_columns"]).T @ tilt, table["p_m"])
 
 
 HIDDEN_STREAM = 101

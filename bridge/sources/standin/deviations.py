@@ -121,11 +121,9 @@ class Deviations:
     @property
     def T_base_table(self) -> Float[np.ndarray, "4 4"]:
         """Moves what is declared on the published table, the plane z = 0, onto the true one."""
-        T = np.eye(4)
-        T[:3, :3] = se3.rotation_from_vector(np.array([*self.table_tilt_rad, 0.0]))
+        R = se3.rotation_from_vector(np.array([*self.table_tilt_rad, 0.0]))
         pivot = np.array(TILTED_ABOUT_M)
-        T[:3, 3] = pivot - T[:3, :3] @ pivot + np.array([0.0, 0.0, self.table_height_m])
-        return T
+        return se3.from_rotation(R, pivot - R @ pivot + [0.0, 0.0, self.table_height_m])
 
     def lens(self, camera_id: str, camera: Camera) -> Lens:
         """The true camera behind a published one."""
@@ -152,10 +150,8 @@ class Deviations:
             T_table_object[2, 3] = model.rest_height_m
             poses[object_id] = self.T_base_table @ T_table_object
             if known is not None and model.fixed:
-                T_declared_true = np.eye(4)
-                T_declared_true[:3, :3] = se3.rotation_from_vector(np.array(known.turn_rad))
-                T_declared_true[:2, 3] = known.shift_m
-                poses[object_id] = poses[object_id] @ T_declared_true
+                turned = se3.small_motion(np.array([*known.turn_rad, *known.shift_m, 0.0]))
+                poses[object_id] = poses[object_id] @ turned
         return poses
 
     def true_task(self, task: Task) -> Task:

@@ -140,10 +140,8 @@ def rest_pose(track: PoseTrajectory) -> Float[np.ndarray, "4 4"]:
             f"no pose from {REST_S[0]} s to {REST_S[1]} s after the start of a recording."
         )
     Ts = track.transforms()[there]
-    T = np.eye(4)
-    T[:3, 3] = np.median(Ts[:, :3, 3], axis=0)
-    T[:3, :3] = se3.nearest_rotation(Ts[:, :3, :3].mean(axis=0))
-    return T
+    R = se3.nearest_rotation(Ts[:, :3, :3].mean(axis=0))
+    return se3.from_rotation(R, np.median(Ts[:, :3, 3], axis=0))
 
 
 def arm_of(push: Push) -> Arm:

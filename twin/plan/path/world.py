@@ -84,10 +84,8 @@ def chain_of(hulls: RobotHulls, width_m: float) -> Chain:
         while joint and joint not in ids:
             joint = int(model.parents[joint])
         number = ids.index(joint) + 1 if joint else 0
-        T_base_hull = np.eye(4)
-        T_base_hull[:3, :3], T_base_hull[:3, 3] = R, t
         joint_of.append(number)
-        Ts.append(se3.invert(frames[number]) @ T_base_hull)
+        Ts.append(se3.invert(frames[number]) @ se3.from_rotation(R, t))
     return Chain(
         placements=np.stack([se3.invert(before) @ own for before, own in pairwise(frames)]),
         axes=np.array(axes),

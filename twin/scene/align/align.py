@@ -114,9 +114,7 @@ def _polished(
     around = place + near.reshape(-1, 3)
     finer = _scores(views, samples, plane, near_yaws, around, FINE_CAP_M)
     i, k = np.unravel_index(int(np.argmax(finer)), finer.shape)
-    T_level_base = np.eye(4)
-    T_level_base[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, near_yaws[i]]))
-    T_level_base[:3, 3] = around[k]
+    T_level_base = se3.small_motion(np.array([0.0, 0.0, near_yaws[i], *around[k]]))
     return float(finer[i, k]), se3.invert(T_level_base) @ plane.T_level_source
 
 

@@ -18,13 +18,13 @@ from twin.errors import TwinError
 from twin.scene.frames.odometry import MIN_AGREEMENT, MIN_OVERLAP, Aligner, Look
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.raster.rasteriser import Rasteriser
 
 MOVED_M, MOVED_RAD = 0.005, np.radians(0.5)
 """From here on a camera was moved; less is the scatter of poses and of this comparison."""
 BEYOND_M = (0.06, 0.02)
 """Depths that differ by more, in the first and in the second round, show another thing."""
-LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.03)
+LIMITS = DepthLimits(max_depth_m=5.0)
 
 
 class MovedCameraError(TwinError):
@@ -65,15 +65,13 @@ class MovedCamera:
         )
 
 
-def moved_camera(
-    frames: Sequence[RgbdFrame], background: GaussianCloud, threads: int = 0
-) -> MovedCamera | None:
+def moved_camera(frames: Sequence[RgbdFrame], background: GaussianCloud) -> MovedCamera | None:
     """Compare frames of one camera with the scene; None where it is as its poses say.
 
     Args:
         frames: Taken while camera, robot and objects stood still.
     """
-    rasteriser, aligner = Rasteriser(RasterConfig(threads=threads)), Aligner(LIMITS.max_depth_m)
+    rasteriser, aligner = Rasteriser(), Aligner(LIMITS.max_depth_m)
     vectors, is_lost = [], False
     for frame in frames:
         T, found = np.eye(4), False
@@ -87,16 +85,14 @@ def moved_camera(
                 break
             T, found = T @ step.T_target_source, True
         if found:
-            vectors.append(np.concatenate([T[:3, 3], se3.vector_from_rotation(T[:3, :3])]))
+            vectors.append(np.concatenate([se3.vector_from_rotation(T[:3, :3]), T[:3, 3]]))
     if not vectors:
         return MovedCamera(T_posed_true=None) if is_lost else None
     middle = np.median(vectors, axis=0)
-    shift_m, turn_rad = (float(np.linalg.norm(part)) for part in (middle[:3], middle[3:]))
+    turn_rad, shift_m = (float(np.linalg.norm(part)) for part in (middle[:3], middle[3:]))
     if shift_m < MOVED_M and turn_rad < MOVED_RAD:
         return None
-    T_posed_true = np.eye(4)
-    T_posed_true[:3, :3], T_posed_true[:3, 3] = se3.rotation_from_vector(middle[3:]), middle[:3]
-    return MovedCamera(T_posed_true=T_posed_true)
+    return MovedCamera(T_posed_true=se3.small_motion(middle))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,20 +27,9 @@ STOP = 5e-6
 """Metres, radians and share of the depth: steps below change nothing that can be measured."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class AnnealingStep:
-    """One annealing step of Tukey's loss."""
-
-    gate_m: float
-    iterations: int
-
-
-COARSE = (AnnealingStep(gate_m=0.08, iterations=10), AnnealingStep(gate_m=0.03, iterations=6))
-FINE = (
-    AnnealingStep(gate_m=0.03, iterations=6),
-    AnnealingStep(gate_m=0.02, iterations=6),
-    AnnealingStep(gate_m=0.012, iterations=12),
-)
+COARSE = ((0.08, 10), (0.03, 6))
+FINE = ((0.03, 6), (0.02, 6), (0.012, 12))
+"""Annealing of Tukey's loss: gate [m] and iterations of each stage."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +57,7 @@ def refine(
     surfaces: Sequence[PosedSurface],
     start: ScenePose,
     *,
-    stages: Sequence[AnnealingStep],
+    stages: Sequence[tuple[float, int]],
     num_points: int,
     with_scale: bool = True,
     seed: int = 0,
@@ -82,13 +71,13 @@ def refine(
     rng = np.random.default_rng(seed)
     pose = start
     equations = None
-    for stage in stages:
+    for gate_m, iterations in stages:
         clouds = [
-            _choose(view, surface, pose, stage.gate_m, num_points // len(views), rng)
+            _choose(view, surface, pose, gate_m, num_points // len(views), rng)
             for view, surface in zip(views, surfaces, strict=True)
         ]
-        for _ in range(stage.iterations):
-            equations = _equations(views, clouds, surfaces, pose, stage.gate_m)
+        for _ in range(iterations):
+            equations = _equations(views, clouds, surfaces, pose, gate_m)
             pose, step = _stepped(pose, equations, with_scale)
             if np.abs(step).max() < STOP:
                 break
@@ -168,10 +157,6 @@ def _stepped(
     else:
         H[6], H[:, 6], g[6], H[6, 6] = 0.0, 0.0, 0.0, 1.0
     step = -np.linalg.lstsq(H, g, rcond=1e-12)[0]
-    T = np.eye(4)
-    T[:3, :3] = se3.rotation_from_vector(step[3:6])
-    T[:3, 3] = step[:3]
-    moved = ScenePose(
-        T_base_source=T @ pose.T_base_source, depth_scale=float(pose.depth_scale + step[6])
-    )
-    return moved, step
+    T = se3.small_motion(np.concatenate([step[3:6], step[:3]]))
+    depth_scale = float(pose.depth_scale + step[6])
+    return ScenePose(T_base_source=T @ pose.T_base_source, depth_scale=depth_scale), step

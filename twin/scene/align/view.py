@@ -28,8 +28,7 @@ class RobotView:
     def cloud(self) -> "ViewCloud":
         """Points and normals of the trusted pixels; computed once."""
         p = np.moveaxis(self.camera.unproject(self.depth_m.astype(np.float64)), -1, 0)
-        limits = DepthLimits(max_depth_m=6.0, flying_fraction=0.03)
-        trusted = trusted_depth_mask(self.depth_m, limits)
+        trusted = trusted_depth_mask(self.depth_m, DepthLimits(max_depth_m=6.0))
         row, column, normals = oriented(p, trusted, trusted)
         return ViewCloud(p_m=p[:, row, column].T, normals=normals.T)
 
@@ -72,7 +71,7 @@ class LevelPlane:
     """Part of all points that lie on it."""
 
 
-def find_planes(views: Sequence[RobotView], *, seed: int = 0) -> list[LevelPlane]:
+def find_planes(views: Sequence[RobotView]) -> list[LevelPlane]:
     """Find the largest planes that can be level, largest first (Fischler and Bolles, 1981).
 
     Gravity is not known: a wall that faces the camera is told from a table by the camera's upper
@@ -87,7 +86,7 @@ def find_planes(views: Sequence[RobotView], *, seed: int = 0) -> list[LevelPlane
     up = -np.mean([view.T_source_camera[:3, 1] for view in views], axis=0)
     back = -np.mean([view.T_source_camera[:3, 2] for view in views], axis=0)
     eye = np.mean([view.T_source_camera[:3, 3] for view in views], axis=0)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     planes: list[LevelPlane] = []
     left = np.ones(len(p), dtype=bool)
     for _ in range(2 * MAX_PLANES):
@@ -132,10 +131,8 @@ def _level(
     aside = np.eye(3)[int(np.argmin(np.abs(normal)))]
     x = np.cross(aside, normal)
     x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(normal, x), normal])
-    foot = eye - normal * (normal @ eye - offset)
-    T[:3, 3] = -T[:3, :3] @ foot
+    R = np.stack([x, np.cross(normal, x), normal])
+    T = se3.from_rotation(R, -R @ (eye - normal * (normal @ eye - offset)))
     xy = se3.apply(T, p)[:, :2]
     low, high = np.quantile(xy, [0.02, 0.98], axis=0)
     return LevelPlane(T_level_source=T, low_m=low, high_m=high, share=share)

@@ -29,12 +29,6 @@ LEAST_LEFT = 1 / 3
 """Share of the pairs that have to lie within the recording when poses are moved in time."""
 REFINEMENTS = 8
 """Halvings of the step around the best."""
-FLANK = 0.04
-"""A peak reaches to where agreement has fallen by this share of it."""
-FLANK_STEP, LONGEST_FLANK = 0.002, 0.2
-"""First step down a flank, doubled each time, of the logarithm of a factor."""
-PEAK_SAMPLES = 17
-"""Of the agreement across a peak; a cubic is fitted to them."""
 GAPS = (1, 2, 4, 8, 16, 32)
 """Pairs are this many frames apart: far ones say most of scale, near ones of time."""
 MAX_PAIRS = 24
@@ -125,7 +119,7 @@ def search_geometry(
     is_clear = best.after >= recorded + LEAST_GAIN and best.after >= LEAST_AGREEMENT
     if not is_clear or off < SMALLEST[best.kind]:
         return None
-    return best if best.kind == "delay" else _smoothed(best, pairs)
+    return best
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,40 +180,6 @@ def _best(kind: str, score: Callable[[float], float], recorded: float) -> Correc
     logs = np.log(FACTORS)
     at, after = _climbed(logs, lambda x: score(float(np.exp(x))))
     return Correction(kind=kind, value=float(np.exp(at)), frames=0.0, before=recorded, after=after)
-
-
-def _smoothed(found: Correction, pairs: Sequence[_Pair]) -> Correction:
-    """A factor at the top of a cubic through its peak, not at the highest of the peak's noise.
-
-    Where poses are noisier than depth may differ, the peak is wide and flat: which of its places
-    is the highest depends on how pixels fall onto pixels. A cubic, for peaks lean to one side.
-    """
-
-    def score(x: float) -> float:
-        factor = float(np.exp(x))
-        return _agreement(pairs, **{found.kind: factor})
-
-    at, level = float(np.log(found.value)), (1 - FLANK) * found.after
-    low, high = (_flank(score, at, sign, level) for sign in (-1.0, 1.0))
-    places = np.linspace(low, high, PEAK_SAMPLES)
-    cubic = np.polynomial.Polynomial.fit(places, [score(float(x)) for x in places], 3)
-    fine = np.linspace(low, high, 1001)
-    value = float(np.exp(fine[np.argmax(cubic(fine))]))
-    return replace(found, value=value, after=_agreement(pairs, **{found.kind: value}))
-
-
-def _flank(score: Callable[[float], float], at: float, sign: float, level: float) -> float:
-    """Where a peak has fallen to a level, to this side of a place on it."""
-    above, below = 0.0, FLANK_STEP
-    while below < LONGEST_FLANK and score(at + sign * below) >= level:
-        above, below = below, 2 * below
-    for _ in range(REFINEMENTS):
-        middle = (above + below) / 2
-        if score(at + sign * middle) < level:
-            below = middle
-        else:
-            above = middle
-    return at + sign * (above + below) / 2
 
 
 def _climbed(

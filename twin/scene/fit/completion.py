@@ -22,7 +22,6 @@ from twin.scene.frames.downscaled import pixels_of
 from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.gaussians import GaussianCloud, concatenate
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.settings import InitialiseConfig
 
 HOLE_ALPHA = 0.5
 """A pixel that lets more than this through shows nothing."""
@@ -59,12 +58,15 @@ class _Hole:
 def complete_holes(
     cloud: GaussianCloud,
     views: Sequence[TrainingView],
-    config: InitialiseConfig,
+    most: int,
     raster: RasterConfig | None = None,
 ) -> GaussianCloud:
-    """Gaussians that close the holes of the training views, marked; none without holes."""
+    """Gaussians that close the holes of the training views, marked; none without holes.
+
+    Args:
+        most: Gaussians.
+    """
     added = cloud.take(np.zeros(0, dtype=np.int64))
-    most = round(config.completion * config.max_splats)
     rasteriser = Rasteriser(raster or RasterConfig())
     holes = [_hole(view, cloud, rasteriser) for view in views]
     order = np.argsort([-int(hole.mask.sum()) for hole in holes], kind="stable")
@@ -73,7 +75,7 @@ def complete_holes(
             break
         hole = _hole(views[index], concatenate([cloud, added]), rasteriser)
         if hole.mask.any():
-            added = concatenate([added, _closed(hole, views, config, most - len(added))])
+            added = concatenate([added, _closed(hole, views, most - len(added))])
     return added.as_completed()
 
 
@@ -94,9 +96,7 @@ def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _
     return _Hole(view=view, mask=mask, drawn_m=drawn.depth_m, beside_m=beside)
 
 
-def _closed(
-    hole: _Hole, views: Sequence[TrainingView], config: InitialiseConfig, most: int
-) -> GaussianCloud:
+def _closed(hole: _Hole, views: Sequence[TrainingView], most: int) -> GaussianCloud:
     """Gaussians for the pixels of one view, coarser where they would be too many."""
     depth_m = _smoothest(hole.drawn_m, hole.mask, hole.beside_m)
     step = 1

@@ -14,9 +14,9 @@ from jaxtyping import Float, Float32, Int8
 
 from bridge.geometry import se3
 from twin.errors import TwinError
+from twin.scene.frames.downscaled import pixels_of
 from twin.scene.frames.rgbd import NEAR_M, PointSet, TrainingView
 from twin.scene.gaussians import GaussianCloud, as_float32, morton_order
-from twin.scene.settings import InitialiseConfig
 
 MAX_LEVEL = 6
 INDEX_BITS = 19
@@ -43,16 +43,15 @@ class NoSurfaceError(TwinError):
     """The depth images hold no usable surface."""
 
 
-def fuse(
-    points: list[PointSet], config: InitialiseConfig, views: Sequence[TrainingView] = ()
-) -> GaussianCloud:
+def fuse(points: list[PointSet], most: int, views: Sequence[TrainingView] = ()) -> GaussianCloud:
     """Average points in voxels of 1.6 pixel footprints, and flatten them along their normal.
 
     Voxel sizes are powers of two times a base size, so that near surfaces keep detail and far
     ones do not waste Gaussians. A coarse voxel gives way where finer ones cover it. All voxels
-    grow together until the budget, less what is left to the fit, holds.
+    grow together until there are few enough.
 
     Args:
+        most: Gaussians.
         views: Whose depth says where the surface is on average; none: voxels stay where they are.
     """
     p = np.concatenate([item.p_m for item in points])
@@ -63,10 +62,9 @@ def fuse(
     wanted = np.float32(FOOTPRINTS) * np.concatenate([item.footprint_m for item in points])
     base = float(np.quantile(wanted, 0.05))
     level = np.clip(np.rint(np.log2(wanted / np.float32(base))), 0, MAX_LEVEL).astype(np.int8)
-    budget = max(round(config.max_splats * (1 - config.growth)), 1)
     inverse, kept, sizes = _voxels(p, level, base)
-    while kept.sum() > budget:
-        base *= 1.05 * float(np.sqrt(kept.sum() / budget))
+    while kept.sum() > most:
+        base *= 1.05 * float(np.sqrt(kept.sum() / most))
         inverse, kept, sizes = _voxels(p, level, base)
     if not kept.any():
         raise NoSurfaceError(_no_surface(len(p)))
@@ -154,10 +152,9 @@ def _measured_offsets(
     for view in views:
         camera, T = view.full.camera, as_float32(se3.invert(view.T_base_color))
         p = means @ T[:3, :3].T + T[:3, 3]
-        voxel = np.flatnonzero(p[:, 2] > NEAR_M)
-        column, row = np.floor(camera.project(p[voxel])[0].T)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        voxel, x, y = voxel[inside], column[inside].astype(np.int32), row[inside].astype(np.int32)
+        row, column, inside = pixels_of(camera, p)
+        voxel = np.flatnonzero(inside & (p[:, 2] > NEAR_M))
+        x, y = column[voxel], row[voxel]
         depth = view.full.depth_m[y, x]
         ray = as_float32(camera.rays()[y, x])
         p, n = p[voxel], normals[voxel] @ T[:3, :3].T

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from bridge.geometry.mesh import sample_triangles
 from twin.robot.surface import ray_scene, tensor
@@ -15,6 +16,8 @@ WIDER = 1.15
 """Gaussians are wider than their spacing by this, so that nothing shows through."""
 FROM_EDGE = 0.95
 """How far from an edge Gaussians end, in their spacing: half of the light passes at the edge."""
+BLUR_M = 0.006
+"""Surface so much farther away than the nearest has less to say about a colour."""
 DIRECTIONS, ROUNDS = 8, 3
 """In which it is looked how far a Gaussian reaches beyond the surface, and how often."""
 
@@ -79,3 +82,32 @@ def within_edges(
         farthest = beyond_m.argmax(axis=1)
         moved -= beyond_m[every, farthest, None] * around[every, farthest]
     return moved
+
+
+def colors_around(
+    p: Float[np.ndarray, "num_points 3"],
+    normals: Float[np.ndarray, "num_points 3"],
+    seen: tuple[np.ndarray, np.ndarray, np.ndarray],
+    count: int,
+    *,
+    sideways: float = 0.0,
+    reach_m: float = np.inf,
+) -> tuple[Float[np.ndarray, "num_points 3"], Float[np.ndarray, " num_points"]]:
+    """Mean colour of the nearest surface that was seen, and how much of it there was.
+
+    Args:
+        seen: Its points, normals and colours.
+        count: Points of it that are looked at.
+        sideways: Share of what faces elsewhere, beside the cosine between normals.
+    """
+    seen_m, seen_normals, seen_colors = seen
+    count = min(count, len(seen_m))
+    distance, ids = cKDTree(seen_m).query(p, k=count)
+    distance, ids = distance.reshape(-1, count), ids.reshape(-1, count)
+    alike = np.einsum("pkc,pc->pk", seen_normals[ids], normals).clip(0.0)
+    nearest = distance.min(axis=1, keepdims=True)
+    weight = (sideways + alike) * np.exp(-0.5 * ((distance - nearest) / BLUR_M) ** 2)
+    weight *= distance < reach_m
+    total = weight.sum(axis=1, keepdims=True)
+    mean = np.einsum("pk,pkc->pc", weight, seen_colors[ids]) / np.maximum(total, 1e-9)
+    return mean, total[:, 0]

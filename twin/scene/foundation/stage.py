@@ -1,11 +1,11 @@
 """Semantics as a stage of ``rebuild``: ask the models, find what is what, write it down."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import UsageError
@@ -18,7 +18,7 @@ from twin.naming.scene_file import (
     write_semantics,
     write_vectors,
 )
-from twin.naming.things import Mask, SemanticScene, SemanticsError
+from twin.naming.things import Mask, SemanticScene
 from twin.naming.words import spoken_name
 from twin.scene.foundation.loading import check_folder, device_of, import_transformers
 from twin.scene.foundation.models import ClipEmbedder, Sam3Segmenter, sam3_folder
@@ -29,11 +29,12 @@ from twin.scene.objects.decompose import Decomposition
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default, scene_from_masks
 from twin.scene.semantics.lift import Viewpoint, render_labels
-from twin.scene.semantics.segment import SOURCE
 from twin.scene.settings import ModelConfig
 
 MAX_VIEWPOINTS = 24
 """Frames that count support; more are thinned out evenly."""
+MODEL_FRAMES = 12
+"""Training frames that large models look at, spread evenly."""
 MIN_SHOWN_PX = 64
 """A thing is cut out of frames that show at least this much of it."""
 MAX_CROPS = 5
@@ -130,48 +131,6 @@ def viewpoint_of(frame: RgbdFrame) -> Viewpoint:
     return Viewpoint(camera=frame.color_camera, T_base_camera=frame.T_base_color)
 
 
-def find_things(
-    background: GaussianCloud,
-    objects: Mapping[str, GaussianCloud],
-    viewpoints: Sequence[Viewpoint],
-    *,
-    masks: Sequence[tuple[Viewpoint, Sequence[Mask]]] = (),
-    surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
-    fused: GaussianCloud | None = None,
-    rasteriser: Rasteriser,
-    advance: Advance = lambda done, note: None,
-) -> SemanticScene:
-    """Say what is what among the Gaussians of the background and of the objects, in this order.
-
-    Nothing found is a remark, not an error: the scene is good without.
-
-    Args:
-        objects: Moved to where they were scanned; without masks each is an instance of that name.
-        masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
-        surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
-            told apart on these.
-        fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
-    """
-    cloud = concatenate([background, *objects.values()])
-    sizes = [len(background), *(len(part) for part in objects.values())]
-    try:
-        if masks:
-            return scene_from_masks(cloud, masks, rasteriser, Sam3Segmenter.kind.name, advance)
-        owner = np.repeat(np.arange(len(sizes)), sizes)
-        return scene_by_default(
-            cloud,
-            viewpoints[:: -(-len(viewpoints) // MAX_VIEWPOINTS) or 1],
-            rasteriser,
-            known={key: owner == n for n, key in enumerate(objects, start=1)},
-            surfaces_m=surfaces_m,
-            fused=fused,
-            advance=advance,
-        )
-    except SemanticsError as error:
-        nothing = np.zeros(len(cloud), dtype=np.uint16)
-        return SemanticScene(instances=(), labels=nothing, source=SOURCE, remark=str(error))
-
-
 def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFrame]:
     """Read at most ``count`` training frames, spread evenly over episodes, cameras and time."""
     numbered = [(index, ns) for index, each in enumerate(choices) for ns in sorted(each.train_ns)]
@@ -206,9 +165,10 @@ def write_scene_semantics(
     objects = decomposed.objects
     placed = {key: moved_cloud(item.cloud, item.T_base_object) for key, item in objects.items()}
     rasteriser = Rasteriser(RasterConfig(threads=threads))
-    num = len(decomposed.background) + sum(len(part) for part in placed.values())
-    output.say(f"name what is in the scene: {num} Gaussians, {len(objects)} objects known")
-    frames = training_frames(choices, models.model_frames) if models.any_named else []
+    parts = {BACKGROUND_KEY: decomposed.background, **placed}
+    rows, cloud = {key: len(part) for key, part in parts.items()}, concatenate([*parts.values()])
+    output.say(f"name what is in the scene: {len(cloud)} Gaussians, {len(objects)} objects known")
+    frames = training_frames(choices, MODEL_FRAMES) if models.any_named else []
     masks: list[tuple[Viewpoint, list[Mask]]] = []
     if models.segmenter:
         with output.progress("ask the segmenter", len(frames)) as advance:
@@ -216,23 +176,25 @@ def write_scene_semantics(
         num_masks = sum(len(found) for _, found in masks)
         output.say(f"{num_masks} masks in {len(frames)} frames")
     with output.progress("name things", 100) as advance:
-        scene = find_things(
-            decomposed.background,
-            placed,
-            [Viewpoint(camera=v.half.camera, T_base_camera=v.T_base_color) for v in views],
-            masks=masks,
-            surfaces_m=decomposed.surfaces_m(),
-            fused=fused,
-            rasteriser=rasteriser,
-            advance=advance,
-        )
+        if masks:
+            kind = Sam3Segmenter.kind.name
+            scene = scene_from_masks(cloud, masks, rasteriser, kind, advance)
+        else:
+            owner = np.repeat(np.arange(len(rows)), list(rows.values()))
+            some = views[:: -(-len(views) // MAX_VIEWPOINTS) or 1]
+            scene = scene_by_default(
+                cloud,
+                [Viewpoint(camera=v.half.camera, T_base_camera=v.T_base_color) for v in some],
+                rasteriser,
+                known={key: owner == n for n, key in enumerate(placed, start=1)},
+                surfaces_m=decomposed.surfaces_m(),
+                fused=fused,
+                advance=advance,
+            )
     for name in (SEMANTICS_FILE, VECTORS_FILE):
         (folder / name).unlink(missing_ok=True)
-    rows = {BACKGROUND_KEY: len(decomposed.background)}
-    rows |= {key: len(part) for key, part in placed.items()}
     record = write_semantics(folder, scene, rows)
     if models.clip:
-        cloud = concatenate([decomposed.background, *placed.values()])
         embedder = ClipEmbedder(Path(models.clip).expanduser(), models.device)
         with output.progress("give things vectors", len(scene.instances)) as advance:
             vectors, shown = thing_vectors(embedder, scene, cloud, frames, rasteriser, advance)

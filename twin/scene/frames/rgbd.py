@@ -44,7 +44,7 @@ class DepthLimits:
 
     max_depth_m: float
     """Depth beyond is left out."""
-    flying_fraction: float
+    flying_fraction: float = 0.03
     """A pixel flies when its depth differs from a neighbour's by more than this share."""
 
 

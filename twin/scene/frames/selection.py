@@ -83,7 +83,7 @@ def pick(
     sharpness = sharpness_of([int(stamps_ns[i]) for look in looks for i in look])
     best = [max(look, key=lambda i: (sharpness[int(stamps_ns[i])], -i)) for look in looks]
     values = np.array([sharpness[int(stamps_ns[i])] for i in best])
-    sharp = np.asarray(values >= BLURRED * _around(values))
+    sharp = np.asarray(values >= BLURRED * ndimage.median_filter(values, 5, mode="nearest"))
     kept = np.array(best)[sharp if sharp.sum() >= min(MIN_KEPT, len(best)) else slice(None)]
     return np.asarray(stamps_ns[kept])
 
@@ -170,11 +170,6 @@ def _shortlist(members: np.ndarray, smear_px: np.ndarray) -> Sequence[int]:
     limit = max(SMEAR_PX, MOTION_SLACK * float(smear_px[members].min()))
     calm = members[smear_px[members] <= limit]
     return [int(index) for index in spread(calm, MAX_LOOKS)]
-
-
-def _around(values: np.ndarray) -> np.ndarray:
-    """Median of each value and its two neighbours to each side."""
-    return np.asarray(ndimage.median_filter(values, 5, mode="nearest"))
 
 
 STATIONARY_TRAIN_FRAMES = 4

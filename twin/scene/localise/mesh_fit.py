@@ -280,8 +280,7 @@ def _starts(
     p = problem.cluster.p_base
     low, high = np.percentile(p, [2, 98], axis=0)
     top = float((problem.surface.p_m @ side[2]).max())
-    standing = np.eye(4)
-    standing[:3, :3] = side
+    standing = se3.from_rotation(side, np.zeros(3))
     state = np.array([*(low + high)[:2] / 2, high[2] - top, 0.0])
     return [
         pose_of(state + np.array([0, 0, 0, yaw])) @ standing

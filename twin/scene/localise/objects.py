@@ -105,11 +105,9 @@ def fit_table(
         robust = tukey_weights(centred, max(6.0 * spread, 1e-3)) * weight
         H, gradient = normal_equations(A, p_base[:, 2], robust)
         x = -np.linalg.solve(H + np.diag(1 / sigma**2), gradient)
-    T_new_old = np.eye(4)
-    T_new_old[:3, :3] = se3.rotation_from_vector(np.array([x[2], x[3], 0.0]))
+    R = se3.rotation_from_vector(np.array([x[2], x[3], 0.0]))
     lifted = p_base_camera + np.array([0.0, 0.0, x[1]])
-    T_new_old[:3, 3] = lifted - T_new_old[:3, :3] @ p_base_camera
-    return T_new_old, float(1 - x[0])
+    return se3.from_rotation(R, lifted - R @ p_base_camera), float(1 - x[0])
 
 
 MAX_FRAMES = 3

@@ -16,7 +16,7 @@ from twin.scene.shape.known import (
     pose_of,
     rectangle_yaw_rad,
     surface_distances,
-    yaw_period_rad,
+    turned_alike,
 )
 
 SCHEMA_VERSION = 1
@@ -103,7 +103,7 @@ def found_by_fit(
         confidence, method = fit.explained * (1 - fit.seen_through), MESH_METHOD
     is_upright = bool(T[2, 2] > UPRIGHT)
     if model.soft is None and is_upright:
-        T = reduce_by_symmetry(T, model)
+        T = turned_alike(T, np.eye(4), model)
     reason = None
     if is_upright and abs(lift_m) <= REST_TOLERANCE_M:
         T[2, 3] = model.rest_height_m
@@ -143,16 +143,3 @@ def found_by_box(
     sure = {"covariance": np.diag(np.square(spread)), "confidence": float((away < BOXED_M).mean())}
     reason = f"the shape of {model.id} is not known yet: only boxed in"
     return _of(model, stamp_ns, detail, T_base_object=T, method=BOX_METHOD, reason=reason, **sure)
-
-
-def reduce_by_symmetry(
-    T_base_object: Float[np.ndarray, "4 4"], model: ObjectModel
-) -> Float[np.ndarray, "4 4"]:
-    """Choose the yaw nearest zero among those that look the same."""
-    period = yaw_period_rad(model)
-    yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
-    reduced = np.mod(yaw + period / 2, period) - period / 2
-    T = T_base_object.copy()
-    c, s = np.cos(reduced), np.sin(reduced)
-    T[:2, :2] = [[c, -s], [s, c]]
-    return T

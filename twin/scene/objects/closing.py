@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.fit.lighting import EVEN, Lighting
-from twin.scene.fit.on_mesh import WIDER, even_points, surface_area_m2, within_edges
+from twin.scene.fit.on_mesh import WIDER, colors_around, even_points, surface_area_m2, within_edges
+from twin.scene.frames.downscaled import pixels_of
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.shape.from_training import image_window
@@ -42,7 +42,6 @@ NEAR_BEND, NEAR_OUTLINE = 1e-3, 1e-6
 """Weights of such pixels: they count where there are no others. Near an edge all colours are still
 the object's own, near its outline they may be the table's."""
 NEIGHBOURS = 24
-BLUR_M = 0.006
 SIDEWAYS = 0.2
 """Share that a surface facing elsewhere has in the colour of a side that nobody saw."""
 
@@ -71,7 +70,9 @@ def closed_object(
     known = is_own if is_own.any() else is_seen
     color = weighted_median(colors, weights)
     light = lighting.brightness(normals @ T_base_object[:3, :3].T)[:, None]
-    color[~known] = _beside(p, normals, known, color / light) * light[~known]
+    seen = p[known], normals[known], (color / light)[known]
+    paint, _ = colors_around(p[~known], normals[~known], seen, NEIGHBOURS, sideways=SIDEWAYS)
+    color[~known] = paint * light[~known]
     cloud = flat_gaussians(p, normals, color, np.full(len(p), WIDER * spacing_m))
     return replace(cloud, completed=~is_seen)
 
@@ -121,14 +122,12 @@ class _Look:
         seen_m = se3.apply(self.T_camera_object, p)
         towards = -seen_m / np.linalg.norm(seen_m, axis=1, keepdims=True)
         cosine = np.einsum("ij,ij->i", normals @ self.T_camera_object[:3, :3].T, towards)
-        uv, z = self.camera.project(np.where(seen_m[:, 2:] > 0, seen_m, 1.0))
-        row = np.floor(uv[:, 1]).astype(np.int64) - self.corner[0]
-        column = np.floor(uv[:, 0]).astype(np.int64) - self.corner[1]
+        row, column, inside = pixels_of(self.camera, seen_m)
+        row, column = row - self.corner[0], column - self.corner[1]
         height, width = self.shown.shape
-        inside = (seen_m[:, 2] > 0) & (row >= 0) & (column >= 0) & (row < height) & (column < width)
-        inside &= cosine > FACING
+        inside &= (cosine > FACING) & (row >= 0) & (column >= 0) & (row < height) & (column < width)
         row, column = np.where(inside, row, 0), np.where(inside, column, 0)
-        inside &= self.shown[row, column] & (z < self.expected_m[row, column] + SAME_M)
+        inside &= self.shown[row, column] & (seen_m[:, 2] < self.expected_m[row, column] + SAME_M)
         weight = self.trust[row, column] * cosine**2
         return self.colors[row, column], np.where(inside, weight, 0.0)
 
@@ -174,21 +173,3 @@ def weighted_median(
     middle = (total >= total[-1] / 2).argmax(axis=0)
     found = np.take_along_axis(ranked, middle[None], axis=0)[0]
     return np.where(total[-1] > 0, found, 0.0)
-
-
-def _beside(
-    p: Float[np.ndarray, "num_points 3"],
-    normals: Float[np.ndarray, "num_points 3"],
-    known: Bool[np.ndarray, " num_points"],
-    colors: Float[np.ndarray, "num_points 3"],
-) -> Float[np.ndarray, "num_other 3"]:
-    """Colours of the nearest surface that was seen, for all other points."""
-    known_ids = np.flatnonzero(known)
-    count = min(NEIGHBOURS, len(known_ids))
-    distance, ids = cKDTree(p[known_ids]).query(p[~known], k=count)
-    distance, ids = distance.reshape(-1, count), known_ids[ids.reshape(-1, count)]
-    alike = np.einsum("pkc,pc->pk", normals[ids], normals[~known]).clip(0.0)
-    nearest = distance.min(axis=1, keepdims=True)
-    weight = (SIDEWAYS + alike) * np.exp(-0.5 * ((distance - nearest) / BLUR_M) ** 2)
-    weight /= weight.sum(axis=1, keepdims=True)
-    return np.asarray(np.einsum("pk,pkc->pc", weight, colors[ids]))

@@ -139,7 +139,7 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
 def describe_scene(record: Mapping[str, Any]) -> str:
     """Say in a few lines what was rebuilt and how well."""
     fitted, cost = record["fit"], record["cost"]
-    asked = fitted.get("iterations_asked")  # not in scenes of older versions
+    asked = fitted["iterations_asked"]
     of_asked = "" if asked is None else f" of {asked}"
     lines = [
         f"scene {record['scene_hash']}: {record['background']['num_splats']} Gaussians"
@@ -163,7 +163,7 @@ def describe_scene(record: Mapping[str, Any]) -> str:
         for key, item in record.get("objects", {}).items()
         if item.get("num_completed")
     ]
-    if fitted.get("underfitted"):
+    if fitted["underfitted"]:
         lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
     images = record["views"]["images"]
     stationary = sum(bool(item["stationary_camera"]) for item in images)

@@ -44,6 +44,8 @@ from twin.scene.store.folder import (
 
 METHOD_VERSION = 27
 """Counts changes of method that make older scenes out of date."""
+COMPLETION = 0.1
+"""Gaussians for what was seen in colour and never measured, at most, in those of the fit."""
 SEARCHED_SPLATS = 80_000
 """Points of the fused surface in which things are looked for, at most."""
 
@@ -76,12 +78,13 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     fitted = _fit(training, config, output)
     clock.end("initialise_and_fit")
     raster = RasterConfig(threads=config.fit.threads)
-    completed = complete_holes(fitted.cloud, training.bare_views, config.initialise, raster)
+    most = round(COMPLETION * config.initialise.max_splats)
+    completed = complete_holes(fitted.cloud, training.bare_views, most, raster)
     output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     fitted = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
-    links = training.robot.frames.links(config.initialise)
+    links = training.robot.frames.links(config.initialise.max_splats)
     decomposed = decompose(placements, fitted.cloud, training.views_of, output, links.lighting)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     clock.end("decompose")
@@ -110,7 +113,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
 
 def _fit(training: TrainingSet, config: RebuildConfig, output: Output) -> FitResult:
     began_s = time.monotonic()
-    first = fuse(training.bare_points, config.initialise, training.bare_views)
+    first = fuse(training.bare_points, config.initialise.first_splats, training.bare_views)
     output.say(f"{len(first)} Gaussians from {len(training.views)} training frames")
     with output.progress("fit", 100) as advance:
         return fit(
@@ -174,14 +177,16 @@ def _write_parts(
     if not config.models.any_named and not has_leaf("perception"):
         return written
     # Not what was fitted: Gaussians gather where colours change, and every fit puts them elsewhere.
-    finer = replace(config.initialise, max_splats=SEARCHED_SPLATS, growth=0.0)
+    searched = None
+    if not config.models.segmenter:
+        searched = fuse(training.points, SEARCHED_SPLATS, training.views)
     named: dict[str, Any] = load_leaf("perception", "name_things")(
         run.scene_dir,
         decomposed,
         training.views,
         config.fit.threads,
         output,
-        fused=None if config.models.segmenter else fuse(training.points, finer, training.views),
+        fused=searched,
         models=config.models,
         choices=training.choices,
         task=scanned_tasks(sources).task,

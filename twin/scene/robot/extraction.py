@@ -5,6 +5,7 @@ What it hid in one frame is filled by the frames in which it stood elsewhere; no
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,12 +28,11 @@ from twin.scene.align.align import Alignment, align_robot
 from twin.scene.align.view import RobotView
 from twin.scene.fit.initialise import NoSurfaceError, flat_gaussians, fuse
 from twin.scene.fit.lighting import EVEN, Lighting, Patches, fit_lighting
-from twin.scene.fit.on_mesh import WIDER, even_points, surface_area_m2, within_edges
+from twin.scene.fit.on_mesh import WIDER, colors_around, even_points, surface_area_m2, within_edges
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
 from twin.scene.robot.splats import posed, surface_links, write_links
-from twin.scene.settings import InitialiseConfig
 from twin.scene.shape.mesh import Mesh
 
 IN_FRONT_M = 0.03
@@ -63,8 +63,7 @@ FITS_M = 0.006
 """Half of the measured points lie nearer to a shape that is the link's."""
 REACH_M = 0.03
 """Colours of points farther away are not the surface's."""
-NEIGHBOURS = 16
-BLUR_M = 0.006
+NEIGHBOURS, LEAST_TOLD = 16, 0.05
 PATCH_M, PATCH_NEIGHBOURS = 0.012, 4
 """Pieces of a link's surface whose light is compared between postures, and how many are looked at
 to find the one that a point lies on."""
@@ -159,7 +158,7 @@ def on_surface(
     side that nobody saw takes the link's own middle colour.
     """
     p, normals = even_points(shapes, spacing_m)
-    seen_m, seen_normals, seen_colors = (
+    seen_m, facing, seen_colors = (
         np.concatenate([getattr(item, name) for item in sets])
         for name in ("p_m", "normals", "colors")
     )
@@ -167,28 +166,11 @@ def on_surface(
     if np.median(away_m) > FITS_M + spacing_m / 2:
         return None
     p = within_edges(p, normals, shapes, spacing_m)
-    colors = _colors(p, normals, seen_m, seen_normals, seen_colors)
+    seen = seen_m, facing, seen_colors
+    colors, told = colors_around(p, normals, seen, NEIGHBOURS, reach_m=REACH_M)
+    colors[told <= LEAST_TOLD] = np.median(seen_colors, axis=0)
     sizes = np.full(len(p), WIDER * spacing_m)
     return flat_gaussians(p, normals, colors, sizes)
-
-
-def _colors(
-    p: Float[np.ndarray, "num_points 3"],
-    normals: Float[np.ndarray, "num_points 3"],
-    seen_m: Float[np.ndarray, "num_seen 3"],
-    seen_normals: Float[np.ndarray, "num_seen 3"],
-    seen_colors: Float[np.ndarray, "num_seen 3"],
-) -> Float[np.ndarray, "num_points 3"]:
-    """Mean colour of the measured points around that face the same way."""
-    distance, ids = cKDTree(seen_m).query(p, k=min(NEIGHBOURS, len(seen_m)))
-    distance, ids = distance.reshape(len(p), -1), ids.reshape(len(p), -1)
-    alike = np.einsum("pkc,pc->pk", seen_normals[ids], normals).clip(0.0)
-    nearest = distance.min(axis=1, keepdims=True)
-    weight = alike * np.exp(-0.5 * ((distance - nearest) / BLUR_M) ** 2) * (distance < REACH_M)
-    total = weight.sum(axis=1, keepdims=True)
-    mean = np.einsum("pk,pkc->pc", weight, seen_colors[ids]) / np.maximum(total, 1e-9)
-    middle = np.median(seen_colors, axis=0)
-    return np.asarray(np.where(total > 0.05, mean, middle))
 
 
 class RobotFrames:
@@ -288,18 +270,21 @@ class RobotFrames:
                 self._seen.setdefault(link, []).append(seen)
         return owner
 
-    def links(self, config: InitialiseConfig) -> LitLinks:
+    def links(self, max_splats: int) -> LitLinks:
         """Gaussians of each link that was seen, in the link's frame, and the light on them.
 
         They lie on the shapes of the description where these fit what was measured; else what was
         measured is fused.
+
+        Args:
+            max_splats: Of the whole fit.
         """
         total = sum(len(item.points.p_m) for seen in self._seen.values() for item in seen)
         clouds = {}
         shapes = self._shapes()
         lighting = link_lighting(shapes, self._seen)
         area_m2 = sum(surface_area_m2(shapes.get(link, [])) for link in self._seen)
-        spacing_m = float(np.sqrt(area_m2 / (ROBOT_SHARE * config.max_splats)))
+        spacing_m = float(np.sqrt(area_m2 / (ROBOT_SHARE * max_splats)))
         for link, seen in sorted(self._seen.items()):
             sets = own_colors(shapes.get(link, []), seen, lighting)
             count = sum(len(item.p_m) for item in sets)
@@ -311,12 +296,9 @@ class RobotFrames:
             if cloud is not None:
                 clouds[link] = cloud
                 continue
-            budget = max(int(ROBOT_SHARE * config.max_splats * count / total), 1)
-            try:
-                own_budget = replace(config, max_splats=budget, growth=UNUSED)
-                clouds[link] = fuse(sets, own_budget)
-            except NoSurfaceError:
-                continue
+            budget = max(int(ROBOT_SHARE * max_splats * count / total), 1)
+            with suppress(NoSurfaceError):
+                clouds[link] = fuse(sets, max(round(budget * (1 - UNUSED)), 1))
         return LitLinks(clouds=clouds, lighting=lighting)
 
     def _shapes(self) -> dict[str, list[Mesh]]:

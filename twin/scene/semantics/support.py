@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from bridge.geometry import se3
 from twin.naming.things import SemanticsError
 from twin.scene.semantics.cluster import SurfacePoints
 
@@ -299,9 +300,7 @@ def _turned_up(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """A rotation that carries ``up`` to z; x stays as near to the old x (or y) as it can."""
     other = np.eye(3)[int(np.abs(up[0]) > np.abs(up[1]))]
     x = _normalised(other - up * (other @ up))
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(up, x), up])
-    return T
+    return se3.from_rotation(np.stack([x, np.cross(up, x), up]), np.zeros(3))
 
 
 def roughness_m(points: SurfacePoints, plane: SupportPlane) -> float:

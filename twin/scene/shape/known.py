@@ -29,6 +29,24 @@ def yaw_period_rad(model: ObjectModel) -> float:
     return np.pi / 2 if np.isclose(model.size_m[0], model.size_m[1]) else np.pi
 
 
+def turned_alike(
+    T_base_object: Float[np.ndarray, "4 4"],
+    T_base_expected: Float[np.ndarray, "4 4"],
+    model: ObjectModel,
+) -> Float[np.ndarray, "4 4"]:
+    """Of the poses in which an object looks the same, the one turned nearest to another."""
+    period = yaw_period_rad(model)
+    turns = [
+        se3.rotation_from_vector(np.array([0.0, 0.0, k * period]))
+        for k in range(round(2 * np.pi / period))
+    ]
+    best = min(
+        (T_base_object[:3, :3] @ turn for turn in turns),
+        key=lambda R: float(se3.rotation_angle_rad(R.T @ T_base_expected[:3, :3])),
+    )
+    return se3.from_rotation(best, T_base_object[:3, 3])
+
+
 def starts(
     points: Float[np.ndarray, "num_points 3"], model: ObjectModel
 ) -> list[Float[np.ndarray, "4"]]:

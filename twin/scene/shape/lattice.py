@@ -52,7 +52,7 @@ class Lattice:
         return Lattice(**found, spacing_m=spacing)
 
 
-def lattice(shape: ObjectShape, spacing_m: float = SPACING_M) -> Lattice:
+def lattice(shape: ObjectShape) -> Lattice:
     """Fill a shape as the bodies of tasks are filled; of what hangs apart, the largest piece.
 
     Raises:
@@ -60,9 +60,9 @@ def lattice(shape: ObjectShape, spacing_m: float = SPACING_M) -> Lattice:
     """
     ends = shape.vertices_m.min(axis=0), shape.vertices_m.max(axis=0)
     try:
-        filled = fill(shape.sdf.distance, *ends, spacing_m)
+        filled = fill(shape.sdf.distance, *ends, SPACING_M)
     except UsageError as error:
-        message = f"no lattice of {spacing_m * 1e3:.1f} mm fits into the shape: choose a finer one."
+        message = f"no lattice of {SPACING_M * 1e3:.1f} mm fits into the shape: choose a finer one."
         raise ShapeError(message) from error
     nodes, tets = _largest_piece(filled.points_m, filled.tetrahedra)
     shares = np.zeros(len(nodes))
@@ -71,7 +71,7 @@ def lattice(shape: ObjectShape, spacing_m: float = SPACING_M) -> Lattice:
         nodes_m=nodes.astype(np.float32),
         tets=tets.astype(np.int32),
         mass_fraction=(shares / shares.sum()).astype(np.float32),
-        spacing_m=spacing_m,
+        spacing_m=SPACING_M,
     )
 
 

@@ -106,13 +106,10 @@ class _State:
 
     def pose(self, view: int, T_base_camera: Float[np.ndarray, "4 4"]) -> np.ndarray:
         """Where a view's camera is now thought to be."""
-        T = np.eye(4)
-        T[:3, :3] = se3.rotation_from_vector(self.moves[view, 3:])
-        T[:3, 3] = self.pivot - T[:3, :3] @ self.pivot + self.moves[view, :3]
-        mount = np.eye(4)
-        mount[:3, :3] = se3.rotation_from_vector(self.errors[self.sensors[view], 3:6])
-        mount[:3, 3] = self.errors[self.sensors[view], :3]
-        return np.asarray(T @ T_base_camera @ mount)
+        shift_m, turn = np.split(self.moves[view], 2)
+        R, mount = se3.rotation_from_vector(turn), self.errors[self.sensors[view]]
+        T = se3.from_rotation(R, self.pivot - R @ self.pivot + shift_m)
+        return np.asarray(T @ T_base_camera @ se3.small_motion(np.r_[mount[3:6], mount[:3]]))
 
     def deeper(self, view: int, points: Float[np.ndarray, "num_points 3"]) -> np.ndarray:
         """Points of a view, in its camera's frame, with the depth as it is now thought to be."""

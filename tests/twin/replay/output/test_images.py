@@ -262,7 +262,6 @@ def test_a_video_has_the_frames_and_what_does_not_go_together_is_refused(
         ({"depth": True}, "--out FOLDER"),
         ({"size": "big"}, "write WIDTHxHEIGHT"),
         ({"compare": True}, "leave out --eye and --size"),
-        ({"object": ("cup=0,0,0",)}, "the scene has no object 'cup'"),
         ({"episode": "trial_9"}, "no episode 'trial_9'.*trial_0001"),
         ({"eye": None}, "belong together"),
     ):

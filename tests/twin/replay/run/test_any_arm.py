@@ -25,7 +25,6 @@ from bridge.episode.streams import JointTrack
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.media.color import decode_color
 from bridge.robots.robot import Robot, read_robot
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.verdict import Verdict
@@ -36,11 +35,14 @@ from twin.replay.path import UnusablePlanError
 from twin.replay.scene import ReplayScene, StartState, StartStates
 from twin.replay.verdict import replay_plan
 from twin.robot.model import load_robot
+from twin.robot.posture import Posture
 from twin.robot.surface import link_surfaces
 from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
 from twin.scene.localise.episode import Phase
+from twin.scene.movable_scene import read_movable_scene
+from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.robot.splats import write_links
-from twin.scene.store.folder import background_hash, write_record
+from twin.scene.store.folder import background_hash, read_scene, write_record
 
 T0 = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -316,18 +318,17 @@ def gate_verdict(run: RunFolder, plan: Plan, scene: ReplayScene) -> Verdict:
 
 def check_picture(run: RunFolder, scene: ReplayScene) -> None:
     """The hand is seen where forward kinematics has it, in two postures that look different."""
-    robot = load_robot(scene.urdf)
-    T, out = T_base_side(scene), run.results_dir / "arm.png"
-    eye, target = ([str(value) for value in p] for p in (T[:3, 3], T[:3, 3] + T[:3, 2]))
-    view = ["--eye", *eye, "--target", *target]
+    robot, rasteriser = load_robot(scene.urdf), Rasteriser()
+    parts = read_movable_scene(run, read_scene(run))
     images = []
     for turned_rad in (0.0, 0.6):
         joints = robot.home_rad.copy()
         joints[0] += turned_rad
-        angles = [str(value) for value in joints]
-        words = ["render", str(run.path), "--out", str(out), "--quiet", *view]
-        assert robot_gst.run([*words, "--joints", *angles]) == 0
-        images.append(decode_color(out.read_bytes()).astype(int))
+        posture = Posture(joints_rad=joints, width_m=0.0)
+        drawn = parts.draw(
+            rasteriser, parts.at({}, posture, scene.urdf), CAMERA, T_base_side(scene)
+        )
+        images.append(drawn.image_u8.astype(int))
         row, column = seen_from(scene, robot.T_base_tcp(joints)[:3, 3])
         near = images[-1][row - 6 : row + 7, column - 6 : column + 7]
         assert (near[..., 2] - near[..., 0] > 60).sum() > 20

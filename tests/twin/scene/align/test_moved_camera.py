@@ -13,7 +13,6 @@ from twin.scene.align.moved_camera import MOVED_M, MOVED_RAD, MovedCamera, moved
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.settings import InitialiseConfig
 
 CAMERA = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
@@ -34,23 +33,21 @@ def seen_from(T_base_camera: np.ndarray, index: int = 0) -> RgbdFrame:
 
 
 def bumped_by(shift_m: tuple[float, ...], turn_deg: tuple[float, ...]) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = se3.rotation_from_vector(np.radians(turn_deg)), shift_m
-    return T
+    return se3.small_motion(np.array([*np.radians(turn_deg), *shift_m]))
 
 
 @pytest.fixture(scope="module")
 def background() -> GaussianCloud:
     frames = [seen_from(textured_room.camera_pose(index, 7), index) for index in range(7)]
     points = [FrameSurface(frame, LIMITS).points() for frame in frames]
-    return fuse(points, InitialiseConfig(max_splats=40_000, growth=0.0))
+    return fuse(points, 40_000)
 
 
 def compared(background: GaussianCloud, bump: np.ndarray) -> MovedCamera | None:
     """What is said of a camera that was bumped, and whose poses are as before."""
     said = textured_room.camera_pose(2, 5)
     frame = replace(seen_from(said @ bump), T_base_color=said, T_base_depth=said)
-    return moved_camera([frame], background, threads=1)
+    return moved_camera([frame], background)
 
 
 def test_a_camera_that_stands_where_it_stood_is_left_alone(background: GaussianCloud) -> None:
@@ -83,7 +80,7 @@ def test_a_camera_before_another_room_is_lost_and_said_to_be(background: Gaussia
         depth_m=np.full((240, 320), 0.45, dtype=np.float32),
         image_u8=np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8),
     )
-    moved = moved_camera([other], background, threads=1)
+    moved = moved_camera([other], background)
     assert moved is not None
     assert moved.T_posed_true is None
     assert "scan again" in moved.describe("side")

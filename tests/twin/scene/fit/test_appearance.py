@@ -12,7 +12,6 @@ from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 from twin.scene.harmonics import harmonic_terms
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.settings import InitialiseConfig
 
 Room = tuple[gaussians.GaussianCloud, list[appearance.ImageObservation]]
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
@@ -23,9 +22,7 @@ GAINS = np.array([[1.1, 0.9, 1.0], [0.8, 1.2, 1.05], [1.1, 0.9, 0.95]])
 def room() -> Room:
     """Sixty Gaussians and three half-size images, each with a hole and a brightness of its own."""
     surfaces = [FrameSurface(textured_room.frame(i, 3), LIMITS) for i in range(3)]
-    cloud = fuse(
-        [surface.points() for surface in surfaces], InitialiseConfig(max_splats=80, growth=0.25)
-    )
+    cloud = fuse([surface.points() for surface in surfaces], 60)
     observations = []
     for index, surface in enumerate(surfaces):
         view = training_view(surface)

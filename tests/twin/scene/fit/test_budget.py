@@ -13,7 +13,7 @@ from twin.scene.fit.optimise import APPEARANCE_STEPS, FitResult, fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import FitSession, Rasteriser
-from twin.scene.settings import FitConfig, InitialiseConfig
+from twin.scene.settings import FitConfig
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 BUDGET = FitConfig(budget_s=10.0, threads=1)
@@ -53,7 +53,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> DrawingClock:
 @pytest.fixture(scope="module")
 def room() -> tuple[GaussianCloud, list[TrainingView]]:
     surfaces = [FrameSurface(textured_room.frame(i, 4), LIMITS) for i in range(4)]
-    start = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=200))
+    start = fuse([surface.points() for surface in surfaces], 100)
     return start, [training_view(surface) for surface in surfaces]
 
 

@@ -14,10 +14,9 @@ from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud, concatenate
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.settings import InitialiseConfig
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
-CONFIG = InitialiseConfig(max_splats=20_000, completion=0.5)
+MOST = 10_000
 RASTER = RasterConfig(threads=1)
 HOLE_M, RADIUS_M = np.array([0.0, 0.1]), 0.12
 
@@ -33,7 +32,7 @@ def with_hole(frame: RgbdFrame) -> RgbdFrame:
 def scanned() -> tuple[GaussianCloud, list[TrainingView], RgbdFrame]:
     frames = [textured_room.frame(index, 9) for index in range(9)]
     surfaces = [FrameSurface(with_hole(f), LIMITS) for k, f in enumerate(frames) if k != 4]
-    cloud = fuse([surface.points() for surface in surfaces], CONFIG)
+    cloud = fuse([surface.points() for surface in surfaces], MOST)
     return cloud, [training_view(surface) for surface in surfaces], frames[4]
 
 
@@ -46,7 +45,7 @@ def test_a_hole_is_closed_at_its_true_distance_and_in_a_view_that_taught_nothing
     scanned: tuple[GaussianCloud, list[TrainingView], RgbdFrame],
 ) -> None:
     cloud, views, held_out = scanned
-    added = complete_holes(cloud, views, CONFIG, RASTER)
+    added = complete_holes(cloud, views, MOST, RASTER)
     inside = np.linalg.norm(added.means_m[:, :2] - HOLE_M, axis=1) < RADIUS_M
     on_table = inside & (np.abs(added.means_m[:, 2]) < 0.1)
     assert on_table.sum() > 10
@@ -67,7 +66,7 @@ def test_what_was_measured_stays_visible(
 ) -> None:
     """Nothing new stands in the light of a measurement: each view still sees its depth."""
     cloud, views, _ = scanned
-    both = concatenate([cloud, complete_holes(cloud, views, CONFIG, RASTER)])
+    both = concatenate([cloud, complete_holes(cloud, views, MOST, RASTER)])
     shares = []
     for view in views:
         full = view.full

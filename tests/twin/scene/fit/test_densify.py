@@ -11,7 +11,6 @@ from twin.scene.fit.optimise import Scores, densify, score
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.settings import InitialiseConfig
 
 Room = tuple[GaussianCloud, list[ImageObservation]]
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
@@ -20,7 +19,7 @@ LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 @pytest.fixture(scope="module")
 def room() -> Room:
     surfaces = [FrameSurface(textured_room.frame(i, 3), LIMITS) for i in range(3)]
-    cloud = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=400))
+    cloud = fuse([surface.points() for surface in surfaces], 200)
     views = [training_view(surface) for surface in surfaces]
     return cloud, [
         ImageObservation(target=view.full, T_base_camera=view.T_base_color, gain=np.ones(3))

@@ -10,14 +10,13 @@ from twin.scene.fit.initialise import NoSurfaceError, fuse
 from twin.scene.frames import rgbd
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.settings import InitialiseConfig
 
 LIMITS = rgbd.DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 
 
-def room_cloud(config: InitialiseConfig) -> GaussianCloud:
+def room_cloud(most: int) -> GaussianCloud:
     surfaces = [rgbd.FrameSurface(textured_room.frame(i, 6), LIMITS) for i in range(6)]
-    return fuse([surface.points() for surface in surfaces], config)
+    return fuse([surface.points() for surface in surfaces], most)
 
 
 def test_points_lie_on_the_surfaces_and_carry_their_colour() -> None:
@@ -64,11 +63,11 @@ def test_depth_moves_to_the_colour_camera() -> None:
 
 @pytest.mark.parametrize("budget", [200, 1000])
 def test_the_budget_of_gaussians_is_kept(budget: int) -> None:
-    assert budget / 4 < len(room_cloud(InitialiseConfig(max_splats=budget))) <= budget
+    assert budget / 2 < len(room_cloud(budget)) <= budget
 
 
 def test_gaussians_lie_flat_on_their_surface() -> None:
-    cloud = room_cloud(InitialiseConfig(max_splats=800))
+    cloud = room_cloud(400)
     thin_axis = se3.rotation_from_quaternion(cloud.quats_wxyz.astype(np.float64))[..., 2]
     table = (np.abs(cloud.means_m[:, 2]) < 0.005) & (cloud.means_m[:, 1] < 0.4)
     assert np.median(np.abs(thin_axis[table, 2])) > 0.99
@@ -95,7 +94,7 @@ def test_views_that_disagree_make_one_surface_and_not_layers() -> None:
     surfaces = [rgbd.FrameSurface(registered_frame(i, f), LIMITS) for i, f in enumerate(factors)]
     points = [surface.points() for surface in surfaces]
     views = [rgbd.training_view(surface) for surface in surfaces]
-    layers, surface = fuse(points, InitialiseConfig()), fuse(points, InitialiseConfig(), views)
+    layers, surface = fuse(points, 30_000), fuse(points, 30_000, views)
     assert len(surface) < 0.9 * len(layers)
     height_m = {}
     for name, cloud in (("layers", layers), ("surface", surface)):
@@ -117,7 +116,7 @@ def test_frames_without_depth_are_refused() -> None:
     item = textured_room.frame(0, 1)
     empty = replace(item, depth_m=np.zeros_like(item.depth_m))
     with pytest.raises(NoSurfaceError, match="0 usable points"):
-        fuse([rgbd.FrameSurface(empty, LIMITS).points()], InitialiseConfig())
+        fuse([rgbd.FrameSurface(empty, LIMITS).points()], 30_000)
 
 
 @pytest.mark.parametrize("nothing", [np.nan, np.inf])

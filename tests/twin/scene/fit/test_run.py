@@ -11,7 +11,7 @@ from twin.scene.fit.optimise import fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud, arrays
 from twin.scene.raster.rasteriser import psnr_db
-from twin.scene.settings import FitConfig, InitialiseConfig
+from twin.scene.settings import FitConfig
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 ADAM_ALONE = FitConfig(iterations=1, threads=1)
@@ -21,9 +21,7 @@ ADAM_ALONE = FitConfig(iterations=1, threads=1)
 @pytest.fixture(scope="module")
 def room() -> tuple[GaussianCloud, list[TrainingView]]:
     surfaces = [FrameSurface(textured_room.frame(i, 4), LIMITS) for i in range(4)]
-    start = fuse(
-        [surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000, growth=0.25)
-    )
+    start = fuse([surface.points() for surface in surfaces], 750)
     return start, [training_view(surface) for surface in surfaces]
 
 

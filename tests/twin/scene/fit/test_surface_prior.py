@@ -8,7 +8,6 @@ from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import SurfacePrior
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.settings import InitialiseConfig
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 
@@ -16,7 +15,7 @@ LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 @pytest.fixture(scope="module")
 def room() -> tuple[GaussianCloud, list[TrainingView]]:
     surfaces = [FrameSurface(textured_room.frame(i, 4), LIMITS) for i in range(4)]
-    start = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000))
+    start = fuse([surface.points() for surface in surfaces], 500)
     return start, [training_view(surface) for surface in surfaces]
 
 

@@ -148,8 +148,6 @@ def test_bad_options_are_refused_before_anything_slow(tmp_path: Path) -> None:
         check_models(ModelConfig(segmenter="sam2:x", prompt=("box",)), None)
     with pytest.raises(WeightsError, match="no such folder"):
         check_models(ModelConfig(clip=str(tmp_path / "nothing")), None)
-    with pytest.raises(UsageError, match="--model-frames 0"):
-        ModelConfig(model_frames=0)
     with pytest.raises(UsageError, match="--prompt"):
         check_models(ModelConfig(segmenter="sam3:x"), None)
     assert check_models(ModelConfig(), None) == {}
@@ -220,7 +218,6 @@ def test_a_rebuild_asks_the_models_it_is_given(
         segmenter=f"sam3:{saved('sam3')}",
         prompt=("red cube",),
         clip=str(saved("clip")),
-        model_frames=3,
         device="cpu",
     )
     config = RebuildConfig(

@@ -92,15 +92,15 @@ def removed(name: str) -> Callable[[Path], None]:
         (set_text("config.json", "["), "not JSON"),
         (set_text("config.json", "[]"), "not an object"),
         (set_text("config.json", '{"model_type": "cat"}'), "type 'cat', not 'owl'"),
-        (removed("model.safetensors"), "no model.safetensors"),
+        (removed("model.safetensors"), "1 of 1 safetensors files are missing"),
         (removed("tokenizer.json"), "no tokenizer.json"),
         (pickled, "pytorch_model.bin, which can run code when opened"),
         (cut_short, "cut short"),
         (set_text("model.safetensors", "version 1 of a pointer"), "git-lfs pointer"),
         (set_text("model.safetensors", "abc"), "cut short"),
         (set_text("model.safetensors", "\x02\0\0\0\0\0\0\0[]"), "no safetensors file"),
-        (a_part_missing, "1 of 2 parts are missing, first model-2"),
-        (a_part_elsewhere, "no safetensors file of this folder"),
+        (a_part_missing, "1 of 2 safetensors files are missing, first 'model-2"),
+        (a_part_elsewhere, "1 of 1 safetensors files are missing, first '../model-1"),
     ],
 )
 def test_a_damaged_folder_is_refused_with_one_sentence_that_says_how(

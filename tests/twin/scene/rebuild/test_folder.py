@@ -172,7 +172,6 @@ def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(tmp_
         (lambda: settings.InitialiseConfig(flying_fraction=float("nan")), "--flying-fraction"),
         (lambda: settings.RenderConfig(at_s=float("nan")), "--at-s"),
         (lambda: settings.RenderConfig(out=Path("a.ply")), "background.ply"),
-        (lambda: settings.RenderConfig(width_m=-0.1), "--width-m"),
         (lambda: settings.RenderConfig(eye=(0.0, 0.0, float("nan"))), "--eye"),
     ],
 )

@@ -10,12 +10,11 @@ import textured_room
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
+from twin.robot.posture import Posture
 from twin.scene import gaussians
-from twin.scene import render as render_module
-from twin.scene.render import object_places, posture_of, render
+from twin.scene.render import render
 from twin.scene.robot.splats import write_links
 from twin.scene.settings import RenderConfig
 from twin.scene.store import folder
@@ -57,30 +56,6 @@ def rebuilt_once(rebuilt_once: Path, tmp_path_factory: pytest.TempPathFactory) -
     return run.path
 
 
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("cup=0,0,0", "no object 'cup'. It has: blob"),
-        ("blob", "is not a pose"),
-        ("blob=1,2", "is not a pose"),
-        ("blob=a,b,c", "is not a pose"),
-        ("blob=nan,0,0", "is not a pose"),
-        ("blob=0,0,0,0,0,0,0", "is not a pose"),
-    ],
-)
-def test_a_place_that_is_none_is_refused(text: str, found: str) -> None:
-    with pytest.raises(UsageError, match=found):
-        object_places([text], ["blob"])
-
-
-def test_joints_for_a_scene_without_robot_are_refused_in_one_sentence(
-    room: RunFolder, tmp_path: Path
-) -> None:
-    assert "no robot splats" in render(room, RenderConfig(out=tmp_path / "a.png"))["robot"]
-    with pytest.raises(UsageError, match="no robot splats"):
-        render(room, RenderConfig(out=tmp_path / "a.png", joints=HOME))
-
-
 def test_seconds_count_from_the_first_stamp_whenever_messages_arrived(
     room: RunFolder, tmp_path: Path
 ) -> None:
@@ -96,24 +71,20 @@ def test_seconds_count_from_the_first_stamp_whenever_messages_arrived(
 
 
 @pytest.fixture
-def with_robot(room: RunFolder, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
+def with_robot(room: RunFolder) -> RunFolder:
     scene = folder.read_scene(room)
     links = {"base_link": blob(1), "tool0": blob(2)}
     folder.write_record(room, {**scene.record, "robot": {"links": write_links(room, links)}})
-    urdf = ROBOT.urdf_text()
-    monkeypatch.setattr(render_module.streams, "robot_description", lambda _episode: urdf)
     return room
 
 
-def test_given_joints_move_the_hand_and_not_the_base(with_robot: RunFolder) -> None:
+def test_other_joints_move_the_hand_and_not_the_base(with_robot: RunFolder) -> None:
     episode = Episode.open(with_robot.episodes_dir / "scan.mcap")
-    trial = open_trial(with_robot, folder.read_scene(with_robot), episode)
+    parts = open_trial(with_robot, folder.read_scene(with_robot), episode).parts
 
     def robot(*joints: float) -> np.ndarray:
-        config = RenderConfig(joints=joints)
-        posture, urdf, words = posture_of(trial, episode.start_ns, config)
-        assert words == "joints given"
-        return trial.parts.at({}, posture, urdf).means_m[-120:]
+        posture = Posture(joints_rad=np.array(joints), width_m=0.0)
+        return parts.at({}, posture, ROBOT.urdf_text()).means_m[-120:]
 
     before, after = robot(*HOME), robot(HOME[0] + 0.5, *HOME[1:])
     np.testing.assert_allclose(after[:60], before[:60], atol=1e-6)
@@ -127,5 +98,3 @@ def test_a_robot_without_recorded_joints_is_left_out_with_a_reason(
 ) -> None:
     drawn = render(with_robot, RenderConfig(out=tmp_path / "a.png"))
     assert drawn["robot"].startswith("not drawn: ")
-    with pytest.raises(UsageError, match="--joints takes 6 angles"):
-        render(with_robot, RenderConfig(joints=(0.0, np.nan, 0.0, 0.0, 0.0, 0.0)))

@@ -24,7 +24,6 @@ from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 from twin.scene.gaussians import GaussianCloud, as_float32, moved_cloud
 from twin.scene.robot.extraction import RobotFrames, robot_mask
 from twin.scene.robot.splats import posed, read_links, write_links
-from twin.scene.settings import InitialiseConfig
 
 URDF = ROBOT.urdf_text()
 HOME = np.array([-0.26, -1.71, 1.37, -1.23, -1.57, 1.31])
@@ -204,7 +203,7 @@ def test_links_are_collected_over_postures_in_their_own_frames(episode: Episode)
     for joints, stamp in ((HOME, SECOND), (AWAY, 3 * SECOND)):
         surface = FrameSurface(frame_at(joints, stamp), limits)
         frames.take_out(episode, surface.frame, surface.points(), training_view(surface))
-    links = frames.links(InitialiseConfig(max_splats=8000, flying_fraction=0.1)).clouds
+    links = frames.links(8000).clouds
     assert {"upper_arm_link", "forearm_link"} <= set(links)
     robot = load_robot(URDF)
     third = HOME + 0.4 * (AWAY - HOME)
@@ -249,4 +248,4 @@ def test_an_episode_without_joints_is_passed_over_with_a_remark(tmp_path: Path) 
     same_points, same_view = frames.take_out(bare, item.frame, points, view)
     assert same_points is points
     assert same_view is view
-    assert frames.links(InitialiseConfig()).clouds == {}
+    assert frames.links(60_000).clouds == {}

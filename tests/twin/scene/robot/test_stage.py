@@ -20,7 +20,7 @@ from bridge.terminal import Output
 from twin.scene.dataset.training_set import read_training_set
 from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.robot.extraction import LitLinks, find_robot, write_robot
-from twin.scene.settings import FrameConfig, InitialiseConfig, RebuildConfig
+from twin.scene.settings import FrameConfig, RebuildConfig
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "align"))
 import cell_views
@@ -69,7 +69,7 @@ def test_in_the_robots_own_frame_its_links_are_collected(run: RunFolder) -> None
     training = read_training_set(choices, RebuildConfig(), QUIET)
     assert training.robot.alignment is None
     assert training.robot.remark == ""
-    links = training.robot.frames.links(InitialiseConfig())
+    links = training.robot.frames.links(60_000)
     assert {"base_link", "upper_arm_link"} <= set(links.clouds)
     record = write_robot(run, training.robot, links)["robot"]
     assert set(record["links"]) == set(links.clouds)
@@ -100,4 +100,4 @@ def test_without_joints_everything_stays_and_the_record_says_why(run: RunFolder)
     assert found.alignment is None
     assert "joint states" in found.remark
     assert "'room'" in found.remark
-    assert found.frames.links(InitialiseConfig()).clouds == {}
+    assert found.frames.links(60_000).clouds == {}

@@ -16,7 +16,6 @@ from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.semantics.lift import Viewpoint
-from twin.scene.settings import InitialiseConfig
 
 CAMERA = Camera(width=320, height=240, fx=285.0, fy=285.0, cx=160.0, cy=120.0)
 TABLE = 0
@@ -294,7 +293,7 @@ def make_world(
     train, held_out = shots[:num_train], shots[num_train:]
     limits = DepthLimits(max_depth_m=2.0, flying_fraction=0.03)
     clouds = [FrameSurface(shot.frame, limits).points() for shot in train]
-    cloud = fuse(clouds, InitialiseConfig(max_splats=60_000, growth=0.25))
+    cloud = fuse(clouds, 45_000)
     return World(pieces, names or TABLETOP_NAMES, train, held_out, cloud)
 
 

@@ -10,9 +10,9 @@ from table_scene import World, make_world, table
 from bridge.geometry import se3
 from twin.naming import scene_file
 from twin.naming.phrases import Asker
-from twin.scene.foundation.stage import find_things
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.semantics.describe import scene_by_default
 
 T_ABOVE = se3.transform_from(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.1, 0.02]))
 
@@ -26,11 +26,12 @@ def added(folder: Path, world: World, **options: object) -> dict[str, object]:
 def written(
     folder: Path, background: GaussianCloud, cube: GaussianCloud, world: World, **options: object
 ) -> dict[str, object]:
-    scene = find_things(
-        background,
-        {"red_cube": cube} if len(cube) else {},
+    cloud = concatenate([background, cube])
+    scene = scene_by_default(
+        cloud,
         [shot.viewpoint for shot in world.train],
-        rasteriser=Rasteriser(RasterConfig(threads=1)),
+        Rasteriser(RasterConfig(threads=1)),
+        known={"red_cube": np.arange(len(cloud)) >= len(background)} if len(cube) else {},
         **options,  # type: ignore[arg-type]
     )
     rows = {"background": len(background)} | ({"red_cube": len(cube)} if len(cube) else {})
