@@ -145,7 +145,9 @@ def _regret(results: Results) -> list[str]:
         return []
     name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
     if regret.value == 0:
-        return [f"The twin and the recorded rates both rank {name} first, which may be by chance."]
+        return [
+            f"The twin and the recorded rates both rank {name} first: chance alone may do that."
+        ]
     taken = "one of them by chance" if " or " in name else "its recorded rate"
     words = f"The twin ranks {name} first; {taken} is {_points(regret.value)}"
     return [f"{words}{_ends(regret, '.0f')} below the best over all tasks."]
@@ -254,7 +256,7 @@ def next_trials(results: Results) -> str:
         return f"{TAKE}for each task one that was not beaten there; none is best on all tasks."
     if not wanted:
         return GIVE_N if _lacks_n(results) else ""
-    more, pair = min(wanted)
+    (more, pair), *others = sorted(wanted)
     made = sum(m.n or 0 for m in results.measurements if m.id.startswith("rate.recorded."))
     if len({name for _, each in asked for name in each}) * more > TOO_MANY * made > 0:
         won = {str(row["candidate"]): _number(row["k"]) or 0.0 for row in standing}
@@ -265,7 +267,8 @@ def next_trials(results: Results) -> str:
         words = f"{words} {2 * more} more trials in all, which is seldom worth it."
         return f"{TAKE}{names[0]}{first} or {' or '.join(names[1:])}: {words}"
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
-    rest = f"; still open then: {len(wanted) - 1} more" if len(wanted) > 1 else ""
+    named = [" against ".join(_differing(each)[0]) for _, each in others[:SHOWN_ANSWERS]]
+    rest = f"; open then, too: {', '.join(named)}" if named else ""
     likely = "if what was seen stays, that is likely to tell these two apart"
     return f"{_more_trials(more, pair, tasks)}; {likely}{rest}."
 
@@ -356,7 +359,10 @@ def _followed(r: Measurement, num_groups: int) -> Against:
     elif r.interval.high < FOLLOWS_R:
         yield True, f"its rates hardly follow the recorded ones (r at most {r.interval.high:.2f})"
     elif r.interval.low <= 0:
-        yield False, f"how its rates follow the recorded ones is too uncertain (r{_ends(r, '.2f')})"
+        yield (
+            False,
+            f"how the twin's rates follow the recorded ones is too uncertain (r{_ends(r, '.2f')})",
+        )
 
 
 def _near(results: Results, bias: Measurement) -> Against:
@@ -371,7 +377,7 @@ def _near(results: Results, bias: Measurement) -> Against:
         which = "too high" if least > 0 else "too low" if most < 0 else "wrong"
         named = f" ({', '.join(bad)})" if off <= SHOWN_ANSWERS and many > 1 else ""
         yield 2 * off > many, f"{_of_tasks(off, many)}its rate is {which}{named}"
-    if open_ or not many:
+    if (open_ or not many) and any(row["low"] is not None for row in rows):
         where = _of_tasks(open_, many)
         yield False, f"{where}it may be off by more than {CLOSE_PP:.0f} points"
 
@@ -454,8 +460,8 @@ def _all_alike(results: Results) -> tuple[str, str]:
     told = f"{words} succeeded, {k} of {n} recorded {noun('trial', n)}; the rate lies between "
     told = f"{told}{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
     cannot = "Nothing to compare: there is one policy on one task; " if len(rates) == 1 else ""
-    few = f"{each} each task; to compare, of two policies or more; to judge the twin, of "
-    few = f"{few}{GROUPS_FOR_R} groups (policies times tasks) or more."
+    few = f"{each} each task; to compare, at least 2 policies; to judge the twin, at least "
+    few = f"{few}{GROUPS_FOR_R} groups (a group: one policy on one task)."
     why = f"while {words} succeeds, no policy can be shown to be better"
     alike = f"check how success is scored; if that is right, {each} {task} task: {why}."
     return (cannot or "Cannot be told: ") + told, few if n < SAYS_LITTLE else alike

@@ -124,7 +124,7 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     words = (
         "make 1 more trial of C and 1 of B; if what was seen stays, that is likely to tell these "
     )
-    assert next_trials(results) == f"{words}two apart; still open then: 1 more."
+    assert next_trials(results) == f"{words}two apart; open then, too: A against B."
     made = Measurement(id="rate.recorded.a", value=0.5, unit="1", definition="d", k=1, n=2)
     few = replace(table, rows=(compared(ALL_TASKS, "A", "no", 4),))
     told = next_trials(replace(results, tables=(few,), measurements=(made,)))
