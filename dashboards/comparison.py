@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bridge.episode.run_folder import RunFolder
-from dashboards.loading import LOADING
 from evaluator.cache import FOLDER, SummaryCache
+from evaluator.compare import Comparison, compare_run
+from evaluator.report.review import refresh
 from evaluator.result import Exclusion, Measurement, Results, load_results
 from evaluator.review_index import (
     RESULTS,
@@ -24,9 +25,6 @@ from evaluator.review_index import (
     state_of,
 )
 from evaluator.trial_row import TrialRow
-
-if TYPE_CHECKING:
-    from evaluator.compare import Comparison
 
 WAITED_FOR = 3_000
 """Files of a run that a page waits for; a larger run is brought up to date behind the page."""
@@ -94,7 +92,7 @@ class Judgement:
         return _results(self.run, stamp_of(self.run.path / RESULTS)) if self.has_results else None
 
     @property
-    def comparison(self) -> "Comparison | None":
+    def comparison(self) -> Comparison | None:
         """Everything the evaluator finds now, for pages that ask it more; None where it cannot."""
         if self.index is None or self.comparison_reason is not None:
             return None
@@ -128,10 +126,7 @@ def _results(run: RunFolder, _stamp: str) -> Results:
 
 
 @lru_cache(maxsize=2)
-def _comparison(run: RunFolder, _state: str) -> "Comparison":
-    with LOADING:
-        from evaluator.compare import compare_run  # noqa: PLC0415  # loads the evaluator
-
+def _comparison(run: RunFolder, _state: str) -> Comparison:
     with SummaryCache(run.results_dir / FOLDER) as cache:
         return compare_run(run, cache=cache)
 
@@ -167,9 +162,6 @@ def judge(run: RunFolder) -> Judgement:
         if state.num_files > WAITED_FOR:
             is_read = _update_behind(run, known, state)
             return Judgement(run=run, index=index, is_old=True, is_being_updated=is_read)
-        with LOADING:
-            from evaluator.report.review import refresh  # noqa: PLC0415  # loads the evaluator
-
         known.unwritten, known.tried = refresh(run), state.digest
         return Judgement(run=run, index=_open(run, known))
 

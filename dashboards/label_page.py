@@ -20,9 +20,9 @@ from dashboards.comparison import Judgement
 from dashboards.episode_page import CameraView
 from dashboards.frames import RENDERED
 from dashboards.library import episode_path
-from dashboards.loading import LOADING
 from dashboards.queue_page import is_label, main_camera, recorded_trials
 from dashboards.recording import PageClock, read_recording
+from evaluator.compare.raters import with_reviews
 from evaluator.result import Table
 
 CAUSES = (
@@ -260,9 +260,6 @@ def summarise(
     tables: tuple[Table, ...] = ()
     missing: tuple[str, ...] = ()
     if released and judgement.comparison is not None:
-        with LOADING:
-            from evaluator.compare.raters import with_reviews  # noqa: PLC0415  # loads the evaluator
-
         before = judgement.comparison
         after = with_reviews(before, found)
         tables = tuple(table for table in after.tables if table.id in TABLES)

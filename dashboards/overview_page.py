@@ -15,8 +15,10 @@ from typing import Any
 from bridge.episode.run_folder import RunFolder
 from dashboards import wording
 from dashboards.comparison import Judgement
-from dashboards.figures import RateGroup, Scatter, scatter
-from evaluator.report.wording import SIM_SIDE, agreeing_side
+from evaluator.compare.rows import RateGroup
+from evaluator.report.figures import Drawing, scatter
+from evaluator.report.views import shown_word
+from evaluator.report.wording import SIM_SIDE, agreeing_side, method_text
 from evaluator.result import Exclusion, Measurement
 from evaluator.review_index import (
     FACETS,
@@ -24,7 +26,7 @@ from evaluator.review_index import (
     IndexedFile,
     Selection,
 )
-from evaluator.trial_row import TrialRow
+from evaluator.trial_row import RECORDED_WORDS, TrialRow
 
 PAGE = 50
 """Trials on one screen."""
@@ -126,10 +128,12 @@ def _card(title: str, pattern: str, below: Sequence[str], judgement: Judgement) 
     if found is None:
         return Card(title=title, value="missing", detail=NO_RESULTS, state="missing")
     more = [_find(other, judgement.measurements) for other in below]
+    is_counted = found.value is not None and found.k is not None  # a share hides how few there are
+    rests_on = wording.evidence(found)
     return Card(
         title=title,
-        value=wording.headline(found),
-        detail=wording.headline_evidence(found),
+        value=f"{found.k} of {found.n}" if is_counted else wording.measured(found),
+        detail=f"{wording.measured(found)}, {rests_on}" if is_counted else rests_on,
         definition=found.definition,
         ids=tuple(m.id for m in (found, *more) if m is not None),
         state="undefined" if found.value is None else "defined",
@@ -217,31 +221,28 @@ def rate_groups(measurements: Sequence[Measurement]) -> list[RateGroup]:
     """Collect the groups that have both rates; over the same trials where trials are known."""
     found = []
     over_same_trials = _rates(measurements, "rate_common")
-    for group, by_side in (over_same_trials or _rates(measurements)).items():
-        if "recorded" not in by_side or SIM_SIDE not in by_side:
-            continue
-        task, condition, policy = _names_of(group)
-        found.append(
-            RateGroup(
-                label=", ".join(p.replace("_", " ") for p in (task, condition, policy) if p),
-                series=" ".join(p.replace("_", " ") for p in (task, policy) if p),
-                task=task,
-                condition=condition,
-                policy=policy,
-                filled=condition.startswith("with_"),
-                replayed=by_side[SIM_SIDE],
-                recorded=by_side["recorded"],
+    for group, rates in (over_same_trials or _rates(measurements)).items():
+        if "recorded" in rates and SIM_SIDE in rates:
+            task, condition, policy = _names_of(group)
+            found.append(
+                RateGroup(
+                    task=task,
+                    condition=condition,
+                    policy=policy,
+                    unit="",
+                    recorded=rates["recorded"],
+                    sim=rates[SIM_SIDE],
+                    recorded_rate=None,
+                    sim_rate=None,
+                )
             )
-        )
     return found
 
 
 def methods(measurements: Sequence[Measurement], start: str) -> str:
     """Name the interval methods of the measurements whose id starts so."""
     named = [
-        wording.method(m.interval)
-        for m in measurements
-        if m.id.startswith(start) and m.interval is not None
+        method_text(m) for m in measurements if m.id.startswith(start) and m.interval is not None
     ]
     return "; ".join(dict.fromkeys(named))
 
@@ -316,7 +317,7 @@ class Overview:
     cards: tuple[Card, ...]
     has_headline: bool
     """Whether at least one card has a value or a reason."""
-    scatter: Scatter | None
+    scatter: Drawing | None
     more_groups: int
     """Groups that are not drawn."""
     rates: RateTable | None
@@ -355,8 +356,10 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
     about = judgement.about
     numbers = judgement.measurements
     cards = headline_cards(judgement)
-    groups = [g for g in rate_groups(numbers) if _is_drawable(g)]
-    drawn = sorted(groups, key=lambda g: not _takes(selection, g))[:MOST_GROUPS]
+    groups = [
+        g for g in rate_groups(numbers) if selection.takes_group(g.task, g.condition, g.policy)
+    ]
+    drawn, word = groups[:MOST_GROUPS], shown_word(RECORDED_WORDS[judgement.stand_in])
     others, num_others, kinds = _others(judgement)
     broken, num_broken = _broken(judgement)
     tasks = about.get("tasks", [])
@@ -371,7 +374,7 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         close_pp=about.get("close_pp", 0.0),
         cards=cards,
         has_headline=any(card.state != "missing" for card in cards),
-        scatter=scatter([g for g in groups if g in drawn]),
+        scatter=scatter(drawn, word),
         more_groups=len(groups) - len(drawn),
         rates=rate_table(numbers, selection),
         twin_failures=_failures(failures, twin=True),
@@ -396,14 +399,6 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         is_old=judgement.is_old,
         is_being_read=judgement.is_being_updated,
     )
-
-
-def _is_drawable(group: RateGroup) -> bool:
-    return group.replayed.value is not None and group.recorded.value is not None
-
-
-def _takes(selection: Selection, group: RateGroup) -> bool:
-    return selection.takes_group(group.task, group.condition, group.policy)
 
 
 def _failures(table: Sequence[Sequence[Any]], *, twin: bool) -> tuple[Failure, ...]:

@@ -59,8 +59,9 @@ class Drawing:
     def inline(self) -> str:
         """For a page that defines the colours; its ids start with the figure's."""
         attributes = f'role="img" aria-labelledby="{self.id}-title {self.id}-alt"'
-        style = '<g style="font:12px var(--figure-font)">'
-        return self._written(attributes, style, {name: f"var(--{name})" for name in LIGHT})
+        style = '<g font-size="12" font-family="var(--figure-font)">'
+        meant = {name: f"var(--{NAMES.get(name, name)})" for name in LIGHT}
+        return self._written(attributes, style, meant)
 
     def _written(self, attributes: str, style: str, colours: dict[str, str]) -> str:
         body = "\n".join(self.marks)

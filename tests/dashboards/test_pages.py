@@ -14,6 +14,8 @@ from dashboards.app import create_app
 from dashboards.errors import NotHereError
 from dashboards.guard import COOKIE, Admission
 from dashboards.library import Library, derived_path, episode_path
+from evaluator.compare import compare_run
+from evaluator.report.figures import drawings_of
 from evaluator.result import load_results
 
 
@@ -28,6 +30,18 @@ def test_the_overview_shows_the_numbers_of_results_json(
     assert "2 groups; it needs at least 3" in text
     assert "95 % Wilson" in text
     assert "Stand-in cell" in text
+
+
+def test_the_first_page_draws_the_rates_as_the_report_does(
+    browser: Any, shared_run: RunFolder
+) -> None:
+    drawn = next(each for each in drawings_of(compare_run(shared_run)) if each.id == "scatter")
+    page = browser.get("/").text
+    assert drawn.inline.count("<circle") == 2
+    shown = page[page.index('<svg class="fig"') :]
+    assert shown[: shown.index("</svg>")].count("<circle") == 2
+    for mark in drawn.marks:
+        assert mark.partition("fill=")[0].partition("stroke=")[0] in shown
 
 
 def test_disagreements_come_first_and_outcomes_have_words(browser: Any) -> None:
