@@ -183,8 +183,9 @@ class Pages:
     def overview(self, request: Request) -> Response:
         """``/``: agreement of twin and recording, and every trial."""
         run = self._run(request)
-        selection = Selection.of(request.query_params)
-        return self._page("overview.html", request, page=build_overview(run, judge(run), selection))
+        known = judge(run)
+        page = build_overview(run, known, Selection.of(request.query_params))
+        return self._page("overview.html", request, page=page, known=known)
 
     def numbers(self, request: Request) -> Response:
         """``/numbers``: every measurement of the evaluation."""
@@ -264,7 +265,8 @@ class Pages:
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""
         run = self._run(request)
-        return self._page("twin.html", request, page=build_twin(run, judge(run)))
+        known = judge(run)
+        return self._page("twin.html", request, page=build_twin(run, known), known=known)
 
     def twin_image(self, request: Request) -> Response:
         """``/twin/<file>/<side>/<camera>?stamp=``: one held-out image."""

@@ -13,7 +13,7 @@ from bridge.episode.run_folder import RunFolder
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare import Comparison, compare_run
 from evaluator.report.review import refresh
-from evaluator.result import Exclusion, Measurement, Results, load_results
+from evaluator.result import Measurement, Results, load_results
 from evaluator.review_index import (
     RESULTS,
     ReviewIndex,
@@ -32,6 +32,9 @@ IMPORTED = "imported"
 """Kind of an episode that is a motion from elsewhere."""
 RENDERS = "image."
 """Begins the ids of numbers about folders of renders."""
+LISTS = ("exclusions", "missing", "answers", "notes", "tasks", "failures", "tables")
+NOTHING: dict[str, Any] = {**dict.fromkeys(LISTS, ()), "num_exclusions": 0}
+"""What an index says at least."""
 LOOKED_AT_S = 5.0
 """A larger run's files are looked at again after this; its folders at each page."""
 
@@ -51,7 +54,7 @@ class Judgement:
     @property
     def about(self) -> dict[str, Any]:
         """What the index says besides trials and files."""
-        return {} if self.index is None else self.index.about
+        return NOTHING | ({} if self.index is None else self.index.about)
 
     @property
     def has_results(self) -> bool:
@@ -80,11 +83,6 @@ class Judgement:
     def measurements(self) -> tuple[Measurement, ...]:
         """The numbers of ``results.json``; none before ``robot-gst evaluate``."""
         return () if self.index is None else self.index.measurements
-
-    @property
-    def exclusions(self) -> tuple[Exclusion, ...]:
-        """The first of what was left out, and why."""
-        return tuple(Exclusion(**item) for item in self.about.get("exclusions", ()))
 
     @property
     def results(self) -> Results | None:

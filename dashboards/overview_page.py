@@ -8,7 +8,7 @@ Measurements are chosen by id; nothing is computed. Rates are ``rate.<side>.<gro
 import re
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +19,12 @@ from evaluator.compare.rows import RateGroup
 from evaluator.report.figures import Drawing, scatter
 from evaluator.report.views import shown_word
 from evaluator.report.wording import SIM_SIDE, agreeing_side, method_text
-from evaluator.result import Exclusion, Measurement
+from evaluator.result import Measurement
 from evaluator.review_index import (
     FACETS,
     NO_RESULTS,
     IndexedFile,
+    ReviewIndex,
     Selection,
 )
 from evaluator.trial_row import RECORDED_WORDS, TrialRow
@@ -307,13 +308,9 @@ class Overview:
     """Everything the first page needs."""
 
     selection: Selection
-    stand_in: bool | None
-    answers: list[tuple[str, str]]
-    notes: tuple[tuple[str, str], ...]
     tasks: tuple[Mapping[str, str], ...]
     """Task, its slug, answer and sentence."""
     more_tasks: int
-    close_pp: float
     cards: tuple[Card, ...]
     has_headline: bool
     """Whether at least one card has a value or a reason."""
@@ -329,22 +326,12 @@ class Overview:
     kinds: tuple[tuple[str, int], ...]
     broken: tuple[IndexedFile, ...]
     num_broken: int
-    tables: tuple[Mapping[str, Any], ...]
-    """Of a run without trials: what the evaluator says of it."""
     undefined: tuple[Undefined, ...]
     num_undefined: int
-    num_numbers: int
-    exclusions: tuple[Exclusion, ...]
-    num_exclusions: int
-    missing: tuple[str, ...]
     notices: tuple[str, ...]
     outdated: str | None
     """A message that the numbers are older than the run, naming the first that differs."""
     next_command: str | None
-    has_methods: bool
-    """Whether renders of methods were compared."""
-    is_old: bool
-    is_being_read: bool
 
 
 def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -> Overview:
@@ -362,16 +349,12 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
     drawn, word = groups[:MOST_GROUPS], shown_word(RECORDED_WORDS[judgement.stand_in])
     others, num_others, kinds = _others(judgement)
     broken, num_broken = _broken(judgement)
-    tasks = about.get("tasks", [])
-    failures = about.get("failures", [])
+    tasks = about["tasks"]
+    failures = about["failures"]
     return Overview(
         selection=selection,
-        stand_in=judgement.stand_in,
-        answers=about.get("answers", []),
-        notes=tuple((name, text) for name, text in about.get("notes", [])),
         tasks=tuple(tasks[:MOST_TASKS]),
         more_tasks=max(0, len(tasks) - MOST_TASKS),
-        close_pp=about.get("close_pp", 0.0),
         cards=cards,
         has_headline=any(card.state != "missing" for card in cards),
         scatter=scatter(drawn, word),
@@ -385,19 +368,11 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         kinds=kinds,
         broken=broken,
         num_broken=num_broken,
-        tables=tuple(about.get("tables", [])),
         undefined=undefined(numbers),
         num_undefined=sum(number.value is None for number in numbers),
-        num_numbers=len(numbers),
-        exclusions=judgement.exclusions,
-        num_exclusions=about.get("num_exclusions", 0),
-        missing=tuple(about.get("missing", ())),
         notices=_notices(judgement),
         outdated=_outdated(judgement),
         next_command=_next_command(run, judgement),
-        has_methods=judgement.has_methods,
-        is_old=judgement.is_old,
-        is_being_read=judgement.is_being_updated,
     )
 
 
@@ -424,20 +399,24 @@ def trial_list(judgement: Judgement, selection: Selection) -> TrialList:
     selected, of = index.count(selection), index.count(Selection())
     pages = max(1, -(-selected // PAGE))
     page = min(selection.page_number, pages)
-    facets = []
-    for name in FACETS:
-        found = index.values(name) if of else ()
-        if len(found) > 1:
-            labelled = [(value, f"{_words(label)} ({count})") for value, label, count in found]
-            facets.append(Facet(name=name, values=(("", "all"), *labelled[:MOST_VALUES])))
     return TrialList(
         trials=index.trials(selection, limit=PAGE, offset=PAGE * (page - 1)),
         selected=selected,
         of=of,
         page=page,
         pages=pages,
-        facets=tuple(facets),
+        facets=tuple(group_facets(index, counted=True)) if of else (),
     )
+
+
+def group_facets(index: ReviewIndex, *, counted: bool) -> Iterator[Facet]:
+    """Task, condition and policy to choose from; ``counted`` says how many trials each has."""
+    for name in FACETS:
+        found = index.values(name)
+        if len(found) > 1:
+            counts = [f" ({count})" if counted else "" for _, _, count in found]
+            labelled = [(v[0], _words(v[1]) + n) for v, n in zip(found, counts, strict=True)]
+            yield Facet(name=name, values=(("", "all"), *labelled[:MOST_VALUES]))
 
 
 def _words(label: str) -> str:

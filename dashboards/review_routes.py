@@ -48,12 +48,13 @@ class _ReviewPages:
         number = query.get("page", "1")
         page = build_queue(
             run,
-            judge(run),
+            known := judge(run),
             readable_reviews(run.path),
             show=query.get("show", ""),
             page=int(number) if number.isascii() and number.isdigit() and len(number) < 9 else 1,
         )
-        return self._page("queue.html", request, page=page, shows=SHOW, sets=labels.SETS)
+        shown = {"page": page, "known": known, "shows": SHOW, "sets": labels.SETS}
+        return self._page("queue.html", request, **shown)
 
     def thumbnail(self, request: Request) -> Response:
         """``/queue/thumbnail/<id>``: the moment of its divergence."""

@@ -83,8 +83,9 @@ class StudyPages:
     def failures(self, request: Request) -> Response:
         """``/failures?cause=&stage=&bodies=&start=&by=``: what goes wrong, and its pictures."""
         run = self._run(request)
-        found = build_failures(run, judge(run), FailureSelection.of(request.query_params))
-        return self._page("failures.html", request, page=found, part_words=PART_WORDS)
+        known = judge(run)
+        found = build_failures(run, known, FailureSelection.of(request.query_params))
+        return self._page("failures.html", request, page=found, known=known, part_words=PART_WORDS)
 
     def picture(self, request: Request) -> Response:
         """``/failures/picture/<id>``: a trial at its moment, recorded beside twin."""
