@@ -17,7 +17,7 @@ from bridge.exchange.reviews import (
     saved_review,
 )
 from dashboards.comparison import Judgement
-from dashboards.episode_page import CameraView
+from dashboards.episode_page import CameraView, camera_view
 from dashboards.frames import RENDERED
 from dashboards.library import episode_path
 from dashboards.queue_page import is_label, main_camera, recorded_trials
@@ -168,14 +168,7 @@ def build_label_page(
         done=len(rated_by(reviews, rater) & set(order)),
         task=recording.info.task or "",
         instruction=recording.info.instruction or "",
-        cameras=tuple(
-            CameraView(
-                id=track.camera_id,
-                times_s=tuple(round(clock.seconds(stamp), 3) for stamp in track.stamps_ns),
-                shown_s=round(clock.seconds(track.stamps_ns[-1]), 3),
-            )
-            for track in tracks
-        ),
+        cameras=tuple(camera_view(track, clock, end) for track in tracks),
         main=main_camera(path).camera_id if tracks else "",
         strip_s=tuple(end * index / (STRIP - 1) for index in range(STRIP)) if tracks else (),
         end_s=end,

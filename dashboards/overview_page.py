@@ -84,7 +84,6 @@ class Card:
     state: str
     """defined, undefined or missing."""
     definition: str = ""
-    ids: tuple[str, ...] = ()
     more: tuple[str, ...] = ()
 
 
@@ -136,7 +135,6 @@ def _card(title: str, pattern: str, below: Sequence[str], judgement: Judgement) 
         value=f"{found.k} of {found.n}" if is_counted else wording.measured(found),
         detail=f"{wording.measured(found)}, {rests_on}" if is_counted else rests_on,
         definition=found.definition,
-        ids=tuple(m.id for m in (found, *more) if m is not None),
         state="undefined" if found.value is None else "defined",
         more=tuple(_small(m) for m in more if m is not None),
     )
