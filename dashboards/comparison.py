@@ -33,7 +33,7 @@ IMPORTED = "imported"
 RENDERS = "image."
 """Begins the ids of numbers about folders of renders."""
 LISTS = ("exclusions", "missing", "answers", "notes", "tasks", "failures", "tables")
-NOTHING: dict[str, Any] = {**dict.fromkeys(LISTS, ()), "num_exclusions": 0}
+NOTHING: dict[str, Any] = {**dict.fromkeys(LISTS, ()), "num_exclusions": 0, "close_pp": 0.0}
 """What an index says at least."""
 LOOKED_AT_S = 5.0
 """A larger run's files are looked at again after this; its folders at each page."""
@@ -78,6 +78,11 @@ class Judgement:
             return False
         files, _ = self.index.files(broken=False)
         return any(file.kind == IMPORTED and file.task for file in files)
+
+    @property
+    def only_a_table(self) -> bool:
+        """Whether the results are of a table: there is no recording."""
+        return self.has_results and not self.has_methods and not self.run.episodes()
 
     @property
     def measurements(self) -> tuple[Measurement, ...]:

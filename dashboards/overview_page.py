@@ -469,9 +469,7 @@ def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
         return f"robot-gst evaluate {path}"
     trials, recorded, replayed = judgement.index.totals()
     if not trials and next(run.episodes_dir.glob("*.mcap"), None) is None:
-        if judgement.has_methods:
-            return None
-        return f"robot-gst record {path}"
+        return None if judgement.has_results else f"robot-gst record {path}"
     if recorded and not replayed:
         has_scene = (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap"))
         return f"robot-gst {'replay' if has_scene else 'rebuild'} {path}"

@@ -156,7 +156,7 @@ def build_queue(
         counts={name: len(rows) for name, rows in chosen.items()},
         page=page,
         num_pages=num_pages,
-        only_from_table=not chosen[""] and bool(judgement.rows),
+        only_from_table=not chosen[""] and (bool(judgement.rows) or judgement.only_a_table),
         problems=tuple(problems),
     )
 

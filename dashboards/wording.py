@@ -51,10 +51,10 @@ SHORT = 24
 
 
 def breakable(text: str) -> Markup:
-    """Let a long name break behind its joints, so that it never widens a page."""
+    """Let a long name break behind its joints, so that it never widens a page; a number stays."""
     if len(text) <= SHORT:
         return escape(text)
-    return Markup("<wbr>").join(re.split(r"(?<=[_./-])(?=\w)", text))
+    return Markup("<wbr>").join(re.split(r"(?<=[^\W\d][_./-])(?=\w)", text))
 
 
 def length_text(length_m: float | None) -> str:

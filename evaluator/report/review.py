@@ -104,7 +104,9 @@ def _write(
         "as_of_ns": read.began_ns,
         "changed_meanwhile": state.newest_ns >= read.began_ns,
         "comparison_reason": read.reason,
-        "outdated": None if is_new or not results or read.reason else _outdated(run, read.rows),
+        "outdated": None
+        if is_new or not results or read.reason or results.source != "run"
+        else _outdated(run, read.rows),
         "results_reason": none,
         "stand_in": stand_in_of(row.stand_in for row in read.rows)
         if results is None or results.stand_in is None

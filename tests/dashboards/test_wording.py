@@ -25,6 +25,11 @@ def test_a_chance_of_success_is_counts_and_whole_percentages() -> None:
     assert plain(wording.success_share(said)) == "4 of 4 varied replays succeed, 51 to 100 %"
 
 
+def test_a_name_breaks_at_its_joints_and_a_number_never() -> None:
+    shown = wording.breakable("gripper_left_finger is 7.4 mm inside, 6/10 [-84, 2.12]")
+    assert shown == "gripper_<wbr>left_<wbr>finger is 7.4 mm inside, 6/10 [-84, 2.12]"
+
+
 def test_a_narrow_column_has_count_and_interval_without_words() -> None:
     rate = measurement(k=2, n=3, counted="trial", interval=WILSON)
     assert plain(wording.measured(rate)) == "66.7 %"
