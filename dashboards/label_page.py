@@ -46,7 +46,6 @@ SETS = {
 STRIP = 6
 """Pictures that sum a recording up, from first to last."""
 MAX_LENGTH = {"rater": 80, "cause": 200, "note": 4000}
-TABLES = ("raters",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,7 +254,7 @@ def summarise(
     if released and judgement.comparison is not None:
         before = judgement.comparison
         after = with_reviews(before, found)
-        tables = tuple(table for table in after.tables if table.id in TABLES)
+        tables = tuple(table for table in after.tables if table.id == "raters")
         missing = tuple(text for text in after.missing if text not in before.missing)
     elif progress and judgement.comparison_reason is not None:
         missing = (f"The trials cannot be compared: {judgement.comparison_reason}",)

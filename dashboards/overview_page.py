@@ -212,7 +212,11 @@ def rate_table(measurements: Sequence[Measurement], selection: Selection) -> Rat
         sides=tuple(SIDE_WORDS.get(side, side.replace("_", " ")) for side in sides),
         rows=tuple(rows),
         more_rows=len(rates) - len(rows),
-        methods=methods(measurements, "rate."),
+        methods="; ".join(
+            dict.fromkeys(
+                method_text(m) for m in measurements if m.id.startswith("rate.") and m.interval
+            )
+        ),
     )
 
 
@@ -236,14 +240,6 @@ def rate_groups(measurements: Sequence[Measurement]) -> list[RateGroup]:
                 )
             )
     return found
-
-
-def methods(measurements: Sequence[Measurement], start: str) -> str:
-    """Name the interval methods of the measurements whose id starts so."""
-    named = [
-        method_text(m) for m in measurements if m.id.startswith(start) and m.interval is not None
-    ]
-    return "; ".join(dict.fromkeys(named))
 
 
 @dataclass(frozen=True, kw_only=True)

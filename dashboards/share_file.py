@@ -2,13 +2,13 @@
 
 import base64
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, PrefixLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, PrefixLoader
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
@@ -312,27 +312,10 @@ def _data(media_type: str, data: bytes) -> str:
 @cache
 def _environment() -> Environment:
     """The report's templates and words, and beside them those of the pages."""
-    report = environment()
-    made = Environment(
-        loader=ChoiceLoader(
-            [
-                PackageLoader("evaluator.report"),
-                PrefixLoader({"pages": PackageLoader("dashboards")}),
-            ]
-        ),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     words = (wording.outcome_word, wording.verdict_word, wording.condition_word, wording.tone)
-    made.filters |= {function.__name__: function for function in words} | {
-        name: report.filters[name] for name in report.filters if name not in made.filters
+    report, pages = environment(), PrefixLoader({"pages": PackageLoader("dashboards")})
+    made = report.overlay(loader=ChoiceLoader([PackageLoader("evaluator.report"), pages]))
+    made.filters = report.filters | {
+        function.__name__: function for function in (*words, wording.length_text)
     }
-    made.filters["length_text"] = wording.length_text
-    made.tests["figures"] = report.tests["figures"]
-    shown: Mapping[str, Any] = {
-        name: value for name, value in report.globals.items() if name.startswith("shown_")
-    }
-    made.globals |= shown
     return made

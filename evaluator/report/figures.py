@@ -149,11 +149,8 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
     for at, together in Counter(places).items():
         if together > 1:
             x, y = left + side * at[0], top + side * (1 - at[1]) + (20 if at[1] > HIGH else -8)
-            right = at[0] > HIGH
-            words = f"\u00d7{together}"
-            marks.append(
-                _text(x - 8 if right else x + 8, y, words, "ink", "end" if right else "start")
-            )
+            aside, anchor = (-8, "end") if at[0] > HIGH else (8, "start")
+            marks.append(_text(x + aside, y, f"\u00d7{together}", "ink", anchor))
     with_too = any(group.condition == WITH for group in drawn)
     filled = " Hollow: without replanning; solid: with." if with_too else ""
     each = [n for n in ("task", "condition", "policy") if any(getattr(g, n) for g in drawn)]
