@@ -103,7 +103,7 @@ def _write(
         "as_of_ns": read.began_ns,
         "changed_meanwhile": state.newest_ns >= read.began_ns,
         "comparison_reason": read.reason,
-        "outdated": None if is_new or read.reason else _outdated(run, read.rows, results),
+        "outdated": None if is_new or not results or read.reason else _outdated(run, read.rows),
         "results_reason": none,
         "stand_in": stand_in_of(row.stand_in for row in read.rows)
         if results is None or results.stand_in is None
@@ -172,10 +172,8 @@ def _shown(table: Table) -> dict[str, Any]:
     }
 
 
-def _outdated(run: RunFolder, rows: Sequence[TrialRow], results: Results | None) -> str | None:
+def _outdated(run: RunFolder, rows: Sequence[TrialRow]) -> str | None:
     """Say what of a trial is not as it was when the stored results were computed; None of none."""
-    if results is None or results.source != "run":
-        return None
     try:
         stored = (run.results_dir / "trials.csv").read_text(encoding="utf-8")
     except (OSError, ValueError):
