@@ -23,13 +23,18 @@ from dashboards import wording
 from dashboards.answers import kept
 from dashboards.comparison import judge
 from dashboards.config import DashboardConfig
+from dashboards.episode_page import build_page
 from dashboards.errors import NotHereError
+from dashboards.frames import RENDERED, pack_frames, read_frame
 from dashboards.guard import Admission, Guard
 from dashboards.library import Library, derived_path, episode_path, scene_stamps
 from dashboards.loading import LOADING
 from dashboards.overview_page import build_overview
+from dashboards.queue_page import drawn_once
+from dashboards.recording import PageClock, read_recording
 from dashboards.review_routes import review_routes
 from dashboards.study_routes import StudyPages
+from dashboards.twin_page import build_twin, view_image
 from evaluator.report.wording import minus
 from evaluator.review_index import SHOW, Selection
 
@@ -102,7 +107,6 @@ def _environment() -> Environment:
         wording.size_text,
         wording.condition_word,
         wording.image_title,
-        wording.percent,
         wording.success_share,
         wording.answer_tone,
         wording.length_text,
@@ -179,8 +183,9 @@ class Pages:
     def overview(self, request: Request) -> Response:
         """``/``: agreement of twin and recording, and every trial."""
         run = self._run(request)
-        selection = Selection.of(request.query_params)
-        return self._page("overview.html", request, page=build_overview(run, judge(run), selection))
+        known = judge(run)
+        page = build_overview(run, known, Selection.of(request.query_params))
+        return self._page("overview.html", request, page=page, known=known)
 
     def numbers(self, request: Request) -> Response:
         """``/numbers``: every measurement of the evaluation."""
@@ -189,9 +194,6 @@ class Pages:
 
     def episode(self, request: Request) -> Response:
         """``/episode/<id>``: one trial and its replays."""
-        with LOADING:
-            from dashboards.episode_page import build_page  # noqa: PLC0415  # reads episodes
-
         run = self._run(request)
         episode_id = request.path_params["id"]
         judgement = judge(run)
@@ -211,10 +213,6 @@ class Pages:
 
     def frame(self, request: Request) -> Response:
         """``/episode/<id>/frame/<camera>?t=``: the nearest camera image, as recorded."""
-        with LOADING:
-            from dashboards.frames import read_frame  # noqa: PLC0415
-            from dashboards.recording import PageClock, read_recording  # noqa: PLC0415
-
         path = episode_path(self._run(request), request.path_params["id"])
         clock = PageClock.of(read_recording(path))
         stamp_ns = clock.stamp_ns(clock.clamp(_seconds(request) or 0.0))
@@ -223,9 +221,6 @@ class Pages:
 
     def frames(self, request: Request) -> Response:
         """``/episode/<id>/frames/<camera>?file=``: all pictures of a camera, or of the twin's."""
-        with LOADING:
-            from dashboards.frames import RENDERED, pack_frames  # noqa: PLC0415
-
         run = self._run(request)
         path = episode_path(run, request.path_params["id"])
         camera_id, name = request.path_params["camera"], request.query_params.get("file")
@@ -245,9 +240,6 @@ class Pages:
 
     def scene_picture(self, request: Request) -> Response:
         """``/episode/<id>/scene.jpg?t=``: the recorded state, before or without the 3D view."""
-        with LOADING:
-            from dashboards.queue_page import drawn_once  # noqa: PLC0415  # reads episodes
-
         run = self._run(request)
         path = episode_path(run, request.path_params["id"])
         t_s = round(_seconds(request) or 0.0, 2)
@@ -272,17 +264,12 @@ class Pages:
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""
-        with LOADING:
-            from dashboards.twin_page import build_twin  # noqa: PLC0415  # reads episodes
-
         run = self._run(request)
-        return self._page("twin.html", request, page=build_twin(run, judge(run)))
+        known = judge(run)
+        return self._page("twin.html", request, page=build_twin(run, known), known=known)
 
     def twin_image(self, request: Request) -> Response:
         """``/twin/<file>/<side>/<camera>?stamp=``: one held-out image."""
-        with LOADING:
-            from dashboards.twin_page import view_image  # noqa: PLC0415  # reads episodes
-
         run = self._run(request)
         path = derived_path(run, request.path_params["name"])
         stamp = request.query_params.get("stamp", "0")

@@ -71,9 +71,9 @@ def share(run: Path, /, *, config: ShareConfig = SHARE, output: Output = OUTPUT)
         "path": str(path),
         "size_bytes": made.size_bytes,
         "trials": list(made.trials),
-        "clips": made.level.words,
+        "clips": made.clips,
     }
-    text = f"{path}: {len(made.trials)} trials, {made.size_bytes / MB:.1f} MB ({made.level.words})"
+    text = f"{path}: {len(made.trials)} trials, {made.size_bytes / MB:.1f} MB ({made.clips})"
     output.result(record, text)
     return 0
 

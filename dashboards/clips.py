@@ -20,7 +20,6 @@ from dashboards.library import derived_paths, episode_path
 from dashboards.loading import LOADING
 from dashboards.queue_page import (
     SUBSAMPLING,
-    Moment,
     drawn_once,
     main_camera,
     moment_of,
@@ -68,8 +67,6 @@ class Footage:
     frames: tuple[Image, ...]
     times_s: tuple[float, ...]
     """From the moment."""
-    moment: Moment | None
-    """None where nothing was found to diverge; the clip is then of the end."""
     has_twin: bool
 
     @property
@@ -90,7 +87,7 @@ def footage(run: RunFolder, row: TrialRow, config: ClipConfig = CONFIG) -> Foota
         NotHereError: When the recording has no picture.
         GstError: When it cannot be read.
     """
-    path, moment, at_ns = _instant(run, row)
+    path, at_ns = _instant(run, row)
     camera = main_camera(path)
     span = (at_ns - round(config.before_s * NS_PER_S), at_ns + round(config.after_s * NS_PER_S))
     recorded = _small(read_span(path, camera.camera_id, *span), config)
@@ -108,20 +105,19 @@ def footage(run: RunFolder, row: TrialRow, config: ClipConfig = CONFIG) -> Foota
     return Footage(
         frames=tuple(frames),
         times_s=tuple((stamp_ns - at_ns) / NS_PER_S for stamp_ns, _ in recorded),
-        moment=moment,
         has_twin=bool(drawn),
     )
 
 
-def _instant(run: RunFolder, row: TrialRow) -> tuple[Path, Moment | None, int]:
-    """The recording, what happened, and when on its clock; without a moment its last picture."""
+def _instant(run: RunFolder, row: TrialRow) -> tuple[Path, int]:
+    """The recording, and when on its clock; without a moment its last picture."""
     path = episode_path(run, row.file.removesuffix(".mcap") or row.episode)
     moment = moment_of(run, row)
     if moment is not None:
         at_ns = recorded_ns(path, moment)
         if at_ns is not None:
-            return path, moment, at_ns
-    return path, None, main_camera(path).stamps_ns[-1]
+            return path, at_ns
+    return path, main_camera(path).stamps_ns[-1]
 
 
 def _twin_pictures(

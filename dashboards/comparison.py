@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bridge.episode.run_folder import RunFolder
-from dashboards.loading import LOADING
 from evaluator.cache import FOLDER, SummaryCache
-from evaluator.result import Exclusion, Measurement, Results, load_results
+from evaluator.compare import Comparison, compare_run
+from evaluator.report.review import refresh
+from evaluator.result import Measurement, Results, load_results
 from evaluator.review_index import (
     RESULTS,
     ReviewIndex,
@@ -25,15 +26,15 @@ from evaluator.review_index import (
 )
 from evaluator.trial_row import TrialRow
 
-if TYPE_CHECKING:
-    from evaluator.compare import Comparison
-
 WAITED_FOR = 3_000
 """Files of a run that a page waits for; a larger run is brought up to date behind the page."""
 IMPORTED = "imported"
 """Kind of an episode that is a motion from elsewhere."""
 RENDERS = "image."
 """Begins the ids of numbers about folders of renders."""
+LISTS = ("exclusions", "missing", "answers", "notes", "tasks", "failures", "tables")
+NOTHING: dict[str, Any] = {**dict.fromkeys(LISTS, ()), "num_exclusions": 0, "close_pp": 0.0}
+"""What an index says at least."""
 LOOKED_AT_S = 5.0
 """A larger run's files are looked at again after this; its folders at each page."""
 
@@ -53,7 +54,7 @@ class Judgement:
     @property
     def about(self) -> dict[str, Any]:
         """What the index says besides trials and files."""
-        return {} if self.index is None else self.index.about
+        return NOTHING | ({} if self.index is None else self.index.about)
 
     @property
     def has_results(self) -> bool:
@@ -79,14 +80,14 @@ class Judgement:
         return any(file.kind == IMPORTED and file.task for file in files)
 
     @property
+    def only_a_table(self) -> bool:
+        """Whether the results are of a table: there is no recording."""
+        return self.has_results and not self.has_methods and not self.run.episodes()
+
+    @property
     def measurements(self) -> tuple[Measurement, ...]:
         """The numbers of ``results.json``; none before ``robot-gst evaluate``."""
         return () if self.index is None else self.index.measurements
-
-    @property
-    def exclusions(self) -> tuple[Exclusion, ...]:
-        """The first of what was left out, and why."""
-        return tuple(Exclusion(**item) for item in self.about.get("exclusions", ()))
 
     @property
     def results(self) -> Results | None:
@@ -94,7 +95,7 @@ class Judgement:
         return _results(self.run, stamp_of(self.run.path / RESULTS)) if self.has_results else None
 
     @property
-    def comparison(self) -> "Comparison | None":
+    def comparison(self) -> Comparison | None:
         """Everything the evaluator finds now, for pages that ask it more; None where it cannot."""
         if self.index is None or self.comparison_reason is not None:
             return None
@@ -128,10 +129,7 @@ def _results(run: RunFolder, _stamp: str) -> Results:
 
 
 @lru_cache(maxsize=2)
-def _comparison(run: RunFolder, _state: str) -> "Comparison":
-    with LOADING:
-        from evaluator.compare import compare_run  # noqa: PLC0415  # loads the evaluator
-
+def _comparison(run: RunFolder, _state: str) -> Comparison:
     with SummaryCache(run.results_dir / FOLDER) as cache:
         return compare_run(run, cache=cache)
 
@@ -167,9 +165,6 @@ def judge(run: RunFolder) -> Judgement:
         if state.num_files > WAITED_FOR:
             is_read = _update_behind(run, known, state)
             return Judgement(run=run, index=index, is_old=True, is_being_updated=is_read)
-        with LOADING:
-            from evaluator.report.review import refresh  # noqa: PLC0415  # loads the evaluator
-
         known.unwritten, known.tried = refresh(run), state.digest
         return Judgement(run=run, index=_open(run, known))
 

@@ -1,7 +1,7 @@
 """What the episode page shows, gathered from one recorded episode and its replays."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,6 @@ class FactorView:
     name: str
     meaning: str
     factor: Factor
-    plan_t_s: float | None
     t_s: float | None
 
 
@@ -41,7 +40,6 @@ class VerdictView:
     subtitle: str
     verdict: Verdict
     factors: tuple[FactorView, ...]
-    file: str
     of_sent_plan: bool
     counts: bool
     """False for a replay that was redone since, with other settings or in another scene, and for
@@ -79,15 +77,6 @@ class CameraView:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EventView:
-    """One line of the event list."""
-
-    t_s: float
-    type: str
-    text: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class EpisodePage:
     """Everything the episode template needs."""
 
@@ -104,7 +93,8 @@ class EpisodePage:
     plots: tuple[TimePlot, ...]
     joint_plots: tuple[TimePlot, ...]
     cameras: tuple[CameraView, ...]
-    events: tuple[EventView, ...]
+    events: tuple[tuple[float, str, str], ...]
+    """Page time [s], what happened, and to what."""
     clock: PageClock
     t_s: float
     failure_t_s: float | None
@@ -237,7 +227,7 @@ def _verdicts(
         started = recording.executed_ns(verdict.plan_id)
         before = started is None or stamp_ns <= started[0]
         title = GATE_BEFORE if before else "Gate, after motion began"
-        views.append(_view(title, "recorded", verdict, recording, sent_id, clock))
+        views.append(_view(title, "recorded", verdict, sent_id, clock))
     last = {_trajectory_of(replay): replay for replay in replays}
     for replay in replays:
         never = _why_never(replay, recording)
@@ -245,7 +235,7 @@ def _verdicts(
         for _, verdict in replay.verdicts:
             title = f"{verdict.trajectory.capitalize()} in the twin"
             subtitle = verdict.mode if counts else f"{verdict.mode}, {never or 'redone since'}"
-            views.append(_view(title, subtitle, verdict, replay, sent_id, clock, counts=counts))
+            views.append(_view(title, subtitle, verdict, sent_id, clock, counts=counts))
     order = {"Planned in the twin": 1, "Executed in the twin": 2}
     views.sort(key=lambda view: (not view.of_sent_plan, not view.counts, order.get(view.title, 0)))
     return tuple(views)
@@ -255,7 +245,6 @@ def _view(
     title: str,
     subtitle: str,
     verdict: Verdict,
-    source: Recording,
     sent_id: str | None,
     clock: PageClock,
     *,
@@ -264,13 +253,11 @@ def _view(
     factors = []
     for name, meaning in FACTORS:
         factor: Factor = getattr(verdict, name)
-        plan_t_s = None if factor.first_t_ns is None else factor.first_t_ns * 1e-9
         factors.append(
             FactorView(
                 name=name,
                 meaning=meaning,
                 factor=factor,
-                plan_t_s=plan_t_s,
                 t_s=clock.of_plan_time(verdict.plan_id, factor.first_t_ns),
             )
         )
@@ -279,7 +266,6 @@ def _view(
         subtitle=subtitle,
         verdict=verdict,
         factors=tuple(factors),
-        file=source.path.name,
         of_sent_plan=sent_id is None or verdict.plan_id == sent_id,
         counts=counts,
         nearest=_nearest_words(verdict),
@@ -297,13 +283,16 @@ def _nearest_words(verdict: Verdict) -> str:
 def _camera(
     track: CameraTrack, replays: Sequence[Recording], clock: PageClock, t_s: float
 ) -> CameraView:
-    times = tuple(round(clock.seconds(stamp), 3) for stamp in track.stamps_ns)
-    return CameraView(
-        id=track.camera_id,
-        times_s=times,
-        shown_s=times[track.nearest(clock.stamp_ns(t_s))],
-        twin=_twin_view(track.camera_id, replays, clock, t_s),
+    return replace(
+        camera_view(track, clock, t_s), twin=_twin_view(track.camera_id, replays, clock, t_s)
     )
+
+
+def camera_view(track: CameraTrack, clock: PageClock, t_s: float) -> CameraView:
+    """Lay out a camera's frames, the one nearest to a page time [s] first."""
+    times = tuple(round(clock.seconds(stamp), 3) for stamp in track.stamps_ns)
+    shown_s = times[track.nearest(clock.stamp_ns(t_s))]
+    return CameraView(id=track.camera_id, times_s=times, shown_s=shown_s)
 
 
 def _twin_view(
@@ -333,13 +322,9 @@ def _twin_view(
     )
 
 
-def _event(event: dict[str, Any], clock: PageClock) -> EventView:
+def _event(event: dict[str, Any], clock: PageClock) -> tuple[float, str, str]:
     parts = [str(event[name]) for name in ("stage_id", "plan_id", "text") if event.get(name)]
     for name in ("outcome", "data"):
         if event.get(name):
             parts.append(", ".join(f"{key} {value}" for key, value in event[name].items()))
-    return EventView(
-        t_s=clock.seconds(event["stamp_ns"]),
-        type=event["type"].replace("_", " "),
-        text=" · ".join(parts),
-    )
+    return clock.seconds(event["stamp_ns"]), event["type"].replace("_", " "), " · ".join(parts)

@@ -7,10 +7,9 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards.clips import can_film
 from dashboards.comparison import Judgement
-from dashboards.overview_page import Facet
+from dashboards.overview_page import Facet, group_facets
 from dashboards.queue_page import Moment, moment_of
 from evaluator.review_index import (
-    FACETS,
     FAILED,
     FAILURE_PARTS,
     NOT_KNOWN,
@@ -65,8 +64,6 @@ class FailuresPage:
     of: int = 0
     """Failures in the run."""
     num_trials: int = 0
-    only_motions: bool = False
-    """Whether the run holds imported motions and not one trial."""
     facets: tuple[Facet, ...] = ()
     failed: tuple[tuple[str, str, int], ...] = ()
     """Value, words and number of each choice of who failed."""
@@ -95,8 +92,7 @@ def build_failures(
         count=count,
         of=_count(index, FailureSelection()),
         num_trials=index.count(Selection()),
-        only_motions=judgement.only_motions,
-        facets=(*_groups(index, selection), *_parts(index, selection)),
+        facets=(*group_facets(index, counted=False), *_parts(index, selection)),
         failed=tuple(
             (value, words, _count(index, FailureSelection(**selection.query(failed=value))))
             for value, words in FAILED.items()
@@ -136,16 +132,6 @@ def _moment(run: RunFolder, row: TrialRow) -> Moment | None:
         return moment_of(run, row)
     except GstError:  # the trial's own page says what is wrong
         return None
-
-
-def _groups(index: ReviewIndex, selection: FailureSelection) -> Sequence[Facet]:
-    found = []
-    for name in FACETS:
-        values = index.values(name)
-        if len(values) > 1:
-            labelled = [(value, label.replace("_", " ")) for value, label, _ in values]
-            found.append(Facet(name=name, values=(("", "all"), *labelled[:MOST_VALUES])))
-    return found
 
 
 def _parts(index: ReviewIndex, selection: FailureSelection) -> Sequence[Facet]:

@@ -4,15 +4,12 @@ Only the layout of a drawing is worked out here; every number that is shown come
 """
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
-
-from evaluator.result import Measurement
 
 MAX_POINTS = 400
 """A line wider than the plot has pixels is thinned to this many points, extremes kept."""
@@ -309,95 +306,3 @@ def _bar(span: Span, x: Axis) -> Bar:
         style=span.style,
         title=span.title or f"{span.label}: {span.start_s:.2f} s to {span.end_s:.2f} s",
     )
-
-
-SIZE = 360
-MARKERS = ("circle", "square", "diamond", "triangle")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RateGroup:
-    """One group (task, condition, policy) with both rates, as the evaluator measured them."""
-
-    label: str
-    series: str
-    """Groups of one series are joined by a line: the same task and policy."""
-    task: str
-    condition: str
-    policy: str
-    filled: bool
-    """Drawn solid: with replanning."""
-    replayed: Measurement
-    recorded: Measurement
-
-
-@dataclass(frozen=True, kw_only=True)
-class Point:
-    """A drawn group [px]; interval ends are None where there is none."""
-
-    group: RateGroup
-    x: float
-    y: float
-    marker: str
-    x_low: float | None
-    x_high: float | None
-    y_low: float | None
-    y_high: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scatter:
-    """Everything a template needs to draw the scatter."""
-
-    size: int
-    axis_x: Axis
-    axis_y: Axis
-    points: tuple[Point, ...]
-    alike: tuple[tuple[float, float, int], ...]
-    """Where groups coincide [px], and how many."""
-    joins: tuple[str, ...]
-    series: tuple[tuple[str, str], ...]
-    """Name of a series and its marker."""
-
-
-def scatter(groups: Sequence[RateGroup]) -> Scatter | None:
-    """Lay out the groups that have both rates; None when there is none."""
-    drawable = [g for g in groups if g.replayed.value is not None and g.recorded.value is not None]
-    if not drawable:
-        return None
-    axis_x = axis(0.0, 1.0, 44, SIZE - 12)
-    axis_y = axis(0.0, 1.0, SIZE - 44, 12)
-    series = list(dict.fromkeys(group.series for group in drawable))
-    markers = {name: MARKERS[index % len(MARKERS)] for index, name in enumerate(series)}
-    points = []
-    for group in drawable:
-        x, y = axis_x.px(group.replayed.value or 0.0), axis_y.px(group.recorded.value or 0.0)
-        across, upright = group.replayed.interval, group.recorded.interval
-        points.append(
-            Point(
-                group=group,
-                x=x,
-                y=y,
-                marker=markers[group.series],
-                x_low=None if across is None else axis_x.px(across.low),
-                x_high=None if across is None else axis_x.px(across.high),
-                y_low=None if upright is None else axis_y.px(upright.low),
-                y_high=None if upright is None else axis_y.px(upright.high),
-            )
-        )
-    return Scatter(
-        size=SIZE,
-        axis_x=axis_x,
-        axis_y=axis_y,
-        points=tuple(points),
-        alike=tuple((*at, n) for at, n in Counter((p.x, p.y) for p in points).items() if n > 1),
-        joins=tuple(_join(points, name) for name in series),
-        series=tuple(markers.items()),
-    )
-
-
-def _join(points: Sequence[Point], series: str) -> str:
-    joined = sorted(
-        (point for point in points if point.group.series == series), key=lambda p: p.group.filled
-    )
-    return " ".join(f"{point.x:g},{point.y:g}" for point in joined)

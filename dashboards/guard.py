@@ -4,10 +4,10 @@ import hmac
 import ipaddress
 import socket
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import urlencode, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.responses import PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -101,7 +101,8 @@ class Guard:
         await (refusal or self._app)(scope, receive, send_with_headers)
 
     def _refusal(self, scope: Scope) -> ASGIApp | None:
-        headers = Headers(scope=scope)
+        asked = HTTPConnection(scope)
+        headers = asked.headers
         name = host_name(headers.get("host", ""))
         if not self._admission.admits_host(name):
             return PlainTextResponse(
@@ -114,9 +115,9 @@ class Guard:
                 status_code=403,
             )
         token = self._admission.token
-        if token is None or _same(_cookie(headers), token):
+        if token is None or _same(asked.cookies.get(COOKIE, ""), token):
             return None
-        query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
+        query = asked.query_params.multi_items()
         if _same(dict(query).get("token", ""), token):
             return _remember_token(scope["path"], query, token)
         return PlainTextResponse(
@@ -145,11 +146,3 @@ def _is_own_origin(headers: Headers) -> bool:
 
 def _same(found: str, wanted: str) -> bool:
     return hmac.compare_digest(found.encode(), wanted.encode())
-
-
-def _cookie(headers: Headers) -> str:
-    try:
-        cookies = SimpleCookie(headers.get("cookie", ""))
-    except CookieError:
-        return ""
-    return cookies[COOKIE].value if COOKIE in cookies else ""

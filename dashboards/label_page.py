@@ -17,12 +17,12 @@ from bridge.exchange.reviews import (
     saved_review,
 )
 from dashboards.comparison import Judgement
-from dashboards.episode_page import CameraView
+from dashboards.episode_page import CameraView, camera_view
 from dashboards.frames import RENDERED
 from dashboards.library import episode_path
-from dashboards.loading import LOADING
 from dashboards.queue_page import is_label, main_camera, recorded_trials
 from dashboards.recording import PageClock, read_recording
+from evaluator.compare.raters import with_reviews
 from evaluator.result import Table
 
 CAUSES = (
@@ -46,7 +46,6 @@ SETS = {
 STRIP = 6
 """Pictures that sum a recording up, from first to last."""
 MAX_LENGTH = {"rater": 80, "cause": 200, "note": 4000}
-TABLES = ("raters",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,14 +167,7 @@ def build_label_page(
         done=len(rated_by(reviews, rater) & set(order)),
         task=recording.info.task or "",
         instruction=recording.info.instruction or "",
-        cameras=tuple(
-            CameraView(
-                id=track.camera_id,
-                times_s=tuple(round(clock.seconds(stamp), 3) for stamp in track.stamps_ns),
-                shown_s=round(clock.seconds(track.stamps_ns[-1]), 3),
-            )
-            for track in tracks
-        ),
+        cameras=tuple(camera_view(track, clock, end) for track in tracks),
         main=main_camera(path).camera_id if tracks else "",
         strip_s=tuple(end * index / (STRIP - 1) for index in range(STRIP)) if tracks else (),
         end_s=end,
@@ -260,12 +252,9 @@ def summarise(
     tables: tuple[Table, ...] = ()
     missing: tuple[str, ...] = ()
     if released and judgement.comparison is not None:
-        with LOADING:
-            from evaluator.compare.raters import with_reviews  # noqa: PLC0415  # loads the evaluator
-
         before = judgement.comparison
         after = with_reviews(before, found)
-        tables = tuple(table for table in after.tables if table.id in TABLES)
+        tables = tuple(table for table in after.tables if table.id == "raters")
         missing = tuple(text for text in after.missing if text not in before.missing)
     elif progress and judgement.comparison_reason is not None:
         missing = (f"The trials cannot be compared: {judgement.comparison_reason}",)

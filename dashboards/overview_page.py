@@ -8,23 +8,26 @@ Measurements are chosen by id; nothing is computed. Rates are ``rate.<side>.<gro
 import re
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from bridge.episode.run_folder import RunFolder
 from dashboards import wording
 from dashboards.comparison import Judgement
-from dashboards.figures import RateGroup, Scatter, scatter
-from evaluator.report.wording import SIM_SIDE, agreeing_side
-from evaluator.result import Exclusion, Measurement
+from evaluator.compare.rows import RateGroup
+from evaluator.report.figures import Drawing, scatter
+from evaluator.report.views import shown_word
+from evaluator.report.wording import SIM_SIDE, agreeing_side, method_text
+from evaluator.result import Measurement
 from evaluator.review_index import (
     FACETS,
     NO_RESULTS,
     IndexedFile,
+    ReviewIndex,
     Selection,
 )
-from evaluator.trial_row import TrialRow
+from evaluator.trial_row import RECORDED_WORDS, TrialRow
 
 PAGE = 50
 """Trials on one screen."""
@@ -81,7 +84,6 @@ class Card:
     state: str
     """defined, undefined or missing."""
     definition: str = ""
-    ids: tuple[str, ...] = ()
     more: tuple[str, ...] = ()
 
 
@@ -126,12 +128,13 @@ def _card(title: str, pattern: str, below: Sequence[str], judgement: Judgement) 
     if found is None:
         return Card(title=title, value="missing", detail=NO_RESULTS, state="missing")
     more = [_find(other, judgement.measurements) for other in below]
+    is_counted = found.value is not None and found.k is not None  # a share hides how few there are
+    rests_on = wording.evidence(found)
     return Card(
         title=title,
-        value=wording.headline(found),
-        detail=wording.headline_evidence(found),
+        value=f"{found.k} of {found.n}" if is_counted else wording.measured(found),
+        detail=f"{wording.measured(found)}, {rests_on}" if is_counted else rests_on,
         definition=found.definition,
-        ids=tuple(m.id for m in (found, *more) if m is not None),
         state="undefined" if found.value is None else "defined",
         more=tuple(_small(m) for m in more if m is not None),
     )
@@ -209,7 +212,11 @@ def rate_table(measurements: Sequence[Measurement], selection: Selection) -> Rat
         sides=tuple(SIDE_WORDS.get(side, side.replace("_", " ")) for side in sides),
         rows=tuple(rows),
         more_rows=len(rates) - len(rows),
-        methods=methods(measurements, "rate."),
+        methods="; ".join(
+            dict.fromkeys(
+                method_text(m) for m in measurements if m.id.startswith("rate.") and m.interval
+            )
+        ),
     )
 
 
@@ -217,33 +224,22 @@ def rate_groups(measurements: Sequence[Measurement]) -> list[RateGroup]:
     """Collect the groups that have both rates; over the same trials where trials are known."""
     found = []
     over_same_trials = _rates(measurements, "rate_common")
-    for group, by_side in (over_same_trials or _rates(measurements)).items():
-        if "recorded" not in by_side or SIM_SIDE not in by_side:
-            continue
-        task, condition, policy = _names_of(group)
-        found.append(
-            RateGroup(
-                label=", ".join(p.replace("_", " ") for p in (task, condition, policy) if p),
-                series=" ".join(p.replace("_", " ") for p in (task, policy) if p),
-                task=task,
-                condition=condition,
-                policy=policy,
-                filled=condition.startswith("with_"),
-                replayed=by_side[SIM_SIDE],
-                recorded=by_side["recorded"],
+    for group, rates in (over_same_trials or _rates(measurements)).items():
+        if "recorded" in rates and SIM_SIDE in rates:
+            task, condition, policy = _names_of(group)
+            found.append(
+                RateGroup(
+                    task=task,
+                    condition=condition,
+                    policy=policy,
+                    unit="",
+                    recorded=rates["recorded"],
+                    sim=rates[SIM_SIDE],
+                    recorded_rate=None,
+                    sim_rate=None,
+                )
             )
-        )
     return found
-
-
-def methods(measurements: Sequence[Measurement], start: str) -> str:
-    """Name the interval methods of the measurements whose id starts so."""
-    named = [
-        wording.method(m.interval)
-        for m in measurements
-        if m.id.startswith(start) and m.interval is not None
-    ]
-    return "; ".join(dict.fromkeys(named))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,17 +302,13 @@ class Overview:
     """Everything the first page needs."""
 
     selection: Selection
-    stand_in: bool | None
-    answers: list[tuple[str, str]]
-    notes: tuple[tuple[str, str], ...]
     tasks: tuple[Mapping[str, str], ...]
     """Task, its slug, answer and sentence."""
     more_tasks: int
-    close_pp: float
     cards: tuple[Card, ...]
     has_headline: bool
     """Whether at least one card has a value or a reason."""
-    scatter: Scatter | None
+    scatter: Drawing | None
     more_groups: int
     """Groups that are not drawn."""
     rates: RateTable | None
@@ -328,22 +320,12 @@ class Overview:
     kinds: tuple[tuple[str, int], ...]
     broken: tuple[IndexedFile, ...]
     num_broken: int
-    tables: tuple[Mapping[str, Any], ...]
-    """Of a run without trials: what the evaluator says of it."""
     undefined: tuple[Undefined, ...]
     num_undefined: int
-    num_numbers: int
-    exclusions: tuple[Exclusion, ...]
-    num_exclusions: int
-    missing: tuple[str, ...]
     notices: tuple[str, ...]
     outdated: str | None
     """A message that the numbers are older than the run, naming the first that differs."""
     next_command: str | None
-    has_methods: bool
-    """Whether renders of methods were compared."""
-    is_old: bool
-    is_being_read: bool
 
 
 def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -> Overview:
@@ -355,23 +337,21 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
     about = judgement.about
     numbers = judgement.measurements
     cards = headline_cards(judgement)
-    groups = [g for g in rate_groups(numbers) if _is_drawable(g)]
-    drawn = sorted(groups, key=lambda g: not _takes(selection, g))[:MOST_GROUPS]
+    groups = [
+        g for g in rate_groups(numbers) if selection.takes_group(g.task, g.condition, g.policy)
+    ]
+    drawn, word = groups[:MOST_GROUPS], shown_word(RECORDED_WORDS[judgement.stand_in])
     others, num_others, kinds = _others(judgement)
     broken, num_broken = _broken(judgement)
-    tasks = about.get("tasks", [])
-    failures = about.get("failures", [])
+    tasks = about["tasks"]
+    failures = about["failures"]
     return Overview(
         selection=selection,
-        stand_in=judgement.stand_in,
-        answers=about.get("answers", []),
-        notes=tuple((name, text) for name, text in about.get("notes", [])),
         tasks=tuple(tasks[:MOST_TASKS]),
         more_tasks=max(0, len(tasks) - MOST_TASKS),
-        close_pp=about.get("close_pp", 0.0),
         cards=cards,
         has_headline=any(card.state != "missing" for card in cards),
-        scatter=scatter([g for g in groups if g in drawn]),
+        scatter=scatter(drawn, word),
         more_groups=len(groups) - len(drawn),
         rates=rate_table(numbers, selection),
         twin_failures=_failures(failures, twin=True),
@@ -382,28 +362,12 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         kinds=kinds,
         broken=broken,
         num_broken=num_broken,
-        tables=tuple(about.get("tables", [])),
         undefined=undefined(numbers),
         num_undefined=sum(number.value is None for number in numbers),
-        num_numbers=len(numbers),
-        exclusions=judgement.exclusions,
-        num_exclusions=about.get("num_exclusions", 0),
-        missing=tuple(about.get("missing", ())),
         notices=_notices(judgement),
         outdated=_outdated(judgement),
         next_command=_next_command(run, judgement),
-        has_methods=judgement.has_methods,
-        is_old=judgement.is_old,
-        is_being_read=judgement.is_being_updated,
     )
-
-
-def _is_drawable(group: RateGroup) -> bool:
-    return group.replayed.value is not None and group.recorded.value is not None
-
-
-def _takes(selection: Selection, group: RateGroup) -> bool:
-    return selection.takes_group(group.task, group.condition, group.policy)
 
 
 def _failures(table: Sequence[Sequence[Any]], *, twin: bool) -> tuple[Failure, ...]:
@@ -429,20 +393,24 @@ def trial_list(judgement: Judgement, selection: Selection) -> TrialList:
     selected, of = index.count(selection), index.count(Selection())
     pages = max(1, -(-selected // PAGE))
     page = min(selection.page_number, pages)
-    facets = []
-    for name in FACETS:
-        found = index.values(name) if of else ()
-        if len(found) > 1:
-            labelled = [(value, f"{_words(label)} ({count})") for value, label, count in found]
-            facets.append(Facet(name=name, values=(("", "all"), *labelled[:MOST_VALUES])))
     return TrialList(
         trials=index.trials(selection, limit=PAGE, offset=PAGE * (page - 1)),
         selected=selected,
         of=of,
         page=page,
         pages=pages,
-        facets=tuple(facets),
+        facets=tuple(group_facets(index, counted=True)) if of else (),
     )
+
+
+def group_facets(index: ReviewIndex, *, counted: bool) -> Iterator[Facet]:
+    """Task, condition and policy to choose from; ``counted`` says how many trials each has."""
+    for name in FACETS:
+        found = index.values(name)
+        if len(found) > 1:
+            counts = [f" ({count})" if counted else "" for _, _, count in found]
+            labelled = [(v[0], _words(v[1]) + n) for v, n in zip(found, counts, strict=True)]
+            yield Facet(name=name, values=(("", "all"), *labelled[:MOST_VALUES]))
 
 
 def _words(label: str) -> str:
@@ -497,9 +465,7 @@ def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
         return f"robot-gst evaluate {path}"
     trials, recorded, replayed = judgement.index.totals()
     if not trials and next(run.episodes_dir.glob("*.mcap"), None) is None:
-        if judgement.has_methods:
-            return None
-        return f"robot-gst record {path}"
+        return None if judgement.has_results else f"robot-gst record {path}"
     if recorded and not replayed:
         has_scene = (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap"))
         return f"robot-gst {'replay' if has_scene else 'rebuild'} {path}"

@@ -73,8 +73,6 @@ class QueueItem:
 
     row: TrialRow
     reason: str
-    distance_m: float | None
-    """Largest distance of the recorded tool from the planned replay's, where it was measured."""
     moment: Moment | None
     moment_t_s: float | None
     """When that is on the trial's own page; None where its plan was never executed."""
@@ -95,8 +93,6 @@ class QueuePage:
     num_pages: int
     only_from_table: bool
     """Whether all trials of the run come from a table: there is nothing to look at."""
-    only_motions: bool
-    """Whether the run holds imported motions and not one trial."""
     problems: tuple[str, ...]
 
 
@@ -149,7 +145,6 @@ def build_queue(
             QueueItem(
                 row=row,
                 reason=REASONS[severity(row)[0]],
-                distance_m=row.distance_m,
                 moment=(moment := moment_of(run, row)),
                 moment_t_s=None if moment is None else _page_t_s(run, row, moment),
                 num_labels=labels.get(row.episode, 0),
@@ -161,8 +156,7 @@ def build_queue(
         counts={name: len(rows) for name, rows in chosen.items()},
         page=page,
         num_pages=num_pages,
-        only_from_table=not chosen[""] and bool(judgement.rows),
-        only_motions=judgement.only_motions,
+        only_from_table=not chosen[""] and (bool(judgement.rows) or judgement.only_a_table),
         problems=tuple(problems),
     )
 

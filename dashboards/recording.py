@@ -52,9 +52,7 @@ class Recording:
     outcome: Outcome | None
     derived: Derived | None
     software: dict[str, Any]
-    duration_s: float
     num_messages: int
-    topics: tuple[str, ...]
     plans: tuple[tuple[int, Plan], ...]
     verdicts: tuple[tuple[int, Verdict], ...]
     events: tuple[dict[str, Any], ...]
@@ -129,9 +127,7 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
         outcome=episode.outcome,
         derived=episode.derived,
         software=episode.metadata_records.get("software", {}),
-        duration_s=episode.duration_s,
         num_messages=sum(topic.count for topic in episode.topics().values()),
-        topics=tuple(topics),
         plans=tuple(problems.attempt(lambda: streams.plans(episode), [])),
         verdicts=tuple(problems.attempt(lambda: streams.verdicts(episode), [])),
         events=tuple(problems.attempt(lambda: executed_events(episode), [])),

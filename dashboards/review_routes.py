@@ -11,10 +11,11 @@ from starlette.routing import Route
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.exchange.reviews import ReviewConflictError, SavedReview, readable_reviews
+from dashboards import label_page as labels
 from dashboards.answers import kept, posted, refused
 from dashboards.comparison import judge
 from dashboards.errors import NotHereError
-from dashboards.loading import LOADING
+from dashboards.queue_page import SHOW, build_queue, thumbnail
 
 MAX_BODY = 64_000
 """Bytes of one label with its note, with a wide margin."""
@@ -42,27 +43,21 @@ class _ReviewPages:
 
     def queue(self, request: Request) -> Response:
         """``/queue?show=&page=``: trials, worst first."""
-        with LOADING:
-            from dashboards import label_page as labels  # noqa: PLC0415  # reads episodes
-            from dashboards.queue_page import SHOW, build_queue  # noqa: PLC0415
-
         run = self._run(request)
         query = request.query_params
         number = query.get("page", "1")
         page = build_queue(
             run,
-            judge(run),
+            known := judge(run),
             readable_reviews(run.path),
             show=query.get("show", ""),
             page=int(number) if number.isascii() and number.isdigit() and len(number) < 9 else 1,
         )
-        return self._page("queue.html", request, page=page, shows=SHOW, sets=labels.SETS)
+        shown = {"page": page, "known": known, "shows": SHOW, "sets": labels.SETS}
+        return self._page("queue.html", request, **shown)
 
     def thumbnail(self, request: Request) -> Response:
         """``/queue/thumbnail/<id>``: the moment of its divergence."""
-        with LOADING:
-            from dashboards.queue_page import thumbnail  # noqa: PLC0415  # reads episodes
-
         run = self._run(request)
         row = judge(run).row(request.path_params["id"])
         if row is None:
@@ -72,9 +67,6 @@ class _ReviewPages:
 
     def label(self, request: Request) -> Response:
         """``/label?rater=&set=&at=``: one trial, blind; without ``at`` the next to label."""
-        with LOADING:
-            from dashboards import label_page as labels  # noqa: PLC0415  # reads episodes
-
         run = self._run(request)
         query = request.query_params
         chosen = query.get("set", "") if query.get("set", "") in labels.SETS else ""
@@ -106,9 +98,6 @@ class _ReviewPages:
         return await run_in_threadpool(self._keep, request, record)
 
     def _keep(self, request: Request, record: dict[str, Any]) -> Response:
-        with LOADING:
-            from dashboards import label_page as labels  # noqa: PLC0415  # reads episodes
-
         try:
             run = self._run(request)
             rater = labels.rater_name(request.query_params.get("rater", ""))
@@ -126,9 +115,6 @@ class _ReviewPages:
 
     def summary(self, request: Request) -> Response:
         """``/reviews``: how far raters are; how far they agree, once nobody labels any more."""
-        with LOADING:
-            from dashboards import label_page as labels  # noqa: PLC0415  # reads episodes
-
         run = self._run(request)
         query = request.query_params
         chosen = query.get("set", "") if query.get("set", "") in labels.SETS else ""

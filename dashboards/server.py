@@ -19,7 +19,7 @@ from bridge.terminal import Output
 from dashboards.app import create_app
 from dashboards.comparison import judge, stop_updates
 from dashboards.config import DashboardConfig
-from dashboards.errors import AddressTakenError
+from dashboards.errors import DashboardError
 from dashboards.guard import Admission, is_loopback
 from dashboards.library import Library
 
@@ -55,7 +55,7 @@ def listen(config: DashboardConfig) -> socket.socket:
     """Bind the address.
 
     Raises:
-        AddressTakenError: When another program has it, or it is not ours to bind.
+        DashboardError: When another program has it, or it is not ours to bind.
     """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
@@ -70,8 +70,9 @@ def listen(config: DashboardConfig) -> socket.socket:
             listener.close()
             raise
     except OSError as error:
-        raise AddressTakenError(
-            host=config.host, port=config.port, reason=error.strerror or str(error)
+        raise DashboardError(
+            f"cannot listen on {config.host} port {config.port}: {error.strerror or error}. "
+            "Choose another port with --port, or --port 0 for any free one."
         ) from error
     return listener
 

@@ -2,13 +2,13 @@
 
 import base64
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, PrefixLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, PrefixLoader
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
@@ -49,24 +49,14 @@ STRIP_FRAMES = 6
 MB = 1_000_000
 
 
-@dataclass(frozen=True, kw_only=True)
-class Level:
-    """How well clips are shown; the next one is smaller."""
-
-    words: str
-    height_px: int
-    rate_hz: int
-    crf: int
-    quality: int
-    is_video: bool = True
-
-
-LEVELS = (
-    Level(words="288 lines, 15 Hz", height_px=288, rate_hz=15, crf=24, quality=82),
-    Level(words="216 lines, 10 Hz", height_px=216, rate_hz=10, crf=28, quality=78),
-    Level(words="144 lines, 6 Hz", height_px=144, rate_hz=6, crf=32, quality=70),
-    Level(words="strips", height_px=120, rate_hz=3, crf=0, quality=65, is_video=False),
-)
+STRIPS = "strips"
+LEVELS = {
+    "288 lines, 15 Hz": ClipConfig(height_px=288, rate_hz=15, crf=24, quality=82),
+    "216 lines, 10 Hz": ClipConfig(height_px=216, rate_hz=10, crf=28, quality=78),
+    "144 lines, 6 Hz": ClipConfig(height_px=144, rate_hz=6, crf=32, quality=70),
+    STRIPS: ClipConfig(height_px=120, rate_hz=3, quality=65),
+}
+"""How well clips are shown; the next one is smaller, and the last ones are pictures."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,11 +71,6 @@ class Clip:
     """What is seen, for those who cannot."""
     width: int
     height: int
-
-    @property
-    def num_bytes(self) -> int:
-        """Length in the file."""
-        return len(self.picture) + len(self.video)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +94,8 @@ class Shared:
 
     text: str
     trials: tuple[str, ...]
-    level: Level
+    clips: str
+    """How well clips are shown: one of ``LEVELS``."""
     notes: tuple[str, ...]
 
     @property
@@ -152,21 +138,16 @@ def build_share(run: RunFolder, config: ShareConfig, *, report: str = "") -> Sha
     rows = chosen_trials(judgement, config.trials)
     shared = _shared_parts(run, judgement, report)
     trials = [_trial(run, row) for row in rows]
-    levels = [level for level in LEVELS if can_film() or not level.is_video]
+    levels = LEVELS if can_film() else (STRIPS,)
     limit = round(config.max_mb * MB)
     least = 0
     for level in levels:
         shown, notes = _with_clips(run, trials, level, config, limit)
         if shown is None:
             continue
-        text = (
-            _environment()
-            .get_template("pages/share.html")
-            .render(**shared, trials=shown, level=level)
-        )
-        made = Shared(
-            text=text, trials=tuple(row.episode for row in rows), level=level, notes=notes
-        )
+        text = _environment().get_template("pages/share.html").render(**shared, trials=shown)
+        named = tuple(row.episode for row in rows)
+        made = Shared(text=text, trials=named, clips=level, notes=notes)
         least = made.size_bytes
         if least <= limit:
             return made
@@ -268,20 +249,13 @@ def _trial(run: RunFolder, row: TrialRow) -> SharedTrial:
 def _with_clips(
     run: RunFolder,
     trials: Sequence[SharedTrial],
-    level: Level,
+    level: str,
     config: ShareConfig,
     limit: int,
 ) -> tuple[list[SharedTrial] | None, tuple[str, ...]]:
     """Add clips of one quality; None as soon as they alone are too large."""
     shown, notes, size = list[SharedTrial](), list[str](), 0
-    clip_config = ClipConfig(
-        before_s=config.before_s,
-        after_s=config.after_s,
-        height_px=level.height_px,
-        rate_hz=level.rate_hz,
-        crf=level.crf,
-        quality=level.quality,
-    )
+    clip_config = replace(LEVELS[level], before_s=config.before_s, after_s=config.after_s)
     for trial in trials:
         if trial.why_no_clip:
             shown.append(trial)
@@ -290,25 +264,25 @@ def _with_clips(
         try:
             episode_path(run, trial.row.file.removesuffix(".mcap"))
             found = footage(run, trial.row, clip_config)
-            clip = _clip(found, clip_config, level, trial)
+            clip = _clip(found, clip_config, trial, is_video=level != STRIPS)
         except GstError as error:
             why = str(error).replace(str(run.path), run.path.name)
             shown.append(replace(trial, why_no_clip=why))
             notes.append(f"{trial.row.episode}: {why}")
             continue
-        size += clip.num_bytes
+        size += len(clip.picture) + len(clip.video)
         if size > limit:
             return None, ()
         shown.append(replace(trial, clip=clip))
     return shown, tuple(notes)
 
 
-def _clip(found: Footage, config: ClipConfig, level: Level, trial: SharedTrial) -> Clip:
+def _clip(found: Footage, config: ClipConfig, trial: SharedTrial, *, is_video: bool) -> Clip:
     height, width = found.frames[0].shape[:2]
     sides = "recorded, and the twin beside it," if found.has_twin else "recorded"
     at = f"around the moment when {trial.moment_text}" if trial.moment_text else "at the end"
     words = f"{trial.row.episode} {sides} {at}"
-    if level.is_video and len(found.frames) > 1:
+    if is_video and len(found.frames) > 1:
         key = encode_jpeg(found.frames[found.key], config.quality, subsampling=SUBSAMPLING)
         return Clip(
             picture=_data("image/jpeg", key),
@@ -338,27 +312,10 @@ def _data(media_type: str, data: bytes) -> str:
 @cache
 def _environment() -> Environment:
     """The report's templates and words, and beside them those of the pages."""
-    report = environment()
-    made = Environment(
-        loader=ChoiceLoader(
-            [
-                PackageLoader("evaluator.report"),
-                PrefixLoader({"pages": PackageLoader("dashboards")}),
-            ]
-        ),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     words = (wording.outcome_word, wording.verdict_word, wording.condition_word, wording.tone)
-    made.filters |= {function.__name__: function for function in words} | {
-        name: report.filters[name] for name in report.filters if name not in made.filters
+    report, pages = environment(), PrefixLoader({"pages": PackageLoader("dashboards")})
+    made = report.overlay(loader=ChoiceLoader([PackageLoader("evaluator.report"), pages]))
+    made.filters = report.filters | {
+        function.__name__: function for function in (*words, wording.length_text)
     }
-    made.filters["length_text"] = wording.length_text
-    made.tests["figures"] = report.tests["figures"]
-    shown: Mapping[str, Any] = {
-        name: value for name, value in report.globals.items() if name.startswith("shown_")
-    }
-    made.globals |= shown
     return made

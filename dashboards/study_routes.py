@@ -12,10 +12,13 @@ from starlette.routing import Route
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, MissingDependencyError, UsageError
 from dashboards.answers import kept
+from dashboards.clips import clip, picture
 from dashboards.comparison import judge
 from dashboards.config import DashboardConfig, ShareConfig
 from dashboards.errors import NotHereError
+from dashboards.failures_page import PART_WORDS, build_failures
 from dashboards.loading import LOADING
+from dashboards.share_file import build_share
 from evaluator.review_index import FailureSelection
 from evaluator.trial_row import TrialRow
 
@@ -79,25 +82,17 @@ class StudyPages:
 
     def failures(self, request: Request) -> Response:
         """``/failures?cause=&stage=&bodies=&start=&by=``: what goes wrong, and its pictures."""
-        with LOADING:
-            from dashboards.failures_page import PART_WORDS, build_failures  # noqa: PLC0415
-
         run = self._run(request)
-        found = build_failures(run, judge(run), FailureSelection.of(request.query_params))
-        return self._page("failures.html", request, page=found, part_words=PART_WORDS)
+        known = judge(run)
+        found = build_failures(run, known, FailureSelection.of(request.query_params))
+        return self._page("failures.html", request, page=found, known=known, part_words=PART_WORDS)
 
     def picture(self, request: Request) -> Response:
         """``/failures/picture/<id>``: a trial at its moment, recorded beside twin."""
-        with LOADING:
-            from dashboards.clips import picture  # noqa: PLC0415  # reads episodes
-
         return kept(picture(self._run(request), self._trial(request)), "image/jpeg")
 
     def clip(self, request: Request) -> Response:
         """``/failures/clip/<id>``: a trial around its moment, as MP4."""
-        with LOADING:
-            from dashboards.clips import clip  # noqa: PLC0415  # reads episodes
-
         try:
             data = clip(self._run(request), self._trial(request))
         except MissingDependencyError as error:
@@ -106,9 +101,6 @@ class StudyPages:
 
     def share(self, request: Request) -> Response:
         """``/share?trial=ID&trial=ID``: these trials in one file, to be saved and sent."""
-        with LOADING:
-            from dashboards.share_file import build_share  # noqa: PLC0415  # loads the evaluator
-
         named = tuple(request.query_params.getlist("trial"))
         try:
             with _SHARING:  # it takes seconds: one at a time

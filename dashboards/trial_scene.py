@@ -92,7 +92,6 @@ class TrialScene:
     """Everything that is drawn of one trial, in the frame of the rebuilt scene."""
 
     times_s: Float[np.ndarray, " num_samples"]
-    scene: Scene | None
     parts: MovableScene | None
     """None where no scene was rebuilt."""
     sides: tuple[Side, ...]
@@ -178,7 +177,6 @@ def gather_scene(
             sides.append(side)
     return TrialScene(
         times_s=gathering.times_s,
-        scene=scene,
         parts=gathering.parts,
         sides=tuple(sides),
         Ts_root_link=_links(gathering, postures, robot),

@@ -46,9 +46,6 @@ class TwinPage:
     problems: tuple[str, ...]
     next_command: str
     """Empty where there is no recording to rebuild from."""
-    stand_in: bool | None
-    has_methods: bool
-    """Whether renders of other methods were compared."""
 
 
 def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
@@ -77,8 +74,6 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
         next_command=""
         if judgement.only_motions or not run.episodes()
         else f"robot-gst rebuild {shlex.quote(str(run.path))}",
-        stand_in=judgement.stand_in,
-        has_methods=judgement.has_methods,
     )
 
 

@@ -59,8 +59,9 @@ class Drawing:
     def inline(self) -> str:
         """For a page that defines the colours; its ids start with the figure's."""
         attributes = f'role="img" aria-labelledby="{self.id}-title {self.id}-alt"'
-        style = '<g style="font:12px var(--figure-font)">'
-        return self._written(attributes, style, {name: f"var(--{name})" for name in LIGHT})
+        style = '<g font-size="12" font-family="var(--figure-font)">'
+        meant = {name: f"var(--{NAMES.get(name, name)})" for name in LIGHT}
+        return self._written(attributes, style, meant)
 
     def _written(self, attributes: str, style: str, colours: dict[str, str]) -> str:
         body = "\n".join(self.marks)
@@ -148,11 +149,8 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
     for at, together in Counter(places).items():
         if together > 1:
             x, y = left + side * at[0], top + side * (1 - at[1]) + (20 if at[1] > HIGH else -8)
-            right = at[0] > HIGH
-            words = f"\u00d7{together}"
-            marks.append(
-                _text(x - 8 if right else x + 8, y, words, "ink", "end" if right else "start")
-            )
+            aside, anchor = (-8, "end") if at[0] > HIGH else (8, "start")
+            marks.append(_text(x + aside, y, f"\u00d7{together}", "ink", anchor))
     with_too = any(group.condition == WITH for group in drawn)
     filled = " Hollow: without replanning; solid: with." if with_too else ""
     each = [n for n in ("task", "condition", "policy") if any(getattr(g, n) for g in drawn)]

@@ -61,8 +61,7 @@ def refresh(run: RunFolder) -> bytes:
         for kind in review_index.FACETS:
             refuse_alike(kind, ((getattr(row, kind), row.episode) for row in found.rows))
         derived = {file.name for file in found.contents.derived}
-        motions = found.summaries.motions
-        read = replace(read, rows=found.rows, motions=motions, derived=derived)
+        read = replace(read, rows=found.rows, motions=found.summaries.motions, derived=derived)
     except GstError as error:
         read = replace(read, reason=str(error))
     try:

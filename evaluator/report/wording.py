@@ -47,7 +47,7 @@ def _figure(value: float, unit: str) -> str:
 def is_share(measurement: Measurement) -> bool:
     """Say whether the value is a share of something, which people read in percent."""
     counted = measurement.k is not None and measurement.n is not None
-    return measurement.unit == "1" and (counted or measurement.id.startswith("rate."))
+    return measurement.unit == "1" and (counted or measurement.id.startswith("rate"))
 
 
 def value_text(measurement: Measurement) -> str:

@@ -18,6 +18,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.media.color import decode_color
 from dashboards import clips
 from dashboards.comparison import judge
+from dashboards.failures_page import PART_WORDS
 from evaluator.compare.failures import (
     NO_ANSWER,
     TWIN_SUCCEEDS,
@@ -77,6 +78,10 @@ def _starts(p_m: np.ndarray, task: str = "pour") -> list[TrialRow]:
         )
         for i, p in enumerate(p_m.tolist())
     ]
+
+
+def test_every_part_of_a_failure_has_its_word() -> None:
+    assert PART_WORDS.keys() == set(FAILURE_PARTS)
 
 
 def test_start_regions_are_halves_wherever_the_robot_stands() -> None:

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dashboards import figures
-from evaluator.result import Interval, Measurement
 
 
 def signal(values: np.ndarray) -> figures.Signal:
@@ -55,7 +54,6 @@ def test_nothing_to_draw_is_none_and_not_an_empty_plot() -> None:
     assert figures.time_plot("t", "m", [], span_s=(0, 1)) is None
     assert figures.time_plot("t", "m", [signal(np.full(3, np.nan))], span_s=(0, 1)) is None
     assert figures.stage_chart([("planned", [])], [], span_s=(0, 1)) is None
-    assert figures.scatter([]) is None
 
 
 def test_stage_bars_keep_their_order_and_lose_labels_that_do_not_fit() -> None:
@@ -70,30 +68,3 @@ def test_stage_bars_keep_their_order_and_lose_labels_that_do_not_fit() -> None:
     assert (first.label, second.label) == ("approach", "")
     assert "grasp" in second.title
     assert chart.marks == ()
-
-
-def rate(value: float, side: str) -> Measurement:
-    interval = Interval(
-        low=max(0.0, value - 0.2), high=min(1.0, value + 0.2), level=0.95, method="w"
-    )
-    return Measurement(
-        id=f"rate.{side}.a.b.c", value=value, unit="1", definition="d", interval=interval, k=1, n=2
-    )
-
-
-def group(replayed: float, recorded: float) -> figures.RateGroup:
-    return figures.RateGroup(
-        label="a", series="a", task="a", condition="with_replanning", policy="", filled=True,
-        replayed=rate(replayed, "sim_planned"), recorded=rate(recorded, "recorded"),
-    )  # fmt: skip
-
-
-def test_groups_in_agreement_lie_on_the_identity_line_also_two_alike() -> None:
-    drawn = figures.scatter([group(0.7, 0.7), group(0.7, 0.7), group(0.2, 0.4)])
-    assert drawn is not None
-    for point in drawn.points[:2]:
-        across = (point.x - drawn.axis_x.px(0)) / (drawn.axis_x.px(1) - drawn.axis_x.px(0))
-        upright = (point.y - drawn.axis_y.px(0)) / (drawn.axis_y.px(1) - drawn.axis_y.px(0))
-        assert across == pytest.approx(0.7, abs=1e-3)
-        assert across == pytest.approx(upright, abs=1e-3)
-    assert drawn.alike == ((drawn.points[0].x, drawn.points[0].y, 2),)

@@ -14,7 +14,10 @@ from dashboards.app import create_app
 from dashboards.errors import NotHereError
 from dashboards.guard import COOKIE, Admission
 from dashboards.library import Library, derived_path, episode_path
+from evaluator.compare import compare_run
+from evaluator.report.figures import drawings_of
 from evaluator.result import load_results
+from robot_gst import run as type_here
 
 
 def test_the_overview_shows_the_numbers_of_results_json(
@@ -28,6 +31,32 @@ def test_the_overview_shows_the_numbers_of_results_json(
     assert "2 groups; it needs at least 3" in text
     assert "95 % Wilson" in text
     assert "Stand-in cell" in text
+
+
+def test_the_first_page_draws_the_rates_as_the_report_does(
+    browser: Any, shared_run: RunFolder
+) -> None:
+    drawn = next(each for each in drawings_of(compare_run(shared_run)) if each.id == "scatter")
+    page = browser.get("/").text
+    assert drawn.inline.count("<circle") == 2
+    shown = page[page.index('<svg class="fig"') :]
+    assert shown[: shown.index("</svg>")].count("<circle") == 2
+    for mark in drawn.marks:
+        assert mark.partition("fill=")[0].partition("stroke=")[0] in shown
+
+
+def test_the_results_of_a_table_ask_for_no_recording(tmp_path: Path, synthetic: ModuleType) -> None:
+    lines = [f"t{i},stack,octo,{'success' if i % 3 else 'failure'}" for i in range(12)]
+    (tmp_path / "study.csv").write_text("\n".join(["trial_id,task,policy,outcome", *lines]))
+    place = RunFolder(tmp_path / "study")
+    assert type_here(["evaluate", f"{place.path}.csv", "--out", str(place.results_dir)]) == 0
+    pages = synthetic.browser_of(place)
+    for address in ("/", "/queue", "/failures"):
+        shown = words(pages.get(address).text)
+        assert "from a table" in shown
+        assert "robot-gst record" not in shown
+        assert "older than the run" not in shown
+    assert "8/12" in words(pages.get("/").text)
 
 
 def test_disagreements_come_first_and_outcomes_have_words(browser: Any) -> None:

@@ -103,7 +103,7 @@ def test_lanes_say_what_is_apart_from_when_on_and_why_plans_were_sent_back(
     ]
     (bar,) = lanes["object apart"].bars
     assert bar.x == pytest.approx(chart.x.px(1 + 2.0))  # the plan starts after one second
-    assert bar.label == "planned – recorded: 69.0\u00a0mm"
+    assert bar.label == "planned – recorded: 69.00\u00a0mm"
     assert "grip apart" not in lanes
     (touch,) = lanes["touch, planned"].bars
     assert (touch.label, touch.x) == ("cube", pytest.approx(chart.x.px(1 + 1.5), abs=1.0))

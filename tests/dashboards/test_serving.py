@@ -15,7 +15,7 @@ from bridge.errors import UsageError
 from bridge.terminal import Output
 from dashboards.config import DashboardConfig
 from dashboards.demo import DemoConfig, run_demo
-from dashboards.errors import AddressTakenError, NotHereError
+from dashboards.errors import DashboardError, NotHereError
 from dashboards.guard import Admission, host_name, is_loopback
 from dashboards.library import derived_paths, episode_path
 from dashboards.server import Address, listen
@@ -24,7 +24,7 @@ from dashboards.server import Address, listen
 def test_a_taken_port_is_one_clear_sentence() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        with pytest.raises(AddressTakenError, match=rf"port {port}: .*in use.*--port 0"):
+        with pytest.raises(DashboardError, match=rf"port {port}: .*in use.*--port 0"):
             listen(DashboardConfig(port=port))
 
 
@@ -44,7 +44,7 @@ def test_a_demo_of_an_unknown_task_is_refused_before_anything_is_recorded(tmp_pa
 
 
 def test_an_address_that_is_not_ours_is_refused() -> None:
-    with pytest.raises(AddressTakenError, match=r"cannot listen on 192\.0\.2\.1"):
+    with pytest.raises(DashboardError, match=r"cannot listen on 192\.0\.2\.1"):
         listen(DashboardConfig(host="192.0.2.1", port=0))
 
 

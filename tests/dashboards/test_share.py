@@ -94,9 +94,9 @@ def test_a_smaller_limit_takes_quality_and_then_refuses(
     monkeypatch.setattr(share_file, "_figure", lambda _: None)
     names = ("trial_0001", "trial_0002")
     full = build_share(run, ShareConfig(trials=names))
-    assert full.level == LEVELS[0]
+    assert full.clips == next(iter(LEVELS))
     less = build_share(run, ShareConfig(trials=names, max_mb=0.9 * full.size_bytes / MB))
-    assert less.level in LEVELS[1:]
+    assert less.clips in [*LEVELS][1:]
     assert less.size_bytes <= 0.9 * full.size_bytes
     assert less.trials == names
     many = tuple(f"trial_000{number}" for number in (1, 2, 3, 4))

@@ -39,7 +39,6 @@ def test_rated_views_come_worst_first_and_unrated_ones_last(copy: RunFolder) -> 
     assert [view.psnr_db for view in page.views] == [18.0, 25.0, None]
     assert [view.ssim for view in page.views] == [0.8, 0.8, None]
     assert page.rated
-    assert page.stand_in is True
 
 
 def test_views_without_scores_are_shown_in_recorded_order(copy: RunFolder) -> None:

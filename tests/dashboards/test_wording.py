@@ -1,7 +1,5 @@
 """Printed numbers keep their count, their interval, and their smallness."""
 
-import pytest
-
 from dashboards import wording
 from evaluator.result import Interval, Measurement
 
@@ -17,23 +15,9 @@ def plain(text: str) -> str:
     return text.replace("\u00a0", " ")
 
 
-@pytest.mark.parametrize(
-    ("value", "unit", "expected"),
-    [
-        (0.0123, "m", "12.3 mm"),
-        (1.2e-5, "m", "0.01 mm"),
-        (0.0, "m", "0.0 mm"),
-        (24.666, "pp", "+25 pp"),
-        (-3.2, "pp", "−3 pp"),
-        (0.8, "fraction", "80 %"),
-        (31.774, "dB", "31.77 dB"),
-        (0.00004, "1", "4e−05"),
-        (7.0, "count", "7"),
-        (1.5, "N", "1.5 N"),
-    ],
-)
-def test_a_value_is_printed_in_its_unit(value: float, unit: str, expected: str) -> None:
-    assert plain(wording.number(value, unit)) == expected
+def test_a_length_keeps_its_unit_on_its_line() -> None:
+    assert wording.length_text(0.0123) == "12.30\u00a0mm"
+    assert wording.length_text(None) == "missing"
 
 
 def test_a_chance_of_success_is_counts_and_whole_percentages() -> None:
@@ -41,12 +25,16 @@ def test_a_chance_of_success_is_counts_and_whole_percentages() -> None:
     assert plain(wording.success_share(said)) == "4 of 4 varied replays succeed, 51 to 100 %"
 
 
-def test_a_rate_in_large_is_its_count_and_below_stands_its_interval() -> None:
+def test_a_name_breaks_at_its_joints_and_a_number_never() -> None:
+    shown = wording.breakable("gripper_left_finger is 7.4 mm inside, 6/10 [-84, 2.12]")
+    assert shown == "gripper_<wbr>left_<wbr>finger is 7.4 mm inside, 6/10 [-84, 2.12]"
+
+
+def test_a_narrow_column_has_count_and_interval_without_words() -> None:
     rate = measurement(k=2, n=3, counted="trial", interval=WILSON)
-    assert wording.headline(rate) == "2 of 3"
-    below = plain(wording.headline_evidence(rate))
-    assert below == "67 % of trials, 21 to 94 % (95 % Wilson)"
-    assert plain(wording.short_evidence(rate)) == "2/3, 21 to 94 %"
+    assert plain(wording.measured(rate)) == "66.7 %"
+    assert plain(wording.evidence(rate)) == "2/3 trials, [20.8, 93.9] (95 % Wilson)"
+    assert plain(wording.short_evidence(rate)) == "2/3, [20.8, 93.9]"
 
 
 def test_undefined_says_why_and_absent_says_missing() -> None:
@@ -58,7 +46,7 @@ def test_undefined_says_why_and_absent_says_missing() -> None:
 
 def test_a_number_without_interval_says_why() -> None:
     bare = measurement(n=4, counted="pair of runs", reason_without_interval="not estimated")
-    assert wording.evidence(bare) == "n = 4 pairs of runs, no interval: not estimated"
+    assert wording.evidence(bare) == "4 pairs of runs, no interval: not estimated"
 
 
 def test_outcomes_have_a_sign_and_a_word() -> None:
