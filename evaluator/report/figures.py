@@ -132,7 +132,10 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
         'stroke-dasharray="4 3"/>',
     ]
     places = [tuple(rate.value or 0.0 for rate in group.pair) for group in drawn]
-    for group, at in zip(drawn, places, strict=True):
+    # What is solid comes last, smaller: where both coincide a dot stands in a ring.
+    for group, at in sorted(
+        zip(drawn, places, strict=True), key=lambda it: it[0].condition == WITH
+    ):
         sim, real = group.pair
         x, y = left + side * at[0], top + side * (1 - at[1])
         if sim.interval is not None:
@@ -141,9 +144,9 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
         if real.interval is not None:
             ends = [top + side * (1 - end) for end in (real.interval.low, real.interval.high)]
             marks.append(_line(x, ends[0], x, ends[1]))
-        fill = "{sim}" if group.condition == WITH else "{paper}"
+        fill, size = ("{sim}", 3) if group.condition == WITH else ("{paper}", 5)
         marks.append(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{fill}" stroke="{{sim}}" '
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" fill="{fill}" stroke="{{sim}}" '
             f'stroke-width="2"><title>{escape(group.label)}</title></circle>'
         )
     for at, together in Counter(places).items():
@@ -152,7 +155,7 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | None:
             aside, anchor = (-8, "end") if at[0] > HIGH else (8, "start")
             marks.append(_text(x + aside, y, f"\u00d7{together}", "ink", anchor))
     with_too = any(group.condition == WITH for group in drawn)
-    filled = " Hollow: without replanning; solid: with." if with_too else ""
+    filled = " Ring: without replanning; dot: with." if with_too else ""
     each = [n for n in ("task", "condition", "policy") if any(getattr(g, n) for g in drawn)]
     bars = any(rate.interval for group in drawn for rate in group.pair)
     drawn_as = f"One mark per group ({', '.join(each)}){BOTH_KNOWN if bars else ''}. Below the"
