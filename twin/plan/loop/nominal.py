@@ -29,7 +29,7 @@ from twin.plan.loop.tau import (
     stage_of_leg,
     stages_of,
 )
-from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, NoPathError, PathConfig, plan_move
+from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, Mover, NoPathError, PathConfig
 from twin.plan.path.transfer import LIFT_M, Leg, plan_transfer
 from twin.plan.problem import Grasp, Joints, Miss, Pose, Problem, Release, State, Vector
 from twin.plan.release.final_states import MAX_RELEASES, final_states, places_on_table
@@ -93,7 +93,7 @@ class Transfer:
     @property
     def end_rad(self) -> Joints:
         """Arm when it has let go and left."""
-        return np.asarray(self.legs[-1].movement.path.joints_rad[-1])
+        return np.asarray(self.legs[-1].path.joints_rad[-1])
 
 
 @dataclass(frozen=True)
@@ -387,7 +387,7 @@ class _Options:
 
     def remarks_of(self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]) -> tuple[str, ...]:
         """Where the numbers of a transfer come from, in words."""
-        postures = sum(leg.movement.path.work.get("postures", 0.0) for leg in legs)
+        postures = sum(leg.path.work.get("postures", 0.0) for leg in legs)
         clear = release.clearance_m
         nearest = f", {clear * 1e3:.0f} mm clear" if np.isfinite(clear) else ""
         return (
@@ -448,7 +448,7 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
                 continue  # it lies where it lay; the time law keeps speeds there
             stage = stage_of_leg(leg.name, ids)
             states = _states_along(problem, grasp, leg)
-            times_s = leg.movement.path.times_s
+            times_s = leg.path.times_s
             asked = [(each, worst_along(each, states, times_s=times_s)) for each in of_stage[stage]]
             if leg.name == "carry":
                 last = flattened(states)
@@ -467,10 +467,10 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
 
 def _states_along(problem: Problem, grasp: Grasp, leg: Leg) -> State:
     """Poses along a leg that carries, as ``worst_along`` takes them."""
-    T_tcp = problem.robot.Ts_base_tcp(leg.movement.path.joints_rad)
+    T_tcp = problem.robot.Ts_base_tcp(leg.path.joints_rad)
     Ts: dict[str, Any] = {name: T[None, None] for name, T in problem.scene.Ts_base_object.items()}
     Ts[grasp.object_id] = (T_tcp @ se3.invert(grasp.T_object_tcp))[None]
-    widths = np.full((1, len(T_tcp)), leg.movement.width_m)
+    widths = np.full((1, len(T_tcp)), leg.width_m)
     return State(Ts_base_object=Ts, T_base_tcp=T_tcp[None], width_m=widths)
 
 
@@ -493,11 +493,12 @@ def _plan_of(
     slow = speed_limits(task, transfers[-1].key).get("leave", 0.0)
     config = PathConfig(seed=seed % 2**31, tool_m_s=slow)
     try:
-        home = plan_move(last, transfers[-1].end_rad, home_rad[None], config, width_m=open_m)
+        mover = Mover(problem=last, config=config, width_m=open_m)
+        home = mover.around(transfers[-1].end_rad, home_rad[None])
     except NoPathError as error:
         remarks += (f"the arm stays where it let go: {error}",)
     else:
-        leg = Leg(name="home", movement=home, g=0)
+        leg = Leg(name="home", path=home, g=0, width_m=open_m)
         trajectory.add(leg, str(task.stages[-1]["id"]), open_m)
     tau = tuple(trajectory.tau)
     return _written(problem, policy, plan_id, tau, trajectory.bounds, there), remarks

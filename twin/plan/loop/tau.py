@@ -53,11 +53,9 @@ class Trajectory:
     def add(self, leg: Leg, stage: str, width_m: float) -> None:
         """Append one movement."""
         begin_s = self.end_s
-        points = waypoints_of(
-            self.robot, leg.movement.path, g=leg.g, width_m=width_m, begin_s=begin_s
-        )
+        points = waypoints_of(self.robot, leg.path, g=leg.g, width_m=width_m, begin_s=begin_s)
         self.tau += points[1:] if self.tau else points
-        self._ends(stage, begin_s, begin_s + float(leg.movement.path.times_s[-1]))
+        self._ends(stage, begin_s, begin_s + float(leg.path.times_s[-1]))
 
     def _pause(self, stage: str, seconds: float, *, g: int, width_m: float) -> None:
         """Stand still while the hand goes to a width, as fast as its fingers may at most."""
