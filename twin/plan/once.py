@@ -379,11 +379,11 @@ def _explained(problem: Problem, plan: Plan, stage: Stage) -> list[str]:
         except (UsageError, TwinError) as error:
             told.append(f"    {record.get('kind')}: {error}")
             continue
+        start = State.single(problem.scene.Ts_base_object, _tool(plan.tau[0]), 0.0)
         if number >= len(stage.subgoal):
-            told.append(f"    kept on the way: {constraint.wanted}")
+            told.append(f"    kept on the way: {constraint.wanted(start)}")
             continue
         at_rest = number < len(goals)
-        start = State.single(problem.scene.Ts_base_object, _tool(plan.tau[0]), 0.0)
         told.append(f"    now: {constraint.explain(start)}")
         state = _state(problem, plan, stage, at_rest=at_rest)
         told.append(f"    {'at rest' if at_rest else then}: {constraint.explain(state)}")

@@ -12,22 +12,20 @@ import numpy as np
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.check import TABLE
+from bridge.task.relations import Measured
 from bridge.task.task_file import ObjectModel
 from twin.plan.constrain.bodies import (
     Record,
-    box_pose,
+    box_of,
     carried,
     directions_of,
-    half_extents_m,
-    heights,
     point_of,
     pose_of,
-    seen_from,
     surface_points,
 )
-from twin.plan.constrain.constraint import Constraint, Term, flattened
+from twin.plan.constrain.constraint import Constraint, flattened
 from twin.plan.constrain.distances import Boxes
-from twin.plan.constrain.relations import RELATIONS
+from twin.plan.constrain.relations import RELATIONS, relation_of
 from twin.plan.constrain.schema import SCENE, Vocabulary, check_constraint, values_of
 from twin.plan.problem import Array, Problem, State
 
@@ -40,7 +38,7 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
             reason = problem.scene.reasons.get(name, "not found")
             message = f"{record['kind']}: {name} was not localised ({reason}). Look again."
             raise UsageError(message)
-    return _KINDS[record["kind"]](record, problem)
+    return _KINDS[record["kind"]](dict(record), problem)
 
 
 _STRAIGHT = np.eye(1, 4)[0]
@@ -49,69 +47,73 @@ _ID_KEYS = ("obj", "container", "support", "reference", "against", "over", "fram
 
 def _distance(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (point_of(record[key], problem) for key in "ab")
-    low, high = float(record.get("min", -np.inf)), float(record.get("max", np.inf))
-    term = Term(
-        what=f"the distance from {a_name} to {b_name}",
-        measure=lambda state: np.linalg.norm(a(state) - b(state), axis=-1),
-    )
-    terms = []
+    limits = []
     if "target" in record:
         target, tol = record["target"], record["tol"]
-        least = target - tol if target > tol else -np.inf
-        terms.append(replace(term, low=least, high=target + tol))
+        limits.append((target - tol if target > tol else -np.inf, target + tol))
     if "min" in record or "max" in record:
-        terms.append(replace(term, low=low, high=high))
-    return Constraint.of(record, *terms)
+        limits.append((record.get("min", -np.inf), record.get("max", np.inf)))
+
+    def measured(state: State) -> list[Measured]:
+        value, what = np.linalg.norm(a(state) - b(state), axis=-1), f"{a_name} to {b_name}"
+        return [
+            Measured(what=f"the distance from {what}", value=value, low=low, high=high)
+            for low, high in limits
+        ]
+
+    return Constraint(record=record, measured=measured)
 
 
 def _above(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (point_of(record[key], problem) for key in "ab")
     height, tol = record["height"], record["tol"]
-    return Constraint.of(
-        record,
-        Term(
-            what=f"the height of {a_name} over {b_name}",
-            measure=lambda state: (a(state) - b(state))[:, 2],
-            low=height - tol,
-            high=height + tol,
-        ),
-        Term(
-            what=f"its distance aside from {b_name}",
-            measure=lambda state: np.linalg.norm((a(state) - b(state))[:, :2], axis=-1),
-            high=record["xy_tol"],
-        ),
-    )
+
+    def measured(state: State) -> list[Measured]:
+        way, what = a(state) - b(state), f"the height of {a_name} over {b_name}"
+        aside = np.linalg.norm(way[:, :2], axis=-1)
+        return [
+            Measured(what=what, value=way[:, 2], low=height - tol, high=height + tol),
+            Measured(what=f"its distance aside from {b_name}", value=aside, high=record["xy_tol"]),
+        ]
+
+    return Constraint(record=record, measured=measured)
 
 
 def _align(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (directions_of(record[key], problem) for key in "ab")
     either = any(record[key].get("axis") == "any" for key in "ab")
     undirected = either or record.get("undirected", False)
+    most_rad = float(np.radians(record["max_deg"]))
 
-    def off(state: State) -> Array:
+    def measured(state: State) -> list[Measured]:
         one, other = a(state)[:, :, None], b(state)[:, None]
         across, along = np.linalg.norm(np.cross(one, other), axis=-1), (one * other).sum(-1)
-        return np.arctan2(across, abs(along) if undirected else along).min(axis=(1, 2))
+        off = np.arctan2(across, abs(along) if undirected else along).min(axis=(1, 2))
+        what = f"the angle between {a_name} and {b_name}"
+        return [Measured(what=what, value=off, high=most_rad, unit="rad")]
 
-    term = Term(
-        what=f"the angle between {a_name} and {b_name}",
-        measure=off,
-        high=float(np.radians(record["max_deg"])),
-        unit="rad",
+    return Constraint(record=record, measured=measured)
+
+
+def _one(
+    record: Record,
+    what: str,
+    measure: Callable[[State], Array],
+    *,
+    low: float,
+    high: float = np.inf,
+) -> Constraint:
+    """A constraint of one length."""
+    return Constraint(
+        record=record,
+        measured=lambda state: [Measured(what=what, value=measure(state), low=low, high=high)],
     )
-    return Constraint.of(record, term)
 
 
 def _clearance(record: Record, problem: Problem) -> Constraint:
     obj, against = record["obj"], record["against"]
-    return Constraint.of(
-        record,
-        Term(
-            what=f"the least distance between {obj} and {against}",
-            measure=_least_distance(obj, against, problem),
-            low=record["min"],
-        ),
-    )
+    what = f"the least distance between {obj} and {against}"
+    return _one(record, what, _least_distance(obj, against, problem), low=record["min"])
 
 
 def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State], Array]:
@@ -150,45 +152,31 @@ def _keepout(record: Record, problem: Problem) -> Constraint:
     """Out of the upright column over the box around an object that stands upright."""
     obj, over = record["obj"], record["region"]["over"]
     points = surface_points(problem, obj)
-    half = half_extents_m(problem.model(over))
 
     def least(state: State) -> Array:
-        surface = carried(pose_of(state, obj), points)
-        beyond = abs(seen_from(box_pose(state, over, problem), surface)[..., :2]) - half[:2]
+        surface, box = carried(pose_of(state, obj), points), box_of(state, over, problem)
+        beyond = replace(box, T_base_box=box.T_base_box[:, None]).beyond_m(surface)[..., :2]
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
         return np.amin(outside + np.minimum(beyond.max(axis=-1), 0.0), axis=-1)
 
-    return Constraint.of(
-        record,
-        Term(
-            what=f"the distance of {obj} from what is over {over}",
-            measure=least,
-            low=record.get("margin", 0.0),
-        ),
-    )
+    what = f"the distance of {obj} from what is over {over}"
+    return _one(record, what, least, low=record.get("margin", 0.0))
 
 
 def _height(record: Record, problem: Problem) -> Constraint:
     table = problem.scene.table_height_m
+    low, high = record.get("min", -np.inf), record.get("max", np.inf)
     if "obj" in record:
-        name = f"the lowest point of {record['obj']}"
-    else:
-        point, name = point_of(record["a"], problem)
+        obj = record["obj"]
+        what = f"the height of the lowest point of {obj} over the table"
 
-    def measure(state: State) -> Array:
-        if "obj" in record:
-            return heights(state, record["obj"], problem)[0] - table
-        return point(state)[:, 2] - table
+        def lowest(state: State) -> Array:
+            return box_of(state, obj, problem).heights_m[0] - table
 
-    return Constraint.of(
-        record,
-        Term(
-            what=f"the height of {name} over the table",
-            measure=measure,
-            low=record.get("min", -np.inf),
-            high=record.get("max", np.inf),
-        ),
-    )
+        return _one(record, what, lowest, low=low, high=high)
+    point, name = point_of(record["a"], problem)
+    what = f"the height of {name} over the table"
+    return _one(record, what, lambda state: point(state)[:, 2] - table, low=low, high=high)
 
 
 def _speed(record: Record, problem: Problem) -> Constraint:
@@ -204,17 +192,15 @@ def _speed(record: Record, problem: Problem) -> Constraint:
         speeds = np.linalg.norm(p[:, 1:] - p[:, :-1], axis=-1) / seconds
         return np.amax(speeds, axis=-1) - limit
 
-    term = Term(what=f"the speed of {name}", measure=_nothing, high=limit, unit="m/s")
-    return replace(Constraint.of(record, term), along=along)
+    def still(state: State) -> list[Measured]:  # a single state has no speed
+        value = 0.0 * state.T_base_tcp[:, 0, 0]
+        return [Measured(what=f"the speed of {name}", value=value, high=limit, unit="m/s")]
 
-
-def _nothing(state: State) -> Array:
-    """What a single state has of a number that only a path has."""
-    return 0.0 * state.T_base_tcp[:, 0, 0]
+    return Constraint(record=record, measured=still, along=along)
 
 
 _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
-    **RELATIONS,
+    **dict.fromkeys(RELATIONS, relation_of),
     "distance": _distance,
     "above": _above,
     "align": _align,

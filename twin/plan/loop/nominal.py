@@ -1,6 +1,6 @@
 """The planner: grasps by margin, final states of each, collision-free timed ways between them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import erfc, sqrt
@@ -11,34 +11,33 @@ import numpy as np
 from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.model_policy import MODEL_POLICY
-from bridge.task.plan import Plan, Waypoint
-from twin.plan.constrain.constraint import SHOWN, Constraint, flattened, violated, worst_along
+from bridge.task.plan import Plan
+from bridge.task.relations import SHOWN
+from twin.plan.constrain.constraint import Constraint, flattened, violated, worst_along
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
 from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
-from twin.plan.loop.push import push_choices, pushed
+from twin.plan.loop.push import push, push_choices
 from twin.plan.loop.steer import Steer
 from twin.plan.loop.tau import (
-    Bounds,
+    OPEN_S,
     Trajectory,
     goals_of,
     plan_stage,
     refuse_without_stages,
-    speed_limits,
+    speed_limit,
     stage_of_leg,
     stages_of,
 )
 from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, Mover, NoPathError, PathConfig
-from twin.plan.path.transfer import LIFT_M, Leg, plan_transfer
+from twin.plan.path.transfer import LEGS, LIFT_M, Leg, plan_transfer
 from twin.plan.problem import Grasp, Joints, Miss, Pose, Problem, Release, State, Vector
 from twin.plan.release.final_states import MAX_RELEASES, final_states, places_on_table
 from twin.plan.release.resting import NoFinalStateError, lying_there
 from twin.replay.clearance.bodies import SCENE
 
 PLANNER = "gst_planner"
-CLOSED_M = 0.0
-"""Commanded width of the closed hand: its force, not its place, is what holds."""
 GRASPS = 6
 WIDER_M = 0.003
 """Kept beyond what was asked for where a path was refused."""
@@ -109,40 +108,46 @@ class PlanProposer:
         task = problem.scene.task
         refuse_lost(problem.scene)
         refuse_without_stages(task)
-        if any(table.get("push") for table in task.stages):
-            return self._pushed(problem, plan_id, count)
+        pushing = any(table.get("push") for table in task.stages)
         search = _Search(problem, seed, steer)
+        offers = _pushes(problem, search) if pushing else _transfers(problem, search)
         found: list[Candidate] = []
-        for transfers in search.sequences():
-            try:
-                plan, remarks = _plan_of(problem, transfers, self.policy, plan_id, seed)
-            except NoPathError as error:
-                search.why = f"{error}."
-                continue
-            cost = sum(each.cost for each in transfers)
-            found.append(Candidate(plan=plan, rank=len(found), cost=cost, remarks=remarks))
+        for cost, trajectory, after, remarks in offers:
+            told = (*remarks, *_go_home(after, trajectory, seed))
+            plan = _written(problem, after, trajectory, self.policy, plan_id)
+            found.append(Candidate(plan=plan, rank=len(found), cost=cost, remarks=told))
             if len(found) == count:
                 break
         if not found:
             raise NoPlanError(search.why)
         return found
 
-    def _pushed(self, problem: Problem, plan_id: str, count: int) -> list[Candidate]:
-        found: list[Candidate] = []
-        why, remarks = "", ("pushed straight, tool down; no distance was looked at",)
-        for choice in push_choices(problem):
-            if len(found) == count:
-                break
-            try:
-                plan = _written(problem, self.policy, plan_id, *pushed(problem, choice))
-            except NoPlanError as error:
-                why = str(error)
-                continue
-            rank = len(found)
-            found.append(Candidate(plan=plan, rank=rank, cost=choice.cost, remarks=remarks))
-        if not found:
-            raise NoPlanError(why)
-        return found
+
+Offer = tuple[float, Trajectory, Problem, tuple[str, ...]]
+"""Its cost, the way, how everything is after it, and remarks."""
+
+
+def _pushes(problem: Problem, search: "_Search") -> Iterator[Offer]:
+    for choice in push_choices():
+        trajectory, after, key = Trajectory(robot=problem.robot), problem, ""
+        try:
+            for key in problem.scene.task.manipulated:  # the message names it
+                after = push(after, key, choice, trajectory)
+        except NoPathError as error:
+            search.why = _why_not_moved(problem, key, error)
+            continue
+        yield choice.cost, trajectory, after, ("pushed straight, tool down",)
+
+
+def _transfers(problem: Problem, search: "_Search") -> Iterator[Offer]:
+    for transfers in search.sequences():
+        trajectory, after = Trajectory(robot=problem.robot), problem
+        for each in transfers:
+            stages = stages_of(problem.scene.task, each.key)
+            trajectory.add_transfer(each.legs, each.grasp, stages)
+            after = _after(after, each)
+        remarks = tuple(text for each in transfers for text in each.remarks)
+        yield sum(each.cost for each in transfers), trajectory, after, remarks
 
 
 class _Search:
@@ -219,7 +224,8 @@ class _Search:
     ) -> Transfer:
         """The first way that keeps what holds on the way."""
         kept = _kept_on_the_way(problem, grasp)
-        limits = speed_limits(problem.scene.task, grasp.object_id)
+        task, stages = problem.scene.task, stages_of(problem.scene.task, grasp.object_id)
+        limits = {leg: speed_limit(task, stage_of_leg(leg, stages)) for leg in LEGS}
         ways, base = _WAYS, PathConfig()
         steer = self._mine(grasp.object_id)
         if steer is not None and steer.change == "path":
@@ -474,45 +480,27 @@ def _states_along(problem: Problem, grasp: Grasp, leg: Leg) -> State:
     return State(Ts_base_object=Ts, T_base_tcp=T_tcp[None], width_m=widths)
 
 
-def _plan_of(
-    problem: Problem, transfers: list[Transfer], policy: str, plan_id: str, seed: int
-) -> tuple[Plan, tuple[str, ...]]:
-    """Write transfers as a plan; at the end the arm goes back to where it stood."""
-    task = problem.scene.task
-    trajectory = Trajectory(robot=problem.robot)
-    there = dict(problem.scene.Ts_base_object)
-    last = problem
-    for each in transfers:
-        trajectory.add_transfer(each.legs, each.grasp, stages_of(task, each.key), CLOSED_M)
-        there[each.key] = each.T_base_lies
-        last = _after(last, each)
-    remarks = tuple(text for each in transfers for text in each.remarks)
-    start = problem.scene.start_rad
-    home_rad = problem.robot.home_rad if start is None else start
-    open_m = transfers[-1].grasp.open_m
-    slow = speed_limits(task, transfers[-1].key).get("leave", 0.0)
-    config = PathConfig(seed=seed % 2**31, tool_m_s=slow)
+def _go_home(after: Problem, trajectory: Trajectory, seed: int) -> tuple[str, ...]:
+    """At the end the arm goes back to where it stood, its hand open."""
+    task, robot, last = after.scene.task, after.robot, trajectory.tau[-1]
+    home_rad, end_rad = (np.array(at.joints_rad) for at in (trajectory.tau[0], last))
+    stage, open_m = str(task.stages[-1]["id"]), float(last.width_m or 0.0)
+    if last.g:
+        open_m = robot.record.gripper.max_width_m
+        trajectory.pause(stage, OPEN_S, g=0, width_m=open_m)
+    config = PathConfig(seed=seed % 2**31, tool_m_s=speed_limit(task, stage))
     try:
-        mover = Mover(problem=last, config=config, width_m=open_m)
-        home = mover.around(transfers[-1].end_rad, home_rad[None])
+        home = Mover(problem=after, config=config, width_m=open_m).around(end_rad, home_rad[None])
     except NoPathError as error:
-        remarks += (f"the arm stays where it let go: {error}",)
-    else:
-        leg = Leg(name="home", path=home, g=0, width_m=open_m)
-        trajectory.add(leg, str(task.stages[-1]["id"]), open_m)
-    tau = tuple(trajectory.tau)
-    return _written(problem, policy, plan_id, tau, trajectory.bounds, there), remarks
+        return (f"the arm stays where it let go: {error}",)
+    trajectory.add(Leg(name="home", path=home, g=0, width_m=open_m), stage, open_m)
+    return ()
 
 
 def _written(
-    problem: Problem,
-    policy: str,
-    plan_id: str,
-    tau: tuple[Waypoint, ...],
-    bounds: Bounds,
-    there: Mapping[str, Pose],
+    problem: Problem, after: Problem, trajectory: Trajectory, policy: str, plan_id: str
 ) -> Plan:
-    """A plan of a trajectory that leaves its objects there."""
+    """A plan of a trajectory that leaves its objects so."""
     task, record = problem.scene.task, problem.robot.record
     return Plan(
         id=plan_id,
@@ -525,6 +513,9 @@ def _written(
         instruction=task.instruction,
         entities={key: se3.pose_record(T) for key, T in problem.scene.Ts_base_object.items()},
         joint_names=record.joints,
-        stages=tuple(plan_stage(task, table, bounds, there) for table in task.stages),
-        tau=tau,
+        stages=tuple(
+            plan_stage(task, table, trajectory.bounds, after.scene.Ts_base_object)
+            for table in task.stages
+        ),
+        tau=tuple(trajectory.tau),
     )

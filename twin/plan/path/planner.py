@@ -126,7 +126,9 @@ class Mover:
                 wider[pair] = wider.get(pair, 0.0) + max(refusal.lacking_m, 0.0) + _WIDER_M
         raise _refused(refusals[0], int(work["postures"]))
 
-    def straight(self, start_rad: Joints, T_base_goal: Pose) -> TimedPath:
+    def straight(
+        self, start_rad: Joints, T_base_goal: Pose, *, tool_m_s: float = CONTACT_M_S
+    ) -> TimedPath:
         """Move the tool straight to a pose, on the branch of the inverse kinematics it starts on.
 
         For the last centimetres, where contact is wanted: pairs that may touch are left to the
@@ -134,7 +136,7 @@ class Mover:
         """
         check_numbers(start_rad, T_base_goal)
         knots = _straight_knots(self.problem.robot, start_rad, T_base_goal)
-        path = timed_path(self._world({}), knots, self.config, tool_m_s=CONTACT_M_S)
+        path = timed_path(self._world({}), knots, self.config, tool_m_s=tool_m_s)
         if refusals := self.refused(path):
             raise _refused(refusals[0])
         return replace(path, work={"postures": float(len(knots))})

@@ -14,6 +14,7 @@ from twin.plan.problem import Grasp, Joints, Pose, Problem, Release, TimedPath
 from twin.replay.clearance.bodies import GRIPPER
 from twin.replay.clearance.monitor import Allowed
 
+LEGS = ("around", "approach", "lift", "carry", "lower", "leave")
 LIFT_M = 0.06
 _LEAST_LIFT_M = 0.02
 _SAME_RAD = 0.001

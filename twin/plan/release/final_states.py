@@ -8,8 +8,9 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
+from bridge.task.relations import SHOWN
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.constrain.constraint import SHOWN, Constraint
+from twin.plan.constrain.constraint import Constraint
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.constrain.schema import values_of
 from twin.plan.problem import Array, Grasp, Miss, Numbers, Pose, Poses, Problem, Release, State
