@@ -31,12 +31,12 @@ from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.ground.run_tasks import UnderstoodTask, names_task, shown_task_file, understand
 from twin.plan.loop.nominal import NOMINAL, PlanProposer
-from twin.plan.loop.propose import Attempt, NoPlanError, plan_and_verify
+from twin.plan.loop.propose import Attempt, plan_and_verify
 from twin.plan.loop.steer import tried_in
 from twin.plan.loop.tau import goals_of
 from twin.plan.missed import missed_before
 from twin.plan.model_goals import Asked, ask_for_goals, client_of
-from twin.plan.problem import Pose, Problem, State
+from twin.plan.problem import NoPlanError, Pose, Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
 from twin.replay.config import ReplayConfig

@@ -14,8 +14,6 @@ from bridge.task.relations import SHOWN, Measured
 from twin.plan.problem import Array, State
 
 SCALES = {"m": 0.01, "rad": np.radians(10.0), "m/s": 0.1}
-_UNITS = {"align": "rad", "upright": "rad", "speed": "m/s"}
-"""Of the violation, by kind; else it is a length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +23,8 @@ class Constraint:
     record: Mapping[str, Any]
     """As it was written, see ``bridge/task/schemas/constraint.schema.json``."""
     measured: Callable[[State], Sequence[Measured]]
+    unit: str = "m"
+    """Of the violation: ``m``, ``rad`` or ``m/s``."""
     along: Callable[[State, Array | None], Array] | None = None
     """Kinds about a path and not a state: f at its worst, of states as ``worst_along`` takes them.
     A single state is then always well."""
@@ -33,11 +33,6 @@ class Constraint:
     def kind(self) -> str:
         """Of the record."""
         return str(self.record["kind"])
-
-    @property
-    def unit(self) -> str:
-        """Of the violation: ``m``, ``rad`` or ``m/s``."""
-        return _UNITS.get(self.kind, "m")
 
     @property
     def scale(self) -> float:
@@ -123,5 +118,6 @@ def flattened(states: State) -> State:
 
 
 def violated(constraints: Sequence[Constraint], state: State) -> list[str]:
-    """Explain what the first state violates; of a best compromise, what contradicts itself."""
-    return [c.explain(state) for c in constraints if bool(c.violation(state)[0] > 0)]
+    """Say what the first state misses; of a best compromise, what contradicts itself."""
+    found = [each for c in constraints for each in c.measured(state)]
+    return [_sentence(each) for each in found if np.ravel(each.excess)[0] > 0]

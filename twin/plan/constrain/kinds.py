@@ -13,7 +13,6 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.relations import Measured
-from bridge.task.task_file import ObjectModel
 from twin.plan.constrain.bodies import (
     Record,
     box_of,
@@ -24,7 +23,7 @@ from twin.plan.constrain.bodies import (
     surface_points,
 )
 from twin.plan.constrain.constraint import Constraint, flattened
-from twin.plan.constrain.distances import Boxes
+from twin.plan.constrain.distances import boxes_clearance
 from twin.plan.constrain.relations import RELATIONS, relation_of
 from twin.plan.constrain.schema import SCENE, Vocabulary, check_constraint, values_of
 from twin.plan.problem import Array, Problem, State
@@ -57,8 +56,7 @@ def _distance(record: Record, problem: Problem) -> Constraint:
     def measured(state: State) -> list[Measured]:
         value, what = np.linalg.norm(a(state) - b(state), axis=-1), f"{a_name} to {b_name}"
         return [
-            Measured(what=f"the distance from {what}", value=value, low=low, high=high)
-            for low, high in limits
+            Measured(f"the distance from {what}", value, low=low, high=high) for low, high in limits
         ]
 
     return Constraint(record=record, measured=measured)
@@ -72,8 +70,8 @@ def _above(record: Record, problem: Problem) -> Constraint:
         way, what = a(state) - b(state), f"the height of {a_name} over {b_name}"
         aside = np.linalg.norm(way[:, :2], axis=-1)
         return [
-            Measured(what=what, value=way[:, 2], low=height - tol, high=height + tol),
-            Measured(what=f"its distance aside from {b_name}", value=aside, high=record["xy_tol"]),
+            Measured(what, way[:, 2], low=height - tol, high=height + tol),
+            Measured(f"its distance aside from {b_name}", aside, high=record["xy_tol"]),
         ]
 
     return Constraint(record=record, measured=measured)
@@ -90,9 +88,9 @@ def _align(record: Record, problem: Problem) -> Constraint:
         across, along = np.linalg.norm(np.cross(one, other), axis=-1), (one * other).sum(-1)
         off = np.arctan2(across, abs(along) if undirected else along).min(axis=(1, 2))
         what = f"the angle between {a_name} and {b_name}"
-        return [Measured(what=what, value=off, high=most_rad, unit="rad")]
+        return [Measured(what, off, high=most_rad, unit="rad")]
 
-    return Constraint(record=record, measured=measured)
+    return Constraint(record=record, measured=measured, unit="rad")
 
 
 def _one(
@@ -106,7 +104,7 @@ def _one(
     """A constraint of one length."""
     return Constraint(
         record=record,
-        measured=lambda state: [Measured(what=what, value=measure(state), low=low, high=high)],
+        measured=lambda state: [Measured(what, measure(state), low=low, high=high)],
     )
 
 
@@ -131,21 +129,17 @@ def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State
         grid = problem.scene.static_sdf.conservative
         return lambda state: grid.distance(carried(pose_of(state, obj), points)).min(axis=-1)
     others = surface_points(problem, against)
-    there, here = (_boxes_of(problem.model(name)) for name in (against, obj))
+    there, here = (
+        boxes_clearance([(se3.transform_from(_STRAIGHT, p), size) for p, size in model.panels()])
+        for model in (problem.model(against), problem.model(obj))
+    )
 
     def between(state: State) -> Array:
         T_against_obj = se3.invert(pose_of(state, against)) @ pose_of(state, obj)
-        return np.minimum(
-            there.candidate_clearance(points, T_against_obj).min(axis=-1),
-            here.candidate_clearance(others, se3.invert(T_against_obj)).min(axis=-1),
-        )
+        T_obj_against = se3.invert(T_against_obj)
+        return np.minimum(there(points, T_against_obj), here(others, T_obj_against))
 
     return between
-
-
-def _boxes_of(model: ObjectModel) -> Boxes:
-    """The boxes that an object is made of, in its frame."""
-    return Boxes.of([(se3.transform_from(_STRAIGHT, p), size) for p, size in model.panels()])
 
 
 def _keepout(record: Record, problem: Problem) -> Constraint:
@@ -194,9 +188,9 @@ def _speed(record: Record, problem: Problem) -> Constraint:
 
     def still(state: State) -> list[Measured]:  # a single state has no speed
         value = 0.0 * state.T_base_tcp[:, 0, 0]
-        return [Measured(what=f"the speed of {name}", value=value, high=limit, unit="m/s")]
+        return [Measured(f"the speed of {name}", value, high=limit, unit="m/s")]
 
-    return Constraint(record=record, measured=still, along=along)
+    return Constraint(record=record, measured=still, unit="m/s", along=along)
 
 
 _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {

@@ -43,7 +43,8 @@ def relation_of(record: Record, problem: Problem) -> Constraint:
         table = Box(T_base_box=top, half_m=np.zeros(3))
         return OF_BOXES[kind](spec, {TABLE: table, **boxes})
 
-    return Constraint(record=dict(record), measured=measured)
+    unit = "rad" if kind == "upright" else "m"
+    return Constraint(record=dict(record), measured=measured, unit=unit)
 
 
 PLACES = ("inside", "on", "outside", "beside", "moved")

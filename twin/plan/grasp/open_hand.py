@@ -53,15 +53,6 @@ class OpenHand:
     closed_in: bool
     """Whether the fingers' hulls fill the space between the pads: then they say nothing of it."""
 
-    def passes(self, centres_m: Points, radius_m: float, margin_m: float) -> Flags:
-        """Which hands come near a ball; those that do not, ``hits`` nothing that is in it."""
-        reach_m = radius_m + np.sqrt(3.0) * margin_m
-        near: Flags = np.zeros(len(centres_m), dtype=bool)
-        for piece in self.pieces:
-            beside = np.maximum(piece.low_m - centres_m, centres_m - piece.high_m)
-            near |= np.linalg.norm(np.maximum(beside, 0.0), axis=1) <= reach_m
-        return near
-
     def hits(
         self, points_m: Float[np.ndarray, "3 num_poses num_points"], margin_m: float
     ) -> dict[str, Flags]:

@@ -16,8 +16,8 @@ from bridge.task.relations import SHOWN
 from twin.plan.constrain.constraint import Constraint, flattened, violated, worst_along
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.reach import nearest_solutions
-from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
-from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
+from twin.plan.grasp.search import GraspSearcher, turned
+from twin.plan.loop.propose import Candidate, refuse_lost
 from twin.plan.loop.push import push, push_choices
 from twin.plan.loop.steer import Steer
 from twin.plan.loop.tau import (
@@ -32,9 +32,19 @@ from twin.plan.loop.tau import (
 )
 from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, Mover, NoPathError, PathConfig
 from twin.plan.path.transfer import LEGS, LIFT_M, Leg, plan_transfer
-from twin.plan.problem import Grasp, Joints, Miss, Pose, Problem, Release, State, Vector
+from twin.plan.problem import (
+    Grasp,
+    Joints,
+    Miss,
+    NoPlanError,
+    Pose,
+    Problem,
+    Release,
+    State,
+    Vector,
+)
 from twin.plan.release.final_states import MAX_RELEASES, final_states, places_on_table
-from twin.plan.release.resting import NoFinalStateError, lying_there
+from twin.plan.release.resting import lying_there
 from twin.replay.clearance.bodies import SCENE
 
 PLANNER = "gst_planner"
@@ -207,7 +217,7 @@ class _Search:
                 yield transfer
             if not found and options.why:
                 self.why = options.why
-        except (NoGraspError, NoFinalStateError) as error:
+        except NoPlanError as error:
             self.why = str(error)
 
     def _mine(self, key: str) -> Steer | None:
@@ -365,7 +375,7 @@ class _Options:
     def _releases(self, grasp: Grasp) -> tuple[Release, ...]:
         try:
             releases = self._final_states(grasp)
-        except NoFinalStateError as error:
+        except NoPlanError as error:
             self.why = str(error)
             if error.cause in _HOPELESS:
                 raise
@@ -394,13 +404,11 @@ class _Options:
     def remarks_of(self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]) -> tuple[str, ...]:
         """Where the numbers of a transfer come from, in words."""
         postures = sum(leg.path.work.get("postures", 0.0) for leg in legs)
-        clear = release.clearance_m
-        nearest = f", {clear * 1e3:.0f} mm clear" if np.isfinite(clear) else ""
         return (
             f"{self._key}: grasp of {self.num_grasps}, {grasp.width_m * 1e3:.0f} mm wide, bears "
             f"{grasp.margin:.1f} standard deviations",
             *(f"{self._key}: {text}" for text in self._remarks),
-            f"{self._key}: final state of J {release.cost:.4f}{nearest}",
+            f"{self._key}: final state of J {release.cost:.4f}",
             f"{self._key}: {postures:.0f} postures looked at on the way",
         )
 

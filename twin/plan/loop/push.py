@@ -9,12 +9,11 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.plan.grasp.reach import nearest_solutions
-from twin.plan.loop.propose import NoPlanError
 from twin.plan.loop.tau import CLOSED_M, Trajectory, speed_limit, stages_of
 from twin.plan.path.planner import Mover, NoPathError, PathConfig, reversed_path
 from twin.plan.path.transfer import Leg
 from twin.plan.path.world import Carried
-from twin.plan.problem import Pose, Problem, TimedPath
+from twin.plan.problem import NoPlanError, Pose, Problem, TimedPath
 from twin.replay.clearance.bodies import GRIPPER
 
 HOVER_M = 0.13

@@ -11,10 +11,9 @@ from bridge.geometry import se3
 from bridge.task.plan import Stage, Waypoint
 from bridge.task.task_file import Task
 from twin.plan.constrain.relations import constraint_of
-from twin.plan.loop.propose import NoPlanError
 from twin.plan.path.planner import STEP_S, waypoints_of
 from twin.plan.path.transfer import Leg
-from twin.plan.problem import Grasp, Pose
+from twin.plan.problem import Grasp, NoPlanError, Pose
 from twin.robot.model import RobotModel
 
 Bounds = Mapping[str, tuple[int, int]]

@@ -28,7 +28,7 @@ def grasp_of(problem: Problem) -> Grasp:
 
 def release_of(grasp: Grasp, T_base_object: np.ndarray) -> Release:
     return Release(
-        object_id="cube", T_base_object=T_base_object, clearance_m=0.01, cost=0.0,
+        object_id="cube", T_base_object=T_base_object, cost=0.0,
         T_base_tcp=T_base_object @ grasp.T_object_tcp,
     )  # fmt: skip
 
