@@ -60,7 +60,6 @@ class Start:
     """When the last of its objects was seen [ns]."""
     localised: Mapping[str, LocalisedObject]
     problem: Problem
-    urdf: str
     from_home: str = ""
     """Why nobody knows where the arm stood, so that plans begin at its home posture; empty: it was
     recorded."""
@@ -152,12 +151,7 @@ def _start(
         refuse_other_robot(run, problem.robot.record)
     refuse_unusable(problem)
     return Start(
-        episode=episode,
-        seen_ns=seen_ns,
-        localised=found,
-        problem=problem,
-        urdf=urdf,
-        from_home=unknown,
+        episode=episode, seen_ns=seen_ns, localised=found, problem=problem, from_home=unknown
     )
 
 

@@ -186,11 +186,11 @@ def _speed(record: Record, problem: Problem) -> Constraint:
         speeds = np.linalg.norm(p[:, 1:] - p[:, :-1], axis=-1) / seconds
         return np.amax(speeds, axis=-1) - limit
 
-    def still(state: State) -> list[Measured]:  # a single state has no speed
+    def at_once(state: State) -> list[Measured]:  # a single state has no speed
         value = 0.0 * state.T_base_tcp[:, 0, 0]
         return [Measured(f"the speed of {name}", value, high=limit, unit="m/s")]
 
-    return Constraint(record=record, measured=still, unit="m/s", along=along)
+    return Constraint(record=record, measured=at_once, unit="m/s", along=along)
 
 
 _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {

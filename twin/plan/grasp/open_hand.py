@@ -24,7 +24,6 @@ _BETWEEN = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])
 class SweptPiece:
     """One convex piece of the hand and all places it passes on the approach, tool frame."""
 
-    link: str
     finger: bool
     """Whether it closes on objects; else it carries those that do."""
     corners_m: Points
@@ -109,7 +108,7 @@ def open_hand(robot: RobotModel, open_m: float, pregrasp_m: float) -> OpenHand:
     T_tcp_base = se3.invert(robot.T_base_link(robot.record.tool_frame, robot.home_rad, open_m))
     fingers = set(gripper.finger_links)
     pieces = [
-        _swept(link, link in fingers, se3.apply(T_tcp_base, points), pregrasp_m)
+        _swept(link in fingers, se3.apply(T_tcp_base, points), pregrasp_m)
         for link, points in placed
     ]
     closing = [piece for piece in pieces if piece.finger]
@@ -129,12 +128,11 @@ def open_hand(robot: RobotModel, open_m: float, pregrasp_m: float) -> OpenHand:
     )
 
 
-def _swept(link: str, finger: bool, corners_m: Points, pregrasp_m: float) -> SweptPiece:
+def _swept(finger: bool, corners_m: Points, pregrasp_m: float) -> SweptPiece:
     corners = corners_m[ConvexHull(corners_m).vertices]
     swept = np.concatenate([corners, corners - [0.0, 0.0, pregrasp_m]])
     equations = np.unique(ConvexHull(swept).equations.round(9), axis=0)
     return SweptPiece(
-        link=link,
         finger=finger,
         corners_m=corners,
         normals=equations[:, :3],

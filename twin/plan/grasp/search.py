@@ -1,5 +1,6 @@
 """All grasps of one object that the hand can reach, the surest first, and why others are none."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -55,7 +56,7 @@ HINTS: Mapping[str, str] = {
 
 
 def no_grasp(object_id: str, cause: str, found: str, hint: str) -> NoPlanError:
-    """An object cannot be taken hold of; why, in one word and in a sentence."""
+    """An object cannot be taken hold of; why, in one word and in more."""
     return NoPlanError(f"no grasp of {object_id}: {found}. {hint}", cause=cause)
 
 
@@ -104,20 +105,15 @@ class _Candidates:
     """Hands on closing lines, object frame; fields are in step."""
 
     lines: Lines
-    rejected: dict[str, int] = field(default_factory=dict)
+    rejected: Counter[str] = field(default_factory=Counter)
 
     def keep(self, mask: Flags, cause: str) -> None:
         """Reject the others."""
-        _count(self.rejected, cause, int((~mask).sum()))
+        self.rejected[cause] += int((~mask).sum())
         self.lines = self.lines.chosen(mask)
 
     def __len__(self) -> int:
         return len(self.lines.widths_m)
-
-
-def _count(rejected: dict[str, int], cause: str, number: int) -> None:
-    if number:
-        rejected[cause] = rejected.get(cause, 0) + number
 
 
 _TARGET_POINTS = 500
@@ -233,10 +229,10 @@ class GraspSearcher:
             self._surfaces[object_id] = SampledSurface(self.problem.shapes[object_id])
         return self._surfaces[object_id]
 
-    def _pairs(self, object_id: str, open_m: float) -> tuple[Pairs, dict[str, int]]:
+    def _pairs(self, object_id: str, open_m: float) -> tuple[Pairs, Counter[str]]:
         """Closing lines that hold, fit between the pads, and are on what was seen."""
         config, shape = self.config, self.problem.shapes[object_id]
-        rejected: dict[str, int] = {}
+        rejected: Counter[str] = Counter()
         kept: Ids = np.zeros(0, dtype=np.int64)
         pairs = antipodal_pairs(
             self._surface(object_id),
@@ -247,7 +243,7 @@ class GraspSearcher:
         )
 
         def keep(pairs: Pairs, mask: Flags, cause: str) -> Pairs:
-            _count(rejected, cause, int((~mask).sum()))
+            rejected[cause] += int((~mask).sum())
             return pairs.chosen(mask)
 
         pairs = keep(pairs, pairs.cosines >= np.cos(CONE_RAD), "cone")
@@ -263,7 +259,7 @@ class GraspSearcher:
         return pairs.chosen(kept), rejected
 
     def _hands_on(
-        self, pairs: Pairs, T_base_object: Pose, hand: OpenHand, rejected: dict[str, int]
+        self, pairs: Pairs, T_base_object: Pose, hand: OpenHand, rejected: Counter[str]
     ) -> _Candidates:
         """Put hands onto closing lines, from several directions and at several depths."""
         down = -T_base_object[2, :3]
@@ -364,7 +360,7 @@ class GraspSearcher:
                 continue
             way = self._reach.first(Ts[index], hand, PREGRASP_M)
             if not isinstance(way, Reached):
-                _count(found.rejected, way, 1)
+                found.rejected[way] += 1
                 continue
             kept.append(index)
             T_object_tcp = lines.Ts_object_tcp[index]

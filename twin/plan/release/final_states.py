@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -154,19 +153,16 @@ class ReleaseSearch:
             Ts_tcp_object={name: self._T_tcp_object},
         )
 
-    @cached_property
-    def _support_m(self) -> float:
-        return support_m(self._problem, self._grasp.object_id)
-
-    def _settled(self, state: State) -> State:
-        """What comes of states in which the object is let go: it lies straight below."""
-        name = self._grasp.object_id
-        T = state.Ts_base_object[name]
-        T = settled(T, self._outline_m, self._support_m, self._miss)
-        return replace(state, Ts_base_object={**state.Ts_base_object, name: T})
-
     def _at_rest(self, goal: Constraint) -> Callable[[State], Sequence[Measured]]:
-        return lambda state: goal.measured(self._settled(state))
+        """Measure where the object comes to lie that is let go."""
+        name = self._grasp.object_id
+        height_m = support_m(self._problem, name)
+
+        def measured(state: State) -> Sequence[Measured]:
+            T = settled(state.Ts_base_object[name], self._outline_m, height_m, self._miss)
+            return goal.measured(replace(state, Ts_base_object={**state.Ts_base_object, name: T}))
+
+        return measured
 
     def _clear(self, state: State) -> list[Measured]:
         """Object and open hand against everything that stands still."""
