@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bridge.task.relations import SHOWN, Measured
-from twin.plan.problem import Array, State
+from twin.plan.problem import Array, Numbers, State
 
 SCALES = {"m": 0.01, "rad": np.radians(10.0), "m/s": 0.1}
 
@@ -25,9 +25,9 @@ class Constraint:
     measured: Callable[[State], Sequence[Measured]]
     unit: str = "m"
     """Of the violation: ``m``, ``rad`` or ``m/s``."""
-    along: Callable[[State, Array | None], Array] | None = None
-    """Kinds about a path and not a state: f at its worst, of states as ``worst_along`` takes them.
-    A single state is then always well."""
+    along: Callable[[State, Numbers], float] | None = None
+    """Kinds about a path and not a state: f at its worst, of the steps of a path and their times
+    [s]. A single state is then always well."""
 
     @property
     def kind(self) -> str:
@@ -60,6 +60,12 @@ class Constraint:
         """Return f of each state, ``(num_states,)``: above 0 violated, by so much of ``unit``."""
         return np.amax(self.parts(state), axis=-1)
 
+    def worst_along(self, steps: State, times_s: Numbers) -> float:
+        """Return f at its worst along a path whose steps have these times."""
+        if self.along is not None:
+            return self.along(steps, times_s)
+        return float(self.violation(steps).max())
+
     def explain(self, state: State) -> str:
         """Say what is asked and what the first of the states has, in words with numbers."""
         holds = bool(self.violation(state)[0] <= 0)
@@ -85,36 +91,6 @@ def _sentence(asked: Measured) -> str:
     missed = max(value - asked.high, asked.low - value) * factor
     verdict = f", missed by {missed:.3g}" if missed > 0 else ""
     return f"{asked.what} is {value * factor:.4g} {unit} (wanted {_wanted(asked)}{verdict})"
-
-
-def worst_along(constraint: Constraint, states: State, *, times_s: Array | None = None) -> Array:
-    """Return f at its worst along each of many paths, ``(num_states,)``.
-
-    Args:
-        states: Poses along the paths, ``(num_states, num_steps, 4, 4)``, of what stands still
-            ``(1, 1, 4, 4)``; widths ``(num_states, num_steps)``.
-        times_s: Of the steps, ``(num_steps,)``. Without them no speed is known, and a limit of it
-            is left to the time law.
-    """
-    if constraint.along is not None:
-        return constraint.along(states, times_s)
-    num_states, num_steps = states.T_base_tcp.shape[:2]
-    found = constraint.violation(flattened(states)).reshape(num_states, num_steps)
-    return np.amax(found, axis=-1)
-
-
-def flattened(states: State) -> State:
-    """All steps of all paths as one batch of states, path by path."""
-    num_states, num_steps = states.T_base_tcp.shape[:2]
-
-    def flat(Ts: Array) -> Array:
-        return np.broadcast_to(Ts, (num_states, num_steps, 4, 4)).reshape(-1, 4, 4)
-
-    return State(
-        Ts_base_object={name: flat(Ts) for name, Ts in states.Ts_base_object.items()},
-        T_base_tcp=flat(states.T_base_tcp),
-        width_m=np.broadcast_to(states.width_m, (num_states, num_steps)).reshape(-1),
-    )
 
 
 def violated(constraints: Sequence[Constraint], state: State) -> list[str]:

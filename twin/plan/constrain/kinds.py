@@ -22,11 +22,11 @@ from twin.plan.constrain.bodies import (
     pose_of,
     surface_points,
 )
-from twin.plan.constrain.constraint import Constraint, flattened
+from twin.plan.constrain.constraint import Constraint
 from twin.plan.constrain.distances import boxes_clearance
 from twin.plan.constrain.relations import RELATIONS, relation_of
 from twin.plan.constrain.schema import SCENE, Vocabulary, check_constraint, values_of
-from twin.plan.problem import Array, Problem, State
+from twin.plan.problem import Array, Numbers, Problem, State
 
 
 def compile_constraint(record: Record, problem: Problem) -> Constraint:
@@ -177,14 +177,12 @@ def _speed(record: Record, problem: Problem) -> Constraint:
     point, name = point_of(record.get("a", {"ee": True}), problem)
     limit = record["max"]
 
-    def along(states: State, times_s: Array | None) -> Array:
-        num_states, num_steps = states.T_base_tcp.shape[:2]
-        if times_s is None or num_steps < 2:
-            return np.full(num_states, -limit)
-        p = point(flattened(states)).reshape(num_states, num_steps, 3)
-        seconds = times_s[1:] - times_s[:-1]
-        speeds = np.linalg.norm(p[:, 1:] - p[:, :-1], axis=-1) / seconds
-        return np.amax(speeds, axis=-1) - limit
+    def along(steps: State, times_s: Numbers) -> float:
+        if len(times_s) < 2:
+            return -float(limit)
+        p = point(steps)
+        speeds = np.linalg.norm(p[1:] - p[:-1], axis=-1) / (times_s[1:] - times_s[:-1])
+        return float(speeds.max() - limit)
 
     def at_once(state: State) -> list[Measured]:  # a single state has no speed
         value = 0.0 * state.T_base_tcp[:, 0, 0]

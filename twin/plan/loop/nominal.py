@@ -13,7 +13,7 @@ from bridge.task.check import TABLE
 from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan
 from bridge.task.relations import SHOWN
-from twin.plan.constrain.constraint import Constraint, flattened, violated, worst_along
+from twin.plan.constrain.constraint import Constraint, violated
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.grasp.search import GraspSearcher, turned
@@ -37,7 +37,6 @@ from twin.plan.problem import (
     Joints,
     Miss,
     NoPlanError,
-    Pose,
     Problem,
     Release,
     State,
@@ -94,15 +93,11 @@ class Transfer:
     grasp: Grasp
     release: Release
     legs: tuple[Leg, ...]
-    T_base_lies: Pose
+    after: Problem
+    """When it was moved: it lies there, and the arm stands where it left."""
     cost: float
     """J of the final state, plus the chance that the grasp misses."""
     remarks: tuple[str, ...] = ()
-
-    @property
-    def end_rad(self) -> Joints:
-        """Arm when it has let go and left."""
-        return np.asarray(self.legs[-1].path.joints_rad[-1])
 
 
 @dataclass(frozen=True)
@@ -155,7 +150,7 @@ def _transfers(problem: Problem, search: "_Search") -> Iterator[Offer]:
         for each in transfers:
             stages = stages_of(problem.scene.task, each.key)
             trajectory.add_transfer(each.legs, each.grasp, stages)
-            after = _after(after, each)
+            after = each.after
         remarks = tuple(text for each in transfers for text in each.remarks)
         yield sum(each.cost for each in transfers), trajectory, after, remarks
 
@@ -191,7 +186,7 @@ class _Search:
             if not made:
                 return None
             transfers.append(made[min(number, len(made) - 1)])
-            problem = _after(problem, transfers[-1])
+            problem = transfers[-1].after
         return transfers
 
     def _transfers(self, problem: Problem, key: str) -> Iterator[Transfer]:
@@ -260,12 +255,18 @@ class _Search:
                 if error.reason != NOT_KEPT and not way.straight:
                     break  # where nothing is free, another height is not either
                 continue
+            lies = lying_there(problem, release, options.miss_with(grasp))
+            scene = replace(
+                problem.scene,
+                Ts_base_object={**problem.scene.Ts_base_object, grasp.object_id: lies},
+                start_rad=legs[-1].path.joints_rad[-1],
+            )
             return Transfer(
                 key=grasp.object_id,
                 grasp=grasp,
                 release=release,
                 legs=legs,
-                T_base_lies=lying_there(problem, release, options.miss_with(grasp)),
+                after=replace(problem, scene=scene),
                 cost=release.cost + erfc(grasp.margin / sqrt(2.0)) / 2,
                 remarks=options.remarks_of(grasp, release, legs),
             )
@@ -291,13 +292,6 @@ def _why_not_moved(problem: Problem, key: str, error: NoPathError) -> str:
     else:
         hint = "Move apart what touches, or put the objects elsewhere."
     return f"{key}: {error}. {hint}"
-
-
-def _after(problem: Problem, moved: Transfer) -> Problem:
-    """The problem when an object was moved: it lies there, the arm stands where it left."""
-    Ts = {**problem.scene.Ts_base_object, moved.key: moved.T_base_lies}
-    scene = replace(problem.scene, Ts_base_object=Ts, start_rad=moved.end_rad)
-    return replace(problem, scene=scene)
 
 
 class _Options:
@@ -463,12 +457,10 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
             stage = stage_of_leg(leg.name, ids)
             states = _states_along(problem, grasp, leg)
             times_s = leg.path.times_s
-            asked = [(each, worst_along(each, states, times_s=times_s)) for each in of_stage[stage]]
+            asked = [(each, each.worst_along(states, times_s)) for each in of_stage[stage]]
             if leg.name == "carry":
-                last = flattened(states)
-                asked += [(each, each.violation(last)[-1:]) for each in at_the_end]
-            for constraint, worst in asked:
-                f = float(worst[0])
+                asked += [(each, float(each.violation(states)[-1])) for each in at_the_end]
+            for constraint, f in asked:
                 if f > 0:
                     factor, unit = SHOWN[constraint.unit]
                     detail = f"{constraint.kind} is violated by {f * factor:.3g} {unit}"
@@ -480,12 +472,12 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
 
 
 def _states_along(problem: Problem, grasp: Grasp, leg: Leg) -> State:
-    """Poses along a leg that carries, as ``worst_along`` takes them."""
+    """What is where in each step of a leg that carries."""
     T_tcp = problem.robot.Ts_base_tcp(leg.path.joints_rad)
-    Ts: dict[str, Any] = {name: T[None, None] for name, T in problem.scene.Ts_base_object.items()}
-    Ts[grasp.object_id] = (T_tcp @ se3.invert(grasp.T_object_tcp))[None]
-    widths = np.full((1, len(T_tcp)), leg.width_m)
-    return State(Ts_base_object=Ts, T_base_tcp=T_tcp[None], width_m=widths)
+    Ts: dict[str, Any] = {name: T[None] for name, T in problem.scene.Ts_base_object.items()}
+    Ts[grasp.object_id] = T_tcp @ se3.invert(grasp.T_object_tcp)
+    widths = np.full(len(T_tcp), leg.width_m)
+    return State(Ts_base_object=Ts, T_base_tcp=T_tcp, width_m=widths)
 
 
 def _go_home(after: Problem, trajectory: Trajectory, seed: int) -> tuple[str, ...]:
