@@ -213,9 +213,14 @@ class ReleaseSearch:
 
         def placed(state: State) -> list[Measured]:
             return [
-                Measured(f"how far {name} is beyond {target.name}", beyond(state), high=0.0),
-                Measured(f"{name} over {target.name}", over(state), low=DROP_M / 2, high=most_m),
-                Measured(f"how far {name} leans", leaning(state), high=MOST_TILT_RAD, unit="rad"),
+                Measured(f"the reach of {name} beyond {target.name}", beyond(state), high=0.0),
+                Measured(
+                    f"the height of {name} over {target.name}",
+                    over(state),
+                    low=DROP_M / 2,
+                    high=most_m,
+                ),
+                Measured(f"the lean of {name}", leaning(state), high=MOST_TILT_RAD, unit="rad"),
             ]
 
         return [Constraint(record={"kind": "placed"}, measured=placed)]
