@@ -167,7 +167,7 @@ class GraspSearcher:
         if not grasps:
             raise self._none(object_id, first[0].rejected, first[1])
         return GraspSearch(
-            grasps=grasps, rejected=found.rejected, remarks=self._remarks(object_id, hand)
+            grasps=grasps, rejected=+found.rejected, remarks=self._remarks(object_id, hand)
         )
 
     def _opened(
