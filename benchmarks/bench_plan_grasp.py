@@ -40,8 +40,8 @@ from bridge.sources.standin.kinematics import tool_down
 from bridge.sources.standin.scan import joint_move
 from bridge.sources.standin.streams import Streams
 from bridge.task.task_file import Task, load_task
-from twin.plan.grasp.search import GraspConfig, GraspSearcher, NoGraspError
-from twin.plan.problem import Grasp, Problem, Shape
+from twin.plan.grasp.search import GraspConfig, GraspSearcher
+from twin.plan.problem import Grasp, NoPlanError, Problem, Shape
 from twin.plan.shapes import shapes_of
 from twin.replay.scene import ReplayScene
 from twin.robot.config import IkConfig
@@ -195,7 +195,7 @@ def search_timed(
     before = time.process_time()
     try:
         found = GraspSearcher(problem, config).search(key)
-    except NoGraspError as error:
+    except NoPlanError as error:
         return (), time.process_time() - before, str(error)
     return found.grasps, time.process_time() - before, str(found.rejected)
 

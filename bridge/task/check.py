@@ -177,10 +177,9 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
 
 def _on_the_way(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
     """What belongs to one verb of a stage, and what holds while the stage lasts."""
-    if "part" in stage and "grasp" not in stage:
-        yield f"{place}.part: belongs to grasp"
-    if "clearance_m" in stage and "carry" not in stage:
-        yield f"{place}.clearance_m: belongs to carry"
+    for key, verb in (("part", "grasp"), ("clearance_m", "carry"), ("speed_m_s", "push")):
+        if key in stage and verb not in stage:
+            yield f"{place}.{key}: belongs to {verb}"
     for number, way in enumerate(stage.get("path", [])):
         yield from _way(f"{place}.path[{number}]", way, table)
 
@@ -200,11 +199,9 @@ def _way(place: str, way: Mapping[str, Any], table: Mapping[str, Any]) -> Iterat
 
 
 def _push(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
-    """A push goes towards a mark, which a predicate names; its speed is nobody else's."""
+    """A push goes towards a mark, which a predicate names."""
     pushed = stage.get("push")
     if pushed is None:
-        if "speed_m_s" in stage:
-            yield f"{place}.speed_m_s: belongs to push"
         return
     if any(verb in stage for verb in VERBS if verb != "push"):
         yield f"{place}.push: a stage that pushes neither grasps, carries nor releases"

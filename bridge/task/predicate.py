@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bridge.errors import UsageError
-from bridge.geometry import se3
 from bridge.task.check import REFERENCES, TABLE
-from bridge.task.relations import RELATIONS, Box, direction_of
-from bridge.task.task_file import ObjectModel, Task
+from bridge.task.relations import RELATIONS, SHOWN, Box, Measured
+from bridge.task.task_file import Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,9 +88,8 @@ def all_hold(findings: list[PredicateResult]) -> bool | None:
 
 def is_goal(spec: Mapping[str, Any]) -> bool:
     """Say whether a predicate asks for a change of place: it does not hold by doing nothing."""
-    return spec["kind"] in ("inside", *RELATIONS) or (
-        spec["kind"] == "moved" and any(key in spec for key in ("at_least_m", "by_m", "target_m"))
-    )
+    asks = any(key in spec for key in ("at_least_m", "by_m", "target_m"))
+    return spec["kind"] in RELATIONS and (spec["kind"] != "moved" or asks)
 
 
 def already_true_at_start(task: Task, rollout: Rollout) -> bool:
@@ -127,82 +125,32 @@ def bodies_of(spec: Mapping[str, Any]) -> list[str]:
     return [spec[key] for key in REFERENCES if key in spec and spec[key] != TABLE]
 
 
-def _inside(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
-    container_id = spec["container"]
-    container = task.objects[container_id]
-    T_container_base = se3.invert(rollout.Ts_base_object[container_id][-1])
-    p = se3.apply(T_container_base, rollout.Ts_base_object[spec["object"]][-1][:3, 3])
-    excess = _cavity_excess_m(container, p, float(spec.get("margin_m", 0.0)))
-    side = "outside" if excess > 0 else "within"
-    detail = f"{spec['object']} centre is {abs(excess) * 1e3:.0f} mm {side} {container_id}"
-    return bool(excess <= 0), detail
-
-
-def _cavity_excess_m(
-    container: ObjectModel, p_container: Float[np.ndarray, "3"], margin_m: float
-) -> float:
-    """Largest distance by which a point leaves the cavity; negative inside [m]."""
-    inner = np.array(container.inner_m)
-    centre = np.array([0.0, 0.0, container.wall_m + inner[2] / 2])
-    return float(np.max(np.abs(p_container - centre) - inner / 2 + margin_m))
+def _told(found: Sequence[Measured]) -> Found:
+    """Whether all that was measured is as it should be, and what it is."""
+    told = []
+    for each in found:
+        factor, unit = SHOWN[each.unit]
+        told.append(f"{each.what} is {round(float(each.value) * factor)} {unit}")
+    return all(bool(each.excess <= 0) for each in found), "; ".join(told)
 
 
 def _relation(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
-    """Whether objects stand to each other as asked, between the boxes around them at the end."""
-    boxes = {key: _box_of(key, task, rollout) for key in bodies_of(spec)}
-    for key, box in boxes.items():
-        if not (np.isfinite(box.T_base_box).all() and np.isfinite(box.half_m).all()):
+    """Whether objects stand to each other, and to where they were, as asked at the end."""
+    boxes, said = {TABLE: Box(T_base_box=np.eye(4), half_m=np.zeros(3))}, ""
+    for key in bodies_of(spec):
+        first, T = rollout.Ts_base_object[key][[0, -1]]
+        extents = rollout.extents_m.get(key)
+        size_m = None if extents is None else extents[-1]
+        box = Box.around(task.objects[key], T, extents_m=size_m, before_m=first[:3, 3])
+        if not (np.isfinite(T).all() and np.isfinite(box.half_m).all()):
             return None, f"the pose of {key} is not a number"
-    value, detail = RELATIONS[spec["kind"]](spec, boxes)
-    return bool(value), detail
-
-
-def _box_of(object_id: str, task: Task, rollout: Rollout) -> Box:
-    """The box around an object at the end."""
-    model = task.objects[object_id]
-    T = rollout.Ts_base_object[object_id][-1].copy()
-    if not model.origin_at_centre:
-        T[:3, 3] += T[:3, 2] * model.size_m[2] / 2
-    extents = rollout.extents_m.get(object_id)
-    half = np.array(model.size_m if extents is None else extents[-1], dtype=np.float64) / 2
-    return Box(T_base_box=T, half_m=half, is_cube=model.symmetry == "cube")
-
-
-MOVED_TOLERANCE_M = 0.02
-"""Of where an object ends that is to move ``by_m``, where a task says nothing else [m]."""
-
-
-def _moved(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
-    """Whether an object is where it should be compared with its own start.
-
-    The way from the first state to the last one is measured straight, or, with ``direction`` (in
-    the base frame), along that direction, backwards counting as negative. It must be
-    ``at_least_m`` and ``at_most_m`` long. With ``by_m`` the origin must end, seen from above,
-    within ``tolerance_m`` of the point so far along ``direction`` from its start. With
-    ``target_m`` it must end within ``tolerance_m`` of that point of the base frame; of a point
-    with two numbers, seen from above.
-    """
-    object_id = spec["object"]
-    first, last = rollout.Ts_base_object[object_id][[0, -1], :3, 3]
-    if not np.isfinite(first).all():
-        return None, f"{object_id} was not localised before"
-    way = last - first
-    if not np.isfinite(last).all():
-        return None, f"{object_id} was not localised at the end"
-    direction = direction_of(spec["direction"]) if "direction" in spec else None
-    length_m = float(np.linalg.norm(way) if direction is None else way @ direction)
-    value = spec.get("at_least_m", -np.inf) <= length_m <= spec.get("at_most_m", np.inf)
-    detail = f"{object_id} moved {length_m * 1e3:.0f} mm"
-    if "by_m" in spec and direction is not None:
-        off_m = float(np.linalg.norm((way - spec["by_m"] * direction)[:2]))
-        value = value and off_m <= spec.get("tolerance_m", MOVED_TOLERANCE_M)
-        detail += f" and is {off_m * 1e3:.0f} mm from where {spec['by_m'] * 1e3:g} mm lead"
-    if "target_m" in spec:
-        target = np.array(spec["target_m"], dtype=np.float64)
-        off_m = float(np.linalg.norm(last[: len(target)] - target))
-        value = value and off_m <= spec["tolerance_m"]
-        detail += f" and is {off_m * 1e3:.0f} mm from its target"
-    return bool(value), detail
+        if spec["kind"] == "moved":
+            if not np.isfinite(first).all():
+                return None, f"{key} was not localised before"
+            said = f"{key} moved {np.linalg.norm(T[:3, 3] - first[:3, 3]) * 1e3:.0f} mm; "
+        boxes[key] = box
+    value, detail = _told(RELATIONS[spec["kind"]](spec, boxes))
+    return value, said + detail
 
 
 def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
@@ -277,8 +225,6 @@ def objects_done(
 
 
 _RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], Found]] = {
-    "inside": _inside,
-    "moved": _moved,
     **dict.fromkeys(RELATIONS, _relation),
     "settled": _settled,
     "no_finger_contact": _no_finger_contact,

@@ -99,12 +99,11 @@ class ObjectModel:
         x, y, z = size
         wall = self.wall_m
         height, middle = z - wall, (z + wall) / 2  # walls stand on the floor
+        along_x, along_y = np.array([x - 2 * wall, wall, height]), np.array([wall, y, height])
         return [
             (np.array([0, 0, wall / 2]), np.array([x, y, wall])),
-            (np.array([(x - wall) / 2, 0, middle]), np.array([wall, y, height])),
-            (np.array([-(x - wall) / 2, 0, middle]), np.array([wall, y, height])),
-            (np.array([0, (y - wall) / 2, middle]), np.array([x - 2 * wall, wall, height])),
-            (np.array([0, -(y - wall) / 2, middle]), np.array([x - 2 * wall, wall, height])),
+            *((np.array([s * (x - wall) / 2, 0, middle]), along_y) for s in (1, -1)),
+            *((np.array([0, s * (y - wall) / 2, middle]), along_x) for s in (1, -1)),
         ]
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from bridge.geometry.mesh import box_corners
-from twin.plan.constrain.distances import Boxes, grid_clearance, lower_by_grid
+from twin.plan.constrain.distances import boxes_clearance, grid_clearance
 from twin.replay.clearance.bodies import NearPairs, half_space_solid, solid_of
 from twin.replay.clearance.bounding_spheres import FINE_M, BoundingSpheres, bounding_spheres_of
 from twin.replay.clearance.distance_grid import GridLookup
@@ -156,25 +156,15 @@ def test_a_surface_is_as_near_to_boxes_as_its_nearest_point() -> None:
     boxes = some_boxes(6)
     points, Ts = bodies(200, 12)
     every = distances_to_boxes(boxes, points, Ts)
-    found = Boxes.of(boxes).candidate_clearance(points, Ts)
-    np.testing.assert_allclose(found, every.min(axis=1), atol=1e-12)
+    found = boxes_clearance(boxes)(points, Ts)
+    np.testing.assert_allclose(found, every.min(axis=(1, 2)), atol=1e-12)
     assert (found < 0).sum() > 20
-    assert Boxes.of([]).candidate_clearance(points, Ts).shape == (200, 0)
 
 
-def test_margins_of_points_are_their_distances_less_what_is_kept(grid: SdfGrid) -> None:
-    boxes, lookup = some_boxes(6), GridLookup(grid)
+def test_a_surface_is_as_near_to_a_grid_as_its_nearest_point(grid: SdfGrid) -> None:
+    lookup = GridLookup(grid)
     points, Ts = bodies(150, 13)
-    keep = np.linspace(0.0, 0.01, 6)
-    to_boxes = (distances_to_boxes(boxes, points, Ts) - keep).min(axis=2)
     placed = np.einsum("nij,pj->npi", Ts[:, :3, :3], points) + Ts[:, None, :3, 3]
-    to_grid = lookup.distance(placed.reshape(-1, 3)).reshape(150, -1) - 0.003
-    for most in (np.inf, 0.02):
-        margins = np.full((150, 60), most)
-        Boxes.of(boxes).lower(margins, keep, points, Ts)
-        np.testing.assert_allclose(margins, np.minimum(to_boxes, most), atol=1e-12)
-        lower_by_grid(lookup, margins, 0.003, points, Ts)
-        expected = np.minimum(np.minimum(to_boxes, to_grid), most)
-        np.testing.assert_allclose(margins, expected, atol=1e-6)
+    to_grid = lookup.distance(placed.reshape(-1, 3)).reshape(150, -1)
     nearest = grid_clearance(lookup, points, Ts)
-    np.testing.assert_allclose(nearest, to_grid.min(axis=1) + 0.003, atol=1e-6)
+    np.testing.assert_allclose(nearest, to_grid.min(axis=1), atol=1e-6)

@@ -20,12 +20,11 @@ from bridge.task.plan_request import PlanAnswer, PlanRequest
 from bridge.task.task_file import Task
 from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
-from twin.errors import TwinError
 from twin.plan.config import LivePlanConfig, PlanConfig
 from twin.plan.loop.nominal import POLICIES, PlanProposer
-from twin.plan.loop.propose import NoPlanError, Proposer, choose
+from twin.plan.loop.propose import Proposer, choose
 from twin.plan.model_goals import ask_for_goals, client_of
-from twin.plan.problem import Problem
+from twin.plan.problem import NoPlanError, Problem
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
 from twin.robot.model import load_robot
@@ -35,10 +34,6 @@ MOST_CANDIDATES = 5
 """Plans that are made at once; a cell may ask for as many rounds."""
 ALIVE = "/alive"
 """Behind the service's key: the liveliness token of the planner that answers there."""
-
-
-class PlannerError(TwinError):
-    """The planner cannot be set up as asked."""
 
 
 class LivePlanner:
@@ -146,7 +141,7 @@ def claim_planner(session: Any, cell: str) -> None:
     """Let other planners of this cell see that there is one."""
     key = cell_topic(cell, PLAN)[1:] + ALIVE
     if session.query_alive(key):
-        raise PlannerError(
+        raise NoPlanError(
             f"a planner answers on {cell}{PLAN} already, and of two only one would be heard. "
             "Stop it first; one whose machine is gone is forgotten after ten seconds."
         )

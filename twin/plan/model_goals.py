@@ -33,7 +33,7 @@ from twin.plan.ground.run_tasks import UnderstoodTask
 from twin.plan.ground.vocabulary import Vocabulary as Things
 from twin.plan.ground.vocabulary import vocabulary_of
 from twin.plan.loop.tau import stages_of
-from twin.plan.problem import Problem
+from twin.plan.problem import Problem, State
 from twin.plan.usable_start import refuse_unusable
 from twin.scene.store.folder import read_record
 
@@ -276,10 +276,10 @@ def _refuse_other_goals(reply: Reply, task: Task) -> None:
 def _with_wishes(problem: Problem, wishes: Sequence[Wish]) -> tuple[Problem, tuple[str, ...]]:
     """Let constraints join the stages of the task; say each in words."""
     tables = {str(table["id"]): dict(table) for table in problem.scene.task.stages}
-    told = []
+    told, now = [], State.single(problem.scene.Ts_base_object, np.eye(4), 0.0)
     for number, wish in enumerate(wishes):
         try:
-            words = compile_constraint(wish.keep, problem).wanted
+            words = compile_constraint(wish.keep, problem).wanted(now)
             places = list(_places(problem.scene.task, wish))
         except GstError as error:
             raise ReplyError(problems=(f"constraints[{number}]: {error}",)) from error

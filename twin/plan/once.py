@@ -21,7 +21,7 @@ from bridge.geometry import se3
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.check import nearest
 from bridge.task.model_policy import MODEL_POLICY
-from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.plan import Plan, Stage
 from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
@@ -31,12 +31,12 @@ from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.ground.run_tasks import UnderstoodTask, names_task, shown_task_file, understand
 from twin.plan.loop.nominal import NOMINAL, PlanProposer
-from twin.plan.loop.propose import Attempt, NoPlanError, plan_and_verify
-from twin.plan.loop.steer import tried_in
+from twin.plan.loop.propose import Attempt, plan_and_verify
+from twin.plan.loop.steer import tool_at, tried_in
 from twin.plan.loop.tau import goals_of
 from twin.plan.missed import missed_before
 from twin.plan.model_goals import Asked, ask_for_goals, client_of
-from twin.plan.problem import Pose, Problem, State
+from twin.plan.problem import NoPlanError, Pose, Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
 from twin.replay.config import ReplayConfig
@@ -60,7 +60,6 @@ class Start:
     """When the last of its objects was seen [ns]."""
     localised: Mapping[str, LocalisedObject]
     problem: Problem
-    urdf: str
     from_home: str = ""
     """Why nobody knows where the arm stood, so that plans begin at its home posture; empty: it was
     recorded."""
@@ -152,12 +151,7 @@ def _start(
         refuse_other_robot(run, problem.robot.record)
     refuse_unusable(problem)
     return Start(
-        episode=episode,
-        seen_ns=seen_ns,
-        localised=found,
-        problem=problem,
-        urdf=urdf,
-        from_home=unknown,
+        episode=episode, seen_ns=seen_ns, localised=found, problem=problem, from_home=unknown
     )
 
 
@@ -379,11 +373,11 @@ def _explained(problem: Problem, plan: Plan, stage: Stage) -> list[str]:
         except (UsageError, TwinError) as error:
             told.append(f"    {record.get('kind')}: {error}")
             continue
+        start = State.single(problem.scene.Ts_base_object, tool_at(plan.tau[0]), 0.0)
         if number >= len(stage.subgoal):
-            told.append(f"    kept on the way: {constraint.wanted}")
+            told.append(f"    kept on the way: {constraint.wanted(start)}")
             continue
         at_rest = number < len(goals)
-        start = State.single(problem.scene.Ts_base_object, _tool(plan.tau[0]), 0.0)
         told.append(f"    now: {constraint.explain(start)}")
         state = _state(problem, plan, stage, at_rest=at_rest)
         told.append(f"    {'at rest' if at_rest else then}: {constraint.explain(state)}")
@@ -402,9 +396,5 @@ def _state(problem: Problem, plan: Plan, stage: Stage, *, at_rest: bool) -> Stat
     held = [each.grasp for each in until if each.grasp is not None][-1:]
     for tried in tried_in(plan):
         if tried.object_id in held and not at_rest:  # it moves with the tool
-            Ts[tried.object_id] = _tool(at) @ se3.invert(tried.T_object_tcp)
-    return State.single(Ts, _tool(at), at.width_m or 0.0)
-
-
-def _tool(at: Waypoint) -> Pose:
-    return se3.transform_from(np.array(at.q_wxyz), np.array(at.p_m))
+            Ts[tried.object_id] = tool_at(at) @ se3.invert(tried.T_object_tcp)
+    return State.single(Ts, tool_at(at), at.width_m or 0.0)

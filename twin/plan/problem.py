@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
+from twin.errors import TwinError
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
 
@@ -32,6 +33,15 @@ Flags = Bool[np.ndarray, " _"]
 Ids = Int[np.ndarray, " _"]
 Array = Any
 """``np.ndarray``, or a number for all states."""
+
+
+class NoPlanError(TwinError):
+    """The planner finds no plan; the message says why and what would help."""
+
+    def __init__(self, message: str, *, cause: str = "") -> None:
+        """Remember the cause, in one word."""
+        self.cause = cause
+        super().__init__(message)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,10 +173,8 @@ class Release:
     T_base_object: Pose
     T_base_tcp: Pose
     """Tool at the release: ``T_base_object @ T_object_tcp`` of the grasp."""
-    clearance_m: float
-    """Least signed distance of the object's points to what stands still, allowed pairs left out."""
     cost: float
-    """J of Eq. 7, and what ranks those with enough clearance."""
+    """J of Eq. 7, by which they are ranked."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import JOINT_STATES
 from bridge.errors import BridgeError
 from bridge.robots.robot import Robot
-from twin.plan.loop.propose import NoPlanError
-from twin.plan.problem import Joints, Problem
+from twin.plan.problem import Joints, NoPlanError, Problem
 from twin.replay.rebuilt_scene import scene_of_other_robot
 from twin.replay.run_job import START_KNOWN_NS, recorded_start
 

@@ -132,7 +132,9 @@ def test_the_goal_held_before_only_where_every_object_was_inside(other_inside: b
         },
         finger_contact={},
     )
-    assert already_true_at_start(task_with(*specs), rollout) is other_inside
+    task = task_with(*specs)
+    task = replace(task, objects={**task.objects, "other": task.objects["cube"]})
+    assert already_true_at_start(task, rollout) is other_inside
 
 
 @pytest.mark.parametrize("ik", [True, None, False])

@@ -38,8 +38,10 @@ def pose(x: float, y: float, z: float, yaw_rad: float = 0.0) -> np.ndarray:
 
 def gap_m(a: Box, b: Box) -> float:
     """Of many at once: the second of three is asked for."""
-    Ts = (np.stack([np.eye(4), box.T_base_box, np.eye(4)]) for box in (a, b))
-    return float(footprint_gap_m(next(Ts), a.half_m, next(Ts), b.half_m)[1])
+    many = (
+        replace(box, T_base_box=np.stack([np.eye(4), box.T_base_box, np.eye(4)])) for box in (a, b)
+    )
+    return float(footprint_gap_m(*many)[1])
 
 
 def rotation(axis: np.ndarray, angle_rad: float) -> np.ndarray:

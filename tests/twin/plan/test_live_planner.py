@@ -29,10 +29,9 @@ from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
 from twin.plan.config import LivePlanConfig, PlanConfig
-from twin.plan.live import LivePlanner, PlannerError, claim_planner, serve_planner
+from twin.plan.live import LivePlanner, claim_planner, serve_planner
 from twin.plan.loop.nominal import PlanProposer
-from twin.plan.loop.propose import NoPlanError
-from twin.plan.problem import Problem
+from twin.plan.problem import NoPlanError, Problem
 
 FILE = chosen_task_file("cube_into_box")
 HOME = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
@@ -249,7 +248,7 @@ def router(endpoint: str) -> Iterator[WireSession]:
 def test_a_second_planner_of_a_cell_is_refused(router: WireSession, endpoint: str) -> None:
     with open_session(WireConfig(connect=(endpoint,))) as other:
         claim_planner(router, "lab")
-        with pytest.raises(PlannerError, match="a planner answers on lab/plan already"):
+        with pytest.raises(NoPlanError, match="a planner answers on lab/plan already"):
             claim_planner(other, "lab")
         claim_planner(other, "lab2")
 

@@ -111,8 +111,7 @@ def run(
     def start_of(run: RunFolder, task: Any, config: Any, robot: str = "") -> once.Start:
         problem = problem_about(task)
         episode = Episode.open(run.episodes()[0])
-        urdf = problem.scene.urdf
-        return once.Start(episode=episode, seen_ns=1, localised={}, problem=problem, urdf=urdf)
+        return once.Start(episode=episode, seen_ns=1, localised={}, problem=problem)
 
     def judge_of(path: Path, scene: Any) -> Callable[[Plan], Verdict]:
         return lambda plan: verdict_of(plan.id)

@@ -35,8 +35,8 @@ def planned(run: RunFolder, answers: list[bool]) -> Planned:
     path = run.episodes_dir / "trial_0001.mcap"
     write_episode(path, FILE, kind="trial")
     problem = problem_of_test()
-    episode, urdf = Episode.open(path), problem.scene.urdf
-    start = Start(episode=episode, seen_ns=SEEN_NS, localised={}, problem=problem, urdf=urdf)
+    episode = Episode.open(path)
+    start = Start(episode=episode, seen_ns=SEEN_NS, localised={}, problem=problem)
     left = iter(answers)
     understood = UnderstoodTask(file=FILE, grounding=None)
     config = PlanConfig(rounds=len(answers))

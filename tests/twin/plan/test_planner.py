@@ -114,17 +114,6 @@ def test_what_was_not_localised_is_not_planned(problem: Problem) -> None:
         PlanProposer().propose(lost, plan_id="p", seed=0, count=1, steer=None)
 
 
-def test_a_task_that_names_a_part_is_refused(problem: Problem) -> None:
-    task = problem.scene.task
-    table = next(table for table in task.stages if "grasp" in table)
-    odd = replace(task, stages=({**table, "part": "top"},))
-    with pytest.raises(NoPlanError, match="takes cube by its top"):
-        PlanProposer().propose(
-            replace(problem, scene=replace(problem.scene, task=odd)),
-            plan_id="p", seed=0, count=1, steer=None,
-        )  # fmt: skip
-
-
 @pytest.mark.parametrize("verb", ["grasp", "release"])
 def test_an_object_without_its_stages_is_named_with_what_to_add(
     problem: Problem, verb: str

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry.mesh import sample_triangles
-from bridge.task.relations import AXES
+from bridge.task.relations import AXES, Box
 from bridge.task.task_file import ObjectModel
 from twin.plan.constrain.schema import BASE
 from twin.plan.problem import Array, Numbers, Points, Problem, State, Vector
@@ -25,53 +25,28 @@ def carried(T: Array, points_m: Array) -> Array:
     return points_m @ T[:, :3, :3].swapaxes(-1, -2) + T[:, None, :3, 3]
 
 
-def seen_from(T: Array, points_m: Array) -> Array:
-    """Points ``(num_states, num_points, 3)`` in the frame of a body with this pose."""
-    return (points_m - T[:, None, :3, 3]) @ T[:, :3, :3]
-
-
 def pose_of(state: State, object_id: str) -> Array:
     """Poses of an object, ``(num_states, 4, 4)``, or one for all states."""
     return state.Ts_base_object[object_id]
 
 
-def half_extents_m(model: ObjectModel) -> Vector:
-    """Of the box around an object."""
-    return np.array(model.size_m) / 2
-
-
-def _middle_m(model: ObjectModel) -> Vector:
-    """Of the outer extents, in the object frame."""
-    return np.array([0.0, 0.0, 0.0 if model.origin_at_centre else model.size_m[2] / 2])
-
-
-def box_pose(state: State, object_id: str, problem: Problem) -> Array:
-    """Poses of the middle of the box around an object, ``(num_states, 4, 4)``."""
-    T = pose_of(state, object_id)
-    model = problem.model(object_id)
-    if model.origin_at_centre:
-        return T
-    shift = np.eye(4)
-    shift[:3, 3] = _middle_m(model)
-    return T @ shift
-
-
-def heights(state: State, object_id: str, problem: Problem) -> tuple[Array, Array]:
-    """Of the lowest and of the highest point of the box around an object [m]."""
-    T = box_pose(state, object_id, problem)
-    reach = (abs(T[:, 2, :3]) * half_extents_m(problem.model(object_id))).sum(-1)
-    return T[:, 2, 3] - reach, T[:, 2, 3] + reach
+def box_of(state: State, object_id: str, problem: Problem) -> Box:
+    """The box around an object in each state."""
+    T, before = pose_of(state, object_id), problem.scene.Ts_base_object.get(object_id)
+    before_m = None if before is None else before[:3, 3]
+    return Box.around(problem.model(object_id), T, before_m=before_m)
 
 
 def _anchor_m(model: ObjectModel, anchor: str) -> Vector:
     """A named point of an object, in its frame."""
     up = np.array([0.0, 0.0, model.size_m[2] / 2])
+    middle = 0 * up if model.origin_at_centre else up
     places: dict[str, Float[np.ndarray, 3]] = {
-        "centroid": _middle_m(model),
+        "centroid": middle,
         "origin": np.zeros(3),
-        "top": _middle_m(model) + up,
-        "bottom": _middle_m(model) - up,
-        "opening": _middle_m(model) + up,
+        "top": middle + up,
+        "bottom": middle - up,
+        "opening": middle + up,
         "handle": np.array(model.grasp_m),
     }
     return places[anchor]

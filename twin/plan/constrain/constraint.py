@@ -1,7 +1,7 @@
 """One constraint, ready to be asked: f of each state, f <= 0 where it is satisfied.
 
-A constraint is one or more terms; each measures a number of a state and says in which interval it
-should be. f is how far the worst term is outside its interval, in the unit of the first term.
+A constraint measures one number of a state or more and says in which interval each should be. f is
+how far the worst is outside its interval, in the unit of the kind.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,97 +10,49 @@ from typing import Any
 
 import numpy as np
 
-from twin.plan.problem import Array, State
+from bridge.task.relations import SHOWN, Measured
+from twin.plan.problem import Array, Numbers, State
 
-Measure = Callable[[State], Array]
-"""A number of each state, ``(num_states,)``."""
 SCALES = {"m": 0.01, "rad": np.radians(10.0), "m/s": 0.1}
-SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "degrees"), "m/s": (1e3, "mm/s")}
-"""By unit: what a number of it is multiplied by for a person, and what it then is."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Term:
-    """One measured number and the interval it should be in."""
-
-    what: str
-    """What is measured, in words: "height of the cube's bottom"."""
-    measure: Measure
-    low: float = -np.inf
-    high: float = np.inf
-    unit: str = "m"
-    """``m``, ``rad`` or ``m/s``."""
-
-    def excess(self, state: State) -> Array:
-        """How far the number is outside its interval; negative inside, ``(num_states,)``."""
-        value = self.measure(state)
-        value = value + 0.0 * state.T_base_tcp[:, 0, 0]  # of what stands still there is one
-        if np.isneginf(self.low):
-            return value - self.high
-        if np.isposinf(self.high):
-            return self.low - value
-        return abs(value - (self.low + self.high) / 2) - (self.high - self.low) / 2
-
-    @property
-    def wanted(self) -> str:
-        """The interval in words, without the unit."""
-        factor, _ = SHOWN[self.unit]
-        low, high = self.low * factor + 0.0, self.high * factor + 0.0  # never -0
-        if np.isneginf(low):
-            return f"at most {high:.4g}"
-        if np.isposinf(low) or np.isposinf(high):
-            return f"at least {low:.4g}"
-        return f"{low:.4g} to {high:.4g}"
-
-    def sentence(self, state: State) -> str:
-        """What is measured in the first state, what is wanted, and by how much it misses."""
-        factor, unit = SHOWN[self.unit]
-        value = float(self.measure(state)[0])
-        missed = max(value - self.high, self.low - value) * factor
-        verdict = f", missed by {missed:.3g}" if missed > 0 else ""
-        return f"{self.what} is {value * factor:.4g} {unit} (wanted {self.wanted}{verdict})"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Constraint:
     """One constraint of a problem."""
 
-    kind: str
     record: Mapping[str, Any]
     """As it was written, see ``bridge/task/schemas/constraint.schema.json``."""
-    terms: tuple[Term, ...]
-    along: Callable[[State, Array | None], Array] | None = None
-    """Kinds about a path and not a state: f at its worst, of states as ``worst_along`` takes them.
-    A single state is then always well."""
+    measured: Callable[[State], Sequence[Measured]]
+    unit: str = "m"
+    """Of the violation: ``m``, ``rad`` or ``m/s``."""
+    along: Callable[[State, Numbers], float] | None = None
+    """Kinds about a path and not a state: f at its worst, of the steps of a path and their times
+    [s]. A single state is then always well."""
 
-    @staticmethod
-    def of(record: Mapping[str, Any], *terms: Term) -> "Constraint":
-        """Make one of a record and what it measures."""
-        return Constraint(kind=record["kind"], record=dict(record), terms=terms)
+    @property
+    def kind(self) -> str:
+        """Of the record."""
+        return str(self.record["kind"])
 
     @property
     def scale(self) -> float:
         """What counts as one unit of violation: 1 cm, 10 degrees, 10 cm/s."""
-        return float(SCALES[self.terms[0].unit])
+        return float(SCALES[self.unit])
 
-    @property
-    def unit(self) -> str:
-        """Of the violation: ``m``, ``rad`` or ``m/s``."""
-        return self.terms[0].unit
-
-    @property
-    def wanted(self) -> str:
-        """What is asked, in words."""
-        return "; ".join(f"{term.what} {term.wanted} {SHOWN[term.unit][1]}" for term in self.terms)
+    def wanted(self, state: State) -> str:
+        """What is asked, in words; a state says what that is about."""
+        found = self.measured(state)
+        return "; ".join(f"{each.what} {_wanted(each)} {SHOWN[each.unit][1]}" for each in found)
 
     def parts(self, state: State) -> Array:
-        """Return f of each term, in the unit of the first one, ``(num_states, num_terms)``.
+        """Return f of each number, in the unit of the kind, ``(num_states, num_numbers)``.
 
         The violation is the greatest. Least squares over the parts sees what the others need.
         """
+        shape = state.T_base_tcp.shape[:1]  # of what stands still there is one number
         found = [
-            term.excess(state) * (1.0 if term.unit == self.unit else self.scale / SCALES[term.unit])
-            for term in self.terms
+            np.broadcast_to(each.excess * (self.scale / SCALES[each.unit]), shape)
+            for each in self.measured(state)
         ]
         return np.stack(found, axis=-1)
 
@@ -108,43 +60,40 @@ class Constraint:
         """Return f of each state, ``(num_states,)``: above 0 violated, by so much of ``unit``."""
         return np.amax(self.parts(state), axis=-1)
 
+    def worst_along(self, steps: State, times_s: Numbers) -> float:
+        """Return f at its worst along a path whose steps have these times."""
+        if self.along is not None:
+            return self.along(steps, times_s)
+        return float(self.violation(steps).max())
+
     def explain(self, state: State) -> str:
         """Say what is asked and what the first of the states has, in words with numbers."""
         holds = bool(self.violation(state)[0] <= 0)
-        told = "; ".join(term.sentence(state) for term in self.terms)
+        told = "; ".join(map(_sentence, self.measured(state)))
         return f"{self.kind} {'holds' if holds else 'is violated'}: {told}"
 
 
-def worst_along(constraint: Constraint, states: State, *, times_s: Array | None = None) -> Array:
-    """Return f at its worst along each of many paths, ``(num_states,)``.
-
-    Args:
-        states: Poses along the paths, ``(num_states, num_steps, 4, 4)``, of what stands still
-            ``(1, 1, 4, 4)``; widths ``(num_states, num_steps)``.
-        times_s: Of the steps, ``(num_steps,)``. Without them no speed is known, and a limit of it
-            is left to the time law.
-    """
-    if constraint.along is not None:
-        return constraint.along(states, times_s)
-    num_states, num_steps = states.T_base_tcp.shape[:2]
-    found = constraint.violation(flattened(states)).reshape(num_states, num_steps)
-    return np.amax(found, axis=-1)
+def _wanted(asked: Measured) -> str:
+    """The interval in words, without the unit."""
+    factor, _ = SHOWN[asked.unit]
+    low, high = asked.low * factor + 0.0, asked.high * factor + 0.0  # never -0
+    if np.isneginf(low):
+        return f"at most {high:.4g}"
+    if np.isposinf(low) or np.isposinf(high):
+        return f"at least {low:.4g}"
+    return f"{low:.4g} to {high:.4g}"
 
 
-def flattened(states: State) -> State:
-    """All steps of all paths as one batch of states, path by path."""
-    num_states, num_steps = states.T_base_tcp.shape[:2]
-
-    def flat(Ts: Array) -> Array:
-        return np.broadcast_to(Ts, (num_states, num_steps, 4, 4)).reshape(-1, 4, 4)
-
-    return State(
-        Ts_base_object={name: flat(Ts) for name, Ts in states.Ts_base_object.items()},
-        T_base_tcp=flat(states.T_base_tcp),
-        width_m=np.broadcast_to(states.width_m, (num_states, num_steps)).reshape(-1),
-    )
+def _sentence(asked: Measured) -> str:
+    """What is measured in the first state, what is wanted, and by how much it misses."""
+    factor, unit = SHOWN[asked.unit]
+    value = float(np.ravel(asked.value)[0])
+    missed = max(value - asked.high, asked.low - value) * factor
+    verdict = f", missed by {missed:.3g}" if missed > 0 else ""
+    return f"{asked.what} is {value * factor:.4g} {unit} (wanted {_wanted(asked)}{verdict})"
 
 
 def violated(constraints: Sequence[Constraint], state: State) -> list[str]:
-    """Explain what the first state violates; of a best compromise, what contradicts itself."""
-    return [c.explain(state) for c in constraints if bool(c.violation(state)[0] > 0)]
+    """Say what the first state misses; of a best compromise, what contradicts itself."""
+    found = [each for c in constraints for each in c.measured(state)]
+    return [_sentence(each) for each in found if np.ravel(each.excess)[0] > 0]

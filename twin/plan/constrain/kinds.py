@@ -12,24 +12,21 @@ import numpy as np
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.check import TABLE
-from bridge.task.task_file import ObjectModel
+from bridge.task.relations import Measured
 from twin.plan.constrain.bodies import (
     Record,
-    box_pose,
+    box_of,
     carried,
     directions_of,
-    half_extents_m,
-    heights,
     point_of,
     pose_of,
-    seen_from,
     surface_points,
 )
-from twin.plan.constrain.constraint import Constraint, Term, flattened
-from twin.plan.constrain.distances import Boxes
-from twin.plan.constrain.relations import RELATIONS
+from twin.plan.constrain.constraint import Constraint
+from twin.plan.constrain.distances import boxes_clearance
+from twin.plan.constrain.relations import RELATIONS, relation_of
 from twin.plan.constrain.schema import SCENE, Vocabulary, check_constraint, values_of
-from twin.plan.problem import Array, Problem, State
+from twin.plan.problem import Array, Numbers, Problem, State
 
 
 def compile_constraint(record: Record, problem: Problem) -> Constraint:
@@ -40,7 +37,7 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
             reason = problem.scene.reasons.get(name, "not found")
             message = f"{record['kind']}: {name} was not localised ({reason}). Look again."
             raise UsageError(message)
-    return _KINDS[record["kind"]](record, problem)
+    return _KINDS[record["kind"]](dict(record), problem)
 
 
 _STRAIGHT = np.eye(1, 4)[0]
@@ -49,69 +46,72 @@ _ID_KEYS = ("obj", "container", "support", "reference", "against", "over", "fram
 
 def _distance(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (point_of(record[key], problem) for key in "ab")
-    low, high = float(record.get("min", -np.inf)), float(record.get("max", np.inf))
-    term = Term(
-        what=f"the distance from {a_name} to {b_name}",
-        measure=lambda state: np.linalg.norm(a(state) - b(state), axis=-1),
-    )
-    terms = []
+    limits = []
     if "target" in record:
         target, tol = record["target"], record["tol"]
-        least = target - tol if target > tol else -np.inf
-        terms.append(replace(term, low=least, high=target + tol))
+        limits.append((target - tol if target > tol else -np.inf, target + tol))
     if "min" in record or "max" in record:
-        terms.append(replace(term, low=low, high=high))
-    return Constraint.of(record, *terms)
+        limits.append((record.get("min", -np.inf), record.get("max", np.inf)))
+
+    def measured(state: State) -> list[Measured]:
+        value, what = np.linalg.norm(a(state) - b(state), axis=-1), f"{a_name} to {b_name}"
+        return [
+            Measured(f"the distance from {what}", value, low=low, high=high) for low, high in limits
+        ]
+
+    return Constraint(record=record, measured=measured)
 
 
 def _above(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (point_of(record[key], problem) for key in "ab")
     height, tol = record["height"], record["tol"]
-    return Constraint.of(
-        record,
-        Term(
-            what=f"the height of {a_name} over {b_name}",
-            measure=lambda state: (a(state) - b(state))[:, 2],
-            low=height - tol,
-            high=height + tol,
-        ),
-        Term(
-            what=f"its distance aside from {b_name}",
-            measure=lambda state: np.linalg.norm((a(state) - b(state))[:, :2], axis=-1),
-            high=record["xy_tol"],
-        ),
-    )
+
+    def measured(state: State) -> list[Measured]:
+        way, what = a(state) - b(state), f"the height of {a_name} over {b_name}"
+        aside = np.linalg.norm(way[:, :2], axis=-1)
+        return [
+            Measured(what, way[:, 2], low=height - tol, high=height + tol),
+            Measured(f"its distance aside from {b_name}", aside, high=record["xy_tol"]),
+        ]
+
+    return Constraint(record=record, measured=measured)
 
 
 def _align(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (directions_of(record[key], problem) for key in "ab")
     either = any(record[key].get("axis") == "any" for key in "ab")
     undirected = either or record.get("undirected", False)
+    most_rad = float(np.radians(record["max_deg"]))
 
-    def off(state: State) -> Array:
+    def measured(state: State) -> list[Measured]:
         one, other = a(state)[:, :, None], b(state)[:, None]
         across, along = np.linalg.norm(np.cross(one, other), axis=-1), (one * other).sum(-1)
-        return np.arctan2(across, abs(along) if undirected else along).min(axis=(1, 2))
+        off = np.arctan2(across, abs(along) if undirected else along).min(axis=(1, 2))
+        what = f"the angle between {a_name} and {b_name}"
+        return [Measured(what, off, high=most_rad, unit="rad")]
 
-    term = Term(
-        what=f"the angle between {a_name} and {b_name}",
-        measure=off,
-        high=float(np.radians(record["max_deg"])),
-        unit="rad",
+    return Constraint(record=record, measured=measured, unit="rad")
+
+
+def _one(
+    record: Record,
+    what: str,
+    measure: Callable[[State], Array],
+    *,
+    low: float,
+    high: float = np.inf,
+) -> Constraint:
+    """A constraint of one length."""
+    return Constraint(
+        record=record,
+        measured=lambda state: [Measured(what, measure(state), low=low, high=high)],
     )
-    return Constraint.of(record, term)
 
 
 def _clearance(record: Record, problem: Problem) -> Constraint:
     obj, against = record["obj"], record["against"]
-    return Constraint.of(
-        record,
-        Term(
-            what=f"the least distance between {obj} and {against}",
-            measure=_least_distance(obj, against, problem),
-            low=record["min"],
-        ),
-    )
+    what = f"the least distance between {obj} and {against}"
+    return _one(record, what, _least_distance(obj, against, problem), low=record["min"])
 
 
 def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State], Array]:
@@ -129,92 +129,70 @@ def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State
         grid = problem.scene.static_sdf.conservative
         return lambda state: grid.distance(carried(pose_of(state, obj), points)).min(axis=-1)
     others = surface_points(problem, against)
-    there, here = (_boxes_of(problem.model(name)) for name in (against, obj))
+    there, here = (
+        boxes_clearance([(se3.transform_from(_STRAIGHT, p), size) for p, size in model.panels()])
+        for model in (problem.model(against), problem.model(obj))
+    )
 
     def between(state: State) -> Array:
         T_against_obj = se3.invert(pose_of(state, against)) @ pose_of(state, obj)
-        return np.minimum(
-            there.candidate_clearance(points, T_against_obj).min(axis=-1),
-            here.candidate_clearance(others, se3.invert(T_against_obj)).min(axis=-1),
-        )
+        T_obj_against = se3.invert(T_against_obj)
+        return np.minimum(there(points, T_against_obj), here(others, T_obj_against))
 
     return between
-
-
-def _boxes_of(model: ObjectModel) -> Boxes:
-    """The boxes that an object is made of, in its frame."""
-    return Boxes.of([(se3.transform_from(_STRAIGHT, p), size) for p, size in model.panels()])
 
 
 def _keepout(record: Record, problem: Problem) -> Constraint:
     """Out of the upright column over the box around an object that stands upright."""
     obj, over = record["obj"], record["region"]["over"]
     points = surface_points(problem, obj)
-    half = half_extents_m(problem.model(over))
 
     def least(state: State) -> Array:
-        surface = carried(pose_of(state, obj), points)
-        beyond = abs(seen_from(box_pose(state, over, problem), surface)[..., :2]) - half[:2]
+        surface, box = carried(pose_of(state, obj), points), box_of(state, over, problem)
+        beyond = replace(box, T_base_box=box.T_base_box[:, None]).beyond_m(surface)[..., :2]
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
         return np.amin(outside + np.minimum(beyond.max(axis=-1), 0.0), axis=-1)
 
-    return Constraint.of(
-        record,
-        Term(
-            what=f"the distance of {obj} from what is over {over}",
-            measure=least,
-            low=record.get("margin", 0.0),
-        ),
-    )
+    what = f"the distance of {obj} from what is over {over}"
+    return _one(record, what, least, low=record.get("margin", 0.0))
 
 
 def _height(record: Record, problem: Problem) -> Constraint:
     table = problem.scene.table_height_m
+    low, high = record.get("min", -np.inf), record.get("max", np.inf)
     if "obj" in record:
-        name = f"the lowest point of {record['obj']}"
-    else:
-        point, name = point_of(record["a"], problem)
+        obj = record["obj"]
+        what = f"the height of the lowest point of {obj} over the table"
 
-    def measure(state: State) -> Array:
-        if "obj" in record:
-            return heights(state, record["obj"], problem)[0] - table
-        return point(state)[:, 2] - table
+        def lowest(state: State) -> Array:
+            return box_of(state, obj, problem).heights_m[0] - table
 
-    return Constraint.of(
-        record,
-        Term(
-            what=f"the height of {name} over the table",
-            measure=measure,
-            low=record.get("min", -np.inf),
-            high=record.get("max", np.inf),
-        ),
-    )
+        return _one(record, what, lowest, low=low, high=high)
+    point, name = point_of(record["a"], problem)
+    what = f"the height of {name} over the table"
+    return _one(record, what, lambda state: point(state)[:, 2] - table, low=low, high=high)
 
 
 def _speed(record: Record, problem: Problem) -> Constraint:
     point, name = point_of(record.get("a", {"ee": True}), problem)
     limit = record["max"]
 
-    def along(states: State, times_s: Array | None) -> Array:
-        num_states, num_steps = states.T_base_tcp.shape[:2]
-        if times_s is None or num_steps < 2:
-            return np.full(num_states, -limit)
-        p = point(flattened(states)).reshape(num_states, num_steps, 3)
-        seconds = times_s[1:] - times_s[:-1]
-        speeds = np.linalg.norm(p[:, 1:] - p[:, :-1], axis=-1) / seconds
-        return np.amax(speeds, axis=-1) - limit
+    def along(steps: State, times_s: Numbers) -> float:
+        if len(times_s) < 2:
+            return -float(limit)
+        p = point(steps)
+        speeds = np.linalg.norm(p[1:] - p[:-1], axis=-1) / (times_s[1:] - times_s[:-1])
+        return float(speeds.max() - limit)
 
-    term = Term(what=f"the speed of {name}", measure=_nothing, high=limit, unit="m/s")
-    return replace(Constraint.of(record, term), along=along)
+    def at_once(state: State) -> list[Measured]:  # a single state has no speed
+        value = 0.0 * state.T_base_tcp[:, 0, 0]
+        return [Measured(f"the speed of {name}", value, high=limit, unit="m/s")]
 
-
-def _nothing(state: State) -> Array:
-    """What a single state has of a number that only a path has."""
-    return 0.0 * state.T_base_tcp[:, 0, 0]
+    return Constraint(record=record, measured=at_once, unit="m/s", along=along)
 
 
 _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
-    **RELATIONS,
+    **dict.fromkeys(RELATIONS, relation_of),
     "distance": _distance,
     "above": _above,
     "align": _align,

@@ -24,7 +24,6 @@ _BETWEEN = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])
 class SweptPiece:
     """One convex piece of the hand and all places it passes on the approach, tool frame."""
 
-    link: str
     finger: bool
     """Whether it closes on objects; else it carries those that do."""
     corners_m: Points
@@ -52,15 +51,6 @@ class OpenHand:
     """Whether it is the same after half a turn about the approach."""
     closed_in: bool
     """Whether the fingers' hulls fill the space between the pads: then they say nothing of it."""
-
-    def passes(self, centres_m: Points, radius_m: float, margin_m: float) -> Flags:
-        """Which hands come near a ball; those that do not, ``hits`` nothing that is in it."""
-        reach_m = radius_m + np.sqrt(3.0) * margin_m
-        near: Flags = np.zeros(len(centres_m), dtype=bool)
-        for piece in self.pieces:
-            beside = np.maximum(piece.low_m - centres_m, centres_m - piece.high_m)
-            near |= np.linalg.norm(np.maximum(beside, 0.0), axis=1) <= reach_m
-        return near
 
     def hits(
         self, points_m: Float[np.ndarray, "3 num_poses num_points"], margin_m: float
@@ -118,7 +108,7 @@ def open_hand(robot: RobotModel, open_m: float, pregrasp_m: float) -> OpenHand:
     T_tcp_base = se3.invert(robot.T_base_link(robot.record.tool_frame, robot.home_rad, open_m))
     fingers = set(gripper.finger_links)
     pieces = [
-        _swept(link, link in fingers, se3.apply(T_tcp_base, points), pregrasp_m)
+        _swept(link in fingers, se3.apply(T_tcp_base, points), pregrasp_m)
         for link, points in placed
     ]
     closing = [piece for piece in pieces if piece.finger]
@@ -138,12 +128,11 @@ def open_hand(robot: RobotModel, open_m: float, pregrasp_m: float) -> OpenHand:
     )
 
 
-def _swept(link: str, finger: bool, corners_m: Points, pregrasp_m: float) -> SweptPiece:
+def _swept(finger: bool, corners_m: Points, pregrasp_m: float) -> SweptPiece:
     corners = corners_m[ConvexHull(corners_m).vertices]
     swept = np.concatenate([corners, corners - [0.0, 0.0, pregrasp_m]])
     equations = np.unique(ConvexHull(swept).equations.round(9), axis=0)
     return SweptPiece(
-        link=link,
         finger=finger,
         corners_m=corners,
         normals=equations[:, :3],

@@ -38,13 +38,6 @@ class SampledSurface:
         self.shape = shape
 
     @cached_property
-    def ball(self) -> tuple[Vector, float]:
-        """Middle and radius of a sphere that holds all of it, object frame."""
-        vertices = self.shape.vertices_m
-        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-        return middle, float(np.linalg.norm(vertices - middle, axis=1).max())
-
-    @cached_property
     def _rays(self) -> Any:
         make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
         rays, shape = make(nthreads=1), self.shape

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.plan.grasp.open_hand import OpenHand
-from twin.plan.problem import Joints, Pose, Poses, Postures, Problem
+from twin.plan.problem import Joints, Pose, Postures, Problem
 from twin.replay.clearance.bodies import own_links
 from twin.replay.clearance.surroundings import Surroundings
 from twin.replay.config import ReplayConfig
@@ -49,26 +49,15 @@ class ArmReach:
             return False
         return self._around.least_m(frozenset(), self._eps_m) >= self._eps_m
 
-
-class Reaches:
-    """Solutions of many grasps, looked at one at a time."""
-
-    def __init__(
-        self, arm: ArmReach, Ts_base_tcp: Poses, hand: OpenHand, pregrasp_m: float
-    ) -> None:
-        """Remember the grasps and what comes before them."""
-        self._arm, self._hand, self._Ts = arm, hand, Ts_base_tcp
-        self._turns = (1.0, -1.0) if hand.symmetric else (1.0,)
-        self._back = np.eye(4)
-        self._back[2, 3] = -pregrasp_m
-
-    def first(self, index: int) -> Reached | str:
-        """The solution nearest to where the arm stands that keeps clear, or why there is none."""
-        robot, start_rad, why = self._arm.robot, self._arm.start_rad, "reach"
+    def first(self, T_base_tcp: Pose, hand: OpenHand, pregrasp_m: float) -> Reached | str:
+        """How to reach a grasp, nearest to where the arm stands and clear, or why it cannot."""
+        back = np.eye(4)
+        back[2, 3] = -pregrasp_m
+        robot, start_rad, why = self.robot, self.start_rad, "reach"
         found: list[tuple[float, Reached, Joints]] = []
-        for sign in self._turns:
-            T = self._Ts[index] * np.array([sign, sign, 1.0, 1.0])
-            reaching, before_T = _reaching(robot, T), T @ self._back
+        for sign in (1.0, -1.0) if hand.symmetric else (1.0,):
+            T = T_base_tcp * np.array([sign, sign, 1.0, 1.0])
+            reaching, before_T = _reaching(robot, T), T @ back
             is_closed = UrInverse.for_robot(robot) is not None
             known = _reaching(robot, before_T) if is_closed else None
             why = "approach" if len(reaching) else why
@@ -82,7 +71,7 @@ class Reaches:
         for _, way, before in sorted(found, key=lambda each: each[0])[:_MOST_BRANCHES]:
             why = "arm"
             # At the grasp and where its approach begins; the hand was looked at all the way.
-            if all(self._arm.is_clear(row, self._hand.open_m) for row in (way.joints_rad, before)):
+            if all(self.is_clear(row, hand.open_m) for row in (way.joints_rad, before)):
                 return way
         return why
 

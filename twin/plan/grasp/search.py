@@ -1,5 +1,6 @@
 """All grasps of one object that the hand can reach, the surest first, and why others are none."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -8,13 +9,23 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from bridge.geometry import se3
-from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.plan.grasp.margin import Doubt, Lines, margins, slacks
 from twin.plan.grasp.open_hand import OpenHand, has_fingers, open_hand
 from twin.plan.grasp.pairs import Pairs, SampledSurface, antipodal_pairs, thinned
-from twin.plan.grasp.reach import ArmReach, Reached, Reaches
-from twin.plan.problem import Covariance, Flags, Grasp, Ids, Numbers, Points, Pose, Poses, Problem
+from twin.plan.grasp.reach import ArmReach, Reached
+from twin.plan.problem import (
+    Covariance,
+    Flags,
+    Grasp,
+    Ids,
+    NoPlanError,
+    Numbers,
+    Points,
+    Pose,
+    Poses,
+    Problem,
+)
 from twin.replay.config import UNKNOWN_POSE_M, UNKNOWN_POSE_RAD
 
 CAUSES: Mapping[str, str] = {
@@ -44,23 +55,9 @@ HINTS: Mapping[str, str] = {
 }
 
 
-class NoGraspError(TwinError):
-    """An object cannot be taken hold of; ``cause`` says why in one word."""
-
-    def __init__(
-        self,
-        *,
-        object_id: str,
-        cause: str,
-        found: str,
-        hint: str,
-        rejected: Mapping[str, int] | None = None,
-    ) -> None:
-        """Remember the object, the cause and how many candidates fell to which cause."""
-        self.object_id = object_id
-        self.cause = cause
-        self.rejected = dict(rejected or {})
-        super().__init__(f"no grasp of {object_id}: {found}. {hint}")
+def no_grasp(object_id: str, cause: str, found: str, hint: str) -> NoPlanError:
+    """An object cannot be taken hold of; why, in one word and in more."""
+    return NoPlanError(f"no grasp of {object_id}: {found}. {hint}", cause=cause)
 
 
 FRICTION = 0.5
@@ -108,20 +105,15 @@ class _Candidates:
     """Hands on closing lines, object frame; fields are in step."""
 
     lines: Lines
-    rejected: dict[str, int] = field(default_factory=dict)
+    rejected: Counter[str] = field(default_factory=Counter)
 
     def keep(self, mask: Flags, cause: str) -> None:
         """Reject the others."""
-        _count(self.rejected, cause, int((~mask).sum()))
+        self.rejected[cause] += int((~mask).sum())
         self.lines = self.lines.chosen(mask)
 
     def __len__(self) -> int:
         return len(self.lines.widths_m)
-
-
-def _count(rejected: dict[str, int], cause: str, number: int) -> None:
-    if number:
-        rejected[cause] = rejected.get(cause, 0) + number
 
 
 _TARGET_POINTS = 500
@@ -154,12 +146,9 @@ class GraspSearcher:
         self.config = GraspConfig() if config is None else config
         robot = problem.robot
         if not has_fingers(robot):
-            raise NoGraspError(
-                object_id="anything",
-                cause="no_gripper",
-                found=f"{robot.record.name} has no fingers that close",
-                hint="Give its gripper in the robot file (docs/robots.md).",
-            )
+            found = f"{robot.record.name} has no fingers that close"
+            hint = "Give its gripper in the robot file (docs/robots.md)."
+            raise no_grasp("anything", "no_gripper", found, hint)
         self.max_width_m = robot.record.gripper.max_width_m
         self._reach = ArmReach(problem)
         self._surfaces: dict[str, SampledSurface] = {}
@@ -178,7 +167,7 @@ class GraspSearcher:
         if not grasps:
             raise self._none(object_id, first[0].rejected, first[1])
         return GraspSearch(
-            grasps=grasps, rejected=found.rejected, remarks=self._remarks(object_id, hand)
+            grasps=grasps, rejected=+found.rejected, remarks=self._remarks(object_id, hand)
         )
 
     def _opened(
@@ -205,33 +194,24 @@ class GraspSearcher:
         except (QhullError, ValueError):
             return
         top_m = float(own[:, 2].max())
-        middle = own[:, :2].mean(axis=0)
-        reach_m = float(np.linalg.norm(own[:, :2] - middle, axis=1).max())
         for name, T in scene.movable().items():
             if name == object_id:
-                continue
-            centre, radius_m = self._surface(name).ball
-            away = se3.apply(T, centre[None])[0, :2] - middle
-            if np.linalg.norm(away) > reach_m + radius_m:
                 continue
             other = se3.apply(T, self._surface(name).points(_NEIGHBOUR_POINTS, 0))
             over = other[(other[:, :2] @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)]
             if len(over) and over[:, 2].min() > top_m - _COVERED_M:
                 found, hint = f"{name} is on top of it", f"Move {name} away first."
-                raise NoGraspError(object_id=object_id, cause="covered", found=found, hint=hint)
+                raise no_grasp(object_id, "covered", found, hint)
 
     def _refuse_too_heavy(self, object_id: str) -> None:
         model = self.problem.model(object_id)
         weight_N = model.mass_kg * PhysicsConfig().gravity_m_s2 * _SAFETY
         held_N = 2 * FRICTION * self._grip_N()
         if weight_N > held_N:
-            raise NoGraspError(
-                object_id=object_id,
-                cause="weight",
-                found=f"friction holds {held_N:.0f} N, and lifting {model.mass_kg:.2f} kg takes up "
-                f"to {weight_N:.0f} N",
-                hint="Press harder (grip_force_N of the task file), or take something lighter.",
-            )
+            found = f"friction holds {held_N:.0f} N, and lifting {model.mass_kg:.2f} kg takes up "
+            found += f"to {weight_N:.0f} N"
+            hint = "Press harder (grip_force_N of the task file), or take something lighter."
+            raise no_grasp(object_id, "weight", found, hint)
 
     def _grip_N(self) -> float:
         given = self.problem.scene.task.grip_force_N
@@ -249,10 +229,10 @@ class GraspSearcher:
             self._surfaces[object_id] = SampledSurface(self.problem.shapes[object_id])
         return self._surfaces[object_id]
 
-    def _pairs(self, object_id: str, open_m: float) -> tuple[Pairs, dict[str, int]]:
+    def _pairs(self, object_id: str, open_m: float) -> tuple[Pairs, Counter[str]]:
         """Closing lines that hold, fit between the pads, and are on what was seen."""
         config, shape = self.config, self.problem.shapes[object_id]
-        rejected: dict[str, int] = {}
+        rejected: Counter[str] = Counter()
         kept: Ids = np.zeros(0, dtype=np.int64)
         pairs = antipodal_pairs(
             self._surface(object_id),
@@ -263,7 +243,7 @@ class GraspSearcher:
         )
 
         def keep(pairs: Pairs, mask: Flags, cause: str) -> Pairs:
-            _count(rejected, cause, int((~mask).sum()))
+            rejected[cause] += int((~mask).sum())
             return pairs.chosen(mask)
 
         pairs = keep(pairs, pairs.cosines >= np.cos(CONE_RAD), "cone")
@@ -279,7 +259,7 @@ class GraspSearcher:
         return pairs.chosen(kept), rejected
 
     def _hands_on(
-        self, pairs: Pairs, T_base_object: Pose, hand: OpenHand, rejected: dict[str, int]
+        self, pairs: Pairs, T_base_object: Pose, hand: OpenHand, rejected: Counter[str]
     ) -> _Candidates:
         """Put hands onto closing lines, from several directions and at several depths."""
         down = -T_base_object[2, :3]
@@ -332,17 +312,9 @@ class GraspSearcher:
                 continue
             sigma_m = float(np.sqrt(np.abs(np.diag(self._covariance(name))[:3]).max()))
             margin_m = self.config.clearance_m + sigma_m
-            surface, T_object_other = self._surface(name), T_object_base @ T
-            middle, radius_m = surface.ball
-            centres = in_tools(found.lines, se3.apply(T_object_other, middle[None]))[..., 0].T
-            near = np.flatnonzero(hand.passes(centres, radius_m, margin_m))
-            if not len(near):
-                continue
-            points = se3.apply(T_object_other, surface.points(_NEIGHBOUR_POINTS, SEED))
-            hits = hand.hits(in_tools(found.lines.chosen(near), points), margin_m)
-            clear: Flags = np.ones(len(found), dtype=bool)
-            clear[near] = ~(hits["fingers"] | hits["palm"])
-            found.keep(clear, "neighbour")
+            points = self._surface(name).points(_NEIGHBOUR_POINTS, SEED)
+            hits = hand.hits(in_tools(found.lines, se3.apply(T_object_base @ T, points)), margin_m)
+            found.keep(~(hits["fingers"] | hits["palm"]), "neighbour")
 
     def _margins(
         self, found: _Candidates, object_id: str, points_m: Points, hand: OpenHand
@@ -380,15 +352,15 @@ class GraspSearcher:
         """Take the surest that the arm reaches, leaving out what is like one that was taken."""
         config, lines = self.config, found.lines
         T = self.problem.scene.Ts_base_object[object_id]
-        arm = Reaches(self._reach, T @ lines.Ts_object_tcp, hand, PREGRASP_M)
+        Ts = T @ lines.Ts_object_tcp
         taken: list[Grasp] = []
         kept: list[int] = []
         for index in np.argsort(-margin, kind="stable").tolist():
             if kept and _is_like(lines, index, kept, hand.symmetric):
                 continue
-            way = arm.first(index)
+            way = self._reach.first(Ts[index], hand, PREGRASP_M)
             if not isinstance(way, Reached):
-                _count(found.rejected, way, 1)
+                found.rejected[way] += 1
                 continue
             kept.append(index)
             T_object_tcp = lines.Ts_object_tcp[index]
@@ -424,7 +396,7 @@ class GraspSearcher:
             remarks.append(f"not localised, so not kept clear of: {', '.join(unseen)}")
         return tuple(remarks)
 
-    def _none(self, object_id: str, rejected: Mapping[str, int], hand: OpenHand) -> NoGraspError:
+    def _none(self, object_id: str, rejected: Mapping[str, int], hand: OpenHand) -> NoPlanError:
         """Name what rejected the candidates that came furthest."""
         cause = [name for name in CAUSES if rejected.get(name)][-1:] or ["cone"]
         found = CAUSES[cause[0]]
@@ -433,13 +405,9 @@ class GraspSearcher:
         if cause[0] == "palm":
             found += f" ({hand.depth_m * 1e3:.0f} mm)"
         counted = ", ".join(f"{name} {rejected[name]}" for name in CAUSES if rejected.get(name))
-        return NoGraspError(
-            object_id=object_id,
-            cause=cause[0],
-            found=f"{found} (rejected: {counted or 'nothing was found'})",
-            hint=HINTS.get(cause[0], "Turn the object, or take another one."),
-            rejected=rejected,
-        )
+        found += f" (rejected: {counted or 'nothing was found'})"
+        hint = HINTS.get(cause[0], "Turn the object, or take another one.")
+        return no_grasp(object_id, cause[0], found, hint)
 
 
 def turned(Ts: Poses) -> Poses:

@@ -1,6 +1,6 @@
 """The planner: grasps by margin, final states of each, collision-free timed ways between them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import erfc, sqrt
@@ -11,34 +11,42 @@ import numpy as np
 from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.model_policy import MODEL_POLICY
-from bridge.task.plan import Plan, Waypoint
-from twin.plan.constrain.constraint import SHOWN, Constraint, flattened, violated, worst_along
+from bridge.task.plan import Plan
+from bridge.task.relations import SHOWN
+from twin.plan.constrain.constraint import Constraint, violated
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.reach import nearest_solutions
-from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
-from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
-from twin.plan.loop.push import push_choices, pushed
+from twin.plan.grasp.search import GraspSearcher, turned
+from twin.plan.loop.propose import Candidate, refuse_lost
+from twin.plan.loop.push import push, push_choices
 from twin.plan.loop.steer import Steer
 from twin.plan.loop.tau import (
-    Bounds,
+    OPEN_S,
     Trajectory,
     goals_of,
     plan_stage,
     refuse_without_stages,
-    speed_limits,
+    speed_limit,
     stage_of_leg,
     stages_of,
 )
-from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, NoPathError, PathConfig, plan_move
-from twin.plan.path.transfer import LIFT_M, Leg, plan_transfer
-from twin.plan.problem import Grasp, Joints, Miss, Pose, Problem, Release, State, Vector
+from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, Mover, NoPathError, PathConfig
+from twin.plan.path.transfer import LEGS, LIFT_M, Leg, plan_transfer
+from twin.plan.problem import (
+    Grasp,
+    Joints,
+    Miss,
+    NoPlanError,
+    Problem,
+    Release,
+    State,
+    Vector,
+)
 from twin.plan.release.final_states import MAX_RELEASES, final_states, places_on_table
-from twin.plan.release.resting import NoFinalStateError, lying_there
+from twin.plan.release.resting import lying_there
 from twin.replay.clearance.bodies import SCENE
 
 PLANNER = "gst_planner"
-CLOSED_M = 0.0
-"""Commanded width of the closed hand: its force, not its place, is what holds."""
 GRASPS = 6
 WIDER_M = 0.003
 """Kept beyond what was asked for where a path was refused."""
@@ -85,15 +93,11 @@ class Transfer:
     grasp: Grasp
     release: Release
     legs: tuple[Leg, ...]
-    T_base_lies: Pose
+    after: Problem
+    """When it was moved: it lies there, and the arm stands where it left."""
     cost: float
     """J of the final state, plus the chance that the grasp misses."""
     remarks: tuple[str, ...] = ()
-
-    @property
-    def end_rad(self) -> Joints:
-        """Arm when it has let go and left."""
-        return np.asarray(self.legs[-1].movement.path.joints_rad[-1])
 
 
 @dataclass(frozen=True)
@@ -109,40 +113,46 @@ class PlanProposer:
         task = problem.scene.task
         refuse_lost(problem.scene)
         refuse_without_stages(task)
-        if any(table.get("push") for table in task.stages):
-            return self._pushed(problem, plan_id, count)
+        pushing = any(table.get("push") for table in task.stages)
         search = _Search(problem, seed, steer)
+        offers = _pushes(problem, search) if pushing else _transfers(problem, search)
         found: list[Candidate] = []
-        for transfers in search.sequences():
-            try:
-                plan, remarks = _plan_of(problem, transfers, self.policy, plan_id, seed)
-            except NoPathError as error:
-                search.why = f"{error}."
-                continue
-            cost = sum(each.cost for each in transfers)
-            found.append(Candidate(plan=plan, rank=len(found), cost=cost, remarks=remarks))
+        for cost, trajectory, after, remarks in offers:
+            told = (*remarks, *_go_home(after, trajectory, seed))
+            plan = _written(problem, after, trajectory, self.policy, plan_id)
+            found.append(Candidate(plan=plan, rank=len(found), cost=cost, remarks=told))
             if len(found) == count:
                 break
         if not found:
             raise NoPlanError(search.why)
         return found
 
-    def _pushed(self, problem: Problem, plan_id: str, count: int) -> list[Candidate]:
-        found: list[Candidate] = []
-        why, remarks = "", ("pushed straight, tool down; no distance was looked at",)
-        for choice in push_choices(problem):
-            if len(found) == count:
-                break
-            try:
-                plan = _written(problem, self.policy, plan_id, *pushed(problem, choice))
-            except NoPlanError as error:
-                why = str(error)
-                continue
-            rank = len(found)
-            found.append(Candidate(plan=plan, rank=rank, cost=choice.cost, remarks=remarks))
-        if not found:
-            raise NoPlanError(why)
-        return found
+
+Offer = tuple[float, Trajectory, Problem, tuple[str, ...]]
+"""Its cost, the way, how everything is after it, and remarks."""
+
+
+def _pushes(problem: Problem, search: "_Search") -> Iterator[Offer]:
+    for choice in push_choices():
+        trajectory, after, key = Trajectory(robot=problem.robot), problem, ""
+        try:
+            for key in problem.scene.task.manipulated:  # the message names it
+                after = push(after, key, choice, trajectory)
+        except NoPathError as error:
+            search.why = _why_not_moved(problem, key, error)
+            continue
+        yield choice.cost, trajectory, after, ("pushed straight, tool down",)
+
+
+def _transfers(problem: Problem, search: "_Search") -> Iterator[Offer]:
+    for transfers in search.sequences():
+        trajectory, after = Trajectory(robot=problem.robot), problem
+        for each in transfers:
+            stages = stages_of(problem.scene.task, each.key)
+            trajectory.add_transfer(each.legs, each.grasp, stages)
+            after = each.after
+        remarks = tuple(text for each in transfers for text in each.remarks)
+        yield sum(each.cost for each in transfers), trajectory, after, remarks
 
 
 class _Search:
@@ -176,7 +186,7 @@ class _Search:
             if not made:
                 return None
             transfers.append(made[min(number, len(made) - 1)])
-            problem = _after(problem, transfers[-1])
+            problem = transfers[-1].after
         return transfers
 
     def _transfers(self, problem: Problem, key: str) -> Iterator[Transfer]:
@@ -202,7 +212,7 @@ class _Search:
                 yield transfer
             if not found and options.why:
                 self.why = options.why
-        except (NoGraspError, NoFinalStateError) as error:
+        except NoPlanError as error:
             self.why = str(error)
 
     def _mine(self, key: str) -> Steer | None:
@@ -219,7 +229,8 @@ class _Search:
     ) -> Transfer:
         """The first way that keeps what holds on the way."""
         kept = _kept_on_the_way(problem, grasp)
-        limits = speed_limits(problem.scene.task, grasp.object_id)
+        task, stages = problem.scene.task, stages_of(problem.scene.task, grasp.object_id)
+        limits = {leg: speed_limit(task, stage_of_leg(leg, stages)) for leg in LEGS}
         ways, base = _WAYS, PathConfig()
         steer = self._mine(grasp.object_id)
         if steer is not None and steer.change == "path":
@@ -244,12 +255,18 @@ class _Search:
                 if error.reason != NOT_KEPT and not way.straight:
                     break  # where nothing is free, another height is not either
                 continue
+            lies = lying_there(problem, release, options.miss_with(grasp))
+            scene = replace(
+                problem.scene,
+                Ts_base_object={**problem.scene.Ts_base_object, grasp.object_id: lies},
+                start_rad=legs[-1].path.joints_rad[-1],
+            )
             return Transfer(
                 key=grasp.object_id,
                 grasp=grasp,
                 release=release,
                 legs=legs,
-                T_base_lies=lying_there(problem, release, options.miss_with(grasp)),
+                after=replace(problem, scene=scene),
                 cost=release.cost + erfc(grasp.margin / sqrt(2.0)) / 2,
                 remarks=options.remarks_of(grasp, release, legs),
             )
@@ -275,13 +292,6 @@ def _why_not_moved(problem: Problem, key: str, error: NoPathError) -> str:
     else:
         hint = "Move apart what touches, or put the objects elsewhere."
     return f"{key}: {error}. {hint}"
-
-
-def _after(problem: Problem, moved: Transfer) -> Problem:
-    """The problem when an object was moved: it lies there, the arm stands where it left."""
-    Ts = {**problem.scene.Ts_base_object, moved.key: moved.T_base_lies}
-    scene = replace(problem.scene, Ts_base_object=Ts, start_rad=moved.end_rad)
-    return replace(problem, scene=scene)
 
 
 class _Options:
@@ -359,7 +369,7 @@ class _Options:
     def _releases(self, grasp: Grasp) -> tuple[Release, ...]:
         try:
             releases = self._final_states(grasp)
-        except NoFinalStateError as error:
+        except NoPlanError as error:
             self.why = str(error)
             if error.cause in _HOPELESS:
                 raise
@@ -387,14 +397,12 @@ class _Options:
 
     def remarks_of(self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]) -> tuple[str, ...]:
         """Where the numbers of a transfer come from, in words."""
-        postures = sum(leg.movement.path.work.get("postures", 0.0) for leg in legs)
-        clear = release.clearance_m
-        nearest = f", {clear * 1e3:.0f} mm clear" if np.isfinite(clear) else ""
+        postures = sum(leg.path.work.get("postures", 0.0) for leg in legs)
         return (
             f"{self._key}: grasp of {self.num_grasps}, {grasp.width_m * 1e3:.0f} mm wide, bears "
             f"{grasp.margin:.1f} standard deviations",
             *(f"{self._key}: {text}" for text in self._remarks),
-            f"{self._key}: final state of J {release.cost:.4f}{nearest}",
+            f"{self._key}: final state of J {release.cost:.4f}",
             f"{self._key}: {postures:.0f} postures looked at on the way",
         )
 
@@ -448,13 +456,11 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
                 continue  # it lies where it lay; the time law keeps speeds there
             stage = stage_of_leg(leg.name, ids)
             states = _states_along(problem, grasp, leg)
-            times_s = leg.movement.path.times_s
-            asked = [(each, worst_along(each, states, times_s=times_s)) for each in of_stage[stage]]
+            times_s = leg.path.times_s
+            asked = [(each, each.worst_along(states, times_s)) for each in of_stage[stage]]
             if leg.name == "carry":
-                last = flattened(states)
-                asked += [(each, each.violation(last)[-1:]) for each in at_the_end]
-            for constraint, worst in asked:
-                f = float(worst[0])
+                asked += [(each, float(each.violation(states)[-1])) for each in at_the_end]
+            for constraint, f in asked:
                 if f > 0:
                     factor, unit = SHOWN[constraint.unit]
                     detail = f"{constraint.kind} is violated by {f * factor:.3g} {unit}"
@@ -466,52 +472,35 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
 
 
 def _states_along(problem: Problem, grasp: Grasp, leg: Leg) -> State:
-    """Poses along a leg that carries, as ``worst_along`` takes them."""
-    T_tcp = problem.robot.Ts_base_tcp(leg.movement.path.joints_rad)
-    Ts: dict[str, Any] = {name: T[None, None] for name, T in problem.scene.Ts_base_object.items()}
-    Ts[grasp.object_id] = (T_tcp @ se3.invert(grasp.T_object_tcp))[None]
-    widths = np.full((1, len(T_tcp)), leg.movement.width_m)
-    return State(Ts_base_object=Ts, T_base_tcp=T_tcp[None], width_m=widths)
+    """What is where in each step of a leg that carries."""
+    T_tcp = problem.robot.Ts_base_tcp(leg.path.joints_rad)
+    Ts: dict[str, Any] = {name: T[None] for name, T in problem.scene.Ts_base_object.items()}
+    Ts[grasp.object_id] = T_tcp @ se3.invert(grasp.T_object_tcp)
+    widths = np.full(len(T_tcp), leg.width_m)
+    return State(Ts_base_object=Ts, T_base_tcp=T_tcp, width_m=widths)
 
 
-def _plan_of(
-    problem: Problem, transfers: list[Transfer], policy: str, plan_id: str, seed: int
-) -> tuple[Plan, tuple[str, ...]]:
-    """Write transfers as a plan; at the end the arm goes back to where it stood."""
-    task = problem.scene.task
-    trajectory = Trajectory(robot=problem.robot)
-    there = dict(problem.scene.Ts_base_object)
-    last = problem
-    for each in transfers:
-        trajectory.add_transfer(each.legs, each.grasp, stages_of(task, each.key), CLOSED_M)
-        there[each.key] = each.T_base_lies
-        last = _after(last, each)
-    remarks = tuple(text for each in transfers for text in each.remarks)
-    start = problem.scene.start_rad
-    home_rad = problem.robot.home_rad if start is None else start
-    open_m = transfers[-1].grasp.open_m
-    slow = speed_limits(task, transfers[-1].key).get("leave", 0.0)
-    config = PathConfig(seed=seed % 2**31, tool_m_s=slow)
+def _go_home(after: Problem, trajectory: Trajectory, seed: int) -> tuple[str, ...]:
+    """At the end the arm goes back to where it stood, its hand open."""
+    task, robot, last = after.scene.task, after.robot, trajectory.tau[-1]
+    home_rad, end_rad = (np.array(at.joints_rad) for at in (trajectory.tau[0], last))
+    stage, open_m = str(task.stages[-1]["id"]), float(last.width_m or 0.0)
+    if last.g:
+        open_m = robot.record.gripper.max_width_m
+        trajectory.pause(stage, OPEN_S, g=0, width_m=open_m)
+    config = PathConfig(seed=seed % 2**31, tool_m_s=speed_limit(task, stage))
     try:
-        home = plan_move(last, transfers[-1].end_rad, home_rad[None], config, width_m=open_m)
+        home = Mover(problem=after, config=config, width_m=open_m).around(end_rad, home_rad[None])
     except NoPathError as error:
-        remarks += (f"the arm stays where it let go: {error}",)
-    else:
-        leg = Leg(name="home", movement=home, g=0)
-        trajectory.add(leg, str(task.stages[-1]["id"]), open_m)
-    tau = tuple(trajectory.tau)
-    return _written(problem, policy, plan_id, tau, trajectory.bounds, there), remarks
+        return (f"the arm stays where it let go: {error}",)
+    trajectory.add(Leg(name="home", path=home, g=0, width_m=open_m), stage, open_m)
+    return ()
 
 
 def _written(
-    problem: Problem,
-    policy: str,
-    plan_id: str,
-    tau: tuple[Waypoint, ...],
-    bounds: Bounds,
-    there: Mapping[str, Pose],
+    problem: Problem, after: Problem, trajectory: Trajectory, policy: str, plan_id: str
 ) -> Plan:
-    """A plan of a trajectory that leaves its objects there."""
+    """A plan of a trajectory that leaves its objects so."""
     task, record = problem.scene.task, problem.robot.record
     return Plan(
         id=plan_id,
@@ -524,6 +513,9 @@ def _written(
         instruction=task.instruction,
         entities={key: se3.pose_record(T) for key, T in problem.scene.Ts_base_object.items()},
         joint_names=record.joints,
-        stages=tuple(plan_stage(task, table, bounds, there) for table in task.stages),
-        tau=tau,
+        stages=tuple(
+            plan_stage(task, table, trajectory.bounds, after.scene.Ts_base_object)
+            for table in task.stages
+        ),
+        tau=tuple(trajectory.tau),
     )

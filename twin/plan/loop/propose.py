@@ -7,14 +7,9 @@ from typing import Protocol, runtime_checkable
 from bridge.task.plan import Plan, Ranking, SteeredBy
 from bridge.task.plan_request import Refusal
 from bridge.task.verdict import Verdict
-from twin.errors import TwinError
 from twin.plan.loop.steer import Steer, steer_by
-from twin.plan.problem import Problem
+from twin.plan.problem import NoPlanError, Problem
 from twin.replay.scene import ReplayScene
-
-
-class NoPlanError(TwinError):
-    """The planner finds no plan; the message says why and what would help."""
 
 
 @dataclass(frozen=True, kw_only=True)

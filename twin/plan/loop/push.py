@@ -1,37 +1,29 @@
-"""Pushing straight, tool down: down behind the object with closed fingers, on to its mark, back.
+"""Pushing straight, tool down, fingers closed: down behind the object, on to its mark, back."""
 
-It looks at no distance and knows no surface; nothing is drawn.
-"""
-
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.geometry.trajectory import PoseTrajectory
-from bridge.task.plan import Waypoint
-from twin.plan.loop.propose import NoPlanError
-from twin.plan.loop.tau import stages_of
-from twin.plan.path.planner import waypoint
-from twin.plan.problem import Joints, Numbers, Pose, Problem
-from twin.robot.config import IkConfig
-from twin.robot.follow import follow_poses
+from twin.plan.grasp.reach import nearest_solutions
+from twin.plan.loop.tau import CLOSED_M, Trajectory, speed_limit, stages_of
+from twin.plan.path.planner import Mover, NoPathError, PathConfig, reversed_path
+from twin.plan.path.transfer import Leg
+from twin.plan.path.world import Carried
+from twin.plan.problem import NoPlanError, Pose, Problem, TimedPath
+from twin.replay.clearance.bodies import GRIPPER
 
-STEP_S = 0.04
 HOVER_M = 0.13
-LOWEST_TOOL_M = 0.016
+TOOL_OVER_TABLE_M = 0.02
 """The tips reach 10 mm below the tool."""
-SPEED_M_S, TURN_RAD_S = 0.25, 1.0
-SHORTEST_S = 0.5
-PUSH_GAP_M, PUSH_OVER_M, FINGERS_HALF_M = 0.03, 0.004, 0.011
-"""Before the fingers meet what they push; of the tool over its lowest place; of the closed pads."""
-PUSH_SPEED_M_S, RAMP_S, PUSH_STEP_S = 0.1, 0.12, 0.02
-"""Of a push whose task says no speed; time to reach it and to stop; between its waypoints."""
+PUSH_GAP_M, FINGERS_HALF_M = 0.03, 0.011
+"""Before the fingers meet what they push; of the closed pads."""
+PUSH_SPEED_M_S = 0.1
+"""Of a push whose task says no speed."""
 WAIT_S = 0.3
-MOST_STEP_RAD = 0.3
 ASIDE_M = (0.0, 0.012, -0.012)
 """Of the fingers, along the pads, from the middle of the object."""
 AHEAD_M = ((0.0, 0.0), (0.015, 0.0), (-0.015, 0.0), (0.0, 0.015), (0.0, -0.015))
@@ -42,165 +34,119 @@ AHEAD_M = ((0.0, 0.0), (0.015, 0.0), (-0.015, 0.0), (0.0, 0.015), (0.0, -0.015))
 class PushChoice:
     """What one candidate does to every object."""
 
-    turns: int
+    turned: bool
+    """The hand, half about its approach."""
     aside_m: float
     ahead_m: tuple[float, float]
 
     @property
     def cost(self) -> float:
         """How far it is from what the task says."""
-        return 0.1 * self.turns + abs(self.aside_m) + float(np.linalg.norm(self.ahead_m))
+        return 0.1 * self.turned + abs(self.aside_m) + float(np.linalg.norm(self.ahead_m))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Leg:
-    stage: str
-    T_base_tcp: Pose
-    g: int = 1
-    pause_s: float = 0.0
-    even_m_s: float | None = None
-    """Goes at this speed but for short ramps; None: slowly, at rest at both ends."""
-
-
-def push_choices(problem: Problem) -> Iterator[PushChoice]:
+def push_choices() -> Iterator[PushChoice]:
     """All candidates, the least turned and shifted first."""
-    task = problem.scene.task
-    turns = max(round(2 * np.pi / task.objects[key].grasp_turn_rad) for key in task.manipulated)
     everything = [
-        PushChoice(turns=turn, aside_m=aside, ahead_m=ahead)
-        for turn, aside, ahead in product(range(turns), ASIDE_M, AHEAD_M)
+        PushChoice(turned=turned, aside_m=aside, ahead_m=ahead)
+        for turned, aside, ahead in product((False, True), ASIDE_M, AHEAD_M)
     ]
     yield from sorted(everything, key=lambda choice: choice.cost)
 
 
-def pushed(
-    problem: Problem, choice: PushChoice
-) -> tuple[tuple[Waypoint, ...], dict[str, tuple[int, int]], dict[str, Pose]]:
-    """Waypoints, when each stage begins and ends [ns], and where everything then lies."""
-    scene, robot = problem.scene, problem.robot
-    start_rad = robot.home_rad if scene.start_rad is None else scene.start_rad
-    there = dict(scene.Ts_base_object)
-    legs: list[_Leg] = []
-    for key in scene.task.manipulated:
-        legs += _push_legs(problem, key, choice, there)
-    legs.append(_Leg(stage=legs[-1].stage, T_base_tcp=robot.T_base_tcp(start_rad), g=0))
-    tau, bounds = _followed(problem, legs, start_rad)
-    return tau, bounds, there
-
-
-def _push_legs(
-    problem: Problem, key: str, choice: PushChoice, there: dict[str, Pose]
-) -> list[_Leg]:
-    """The movements for one object; ``there`` then has it where it comes to lie."""
-    task, T = problem.scene.task, there[key]
-    mark = task.mark_of(key)
+def push(problem: Problem, key: str, choice: PushChoice, trajectory: Trajectory) -> Problem:
+    """Append one push; return the problem as it leaves it."""
+    task, T = problem.scene.task, problem.scene.Ts_base_object[key]
+    stage, mark = stages_of(task, key).get("push"), task.mark_of(key)
+    if stage is None:
+        raise NoPlanError(f"task {task.name} pushes some objects and carries {key}: make it two.")
     if mark is None:
         raise NoPlanError(
             f"nothing in task {task.name} says where {key} is to be pushed. Add a success "
             "predicate moved with target_m to the task file (docs/tasks.md)."
         )
-    stage = stages_of(task, key).get("push")
-    if stage is None:
-        raise NoPlanError(f"task {task.name} pushes some objects and carries {key}: make it two.")
-    table = next(each for each in task.stages if each["id"] == stage)
     to = np.array(mark) + np.array(choice.ahead_m)
-    way = to - T[:2, 3]
-    far_m = float(np.linalg.norm(way))
+    far_m = float(np.linalg.norm(to - T[:2, 3]))
     if far_m < PUSH_GAP_M:
         raise NoPlanError(
             f"{key} lies {far_m * 1e3:.0f} mm from its mark, too near to be pushed: at least "
             f"{PUSH_GAP_M * 1e3:.0f} mm are needed. Put it farther away."
         )
-    along = way / far_m
-    half = np.array(task.objects[key].size_m[:2]) / 2
+    T_lies = T.copy()
+    T_lies[:2, 3] = to
+    lying = {**problem.scene.Ts_base_object, key: T_lies}
+    after = replace(problem, scene=replace(problem.scene, Ts_base_object=lying))
+    table = next(each for each in task.stages if each["id"] == stage)
+    speed_m_s = float(table.get("speed_m_s", PUSH_SPEED_M_S))
+    tools = _tools(problem, key, choice, (to - T[:2, 3]) / far_m, far_m)
+    config = PathConfig(tool_m_s=speed_limit(task, stage))
+    paths = _paths(problem, after, key, tools, speed_m_s, config)
+    for number, path in enumerate(paths):
+        trajectory.add(Leg(name="push", path=path, g=1, width_m=CLOSED_M), stage, CLOSED_M)
+        if number == len(paths) - 3:
+            trajectory.pause(stage, WAIT_S, g=1, width_m=CLOSED_M)
+    end_rad = paths[-1].joints_rad[-1]
+    return replace(after, scene=replace(after.scene, start_rad=end_rad))
+
+
+def _tools(
+    problem: Problem, key: str, choice: PushChoice, along: Float[np.ndarray, "2"], far_m: float
+) -> list[Pose]:
+    """The tool behind the object, where it touches it, at the end, and drawn back from there."""
+    T, half = problem.scene.Ts_base_object[key], np.array(problem.model(key).size_m[:2]) / 2
     local = np.abs(T[:2, :2].T @ along)
     reach_m = float(np.min(half / np.maximum(local, 1e-9))) + FINGERS_HALF_M
-    aside = np.array([-along[1], along[0]]) * choice.aside_m
-    tool = _tool_down(float(np.arctan2(along[1], along[0])) + np.pi * (choice.turns % 2))
-    height_m = problem.scene.table_height_m + LOWEST_TOOL_M + PUSH_OVER_M
-
-    def at(p: Float[np.ndarray, "2"], up_m: float = 0.0) -> Pose:
-        T_tool = tool.copy()
-        T_tool[:3, 3] = [*p, height_m + up_m]
-        return T_tool
-
-    behind = T[:2, 3] - (reach_m + PUSH_GAP_M) * along + aside
-    ahead = to - reach_m * along + aside
-    back = ahead - PUSH_GAP_M * along
-    there[key] = T.copy()
-    there[key][:2, 3] = to
-    speed = float(table.get("speed_m_s", PUSH_SPEED_M_S))
-    return [
-        _Leg(stage=stage, T_base_tcp=at(behind, HOVER_M)),
-        _Leg(stage=stage, T_base_tcp=at(behind)),
-        _Leg(stage=stage, T_base_tcp=at(ahead), even_m_s=speed),
-        _Leg(stage=stage, T_base_tcp=at(ahead), pause_s=WAIT_S),
-        _Leg(stage=stage, T_base_tcp=at(back)),
-        _Leg(stage=stage, T_base_tcp=at(back, HOVER_M)),
-    ]
+    c, s = along * (-1.0 if choice.turned else 1.0)
+    tool = np.eye(4)  # z down, y across the fingers
+    tool[:3, :3] = [[-c, -s, 0.0], [-s, c, 0.0], [0.0, 0.0, -1.0]]
+    tool[2, 3] = problem.scene.table_height_m + TOOL_OVER_TABLE_M
+    middle = T[:2, 3] + np.array([-along[1], along[0]]) * choice.aside_m
+    found = []
+    for way_m in (-PUSH_GAP_M, 0.0, far_m, far_m - PUSH_GAP_M):
+        at = tool.copy()
+        at[:2, 3] = middle + (way_m - reach_m) * along
+        found.append(at)
+    return found
 
 
-def _tool_down(yaw_rad: float) -> Pose:
-    """Tool z down, y across the fingers along the base's y at yaw 0."""
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-    T = np.eye(4)
-    T[:3, :3] = np.array([[-c, -s, 0.0], [-s, c, 0.0], [0.0, 0.0, -1.0]])
-    return T
-
-
-def _followed(
-    problem: Problem, legs: Sequence[_Leg], start_rad: Joints
-) -> tuple[tuple[Waypoint, ...], dict[str, tuple[int, int]]]:
-    """Waypoints along the legs, and when each stage begins and ends."""
+def _paths(
+    problem: Problem,
+    after: Problem,
+    key: str,
+    tools: list[Pose],
+    speed_m_s: float,
+    config: PathConfig,
+) -> list[TimedPath]:
+    """Around, down, on to the object, with it to its mark, back and up."""
+    behind, touching, end, back = tools
     robot = problem.robot
-    T, joints, t_s = robot.T_base_tcp(start_rad), start_rad, 0.0
-    tau = [waypoint(0.0, T, joints, g=legs[0].g)]
-    bounds: dict[str, tuple[int, int]] = {}
-    for leg in legs:
-        seconds, law = _law(T, leg)
-        steps = len(law)
-        u = np.arange(1, steps + 1) / steps
-        ends = np.array([T, leg.T_base_tcp])
-        line = PoseTrajectory(
-            np.array([0, 10**9], dtype=np.int64),
-            ends[:, :3, 3],
-            np.array([se3.quaternion_from_rotation(each[:3, :3]) for each in ends]),
-        )
-        begin_ns = round(t_s * 1e9)
-        Ts = line.at((law * 1e9).astype(np.int64)).transforms()
-        found = follow_poses(robot, Ts, start_rad=joints, config=IkConfig())
-        rows = np.vstack([joints, found.joints_rad])
-        if not found.reached.all() or np.abs(np.diff(rows, axis=0)).max() > MOST_STEP_RAD:
-            raise NoPlanError(
-                f"the arm cannot follow stage {leg.stage}. Move the object, or where it goes, "
-                "nearer to the arm."
-            )
-        for share, pose, row in zip(u, Ts, found.joints_rad, strict=True):
-            tau.append(waypoint(t_s + float(share) * seconds, pose, row, g=leg.g))
-        joints = rows[-1]
-        t_s += seconds
-        T = leg.T_base_tcp
-        bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], round(t_s * 1e9))
-    return tuple(tau), bounds
+    start = problem.scene.start_rad
+    start_rad = robot.home_rad if start is None else start
+    allowed = problem.contacts_of("push", key) | {frozenset((GRIPPER, key))}
+    free = Mover(problem=problem, config=config, width_m=CLOSED_M)
+    hand = replace(free, allowed=allowed)
+    T = problem.scene.Ts_base_object[key]
+    held = Carried(object_id=key, T_tcp_object=se3.invert(touching) @ T)
+    failure = NoPathError(reason="unreachable", detail="no joints reach behind it")
+    for joints_rad in nearest_solutions(robot, behind, start_rad):
+        try:
+            rise = hand.straight(joints_rad, _raised(behind))
+            around = free.around(start_rad, rise.joints_rad[-1:])
+            near = hand.straight(joints_rad, touching)
+            pushing = replace(hand, carried=held)
+            pushed = pushing.straight(near.joints_rad[-1], end, tool_m_s=speed_m_s)
+            leaving = replace(hand, problem=after)
+            away = leaving.straight(pushed.joints_rad[-1], back)
+            up = leaving.straight(away.joints_rad[-1], _raised(back))
+        except NoPathError as error:
+            failure = error
+            continue
+        return [around, reversed_path(rise), near, pushed, away, up]
+    failure.leg = "push"
+    raise failure
 
 
-def _law(T: Pose, leg: _Leg) -> tuple[float, Numbers]:
-    """How long a leg takes, and which share of its way is done after each step."""
-    if leg.even_m_s is None:
-        steps = max(1, round((leg.pause_s or _duration_s(T, leg.T_base_tcp)) / STEP_S))
-        u = np.arange(1, steps + 1) / steps
-        return steps * STEP_S, u**3 * (10 - 15 * u + 6 * u**2)  # with little jerk
-    far_m = float(np.linalg.norm(leg.T_base_tcp[:3, 3] - T[:3, 3]))
-    seconds = far_m / leg.even_m_s + RAMP_S
-    ramp = RAMP_S / seconds
-    steps = max(1, round(seconds / PUSH_STEP_S))
-    u = np.arange(1, steps + 1) / steps
-    begins, ends = np.minimum(u, ramp), np.maximum(u - 1 + ramp, 0.0)
-    done = u - begins + begins**2 / (2 * ramp) - ends**2 / (2 * ramp)
-    return seconds, done / (1 - ramp)
-
-
-def _duration_s(T: Pose, T_next: Pose) -> float:
-    far_m = float(np.linalg.norm(T_next[:3, 3] - T[:3, 3]))
-    turn_rad = float(se3.rotation_angle_rad(T[:3, :3].T @ T_next[:3, :3]))
-    return max(SHORTEST_S, far_m / SPEED_M_S, turn_rad / TURN_RAD_S)
+def _raised(T: Pose) -> Pose:
+    found = T.copy()
+    found[2, 3] += HOVER_M
+    return found

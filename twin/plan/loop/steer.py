@@ -206,8 +206,8 @@ def tried_in(plan: Plan) -> tuple[Tried, ...]:
         found.append(
             Tried(
                 object_id=stage.grasp,
-                T_object_tcp=se3.invert(T_base_object) @ _pose(closing),
-                T_base_release=None if opening is None else _pose(opening),
+                T_object_tcp=se3.invert(T_base_object) @ tool_at(closing),
+                T_base_release=None if opening is None else tool_at(opening),
             )
         )
     return tuple(found)
@@ -217,5 +217,6 @@ def _first(plan: Plan, from_ns: int, *, g: int) -> Waypoint | None:
     return next((each for each in plan.tau if each.t_ns >= from_ns and each.g == g), None)
 
 
-def _pose(waypoint: Waypoint) -> Pose:
+def tool_at(waypoint: Waypoint) -> Pose:
+    """Pose of the tool that is commanded."""
     return se3.transform_from(np.array(waypoint.q_wxyz), np.array(waypoint.p_m))

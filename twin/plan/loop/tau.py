@@ -11,17 +11,17 @@ from bridge.geometry import se3
 from bridge.task.plan import Stage, Waypoint
 from bridge.task.task_file import Task
 from twin.plan.constrain.relations import constraint_of
-from twin.plan.loop.propose import NoPlanError
 from twin.plan.path.planner import STEP_S, waypoints_of
 from twin.plan.path.transfer import Leg
-from twin.plan.problem import Grasp, Pose
+from twin.plan.problem import Grasp, NoPlanError, Pose
 from twin.robot.model import RobotModel
 
 Bounds = Mapping[str, tuple[int, int]]
 """When each stage begins and ends, from the start of the plan [ns]."""
-LEGS = ("around", "approach", "lift", "carry", "lower", "leave")
 KEPT_SHARE = 0.99
 """Of a speed limit that is driven at most, so that rounding breaks none."""
+CLOSED_M = 0.0
+"""Commanded width of the closed hand: its force, not its place, is what holds."""
 SETTLE_S, CLOSE_S, OPEN_S = 0.2, 0.7, 0.5
 """Standing still before the hand moves, while it closes, and while it opens."""
 
@@ -35,31 +35,27 @@ class Trajectory:
     bounds: dict[str, tuple[int, int]] = field(default_factory=dict)
     end_s: float = 0.0
 
-    def add_transfer(
-        self, legs: Sequence[Leg], grasp: Grasp, stages: Mapping[str, str], closed_m: float
-    ) -> None:
+    def add_transfer(self, legs: Sequence[Leg], grasp: Grasp, stages: Mapping[str, str]) -> None:
         """Append a pick and place."""
         for leg in legs:
             stage = stage_of_leg(leg.name, stages)
-            width_m = closed_m if leg.g else grasp.open_m
+            width_m = CLOSED_M if leg.g else grasp.open_m
             self.add(leg, stage, width_m)
             if leg.name == "approach":
-                self._pause(stage, SETTLE_S, g=0, width_m=grasp.open_m)
-                self._pause(stage, CLOSE_S, g=1, width_m=closed_m)
+                self.pause(stage, SETTLE_S, g=0, width_m=grasp.open_m)
+                self.pause(stage, CLOSE_S, g=1, width_m=CLOSED_M)
             if leg.name == "lower":
-                self._pause(stage, SETTLE_S, g=1, width_m=closed_m)
-                self._pause(stage, OPEN_S, g=0, width_m=grasp.open_m)
+                self.pause(stage, SETTLE_S, g=1, width_m=CLOSED_M)
+                self.pause(stage, OPEN_S, g=0, width_m=grasp.open_m)
 
     def add(self, leg: Leg, stage: str, width_m: float) -> None:
         """Append one movement."""
         begin_s = self.end_s
-        points = waypoints_of(
-            self.robot, leg.movement.path, g=leg.g, width_m=width_m, begin_s=begin_s
-        )
+        points = waypoints_of(self.robot, leg.path, g=leg.g, width_m=width_m, begin_s=begin_s)
         self.tau += points[1:] if self.tau else points
-        self._ends(stage, begin_s, begin_s + float(leg.movement.path.times_s[-1]))
+        self._ends(stage, begin_s, begin_s + float(leg.path.times_s[-1]))
 
-    def _pause(self, stage: str, seconds: float, *, g: int, width_m: float) -> None:
+    def pause(self, stage: str, seconds: float, *, g: int, width_m: float) -> None:
         """Stand still while the hand goes to a width, as fast as its fingers may at most."""
         here, begin_s = self.tau[-1], self.end_s
         before_m = width_m if here.width_m is None else here.width_m
@@ -108,15 +104,11 @@ def stage_of_leg(leg: str, stages: Mapping[str, str]) -> str:
     return stages.get("carry", stages["release"]) if leg == "carry" else stages["release"]
 
 
-def speed_limits(task: Task, key: str) -> dict[str, float]:
-    """How fast anything may be on each leg that moves an object [m/s]."""
-    ids = stages_of(task, key)
-    of_stage: dict[str, list[float]] = {}
-    for table in task.stages:
-        found = [way["max"] for way in table.get("path", ()) if way["kind"] == "speed"]
-        of_stage[str(table["id"])] = found
-    limits = {leg: of_stage[stage_of_leg(leg, ids)] for leg in LEGS}
-    return {leg: KEPT_SHARE * min(found) for leg, found in limits.items() if found}
+def speed_limit(task: Task, stage: str) -> float:
+    """How fast anything may be in a stage [m/s]; 0: nothing is said of it."""
+    paths = (table.get("path", ()) for table in task.stages if str(table["id"]) == stage)
+    found = [way["max"] for path in paths for way in path if way["kind"] == "speed"]
+    return KEPT_SHARE * min(found, default=0.0)
 
 
 def refuse_without_stages(task: Task) -> None:

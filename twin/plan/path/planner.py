@@ -8,13 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.task.plan import Waypoint
+from bridge.task.causes import Cause
+from bridge.task.plan import Plan, Stage, Waypoint
 from twin.errors import TwinError
-from twin.plan.path.decide import Decision, PathRefusal, decide
 from twin.plan.path.world import SPARE_M, Carried, World, build_world
-from twin.plan.problem import Joints, Pose, Postures, Problem, TimedPath
-from twin.replay.clearance.monitor import Allowed
+from twin.plan.problem import Joints, Pose, Poses, Postures, Problem, TimedPath
+from twin.replay.clearance.bodies import own_links
+from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig
+from twin.robot.collision import hulls_of
 from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 from twin.robot.model import RobotModel
@@ -80,26 +82,66 @@ class NoPathError(TwinError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Movement:
-    """A timed path with what was decided of it."""
+class PathRefusal:
+    """Two bodies that come too near on a movement."""
 
-    path: TimedPath
-    decision: Decision
-    width_m: float
-    carried: Carried | None
+    bodies: tuple[str, str]
+    lacking_m: float
+    """How much farther apart they should have been."""
+    detail: str
 
 
-@dataclass(frozen=True)
-class _Asked:
+@dataclass(frozen=True, kw_only=True)
+class Mover:
     """What every movement is asked with: the scene, the hand, what may touch."""
 
     problem: Problem
     config: PathConfig
     width_m: float
-    carried: Carried | None
-    allowed: Allowed
+    """Between the pads."""
+    carried: Carried | None = None
+    allowed: Allowed = frozenset()
+    """Pairs that may touch, but not lie in each other."""
 
-    def world(self, wider_m: Mapping[frozenset[str], float] | None = None) -> World:
+    def around(self, start_rad: Joints, goals_rad: Postures) -> TimedPath:
+        """Find a collision-free, short, timed movement to one of some postures."""
+        check_numbers(start_rad, goals_rad)
+        config = self.config
+        wider: dict[frozenset[str], float] = {}
+        work: dict[str, float] = {}
+        refusals: tuple[PathRefusal, ...] = ()
+        for turn in range(config.rounds):
+            world = self._world(wider)
+            _let_ends_be(world, np.vstack([start_rad[None], goals_rad]), wider)
+            knots = _searched(world, start_rad, goals_rad, config, turn, work, refusals)
+            # A margin grows with speed: what was refused is searched again wider, driven slower.
+            slower = replace(config, speed_share=config.speed_share * 0.75**turn)
+            path = timed_path(world, knots, slower)
+            refusals = self.refused(path)
+            work["rounds"] = float(turn + 1)
+            if not refusals:
+                return replace(path, work=work)
+            for refusal in refusals:
+                pair = frozenset(refusal.bodies)
+                wider[pair] = wider.get(pair, 0.0) + max(refusal.lacking_m, 0.0) + _WIDER_M
+        raise _refused(refusals[0], int(work["postures"]))
+
+    def straight(
+        self, start_rad: Joints, T_base_goal: Pose, *, tool_m_s: float = CONTACT_M_S
+    ) -> TimedPath:
+        """Move the tool straight to a pose, on the branch of the inverse kinematics it starts on.
+
+        For the last centimetres, where contact is wanted: pairs that may touch are left to the
+        exact check.
+        """
+        check_numbers(start_rad, T_base_goal)
+        knots = _straight_knots(self.problem.robot, start_rad, T_base_goal)
+        path = timed_path(self._world({}), knots, self.config, tool_m_s=tool_m_s)
+        if refusals := self.refused(path):
+            raise _refused(refusals[0])
+        return replace(path, work={"postures": float(len(knots))})
+
+    def _world(self, wider_m: Mapping[frozenset[str], float]) -> World:
         """What the search keeps clear of, refused pairs farther."""
         return build_world(
             self.problem,
@@ -107,67 +149,73 @@ class _Asked:
             eps_col_m=self.config.replay.eps_col_m,
             carried=self.carried,
             allowed=self.allowed,
-            wider_m=wider_m or {},
+            wider_m=wider_m,
         )
 
-    def decided(self, path: TimedPath) -> Movement:
-        """The movement with the exact checks' last word."""
-        decision = decide(
-            self.problem,
-            path,
-            width_m=self.width_m,
-            config=self.config.replay,
-            carried=self.carried,
-            allowed=self.allowed,
+    def refused(self, path: TimedPath) -> tuple[PathRefusal, ...]:
+        """Return what the monitor's exact clearance, the last word, refuses of a movement."""
+        hulls, links = hulls_of(self.problem.robot), own_links(hulls_of(self.problem.robot))
+        monitor = ClearanceMonitor(self.problem.scene, self._plan(), hulls, self.config.replay)
+        poses = self._object_poses(path.joints_rad)
+        stamps = np.round(path.times_s * 1e9).astype(np.int64)
+        refusals: list[PathRefusal] = []
+        for index, joints in enumerate(path.joints_rad):
+            Ts = {name: rows[index] for name, rows in poses.items()}
+            monitor.measure(int(stamps[index]), joints, self.width_m, Ts)
+            if links.touch():
+                closest = hulls.self_distance()
+                told = f"{closest.links[0]} touches {closest.links[1]}"
+                lacking_m = -closest.distance_m
+                refusals.append(PathRefusal(bodies=closest.links, lacking_m=lacking_m, detail=told))
+                break
+        for failure in monitor.failures:
+            one, other = failure.bodies
+            if failure.cause == Cause.DEEP_CONTACT:
+                found = [c for c in monitor.contacts() if {*c.bodies} == {one, other}]
+                least_m = min((contact.min_distance_m for contact in found), default=0.0)
+                lacking_m = -MAX_CONTACT_DEPTH_M - least_m
+            else:
+                lacking_m = monitor.lacking_m[failure.bodies]
+            refusals.append(
+                PathRefusal(bodies=(one, other), lacking_m=lacking_m, detail=failure.detail)
+            )
+        return tuple(refusals)
+
+    def _object_poses(self, joints_rad: Postures) -> dict[str, Poses]:
+        """Where the movable objects are along a movement: at their start, or in the hand."""
+        poses = {
+            name: np.repeat(T[None], len(joints_rad), axis=0)
+            for name, T in self.problem.scene.movable().items()
+        }
+        if self.carried is not None:
+            T_tcp = self.problem.robot.Ts_base_tcp(joints_rad)
+            poses[self.carried.object_id] = T_tcp @ self.carried.T_tcp_object
+        return poses
+
+    def _plan(self) -> Plan:
+        """The one stage that a movement is, as the monitor reads it."""
+        pairs = tuple((min(pair), max(pair)) for pair in sorted(self.allowed, key=sorted))
+        return Plan(
+            id="move",
+            planner="",
+            policy="",
+            condition="",
+            robot=self.problem.robot.name,
+            frame=self.problem.robot.record.base_frame,
+            instruction="",
+            stages=(Stage(id="move", text="", allowed_contacts=pairs),),
+            tau=(),
         )
-        return Movement(path=path, decision=decision, width_m=self.width_m, carried=self.carried)
 
 
-def plan_move(
-    problem: Problem,
-    start_rad: Joints,
-    goals_rad: Postures,
-    config: PathConfig,
-    *,
-    width_m: float,
-    carried: Carried | None = None,
-    allowed: Allowed = frozenset(),
-) -> Movement:
-    """Find a collision-free, short, timed movement to one of some postures."""
-    check_numbers(start_rad, goals_rad)
-    asked = _Asked(problem, config, width_m, carried, allowed)
-    wider: dict[frozenset[str], float] = {}
-    work: dict[str, float] = {}
-    refusals: tuple[PathRefusal, ...] = ()
-    for turn in range(config.rounds):
-        world = asked.world(wider)
-        _let_ends_be(world, np.vstack([start_rad[None], goals_rad]), wider)
-        knots = _searched(world, start_rad, goals_rad, config, turn, work, refusals)
-        # A margin grows with speed: what was refused is searched again wider, and driven slower.
-        slower = replace(config, speed_share=config.speed_share * 0.75**turn)
-        path = timed_path(world, knots, slower)
-        movement = asked.decided(path)
-        work["rounds"] = float(turn + 1)
-        if movement.decision.accepted:
-            return replace(movement, path=replace(path, work=work))
-        refusals = movement.decision.refusals
-        _widen(wider, refusals)
-    raise NoPathError(
-        reason="refused", bodies=refusals[0].bodies, detail=refusals[0].detail,
-        work=int(work["postures"]),
-    )  # fmt: skip
+def _refused(refusal: PathRefusal, work: int = 0) -> NoPathError:
+    return NoPathError(reason="refused", bodies=refusal.bodies, detail=refusal.detail, work=work)
 
 
 def check_numbers(*postures: Float[np.ndarray, "..."]) -> None:
     """Refuse postures that are no numbers."""
     if not all(np.isfinite(rows).all() for rows in postures):
         raise NoPathError(reason="not a posture", detail="joints that are not finite")
-
-
-def _widen(wider: dict[frozenset[str], float], refusals: tuple[PathRefusal, ...]) -> None:
-    for refusal in refusals:
-        pair = frozenset(refusal.bodies)
-        wider[pair] = wider.get(pair, 0.0) + max(refusal.lacking_m, 0.0) + _WIDER_M
 
 
 def _let_ends_be(world: World, ends_rad: Postures, wider_m: Mapping[frozenset[str], float]) -> None:
@@ -246,37 +294,7 @@ def limits_of(robot: RobotModel, config: PathConfig) -> tuple[Joints, Joints, fl
     )
 
 
-def plan_straight(
-    problem: Problem,
-    start_rad: Joints,
-    T_base_goal: Pose,
-    config: PathConfig,
-    *,
-    width_m: float,
-    carried: Carried | None = None,
-    allowed: Allowed = frozenset(),
-) -> Movement:
-    """Move the tool straight to a pose, on the branch of the inverse kinematics it starts on.
-
-    For the last centimetres, where contact is wanted: pairs in ``allowed`` are left to the exact
-    check, which lets them touch but not lie in each other.
-    """
-    check_numbers(start_rad, T_base_goal)
-    asked = _Asked(
-        problem=problem, config=config, width_m=width_m, carried=carried, allowed=allowed
-    )
-    knots = _straight_knots(problem.robot, start_rad, T_base_goal, config)
-    path = timed_path(asked.world(), knots, config, tool_m_s=CONTACT_M_S)
-    movement = asked.decided(path)
-    if not movement.decision.accepted:
-        first = movement.decision.refusals[0]
-        raise NoPathError(reason="refused", bodies=first.bodies, detail=first.detail)
-    return replace(movement, path=replace(path, work={"postures": float(len(knots))}))
-
-
-def _straight_knots(
-    robot: RobotModel, start_rad: Joints, T_base_goal: Pose, config: PathConfig
-) -> Postures:
+def _straight_knots(robot: RobotModel, start_rad: Joints, T_base_goal: Pose) -> Postures:
     """Joints along a straight line of the tool, one branch all the way."""
     T_start = robot.T_base_tcp(start_rad)
     (q_start, p_start), (q_goal, p_goal) = se3.split(T_start), se3.split(T_base_goal)
@@ -284,15 +302,9 @@ def _straight_knots(
     turn_rad = 2 * np.arccos(min(1.0, abs(float(q_start @ q_goal))))
     count = int(np.ceil(max(way_m / _STRAIGHT_M, turn_rad / _STRAIGHT_RAD, 1.0)))
     shares = np.linspace(0.0, 1.0, count + 1)[1:]
-    Ts = np.stack(
-        [
-            se3.transform_from(
-                se3.interpolate_quaternion(q_start, q_goal, np.array(share)),
-                p_start + share * (p_goal - p_start),
-            )
-            for share in shares
-        ]
-    )
+    turns = (se3.interpolate_quaternion(q_start, q_goal, np.array(s)) for s in shares)
+    places = p_start + shares[:, None] * (p_goal - p_start)
+    Ts = np.stack([se3.transform_from(q, p) for q, p in zip(turns, places, strict=True)])
     followed = follow_poses(robot, Ts, start_rad=start_rad, config=IkConfig())
     if not followed.reached.all():
         share = shares[int(np.argmin(followed.reached))]

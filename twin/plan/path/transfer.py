@@ -8,19 +8,13 @@ import numpy as np
 
 from bridge.geometry import se3
 from twin.plan.grasp.reach import nearest_solutions
-from twin.plan.path.planner import (
-    Movement,
-    NoPathError,
-    PathConfig,
-    plan_move,
-    plan_straight,
-    reversed_path,
-)
+from twin.plan.path.planner import Mover, NoPathError, PathConfig, reversed_path
 from twin.plan.path.world import Carried
-from twin.plan.problem import Grasp, Joints, Pose, Problem, Release
+from twin.plan.problem import Grasp, Joints, Pose, Problem, Release, TimedPath
 from twin.replay.clearance.bodies import GRIPPER
 from twin.replay.clearance.monitor import Allowed
 
+LEGS = ("around", "approach", "lift", "carry", "lower", "leave")
 LIFT_M = 0.06
 _LEAST_LIFT_M = 0.02
 _SAME_RAD = 0.001
@@ -34,9 +28,11 @@ class Leg:
 
     name: str
     """around, approach, lift, carry, lower or leave."""
-    movement: Movement
+    path: TimedPath
     g: int
     """1 closed, 0 open."""
+    width_m: float
+    """Between the pads."""
 
 
 def plan_transfer(
@@ -67,7 +63,7 @@ def plan_transfer(
         tool_m_s=tool_m_s or {},
     )
     taken = transfer.take(start_rad)
-    lifted_rad = taken[-1].movement.path.joints_rad[-1]
+    lifted_rad = taken[-1].path.joints_rad[-1]
     failure = NoPathError(reason="unreachable", detail="no joints reach the release pose")
     for joints_rad in nearest_solutions(problem.robot, release.T_base_tcp, lifted_rad):
         try:
@@ -89,52 +85,61 @@ class _Transfer:
     straight: bool
     tool_m_s: Mapping[str, float]
 
-    def _driven(self, leg: str) -> PathConfig:
-        return replace(self.config, tool_m_s=self.tool_m_s.get(leg, 0.0))
+    def _open(self, leg: str, verb: str = "") -> Mover:
+        """What an open hand moves with on a leg; it may touch what a verb's stages let touch."""
+        return self._mover(leg, self.grasp.open_m, self._touching(verb) if verb else frozenset())
+
+    def _holding(self, leg: str, verb: str = "") -> Mover:
+        """What the hand moves with that holds the object."""
+        held = Carried(
+            object_id=self.grasp.object_id, T_tcp_object=se3.invert(self.grasp.T_object_tcp)
+        )
+        allowed = self._touching(verb) if verb else self._grip
+        return self._mover(leg, self.grasp.width_m, allowed, held)
+
+    def _mover(
+        self, leg: str, width_m: float, allowed: Allowed, held: Carried | None = None
+    ) -> Mover:
+        config = replace(self.config, tool_m_s=self.tool_m_s.get(leg, 0.0))
+        return Mover(
+            problem=self.problem, config=config, width_m=width_m, carried=held, allowed=allowed
+        )
 
     def take(self, start_rad: Joints) -> tuple[Leg, Leg, Leg]:
         """From where the arm stands to the lifted object."""
         grasp = self.grasp
-        taking = self._touching("grasp")
         with _named("approach"):
             T_base_tcp = self.problem.robot.T_base_tcp(grasp.joints_rad)
             back = T_base_tcp @ _along_z(-grasp.pregrasp_m)
-            out = plan_straight(
-                self.problem, grasp.joints_rad, back, self._driven("approach"),
-                width_m=grasp.open_m, allowed=taking,
-            )  # fmt: skip
+            out = self._open("approach", "grasp").straight(grasp.joints_rad, back)
         with _named("around"):
-            ends = out.path.joints_rad[-1:]
-            driven = self._driven("around")
-            around = plan_move(self.problem, start_rad, ends, driven, width_m=grasp.open_m)
+            around = self._open("around").around(start_rad, out.joints_rad[-1:])
         with _named("lift"):
-            lift = self._straight_up(grasp.joints_rad, taking, self._driven("lift"))
+            lift = self._straight_up(grasp.joints_rad, self._holding("lift", "grasp"))
         return (
-            Leg(name="around", movement=around, g=0),
-            Leg(name="approach", movement=_backwards(out), g=0),
-            Leg(name="lift", movement=lift, g=1),
+            Leg(name="around", path=around, g=0, width_m=grasp.open_m),
+            Leg(name="approach", path=reversed_path(out), g=0, width_m=grasp.open_m),
+            Leg(name="lift", path=lift, g=1, width_m=grasp.width_m),
         )
 
     def put(self, lifted_rad: Joints, joints_rad: Joints) -> tuple[Leg, Leg, Leg]:
         """From the lifted object to where the arm has left, let go with these joints."""
-        leaving = self._touching("release")
+        grasp = self.grasp
         with _named("lower"):
-            rise = self._straight_up(joints_rad, leaving, self._driven("lower"))
+            rise = self._straight_up(joints_rad, self._holding("lower", "release"))
         with _named("carry"):
-            over_rad = rise.path.joints_rad[-1]
-            carry = (self._carry_straight if self.straight else self._carry)(lifted_rad, over_rad)
+            over_rad = rise.joints_rad[-1]
+            mover = self._holding("carry")
+            if self.straight:
+                carry = self._carry_straight(mover, lifted_rad, over_rad)
+            else:
+                carry = mover.around(lifted_rad, over_rad[None])
         with _named("leave"):
-            leave = self._leave(joints_rad, leaving)
+            leave = self._leave(joints_rad)
         return (
-            Leg(name="carry", movement=carry, g=1),
-            Leg(name="lower", movement=_backwards(rise), g=1),
-            Leg(name="leave", movement=leave, g=0),
-        )
-
-    @property
-    def _held(self) -> Carried:
-        return Carried(
-            object_id=self.grasp.object_id, T_tcp_object=se3.invert(self.grasp.T_object_tcp)
+            Leg(name="carry", path=carry, g=1, width_m=grasp.width_m),
+            Leg(name="lower", path=reversed_path(rise), g=1, width_m=grasp.width_m),
+            Leg(name="leave", path=leave, g=0, width_m=grasp.open_m),
         )
 
     @property
@@ -144,55 +149,39 @@ class _Transfer:
     def _touching(self, verb: str) -> Allowed:
         return self.problem.contacts_of(verb, self.grasp.object_id) | self._grip
 
-    def _straight_up(self, joints_rad: Joints, allowed: Allowed, config: PathConfig) -> Movement:
+    def _straight_up(self, joints_rad: Joints, mover: Mover) -> TimedPath:
         """Lift as far as is free and within reach, at least two centimetres."""
         rise_m = self.lift_m
         while True:
             T = self.problem.robot.T_base_tcp(joints_rad)
             T[2, 3] += rise_m
             try:
-                return plan_straight(
-                    self.problem, joints_rad, T, config, width_m=self.grasp.width_m,
-                    carried=self._held, allowed=allowed,
-                )  # fmt: skip
+                return mover.straight(joints_rad, T)
             except NoPathError:
                 if rise_m / 2 < _LEAST_LIFT_M:
                     raise
             rise_m /= 2
 
-    def _carry(self, start_rad: Joints, goal_rad: Joints) -> Movement:
-        """Carry around whatever stands in between."""
-        return plan_move(
-            self.problem, start_rad, goal_rad[None], self._driven("carry"),
-            width_m=self.grasp.width_m, carried=self._held, allowed=self._grip,
-        )  # fmt: skip
-
-    def _carry_straight(self, start_rad: Joints, goal_rad: Joints) -> Movement:
+    def _carry_straight(self, mover: Mover, start_rad: Joints, goal_rad: Joints) -> TimedPath:
         """Carry along a straight line that ends on the branch on which the object is let down."""
-        goal = self.problem.robot.T_base_tcp(goal_rad)
-        movement = plan_straight(
-            self.problem, start_rad, goal, self._driven("carry"), width_m=self.grasp.width_m,
-            carried=self._held, allowed=self._grip,
-        )  # fmt: skip
-        off_rad = float(np.abs(movement.path.joints_rad[-1] - goal_rad).max())
+        path = mover.straight(start_rad, self.problem.robot.T_base_tcp(goal_rad))
+        off_rad = float(np.abs(path.joints_rad[-1] - goal_rad).max())
         if off_rad > _SAME_RAD:
             detail = f"the straight line ends {off_rad:.2f} rad from how the arm lets down"
             raise NoPathError(reason="branch", detail=detail)
-        return movement
+        return path
 
-    def _leave(self, joints_rad: Joints, allowed: Allowed) -> Movement:
+    def _leave(self, joints_rad: Joints) -> TimedPath:
         """Straight back; the farther the better, for next to a rim nothing else may be planned."""
         scene, release = self.problem.scene, self.release
         poses = {**scene.Ts_base_object, self.grasp.object_id: release.T_base_object}
         placed = replace(self.problem, scene=replace(scene, Ts_base_object=poses))
+        mover = replace(self._open("leave", "release"), problem=placed)
         failure = NoPathError(reason="unreachable")
         for more_m in _LEAVE_MORE_M:
             away = release.T_base_tcp @ _along_z(-self.grasp.pregrasp_m - more_m)
             try:
-                return plan_straight(
-                    placed, joints_rad, away, self._driven("leave"), width_m=self.grasp.open_m,
-                    allowed=allowed,
-                )  # fmt: skip
+                return mover.straight(joints_rad, away)
             except NoPathError as error:
                 failure = error
         raise failure
@@ -212,7 +201,3 @@ def _along_z(way_m: float) -> Pose:
     T = np.eye(4)
     T[2, 3] = way_m
     return T
-
-
-def _backwards(movement: Movement) -> Movement:
-    return replace(movement, path=reversed_path(movement.path))

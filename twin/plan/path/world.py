@@ -150,53 +150,47 @@ class World:
     limits_m: list[float]
 
 
-@dataclass(kw_only=True)
-class _Builder:
-    """Adds pairs one after the other, each with what it must keep."""
+def _add_pairs(
+    motion: Motion,
+    hulls: RobotHulls,
+    boxes: list[str],
+    carried: Carried | None,
+    *,
+    has_grid: bool,
+    eps_m: float,
+    allowed: Allowed,
+    wider_m: Mapping[frozenset[str], float],
+) -> tuple[list[Names], list[float]]:
+    """Add the pairs that are kept apart; return their names, and how far."""
+    names: list[Names] = []
+    limits_m: list[float] = []
 
-    motion: Motion
-    hulls: RobotHulls
-    carried: Carried | None
-    eps_m: float
-    allowed: Allowed
-    wider_m: Mapping[frozenset[str], float]
-    names: list[Names] = field(default_factory=list)
-    limits_m: list[float] = field(default_factory=list)
-
-    def add_standing(self, boxes: list[str], *, has_grid: bool) -> None:
-        """Links and what is carried against boxes, the table and the rest of the scene."""
-        stationary, _ = stationary_links(self.hulls)
-        bodies = [hull.link for hull in self.hulls.hulls]
-        bodies += [self.carried.object_id] if self.carried is not None else []
-        for body, name in enumerate(bodies):
-            for number, other in enumerate(boxes):
-                self._pair(body, BOX, number, (name, other))
-            if name not in stationary:
-                self._pair(body, PLANE, 0, (name, TABLE))
-                if has_grid:
-                    self._pair(body, GRID, 0, (name, SCENE))
-
-    def add_own(self) -> None:
-        """Links against each other, and what is carried against those that do not hold it."""
-        links = [hull.link for hull in self.hulls.hulls]
-        for one, other in self.hulls.pairs:
-            self._pair(one, BODY, other, (links[one], links[other]), eps_m=0.0)
-        if self.carried is not None:
-            for index, link in enumerate(links):
-                self._pair(len(links), BODY, index, (link, self.carried.object_id))
-
-    def _pair(
-        self, body: int, kind: int, other: int, names: Names, eps_m: float | None = None
-    ) -> None:
+    def pair(body: int, kind: int, other: int, named: Names, least_m: float = eps_m) -> None:
         """Add one, unless it may touch: what was refused before may not."""
-        more = self.wider_m.get(frozenset(names))
-        known = names_of(names[0], self.hulls.robot.record.gripper)
-        if more is None and any(frozenset((name, names[1])) in self.allowed for name in known):
+        more = wider_m.get(frozenset(named))
+        known = names_of(named[0], hulls.robot.record.gripper)
+        if more is None and any(frozenset((name, named[1])) in allowed for name in known):
             return
-        limit_m = (self.eps_m if eps_m is None else eps_m) + SPARE_M + (more or 0.0)
-        self.motion.add_pair(body, kind, other, limit_m)
-        self.names.append(names)
-        self.limits_m.append(limit_m)
+        limits_m.append(least_m + SPARE_M + (more or 0.0))
+        motion.add_pair(body, kind, other, limits_m[-1])
+        names.append(named)
+
+    stationary, _ = stationary_links(hulls)
+    links = [hull.link for hull in hulls.hulls]
+    held = [] if carried is None else [carried.object_id]
+    for body, name in enumerate([*links, *held]):
+        for number, other in enumerate(boxes):
+            pair(body, BOX, number, (name, other))
+        if name not in stationary:
+            pair(body, PLANE, 0, (name, TABLE))
+            if has_grid:
+                pair(body, GRID, 0, (name, SCENE))
+    for one, two in hulls.pairs:
+        pair(one, BODY, two, (links[one], links[two]), 0.0)
+    for name in held:  # those links that do not hold it
+        for index, link in enumerate(links):
+            pair(len(links), BODY, index, (link, name))
+    return names, limits_m
 
 
 def _placed_spheres(T: Pose, spheres_m: Spheres) -> Spheres:
@@ -235,18 +229,18 @@ def build_world(
     motion.set_table(problem.scene.table_height_m)
     for _, T, size in obstacles:
         motion.add_box(T, np.asarray(size, dtype=np.float64) / 2)
-    builder = _Builder(
-        motion=motion,
-        hulls=hulls,
-        carried=carried,
+    names, limits_m = _add_pairs(
+        motion,
+        hulls,
+        [name for name, *_ in obstacles],
+        carried,
+        has_grid=lookup is not None,
         eps_m=eps_col_m,
         allowed=allowed,
         wider_m=wider_m or {},
     )
-    builder.add_standing([name for name, *_ in obstacles], has_grid=lookup is not None)
-    builder.add_own()
     motion.prepare()
-    return World(motion=motion, names=builder.names, robot=robot, limits_m=builder.limits_m)
+    return World(motion=motion, names=names, robot=robot, limits_m=limits_m)
 
 
 PlacedBox = tuple[str, Pose, Vector]
@@ -297,39 +291,22 @@ def _add_bodies(
     lookup: GridLookup | None,
 ) -> _Points:
     """Add the links, then what is carried."""
-    points = _Points()
+    points, trees = _Points(), [None] * len(hulls.hulls) if lookup is None else _link_trees(hulls)
+    corners = [hull.points_m for hull in hulls.hulls]
     fitted = _link_spheres(hulls)
-    trees = _link_trees(hulls) if lookup is not None else ()
-    for index, hull in enumerate(hulls.hulls):
-        T = chain.Ts_joint_hull[index]
-        roots, cover = (0, 0), 0.0
-        if trees:
-            roots, cover = points.add(trees[index], T), trees[index].cover_m
-        motion.add_body(
-            chain.joint_of[index],
-            se3.apply(T, hull.points_m),
-            _placed_spheres(T, fitted[index][0]),
-            fitted[index][1],
-            cover,
-            *roots,
-        )
+    bodies = [*zip(chain.joint_of, chain.Ts_joint_hull, corners, fitted, trees, strict=True)]
     if carried is not None:
-        size = problem.model(carried.object_id).size_m
-        corners = box_corners(np.array(size))
+        box = box_corners(np.array(problem.model(carried.object_id).size_m))
+        spheres = covering_spheres(box)
+        tree = None if lookup is None else bounding_spheres_of(box)
         T = chain.T_last_tcp @ carried.T_tcp_object
-        spheres = covering_spheres(corners)
+        bodies.append((len(chain.placements), T, box, (spheres, excess_m(box, spheres)), tree))
+    for joint, T, own, (spheres, excess), tree in bodies:
         roots, cover = (0, 0), 0.0
-        if lookup is not None:
-            tree = bounding_spheres_of(corners)
+        if tree is not None:
             roots, cover = points.add(tree, T), tree.cover_m
-        motion.add_body(
-            len(chain.placements),
-            se3.apply(T, corners),
-            _placed_spheres(T, spheres),
-            excess_m(corners, spheres),
-            cover,
-            *roots,
-        )
+        placed = _placed_spheres(T, spheres)
+        motion.add_body(joint, se3.apply(T, own), placed, excess, cover, *roots)
     return points
 
 

@@ -1,21 +1,31 @@
 """Final states of a carried object: solved for, perturbed, checked, ranked."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
+from bridge.task.relations import Measured
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.constrain.constraint import SHOWN, Constraint
+from twin.plan.constrain.constraint import Constraint, violated
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.constrain.schema import values_of
-from twin.plan.problem import Array, Grasp, Miss, Numbers, Pose, Poses, Problem, Release, State
-from twin.plan.release.obstacles import allowed_with, hand_points, obstacles_of
+from twin.plan.problem import (
+    Array,
+    Grasp,
+    Miss,
+    NoPlanError,
+    Numbers,
+    Pose,
+    Poses,
+    Problem,
+    Release,
+    State,
+)
+from twin.plan.release.obstacles import hand_points, obstacles_of
 from twin.plan.release.resting import (
-    NoFinalStateError,
     Target,
     resting_poses,
     settled,
@@ -23,11 +33,16 @@ from twin.plan.release.resting import (
     support_m,
     target_of,
 )
-from twin.plan.stage.solver import ANGLE_RAD, CostTerm, StageProblem, StageState, distinct, solve
+from twin.plan.stage.solver import (
+    ANGLE_RAD,
+    StageProblem,
+    StageState,
+    distinct,
+    perturbed,
+    solve,
+)
 from twin.robot.collision import hulls_of
 
-NEAR_M = 0.02
-"""Margins above this are not told apart while a stage is solved."""
 TAU_P_M = 0.02
 """Bound of the shifts of Eq. 8, along each axis."""
 TAU_R_RAD = ANGLE_RAD
@@ -113,10 +128,7 @@ class ReleaseSearch:
         self._outline_m = self._points_m[ConvexHull(self._points_m).vertices]
         self._hand_m = hand_points(hulls, self._width_m, HAND_POINTS)
         self._obstacles = obstacles_of(problem, hulls, {grasp.object_id})
-        pairs = problem.contacts_of("release", grasp.object_id)
-        names = self._obstacles.names
-        self._allowed = allowed_with(grasp.object_id, pairs, names)
-        self._hand_allowed = allowed_with(gripper.name, pairs, names)
+        self._pairs = problem.contacts_of("release", grasp.object_id)
         self._T_tcp_object = se3.invert(grasp.T_object_tcp)
         self._sigma_m = sideways_sigma_m(problem, grasp.object_id)
 
@@ -128,14 +140,11 @@ class ReleaseSearch:
             target: What it is put into or onto; None: goals alone say it.
         """
         name, scene = self._grasp.object_id, self._problem.scene
-        terms = [
-            CostTerm(name=f"{name} clear of what is around", violation=self._object_too_near),
-            CostTerm(name="the open hand clear of what is around", violation=self._hand_too_near),
-        ]
+        terms = [Constraint(record={"kind": "clear"}, measured=self._clear)]
         if target is not None:
             terms += self._placed(T_rest, target)
-        terms += [CostTerm.of(goal, self._settled) for goal in self._goals]
-        terms += [CostTerm.of(wish) for wish in self._wishes]
+        terms += [replace(goal, measured=self._at_rest(goal)) for goal in self._goals]
+        terms += self._wishes
         return StageProblem(
             nominal_T_base_tcp=self._miss.undone(T_rest) @ self._grasp.T_object_tcp,
             width_m=self._width_m,
@@ -144,26 +153,32 @@ class ReleaseSearch:
             Ts_tcp_object={name: self._T_tcp_object},
         )
 
-    @cached_property
-    def _support_m(self) -> float:
-        return support_m(self._problem, self._grasp.object_id)
-
-    def _settled(self, state: State) -> State:
-        """What comes of states in which the object is let go: it lies straight below."""
+    def _at_rest(self, goal: Constraint) -> Callable[[State], Sequence[Measured]]:
+        """Measure where the object comes to lie that is let go."""
         name = self._grasp.object_id
-        T = state.Ts_base_object[name]
-        T = settled(T, self._outline_m, self._support_m, self._miss)
-        return replace(state, Ts_base_object={**state.Ts_base_object, name: T})
+        height_m = support_m(self._problem, name)
 
-    def _object_too_near(self, state: State) -> Array:
-        T, keep_m = state.Ts_base_object[self._grasp.object_id], _keep_m(self._allowed)
-        return -self._obstacles.margins(self._points_m, T, keep_m, most_m=NEAR_M)
+        def measured(state: State) -> Sequence[Measured]:
+            T = settled(state.Ts_base_object[name], self._outline_m, height_m, self._miss)
+            return goal.measured(replace(state, Ts_base_object={**state.Ts_base_object, name: T}))
 
-    def _hand_too_near(self, state: State) -> Array:
-        keep_m = _keep_m(self._hand_allowed)
-        return -self._obstacles.margins(self._hand_m, state.T_base_tcp, keep_m, most_m=NEAR_M)
+        return measured
 
-    def _placed(self, T_rest: Pose, target: Target) -> list[CostTerm]:
+    def _clear(self, state: State) -> list[Measured]:
+        """Object and open hand against everything that stands still."""
+        name, hand = self._grasp.object_id, self._problem.robot.record.gripper.name
+        found = []
+        for body, points_m, Ts in (
+            (name, self._points_m, state.Ts_base_object[name]),
+            (hand, self._hand_m, state.T_base_tcp),
+        ):
+            for other, away in self._obstacles.items():
+                low_m = 0.0 if frozenset((body, other)) in self._pairs else EPS_COL_M
+                what = f"the distance of {body} from {other}"
+                found.append(Measured(what, away(points_m, Ts), low=low_m))
+        return found
+
+    def _placed(self, T_rest: Pose, target: Target) -> list[Constraint]:
         """Inside of the area, at a small height, level."""
         name = self._grasp.object_id
         margin = SIGMAS * float(np.hypot(target.sigma_m, self._sigma_m))
@@ -186,21 +201,29 @@ class ReleaseSearch:
             reach = np.abs(axes + middle).max(axis=1).reshape(-1, 2)
             return (reach - half + margin).max(axis=1)
 
-        def off_height(state: State) -> Array:
+        most_m = np.inf if self._wishes else MOST_DROP_M + target.rim_m
+
+        def over(state: State) -> Array:
             T = state.Ts_base_object[name]
-            over = (T[:, 2, :3] @ self._outline_m.T).min(axis=1) + T[:, 2, 3] - target.T_base[2, 3]
-            most = np.inf if self._wishes else MOST_DROP_M + target.rim_m
-            return np.maximum(over - most, DROP_M / 2 - over)
+            return (T[:, 2, :3] @ self._outline_m.T).min(axis=1) + T[:, 2, 3] - target.T_base[2, 3]
 
         def leaning(state: State) -> Array:
             z = state.Ts_base_object[name][:, :3, :3] @ up
-            return np.arctan2(np.hypot(z[:, 0], z[:, 1]), z[:, 2]) - MOST_TILT_RAD
+            return np.arctan2(np.hypot(z[:, 0], z[:, 1]), z[:, 2])
 
-        return [
-            CostTerm(name=f"{name} within {target.name}", violation=beyond),
-            CostTerm(name=f"{name} a little above {target.name}", violation=off_height),
-            CostTerm(name=f"{name} level", violation=leaning, scale=ANGLE_RAD, unit="rad"),
-        ]
+        def placed(state: State) -> list[Measured]:
+            return [
+                Measured(f"the reach of {name} beyond {target.name}", beyond(state), high=0.0),
+                Measured(
+                    f"the height of {name} over {target.name}",
+                    over(state),
+                    low=DROP_M / 2,
+                    high=most_m,
+                ),
+                Measured(f"the lean of {name}", leaning(state), high=MOST_TILT_RAD, unit="rad"),
+            ]
+
+        return [Constraint(record={"kind": "placed"}, measured=placed)]
 
     def answer(self, stages: Sequence[StageProblem], seed: int) -> tuple[Release, ...]:
         """Solve each way to rest, perturb the best, keep the distinct feasible ones."""
@@ -217,8 +240,7 @@ class ReleaseSearch:
             drawn = perturbed(
                 state.T_base_tcp, tau_p_m=TAU_P_M, tau_r_rad=TAU_R_RAD, count=count, rng=rng
             )
-            violations, J = stage.judged(drawn)
-            free = (violations <= 0).all(axis=1)
+            free, J = stage.judged(drawn)
             Ts.append(drawn[free])
             costs.append(J[free])
         return self._releases(np.concatenate(Ts), np.concatenate(costs))
@@ -226,68 +248,24 @@ class ReleaseSearch:
     def _releases(self, Ts: Poses, costs: Numbers) -> tuple[Release, ...]:
         order = np.argsort(costs, kind="stable")
         chosen = distinct(Ts, order, MAX_RELEASES)
-        Ts_object = Ts[chosen] @ self._T_tcp_object
-        distances = self._obstacles.distances(self._points_m, Ts_object)
-        counted = np.where(self._allowed > 0, np.inf, distances).min(axis=1, initial=np.inf)
         return tuple(
             Release(
                 object_id=self._grasp.object_id,
-                T_base_object=T_object,
+                T_base_object=Ts[index] @ self._T_tcp_object,
                 T_base_tcp=Ts[index],
-                clearance_m=float(clearance),
                 cost=float(costs[index]),
             )
-            for index, T_object, clearance in zip(chosen, Ts_object, counted, strict=True)
+            for index in chosen
         )
 
-    def _nothing(self, stage: StageProblem, nearest: StageState) -> NoFinalStateError:
+    def _nothing(self, stage: StageProblem, nearest: StageState) -> NoPlanError:
         """Say what was in the way where the least was."""
-        told = "; ".join(
-            f"{term.name}: by {f * SHOWN[term.unit][0]:.1f} {SHOWN[term.unit][1]}"
-            for f, term in zip(nearest.violations, stage.subgoal, strict=True)
-            if f > 0
-        )
-        near = ", ".join(self._in_the_way(nearest.T_base_tcp))
+        told = "; ".join(violated(stage.subgoal, stage.state(nearest.T_base_tcp[None])))
         message = (
-            f"no final state of {self._grasp.object_id} was found. In the best one this does not "
-            f"hold: {told or 'nothing stands out'}{f' (too near: {near})' if near else ''}. Clear "
+            f"no final state of {self._grasp.object_id} was found. In the best one {told}. Clear "
             "the place, or name another one."
         )
-        return NoFinalStateError(cause="no_free_pose", message=message)
-
-    def _in_the_way(self, T_base_tcp: Pose) -> list[str]:
-        """What the object or the open hand would be too near to."""
-        bodies = (
-            (self._points_m, T_base_tcp @ self._T_tcp_object, self._allowed),
-            (self._hand_m, T_base_tcp, self._hand_allowed),
-        )
-        short = np.zeros(len(self._obstacles.names), dtype=np.bool_)
-        for points_m, T, allowed in bodies:
-            short |= self._obstacles.distances(points_m, T[None])[0] < _keep_m(allowed)
-        return [name for name, is_near in zip(self._obstacles.names, short, strict=True) if is_near]
-
-
-def _keep_m(allowed: Array) -> Numbers:
-    return np.asarray(EPS_COL_M * (1.0 - allowed))
-
-
-def perturbed(
-    T_base_tcp: Pose, *, tau_p_m: float, tau_r_rad: float, count: int, rng: np.random.Generator
-) -> Poses:
-    """Draw end-effector poses around a nominal one, Eq. 8 and 9 of the paper.
-
-    The position moves by a vector uniform in a box. The paper bounds the rotation vector and says
-    neither how it is drawn nor in which frame; here its axis is uniform on the sphere, its angle
-    uniform in [0, tau_r], and it turns the tool in the tool's own frame (errata, resolution 7).
-    """
-    shift = rng.uniform(-tau_p_m, tau_p_m, (count, 3))
-    axis = rng.normal(size=(count, 3))
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    turn = axis * rng.uniform(0.0, tau_r_rad, (count, 1))
-    T = np.repeat(T_base_tcp[None], count, axis=0)
-    T[:, :3, :3] = T[:, :3, :3] @ se3.rotation_from_vector(turn)
-    T[:, :3, 3] += shift
-    return T
+        return NoPlanError(message, cause="no_free_pose")
 
 
 def places_on_table(
@@ -324,7 +302,7 @@ def places_on_table(
             f"no free place on the table fits {key}. In the best one {worst.explain(one)}. Clear "
             "the table there, or ask for less."
         )
-        raise NoFinalStateError(cause="no_free_pose", message=message)
+        raise NoPlanError(message, cause="no_free_pose")
     near = np.flatnonzero(total <= (0.0 if (total <= 0).any() else _NEARLY))
     slack = np.minimum(-excess[:, near].max(axis=0), 1.0)
     travel = np.linalg.norm(Ts[near, :2, 3] - T_now[:2, 3], axis=1)

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.task_file import ObjectModel
-from twin.errors import TwinError
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.problem import (
     Grasp,
     Miss,
+    NoPlanError,
     Points,
     Pose,
     Poses,
@@ -25,15 +25,6 @@ from twin.plan.problem import (
 
 QUARTER_TURNS = 4
 _SAME_RAD = 0.02
-
-
-class NoFinalStateError(TwinError):
-    """An object can be let go nowhere."""
-
-    def __init__(self, *, cause: str, message: str) -> None:
-        """Remember the cause."""
-        self.cause = cause
-        super().__init__(message)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +59,12 @@ def target_of(problem: Problem, object_id: str) -> Target:
             f"no success predicate of task {scene.task.name} says what {object_id} is to be "
             "inside or on: give the final state's constraints and where to begin."
         )
-        raise NoFinalStateError(cause="nowhere_said", message=message)
+        raise NoPlanError(message, cause="nowhere_said")
     relation, name = goal
     T_found = scene.Ts_base_object.get(name)
     if T_found is None:
         message = f"{name} was not localised: nobody knows where {object_id} is to be put."
-        raise NoFinalStateError(cause="not_localised", message=message)
+        raise NoPlanError(message, cause="not_localised")
     model = problem.model(name)
     inside = relation == "inside"
     x, y, _ = model.inner_m if inside else model.size_m
@@ -166,7 +157,7 @@ def resting_poses(
     T_now = problem.scene.Ts_base_object.get(grasp.object_id)
     if T_now is None:
         message = f"{grasp.object_id} was not localised: nobody knows which way up it is."
-        raise NoFinalStateError(cause="not_localised", message=message)
+        raise NoPlanError(message, cause="not_localised")
     points = surface_points(problem, grasp.object_id)
     found = []
     model = problem.model(grasp.object_id)
@@ -186,5 +177,5 @@ def resting_poses(
             f"held as it is, {grasp.object_id} can be put down in no way in which the tool points "
             "downwards: take it by another grasp."
         )
-        raise NoFinalStateError(cause="tool_direction", message=message)
+        raise NoPlanError(message, cause="tool_direction")
     return found

@@ -8,7 +8,7 @@ small margin, so that the regulariser leaves an answer inside of what is allowed
 around a nominal one, and the best of them are followed by SciPy's least squares.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from bridge.geometry import se3
 from twin.plan.constrain.constraint import Constraint
-from twin.plan.problem import Array, Numbers, Pose, Poses, State
+from twin.plan.problem import Flags, Numbers, Pose, Poses, State
 
 LENGTH_M = 0.01
 """Unit of lengths in the regulariser and in steps."""
@@ -36,30 +36,6 @@ _DIFFERENCE = 1e-4
 """Step of numeric derivatives, in units."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CostTerm:
-    """One constraint in the sum."""
-
-    name: str
-    violation: Callable[[State], Array]
-    """f of states at the end: ``(num_states,)``, or a column for each of its parts, in metres or
-    radians; satisfied where none is above zero."""
-    scale: float = LENGTH_M
-    unit: str = "m"
-
-    @staticmethod
-    def of(
-        constraint: Constraint, at: Callable[[State], State] = lambda state: state
-    ) -> "CostTerm":
-        """A compiled constraint that must hold in what a state becomes; each part counts."""
-        return CostTerm(
-            name=constraint.kind,
-            violation=lambda state: constraint.parts(at(state)),
-            scale=constraint.scale,
-            unit=constraint.unit,
-        )
-
-
 def moved(T: Poses, step: Float[np.ndarray, "_ 6"]) -> Poses:
     """Poses after steps: of the position in the base frame [m], of a turn in the tool's [rad]."""
     found = T.copy()
@@ -73,7 +49,7 @@ class StageProblem:
     """One stage as an optimisation problem; poses ``T_base_tcp`` in batches."""
 
     nominal_T_base_tcp: Pose
-    subgoal: tuple[CostTerm, ...]
+    subgoal: tuple[Constraint, ...]
     """What must hold where the stage ends; at least one."""
     width_m: float = 0.0
     Ts_base_object: Mapping[str, Pose] = field(default_factory=dict)
@@ -81,35 +57,27 @@ class StageProblem:
     Ts_tcp_object: Mapping[str, Pose] = field(default_factory=dict)
     """Objects that move with the tool, as it took them (errata: at the grasp instant)."""
 
-    def violations(self, Ts: Poses) -> list[Float[np.ndarray, "_ num_parts"]]:
-        """Evaluate f of every term."""
+    def state(self, Ts: Poses) -> State:
+        """What is where with the tool at some poses."""
         poses = {name: np.broadcast_to(T, Ts.shape) for name, T in self.Ts_base_object.items()}
         poses |= {name: Ts @ T for name, T in self.Ts_tcp_object.items()}
-        widths = np.full(len(Ts), self.width_m)
-        end = State(Ts_base_object=poses, T_base_tcp=Ts, width_m=widths)
-        found = [np.asarray(term.violation(end)) for term in self.subgoal]
-        return [values[:, None] if values.ndim == 1 else values for values in found]
+        return State(Ts_base_object=poses, T_base_tcp=Ts, width_m=np.full(len(Ts), self.width_m))
 
-    def residuals(self, Ts: Poses) -> Float[np.ndarray, "_ num_residuals"]:
-        """Return numbers whose squares add up to J, those of the regulariser last."""
-        return self._residuals(Ts, self.violations(Ts))
-
-    def _residuals(self, Ts: Poses, violations: Sequence[np.ndarray]) -> np.ndarray:
-        columns = [
-            np.clip(found / term.scale + MARGIN, 0.0, None)
-            for term, found in zip(self.subgoal, violations, strict=True)
-        ]
-        nominal = self.nominal_T_base_tcp
+    def residuals(self, Ts: Poses) -> tuple[Flags, Float[np.ndarray, "_ num_residuals"]]:
+        """Whether every constraint is satisfied, and numbers whose squares add up to J."""
+        state, nominal = self.state(Ts), self.nominal_T_base_tcp
+        found = [(each.parts(state), each.scale) for each in self.subgoal]
+        columns = [np.clip(parts / scale + MARGIN, 0.0, None) for parts, scale in found]
         turn = se3.vector_from_rotation(nominal[:3, :3].T @ Ts[:, :3, :3])
         way = np.concatenate([Ts[:, :3, 3] - nominal[:3, 3], turn], axis=1) / UNITS
-        return np.concatenate([*columns, way * np.sqrt(LAMBDA_REG)], axis=1)
+        holds = np.all([(parts <= 0).all(axis=1) for parts, _ in found], axis=0)
+        return holds, np.concatenate([*columns, way * np.sqrt(LAMBDA_REG)], axis=1)
 
-    def judged(self, Ts: Poses) -> tuple[Float[np.ndarray, "_ num_terms"], Numbers]:
-        """The greatest violation of each term, and J."""
-        violations = self.violations(Ts)
-        greatest = np.stack([parts.max(axis=1) for parts in violations], axis=1)
-        J = np.square(self._residuals(Ts, violations)).sum(axis=1)
-        return greatest, np.where(np.isfinite(J), J, np.inf)
+    def judged(self, Ts: Poses) -> tuple[Flags, Numbers]:
+        """Whether every constraint is satisfied, and J."""
+        holds, residuals = self.residuals(Ts)
+        J = np.square(residuals).sum(axis=1)
+        return holds, np.where(np.isfinite(J), J, np.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,29 +86,34 @@ class StageState:
 
     T_base_tcp: Pose
     cost: float
-    violations: tuple[float, ...]
-    """f of each term [m or rad]."""
+    is_feasible: bool
+    """Whether it satisfies every constraint."""
 
-    @property
-    def is_feasible(self) -> bool:
-        """Whether it satisfies every constraint."""
-        return max(self.violations) <= 0
+
+def perturbed(
+    T_base_tcp: Pose, *, tau_p_m: float, tau_r_rad: float, count: int, rng: np.random.Generator
+) -> Poses:
+    """Draw end-effector poses around a nominal one, Eq. 8 and 9 of the paper.
+
+    The position moves by a vector uniform in a box. The paper bounds the rotation vector and says
+    neither how it is drawn nor in which frame; here its axis is uniform on the sphere, its angle
+    uniform in [0, tau_r], and it turns the tool in the tool's own frame (errata, resolution 7).
+    """
+    shift = rng.uniform(-tau_p_m, tau_p_m, (count, 3))
+    axis = rng.normal(size=(count, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    turn = axis * rng.uniform(0.0, tau_r_rad, (count, 1))
+    return moved(np.repeat(T_base_tcp[None], count, axis=0), np.concatenate([shift, turn], axis=1))
 
 
 def drawn_around(T: Pose, count: int, seed: int) -> Poses:
     """Draw states around a nominal one; the first is the nominal one itself."""
     rng = np.random.default_rng(seed)
-    shift = rng.uniform(-1.0, 1.0, (count, 3)) * SPREAD_M
-    shift[:, 2] = np.abs(shift[:, 2])
-    about = np.zeros((count, 3))
-    about[:, 2] = rng.uniform(-np.pi, np.pi, count)
-    axis = rng.normal(size=(count, 3))
-    turn = axis / np.linalg.norm(axis, axis=1, keepdims=True)
-    turn *= rng.uniform(0.0, SPREAD_RAD, (count, 1))
-    shift[0], about[0], turn[0] = 0.0, 0.0, 0.0
-    Ts = np.repeat(T[None], count, axis=0)
-    Ts[:, :3, :3] = se3.rotation_from_vector(about) @ T[:3, :3] @ se3.rotation_from_vector(turn)
-    Ts[:, :3, 3] += shift
+    Ts = perturbed(T, tau_p_m=SPREAD_M, tau_r_rad=SPREAD_RAD, count=count, rng=rng)
+    Ts[:, 2, 3] = T[2, 3] + np.abs(Ts[:, 2, 3] - T[2, 3])
+    about = rng.uniform(-np.pi, np.pi, (count, 1)) * [0.0, 0.0, 1.0]
+    Ts[:, :3, :3] = se3.rotation_from_vector(about) @ Ts[:, :3, :3]
+    Ts[0] = T
     return Ts
 
 
@@ -152,15 +125,11 @@ def solve(
     _, costs = problem.judged(Ts)
     best = distinct(Ts, np.argsort(costs, kind="stable"), followed)
     Ts = np.stack([_followed(problem, T, steps) for T in Ts[list(dict.fromkeys([0, *best]))]])
-    violations, costs = problem.judged(Ts)
-    order = np.lexsort((costs, (violations > 0).any(axis=1)))
+    holds, costs = problem.judged(Ts)
+    order = np.lexsort((costs, ~holds))
     return [
-        StageState(
-            T_base_tcp=Ts[index],
-            cost=float(costs[index]),
-            violations=tuple(violations[index].tolist()),
-        )
-        for index in distinct(Ts, order, followed)
+        StageState(T_base_tcp=Ts[k], cost=float(costs[k]), is_feasible=bool(holds[k]))
+        for k in distinct(Ts, order, followed)
     ]
 
 
@@ -172,11 +141,11 @@ def _followed(problem: StageProblem, T: Pose, steps: int) -> Pose:
         return moved(np.repeat(T[None], len(x), axis=0), x * UNITS)
 
     def slope(x: np.ndarray) -> np.ndarray:
-        r = problem.residuals(at(x + around))
+        _, r = problem.residuals(at(x + around))
         return np.asarray((r[1:] - r[0]).T / _DIFFERENCE)
 
     found = least_squares(
-        lambda x: problem.residuals(at(x[None]))[0], np.zeros(6), jac=slope, max_nfev=steps
+        lambda x: problem.residuals(at(x[None]))[1][0], np.zeros(6), jac=slope, max_nfev=steps
     )
     return np.asarray(at(found.x[None])[0])
 

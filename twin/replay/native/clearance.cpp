@@ -92,12 +92,6 @@ NB_MODULE(_clearance, module) {
     module.def("surface_to_boxes", &surface_to_boxes, "turns"_a, "centres"_a, "halves"_a, "R"_a,
                "t"_a, "points"_a, "answers"_a.noconvert(),
                "Smallest distance of one body's points to each box, for every pose of the body.");
-    module.def("points_to_grid", &points_to_grid, "values"_a, "origin"_a, "voxel"_a, "keep"_a,
-               "R"_a, "t"_a, "points"_a, "answers"_a.noconvert(),
-               "Lower answers to each point's distance to a grid less what is to be kept.");
-    module.def("points_to_boxes", &points_to_boxes, "turns"_a, "centres"_a, "halves"_a, "keep"_a,
-               "most"_a, "R"_a, "t"_a, "points"_a, "answers"_a.noconvert(),
-               "Lower answers, none above most, to each point's distance to the boxes less keep.");
     module.def("least", &least, "values"_a, "origin"_a, "voxel"_a, "R"_a, "t"_a, "points"_a,
                "radius"_a, "children"_a, "roots"_a, "cover"_a, "centres"_a,
                "reaches"_a, "below"_a,

@@ -1,17 +1,29 @@
 """Laws of every kind of constraint: sign, unit, derivative, invariance, both libraries."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from block_scene import EXAMPLES, START, around, blocks, state
+from block_scene import EXAMPLES, START, around, blocks, blocks_task, state
 
 from bridge.errors import UsageError
-from twin.plan.constrain.constraint import Constraint, worst_along
+from bridge.task.relations import RELATIONS
+from twin.plan.constrain.bodies import box_of
+from twin.plan.constrain.constraint import Constraint
 from twin.plan.constrain.kinds import KINDS, compile_constraint
-from twin.plan.problem import State
+from twin.plan.constrain.relations import constraint_of, predicate_of
 
 PATH_KINDS = {"speed"}
+GOALS: list[dict[str, Any]] = [
+    {"kind": "on", "object": "cube", "support": "brick", "margin_m": 0.004, "tolerance_m": 0.02},
+    {"kind": "inside", "object": "cube", "container": "box", "margin_m": 0.01},
+    {"kind": "beside", "object": "cube", "reference": "brick", "gap_m": [0.005, 0.05]},
+    {"kind": "upright", "object": "cube", "tolerance_rad": 0.3},
+    {"kind": "moved", "object": "cube", "at_least_m": 0.16, "direction": [0.3, 1.0, 0.0]},
+    {"kind": "moved", "object": "cube", "target_m": [0.46, 0.01], "tolerance_m": 0.02},
+    {"kind": "moved", "object": "cube", "by_m": 0.16, "direction": "left", "tolerance_m": 0.02},
+]
 
 
 def made(name: str) -> Constraint:
@@ -33,34 +45,11 @@ def test_f_is_at_most_zero_where_it_holds_and_above_zero_where_not(name: str) ->
     assert "missed by" in constraint.explain(bad)
 
 
-def paths(num_states: int, num_steps: int) -> State:
-    states = around(START, num_states * num_steps, np.random.default_rng(7))
-    objects = {
-        key: T.reshape(num_states, num_steps, 4, 4) if len(T) > 1 else T[None]
-        for key, T in states.Ts_base_object.items()
-    }
-    return State(
-        Ts_base_object=objects,
-        T_base_tcp=states.T_base_tcp.reshape(num_states, num_steps, 4, 4),
-        width_m=np.zeros((num_states, num_steps)),
-    )
-
-
-def at_step(states: State, index: int) -> State:
-    return State(
-        Ts_base_object={
-            key: T[:, min(index, T.shape[1] - 1)] for key, T in states.Ts_base_object.items()
-        },
-        T_base_tcp=states.T_base_tcp[:, index],
-        width_m=states.width_m[:, index],
-    )
-
-
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_along_a_path_the_worst_step_counts(name: str) -> None:
-    constraint, states = made(name), paths(6, 5)
-    each = np.stack([constraint.violation(at_step(states, step)) for step in range(5)], axis=1)
-    np.testing.assert_allclose(worst_along(constraint, states), each.max(axis=1), atol=1e-15)
+    constraint, steps = made(name), around(START, 5, np.random.default_rng(7))
+    worst = constraint.worst_along(steps, np.arange(5.0))
+    assert worst == constraint.violation(steps).max()
 
 
 def test_what_was_not_localised_cannot_be_planned_with() -> None:
@@ -84,3 +73,30 @@ def test_a_state_that_is_no_number_does_not_hold() -> None:
     for name in EXAMPLES:
         lost = {key: np.full((4, 4), np.nan) for key in ("cube", "brick", "tcp")}
         assert not made(name).violation(state(**lost))[0] <= 0, name
+
+
+@pytest.mark.parametrize("spec", GOALS)
+def test_a_goal_is_the_same_predicate_again_when_it_was_a_constraint(spec: dict[str, Any]) -> None:
+    record = constraint_of(spec, blocks_task())
+    assert record is not None
+    back = predicate_of(record)
+    assert back.keys() == spec.keys()
+    assert back == spec | {
+        key: pytest.approx(spec[key]) for key in ("tolerance_rad",) if key in spec
+    }
+
+
+def test_what_is_about_no_pose_has_no_constraint() -> None:
+    spec = {"kind": "settled", "object": "cube", "max_speed_m_s": 0.02, "for_s": 0.3}
+    assert constraint_of(spec, blocks_task()) is None
+
+
+def test_aligned_is_align_with_axes_that_may_point_either_way() -> None:
+    spec = {"object": "brick", "reference": "post", "axis": "y", "reference_axis": "y"}
+    states = around(START, 200, np.random.default_rng(8))
+    record = constraint_of({"kind": "aligned", **spec}, blocks_task())
+    boxes = {key: box_of(states, key, blocks()) for key in ("brick", "post")}
+    (wanted,) = RELATIONS["aligned"](spec, boxes)
+    f = compile_constraint(record or {}, blocks()).violation(states)
+    np.testing.assert_allclose(f, wanted.excess, atol=1e-9)
+    assert 0.02 < (f <= 0).mean() < 0.98

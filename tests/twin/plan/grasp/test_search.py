@@ -10,7 +10,6 @@ import pytest
 from bridge.geometry import se3
 from bridge.robots.robot import read_robot
 from bridge.task.task_file import Task, load_task
-from twin.plan.grasp.open_hand import OpenHand
 from twin.plan.grasp.search import (
     CAUSES,
     CONE_RAD,
@@ -20,9 +19,8 @@ from twin.plan.grasp.search import (
     GraspConfig,
     GraspSearch,
     GraspSearcher,
-    NoGraspError,
 )
-from twin.plan.problem import Problem
+from twin.plan.problem import NoPlanError, Problem
 from twin.plan.shapes import shapes_of
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of, signed_distance
@@ -69,9 +67,9 @@ def two_cubes(lower: np.ndarray, other: np.ndarray) -> Problem:
     return problem(task, dict(zip(names, (lower, other), strict=False)))
 
 
-def refusal(given: Problem, object_id: str, config: GraspConfig = FEW) -> NoGraspError:
+def refusal(given: Problem, object_id: str, config: GraspConfig = FEW) -> NoPlanError:
     config = replace(FEW, samples=400)
-    with pytest.raises(NoGraspError) as caught:
+    with pytest.raises(NoPlanError) as caught:
         GraspSearcher(given, config).search(object_id)
     return caught.value
 
@@ -234,28 +232,6 @@ def test_where_no_finger_fits_the_neighbours_are_named() -> None:
     assert refusal(among_cubes(0.008), "red").cause == "neighbour"
 
 
-@pytest.mark.parametrize("gap_m", [0.025, 0.035])
-def test_neighbours_that_no_hand_comes_near_are_left_out_and_nothing_else(
-    gap_m: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given = among_cubes(gap_m)
-    quick = GraspSearcher(given, FEW).search("red")
-    asked: list[float] = []
-
-    def all_of_them(hand: OpenHand, centres_m: np.ndarray, *_: float) -> np.ndarray:
-        asked.append(len(centres_m))
-        return np.ones(len(centres_m), dtype=bool)
-
-    monkeypatch.setattr(OpenHand, "passes", all_of_them)
-    thorough = GraspSearcher(given, FEW).search("red")
-    assert asked
-    assert quick.rejected == thorough.rejected
-    assert quick.rejected["neighbour"] > 0
-    for one, other in zip(quick.grasps, thorough.grasps, strict=True):
-        np.testing.assert_array_equal(one.T_object_tcp, other.T_object_tcp)
-        assert one.margin == other.margin
-
-
 def test_a_less_certain_pose_leaves_less_margin() -> None:
     task, poses = load_task("cube_into_box"), {"cube": standing(0.48, -0.15, 0.02)}
     margins = [
@@ -288,7 +264,7 @@ def test_what_lies_under_something_is_not_grasped_and_that_is_named() -> None:
 def test_what_is_too_far_away_is_not_reached() -> None:
     error = refusal(cube_problem(standing(1.3, 0.0, 0.02)), "cube")
     assert error.cause == "reach"
-    assert error.rejected["reach"] > 0
+    assert "reach " in str(error)
 
 
 def test_what_is_wider_than_the_hand_is_not_grasped() -> None:
@@ -317,7 +293,7 @@ def test_what_is_too_heavy_for_the_pads_is_not_grasped() -> None:
 
 def test_an_arm_without_fingers_grasps_nothing() -> None:
     given = cube_problem(robot="kinova_j2s6s200")
-    with pytest.raises(NoGraspError) as caught:
+    with pytest.raises(NoPlanError) as caught:
         GraspSearcher(given)
     assert caught.value.cause == "no_gripper"
     assert "kinova" in str(caught.value)

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 from path_scene import EPS_M, WIDTH_M, Pairs, at, joints_at, tool_down
 
-from twin.plan.path import planner
-from twin.plan.path.decide import PathRefusal, decide
-from twin.plan.path.planner import Movement, NoPathError, PathConfig, plan_move
+from twin.plan.path.planner import Mover, NoPathError, PathConfig, PathRefusal
 from twin.plan.path.world import Carried, build_world
-from twin.plan.problem import Problem, TimedPath
+from twin.plan.problem import TimedPath
 
 CONFIG = PathConfig()
 
 
-def moved(pairs: Pairs, index: int, config: PathConfig = CONFIG, **more: object) -> Movement:
-    goals = pairs.goals[index][None]
-    return plan_move(pairs.problem, pairs.starts[index], goals, config, width_m=WIDTH_M, **more)
+def mover(pairs: Pairs, config: PathConfig = CONFIG) -> Mover:
+    return Mover(problem=pairs.problem, config=config, width_m=WIDTH_M)
+
+
+def moved(pairs: Pairs, index: int, config: PathConfig = CONFIG) -> TimedPath:
+    return mover(pairs, config).around(pairs.starts[index], pairs.goals[index][None])
 
 
 def straight(pairs: Pairs, index: int) -> TimedPath:
@@ -44,12 +45,9 @@ def test_a_way_is_found_around_box_post_wall_and_the_arm_itself(pairs: Pairs) ->
 
 def test_where_going_straight_is_refused_the_planned_way_is_not(pairs: Pairs) -> None:
     index = pairs.kinds.index("post")
-    movement = moved(pairs, index)
-    assert movement.decision.accepted
-    assert movement.decision.clearance_m >= EPS_M
-    refused = decide(pairs.problem, straight(pairs, index), width_m=WIDTH_M, config=CONFIG.replay)
-    assert not refused.accepted
-    assert "post" in {body for refusal in refused.refusals for body in refusal.bodies}
+    assert not mover(pairs).refused(moved(pairs, index))
+    refused = mover(pairs).refused(straight(pairs, index))
+    assert "post" in {body for refusal in refused for body in refusal.bodies}
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_one_another_way(pairs: Pairs) -> None:
@@ -78,8 +76,8 @@ def test_shortcuts_make_a_way_shorter(pairs: Pairs) -> None:
 def test_of_several_goals_one_is_reached_and_those_that_touch_are_left_out(pairs: Pairs) -> None:
     start, goal = pairs.starts[0], pairs.goals[0]
     inside = joints_at(pairs.problem, tool_down(0.42, 0.05, 0.1, 0.0), start)  # in the wall
-    movement = plan_move(pairs.problem, start, np.stack([inside, goal]), CONFIG, width_m=WIDTH_M)
-    assert np.array_equal(movement.path.joints_rad[-1], goal)
+    path = mover(pairs).around(start, np.stack([inside, goal]))
+    assert np.array_equal(path.joints_rad[-1], goal)
 
 
 @pytest.mark.parametrize("end", ["start", "goal"])
@@ -87,7 +85,7 @@ def test_an_end_that_touches_is_refused_by_the_names_of_the_pair(pairs: Pairs, e
     inside = joints_at(pairs.problem, tool_down(0.42, 0.05, 0.2, np.pi / 2), None)
     ends = (inside, pairs.goals[0]) if end == "start" else (pairs.starts[0], inside)
     with pytest.raises(NoPathError, match=f"{end} touches: .* and wall") as caught:
-        plan_move(pairs.problem, ends[0], ends[1][None], CONFIG, width_m=WIDTH_M)
+        mover(pairs).around(ends[0], ends[1][None])
     assert caught.value.bodies[1] == "wall"
 
 
@@ -97,10 +95,10 @@ def test_numbers_that_are_none_limits_and_budgets_are_refused(pairs: Pairs) -> N
         beyond = goal.copy()
         beyond[2] = wrong
         with pytest.raises(NoPathError, match=reason):
-            plan_move(pairs.problem, start, beyond[None], CONFIG, width_m=WIDTH_M)
+            mover(pairs).around(start, beyond[None])
     few = replace(CONFIG, max_postures=60)
     with pytest.raises(NoPathError, match="budget spent") as caught:
-        plan_move(pairs.problem, start, goal[None], few, width_m=WIDTH_M)
+        mover(pairs, few).around(start, goal[None])
     assert 60 <= caught.value.work < 300
 
 
@@ -113,7 +111,7 @@ def test_a_goal_behind_walls_all_around_spends_the_budget_and_no_more(pairs: Pai
     index = pairs.kinds.index("wall")
     config = replace(CONFIG, max_nodes=150, max_postures=20_000)
     with pytest.raises(NoPathError) as caught:
-        plan_move(closed, pairs.starts[index], pairs.goals[index][None], config, width_m=WIDTH_M)
+        moved(replace(pairs, problem=closed), index, config)
     assert caught.value.reason in ("budget spent", "start touches", "goal touches")
     assert caught.value.work < 21_000
 
@@ -130,42 +128,34 @@ def test_what_is_refused_is_searched_again_with_the_pair_farther_apart(
         return min(motion.distance(row, pair)[0] for row in rows)
 
     def at_ends_m(pair: int) -> float:
-        return least_m(near.path.joints_rad[[0, -1]], pair)
+        return least_m(near.joints_rad[[0, -1]], pair)
 
     walls = [i for i, pair in enumerate(pairs.world.names) if pair[1] in ("wall", "post", "box")]
-    rows = near.path.joints_rad
+    rows = near.joints_rad
     nearer = max(walls, key=lambda pair: at_ends_m(pair) - least_m(rows, pair))
     bodies, before_m = pairs.world.names[nearer], least_m(rows, nearer)
     wanted_m = before_m + 0.01
     assert at_ends_m(nearer) > wanted_m
     asked: list[TimedPath] = []
 
-    def strict(problem: Problem, timed: TimedPath, **more: object) -> object:
-        decision = decide(problem, timed, **more)
+    def strict(self: Mover, timed: TimedPath) -> tuple[PathRefusal, ...]:
         asked.append(timed)
         if len(asked) > 1:
-            return decision
-        pair = PathRefusal(bodies=bodies, lacking_m=wanted_m, t_ns=0, detail="")
-        return replace(decision, refusals=(pair,))
+            return refused(self, timed)
+        return (PathRefusal(bodies=bodies, lacking_m=wanted_m, detail=""),)
 
-    monkeypatch.setattr(planner, "decide", strict)
+    refused = Mover.refused
+    monkeypatch.setattr(Mover, "refused", strict)
     farther = moved(pairs, index)
-    assert 2 <= farther.path.work["rounds"] <= CONFIG.rounds  # margins grow with speed
-    assert least_m(farther.path.joints_rad, nearer) >= wanted_m
+    assert 2 <= farther.work["rounds"] <= CONFIG.rounds  # margins grow with speed
+    assert least_m(farther.joints_rad, nearer) >= wanted_m
 
 
 def test_what_stays_refused_is_not_handed_out(
     pairs: Pairs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refusal = PathRefusal(
-        bodies=("forearm_link", "post"), lacking_m=0.001, t_ns=0, detail="too near"
-    )
-    real = planner.decide
-
-    def never(problem: Problem, timed: TimedPath, **more: object) -> object:
-        return replace(real(problem, timed, **more), refusals=(refusal,))
-
-    monkeypatch.setattr(planner, "decide", never)
+    refusal = PathRefusal(bodies=("forearm_link", "post"), lacking_m=0.001, detail="too near")
+    monkeypatch.setattr(Mover, "refused", lambda *asked: (refusal,))
     with pytest.raises(NoPathError, match="refused: forearm_link and post") as caught:
         moved(pairs, 0, replace(CONFIG, rounds=2))
     assert caught.value.bodies == ("forearm_link", "post")
@@ -179,13 +169,11 @@ def test_a_carried_object_is_taken_around_too(pairs: Pairs) -> None:
     carried = Carried(object_id="cube", T_tcp_object=long)
     allowed = frozenset({frozenset(("gripper", "cube"))})
     full = build_world(problem, width_m=0.04, eps_col_m=EPS_M, carried=carried, allowed=allowed)
-    movement = plan_move(
-        problem, pairs.starts[index], pairs.goals[index][None], CONFIG, width_m=0.04,
-        carried=carried, allowed=allowed,
-    )  # fmt: skip
-    assert movement.decision.accepted
+    holding = replace(mover(pairs), width_m=0.04, carried=carried, allowed=allowed)
+    path = holding.around(pairs.starts[index], pairs.goals[index][None])
+    assert not holding.refused(path)
     wall = [i for i, pair in enumerate(full.names) if pair == ("cube", "wall")]
-    least = min(full.motion.distance(row, wall[0])[0] for row in movement.path.joints_rad)
+    least = min(full.motion.distance(row, wall[0])[0] for row in path.joints_rad)
     assert least >= EPS_M
     # The way that was found without it leads it into the wall.
     outcome, *_, knots, _ = found(pairs, index)

@@ -1,5 +1,6 @@
 """Stage optimisation: against SciPy, and its own promises."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 from scipy.optimize import minimize
 
 from bridge.geometry import se3
+from bridge.task.relations import Measured
+from twin.plan.constrain.constraint import Constraint, violated
 from twin.plan.problem import State
 from twin.plan.stage import solver
 
@@ -15,26 +18,28 @@ DOWN[:3, 3] = (0.5, 0.2, 0.12)
 CENTRE = np.array([0.56, 0.2])
 
 
-def height(state: State) -> object:
-    return abs(state.T_base_tcp[:, 2, 3] - 0.1) - 0.005
+def height(state: State) -> list[Measured]:
+    return [Measured("height", state.T_base_tcp[:, 2, 3], low=0.095, high=0.105)]
 
 
-def inside(state: State) -> object:
+def inside(state: State) -> list[Measured]:
     """Two parts: along x and along y."""
-    return abs(state.T_base_tcp[:, :2, 3] - CENTRE) - 0.03
+    x, y = abs(state.T_base_tcp[:, :2, 3] - CENTRE).T
+    return [Measured("x", x, high=0.03), Measured("y", y, high=0.03)]
 
 
-def leaning(state: State) -> object:
+def leaning(state: State) -> list[Measured]:
     z = state.T_base_tcp[:, :3, 2]
     flat = (z[:, 0] ** 2 + z[:, 1] ** 2 + 1e-12) ** 0.5
-    return np.arctan2(flat, -z[:, 2]) - np.radians(5.0)
+    off_rad = np.arctan2(flat, -z[:, 2])
+    return [Measured("lean", off_rad, high=np.radians(5.0), unit="rad")]
 
 
-SUBGOAL = (
-    solver.CostTerm(name="height", violation=height),
-    solver.CostTerm(name="inside", violation=inside),
-    solver.CostTerm(name="leaning", violation=leaning, scale=solver.ANGLE_RAD),
-)
+def asked(measured: Callable[[State], list[Measured]], unit: str = "m") -> Constraint:
+    return Constraint(record={"kind": "test"}, measured=measured, unit=unit)
+
+
+SUBGOAL = (asked(height), asked(inside), asked(leaning, "rad"))
 STAGE = solver.StageProblem(nominal_T_base_tcp=DOWN, subgoal=SUBGOAL)
 
 
@@ -57,8 +62,8 @@ def test_answers_are_distinct_and_those_that_satisfy_everything_come_first() -> 
     ranks = [(not state.is_feasible, state.cost) for state in found]
     assert ranks == sorted(ranks)
     for index, one in enumerate(found):
-        violations, J = STAGE.judged(one.T_base_tcp[None])
-        np.testing.assert_allclose(violations[0], one.violations, atol=1e-12)
+        holds, J = STAGE.judged(one.T_base_tcp[None])
+        assert holds[0] == one.is_feasible
         assert J[0] == pytest.approx(one.cost)
         for other in found[:index]:
             away = np.linalg.norm(one.T_base_tcp[:3, 3] - other.T_base_tcp[:3, 3])
@@ -82,36 +87,35 @@ def test_j_is_the_sum_of_the_paper() -> None:
     x = np.array(f) / (0.01, 0.01, solver.ANGLE_RAD) + solver.MARGIN
     omega = (0.1**2 + 0.03**2) / 0.01**2 + (0.3 / solver.ANGLE_RAD) ** 2
     wanted = (np.clip(x, 0.0, None) ** 2).sum() + solver.LAMBDA_REG * omega
-    violations, J = STAGE.judged(T[None])
+    holds, J = STAGE.judged(T[None])
     assert J[0] == pytest.approx(wanted, rel=1e-5)
-    np.testing.assert_allclose(violations[0], f, atol=1e-5)
+    assert not holds[0]
 
 
 def test_what_contradicts_itself_has_no_answer_and_says_what_is_wrong() -> None:
-    high = solver.CostTerm(name="high", violation=lambda state: 0.2 - state.T_base_tcp[:, 2, 3])
+    high = asked(lambda state: [Measured("high", state.T_base_tcp[:, 2, 3], low=0.2)])
     found = solver.solve(replace(STAGE, subgoal=(*SUBGOAL, high)))
     assert not any(state.is_feasible for state in found)
-    terms = zip((*SUBGOAL, high), found[0].violations, strict=True)
-    wrong = {term.name for term, f in terms if f > 0}
-    assert wrong == {"height", "high"}
+    told = violated((*SUBGOAL, high), STAGE.state(found[0].T_base_tcp[None]))
+    assert [text.split()[0] for text in told] == ["height", "high"]
 
 
 def test_what_is_carried_moves_with_the_tool() -> None:
     T_tcp_object = solver.moved(np.eye(4)[None], np.array([[0.01, 0.0, 0.03, 0.2, 0.0, 0.5]]))[0]
     seen = {}
 
-    def look(state: State) -> object:
+    def look(state: State) -> list[Measured]:
         seen.update(state.Ts_base_object)
-        return state.T_base_tcp[:, 0, 3] - 1.0
+        return [Measured("look", state.T_base_tcp[:, 0, 3], high=1.0)]
 
     problem = solver.StageProblem(
         nominal_T_base_tcp=DOWN,
-        subgoal=(solver.CostTerm(name="look", violation=look),),
+        subgoal=(asked(look),),
         Ts_base_object={"box": np.eye(4)},
         Ts_tcp_object={"cube": T_tcp_object},
     )
     Ts = solver.drawn_around(DOWN, 32, 0)
-    problem.violations(Ts)
+    problem.judged(Ts)
     np.testing.assert_allclose(seen["cube"], Ts @ T_tcp_object)
     assert seen["box"].shape == (32, 4, 4)
 
