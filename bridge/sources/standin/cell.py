@@ -188,10 +188,12 @@ class StandinCell:
         # The controller closes its loop on encoder readings, which are off by a constant.
         true_target = self.target_rad - self.hidden.joint_offset_rad
         self.world.command(true_target, self._width_m)
+        efforts_Nm = np.zeros(len(true_target))
         for _ in range(self._steps_per_tick):
             self.world.step()
+            efforts_Nm += self.world.joint_efforts_Nm / self._steps_per_tick
         self.now_ns += TICK_NS
-        self._publish_robot()
+        self._publish_robot(efforts_Nm)
         if self._is_due("truth", TRUTH_NS):
             self._publish_truth()
         rate = self.config.rate_hz
@@ -204,12 +206,12 @@ class StandinCell:
         self._due[name] = max(self._due[name] + period_ns, self.now_ns - period_ns // 2)
         return True
 
-    def _publish_robot(self) -> None:
+    def _publish_robot(self, efforts_Nm: Float[np.ndarray, "6"]) -> None:
         world, streams = self.world, self.streams
         noise = self._rng.normal(0.0, self.file.sensors.encoder_noise_rad, 6)
         motors_rad = world.joints_rad + world.slack_rad
         encoders = np.asarray(motors_rad + self.hidden.joint_offset_rad + noise)
-        streams.joints(encoders, world.joint_speeds_rad_s, world.joint_efforts_Nm, self.now_ns)
+        streams.joints(encoders, world.joint_speeds_rad_s, efforts_Nm, self.now_ns)
         streams.tcp(self.kinematics.T_base_tcp(encoders), self.now_ns)
         if self._is_due("frames", FRAMES_NS):
             streams.camera_poses(self._believed(encoders), self.now_ns, static=False)

@@ -4,7 +4,7 @@ Of the runs of each task in the order of their numbers the first, third, fifth .
 tasks together; the others are held out and say whether *planned* comes nearer.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from statistics import median
 from typing import Any
@@ -19,8 +19,11 @@ from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.motion import Motion, find_motion
 from twin.calibrate.physics.push_fit import calibrate_pushes, describe_pushes, recordings, split
 from twin.calibrate.physics.pushes import Push, UnusablePushError, arm_of, described, seen_of
+from twin.calibrate.weights import calibrate_weights, describe_weights
+from twin.replay.rebuilt_scene import MASSES
 from twin.scene.store.calibration import write_part
 
+Describe = Callable[[Mapping[str, Any], str], str]
 PART = "motion"
 """Of ``calibration.json``."""
 
@@ -99,22 +102,22 @@ def describe_motion(record: Mapping[str, Any], calibration_id: str) -> str:
     return "\n".join([*lines, *(f"  {name}: {why}" for name, why in record["skipped"].items())])
 
 
-def calibrate_imported(
+def calibrate_physics(
     run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[dict[str, Any], str]:
-    """Find the arm's motion and its pushes' friction where a run has them; record and words."""
-    record: dict[str, Any] = {}
-    words = []
-    try:
-        record[PART], record["calibration_id"] = calibrate_motion(run)
-        words.append(describe_motion(record[PART], record["calibration_id"]))
-    except (UsageError, UnusablePushError) as error:
-        words.append(f"motion: {error}")
-    try:
-        record["physics"], record["calibration_id"] = calibrate_pushes(run, config, output)
-        words.append(describe_pushes(record["physics"], record["calibration_id"]))
-    except UnusablePushError as error:
-        words.append(f"friction: {error}")
+    """Find the arm's motion, its pushes' friction and what it weighed, where a run has them."""
+    parts: dict[str, tuple[Callable[[], tuple[Mapping[str, Any], str]], Describe]] = {
+        PART: (lambda: calibrate_motion(run), describe_motion),
+        "physics": (lambda: calibrate_pushes(run, config, output), describe_pushes),
+        MASSES: (lambda: calibrate_weights(run), describe_weights),
+    }
+    record, words = dict[str, Any](), []
+    for name, (calibrate, describe) in parts.items():
+        try:
+            record[name], record["calibration_id"] = calibrate()
+            words.append(describe(record[name], record["calibration_id"]))
+        except (UsageError, UnusablePushError) as error:
+            words.append(f"{name}: {error}")
     if not record:
         raise UnusablePushError(" ".join(words))
     return record, "\n".join(words)
