@@ -121,7 +121,7 @@ def test_planned_replays_follow_the_arm_as_it_was_seen_to_move(tmp_path: Path) -
     record, words = calibrate_physics(run, CalibrateConfig(physics=True), QUIET)
     assert record["motion"]["delay_s"]["push"] == pytest.approx(pushed_boxes.DELAY_S, abs=0.02)
     assert "physics" not in record
-    assert "friction: 0 pushes" in words
+    assert "physics: 0 pushes" in words
     assert re.search(r"zero of turn .* not determined: only together with (base|tool)", words)
     rows = replay(run)["imported"]
     for row, before in zip(rows, nominal, strict=True):
