@@ -38,7 +38,7 @@ from bridge.sources.standin.streams import Streams
 from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.task.task_file import load_task
 from twin.calibrate import weights
-from twin.calibrate.held_mass import NoWeightError
+from twin.calibrate.weights import NoWeightError
 
 MASSES_KG = np.geomspace(0.03, 1.0, 20)
 TASKS = ("cube_into_box", "heavy_block_into_box")
