@@ -21,11 +21,11 @@ from bridge.geometry import se3
 from bridge.robots.robot import robot_of
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
-from twin.calibrate.hand_eye import TargetCamera, find_camera
+from twin.calibrate.hand_eye import find_camera
 from twin.calibrate.pairs import PosePairs, recorded_pairs, target_cameras
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture, PostureTrack, distinct_postures, posture_track
-from twin.scene.align.align import Alignment, RobotNotAlignedError, align_robot
+from twin.scene.align.align import RobotNotAlignedError, align_robot
 from twin.scene.align.view import RobotView
 from twin.scene.frames.camera_poses import base_tree, same_pose
 from twin.scene.store.calibration import CALIBRATION_FILE, write_calibration
@@ -74,17 +74,6 @@ def _moves(episode: Episode, camera_id: str) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FixedCamera:
-    """What was found of one fixed camera."""
-
-    alignment: Alignment
-    """``T_base_source`` is ``T_base_depth``, the pose of the depth camera."""
-    T_base_nominal: Float[np.ndarray, "4 4"] | None
-    """Where the recording has it."""
-    episodes: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Seen:
     """A depth image that shows the robot standing still."""
 
@@ -93,8 +82,10 @@ class _Seen:
     posture: Posture
 
 
-def find_fixed_camera(episodes: Sequence[Episode], camera_id: str, *, seed: int) -> FixedCamera:
-    """Find the pose and depth scale of a fixed camera in the robot's base frame.
+def find_fixed_camera(
+    episodes: Sequence[Episode], camera_id: str, base: str, *, seed: int
+) -> dict[str, Any]:
+    """Find the pose and depth scale of a fixed depth camera in the robot's base frame.
 
     The search begins where the recording has the camera; when the robot is not there, or the
     recording does not say, the whole table is searched.
@@ -122,11 +113,20 @@ def find_fixed_camera(episodes: Sequence[Episode], camera_id: str, *, seed: int)
         if nominal is None:
             raise
         alignment = align_robot(views, robot, seed=seed)
-    return FixedCamera(
-        alignment=alignment,
-        T_base_nominal=nominal,
-        episodes=tuple(dict.fromkeys(item.episode.info.id for item in chosen)),
-    )
+    record = {
+        "method": "depth of the robot against its description",
+        "mount": "fixed",
+        "link": base,
+        "stream": "depth",
+        "T_link_camera": se3.pose_record(alignment.T_base_source),
+        **alignment.to_record(),
+        "sources": list(dict.fromkeys(item.episode.info.id for item in chosen)),
+    }
+    if nominal is not None:
+        change = se3.invert(nominal) @ alignment.T_base_source
+        record["correction_m"] = float(np.linalg.norm(change[:3, 3]))
+        record["correction_rad"] = float(se3.rotation_angle_rad(change[:3, :3]))
+    return record
 
 
 def _tracks(episodes: Sequence[Episode]) -> dict[str, PostureTrack]:
@@ -229,8 +229,7 @@ def _camera(
 ) -> dict[str, Any]:
     if camera_id in target_cameras(episodes):
         pairs = recorded_pairs(episodes, camera_id, config.link)
-        found = find_camera(pairs, config.mount, seed=config.seed)
-        return target_record(found, pairs, config.link, base)
+        return target_record(pairs, config, base)
     topic = f"...{CAMERAS}{camera_id}{TARGET_POSE}"
     if where == NO_DEPTH:
         message = (
@@ -245,17 +244,17 @@ def _camera(
         )
         raise NothingToCalibrateError(message)
     with_depth = [episode for episode in episodes if camera_id in depth_cameras(episode)]
-    return fixed_record(find_fixed_camera(with_depth, camera_id, seed=config.seed), base)
+    return find_fixed_camera(with_depth, camera_id, base, seed=config.seed)
 
 
-def target_record(found: TargetCamera, pairs: PosePairs, link: str, base: str) -> dict[str, Any]:
-    """Say what pose pairs gave."""
-    solution = found.solution
-    in_hand = found.mount == "hand"
+def target_record(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[str, Any]:
+    """Say what pose pairs give."""
+    solution, mount = find_camera(pairs, config.mount, seed=config.seed)
+    in_hand = mount == "hand"
     return {
         "method": "target pose pairs, AX = ZB",
-        "mount": found.mount,
-        "link": link if in_hand else base,
+        "mount": mount,
+        "link": config.link if in_hand else base,
         "stream": "color",
         "T_link_camera": se3.pose_record(solution.X if in_hand else solution.Z),
         "T_base_target" if in_hand else "T_effector_target": se3.pose_record(
@@ -270,24 +269,6 @@ def target_record(found: TargetCamera, pairs: PosePairs, link: str, base: str) -
         "second_turn_rad": solution.second_turn_rad,
         "sources": [pairs.source],
     }
-
-
-def fixed_record(found: FixedCamera, base: str) -> dict[str, Any]:
-    """Say what the robot seen by a fixed camera gave."""
-    record = {
-        "method": "depth of the robot against its description",
-        "mount": "fixed",
-        "link": base,
-        "stream": "depth",
-        "T_link_camera": se3.pose_record(found.alignment.T_base_source),
-        **found.alignment.to_record(),
-        "sources": list(found.episodes),
-    }
-    if found.T_base_nominal is not None:
-        change = se3.invert(found.T_base_nominal) @ found.alignment.T_base_source
-        record["correction_m"] = float(np.linalg.norm(change[:3, 3]))
-        record["correction_rad"] = float(se3.rotation_angle_rad(change[:3, :3]))
-    return record
 
 
 def _nothing(run: RunFolder, reasons: Mapping[str, str]) -> str:

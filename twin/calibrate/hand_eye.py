@@ -120,12 +120,9 @@ def solve(
     *,
     seed: int = 0,
 ) -> RobotWorld:
-    """Find X and Z with A X = Z B.
+    """Find X and Z with A X = Z B: from the closed form on, by Cauchy's loss of the misfits.
 
-    Starts from the closed form and minimises Cauchy's loss of the misfits.
-
-    Raises:
-        UndeterminedCameraError: Too few pairs, or rotations about one axis only.
+    UndeterminedCameraError for too few pairs, and for rotations about one axis only.
     """
     turn = check_motions(Ts_a)
     X = solve_hand_eye(Ts_a, Ts_b)
@@ -182,12 +179,7 @@ def misfits(
     X: Float[np.ndarray, "4 4"],
     Z: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "num_pairs 6"]:
-    """Translation [m] and rotation vector [rad] of E = (Z B)^-1 A X for each pair.
-
-    Args:
-        X: The transform behind A, such as ``T_hand_camera``.
-        Z: The transform before B, such as ``T_base_target``.
-    """
+    """Translation [m] and rotation vector [rad] of E = (Z B)^-1 A X for each pair."""
     E = se3.invert(Z @ Ts_b) @ Ts_a @ X
     return np.concatenate([E[:, :3, 3], se3.vector_from_rotation(E[:, :3, :3])], axis=1)
 
@@ -227,36 +219,17 @@ MAX_RESIDUAL_RAD = 0.05
 """Pairs that disagree by more belong to no one mounting."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TargetCamera:
-    """What was found, and how the camera is mounted."""
-
-    solution: RobotWorld
-    mount: Mount
-    """``hand`` or ``fixed``."""
-
-
-def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> TargetCamera:
-    """Find a camera from pose pairs; says so when the pairs belong to the other mounting.
+def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> tuple[RobotWorld, Mount]:
+    """Find a camera from pose pairs, and its mounting; ``auto`` takes what fits clearly better.
 
     With the camera in the hand X is ``T_effector_camera`` and Z is ``T_base_target``; with a fixed
-    camera X is ``T_effector_target`` and Z is ``T_base_camera``.
-
-    Args:
-        mount: Where the camera is said to be: ``hand``, ``fixed``, or ``auto`` to take what fits
-            clearly better.
-
-    Raises:
-        UndeterminedCameraError: Too few pairs, rotations about one axis only, pairs that fit
-            neither mounting, or that fit the other one than was asked for.
+    camera X is ``T_effector_target`` and Z is ``T_base_camera``. UndeterminedCameraError also where
+    pairs fit neither mounting, or the other one than was asked for.
     """
     seen = pairs.Ts_camera_target
     each: dict[Mount, np.ndarray] = {"hand": se3.invert(seen), "fixed": seen}
-    found = {
-        name: TargetCamera(solution=solve(pairs.Ts_base_effector, Ts, seed=seed), mount=name)
-        for name, Ts in each.items()
-    }
-    size = {name: item.solution.residual_m.value for name, item in found.items()}
+    found = {name: solve(pairs.Ts_base_effector, Ts, seed=seed) for name, Ts in each.items()}
+    size = {name: item.residual_m.value for name, item in found.items()}
     best, other = sorted(each, key=lambda name: size[name])
     if mount == "auto" and size[other] < CLEARLY * size[best]:
         message = (
@@ -273,11 +246,7 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> TargetCamer
             f"--mount {best}, or invert the target poses: T_camera_target is wanted."
         )
         raise UndeterminedCameraError(message)
-    return _believable(found[chosen], pairs)
-
-
-def _believable(found: TargetCamera, pairs: PosePairs) -> TargetCamera:
-    metres, turn = found.solution.residual_m.value, found.solution.residual_rad.value
+    metres, turn = size[chosen], found[chosen].residual_rad.value
     if metres > MAX_RESIDUAL_M or turn > MAX_RESIDUAL_RAD:
         message = (
             f"the pose pairs of {pairs.source} disagree by {metres * 1e3:.0f} mm and "
@@ -285,4 +254,4 @@ def _believable(found: TargetCamera, pairs: PosePairs) -> TargetCamera:
             "or a target that moved. Check --link, and that robot and target stood still."
         )
         raise UndeterminedCameraError(message)
-    return found
+    return found[chosen], chosen

@@ -106,14 +106,6 @@ class Trials:
     tasks: frozenset[str]
     """Of all trials that were recorded, usable or not."""
 
-    def of_each_task(self) -> dict[str, list[Trial]]:
-        """The usable ones by name of their task, in the order of names."""
-        names = sorted({trial.scene.task.name for trial in self.usable})
-        return {
-            name: [trial for trial in self.usable if trial.scene.task.name == name]
-            for name in names
-        }
-
 
 @dataclass(frozen=True, kw_only=True)
 class Ended:
@@ -342,7 +334,8 @@ def calibrate_posterior(
         The record, and the id of the calibration that holds now.
     """
     found, tasks = read_trials(run, output), dict[str, Any]()
-    for name, trials in found.of_each_task().items():
+    for name in sorted({trial.scene.task.name for trial in found.usable}):
+        trials = [trial for trial in found.usable if trial.scene.task.name == name]
         beforehand = draw_beforehand(num_draws, rigid_movers(trials[0].scene.task))
         draws = weighed(beforehand, trials, workers=workers, output=output)
         tasks[name] = {

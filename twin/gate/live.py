@@ -70,14 +70,6 @@ class CameraNotReadyError(TwinError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PosedFrames:
-    """Frames of one camera, and the frame their poses are in."""
-
-    root: str
-    frames: list[RgbdFrame]
-
-
-@dataclass(frozen=True, kw_only=True)
 class LiveCell:
     """What is known at one moment of where things are."""
 
@@ -126,8 +118,11 @@ class LiveCell:
 
 def frames_of(
     camera_id: str, camera: LiveCamera, cell: LiveCell, quiet_since_ns: int, max_frames: int
-) -> PosedFrames:
-    """One camera's newest frames at rest, later than the last execution (cell's clock)."""
+) -> tuple[str, list[RgbdFrame]]:
+    """The frame that poses are in, and one camera's newest frames at rest.
+
+    They are later than the last execution (cell's clock).
+    """
     missing = [f"{name}/info" for name in ("color", "depth") if name not in camera.infos]
     if missing:
         raise CameraNotReadyError(f"no calibration on {' and '.join(missing)}")
@@ -148,12 +143,22 @@ def frames_of(
     if not pairs:
         raise CameraNotReadyError("no colour and depth pair taken at rest since the last motion")
     oldest_ns = pairs[-1][0].stamp_ns - MAX_SPAN_NS
+    tree, lenses = poses.tree, {name: info.camera for name, info in camera.infos.items()}
     frames = [
-        with_true_depth(_frame(camera_id, camera.infos, poses.tree, color, depth), poses)
+        RgbdFrame(
+            camera_id=camera_id,
+            stamp_ns=color.stamp_ns,
+            image_u8=color.image_u8(),
+            depth_m=depth.depth_m(),
+            color_camera=lenses["color"],
+            depth_camera=lenses["depth"],
+            T_base_color=tree.T_root_frame(frame_id, color.stamp_ns),
+            T_base_depth=tree.T_root_frame(camera.infos["depth"].frame_id, depth.stamp_ns),
+        )
         for color, depth in pairs[-max_frames:]
         if color.stamp_ns >= oldest_ns
     ]
-    return PosedFrames(root=poses.tree.root_of(frame_id), frames=frames)
+    return tree.root_of(frame_id), [with_true_depth(frame, poses) for frame in frames]
 
 
 def _pairs(camera: LiveCamera) -> list[tuple[CompressedColor | RawColor, DepthImage]]:
@@ -163,25 +168,6 @@ def _pairs(camera: LiveCamera) -> list[tuple[CompressedColor | RawColor, DepthIm
         if gaps_ns and min(gaps_ns) <= PAIRING_TOLERANCE_NS:
             pairs.append((color, camera.depths[gaps_ns.index(min(gaps_ns))]))
     return pairs
-
-
-def _frame(
-    camera_id: str,
-    infos: dict[str, CameraInfo],
-    tree: TransformTree,
-    color: CompressedColor | RawColor,
-    depth: DepthImage,
-) -> RgbdFrame:
-    return RgbdFrame(
-        camera_id=camera_id,
-        stamp_ns=color.stamp_ns,
-        image_u8=color.image_u8(),
-        depth_m=depth.depth_m(),
-        color_camera=infos["color"].camera,
-        depth_camera=infos["depth"].camera,
-        T_base_color=tree.T_root_frame(infos["color"].frame_id, color.stamp_ns),
-        T_base_depth=tree.T_root_frame(infos["depth"].frame_id, depth.stamp_ns),
-    )
 
 
 KEPT_TRANSFORMS = 1000
@@ -401,7 +387,7 @@ class LiveView:
             joints=joints,
             urdf=urdf,
         )
-        found: dict[str, PosedFrames] = {}
+        found: dict[str, tuple[str, list[RgbdFrame]]] = {}
         reasons: list[str] = []
         for camera_id, camera in cameras.items():
             age_ns = newest_ns - max((image.stamp_ns for image in camera.colors), default=newest_ns)
@@ -414,11 +400,11 @@ class LiveView:
                 )
             except GstError as error:
                 reasons.append(f"{camera_id}: {error}")
-        root = common_root([item.root for item in found.values()], base_frame)
+        root = common_root([own for own, _ in found.values()], base_frame)
         reasons += [
-            f"{camera_id}: its poses are in frame {item.root!r}, not in {root!r}"
-            for camera_id, item in found.items()
-            if item.root != root
+            f"{camera_id}: its poses are in frame {own!r}, not in {root!r}"
+            for camera_id, (own, _) in found.items()
+            if own != root
         ]
-        frames = [f for item in found.values() if item.root == root for f in item.frames]
+        frames = [frame for own, some in found.values() if own == root for frame in some]
         return LiveFrames(frames=frames, reasons=reasons)

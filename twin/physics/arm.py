@@ -2,7 +2,7 @@
 
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,8 +21,10 @@ from twin.physics.engine import pybullet
 # PyBullet gives links without ``<inertial>`` a mass of 1 kg, massless frames included, and makes
 # its own hulls of meshes; both are settled here so that it simulates the robot that was described.
 
-_TINY_MASS_KG = 1e-3
-_TINY_INERTIA_KG_M2 = 1e-6
+_TINY_INERTIAL = (
+    '<inertial><mass value="0.001"/>'
+    '<inertia ixy="0" ixz="0" iyz="0" ixx="1e-06" iyy="1e-06" izz="1e-06"/></inertial>'
+)
 
 Hulls = Mapping[str, Sequence[Float[np.ndarray, "num_points 3"]]]
 
@@ -34,22 +36,13 @@ def write_description(urdf: str, mesh_hulls_m: Hulls, folder: Path) -> Path:
         for visual in link.findall("visual"):
             link.remove(visual)
         if link.find("inertial") is None:
-            link.append(_tiny_inertial())
+            link.append(ET.fromstring(_TINY_INERTIAL))
         hulls = mesh_hulls_m.get(link.get("name", ""), ())
         if hulls:  # by number: a name may hold a slash
             _replace_meshes(link, hulls, folder, f"link_{number}")
     path = folder / "robot.urdf"
     path.write_text(ET.tostring(root, encoding="unicode"))
     return path
-
-
-def _tiny_inertial() -> ET.Element:
-    inertial = ET.Element("inertial")
-    ET.SubElement(inertial, "mass", value=str(_TINY_MASS_KG))
-    inertia = ET.SubElement(inertial, "inertia", ixy="0", ixz="0", iyz="0")
-    for axis in ("ixx", "iyy", "izz"):
-        inertia.set(axis, str(_TINY_INERTIA_KG_M2))
-    return inertial
 
 
 def _replace_meshes(
@@ -115,6 +108,19 @@ class _Drive:
         return self.multiplier * self.finger.slope(width_m)
 
 
+def require_parts(record: Robot, joints: Collection[str], links: Collection[str]) -> None:
+    """Refuse (PhysicsError) a description that lacks a part of the robot's arm or fingers."""
+    missing = [name for name in (*record.joints, *record.finger_joints) if name not in joints]
+    tool = (record.tool_frame, *record.gripper.finger_links)
+    missing += [name for name in tool if name not in links]
+    if missing:
+        message = (
+            f"the robot description lacks {', '.join(missing)}; it has the joints "
+            f"{', '.join(joints)}. Physics needs the arm and the fingers of {record.name!r}."
+        )
+        raise PhysicsError(message)
+
+
 class Arm:
     """One robot with its base at the origin of a PyBullet client."""
 
@@ -173,17 +179,7 @@ class Arm:
                 fixed.add(index)
         self.base_links = tuple(sorted(fixed - {-1}))
         """What no joint moves."""
-        wanted = (*record.joints, *record.finger_joints)
-        missing = [name for name in wanted if name not in self._joints] + [
-            name for name in (record.tool_frame, *gripper.finger_links) if name not in self.links
-        ]
-        if missing:
-            message = (
-                f"the robot description lacks {', '.join(missing)}; it has the joints "
-                f"{', '.join(self._joints)}. Physics needs the arm and the fingers of "
-                f"{record.name!r}."
-            )
-            raise PhysicsError(message)
+        require_parts(record, self._joints, self.links)
         self._arm = [self._joints[name] for name in record.joints]
         self._drives = self._driven(mimics)
         self._fingers = [drive.index for drive in self._drives]
@@ -399,12 +395,9 @@ def _numbers(joints: Joints) -> list[float]:
     return joints if isinstance(joints, list) else joints.tolist()
 
 
-# Fingers that press on what does not yield get their force in fewer iterations of the solver.
-# The solver begins each step with fingers that press by nothing, and each of its iterations adds
-# what stops a finger at the speed it is driven with. At the usual speed 20 N take 45 iterations;
-# all else takes 10. Fingers that stand still although they are told to close are therefore driven
-# faster. Their force is the same. What they hold may give way: then they are at the usual speed
-# again before they have gone far. docs/decisions/0017-contact-physics.md.
+# Stalled fingers are driven faster: the same force in fewer iterations of the solver. What they
+# hold may give way: then they are at the usual speed again before they have gone far.
+# docs/decisions/0017-contact-physics.md.
 
 PRESS_M_S = 0.8
 """Speed with which stalled fingers are driven; until somebody looks they go 7 mm at most."""
@@ -434,13 +427,11 @@ class Press:
             self._found = 0
             self._arm.press(None)
         elif self._arm.closing and self._steps % EVERY_STEPS == 0:
-            self._found = self._found + 1 if self._stalled() else 0
+            stalled = bool(self._arm.finger_links) and all(
+                short_m > SHORT_M and abs(speed_m_s) < STALLED_M_S
+                for short_m, speed_m_s in self._arm.fingers()
+            )
+            self._found = self._found + 1 if stalled else 0
             self._arm.press(PRESS_M_S if self._found >= PATIENCE else None)
         elif not self._arm.closing:
             self._found = 0
-
-    def _stalled(self) -> bool:
-        return bool(self._arm.finger_links) and all(
-            short_m > SHORT_M and abs(speed_m_s) < STALLED_M_S
-            for short_m, speed_m_s in self._arm.fingers()
-        )

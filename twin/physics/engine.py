@@ -26,18 +26,10 @@ _IDLE: list[int] = []
 same (a test)."""
 
 
-def take_client() -> int:
-    """Return the number of a client without anything in it, with the engine's own settings."""
-    if not _IDLE:
-        return int(pybullet.connect(pybullet.DIRECT))
-    client = _IDLE.pop()
-    pybullet.resetSimulation(physicsClientId=client)
-    return client
-
-
 def open_client(config: PhysicsConfig) -> int:
-    """Take a client and give it the settings of every world: rate, solver, gravity."""
-    client = take_client()
+    """Take an empty client and give it the settings of every world: rate, solver, gravity."""
+    client = _IDLE.pop() if _IDLE else int(pybullet.connect(pybullet.DIRECT))
+    pybullet.resetSimulation(physicsClientId=client)
     pybullet.setPhysicsEngineParameter(
         fixedTimeStep=1.0 / config.rate_hz,
         numSolverIterations=config.solver_iterations,

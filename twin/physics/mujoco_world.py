@@ -21,7 +21,7 @@ from jaxtyping import Float
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.robot import Robot, mimics_of, robot_of
-from twin.physics.arm import Hulls, Joints, PhysicsError, write_description
+from twin.physics.arm import Hulls, Joints, PhysicsError, require_parts, write_description
 from twin.physics.bending import SoftBodies
 from twin.physics.config import FINGER_SPEED_M_S, RIGID_ONLY, PhysicsConfig
 from twin.physics.unseen import EVEN, Unseen, box_inertia
@@ -78,7 +78,8 @@ class MujocoArm:
 
     def __init__(self, spec: Any, record: Robot, config: PhysicsConfig) -> None:
         """Give the joints motors."""
-        _check_names(spec, record)
+        links = [body.name for body in spec.bodies]
+        require_parts(record, [joint.name for joint in spec.joints], links)
         self._record, self._config = record, config
         self._drives = record.gripper.fingers
         self._model: Any = None
@@ -175,22 +176,6 @@ def _refuse_gripper(record: Robot, urdf: str) -> None:
         message = (
             f"MuJoCo replays fingers that slide, each with a motor of its own; of {record.name!r} "
             f"{', '.join(unfit)} turns or follows another joint. Use --engine pybullet."
-        )
-        raise PhysicsError(message)
-
-
-def _check_names(spec: Any, record: Robot) -> None:
-    joints = [joint.name for joint in spec.joints]
-    links = [body.name for body in spec.bodies]
-    wanted = (*record.joints, *(finger.joint for finger in record.gripper.fingers))
-    missing = [name for name in wanted if name not in joints]
-    missing += [
-        name for name in (record.tool_frame, *record.gripper.finger_links) if name not in links
-    ]
-    if missing:
-        message = (
-            f"the robot description lacks {', '.join(missing)}; it has the joints "
-            f"{', '.join(joints)}. Physics needs the arm and two prismatic fingers."
         )
         raise PhysicsError(message)
 

@@ -14,6 +14,7 @@ from twin.physics.engines import PhysicsWorld, open_world
 from twin.policies.errors import StoppedError
 from twin.policies.limits import refuse_target
 from twin.policies.starts import Start
+from twin.replay.checks import stops_of_arm
 from twin.replay.dynamics import Samples, free_start, mesh_hulls, soft_models, spawn
 from twin.replay.observed import observed_plan
 from twin.replay.path import JointPath
@@ -120,16 +121,11 @@ class TwinCell:
                 return
 
     def _stop_where_the_arm_would(self) -> None:
-        record, found = self.robot.record, self.posture()[0]
-        off = np.abs(found - self.target_rad)
-        worst = int(np.argmax(off))
-        if record.tracking_error_rad is not None and off[worst] > record.tracking_error_rad:
-            detail = f"{self.robot.joints[worst]} is {off[worst]:.3f} rad from where it was sent"
-            raise StoppedError(name="tracking", detail=detail)
-        force_N = self._world.arm_force_N()
-        if record.contact_force_N is not None and force_N > record.contact_force_N:
-            detail = f"{force_N:.0f} N on the arm, it stops at {record.contact_force_N:.0f} N"
-            raise StoppedError(name="force", detail=detail)
+        off_rad = self.posture()[0] - self.target_rad
+        pressed_N = np.array([self._world.arm_force_N()])
+        now_ns = np.array([self.t_ns])
+        for failure in stops_of_arm(now_ns, off_rad[None], pressed_N, self.robot.record):
+            raise StoppedError(name=failure.cause, detail=failure.detail)
 
     def hold(self, duration_s: float) -> None:
         """Stay where the last target was."""

@@ -14,7 +14,7 @@ class StoppedError(TwinError):
         """Remember which limit it was.
 
         Args:
-            name: The limit, in the words of the gate: limits, start, force ...
+            name: The limit, in the words of the gate: limits, start, contact_force ...
         """
         self.name = name
         super().__init__(f"{name}: {detail}")

@@ -7,7 +7,7 @@ from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from twin.replay.config import ReplayConfig
 
-_WORDS = {True: "accepted", False: "rejected", None: "undecided"}
+WORDS = {True: "accepted", False: "rejected", None: "undecided"}
 _DISAGREE = "engines disagree: "
 
 
@@ -25,7 +25,11 @@ def compared(verdicts: Sequence[Verdict]) -> list[Verdict]:
     """Say in each verdict on one trajectory where another engine's says something else."""
     if len({verdict.accepted for verdict in verdicts}) == 1:
         return list(verdicts)
-    answers = _DISAGREE + "; ".join(_saying(verdict) for verdict in verdicts)
+    answers = _DISAGREE + "; ".join(
+        f"{verdict.engine} {WORDS[verdict.accepted]}"
+        + (f" ({verdict.reason})" if verdict.reason and not verdict.accepted else "")
+        for verdict in verdicts
+    )
     return [
         replace(verdict, warnings=(*verdict.warnings, answers), reason=verdict.reason or answers)
         for verdict in verdicts
@@ -35,8 +39,3 @@ def compared(verdicts: Sequence[Verdict]) -> list[Verdict]:
 def disagreement_of(verdict: Verdict) -> str | None:
     """What each engine says, where they say something else; None where they agree."""
     return next((text for text in verdict.warnings if text.startswith(_DISAGREE)), None)
-
-
-def _saying(verdict: Verdict) -> str:
-    why = f" ({verdict.reason})" if verdict.reason and not verdict.accepted else ""
-    return f"{verdict.engine} {_WORDS[verdict.accepted]}{why}"

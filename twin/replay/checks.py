@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from bridge.robots.robot import Robot
 from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import Task
 from twin.replay.config import START_M, START_RAD
-from twin.replay.dynamics import States
 from twin.replay.failure import Failure
 from twin.replay.path import JointPath
 from twin.robot.model import RobotModel
@@ -137,32 +137,28 @@ def limited_to_task(plan: Plan, task: Task) -> Plan:
 # What the robot itself would stop at.
 
 
-def simulated_limit_failures(path: JointPath, states: States, robot: RobotModel) -> list[Failure]:
-    """Find where the arm would stop by itself: pressed too hard, or too far from its command."""
-    failures, record = [], robot.record
+def stops_of_arm(
+    stamps_ns: Int[np.ndarray, " num_states"],
+    off_rad: Float[np.ndarray, "num_states num_joints"],
+    force_N: Float[np.ndarray, " _"],
+    record: Robot,
+) -> list[Failure]:
+    """Find where an arm would stop by itself: too far from its command, or pressed too hard."""
+    failures = []
     limit_rad, limit_N = record.tracking_error_rad, record.contact_force_N
-    if limit_rad is not None:
-        off = np.abs(states.joints_rad - path.joints_at(states.stamps_ns))
-        over = ~(off <= limit_rad)
-        if np.any(over):
-            index, joint = np.argwhere(over)[0].tolist()
-            name = record.joints[joint]
-            detail = (
-                f"{name} is {off[index, joint]:.3f} rad from where it is commanded, the limit is "
-                f"{limit_rad:g} rad"
-            )
-            t_ns = int(states.stamps_ns[index])
-            failures.append(
-                Failure(t_ns=t_ns, cause=Cause.TRACKING_ERROR, bodies=(name,), detail=detail)
-            )
-    if limit_N is not None and len(states.arm_force_N):
-        over_N = np.flatnonzero(~(states.arm_force_N <= limit_N))
-        if len(over_N):
-            index = int(over_N[0])
-            detail = (
-                f"the arm is pressed with {states.arm_force_N[index]:.0f} N, the limit is "
-                f"{limit_N:g} N"
-            )
-            t_ns = int(states.stamps_ns[index])
-            failures.append(Failure(t_ns=t_ns, cause=Cause.CONTACT_FORCE, detail=detail))
+    over = [] if limit_rad is None else np.argwhere(~(np.abs(off_rad) <= limit_rad)).tolist()
+    for index, joint in over[:1]:
+        name, t_ns = record.joints[joint], int(stamps_ns[index])
+        detail = (
+            f"{name} is {abs(off_rad[index, joint]):.3f} rad from where it is commanded, the limit "
+            f"is {limit_rad:g} rad"
+        )
+        failures.append(
+            Failure(t_ns=t_ns, cause=Cause.TRACKING_ERROR, bodies=(name,), detail=detail)
+        )
+    pressed = [] if limit_N is None else np.flatnonzero(~(force_N <= limit_N)).tolist()
+    for index in pressed[:1]:
+        detail = f"the arm is pressed with {force_N[index]:.0f} N, the limit is {limit_N:g} N"
+        t_ns = int(stamps_ns[index])
+        failures.append(Failure(t_ns=t_ns, cause=Cause.CONTACT_FORCE, detail=detail))
     return failures

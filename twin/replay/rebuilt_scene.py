@@ -41,14 +41,6 @@ class UnreadablePosteriorError(TwinError):
 MASSES = "masses"
 """The part of calibration.json that says what objects weighed in the hand."""
 OTHER_TASKS = "the posterior has no trials of this task: its samples draw from the priors"
-ALL_TASKS = (
-    "the posterior was weighed by all tasks of its run together, by an older version; make it "
-    "again: calibrate RUN --posterior"
-)
-OF_PROBES = (
-    "calibration.json says what probes showed of poses or masses, which replays no longer use; "
-    "make a posterior: calibrate RUN --posterior"
-)
 
 
 def calibrated(
@@ -82,11 +74,9 @@ def calibrated(
 
 
 def posterior_of(calibration: Calibration, task: Task) -> tuple[PosteriorDraw, ...]:
-    """The draws that a task's trials left some weight; empty where it has none of its own.
-
-    Of a file that is older than draws of each task, those of all its tasks together.
-    """
-    draws = _posterior(calibration, task).get("draws", [])
+    """The draws that a task's trials left some weight; empty where it has none of its own."""
+    tasks = _mapping(_mapping(calibration.record, "posterior"), "tasks")
+    draws = _mapping(tasks, task.name).get("draws", [])
     try:
         return msgspec.convert(draws, tuple[PosteriorDraw, ...])
     except msgspec.ValidationError as error:
@@ -104,22 +94,10 @@ def masses_of(calibration: Calibration | None, task: Task) -> dict[str, tuple[fl
     }
 
 
-def _posterior(calibration: Calibration, task: Task) -> Mapping[str, Any]:
-    found = _mapping(calibration.record, "posterior")
-    return _mapping(_mapping(found, "tasks"), task.name) if "tasks" in found else found
-
-
 def calibration_notes(calibration: Calibration | None, task: Task) -> tuple[str, ...]:
-    """What has to be said of a calibration: a posterior that is not the task's own, an old part."""
-    if calibration is None:
-        return ()
-    notes, found = [], _mapping(calibration.record, "posterior")
-    if found and task.name not in _mapping(found, "tasks"):
-        notes.append(OTHER_TASKS if "tasks" in found else ALL_TASKS)
-    physics = _mapping(calibration.record, "physics")
-    if physics.get("pose_bias") or physics.get("masses"):
-        notes.append(OF_PROBES)
-    return tuple(notes)
+    """What has to be said of a calibration: a posterior that is not the task's own."""
+    found = {} if calibration is None else _mapping(calibration.record, "posterior")
+    return (OTHER_TASKS,) if found and task.name not in _mapping(found, "tasks") else ()
 
 
 def for_task(config: ReplayConfig, calibration: Calibration | None, task: Task) -> ReplayConfig:
@@ -141,11 +119,10 @@ def physics_of(calibration: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _identified(record: Mapping[str, Any], key: str) -> dict[str, float]:
-    """A number of each identified quantity, where it has one; a plain number is a value."""
+    """A number of each identified quantity, where it has one."""
     found = {}
     for name, item in _mapping(_mapping(record, "physics"), "identified").items():
-        plain = item if key == "value" else None
-        value = item.get(key) if isinstance(item, Mapping) else plain
+        value = item.get(key) if isinstance(item, Mapping) else None
         if isinstance(value, int | float) and np.isfinite(value):
             found[name] = float(value)
     return found

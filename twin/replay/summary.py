@@ -14,9 +14,9 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.task.verdict import SAME_ENGINE
+from twin.replay.agreement import WORDS
 from twin.replay.failure import NOT_EVALUATED
 
-WORDS = {True: "accepted", False: "rejected", None: "undecided"}
 LABELS = ("success", "failure", "unknown")
 PLANNED, EXECUTED, SEEN = "planned in twin", "executed in twin", "executed as seen"
 TRAJECTORIES = ((PLANNED, "planned"), (EXECUTED, "executed"), (SEEN, "recorded_predicates"))
@@ -194,19 +194,14 @@ def _reason_lines(rows: Rows) -> list[str]:
     lines = []
     for title, listed in lists:
         lines += ["", title] if listed else []
-        for (episode, plan, reason), which in _by_reason(listed).items():
+        alike: dict[tuple[str, str, str | None], list[str]] = {}
+        for row in listed:
+            key = (row["episode"], row["plan"], row["reason"])
+            alike.setdefault(key, []).append(f"{row['trajectory']} {row['mode']}")
+        for (episode, plan, reason), which in alike.items():
             bare = (reason or "no reason given").removeprefix(f"{title} ")
             lines.append(f"  {episode} {plan} {', '.join(which)}: {bare}")
     return lines
-
-
-def _by_reason(rows: Rows) -> dict[tuple[str, str, str | None], list[str]]:
-    """Which replays of a plan have the same reason, in the order of the rows."""
-    found: dict[tuple[str, str, str | None], list[str]] = {}
-    for row in rows:
-        key = (row["episode"], row["plan"], row["reason"])
-        found.setdefault(key, []).append(f"{row['trajectory']} {row['mode']}")
-    return found
 
 
 def _skipped_lines(skipped: Mapping[str, str], what: str) -> list[str]:
@@ -289,9 +284,7 @@ def _divergence_lines(executions: Rows) -> list[str]:
 
 def _motion_lines(rows: Rows) -> list[str]:
     """Say how many replays there are of imported recordings."""
-    counts: dict[str, int] = {}
-    for row in rows:
-        counts[row["trajectory"]] = counts.get(row["trajectory"], 0) + 1
+    counts = Counter(row["trajectory"] for row in rows)
     lines = [
         f"imported recordings, {trajectory} ({words}): {counts[trajectory]} replays"
         for trajectory, words in (("planned", "joint schedule"), ("executed", "measured tool"))

@@ -26,8 +26,8 @@ from bridge.task.verdict import Factor, Verdict
 from twin.physics.engines import engine_version
 from twin.replay.checks import (
     limited_to_task,
-    simulated_limit_failures,
     start_failures,
+    stops_of_arm,
     task_failures,
 )
 from twin.replay.clearance.monitor import ClearanceMonitor
@@ -334,7 +334,9 @@ def _judge(
     # What was executed is judged by where things end: it is known whether they were dropped.
     planned = moved.by_physics and commanded.trajectory == "planned"
     if planned:
-        simulated = simulated_limit_failures(path, states, load_robot(scene.urdf))
+        off_rad = states.joints_rad - path.joints_at(states.stamps_ns)
+        record = load_robot(scene.urdf).record
+        simulated = stops_of_arm(states.stamps_ns, off_rad, states.arm_force_N, record)
         checks = {**checks, "limits": checks["limits"] + simulated}
     unreachable_ns = commanded.unreachable_ns
     if moved.by_physics or config.mode == "kinematic":

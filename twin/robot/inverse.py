@@ -276,8 +276,7 @@ def _descend(
     )
 
 
-# Whether an arm has the geometry of a UR, and its lengths, read off its joint axes.
-# Nothing depends on how a description places its link frames: the axes at zero joints decide. A
+# Whether an arm has the geometry of a UR: its joint axes at zero decide, not its link frames. A
 # Denavit-Hartenberg chain is laid through them and must then reproduce pinocchio's kinematics.
 
 _SAME_DIRECTION = 1e-4
@@ -320,15 +319,6 @@ class UrGeometry:
         for row in zip(theta, a, d, _ALPHA, strict=True):
             T = T @ _link(*row)
         return np.asarray(T @ self.T_6_tcp)
-
-
-def ur_geometry(robot: RobotModel) -> UrGeometry | None:
-    """Read the geometry off the joint axes; None when the arm has another one."""
-    axes = _axes(robot)
-    if axes is None:
-        return None
-    geometry = _through(*axes, robot.T_base_tcp(np.zeros(6)))
-    return None if geometry is None else _checked(geometry, robot)
 
 
 def _axes(robot: RobotModel) -> tuple[Float[np.ndarray, "6 3"], Float[np.ndarray, "6 3"]] | None:
@@ -418,12 +408,10 @@ def _link(theta: float, a_m: float, d_m: float, alpha: float) -> Pose:
     )
 
 
-# The closed form for UR-type arms. The second, third and fourth axes are parallel, so the direction
-# n they share and the wrist point (where the last two axes meet) give the joints one after another
-# (Hawkins 2013, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms"):
-# n . wrist = d4 has two shoulders; n seen from the tool gives two wrists, and with them the fifth
-# axis; what is left is a planar arm with two elbows. Angles come from two-argument arctangents of
-# quantities that stay exact near the singularities.
+# The closed form for UR-type arms (Hawkins 2013, "Analytic inverse kinematics for the Universal
+# Robots UR-5/UR-10 arms"): n, the direction of the second to fourth axis, with n . wrist = d4 has
+# two shoulders; n seen from the tool gives two wrists, and with them the fifth axis; what is left
+# is a planar arm with two elbows. Arctangents take what stays exact near the singularities.
 
 NUM_BRANCHES = 8
 """Branch number: 4 * shoulder + 2 * wrist + elbow, each 0 or 1."""
@@ -449,7 +437,9 @@ class UrInverse:
     @lru_cache(maxsize=4)
     def for_robot(robot: RobotModel) -> "UrInverse | None":
         """Return the inverse of a robot's arm, None when its geometry is not that of a UR."""
-        geometry = ur_geometry(robot)
+        axes = _axes(robot)
+        laid = None if axes is None else _through(*axes, robot.T_base_tcp(np.zeros(6)))
+        geometry = None if laid is None else _checked(laid, robot)
         if geometry is None:
             return None
         return UrInverse(geometry=geometry, lower_rad=robot.lower_rad, upper_rad=robot.upper_rad)

@@ -227,8 +227,9 @@ def test_the_search_begins_where_tf_believes_the_camera_also_below_a_world(
         raise RobotNotAlignedError(found="nothing", hint="Look elsewhere.")
 
     monkeypatch.setattr(cameras, "align_robot", look)
+    episodes = [Episode.open(path) for path in run.episodes()]
     with pytest.raises(RobotNotAlignedError):
-        cameras.find_fixed_camera([Episode.open(path) for path in run.episodes()], "side", seed=0)
+        cameras.find_fixed_camera(episodes, "side", "base_link", seed=0)
     first, whole_table = begun
     assert whole_table is None
     assert first is not None

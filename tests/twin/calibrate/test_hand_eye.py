@@ -137,10 +137,10 @@ def pairs_of(Ts_a: np.ndarray, Ts_b: np.ndarray) -> PosePairs:
 def test_the_mounting_is_found_and_the_wrong_one_is_refused(mount: str) -> None:
     Ts_a, Ts_b, X, Z = made_pairs(4, 15, metres=5e-4, radians=5e-4)
     pairs = pairs_of(Ts_a, se3.invert(Ts_b) if mount == "hand" else Ts_b)
-    found = hand_eye.find_camera(pairs, "auto")
-    assert found.mount == mount
-    assert distance(found.solution.X, X) < 2e-3
-    assert distance(found.solution.Z, Z) < 4e-3
+    found, chosen = hand_eye.find_camera(pairs, "auto")
+    assert chosen == mount
+    assert distance(found.X, X) < 2e-3
+    assert distance(found.Z, Z) < 4e-3
     other = "fixed" if mount == "hand" else "hand"
     with pytest.raises(hand_eye.UndeterminedCameraError, match=f"--mount {mount}, or invert"):
         hand_eye.find_camera(pairs, other)  # type: ignore[arg-type]
@@ -153,8 +153,8 @@ def test_opencv_finds_the_same_camera_in_recorded_pairs() -> None:
     if not hasattr(cv2, "calibrateHandEye"):
         pytest.skip("this OpenCV has no calibrateHandEye (the main module of version 5 lacks it)")
     A, B = np.moveaxis(np.array(json.loads(MOVEIT.read_text())), 1, 0)
-    found = hand_eye.find_camera(pairs_of(A, B), "auto")
-    Ts_seen = B if found.mount == "hand" else se3.invert(B)
+    found, mount = hand_eye.find_camera(pairs_of(A, B), "auto")
+    Ts_seen = B if mount == "hand" else se3.invert(B)
     R, t = cv2.calibrateHandEye(
         A[:, :3, :3], A[:, :3, 3], Ts_seen[:, :3, :3], Ts_seen[:, :3, 3],
         method=cv2.CALIB_HAND_EYE_PARK,

@@ -273,15 +273,6 @@ def test_a_task_takes_its_own_draws_and_never_silently_anothers(tmp_path: Path) 
     assert rebuilt_scene.read_rebuilt_scene(run, alone).notes == (rebuilt_scene.OTHER_TASKS,)
 
 
-def test_a_file_older_than_draws_of_each_task_is_read_and_says_what_it_is(tmp_path: Path) -> None:
-    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(2)
-    write_part(run, "posterior", {**of_one_task(draws), "skipped": {}})
-    known = read_calibration(run)
-    assert known is not None
-    assert rebuilt_scene.posterior_of(known, TASK) == tuple(draws)
-    assert rebuilt_scene.read_rebuilt_scene(run, TASK).notes == (rebuilt_scene.ALL_TASKS,)
-
-
 def test_a_task_is_weighed_by_its_own_trials_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -88,7 +88,7 @@ def test_the_arm_stops_by_itself_at_the_force_of_its_robot_file(
     assert isinstance(robot.record, robots.Robot)
     cell = TwinCell(start)
     try:
-        with pytest.raises(StoppedError, match=r"force: \d+ N on the arm, it stops at 150 N"):
+        with pytest.raises(StoppedError, match=r"contact_force: .* \d+ N, the limit is 150 N"):
             press(cell)
     finally:
         cell.close()

@@ -141,7 +141,6 @@ def calibrate_pushes(
         "fitted": _score(pushes, fitted, *_point(best)),
         "sources": {name: {"kind": "push", "sha256": pushes[name].sha256} for name in pushes},
         "skipped": skipped,
-        "num_evaluations": int(grid.size),
     }
     record["id"] = provenance.hash_settings(record)
     return record, str(write_physics(run, record)["calibration_id"])
@@ -216,17 +215,15 @@ def _record(
     own = PhysicsConfig().object_friction
     parameters, identified = {}, {}
     rows = (
-        ("finger_rad", FINGERS_RAD, "rad", "angle of the fingers", 0.0, None),
-        (SURFACE_FRICTION, SURFACE, "1", "friction of box on table", own * own, "surface_friction"),
-        (FINGER_FRICTION, HAND, "1", "friction of hand on box", own, "finger_friction"),
+        ("finger_rad", FINGERS_RAD, "rad", None),
+        (SURFACE_FRICTION, SURFACE, "1", "surface_friction"),
+        (FINGER_FRICTION, HAND, "1", "finger_friction"),
     )
-    for index, (name, values, unit, about, usual, field) in enumerate(rows):
+    for index, (name, values, unit, field) in enumerate(rows):
         low, high = np.quantile(values[again[:, index]], [0.025, 0.975], method="nearest")
         whole = bool(low == values[0] and high == values[-1])
         parameters[name] = {
-            "about": about,
             "unit": unit,
-            "nominal": usual,
             "value": float(values[best[index]]),
             "low": float(low),
             "high": float(high),

@@ -118,10 +118,9 @@ def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Ha
         T_hand_tool=se3.invert(T_world_hand) @ rest_pose(tool),
         T_world_box=None,
     )
-    return push if not motion.boxes else _with_box(push, episode, next(iter(motion.boxes)))
-
-
-def _with_box(push: Push, episode: Episode, box: str) -> Push:
+    if not motion.boxes:
+        return push
+    box = next(iter(motion.boxes))
     topic = object_pose_topics(episode).get(box)
     if topic is None:
         raise UnusablePushError(f"{push.episode}: no poses of {box!r} were recorded.")

@@ -119,7 +119,8 @@ def calibration(**identified: object) -> Calibration:
 
 
 def test_calibrated_physics_is_used_where_the_user_said_nothing() -> None:
-    found = calibration(object_friction=0.42, grip_force_N={"value": 9.0}, gravity_m_s2=None)
+    values = {"object_friction": {"value": 0.42}, "grip_force_N": {"value": 9.0}}
+    found = calibration(**values, gravity_m_s2=None)
     physics = calibrated(ReplayConfig(), found, TASK).physics
     assert (physics.object_friction, physics.grip_force_N) == (0.42, 9.0)
     assert physics.gravity_m_s2 == PhysicsConfig().gravity_m_s2

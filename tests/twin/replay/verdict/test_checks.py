@@ -9,7 +9,7 @@ import pytest
 from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.task.plan import Plan, Stage
 from bridge.task.verdict import Factor, Verdict
-from twin.replay.checks import limited_to_task, simulated_limit_failures, task_failures
+from twin.replay.checks import limited_to_task, stops_of_arm, task_failures
 from twin.replay.config import ReplayConfig
 from twin.replay.dynamics import States
 from twin.replay.motion import motion_failures
@@ -220,8 +220,9 @@ def test_a_robot_that_would_stop_by_itself_is_not_told_to_go_on() -> None:
         finger_contact={},
         arm_force_N=np.array([149.0, 151.0]),
     )
-    robot = load_robot(ROBOT.urdf_text())
-    tracking, force = simulated_limit_failures(path, states, robot)
+    off_rad = states.joints_rad - path.joints_rad
+    force_N, record = states.arm_force_N, ROBOT
+    tracking, force = stops_of_arm(states.stamps_ns, off_rad, force_N, record)
     assert (tracking.cause, tracking.bodies, tracking.t_ns) == (
         "tracking_error",
         ("elbow_joint",),
@@ -229,8 +230,7 @@ def test_a_robot_that_would_stop_by_itself_is_not_told_to_go_on() -> None:
     )
     assert force.cause == "contact_force"
     assert "151 N, the limit is 150 N" in force.detail
-    at_command = replace(states, joints_rad=path.joints_rad)
-    assert simulated_limit_failures(path, at_command, robot)[0] == force
+    assert stops_of_arm(states.stamps_ns, 0 * off_rad, force_N, record) == [force]
 
 
 def test_early_refusal_and_whole_replay_agree_on_plans_that_physics_need_not_see(
