@@ -23,9 +23,13 @@ from twin.physics.config import PhysicsConfig
 from twin.physics.engine import give_client_back, open_client, pybullet
 from twin.physics.unseen import EVEN, Unseen, box_inertia
 
-# Friction that holds where it held: PyBullet's friction anchors. The engine keeps all of a contact
-# point, also its normal in the world, which goes wrong when what is held turns: a body that has
-# turned by a little takes hold anew. docs/decisions/0017-contact-physics.md.
+# Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
+# Without anchors friction acts against velocities only, and what the solver leaves of them adds
+# up to a creep that takes hundreds of iterations to keep small. With an anchor a contact point
+# stays where it took hold while its force is within Coulomb's cone, and is let go when it is not.
+# The engine then keeps all of the point, also its normal in the world, which goes wrong when what
+# is held turns. So a body that has turned by a little takes hold anew.
+# docs/decisions/0017-contact-physics.md.
 
 TURN_RAD = 0.03
 """A body that has turned by this much takes hold anew."""

@@ -13,8 +13,11 @@ from scipy.spatial import ConvexHull
 
 from twin.robot.model import RobotDescriptionError, RobotModel
 
-# TRAP (measured): ``BVHModel.buildConvexRepresentation`` reuses the concave triangles of the mesh,
-# and distances come out up to 95 mm too large. ``ConvexBase.convexHull`` computes a true hull.
+# Convex hulls of the robot's links, the one shape that pinocchio, coal and PyBullet all share.
+# TRAP (measured, design page on physics): ``BVHModel.buildConvexRepresentation`` reuses the
+# concave triangles of the mesh; distances then come out up to 95 mm too large, which is the
+# unsafe side. ``ConvexBase.convexHull`` computes a true hull; a test pins hull distance <= mesh
+# distance.
 
 _CYLINDER_SIDES, _FEW = 24, 200
 _THINNEST_M = 1e-7
