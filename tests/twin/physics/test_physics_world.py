@@ -11,7 +11,6 @@ from bridge.geometry.mesh import box_corners
 from twin.physics import engine
 from twin.physics.arm import Arm, write_description
 from twin.physics.config import PhysicsConfig
-from twin.physics.engine import pybullet
 from twin.physics.world import World
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
@@ -42,19 +41,18 @@ def dropped(urdf: str, steps: int = 120) -> tuple[np.ndarray, str]:
 def test_what_a_world_before_was_told_changes_nothing(urdf: str) -> None:
     """Clients are used again: settings, bodies and constraints of one world end with it."""
     while engine._IDLE:
-        pybullet.disconnect(physicsClientId=engine._IDLE.pop())
+        engine._IDLE.pop().disconnect()
     first = dropped(urdf, 60)[1]
     odd = PhysicsConfig(rate_hz=480, solver_iterations=7, solver_residual=1e-2, gravity_m_s2=1.0)
     with World(urdf, {}, odd) as world:
         client = world.client
-        pybullet.setPhysicsEngineParameter(
+        client.setPhysicsEngineParameter(
             enableConeFriction=0,
             erp=0.9,
             contactERP=0.9,
             frictionERP=0.9,
             numSubSteps=3,
             reportSolverAnalytics=1,
-            physicsClientId=client,
         )
         world.add_free("left", SIZE, 0.05, at(0.5, 0.0, 0.3))
         for _ in range(20):
