@@ -107,9 +107,9 @@ class RobotWorld:
     """Median over pairs of the distance between the two ways to the camera or target."""
     residual_rad: Interval
     """The same for the angle."""
-    x_sigma_m: float
+    sigma_m: float
     """Standard deviation of the position of X, all axes together."""
-    x_sigma_rad: float
+    sigma_rad: float
     second_turn_rad: float
     """Root mean square turn about the second axis; what determines the translation of X."""
 
@@ -145,8 +145,8 @@ def solve(
         num_outliers=int((far > OUTLIER_SQUARE).sum()),
         residual_m=Interval(float(np.median(distance)), float(low[0]), float(high[0])),
         residual_rad=Interval(float(np.median(angle)), float(low[1]), float(high[1])),
-        x_sigma_m=float(np.sqrt(variance[3:6].sum())),
-        x_sigma_rad=float(np.sqrt(variance[:3].sum())),
+        sigma_m=float(np.sqrt(variance[3:6].sum())),
+        sigma_rad=float(np.sqrt(variance[:3].sum())),
         second_turn_rad=turn,
     )
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import chi2
 
-from bridge.episode import provenance, schema, streams
+from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import JointSample
 from bridge.episode.executions import executed_events
 from bridge.episode.reader import Episode
@@ -108,10 +108,8 @@ def weight_of(robot: RobotModel, moved: np.ndarray, free: Which, held: Which) ->
         speed[at], rise[at] = v[row], a[row]
         state = (model, data, robot.configuration(q[row]), speed, rise)
         described[row] = pin.rnea(*state)[at]
-        zeros, links_off = (
-            pin.computeRNEADerivatives(*state)[0],
-            pin.computeJointTorqueRegressor(*state),
-        )
+        zeros = pin.computeRNEADerivatives(*state)[0]
+        links_off = pin.computeJointTorqueRegressor(*state)
         own = [links_off[at, 10 * (link - 1) : 10 * link] for link in links]
         joints = (one, share[row] * one, *(np.diag(x[row]) for x in (dry, v, a)))
         weight = carries * links_off[at, last : last + 10] @ to_link
@@ -191,8 +189,7 @@ def calibrate_weights(run: RunFolder) -> tuple[dict[str, Any], str]:
         found.setdefault(task, {})[name] = together(mine)
     notes = [note for task, objects in found.items() for note in unlike(tasks[task], objects)]
     record: dict[str, Any] = {"tasks": found, "notes": notes, "not_determined": reasons}
-    record["id"] = provenance.hash_settings(record)
-    return record, str(write_part(run, MASSES, record)["calibration_id"])
+    return write_part(run, MASSES, record)
 
 
 def weighed(episode: Episode, task: Task) -> list[dict[str, Any]]:

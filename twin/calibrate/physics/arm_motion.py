@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.terminal import Output
@@ -23,7 +22,6 @@ from twin.calibrate.weights import calibrate_weights, describe_weights
 from twin.replay.rebuilt_scene import MASSES
 from twin.scene.store.calibration import write_part
 
-Describe = Callable[[Mapping[str, Any], str], str]
 PART = "motion"
 """Of ``calibration.json``."""
 
@@ -65,8 +63,7 @@ def calibrate_motion(run: RunFolder) -> tuple[dict[str, Any], str]:
         "sources": {push.episode: push.sha256 for push in pushes},
         "skipped": skipped,
     }
-    record["id"] = provenance.hash_settings(record)
-    return record, str(write_part(run, PART, record)["calibration_id"])
+    return write_part(run, PART, record)
 
 
 def end_point_m(push: Push, motion: Motion) -> float:
@@ -106,7 +103,7 @@ def calibrate_physics(
     run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[dict[str, Any], str]:
     """Find the arm's motion, its pushes' friction and what it weighed, where a run has them."""
-    parts: dict[str, tuple[Callable[[], tuple[Mapping[str, Any], str]], Describe]] = {
+    parts: dict[str, tuple[Callable[[], tuple[Any, str]], Callable[[Any, str], str]]] = {
         PART: (lambda: calibrate_motion(run), describe_motion),
         "physics": (lambda: calibrate_pushes(run, config, output), describe_pushes),
         MASSES: (lambda: calibrate_weights(run), describe_weights),
