@@ -205,7 +205,10 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
             reasons[camera_id] = str(error)
             output.detail(f"camera {camera_id}: {error}")
     if not found:
-        raise UsageError(_nothing(run, reasons))
+        told = " ".join(f"{key}: {reason}" for key, reason in sorted(reasons.items()))
+        nothing = f"no episode in {run.episodes_dir} has target poses or depth images of a camera. "
+        nothing += "Record one of them."
+        raise UsageError(f"no camera could be calibrated. {told}" if told else nothing)
     return write_calibration(run, found, reasons)
 
 
@@ -258,16 +261,6 @@ def target_record(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[
         **found,
         "sources": [pairs.source],
     }
-
-
-def _nothing(run: RunFolder, reasons: Mapping[str, str]) -> str:
-    if not reasons:
-        return (
-            f"no episode in {run.episodes_dir} has target poses or depth images of a camera. "
-            "Record one of them."
-        )
-    listed = " ".join(f"{key}: {reason}" for key, reason in sorted(reasons.items()))
-    return f"no camera could be calibrated. {listed}"
 
 
 def describe_cameras(record: Mapping[str, Any]) -> str:

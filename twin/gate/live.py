@@ -339,28 +339,23 @@ class LiveView:
 
     def urdf(self) -> str | None:
         """The robot description, None before it arrived."""
-        with self._lock:
-            return self._urdf
+        return self._urdf
 
     def newest_ns(self) -> int:
         """Latest source time seen, on the cell's own clock; 0 before anything arrived."""
-        with self._lock:
-            return self._newest_ns
+        return self._newest_ns
 
     def heard_ns(self) -> int:
         """When the last message arrived, on the receiver's clock; 0 before the first."""
-        with self._lock:
-            return self._heard_ns
+        return self._heard_ns
 
     def joints(self) -> HeardJoints | None:
         """The latest joint states, the arm's where there are several; None before any arrived."""
-        with self._lock:
-            return self._heard_joints
+        return self._heard_joints
 
     def executing(self) -> str | None:
         """Id of the plan that is being executed right now, None at rest."""
-        with self._lock:
-            return self._executing
+        return self._executing
 
     def frames(self, *, max_age_ns: int, max_per_camera: int) -> LiveFrames:
         """Each camera's newest frames after the last execution; none too old on cell's clock."""

@@ -162,13 +162,13 @@ def _asked(gate: GateConfig, task: Task, **asked: Any) -> Question:
     """A question as a gate with these settings has it."""
     config = replace(gate.replay, mode="dynamic", samples=gate.samples)
     config.refuse_soft(task.soft_objects)
-    more = {"max_steps": gate.max_steps, "any_robot": bool(gate.robot)}
-    return Question(task=task, config=config, **more, **asked)
+    asked |= {"max_steps": gate.max_steps, "any_robot": bool(gate.robot)}
+    return Question(task=task, config=config, **asked)
 
 
 def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
     """Judge here as a gate does in its own process; UndecidedError: a replay has too many steps."""
-    known = {
+    known: dict[str, Any] = {
         "run_path": run_path,
         "Ts_base_object": scene.Ts_base_object,
         "covariances": dict(scene.covariances),

@@ -86,7 +86,7 @@ class PhysicsError(TwinError):
     """The physics engine refused or lost something."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Drive:
     """A finger joint with a motor: one of the record's, or one that mimics one of them."""
 
@@ -190,16 +190,9 @@ class Arm:
     def _driven(self, mimics: Sequence[Mimic]) -> list[_Drive]:
         """The joints that open the gripper, leaders and followers."""
         leaders = {item.joint: item for item in self.record.gripper.fingers}
-        drives = [
-            _Drive(index=self._joints[name], finger=finger) for name, finger in leaders.items()
-        ]
+        drives = [_Drive(self._joints[name], finger) for name, finger in leaders.items()]
         return drives + [
-            _Drive(
-                index=self._joints[item.joint],
-                finger=leaders[item.leader],
-                multiplier=item.multiplier,
-                offset=item.offset,
-            )
+            _Drive(self._joints[item.joint], leaders[item.leader], item.multiplier, item.offset)
             for item in mimics
             if item.leader in leaders and item.joint not in leaders
         ]

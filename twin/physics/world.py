@@ -10,7 +10,7 @@ same bits on every run.
 from collections.abc import Callable, Sequence
 from math import cos
 from operator import methodcaller
-from typing import TypeVar
+from typing import Self
 
 import numpy as np
 from jaxtyping import Float
@@ -80,9 +80,6 @@ Box = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 """Centre and extents in the owner's frame [m]."""
 
 
-_World = TypeVar("_World")
-
-
 class Bodies:
     """An empty world of PyBullet. A context manager: its client goes away at the end."""
 
@@ -126,7 +123,7 @@ class Bodies:
             give_client_back(self.client)
             self.client = Client(-1)
 
-    def __enter__(self: _World) -> _World:
+    def __enter__(self) -> Self:
         """Use as a context manager."""
         return self
 

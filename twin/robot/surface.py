@@ -82,7 +82,7 @@ def link_surfaces(robot: RobotModel) -> tuple[LinkSurface, ...]:
         )
     if not surfaces:
         raise RobotDescriptionError(
-            found="has no collision shapes", hint="Without them nobody can say how it looks."
+            "has no collision shapes", "Without them nobody can say how it looks."
         )
     return tuple(surfaces)
 
@@ -179,8 +179,8 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
         vertices = np.asarray(mesh.vertices)
     else:
         raise RobotDescriptionError(
-            found=f"has a collision shape {type(shape).__name__} at {item.name}",
-            hint="Known: mesh, box, cylinder, sphere.",
+            f"has a collision shape {type(shape).__name__} at {item.name}",
+            "Known: mesh, box, cylinder, sphere.",
         )
     return vertices, np.asarray(mesh.triangles).astype(np.int64)
 

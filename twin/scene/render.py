@@ -73,8 +73,8 @@ def _given_posture(
     urdf = streams.robot_description(episode)
     if urdf is None:
         raise RobotDescriptionError(
-            found=f"is missing in episode {episode.info.id}",
-            hint=f"Choose an --episode that has {ROBOT_DESCRIPTION}.",
+            f"is missing in episode {episode.info.id}",
+            f"Choose an --episode that has {ROBOT_DESCRIPTION}.",
         )
     return Posture(joints_rad=joints, width_m=width_m or 0.0), urdf, "joints given"
 

@@ -24,9 +24,10 @@ from bridge.terminal import Output
 from twin import cli
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.pushes import UnusablePushError
+from twin.calibrate.posterior import draw_beforehand
 from twin.calibrate.weights import NoWeightError, smoothed, together, unlike, weighed, weight_of
 from twin.gate.twin_process import judge_of
-from twin.replay.config import PosteriorDraw, ReplayConfig
+from twin.replay.config import ReplayConfig
 from twin.replay.monte_carlo import draw_variation, with_draw
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.robot.model import load_robot
@@ -171,16 +172,7 @@ def test_what_a_trial_weighed_turns_the_next_verdict(
     config = for_task(ReplayConfig(), read_calibration(run), task)
     drawn = draw_variation(np.random.default_rng(0), scene(), config).objects["cube"].mass_kg
     assert 0 < abs(drawn - scene().task.objects["cube"].mass_kg) < 0.1
-    wide = PosteriorDraw(
-        finger_pair_friction=0.5,
-        surface_pair_friction=0.4,
-        mass_scale=2.0,
-        grip_scale=1.0,
-        bias_m=(0.0, 0.0),
-        wrong_yes=0.0,
-        wrong_no=0.0,
-        weight=1.0,
-    )
+    wide = replace(draw_beforehand(1)[0], mass_scale=2.0)
     for settings, times in ((config, 1.0), (ReplayConfig(), 2.0)):
         varied, _ = with_draw(wide, scene(), settings)
         ratio = varied.task.objects["cube"].mass_kg / scene().task.objects["cube"].mass_kg
@@ -204,10 +196,8 @@ def said(episode: str, mass_kg: float, half_kg: float) -> dict[str, Any]:
 
 
 def test_trials_that_agree_narrow_the_interval_and_others_are_named() -> None:
-    one, both = (
-        together([said("a", 0.30, 0.02)]),
-        together([said("a", 0.30, 0.02), said("b", 0.31, 0.02)]),
-    )
+    one = together([said("a", 0.30, 0.02)])
+    both = together([said("a", 0.30, 0.02), said("b", 0.31, 0.02)])
     assert both["value"] == pytest.approx(0.305)
     assert both["high"] - both["low"] < 0.8 * (one["high"] - one["low"])
     swapped = together([said("a", 0.30, 0.02), said("b", 0.05, 0.02)])
@@ -217,10 +207,8 @@ def test_trials_that_agree_narrow_the_interval_and_others_are_named() -> None:
 
 def test_objects_that_look_alike_and_differ_in_mass_are_named() -> None:
     task = load_task("stack_two_cubes")
-    first, second = (
-        task.manipulated[0],
-        next(key for key in task.objects if key != task.manipulated[0]),
-    )
+    first = task.manipulated[0]
+    second = next(key for key in task.objects if key != first)
     twins = replace(task, objects={**task.objects, second: replace(task.objects[first], id=second)})
     found = {first: together([said("a", 0.3, 0.02)]), second: together([said("a", 0.1, 0.02)])}
     assert "look alike and weigh 0.300 and 0.100 kg" in unlike(twins, found)[0]

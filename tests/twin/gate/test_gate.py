@@ -27,7 +27,7 @@ from bridge.task.task_file import Task, load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate import gate as gate_module
-from twin.gate.gate import JudgedTasks, PlanTooLargeError, no_verdict, of_another_scene
+from twin.gate.gate import JudgedTasks, PlanTooLargeError, of_another_scene
 
 
 def arm(**changes: Any) -> Any:
@@ -53,16 +53,6 @@ def test_the_verdict_is_the_replays_from_the_localised_poses() -> None:
     assert sorted(seen["poses"]) == ["box", "cube"]
     assert seen["urdf"] == URDF
     assert seen["start_rad"].tolist() == [0.0] * 6
-
-
-def test_a_task_with_soft_objects_is_replayed_like_any_other() -> None:
-    file = chosen_task_file("sloth_into_basket")
-    there = {
-        name: SimpleNamespace(found=True, reason=None, T_base_object=np.eye(4))
-        for name in file.task().objects
-    }
-    gate = gate_with(tasks=JudgedTasks(only=file), localise=lambda *_: there)
-    assert gate.judge(replace(PLAN, task="sloth_into_basket").to_json()).accepted is True
 
 
 def sees(**seen: Any) -> dict[str, Any]:
@@ -246,12 +236,6 @@ def test_a_gate_of_one_task_wants_that_very_file() -> None:
     assert "that is asked for has sha256 000000000000" in (other.reason or "")
     same = replace(PLAN, task_sha256=TASK_FILE.sha256)
     assert gate_with().judge(same.to_json()).accepted is True
-
-
-def test_no_verdict_is_never_a_yes() -> None:
-    verdict = no_verdict(PLAN, "because")
-    assert verdict.accepted is None
-    assert verdict.reason == "because"
 
 
 def test_the_same_frames_are_searched_again_for_another_task(any_task: JudgedTasks) -> None:

@@ -140,7 +140,7 @@ def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
 
 def write_part(run: RunFolder, name: str, part: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     """Write what was learned, in place of an earlier one; returns it and the calibration's id."""
-    named = {**part, "id": provenance.hash_settings(part)}
+    named = {**part, "id": provenance.hash_settings(dict(part))}
     return named, str(_store(run, {**_kept(run), name: named})["calibration_id"])
 
 
