@@ -231,17 +231,15 @@ def _camera(
         return target_record(pairs, config, base)
     topic = f"...{CAMERAS}{camera_id}{TARGET_POSE}"
     if where == NO_DEPTH:
-        message = (
+        raise UsageError(
             f"camera {camera_id} has neither target poses (topic {topic}) "
             "nor depth images with intrinsics. Record one of them."
         )
-        raise UsageError(message)
     if where == MOVING:
-        message = (
+        raise UsageError(
             f"camera {camera_id} moves with the robot and there are no target poses of it. Record "
             f"a target from 10 to 20 places on {topic}."
         )
-        raise UsageError(message)
     with_depth = [episode for episode in episodes if camera_id in depth_cameras(episode)]
     return find_fixed_camera(with_depth, camera_id, base, seed=config.seed)
 

@@ -154,22 +154,20 @@ def solve(
 def check_motions(Ts_a: Float[np.ndarray, "num_pairs 4 4"]) -> float:
     """Return the root mean square turn about the second axis of all motions [rad]."""
     if len(Ts_a) < MIN_PAIRS:
-        message = (
+        raise UndeterminedCameraError(
             f"{len(Ts_a)} pair(s) of poses do not determine a camera; at least {MIN_PAIRS} are "
             "needed, 10 to 20 are good. Record the target from more places."
         )
-        raise UndeterminedCameraError(message)
     P, _ = motions(Ts_a, Ts_a)
     turns = se3.vector_from_rotation(P[:, :3, :3])
     sizes = np.linalg.svd(turns, compute_uv=False) / np.sqrt(len(turns))
     if sizes[1] < MIN_TURN_RAD:
         found = "does not turn at all" if sizes[0] < MIN_TURN_RAD else "turns about one axis only"
-        message = (
+        raise UndeterminedCameraError(
             f"over {len(Ts_a)} poses the hand {found} ({np.degrees(sizes[1]):.1f} degrees about "
             f"any second axis, {np.degrees(MIN_TURN_RAD):.0f} are needed): the camera's position "
             "is not determined. Tilt the tool about two different axes, 20 degrees or more."
         )
-        raise UndeterminedCameraError(message)
     return float(sizes[1])
 
 
@@ -232,26 +230,23 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> tuple[Robot
     size = {name: item.residual_m.value for name, item in found.items()}
     best, other = sorted(each, key=lambda name: size[name])
     if mount == "auto" and size[other] < CLEARLY * size[best]:
-        message = (
+        raise UndeterminedCameraError(
             f"the {len(pairs)} pose pairs of {pairs.source} fit a camera in the hand to "
             f"{size['hand'] * 1e3:.1f} mm and a fixed one to {size['fixed'] * 1e3:.1f} mm, which "
             "does not tell them apart. Say which: --mount hand or --mount fixed."
         )
-        raise UndeterminedCameraError(message)
     chosen = best if mount == "auto" else mount
     if chosen != best and size[chosen] > CLEARLY * size[best]:
-        message = (
+        raise UndeterminedCameraError(
             f"the pose pairs of {pairs.source} miss a camera mounted {chosen!r} by "
             f"{size[chosen] * 1e3:.1f} mm and fit {best!r} to {size[best] * 1e3:.1f} mm. Say "
             f"--mount {best}, or invert the target poses: T_camera_target is wanted."
         )
-        raise UndeterminedCameraError(message)
     metres, turn = size[chosen], found[chosen].residual_rad.value
     if metres > MAX_RESIDUAL_M or turn > MAX_RESIDUAL_RAD:
-        message = (
+        raise UndeterminedCameraError(
             f"the pose pairs of {pairs.source} disagree by {metres * 1e3:.0f} mm and "
             f"{turn * 57.3:.1f} degrees (median): they come from different instants, another link "
             "or a target that moved. Check --link, and that robot and target stood still."
         )
-        raise UndeterminedCameraError(message)
     return found[chosen], chosen

@@ -295,9 +295,7 @@ def describe_weights(record: Mapping[str, Any], calibration_id: str) -> str:
             lines.append(f"  {task} {name}: {item['value']:.3f} kg {ends}, {used}")
             for row in item["sources"]:
                 pairs = zip(row["centre_m"], row["centre_half_m"], strict=True)
-                centre = ", ".join(
-                    f"{1e3 * value:.0f} +- {1e3 * half:.0f}" for value, half in pairs
-                )
+                centre = ", ".join(f"{1e3 * x:.0f} +- {1e3 * half:.0f}" for x, half in pairs)
                 when = f"{row['episode']}, {row['from_s']:.2f} to {row['to_s']:.2f} s"
                 told = f"{row['mass_kg']:.3f} +- {row['half_kg']:.3f} kg"
                 lines.append(f"    {when}: {told}, centre ({centre}) mm from the tool")

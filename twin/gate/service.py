@@ -145,8 +145,7 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     from twin.scene.store.folder import scene_hash_of  # noqa: PLC0415
 
     if not CELL_NAME.match(config.cell):
-        message = f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'."
-        raise UsageError(message)
+        raise UsageError(f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'.")
     run = RunFolder.open(path)
     tasks = JudgedTasks(
         only=chosen_task_file(config.task, tasks_dir=run.tasks_dir) if config.task else None,

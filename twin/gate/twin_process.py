@@ -203,9 +203,7 @@ class TwinProcess:
 
     def localise(self, frames: Any, task: Task, ends_s: float) -> Mapping[str, Any]:
         """Find a task's objects."""
-        item = (self._run_path, frames, task)
-        found: Mapping[str, Any] = self._do("localisation", look, item, ends_s)
-        return found
+        return dict(self._do("localisation", look, (self._run_path, frames, task), ends_s))
 
     def replay(
         self,

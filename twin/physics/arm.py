@@ -114,11 +114,10 @@ def require_parts(record: Robot, joints: Collection[str], links: Collection[str]
     tool = (record.tool_frame, *record.gripper.finger_links)
     missing += [name for name in tool if name not in links]
     if missing:
-        message = (
+        raise PhysicsError(
             f"the robot description lacks {', '.join(missing)}; it has the joints "
             f"{', '.join(joints)}. Physics needs the arm and the fingers of {record.name!r}."
         )
-        raise PhysicsError(message)
 
 
 class Arm:
@@ -149,11 +148,10 @@ class Arm:
                 flags = pybullet.URDF_USE_INERTIA_FROM_FILE
                 return int(self._client.loadURDF(str(path), useFixedBase=True, flags=flags))
             except pybullet.error as error:
-                message = (
+                raise PhysicsError(
                     f"PyBullet does not load the robot description ({error}). "
                     "Check its links and collision meshes."
-                )
-                raise PhysicsError(message) from error
+                ) from error
 
     def _index_joints(self, mimics: Sequence[Mimic]) -> None:
         record, gripper = self.record, self.record.gripper

@@ -10,7 +10,7 @@ same bits on every run.
 from collections.abc import Callable, Sequence
 from math import cos
 from operator import methodcaller
-from typing import Self
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -80,6 +80,9 @@ Box = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 """Centre and extents in the owner's frame [m]."""
 
 
+_World = TypeVar("_World")
+
+
 class Bodies:
     """An empty world of PyBullet. A context manager: its client goes away at the end."""
 
@@ -123,7 +126,7 @@ class Bodies:
             give_client_back(self.client)
             self.client = Client(-1)
 
-    def __enter__(self) -> Self:
+    def __enter__(self: _World) -> _World:
         """Use as a context manager."""
         return self
 
@@ -300,6 +303,5 @@ class World(Bodies):
         if object_id not in self.free_ids:
             soft = () if self._soft is None else self._soft.names
             known = ", ".join([*self.free_ids, *soft]) or "none"
-            message = f"no object {object_id!r} moves in this world. There are: {known}."
-            raise PhysicsError(message)
+            raise PhysicsError(f"no object {object_id!r} moves in this world. There are: {known}.")
         return self.free_ids[object_id]

@@ -97,15 +97,10 @@ def test_it_knows_how_wrong_the_position_is() -> None:
 
 def about_one_axis(count: int, wobble_rad: float) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
-    Ts = []
-    for turn in np.linspace(-1.0, 1.0, count):
-        T = np.eye(4)
-        T[:3, :3] = se3.rotation_from_vector(
-            np.array([0, 0, turn]) + rng.normal(size=3) * wobble_rad
-        )
-        T[:3, 3] = rng.normal(size=3) * 0.2
-        Ts.append(T)
-    Ts_a = np.array(Ts)
+    turns = np.outer(np.linspace(-1.0, 1.0, count), [0, 0, 1])
+    Ts_a = np.tile(np.eye(4), (count, 1, 1))
+    Ts_a[:, :3, :3] = se3.rotation_from_vector(turns + rng.normal(size=turns.shape) * wobble_rad)
+    Ts_a[:, :3, 3] = rng.normal(size=(count, 3)) * 0.2
     X, Z = transform(rng, 0.1), transform(rng)
     return Ts_a, se3.invert(Z) @ Ts_a @ X
 

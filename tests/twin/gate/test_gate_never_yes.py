@@ -29,7 +29,8 @@ class ChangingPerception(FakePerception):
     postures: list[Any] = field(default_factory=lambda: [HOME])
 
     def joints(self) -> Any:
-        return self.postures.pop(0) if len(self.postures) > 1 else self.postures[0]
+        self.arm = self.postures.pop(0) if len(self.postures) > 1 else self.postures[0]
+        return super().joints()
 
     def executing(self) -> str | None:
         return self.executed.pop(0) if len(self.executed) > 1 else self.executed[0]
@@ -81,7 +82,7 @@ LOOKS = [[frame(1)], [frame(2)]]
 
 
 def at(joints_rad: list[float]) -> Any:
-    return SimpleNamespace(**{**vars(HOME), "position_rad": np.array(joints_rad)})
+    return SimpleNamespace(**{**vars(HOME), "position": np.array(joints_rad)})
 
 
 def test_a_yes_needs_the_cell_to_be_as_it_was_judged() -> None:

@@ -21,9 +21,8 @@ def test_a_wall_reaches_as_far_as_its_pose_says(urdf: str, seed: int) -> None:
         for axis in range(3):
             centre = np.array([0.05, 0.0, 0.0])
             start = centre + np.eye(3)[axis]
-            hit = world.client.rayTest(se3.apply(T, start).tolist(), se3.apply(T, centre).tolist())[
-                0
-            ]
+            ends = (se3.apply(T, point).tolist() for point in (start, centre))
+            (hit,) = world.client.rayTest(*ends)
             assert hit[2] == pytest.approx(1.0 - extents[axis] / 2, abs=1e-3)
 
 
