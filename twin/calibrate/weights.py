@@ -49,7 +49,7 @@ ZERO_RAD, LATE_S, LINK, CENTRE_M = 0.003, 0.01, 0.05, 0.01
 MASS_KG, HAND_M, LEVER = 5.0, 0.05, 0.005
 """Of the weight, of where it lies from the tool along each axis, of levers in parts of them."""
 CREEP_RAD_S, LEAST_NM = 0.01, 1e-3
-"""A joint that is slower may be held by dry friction, either way; none is believed better."""
+"""A joint that is slower may be held by dry friction, either way; none is known better."""
 TAILS, ROUNDS, FEWEST = 4, 8, 20
 """Degrees of freedom of Student's t, which residuals have, for fingers touch things; fits, each
 with weights from the one before; samples, at least."""
@@ -266,8 +266,8 @@ def together(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     weights = (np.array([row["half_kg"] for row in rows]) / Z_95) ** -2.0
     value, why = float(np.average(masses, weights=weights)), ""
     if float((weights * (masses - value) ** 2).sum()) > chi2.ppf(AGREE, len(rows) - 1):
-        said = ", ".join(f"{row['mass_kg']:.3f} kg in {row['episode']}" for row in rows)
-        why = f"trials do not agree ({said}): another object, or its look-alike, was held"
+        each = ", ".join(f"{row['mass_kg']:.3f} kg in {row['episode']}" for row in rows)
+        why = f"trials do not agree ({each}): another object, or its look-alike, was held"
     sigma = max(float(weights.sum()) ** -0.5, LEVER * value)
     ends = {"low": value - Z_95 * sigma, "high": value + Z_95 * sigma, "why": why}
     return {"value": value, **ends, "sigma_log": sigma / value, "sources": list(rows)}
