@@ -54,6 +54,9 @@ class FileSession:
             return json.dumps({"of": len(done), "episodes": done}).encode()
         raise NoReplyError(key=key, timeout_s=timeout_s)
 
+    def subscribe(self, key_expression: str, callback: object) -> None:
+        """Nobody else sends."""
+
     def _stop(self, outcome: dict[str, Any] | None, *, discard: bool) -> None:
         writer, self._writer = self._writer, None
         if writer is None:

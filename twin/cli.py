@@ -113,7 +113,7 @@ def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Outp
 
     Writes scene/calibration.json.
     Example: robot-gst calibrate runs/monday --cameras
-    From imported pushes: robot-gst calibrate runs/kinova --physics
+    From imported pushes, or trials' efforts: robot-gst calibrate runs/kinova --physics
     From trials: robot-gst calibrate runs/monday --posterior
 
     Args:
@@ -136,9 +136,9 @@ def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Outp
         output.result(record, describe_posterior(posterior, calibration_id))
         return 0
     if config.physics:
-        from twin.calibrate.physics.arm_motion import calibrate_imported
+        from twin.calibrate.physics.arm_motion import calibrate_physics
 
-        output.result(*calibrate_imported(run_folder, config, output))
+        output.result(*calibrate_physics(run_folder, config, output))
         return 0
     from twin.calibrate.cameras import calibrate_cameras, describe_cameras
 

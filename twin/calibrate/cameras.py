@@ -182,10 +182,6 @@ def _nominal_pose(seen: _Seen, camera_id: str) -> Float[np.ndarray, "4 4"] | Non
     return T if root == streams.recorded_robot(seen.episode).base_frame else None
 
 
-class NothingToCalibrateError(UsageError):
-    """The run holds nothing from which a camera could be found."""
-
-
 def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -> dict[str, Any]:
     """Find every camera the run has data of, and write ``scene/calibration.json``.
 
@@ -209,7 +205,10 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
             reasons[camera_id] = str(error)
             output.detail(f"camera {camera_id}: {error}")
     if not found:
-        raise NothingToCalibrateError(_nothing(run, reasons))
+        told = " ".join(f"{key}: {reason}" for key, reason in sorted(reasons.items()))
+        nothing = f"no episode in {run.episodes_dir} has target poses or depth images of a camera. "
+        nothing += "Record one of them."
+        raise UsageError(f"no camera could be calibrated. {told}" if told else nothing)
     return write_calibration(run, found, reasons)
 
 
@@ -232,17 +231,15 @@ def _camera(
         return target_record(pairs, config, base)
     topic = f"...{CAMERAS}{camera_id}{TARGET_POSE}"
     if where == NO_DEPTH:
-        message = (
+        raise UsageError(
             f"camera {camera_id} has neither target poses (topic {topic}) "
             "nor depth images with intrinsics. Record one of them."
         )
-        raise NothingToCalibrateError(message)
     if where == MOVING:
-        message = (
+        raise UsageError(
             f"camera {camera_id} moves with the robot and there are no target poses of it. Record "
             f"a target from 10 to 20 places on {topic}."
         )
-        raise NothingToCalibrateError(message)
     with_depth = [episode for episode in episodes if camera_id in depth_cameras(episode)]
     return find_fixed_camera(with_depth, camera_id, base, seed=config.seed)
 
@@ -250,35 +247,18 @@ def _camera(
 def target_record(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[str, Any]:
     """Say what pose pairs give."""
     solution, mount = find_camera(pairs, config.mount, seed=config.seed)
-    in_hand = mount == "hand"
+    found, names = asdict(solution), ("T_link_camera", "T_effector_target")
+    X, Z = (se3.pose_record(found.pop(name)) for name in "XZ")
+    names = ("T_link_camera", "T_base_target") if mount == "hand" else names[::-1]
     return {
         "method": "target pose pairs, AX = ZB",
         "mount": mount,
-        "link": config.link if in_hand else base,
+        "link": config.link if mount == "hand" else base,
         "stream": "color",
-        "T_link_camera": se3.pose_record(solution.X if in_hand else solution.Z),
-        "T_base_target" if in_hand else "T_effector_target": se3.pose_record(
-            solution.Z if in_hand else solution.X
-        ),
-        "residual_m": asdict(solution.residual_m),
-        "residual_rad": asdict(solution.residual_rad),
-        "sigma_m": solution.x_sigma_m,
-        "sigma_rad": solution.x_sigma_rad,
-        "num_pairs": solution.num_pairs,
-        "num_outliers": solution.num_outliers,
-        "second_turn_rad": solution.second_turn_rad,
+        **dict(zip(names, (X, Z), strict=True)),
+        **found,
         "sources": [pairs.source],
     }
-
-
-def _nothing(run: RunFolder, reasons: Mapping[str, str]) -> str:
-    if not reasons:
-        return (
-            f"no episode in {run.episodes_dir} has target poses or depth images of a camera. "
-            "Record one of them."
-        )
-    listed = " ".join(f"{key}: {reason}" for key, reason in sorted(reasons.items()))
-    return f"no camera could be calibrated. {listed}"
 
 
 def describe_cameras(record: Mapping[str, Any]) -> str:

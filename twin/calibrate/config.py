@@ -18,8 +18,8 @@ class CalibrateConfig:
     cameras: bool = False
     """Where the cameras are, written to RUN/scene/calibration.json."""
     physics: bool = False
-    """Motion of the arm and friction of pushes from imported recordings, written to
-    RUN/scene/calibration.json; used where held-out ones confirm it."""
+    """Motion of the arm and friction of pushes from imported recordings, used where held-out ones
+    confirm it, and masses from the joint efforts of trials; to RUN/scene/calibration.json."""
     posterior: bool = False
     """Which friction, masses, force and common shift agree with the trials executed in this run,
     written to RUN/scene/calibration.json; samples of replays and of the gate then draw from it."""

@@ -104,9 +104,9 @@ class RobotWorld:
     """Median over pairs of the distance between the two ways to the camera or target."""
     residual_rad: Interval
     """The same for the angle."""
-    x_sigma_m: float
+    sigma_m: float
     """Standard deviation of the position of X, all axes together."""
-    x_sigma_rad: float
+    sigma_rad: float
     second_turn_rad: float
     """Root mean square turn about the second axis; what determines the translation of X."""
 
@@ -142,8 +142,8 @@ def solve(
         num_outliers=int((far > OUTLIER_SQUARE).sum()),
         residual_m=Interval(float(np.median(distance)), float(low[0]), float(high[0])),
         residual_rad=Interval(float(np.median(angle)), float(low[1]), float(high[1])),
-        x_sigma_m=float(np.sqrt(variance[3:6].sum())),
-        x_sigma_rad=float(np.sqrt(variance[:3].sum())),
+        sigma_m=float(np.sqrt(variance[3:6].sum())),
+        sigma_rad=float(np.sqrt(variance[:3].sum())),
         second_turn_rad=turn,
     )
 
@@ -151,22 +151,20 @@ def solve(
 def check_motions(Ts_a: Float[np.ndarray, "num_pairs 4 4"]) -> float:
     """Return the root mean square turn about the second axis of all motions [rad]."""
     if len(Ts_a) < MIN_PAIRS:
-        message = (
+        raise UndeterminedCameraError(
             f"{len(Ts_a)} pair(s) of poses do not determine a camera; at least {MIN_PAIRS} are "
             "needed, 10 to 20 are good. Record the target from more places."
         )
-        raise UndeterminedCameraError(message)
     P, _ = motions(Ts_a, Ts_a)
     turns = se3.vector_from_rotation(P[:, :3, :3])
     sizes = np.linalg.svd(turns, compute_uv=False) / np.sqrt(len(turns))
     if sizes[1] < MIN_TURN_RAD:
         found = "does not turn at all" if sizes[0] < MIN_TURN_RAD else "turns about one axis only"
-        message = (
+        raise UndeterminedCameraError(
             f"over {len(Ts_a)} poses the hand {found} ({np.degrees(sizes[1]):.1f} degrees about "
             f"any second axis, {np.degrees(MIN_TURN_RAD):.0f} are needed): the camera's position "
             "is not determined. Tilt the tool about two different axes, 20 degrees or more."
         )
-        raise UndeterminedCameraError(message)
     return float(sizes[1])
 
 
@@ -229,26 +227,23 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> tuple[Robot
     size = {name: item.residual_m.value for name, item in found.items()}
     best, other = sorted(each, key=lambda name: size[name])
     if mount == "auto" and size[other] < CLEARLY * size[best]:
-        message = (
+        raise UndeterminedCameraError(
             f"the {len(pairs)} pose pairs of {pairs.source} fit a camera in the hand to "
             f"{size['hand'] * 1e3:.1f} mm and a fixed one to {size['fixed'] * 1e3:.1f} mm, which "
             "does not tell them apart. Say which: --mount hand or --mount fixed."
         )
-        raise UndeterminedCameraError(message)
     chosen = best if mount == "auto" else mount
     if chosen != best and size[chosen] > CLEARLY * size[best]:
-        message = (
+        raise UndeterminedCameraError(
             f"the pose pairs of {pairs.source} miss a camera mounted {chosen!r} by "
             f"{size[chosen] * 1e3:.1f} mm and fit {best!r} to {size[best] * 1e3:.1f} mm. Say "
             f"--mount {best}, or invert the target poses: T_camera_target is wanted."
         )
-        raise UndeterminedCameraError(message)
     metres, turn = size[chosen], found[chosen].residual_rad.value
     if metres > MAX_RESIDUAL_M or turn > MAX_RESIDUAL_RAD:
-        message = (
+        raise UndeterminedCameraError(
             f"the pose pairs of {pairs.source} disagree by {metres * 1e3:.0f} mm and "
             f"{turn * 57.3:.1f} degrees (median): they come from different instants, another link "
             "or a target that moved. Check --link, and that robot and target stood still."
         )
-        raise UndeterminedCameraError(message)
     return found[chosen], chosen

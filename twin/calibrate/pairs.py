@@ -57,8 +57,7 @@ def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> Po
         episodes: Those without poses of a target from this camera are passed over.
         link: Robot link whose pose in the base is the other half of a pair.
     """
-    hands: list[np.ndarray] = []
-    targets: list[np.ndarray] = []
+    stops: list[tuple[np.ndarray, np.ndarray]] = []
     used = []
     for episode in episodes:
         topics = [
@@ -71,15 +70,9 @@ def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> Po
         if not samples:
             continue
         used.append(episode.info.id)
-        for hand, target in _stops(posture_track(episode), samples, link):
-            hands.append(hand)
-            targets.append(target)
-    empty = np.zeros((0, 4, 4))
-    return PosePairs(
-        Ts_base_effector=np.array(hands) if hands else empty,
-        Ts_camera_target=np.array(targets) if targets else empty,
-        source=", ".join(used),
-    )
+        stops += _stops(posture_track(episode), samples, link)
+    hands, targets = np.array(stops).reshape(-1, 2, 4, 4).swapaxes(0, 1)
+    return PosePairs(Ts_base_effector=hands, Ts_camera_target=targets, source=", ".join(used))
 
 
 def _stops(

@@ -18,8 +18,9 @@ from jaxtyping import Float
 from scipy.special import betaln, ndtri
 from scipy.stats import qmc
 
-from bridge.episode import provenance, streams
+from bridge.episode import streams
 from bridge.episode.catalogue import outcome_of
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
@@ -64,15 +65,11 @@ CENTRE_OF_MASS = 0.15
 have 0, a bottle that is half full 0.5 along its height."""
 
 
-class NoTrialsError(UsageError):
-    """Nothing was executed that could be weighed by."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Trial:
     """One executed plan, what it began from and how it ended."""
 
-    episode: str
+    info: EpisodeInfo
     sha256: str
     plan: Plan
     scene: ReplayScene
@@ -80,20 +77,11 @@ class Trial:
     success: bool
     ends_m: Mapping[str, Float[np.ndarray, "2"]]
     """Where objects that move were localised afterwards, x and y; without those not found."""
-    cell: str = ""
-    task_sha256: str = ""
-    start_seed: int | None = None
-    """What it began from and with what file, so that others can be kept apart from it."""
 
     def to_record(self) -> dict[str, Any]:
-        """What a posterior says of its source."""
-        return {
-            "sha256": self.sha256,
-            "success": self.success,
-            "cell": self.cell,
-            "task_sha256": self.task_sha256,
-            "start_seed": self.start_seed,
-        }
+        """What a posterior says of its source, so that others can be kept apart from it."""
+        kept = {name: getattr(self.info, name) for name in ("cell", "task_sha256", "start_seed")}
+        return {"sha256": self.sha256, "success": self.success, **kept}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,8 +129,8 @@ def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDra
             bias_m=(float(bias[0]), float(bias[1])),
             boxes=_boxes(movers, row.reshape(-1, 4)),
             weight=1.0 / count,
-            wrong_yes=Record(right=0, wrong=0).probability_wrong,
-            wrong_no=Record(right=0, wrong=0).probability_wrong,
+            wrong_yes=WRONG[0] / sum(WRONG),
+            wrong_no=WRONG[0] / sum(WRONG),
         )
         for (finger, surface), (mass, grip), bias, row in zip(
             frictions, factors, BIAS_M * z[:, 4:6], unit[:, 6:], strict=True
@@ -179,7 +167,7 @@ def read_trials(run: RunFolder, output: Output) -> Trials:
     if not trials:
         why = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
         message = f"{run.path} has no executed trial with an outcome. {why}".rstrip()
-        raise NoTrialsError(message)
+        raise UsageError(message)
     return Trials(usable=trials, skipped=reasons, tasks=frozenset(tasks - {""}))
 
 
@@ -210,7 +198,7 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
         known = replace(known, record=record)
     config = for_task(ReplayConfig(), known, task)
     return Trial(
-        episode=episode.info.id,
+        info=episode.info,
         sha256=episode.sha256(),
         plan=plan,
         scene=scene,
@@ -219,9 +207,6 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
         ends_m={
             name: T[:2, 3] for name, T in after.Ts_base_object.items() if name in scene.movable()
         },
-        cell=episode.info.cell,
-        task_sha256=episode.info.task_sha256,
-        start_seed=episode.info.start_seed,
     )
 
 
@@ -256,24 +241,15 @@ def log_nearness(trial: Trial, ended: Ended) -> float:
     return total
 
 
-@dataclass(frozen=True, kw_only=True)
-class Record:
-    """How often a draw's answer was right in trials in which it was the same."""
+def trusted(right: Any, wrong: Any) -> tuple[Any, Any]:
+    """Of how often an answer was right and wrong in trials in which a draw gave it.
 
-    right: int
-    wrong: int
-
-    @property
-    def log_likelihood(self) -> float:
-        """Of exactly these, however often it is wrong in this session."""
-        a, b = WRONG
-        return float(betaln(a + self.wrong, b + self.right) - betaln(a, b))
-
-    @property
-    def probability_wrong(self) -> float:
-        """That the next such answer is wrong."""
-        a, b = WRONG
-        return (a + self.wrong) / (a + b + self.wrong + self.right)
+    Returns:
+        The log likelihood of exactly these, however often it is wrong in this session, and the
+        probability that the next such answer is wrong.
+    """
+    a, b = WRONG[0] + wrong, WRONG[1] + right
+    return betaln(a, b) - betaln(*WRONG), a / (a + b)
 
 
 Piece = tuple[int, Trial, PosteriorDraw]
@@ -305,18 +281,14 @@ def weighed(
                 raise RuntimeError(ended.trace or ended.message)
             logs[number] += log_nearness(trial, ended)
             counts[number, int(ended.success), int(ended.success == trial.success)] += 1
-            advance(done, trial.episode)
-    records = [
-        [Record(right=int(right), wrong=int(wrong)) for wrong, right in rows] for rows in counts
-    ]
-    logs += [no.log_likelihood + yes.log_likelihood for no, yes in records]
+            advance(done, trial.info.id)
+    likelihoods, wrong = trusted(counts[:, :, 1], counts[:, :, 0])
+    logs += likelihoods.sum(axis=1)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     return [
-        replace(
-            draw, weight=float(w), wrong_yes=yes.probability_wrong, wrong_no=no.probability_wrong
-        )
-        for draw, w, (no, yes) in zip(draws, weights, records, strict=True)
+        replace(draw, weight=weight, wrong_yes=yes, wrong_no=no)
+        for draw, weight, (no, yes) in zip(draws, weights.tolist(), wrong.tolist(), strict=True)
     ]
 
 
@@ -341,15 +313,14 @@ def calibrate_posterior(
         tasks[name] = {
             "draws": [asdict(draw) for draw in draws],
             "effective_draws": effective(draws),
-            "sources": {trial.episode: trial.to_record() for trial in trials},
+            "sources": {trial.info.id: trial.to_record() for trial in trials},
         }
     record: dict[str, Any] = {
         "tasks": tasks,
         "without_trials": sorted(found.tasks - tasks.keys()),
         "skipped": found.skipped,
     }
-    record["id"] = provenance.hash_settings(record)
-    return record, str(write_part(run, "posterior", record)["calibration_id"])
+    return write_part(run, "posterior", record)
 
 
 def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:

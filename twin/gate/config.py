@@ -69,5 +69,6 @@ class GateConfig:
             },
         )
         if self.min_p_success > 0 and self.samples == 0:
-            message = "--min-p-success needs samples to count: add, for example, --samples 16."
-            raise UsageError(message)
+            raise UsageError(
+                "--min-p-success needs samples to count: add, for example, --samples 16."
+            )

@@ -131,7 +131,7 @@ class Perception(Protocol):
         """The robot description."""
 
     def joints(self) -> Any:
-        """The latest joint states, with their names, stamp and arrival; None before any."""
+        """The latest ``JointSample``, and when it arrived; None before any."""
 
     def executing(self) -> str | None:
         """The plan being executed right now."""
@@ -337,10 +337,11 @@ class Gate:
 
     def _where_the_arm_is(self, arrived_ns: int, robot: Robot) -> Joints:
         """The arm's joints as the cell said last, in their order [rad]."""
-        heard = self._perception.joints()
+        known = self._perception.joints()
         topic = cell_topic(self._config.cell, JOINT_STATES)
-        if heard is None:
+        if known is None:
             raise UndecidedError(f"no joint states have arrived on {topic}")
+        heard, received_ns = known
         missing = [name for name in robot.joints if name not in heard.names]
         if missing:
             raise UndecidedError(
@@ -348,7 +349,7 @@ class Gate:
                 f"{', '.join(heard.names) or 'nothing'}, and lack {', '.join(missing)}"
             )
         behind_ns = self._perception.newest_ns() - heard.stamp_ns
-        silent_ns = arrived_ns - max(heard.received_ns, self._contact_ns)
+        silent_ns = arrived_ns - max(received_ns, self._contact_ns)
         age_s, limit_s = max(behind_ns, silent_ns) * 1e-9, MAX_JOINT_AGE_S
         if age_s > limit_s:
             raise UndecidedError(
@@ -356,7 +357,7 @@ class Gate:
                 f"{limit_s:g} s say where the robot is"
             )
         order = [heard.names.index(name) for name in robot.joints]
-        values: Joints = np.asarray(heard.position_rad, dtype=np.float64)
+        values: Joints = np.asarray(heard.position, dtype=np.float64)
         if len(values) != len(heard.names) or not np.isfinite(values[order]).all():
             raise UndecidedError(f"the joint states on {topic} hold no numbers for every joint")
         return values[order]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from bridge.clock import STEP_NS
 from bridge.episode.cdr import codec
@@ -182,19 +182,6 @@ MAX_FRAMES = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeardJoints:
-    """The latest joint states of an arm."""
-
-    names: tuple[str, ...]
-    position_rad: Float[np.ndarray, " num_joints"]
-    """In the order of ``names``."""
-    stamp_ns: int
-    """On the cell's own clock."""
-    received_ns: int
-    """On the receiver's."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class LiveFrames:
     """Frames taken since the last motion, and why cameras gave none."""
 
@@ -213,7 +200,7 @@ class LiveView:
         self._calibration = calibration
         self._places = {} if calibration is None else dict(calibration.cameras)  # never ``/tf``
         self._joints: deque[bytes] = deque(maxlen=KEPT_JOINTS)
-        self._heard_joints: HeardJoints | None = None
+        self._heard_joints: tuple[JointSample, int] | None = None
         self._lock = threading.Lock()
         self._cameras: dict[str, LiveCamera] = {}
         self._static: dict[str, FrameTransform] = {}
@@ -266,13 +253,8 @@ class LiveView:
         self._newest_ns = max(self._newest_ns, sample.stamp_ns)
         # A gripper may publish beside the arm: it does not take the arm's place.
         known = self._heard_joints
-        if known is None or self._is_of_arm(sample.names) or not self._is_of_arm(known.names):
-            self._heard_joints = HeardJoints(
-                names=tuple(sample.names),
-                position_rad=np.array(sample.position, dtype=np.float64),
-                stamp_ns=sample.stamp_ns,
-                received_ns=received_ns,
-            )
+        if known is None or self._is_of_arm(sample.names) or not self._is_of_arm(known[0].names):
+            self._heard_joints = sample, received_ns
 
     def _watch_clock(self, stamp_ns: int) -> None:
         """Notice a clock that was set back: a cell started again, a simulation from its start.
@@ -300,7 +282,7 @@ class LiveView:
         if self._urdf is not None:
             return set(robot_of(self._urdf).joints) <= set(names)
         known = self._heard_joints
-        return known is None or len(names) >= len(known.names)
+        return known is None or len(names) >= len(known[0].names)
 
     def _take_event(self, data: bytes) -> None:
         event = parse_record(data, name="event", package="bridge.episode")
@@ -339,28 +321,26 @@ class LiveView:
 
     def urdf(self) -> str | None:
         """The robot description, None before it arrived."""
-        with self._lock:
-            return self._urdf
+        return self._urdf
 
     def newest_ns(self) -> int:
         """Latest source time seen, on the cell's own clock; 0 before anything arrived."""
-        with self._lock:
-            return self._newest_ns
+        return self._newest_ns
 
     def heard_ns(self) -> int:
         """When the last message arrived, on the receiver's clock; 0 before the first."""
-        with self._lock:
-            return self._heard_ns
+        return self._heard_ns
 
-    def joints(self) -> HeardJoints | None:
-        """The latest joint states, the arm's where there are several; None before any arrived."""
-        with self._lock:
-            return self._heard_joints
+    def joints(self) -> tuple[JointSample, int] | None:
+        """The latest joint states, the arm's where there are several, and when they arrived.
+
+        Stamped by the cell's clock, arrived by the receiver's; None before any.
+        """
+        return self._heard_joints
 
     def executing(self) -> str | None:
         """Id of the plan that is being executed right now, None at rest."""
-        with self._lock:
-            return self._executing
+        return self._executing
 
     def frames(self, *, max_age_ns: int, max_per_camera: int) -> LiveFrames:
         """Each camera's newest frames after the last execution; none too old on cell's clock."""

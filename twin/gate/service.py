@@ -32,9 +32,9 @@ from twin.errors import TwinError
 from twin.gate.config import GateConfig
 from twin.gate.gate import Gate, JudgedTasks, Perception
 from twin.gate.twin_process import TwinProcess
+from twin.replay.agreement import WORDS
 
 CELL_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
-VERDICT_WORDS = {True: "accepted", False: "rejected", None: "no verdict"}
 
 
 class GateError(TwinError):
@@ -63,7 +63,7 @@ def serve_gate(
         seconds = time.monotonic() - started
         p = verdict.p_success
         share = f" {p['k']:g} of {p['n']:g} samples succeed." if p else ""
-        text = f"{verdict.plan_id}: {VERDICT_WORDS[verdict.accepted]} in {seconds:.1f} s.{share}"
+        text = f"{verdict.plan_id}: {WORDS[verdict.accepted]} in {seconds:.1f} s.{share}"
         output.say(printable(f"{text} {verdict.reason or ''}".rstrip()))
         return data
 
@@ -145,8 +145,7 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     from twin.scene.store.folder import scene_hash_of  # noqa: PLC0415
 
     if not CELL_NAME.match(config.cell):
-        message = f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'."
-        raise UsageError(message)
+        raise UsageError(f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'.")
     run = RunFolder.open(path)
     tasks = JudgedTasks(
         only=chosen_task_file(config.task, tasks_dir=run.tasks_dir) if config.task else None,

@@ -158,28 +158,24 @@ def _steps_of(question: Question, config: ReplayConfig) -> int:
     return steps
 
 
+def _asked(gate: GateConfig, task: Task, **asked: Any) -> Question:
+    """A question as a gate with these settings has it."""
+    config = replace(gate.replay, mode="dynamic", samples=gate.samples)
+    config.refuse_soft(task.soft_objects)
+    asked |= {"max_steps": gate.max_steps, "any_robot": bool(gate.robot)}
+    return Question(task=task, config=config, **asked)
+
+
 def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
     """Judge here as a gate does in its own process; UndecidedError: a replay has too many steps."""
-    config = GateConfig()
-
-    def judge(plan: Plan) -> Verdict:
-        replay = replace(config.replay, mode="dynamic", samples=config.samples)
-        replay.refuse_soft(scene.task.soft_objects)
-        return answer(
-            Question(
-                run_path=run_path,
-                plan=plan,
-                task=scene.task,
-                Ts_base_object=scene.Ts_base_object,
-                covariances=dict(scene.covariances),
-                urdf=scene.urdf,
-                config=replay,
-                max_steps=config.max_steps,
-                start_rad=scene.start_rad,
-            )
-        )
-
-    return judge
+    known: dict[str, Any] = {
+        "run_path": run_path,
+        "Ts_base_object": scene.Ts_base_object,
+        "covariances": dict(scene.covariances),
+        "urdf": scene.urdf,
+        "start_rad": scene.start_rad,
+    }
+    return lambda plan: answer(_asked(GateConfig(), scene.task, plan=plan, **known))
 
 
 class TwinProcess:
@@ -187,10 +183,7 @@ class TwinProcess:
 
     def __init__(self, run_path: Path, config: GateConfig, output: Output) -> None:
         """Start it; it imports what it needs while the gate connects."""
-        self._run_path, self._output = run_path, output
-        self._config = replace(config.replay, mode="dynamic", samples=config.samples)
-        self._max_steps = config.max_steps
-        self._any_robot = bool(config.robot)
+        self._run_path, self._config, self._output = run_path, config, output
         self._swapping = threading.Lock()
         self._closed = False
         self._worker: Worker | None = None
@@ -210,9 +203,7 @@ class TwinProcess:
 
     def localise(self, frames: Any, task: Task, ends_s: float) -> Mapping[str, Any]:
         """Find a task's objects."""
-        item = (self._run_path, frames, task)
-        found: Mapping[str, Any] = self._do("localisation", look, item, ends_s)
-        return found
+        return dict(self._do("localisation", look, (self._run_path, frames, task), ends_s))
 
     def replay(
         self,
@@ -224,20 +215,17 @@ class TwinProcess:
         ends_s: float,
     ) -> Verdict:
         """Replay a plan from where its objects were found and the arm stands."""
-        self._config.refuse_soft(task.soft_objects)
-        question = Question(
+        question = _asked(
+            self._config,
+            task,
             run_path=self._run_path,
             plan=plan,
-            task=task,
             Ts_base_object={name: item.T_base_object for name, item in found.items()},
             covariances={
                 name: item.covariance for name, item in found.items() if item.covariance is not None
             },
             urdf=urdf,
-            config=self._config,
-            max_steps=self._max_steps,
             start_rad=start_rad,
-            any_robot=self._any_robot,
         )
         verdict: Verdict = self._do("replay", answer, question, ends_s)
         return verdict

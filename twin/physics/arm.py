@@ -15,7 +15,7 @@ from bridge.geometry import se3
 from bridge.robots.robot import Finger, Mimic, Robot, mimics_of, robot_of
 from twin.errors import TwinError
 from twin.physics.config import FINGER_SPEED_M_S, PhysicsConfig
-from twin.physics.engine import pybullet
+from twin.physics.engine import Client, pybullet
 
 # The robot description as PyBullet should load it.
 # PyBullet gives links without ``<inertial>`` a mass of 1 kg, massless frames included, and makes
@@ -86,7 +86,7 @@ class PhysicsError(TwinError):
     """The physics engine refused or lost something."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Drive:
     """A finger joint with a motor: one of the record's, or one that mimics one of them."""
 
@@ -114,17 +114,18 @@ def require_parts(record: Robot, joints: Collection[str], links: Collection[str]
     tool = (record.tool_frame, *record.gripper.finger_links)
     missing += [name for name in tool if name not in links]
     if missing:
-        message = (
+        raise PhysicsError(
             f"the robot description lacks {', '.join(missing)}; it has the joints "
             f"{', '.join(joints)}. Physics needs the arm and the fingers of {record.name!r}."
         )
-        raise PhysicsError(message)
 
 
 class Arm:
     """One robot with its base at the origin of a PyBullet client."""
 
-    def __init__(self, client: int, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
+    def __init__(
+        self, client: Client, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig
+    ) -> None:
         """Load it."""
         self._client = client
         self._config = config
@@ -144,20 +145,13 @@ class Arm:
         with tempfile.TemporaryDirectory(prefix="robot-gst-physics-") as folder:
             path = write_description(urdf, mesh_hulls_m, Path(folder))
             try:
-                return int(
-                    pybullet.loadURDF(
-                        str(path),
-                        useFixedBase=True,
-                        flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-                        physicsClientId=self._client,
-                    )
-                )
+                flags = pybullet.URDF_USE_INERTIA_FROM_FILE
+                return int(self._client.loadURDF(str(path), useFixedBase=True, flags=flags))
             except pybullet.error as error:
-                message = (
+                raise PhysicsError(
                     f"PyBullet does not load the robot description ({error}). "
                     "Check its links and collision meshes."
-                )
-                raise PhysicsError(message) from error
+                ) from error
 
     def _index_joints(self, mimics: Sequence[Mimic]) -> None:
         record, gripper = self.record, self.record.gripper
@@ -168,8 +162,8 @@ class Arm:
         parents: dict[str, int] = {}
         fixed: set[int] = {-1}
         client = self._client
-        for index in range(pybullet.getNumJoints(self.id, physicsClientId=client)):
-            item = pybullet.getJointInfo(self.id, index, physicsClientId=client)
+        for index in range(client.getNumJoints(self.id)):
+            item = client.getJointInfo(self.id, index)
             self._joints[item[1].decode()] = index
             self.links[item[12].decode()] = index
             self._efforts[item[1].decode()] = item[10]
@@ -194,23 +188,16 @@ class Arm:
     def _driven(self, mimics: Sequence[Mimic]) -> list[_Drive]:
         """The joints that open the gripper, leaders and followers."""
         leaders = {item.joint: item for item in self.record.gripper.fingers}
-        drives = [
-            _Drive(index=self._joints[name], finger=finger) for name, finger in leaders.items()
-        ]
+        drives = [_Drive(self._joints[name], finger) for name, finger in leaders.items()]
         return drives + [
-            _Drive(
-                index=self._joints[item.joint],
-                finger=leaders[item.leader],
-                multiplier=item.multiplier,
-                offset=item.offset,
-            )
+            _Drive(self._joints[item.joint], leaders[item.leader], item.multiplier, item.offset)
             for item in mimics
             if item.leader in leaders and item.joint not in leaders
         ]
 
     def _opening(self, index: int) -> tuple[float, ...]:
         """Direction in which a finger's pad goes when the gripper opens, in the finger's frame."""
-        item = pybullet.getJointInfo(self.id, index, physicsClientId=self._client)
+        item = self._client.getJointInfo(self.id, index)
         drive = next(drive for drive in self._drives if drive.index == index)
         opens = 1.0 if drive.slope(self._max_width_m / 2) > 0 else -1.0
         axis = np.array(item[13]) * opens
@@ -224,44 +211,22 @@ class Arm:
 
     def _couple_fingers(self) -> None:
         for link in self.finger_links:
-            pybullet.changeDynamics(
-                self.id,
-                link,
-                lateralFriction=self._config.finger_friction,
-                physicsClientId=self._client,
-            )
+            self._client.changeDynamics(self.id, link, lateralFriction=self._config.finger_friction)
         if len(self._fingers) != 2:
             return
         first, second = (drive.slope(self._max_width_m / 2) for drive in self._drives)
-        gear = pybullet.createConstraint(
-            self.id,
-            self._fingers[0],
-            self.id,
-            self._fingers[1],
-            pybullet.JOINT_GEAR,
-            [0, 1, 0],
-            [0, 0, 0],
-            [0, 0, 0],
-            physicsClientId=self._client,
-        )
-        pybullet.changeConstraint(
-            gear,
-            gearRatio=-first / second,
-            erp=0.2,
-            maxForce=10 * self._config.grip_force_N,
-            physicsClientId=self._client,
+        ends, zero = (self.id, self._fingers[0], self.id, self._fingers[1]), [0, 0, 0]
+        gear = self._client.createConstraint(*ends, pybullet.JOINT_GEAR, [0, 1, 0], zero, zero)
+        self._client.changeConstraint(
+            gear, gearRatio=-first / second, erp=0.2, maxForce=10 * self._config.grip_force_N
         )
 
     def reset(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
         """Put the robot into a posture at rest, without simulating."""
         for index, value in zip(self._arm, joints_rad, strict=True):
-            pybullet.resetJointState(
-                self.id, index, float(value), 0.0, physicsClientId=self._client
-            )
+            self._client.resetJointState(self.id, index, float(value), 0.0)
         for drive in self._drives:
-            pybullet.resetJointState(
-                self.id, drive.index, drive.value(float(width_m)), 0.0, physicsClientId=self._client
-            )
+            self._client.resetJointState(self.id, drive.index, drive.value(float(width_m)), 0.0)
 
     def command(self, joints_rad: Joints, velocity_rad_s: Joints, width_m: float) -> None:
         """Set the targets the motors follow from the next step on; the width as far as it goes.
@@ -270,14 +235,13 @@ class Arm:
         """
         order = (_numbers(joints_rad), _numbers(velocity_rad_s))
         if order != self._arm_order:
-            pybullet.setJointMotorControlArray(
+            self._client.setJointMotorControlArray(
                 self.id,
                 self._arm,
                 pybullet.POSITION_CONTROL,
                 targetPositions=order[0],
                 targetVelocities=order[1],
                 forces=self._arm_forces,
-                physicsClientId=self._client,
             )
             self._arm_order = order
         if not self._drives:
@@ -304,7 +268,7 @@ class Arm:
 
     def fingers(self) -> list[tuple[float, float]]:
         """How far each finger is from being as closed as it was told [m], and its speed [m/s]."""
-        states = pybullet.getJointStates(self.id, self._fingers, physicsClientId=self._client)
+        states = self._client.getJointStates(self.id, self._fingers)
         share, found = 1.0 / len(self._drives), []
         for drive, state in zip(self._drives, states, strict=True):
             width_m = drive.width_m(state[0])
@@ -320,7 +284,7 @@ class Arm:
         for drive in self._drives:
             # Of the width each finger has its share; what a joint does per metre of that.
             lever = len(self._drives) * abs(drive.slope(target_m))
-            pybullet.setJointMotorControl2(
+            self._client.setJointMotorControl2(
                 self.id,
                 drive.index,
                 pybullet.POSITION_CONTROL,
@@ -328,7 +292,6 @@ class Arm:
                 force=self._config.grip_force_N / lever,
                 maxVelocity=speed_m_s * lever,
                 positionGain=gain,
-                physicsClientId=self._client,
             )
 
     def yield_fingers(self, reaction_N: float) -> None:
@@ -356,9 +319,7 @@ class Arm:
 
     def posture(self) -> tuple[Float[np.ndarray, " num_joints"], float]:
         """Where the arm is, and the distance between the finger pads; one question for both."""
-        states = pybullet.getJointStates(
-            self.id, [*self._arm, *self._fingers], physicsClientId=self._client
-        )
+        states = self._client.getJointStates(self.id, [*self._arm, *self._fingers])
         places = [state[0] for state in states]
         count = len(self._arm)
         pairs = zip(self._drives, places[count:], strict=True)
@@ -367,9 +328,7 @@ class Arm:
 
     def link_poses(self, links: Sequence[int]) -> list[LinkPose]:
         """Position [m] and quaternion xyzw of the frames of links, base frame."""
-        states = pybullet.getLinkStates(
-            self.id, links, computeForwardKinematics=1, physicsClientId=self._client
-        )
+        states = self._client.getLinkStates(self.id, links, computeForwardKinematics=1)
         return [(state[4], state[5]) for state in states]
 
     def T_base_link(self, link: str) -> Float[np.ndarray, "4 4"]:
@@ -381,13 +340,12 @@ class Arm:
         self, link: str | None, force_N: tuple[float, ...], point_m: tuple[float, ...]
     ) -> None:
         """Apply a force at a point (base frame) in the next step; None: to the fingers' parent."""
-        pybullet.applyExternalForce(
+        self._client.applyExternalForce(
             self.id,
             self._finger_parent if link is None else self.links[link],
             force_N,
             point_m,
             pybullet.WORLD_FRAME,
-            physicsClientId=self._client,
         )
 
 

@@ -65,11 +65,10 @@ def _robot_spec(urdf: str, hulls: tuple[tuple[str, tuple[bytes, ...]], ...]) -> 
             spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"), assets=assets)
             spec.copy().compile()
         except ValueError as error:
-            message = (
+            raise PhysicsError(
                 f"MuJoCo does not load the robot description ({error}). "
                 "Check its links and collision meshes."
-            )
-            raise PhysicsError(message) from error
+            ) from error
     return spec
 
 
@@ -173,11 +172,10 @@ def _refuse_gripper(record: Robot, urdf: str) -> None:
     others = [item.joint for item in fingers if item.turns or item.link_m or item.table]
     unfit = others + [name for name in followers if name not in record.finger_joints]
     if unfit:
-        message = (
+        raise PhysicsError(
             f"MuJoCo replays fingers that slide, each with a motor of its own; of {record.name!r} "
             f"{', '.join(unfit)} turns or follows another joint. Use --engine pybullet."
         )
-        raise PhysicsError(message)
 
 
 def _add_motor(spec: Any, joint: str, most: float) -> Any:
@@ -233,7 +231,6 @@ class MujocoWorld:
         self.robot = MujocoArm(self._spec, self._record, config)
         self.free_objects: list[str] = []
         self._shapes: list[_Shape] = []
-        self._finger_shapes: set[str] = set()
         self._add_robot_shapes()
         self._model: Any = None
         self._data: Any = None
@@ -255,8 +252,6 @@ class MujocoWorld:
                 self._shapes.append(
                     _Shape(name=geom.name, friction=mu, owner="robot", on_table=on_table)
                 )
-                if finger:
-                    self._finger_shapes.add(geom.name)
 
     def add_table(self, height_m: float, size_m: float = 4.0, thickness_m: float = 0.4) -> None:
         """Add the table: a slab whose top is at the height."""
@@ -332,10 +327,12 @@ class MujocoWorld:
         for shape in self._shapes:
             if shape.owner == "object":
                 self._geoms[shape.body].add(int(self._model.geom(shape.name).id))
-        self._robot_geoms = {
-            int(self._model.geom(shape.name).id) for shape in self._shapes if shape.owner == "robot"
+        robot = [shape.name for shape in self._shapes if shape.owner == "robot"]
+        self._robot_geoms = {int(self._model.geom(name).id): name for name in robot}
+        fingers = self._record.gripper.finger_links
+        self._finger_geoms = {
+            k for k, name in self._robot_geoms.items() if name.rpartition("/")[0] in fingers
         }
-        self._finger_geoms = {int(self._model.geom(name).id) for name in self._finger_shapes}
         mujoco.mj_forward(self._model, self._data)
 
     def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
@@ -390,8 +387,7 @@ class MujocoWorld:
             self._compile()
         if object_id not in self._addresses:
             known = ", ".join(self.free_objects) or "none"
-            message = f"no object {object_id!r} moves in this world. There are: {known}."
-            raise PhysicsError(message)
+            raise PhysicsError(f"no object {object_id!r} moves in this world. There are: {known}.")
         return self._addresses[object_id]
 
     def __enter__(self) -> "MujocoWorld":

@@ -43,16 +43,12 @@ class PushWorld(Bodies):
         self._anchors.add(self._object)
         self._hand: list[int] = []
         for points_m in hulls_m:
-            shape = pybullet.createCollisionShape(
-                pybullet.GEOM_MESH, vertices=points_m.tolist(), physicsClientId=self._client
-            )
+            shape = self.client.createCollisionShape(pybullet.GEOM_MESH, vertices=points_m.tolist())
             body = self._body(shape, _HAND_MASS_KG, away)
             self._set_friction(body, config.finger_friction)
             self._undamp(body)
             for other in (table, *self._hand):
-                pybullet.setCollisionFilterPair(
-                    body, other, -1, -1, 0, physicsClientId=self._client
-                )
+                self.client.setCollisionFilterPair(body, other, -1, -1, 0)
             self._hand.append(body)
 
     def step(
@@ -69,13 +65,9 @@ class PushWorld(Bodies):
         velocity[2] += self.config.gravity_m_s2 / self.config.rate_hz  # which the step takes away
         turning = turning_rad_s.tolist()
         for body in self._hand:
-            pybullet.resetBasePositionAndOrientation(
-                body, position, orientation, physicsClientId=self._client
-            )
-            pybullet.resetBaseVelocity(body, velocity, turning, physicsClientId=self._client)
+            self.client.resetBasePositionAndOrientation(body, position, orientation)
+            self.client.resetBaseVelocity(body, velocity, turning)
         self._anchors.refresh()
-        pybullet.stepSimulation(physicsClientId=self._client)
-        p, (x, y, z, w) = pybullet.getBasePositionAndOrientation(
-            self._object, physicsClientId=self._client
-        )
+        self.client.stepSimulation()
+        p, (x, y, z, w) = self.client.getBasePositionAndOrientation(self._object)
         return np.array([*p, w, x, y, z])

@@ -7,6 +7,7 @@ on boxes as velocity, on the arm as a force, on the fingers as a slower drive.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int32
@@ -14,7 +15,7 @@ from jaxtyping import Float, Int32
 from bridge.geometry import se3
 from twin.physics.arm import Arm, Hulls, LinkPose
 from twin.physics.config import PhysicsConfig
-from twin.physics.engine import pybullet
+from twin.physics.engine import Client
 from twin.physics.soft import Skin, SoftHealth, SoftModel, bind_points, health_of, rigid_fit
 from twin.physics.soft_solver import ConvexPiece, SoftSolver, add_body, box_piece, link_pieces
 from twin.physics.unseen import EVEN, Unseen, box_inertia
@@ -94,17 +95,6 @@ def _rotated(q_xyzw: tuple[float, ...], v: tuple[float, ...]) -> Three:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Placed:
-    """One piece as the solver will get it."""
-
-    piece: ConvexPiece
-    pose: tuple[float, ...]
-    friction: float
-    mass_kg: float = 0.0
-    inertia: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-@dataclass(frozen=True, kw_only=True)
 class _SoftBody:
     index: int
     model: SoftModel
@@ -118,14 +108,15 @@ class SoftWorld:
     """The soft part of a world. Costs nothing until a soft body is added."""
 
     def __init__(
-        self, client: int, arm: Arm, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig
+        self, client: Client, arm: Arm, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig
     ) -> None:
         """Remember what soft bodies will meet."""
         self.names: dict[str, _SoftBody] = {}
         self._client, self._arm, self._config = client, arm, config
         self._description = (urdf, mesh_hulls_m)
         self._period_s = 1.0 / config.rate_hz
-        self._waiting: list[_Placed] = []
+        self._waiting: list[tuple[Any, ...]] = []
+        """Pieces as the solver will get them."""
         self._free: dict[int, int] = {}
         self._solver: SoftSolver | None = None
         self._num_pieces = 0
@@ -142,13 +133,8 @@ class SoftWorld:
         self, size_m: Float[np.ndarray, "3"], T_base_box: Float[np.ndarray, "4 4"]
     ) -> None:
         """Add a box that never moves."""
-        self._add(
-            _Placed(
-                piece=box_piece(size_m, np.eye(4)),
-                pose=_pose(T_base_box),
-                friction=self._config.surface_friction,
-            )
-        )
+        pose, friction = _pose(T_base_box), self._config.surface_friction
+        self._add(box_piece(size_m, np.eye(4)), pose, friction)
 
     def add_free(
         self,
@@ -163,40 +149,36 @@ class SoftWorld:
         T_base_body[:3, 3] = se3.apply(T_base_box, np.array(unseen.centre_of_mass_m))
         T_body_box[:3, 3] = -np.array(unseen.centre_of_mass_m)
         self._free[body] = self._add(
-            _Placed(
-                piece=box_piece(size_m, T_body_box),
-                pose=_pose(T_base_body),
-                friction=self._config.object_friction,
-                mass_kg=mass_kg,
-                inertia=box_inertia(size_m, mass_kg),
-            )
+            box_piece(size_m, T_body_box),
+            _pose(T_base_body),
+            self._config.object_friction,
+            mass_kg,
+            box_inertia(size_m, mass_kg),
         )
 
-    def _add(self, placed: _Placed) -> int:
+    def _add(
+        self,
+        piece: ConvexPiece,
+        pose: tuple[float, ...],
+        friction: float,
+        mass_kg: float = 0.0,
+        inertia: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    ) -> int:
         """Returns the number that the solver gives, or will give, to the piece."""
         self._num_pieces += 1
+        numbers = (np.array(pose), friction, mass_kg, np.array(inertia))
+        placed = (piece.planes, piece.corners_m, *numbers)
         if self._solver is None:
             self._waiting.append(placed)
         else:
-            self._hand_over(placed)
+            self._solver.add_collider(*placed)
         return self._num_pieces - 1
-
-    def _hand_over(self, placed: _Placed) -> None:
-        solver = self._begun()
-        solver.add_collider(
-            placed.piece.planes,
-            placed.piece.corners_m,
-            np.array(placed.pose),
-            placed.friction,
-            placed.mass_kg,
-            np.array(placed.inertia),
-        )
 
     def _begun(self) -> SoftSolver:
         if self._solver is None:
             self._solver = SoftSolver(self._period_s, SUBSTEPS, self._config.gravity_m_s2)
             for placed in self._waiting:
-                self._hand_over(placed)
+                self._solver.add_collider(*placed)
             self._waiting.clear()
             self._add_links()
         return self._solver
@@ -210,12 +192,7 @@ class SoftWorld:
             friction = config.finger_friction if finger else config.surface_friction
             self._links.append(link)
             self._link_pieces[link] = [
-                self._add(
-                    _Placed(
-                        piece=piece, pose=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), friction=friction
-                    )
-                )
-                for piece in pieces
+                self._add(piece, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), friction) for piece in pieces
             ]
         self._link_ids = [self._arm.links[link] for link in self._links]
         link_of = {piece: link for link in self._links for piece in self._link_pieces[link]}
@@ -271,7 +248,7 @@ class SoftWorld:
             for _ in range(len(self._link_pieces[link]))
         ]
         for body in self._free:
-            p, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+            p, q = self._client.getBasePositionAndOrientation(body)
             poses.append((*p, *q))
         self._solver.step(self._driven(), np.array(poses))
         self._pushed, self._pushes = self._solver.pushed(), self._solver.pushes()
@@ -286,16 +263,11 @@ class SoftWorld:
 
     def _change(self, body: int, change: Float[np.ndarray, "9"]) -> None:
         """Add to the speed, the turning and the place of a box."""
-        p, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
-        v, omega = pybullet.getBaseVelocity(body, physicsClientId=self._client)
-        pybullet.resetBasePositionAndOrientation(
-            body, (np.array(p) + change[6:]).tolist(), q, physicsClientId=self._client
-        )
-        pybullet.resetBaseVelocity(
-            body,
-            (np.array(v) + change[:3]).tolist(),
-            (np.array(omega) + change[3:6]).tolist(),
-            physicsClientId=self._client,
+        p, q = self._client.getBasePositionAndOrientation(body)
+        v, omega = self._client.getBaseVelocity(body)
+        self._client.resetBasePositionAndOrientation(body, (np.array(p) + change[6:]).tolist(), q)
+        self._client.resetBaseVelocity(
+            body, (np.array(v) + change[:3]).tolist(), (np.array(omega) + change[3:6]).tolist()
         )
 
     def nodes_m(self, object_id: str) -> Float[np.ndarray, "num_nodes 3"]:

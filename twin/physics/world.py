@@ -20,7 +20,7 @@ from bridge.leaves import load_leaf
 from twin.physics.arm import Arm, Hulls, PhysicsError, Press
 from twin.physics.bending import SoftBodies
 from twin.physics.config import PhysicsConfig
-from twin.physics.engine import give_client_back, open_client, pybullet
+from twin.physics.engine import Client, give_client_back, open_client, pybullet
 from twin.physics.unseen import EVEN, Unseen, box_inertia
 
 # Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
@@ -42,16 +42,16 @@ _DYNAMIC, _ALL = 1, -1
 class FrictionAnchors:
     """The anchors of the rigid bodies that move freely in one PyBullet client."""
 
-    def __init__(self, client: int) -> None:
+    def __init__(self, client: Client) -> None:
         """Start without bodies."""
-        self._client = client
+        self.client = client
         self._held: dict[int, tuple[float, ...]] = {}
         self._steps = 0
 
     def add(self, body: int) -> None:
         """Let a body's contacts hold from now on."""
         self._held[body] = self._orientation(body)
-        pybullet.changeDynamics(body, -1, frictionAnchor=1, physicsClientId=self._client)
+        self.client.changeDynamics(body, -1, frictionAnchor=1)
 
     def refresh(self) -> bool:
         """Let bodies that have turned take hold anew in the next step; whether any does.
@@ -67,14 +67,12 @@ class FrictionAnchors:
             if abs(x * x0 + y * y0 + z * z0 + w * w0) < cos(TURN_RAD / 2):
                 self._held[body] = now
                 # Setting the group that it has already is how PyBullet drops contact points.
-                pybullet.setCollisionFilterGroupMask(
-                    body, -1, _DYNAMIC, _ALL, physicsClientId=self._client
-                )
+                self.client.setCollisionFilterGroupMask(body, -1, _DYNAMIC, _ALL)
                 anew = True
         return anew
 
     def _orientation(self, body: int) -> tuple[float, ...]:
-        _, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+        _, q = self.client.getBasePositionAndOrientation(body)
         return tuple(q)
 
 
@@ -91,45 +89,42 @@ class Bodies:
     def __init__(self, config: PhysicsConfig) -> None:
         """Take a client."""
         self.config = config
-        self._client = open_client(config)
-        self._anchors = FrictionAnchors(self._client)
+        self.client = open_client(config)
+        self._anchors = FrictionAnchors(self.client)
 
     def _box(
         self, size_m: Float[np.ndarray, "3"], mass_kg: float, T: Float[np.ndarray, "4 4"]
     ) -> int:
-        shape = pybullet.createCollisionShape(
-            pybullet.GEOM_BOX, halfExtents=(size_m / 2).tolist(), physicsClientId=self._client
+        shape = self.client.createCollisionShape(
+            pybullet.GEOM_BOX, halfExtents=(size_m / 2).tolist()
         )
         return self._body(shape, mass_kg, T)
 
     def _body(self, shape: int, mass_kg: float, T: Float[np.ndarray, "4 4"]) -> int:
         q, p = se3.split(T)
         return int(
-            pybullet.createMultiBody(
+            self.client.createMultiBody(
                 baseMass=mass_kg,
                 baseCollisionShapeIndex=shape,
                 basePosition=p.tolist(),
                 baseOrientation=[q[1], q[2], q[3], q[0]],
                 # What never moves needs no articulated body: the same bits for less.
                 useMaximalCoordinates=mass_kg == 0.0,
-                physicsClientId=self._client,
             )
         )
 
     def _undamp(self, body: int) -> None:
         """Nothing slows down in the air; the engine would take 3 s for 83 % of a spin's energy."""
-        pybullet.changeDynamics(
-            body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client
-        )
+        self.client.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
 
     def _set_friction(self, body: int, friction: float) -> None:
-        pybullet.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=self._client)
+        self.client.changeDynamics(body, -1, lateralFriction=friction)
 
     def close(self) -> None:
         """Give the client back; a second call does nothing."""
-        if self._client >= 0:
-            give_client_back(self._client)
-            self._client = -1
+        if self.client.number >= 0:
+            give_client_back(self.client)
+            self.client = Client(-1)
 
     def __enter__(self: _World) -> _World:
         """Use as a context manager."""
@@ -149,7 +144,7 @@ class World(Bodies):
         self.free_ids: dict[str, int] = {}
         self._centres_m: dict[str, Float[np.ndarray, 3]] = {}
         try:
-            self.robot = Arm(self._client, urdf, mesh_hulls_m, config)
+            self.robot = Arm(self.client, urdf, mesh_hulls_m, config)
         except PhysicsError:
             self.close()
             raise
@@ -178,9 +173,7 @@ class World(Bodies):
         body = self.add_static([(centre, extents)], np.eye(4))[0]
         # The robot stands on the table: its base touches it by construction.
         for link in (-1, *self.robot.base_links):
-            pybullet.setCollisionFilterPair(
-                self.robot.id, body, link, -1, 0, physicsClientId=self._client
-            )
+            self.client.setCollisionFilterPair(self.robot.id, body, link, -1, 0)
         return body
 
     def add_free(
@@ -212,28 +205,16 @@ class World(Bodies):
     ) -> int:
         """A box whose frame is its centre of mass, as the engine wants it."""
         solids, centre = unseen.solids(size_m), np.array(unseen.centre_of_mass_m)
-        q, _ = se3.split(T_base_object)
-        shape = pybullet.createCollisionShapeArray(
+        T_base_mass = T_base_object.copy()
+        T_base_mass[:3, 3] = se3.apply(T_base_object, centre)
+        shape = self.client.createCollisionShapeArray(
             shapeTypes=[pybullet.GEOM_BOX] * len(solids),
             halfExtents=[(extents / 2).tolist() for extents in solids],
             collisionFramePositions=[(-centre).tolist()] * len(solids),
-            physicsClientId=self._client,
         )
-        body = int(
-            pybullet.createMultiBody(
-                baseMass=mass_kg,
-                baseCollisionShapeIndex=shape,
-                basePosition=se3.apply(T_base_object, centre).tolist(),
-                baseOrientation=[q[1], q[2], q[3], q[0]],
-                physicsClientId=self._client,
-            )
-        )
-        pybullet.changeDynamics(
-            body,
-            -1,
-            localInertiaDiagonal=list(box_inertia(size_m, mass_kg)),
-            physicsClientId=self._client,
-        )
+        body = self._body(shape, mass_kg, T_base_mass)
+        inertia = list(box_inertia(size_m, mass_kg))
+        self.client.changeDynamics(body, -1, localInertiaDiagonal=inertia)
         return body
 
     def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
@@ -250,7 +231,7 @@ class World(Bodies):
         anew = self._anchors.refresh()
         if soft is None or not soft.names:  # soft bodies slow the fingers down themselves
             self._press.update(anew=anew)
-        pybullet.stepSimulation(physicsClientId=self._client)
+        self.client.stepSimulation()
         if soft is not None:
             soft.step()
 
@@ -261,9 +242,7 @@ class World(Bodies):
         """
         if (soft := self._softly(object_id)) is not None:
             return soft.pose(object_id)
-        p, (x, y, z, w) = pybullet.getBasePositionAndOrientation(
-            self._free(object_id), physicsClientId=self._client
-        )
+        p, (x, y, z, w) = self.client.getBasePositionAndOrientation(self._free(object_id))
         centre = self._centres_m.get(object_id)
         if centre is not None:
             p = (
@@ -286,15 +265,13 @@ class World(Bodies):
         return any(
             point[8] <= 0.0
             for link in self.robot.finger_links
-            for point in pybullet.getContactPoints(
-                self.robot.id, body, linkIndexA=link, physicsClientId=self._client
-            )
+            for point in self.client.getContactPoints(self.robot.id, body, linkIndexA=link)
         )
 
     def arm_force_N(self) -> float:
         """Size of the force that rigid bodies exert on the arm in all; a grasp's cancel out."""
         total = np.zeros(3)
-        for point in pybullet.getContactPoints(self.robot.id, physicsClientId=self._client):
+        for point in self.client.getContactPoints(self.robot.id):
             if point[1] != point[2]:  # not the arm against itself
                 total += point[9] * np.array(point[7])
                 total += point[10] * np.array(point[11]) + point[12] * np.array(point[13])
@@ -304,7 +281,7 @@ class World(Bodies):
         """What is soft in this world; asking the first time begins it."""
         if self._soft is None:
             begin = load_leaf("soft", "world")
-            soft: SoftBodies = begin(self._client, self.robot, *self._description, self.config)
+            soft: SoftBodies = begin(self.client, self.robot, *self._description, self.config)
             for add in self._solids:
                 add(soft)
             self._soft, self._solids = soft, []
@@ -326,11 +303,5 @@ class World(Bodies):
         if object_id not in self.free_ids:
             soft = () if self._soft is None else self._soft.names
             known = ", ".join([*self.free_ids, *soft]) or "none"
-            message = f"no object {object_id!r} moves in this world. There are: {known}."
-            raise PhysicsError(message)
+            raise PhysicsError(f"no object {object_id!r} moves in this world. There are: {known}.")
         return self.free_ids[object_id]
-
-    @property
-    def client(self) -> int:
-        """PyBullet's number of this world."""
-        return self._client

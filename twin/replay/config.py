@@ -70,6 +70,8 @@ class VariationConfig:
     calibrated: tuple[tuple[str, float], ...] = ()
     """Fields of ``PhysicsConfig`` with the spread of their logarithm that calibration found; they
     replace the priors."""
+    masses: tuple[tuple[str, float], ...] = ()
+    """Objects that were weighed in the hand, with the spread of the logarithm of their mass."""
     posterior: tuple[PosteriorDraw, ...] = ()
     """What the session's own trials left of wide priors; samples draw frictions, force, masses and
     a common shift of all poses from it instead of from the priors."""
@@ -99,9 +101,9 @@ class VariationConfig:
             spreads[FRICTIONS[0]] = 0.0
         return {**spreads, **{name: known[name] for name in sorted(known)}}
 
-    def mass_spread(self) -> float:
+    def mass_spread(self, name: str) -> float:
         """Spread of the logarithm of an object's mass; draws of a posterior have it already."""
-        return 0.0 if self.posterior else MASS_LOG
+        return dict(self.masses).get(name, 0.0 if self.posterior else MASS_LOG)
 
 
 Mode = Literal["kinematic", "dynamic"]

@@ -17,7 +17,7 @@ def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict
     """What became of each grasp of a plan, for whoever plans again; as verdicts keep it."""
     stretches = []
     for first, end in _closed(plan, path, result.stamps_ns):
-        name = _grasped(plan, int(result.stamps_ns[first]))
+        name = grasped(plan, int(result.stamps_ns[first]))
         if name is not None and name in result.finger_contact:
             stretches.append((name, first, end))
     held = {name for name, first, end in stretches if _carries(result, name, first, end)}
@@ -59,7 +59,7 @@ def _closed(
     return runs_of_true((index >= 0) & told[np.clip(index, 0, len(told) - 1)])
 
 
-def _grasped(plan: Plan, t_ns: int) -> str | None:
+def grasped(plan: Plan, t_ns: int) -> str | None:
     """The object of the newest stage that grasps one and has begun."""
     begun = [stage for stage in plan.stages if stage.grasp and stage.t_start_ns <= t_ns]
     return max(begun, key=lambda stage: stage.t_start_ns).grasp if begun else None

@@ -26,7 +26,6 @@ from twin.replay.config import (
     BoxDraw,
     PosteriorDraw,
     ReplayConfig,
-    VariationConfig,
 )
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
@@ -103,8 +102,11 @@ def with_draw(
         surface_friction=draw.surface_pair_friction / own,
         grip_force_N=config.physics.grip_force_N * draw.grip_scale,
     )
+    known = dict(config.variation.masses)  # weighed, so nothing is left to scale
     objects = {
-        name: model if model.fixed else replace(model, mass_kg=model.mass_kg * draw.mass_scale)
+        name: model
+        if model.fixed or name in known
+        else replace(model, mass_kg=model.mass_kg * draw.mass_scale)
         for name, model in scene.task.objects.items()
     }
     poses = {}
@@ -164,7 +166,7 @@ def draw_variation(
         model = scene.task.objects[name]
         # Always eight numbers, so that an object's draw does not depend on what others are.
         z = rng.standard_normal(8)
-        objects[name] = _varied_model(model, z[6:], settings)
+        objects[name] = _varied_model(model, z[6:], settings.mass_spread(name))
         if name in scene.Ts_base_object:
             T = scene.Ts_base_object[name]
             root = _root(T, model, scene, name)
@@ -178,15 +180,13 @@ def draw_variation(
     )
 
 
-def _varied_model(
-    model: ObjectModel, z: Float[np.ndarray, "2"], settings: VariationConfig
-) -> ObjectModel:
+def _varied_model(model: ObjectModel, z: Float[np.ndarray, "2"], mass_log: float) -> ObjectModel:
     if model.fixed:
         return model
     soft = model.soft
     if soft is not None:
         soft = replace(soft, young_pa=soft.young_pa * float(np.exp(YOUNG_LOG * z[1])))
-    mass_kg = model.mass_kg * float(np.exp(settings.mass_spread() * z[0]))
+    mass_kg = model.mass_kg * float(np.exp(mass_log * z[0]))
     return replace(model, mass_kg=mass_kg, soft=soft)
 
 

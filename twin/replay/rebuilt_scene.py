@@ -38,6 +38,8 @@ class UnreadablePosteriorError(TwinError):
     """The posterior of calibration.json is none; make it again: calibrate RUN --posterior."""
 
 
+MASSES = "masses"
+"""The part of calibration.json that says what objects weighed in the hand."""
 OTHER_TASKS = "the posterior has no trials of this task: its samples draw from the priors"
 
 
@@ -64,8 +66,10 @@ def calibrated(
         for name, spread in sorted(_identified(calibration.record, "sigma_log").items())
         if name in taken and spread >= 0
     )
-    draws = () if task is None else posterior_of(calibration, task)
-    variation = replace(config.variation, calibrated=spreads, posterior=draws)
+    variation = replace(config.variation, calibrated=spreads)
+    if task is not None:
+        masses = tuple((key, spread) for key, (_, spread) in masses_of(calibration, task).items())
+        variation = replace(variation, masses=masses, posterior=posterior_of(calibration, task))
     return replace(config, physics=physics, variation=variation)
 
 
@@ -77,6 +81,17 @@ def posterior_of(calibration: Calibration, task: Task) -> tuple[PosteriorDraw, .
         return msgspec.convert(draws, tuple[PosteriorDraw, ...])
     except msgspec.ValidationError as error:
         raise UnreadablePosteriorError(f"the posterior of calibration.json: {error}") from error
+
+
+def masses_of(calibration: Calibration | None, task: Task) -> dict[str, tuple[float, float]]:
+    """Masses [kg] of a task's objects that trials weighed, with the spread of the logarithm."""
+    record = {} if calibration is None else calibration.record
+    found = _mapping(_mapping(_mapping(record, MASSES), "tasks"), task.name)
+    return {
+        name: (item["value"], item["sigma_log"])
+        for name, item in found.items()
+        if name in task.objects and not item["why"]
+    }
 
 
 def calibration_notes(calibration: Calibration | None, task: Task) -> tuple[str, ...]:
@@ -136,6 +151,8 @@ class RebuiltScene:
     shape_sources: Mapping[str, str] = field(default_factory=dict)
     """Per object: where its shape comes from."""
     calibration_id: str | None = None
+    masses_kg: Mapping[str, float] = field(default_factory=dict)
+    """Of objects that were weighed in the hand; the task file's stand in for others."""
     rim_heights_m: Mapping[str, float] = field(default_factory=dict)
     """Of containers as the scan shows them; published sizes stand in for others."""
     notes: tuple[str, ...] = ()
@@ -151,6 +168,10 @@ class RebuiltScene:
         covariances: Mapping[str, Float[np.ndarray, "6 6"]] | None = None,
     ) -> ReplayScene:
         """Put objects into the scene: where a replay happens."""
+        weighed = {
+            key: replace(task.objects[key], mass_kg=mass) for key, mass in self.masses_kg.items()
+        }
+        task = replace(task, objects={**task.objects, **weighed})
         return ReplayScene(
             task=with_heights(task, self.rim_heights_m),
             urdf=urdf,
@@ -172,6 +193,7 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
     rebuilt = RebuiltScene(
         shape_sources=sources,
         calibration_id=None if calibration is None else calibration.calibration_id,
+        masses_kg={key: mass for key, (mass, _) in masses_of(calibration, task).items()},
         notes=calibration_notes(calibration, task),
     )
     record = read_record(run)

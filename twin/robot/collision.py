@@ -61,8 +61,8 @@ def collision_geometry(model: pin.Model, urdf: str) -> pin.GeometryModel:
         return pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(
-            found=f"has collision shapes that cannot be read ({str(error)[:200]})",
-            hint="Check its mesh files.",
+            f"has collision shapes that cannot be read ({str(error)[:200]})",
+            "Check its mesh files.",
         ) from error
 
 
@@ -76,8 +76,8 @@ def link_hulls(robot: RobotModel) -> list[LinkHull]:
         points = corners_of(item) @ T_link_shape.rotation.T + T_link_shape.translation
         if not _has_volume(points):
             raise RobotDescriptionError(
-                found=f"has a collision shape without volume at the link {frame.name!r}",
-                hint="Give it three extents above zero, or leave it out.",
+                f"has a collision shape without volume at the link {frame.name!r}",
+                "Give it three extents above zero, or leave it out.",
             )
         shape = convex_hull(points)
         corners = np.array(shape.points())
@@ -85,8 +85,8 @@ def link_hulls(robot: RobotModel) -> list[LinkHull]:
         hulls.append(LinkHull(link=frame.name, points_m=corners, shape=shape, from_mesh=from_mesh))
     if not hulls:
         raise RobotDescriptionError(
-            found="gives no link a collision shape",
-            hint="Give each link <collision>, or nothing would be watched.",
+            "gives no link a collision shape",
+            "Give each link <collision>, or nothing would be watched.",
         )
     return hulls
 
@@ -122,8 +122,8 @@ def corners_of(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
         prism[:, 2] *= shape.halfLength + shape.radius * isinstance(shape, coal.Capsule)
         return prism
     raise RobotDescriptionError(
-        found=f"has a collision shape {type(shape).__name__} at {item.name}",
-        hint="Known: mesh, box, cylinder, sphere, capsule.",
+        f"has a collision shape {type(shape).__name__} at {item.name}",
+        "Known: mesh, box, cylinder, sphere, capsule.",
     )
 
 

@@ -25,7 +25,7 @@ class Hand:
         """Read a description; meshes are looked for beside it."""
         if not urdf.is_file():
             raise RobotDescriptionError(
-                found=f"is not at {urdf}", hint="Import the data set again, with its robot folder."
+                f"is not at {urdf}", "Import the data set again, with its robot folder."
             )
         root = parse_description(urdf.read_text())
         _with_local_meshes(root, urdf.parent)
@@ -37,11 +37,11 @@ class Hand:
         missing = [name for name in joints if name not in known]
         if missing:
             raise RobotDescriptionError(
-                found=f"lacks the joints {', '.join(missing)}", hint=f"It has: {', '.join(known)}."
+                f"lacks the joints {', '.join(missing)}", f"It has: {', '.join(known)}."
             )
         if not self._model.existFrame(hand_link):
             names = ", ".join(link.get("name", "") for link in root.findall("link"))
-            raise RobotDescriptionError(found=f"lacks {hand_link!r}", hint=f"It has: {names}.")
+            raise RobotDescriptionError(f"lacks {hand_link!r}", f"It has: {names}.")
         arms = [self._model.joints[self._model.getJointId(name)] for name in joints]
         self._ids, self._velocity_ids = [j.idx_q for j in arms], [j.idx_v for j in arms]
         self._frame = self._model.getFrameId(hand_link)
@@ -102,7 +102,7 @@ def _with_local_meshes(root: ET.Element, folder: Path) -> None:
             path = folder / local
             if not path.is_file():
                 raise RobotDescriptionError(
-                    found=f"names the mesh {name!r}, which is not at {path}",
-                    hint="Put it there, or import the data set again with its robot folder.",
+                    f"names the mesh {name!r}, which is not at {path}",
+                    "Put it there, or import the data set again with its robot folder.",
                 )
             mesh.set("filename", str(path))

@@ -23,9 +23,8 @@ from twin.errors import TwinError
 class RobotDescriptionError(TwinError):
     """A URDF text cannot be used."""
 
-    def __init__(self, *, found: str, hint: str) -> None:
-        """Remember what was found."""
-        self.found = found
+    def __init__(self, found: str, hint: str) -> None:
+        """Say what was found, and what helps."""
         super().__init__(f"the robot description {found}. {hint}")
 
 
@@ -38,15 +37,15 @@ def mimicked(urdf: str) -> tuple[Mimic, ...]:
     for item in found:
         if item.leader not in leaders:
             raise RobotDescriptionError(
-                found=f"lets the joint {item.joint!r} mimic {item.leader!r}, which is not there or "
+                f"lets the joint {item.joint!r} mimic {item.leader!r}, which is not there or "
                 "mimics another",
-                hint="Let it mimic a joint that moves by itself.",
+                "Let it mimic a joint that moves by itself.",
             )
         if not (math.isfinite(item.multiplier) and math.isfinite(item.offset)):
             raise RobotDescriptionError(
-                found=f"lets the joint {item.joint!r} mimic {item.leader!r} by something that is "
+                f"lets the joint {item.joint!r} mimic {item.leader!r} by something that is "
                 "not a number",
-                hint="Give multiplier and offset as numbers.",
+                "Give multiplier and offset as numbers.",
             )
     return found
 
@@ -69,13 +68,13 @@ def parse_description(urdf: str) -> ET.Element:
         root = ET.fromstring(urdf)
     except ET.ParseError as error:
         raise RobotDescriptionError(
-            found=f"is not XML ({error})",
-            hint=f"Record the robot's URDF on {ROBOT_DESCRIPTION}, or attach it as robot.urdf.",
+            f"is not XML ({error})",
+            f"Record the robot's URDF on {ROBOT_DESCRIPTION}, or attach it as robot.urdf.",
         ) from error
     if root.tag != "robot":
         raise RobotDescriptionError(
-            found=f"has the root element <{root.tag}>, not <robot>",
-            hint="Expand xacro files before publishing them.",
+            f"has the root element <{root.tag}>, not <robot>",
+            "Expand xacro files before publishing them.",
         )
     _check_names(root)
     return root
@@ -86,14 +85,11 @@ def _check_names(root: ET.Element) -> None:
     for tag in ("link", "joint"):
         names = [element.get("name", "").strip() for element in root.findall(tag)]
         if "" in names:
-            raise RobotDescriptionError(
-                found=f"has a {tag} without a name", hint="Name every link and joint."
-            )
+            raise RobotDescriptionError(f"has a {tag} without a name", "Name every link and joint.")
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise RobotDescriptionError(
-                found=f"has more than one {tag} named {', '.join(twice)}",
-                hint="Give each a name of its own.",
+                f"has more than one {tag} named {', '.join(twice)}", "Give each a name of its own."
             )
 
 
@@ -144,8 +140,8 @@ def _with_limits(urdf: str, record: Robot) -> str:
     refused = list(_refusals(root))
     if refused:
         raise RobotDescriptionError(
-            found=f"has {'; '.join(refused)}",
-            hint="A serial arm on a fixed base is needed, of joints with one axis each and of "
+            f"has {'; '.join(refused)}",
+            "A serial arm on a fixed base is needed, of joints with one axis each and of "
             "shapes with three extents above 0.",
         )
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
@@ -211,7 +207,7 @@ def built(urdf: str) -> pin.Model:
         return pin.buildModelFromXML(urdf)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(
-            found=f"is refused by pinocchio ({str(error)[:200]})", hint="Check it."
+            f"is refused by pinocchio ({str(error)[:200]})", "Check it."
         ) from error
 
 
@@ -243,9 +239,7 @@ class RobotModel:
         """With the fingers where they were asked for last, at this width [m]."""
         self._opened_m = math.nan
         self.arm_ids = np.array([self._q_id(name) for name in self.joints])
-        self.arm_velocity_ids = np.array(
-            [int(self.model.joints[self.model.getJointId(name)].idx_v) for name in self.joints]
-        )
+        self.arm_velocity_ids = np.array([self.effort_id(name) for name in self.joints])
         self._fingers = [
             (self._q_id(finger.joint), finger)
             for finger in self.record.gripper.fingers
@@ -277,22 +271,21 @@ class RobotModel:
         missing = [name for name in self.joints if not self.model.existJointName(name)]
         if missing:
             raise RobotDescriptionError(
-                found=f"lacks the joints {', '.join(missing)} of {self.record.name}",
-                hint=f"It has: {', '.join(list(self.model.names)[1:])}. {_OTHER_ROBOT}",
+                f"lacks the joints {', '.join(missing)} of {self.record.name}",
+                f"It has: {', '.join(list(self.model.names)[1:])}. {_OTHER_ROBOT}",
             )
         if not self.model.existFrame(self.record.tool_frame):
             raise RobotDescriptionError(
-                found=f"lacks the frame {self.record.tool_frame!r}",
-                hint="Add a link of that name where plans put the tool centre point. "
-                f"{_OTHER_ROBOT}",
+                f"lacks the frame {self.record.tool_frame!r}",
+                f"Add a link of that name where plans put the tool centre point. {_OTHER_ROBOT}",
             )
 
     def _check_joints(self) -> None:
         for name in self.joints:
             if self._slides(name):
                 raise RobotDescriptionError(
-                    found=f"has the joint {name!r}, which slides",
-                    hint="An arm of five to seven joints that turn is needed.",
+                    f"has the joint {name!r}, which slides",
+                    "An arm of five to seven joints that turn is needed.",
                 )
         for finger in self.record.gripper.fingers:
             name, wanted = finger.joint, "turn" if finger.turns else "slide"
@@ -300,8 +293,8 @@ class RobotModel:
                 continue
             if self._joint(name).nq != 1 or self._slides(name) == finger.turns:
                 raise RobotDescriptionError(
-                    found=f"has the finger joint {name!r}, which does not {wanted}",
-                    hint="Say of it in the robot file whether it turns, and give it limits.",
+                    f"has the finger joint {name!r}, which does not {wanted}",
+                    "Say of it in the robot file whether it turns, and give it limits.",
                 )
 
     def _check_serial(self, followers: set[str]) -> None:
@@ -316,17 +309,17 @@ class RobotModel:
         aside = [name for name in self.joints if name not in chain]
         if aside:
             raise RobotDescriptionError(
-                found=f"has {', '.join(aside)} on a branch that does not carry the tool frame "
+                f"has {', '.join(aside)} on a branch that does not carry the tool frame "
                 f"{self.record.tool_frame!r}",
-                hint=f"The tool is moved by {', '.join(chain) or 'no joint'}.",
+                f"The tool is moved by {', '.join(chain) or 'no joint'}.",
             )
         known = {*self.joints, *self.record.finger_joints, *followers}
         more = [name for name in names[1:] if name not in known]
         if more or [name for name in chain if name in self.joints] != list(self.joints):
             raise RobotDescriptionError(
-                found=f"moves by {', '.join(more or chain)}, "
+                f"moves by {', '.join(more or chain)}, "
                 + ("which is neither arm nor finger" if more else "in another order"),
-                hint="List the arm's joints from base to tool as joints, those that never move as "
+                "List the arm's joints from base to tool as joints, those that never move as "
                 "held, the fingers' under gripper.fingers.",
             )
 
@@ -338,9 +331,9 @@ class RobotModel:
         for name, low, high, speed in rows:
             if not (low < high and speed >= 0):
                 raise RobotDescriptionError(
-                    found=f"limits the joint {name!r} to {low:.3f} to {high:.3f} rad and "
+                    f"limits the joint {name!r} to {low:.3f} to {high:.3f} rad and "
                     f"{speed:.3f} rad/s",
-                    hint="Give lower, upper and velocity as numbers, lower below upper.",
+                    "Give lower, upper and velocity as numbers, lower below upper.",
                 )
 
     def _check_followers(self, followers: Sequence[Mimic]) -> None:
@@ -348,9 +341,9 @@ class RobotModel:
             for name in (item.joint, item.leader):
                 if not self.model.existJointName(name) or self._joint(name).nq != 1:
                     raise RobotDescriptionError(
-                        found=f"lets the joint {item.joint!r} mimic {item.leader!r}, and {name!r} "
+                        f"lets the joint {item.joint!r} mimic {item.leader!r}, and {name!r} "
                         "is fixed or turns without end",
-                        hint="Make both revolute or prismatic, with limits, or list both as held.",
+                        "Make both revolute or prismatic, with limits, or list both as held.",
                     )
 
     def _T_root_base(self) -> Float[np.ndarray, "4 4"]:
@@ -358,14 +351,14 @@ class RobotModel:
         base = self.record.base_frame
         if not self.model.existFrame(base):
             raise RobotDescriptionError(
-                found=f"lacks the base frame {base!r}",
-                hint=f"It has: {', '.join(frame.name for frame in self.model.frames)}.",
+                f"lacks the base frame {base!r}",
+                f"It has: {', '.join(frame.name for frame in self.model.frames)}.",
             )
         frame = self.model.frames[self.frame_id(base)]
         if frame.parentJoint != 0:
             raise RobotDescriptionError(
-                found=f"moves the base frame {base!r} by {self.model.names[frame.parentJoint]!r}",
-                hint="Name a frame that no joint moves as base_frame.",
+                f"moves the base frame {base!r} by {self.model.names[frame.parentJoint]!r}",
+                "Name a frame that no joint moves as base_frame.",
             )
         return np.array(frame.placement.homogeneous)
 
@@ -379,9 +372,9 @@ class RobotModel:
         ):
             if not low <= value <= high:
                 raise RobotDescriptionError(
-                    found=f"limits the joint {name!r} to {low:.3f} to {high:.3f} rad, and home_rad "
+                    f"limits the joint {name!r} to {low:.3f} to {high:.3f} rad, and home_rad "
                     f"puts it at {value:.3f}",
-                    hint="Choose a posture within the limits.",
+                    "Choose a posture within the limits.",
                 )
         return home
 
@@ -403,11 +396,10 @@ class RobotModel:
         return int(self._joint(name).idx_v)
 
     def _q_id(self, name: str) -> int:
-        return int(self.model.joints[self.model.getJointId(name)].idx_q)
+        return int(self._joint(name).idx_q)
 
     def _arm(self, values: Float[np.ndarray, " num_values"]) -> Float[np.ndarray, " num_joints"]:
-        picked: Float[np.ndarray, " num_joints"] = np.asarray(values)[self.arm_ids]
-        return picked
+        return np.array(values[self.arm_ids])
 
     def configuration(
         self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
@@ -450,7 +442,7 @@ class RobotModel:
         """Pose of any link or frame."""
         if not self.model.existFrame(link):
             names = ", ".join(frame.name for frame in self.model.frames)
-            raise RobotDescriptionError(found=f"lacks {link!r}", hint=f"It has: {names}.")
+            raise RobotDescriptionError(f"lacks {link!r}", f"It has: {names}.")
         pin.forwardKinematics(self.model, self.data, self.configuration(joints_rad, width_m))
         T = pin.updateFramePlacement(self.model, self.data, self.frame_id(link))
         return np.array(T.homogeneous)
@@ -461,8 +453,8 @@ def check_dynamics(robot: RobotModel) -> None:
     lacking = list(without_dynamics(robot))
     if lacking:
         raise RobotDescriptionError(
-            found=f"gives {'; '.join(lacking)}",
-            hint="Give links <inertial> with a mass and an inertia above 0, and joints "
+            f"gives {'; '.join(lacking)}",
+            "Give links <inertial> with a mass and an inertia above 0, and joints "
             "<limit effort=...>, the torque of the motor in Nm.",
         )
 

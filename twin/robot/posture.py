@@ -122,8 +122,8 @@ def posture_track(episode: Episode) -> PostureTrack:
     urdf = robot_description(episode)
     if urdf is None:
         raise RobotDescriptionError(
-            found=f"is missing in episode {episode.info.id}",
-            hint=f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
+            f"is missing in episode {episode.info.id}",
+            f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
         )
     arm = joint_track(episode)
     robot = robot_of(urdf)
@@ -163,6 +163,6 @@ def check_joints(arm: JointTrack, source: str, robot: Robot) -> None:
     missing = [name for name in robot.joints if name not in arm.names]
     if missing:
         raise RobotDescriptionError(
-            found=f"does not fit {source}, which lacks {', '.join(missing)}",
-            hint=f"Its joint states have: {', '.join(arm.names)}.",
+            f"does not fit {source}, which lacks {', '.join(missing)}",
+            f"Its joint states have: {', '.join(arm.names)}.",
         )

@@ -16,7 +16,7 @@ import pinocchio as pin
 from jaxtyping import Float, Float32, Int, Int64
 
 from bridge.geometry import se3
-from bridge.geometry.mesh import box_corners, sample_triangles
+from bridge.geometry.mesh import sample_triangles
 from twin.robot.collision import collision_geometry
 from twin.robot.model import RobotDescriptionError, RobotModel
 from twin.robot.posture import Posture
@@ -82,7 +82,7 @@ def link_surfaces(robot: RobotModel) -> tuple[LinkSurface, ...]:
         )
     if not surfaces:
         raise RobotDescriptionError(
-            found="has no collision shapes", hint="Without them nobody can say how it looks."
+            "has no collision shapes", "Without them nobody can say how it looks."
         )
     return tuple(surfaces)
 
@@ -159,12 +159,6 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
     import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
 
     shape = item.geometry
-    if isinstance(shape, coal.Box):
-        faces = np.array(
-            [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-        )
-        halves = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
-        return box_corners(2 * np.array(shape.halfSide)), halves
     if isinstance(shape, coal.BVHModelBase) and Path(str(item.meshPath)).suffix in _NOT_READ:
         corners = [shape.tri_indices(index) for index in range(shape.num_tris)]
         triangles = [[item[0], item[1], item[2]] for item in corners]
@@ -172,6 +166,10 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
     if isinstance(shape, coal.BVHModelBase):
         mesh = open3d.io.read_triangle_mesh(Path(str(item.meshPath)))
         vertices = np.asarray(mesh.vertices) * np.array(item.meshScale)
+    elif isinstance(shape, coal.Box):
+        half = np.array(shape.halfSide)
+        mesh = open3d.geometry.TriangleMesh.create_box(*(2 * half))
+        vertices = np.asarray(mesh.vertices) - half
     elif isinstance(shape, coal.Cylinder):
         radius, height = float(shape.radius), 2.0 * float(shape.halfLength)
         mesh = open3d.geometry.TriangleMesh.create_cylinder(radius, height)
@@ -181,8 +179,8 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
         vertices = np.asarray(mesh.vertices)
     else:
         raise RobotDescriptionError(
-            found=f"has a collision shape {type(shape).__name__} at {item.name}",
-            hint="Known: mesh, box, cylinder, sphere.",
+            f"has a collision shape {type(shape).__name__} at {item.name}",
+            "Known: mesh, box, cylinder, sphere.",
         )
     return vertices, np.asarray(mesh.triangles).astype(np.int64)
 

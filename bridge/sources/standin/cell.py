@@ -169,8 +169,7 @@ class StandinCell:
         joints_rad: Float[np.ndarray, "num_waypoints 6"],
     ) -> None:
         """Send joint targets, interpolated between waypoints; times count from now."""
-        count = round(int(times_ns[-1]) / TICK_NS)
-        ticks_ns = np.arange(1, count + 1) * TICK_NS
+        ticks_ns = np.arange(1, round(int(times_ns[-1]) / TICK_NS) + 1) * TICK_NS
         columns = [np.interp(ticks_ns, times_ns, joints_rad[:, joint]) for joint in range(6)]
         for row in np.stack(columns, axis=1):
             self.target_rad = row
@@ -186,12 +185,13 @@ class StandinCell:
         step = FINGER_SPEED_M_S * TICK_NS * 1e-9
         self._width_m += float(np.clip(self._width_target_m - self._width_m, -step, step))
         # The controller closes its loop on encoder readings, which are off by a constant.
-        true_target = self.target_rad - self.hidden.joint_offset_rad
-        self.world.command(true_target, self._width_m)
+        self.world.command(self.target_rad - self.hidden.joint_offset_rad, self._width_m)
+        efforts_Nm = np.zeros(6)
         for _ in range(self._steps_per_tick):
             self.world.step()
+            efforts_Nm += self.world.joint_efforts_Nm / self._steps_per_tick
         self.now_ns += TICK_NS
-        self._publish_robot()
+        self._publish_robot(efforts_Nm)
         if self._is_due("truth", TRUTH_NS):
             self._publish_truth()
         rate = self.config.rate_hz
@@ -204,12 +204,11 @@ class StandinCell:
         self._due[name] = max(self._due[name] + period_ns, self.now_ns - period_ns // 2)
         return True
 
-    def _publish_robot(self) -> None:
+    def _publish_robot(self, efforts_Nm: Float[np.ndarray, "6"]) -> None:
         world, streams = self.world, self.streams
         noise = self._rng.normal(0.0, self.file.sensors.encoder_noise_rad, 6)
-        motors_rad = world.joints_rad + world.slack_rad
-        encoders = np.asarray(motors_rad + self.hidden.joint_offset_rad + noise)
-        streams.joints(encoders, world.joint_speeds_rad_s, world.joint_efforts_Nm, self.now_ns)
+        encoders = world.joints_rad + world.slack_rad + self.hidden.joint_offset_rad + noise
+        streams.joints(encoders, world.joint_speeds_rad_s, efforts_Nm, self.now_ns)
         streams.tcp(self.kinematics.T_base_tcp(encoders), self.now_ns)
         if self._is_due("frames", FRAMES_NS):
             streams.camera_poses(self._believed(encoders), self.now_ns, static=False)

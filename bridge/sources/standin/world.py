@@ -464,8 +464,9 @@ class World:
 
     @property
     def joint_efforts_Nm(self) -> Float[np.ndarray, "6"]:
-        """Torques of the arm's servos."""
-        return np.array(self._data.actuator_force[: len(ARM_JOINTS)])
+        """Torques of the arm's motors, with those that carry its own weight."""
+        servos = self._data.actuator_force[: len(ARM_JOINTS)]
+        return np.array(servos + self._data.qfrc_gravcomp[self._arm_dofs])
 
     @property
     def width_m(self) -> float:

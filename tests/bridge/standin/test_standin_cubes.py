@@ -102,7 +102,7 @@ def test_beside_is_the_middle_of_the_gap_with_a_finger_on_either_side_of_it(
     rollout = Rollout(stamps_ns=np.array([0, 1]), Ts_base_object=rows, finger_contact={})
     found = evaluate_success(task, rollout)[0]
     assert found.value is True, found.detail
-    assert "20 mm from other" in found.detail
+    assert "seen from above is 20 mm" in found.detail
     for taken in (-1.0, 0.4, 2.5):
         closing = tool_down(np.zeros(3), place.turned_to(taken))[:2, 1]
         assert abs(float(closing @ (T - seen["other"])[:2, 3])) < 1e-9

@@ -145,18 +145,12 @@ def test_a_target_seen_from_the_hand_gives_the_camera(
     assert item["residual_m"]["low"] <= item["residual_m"]["value"] <= item["residual_m"]["high"]
 
 
-def test_a_detection_that_is_no_number_is_left_out(run: RunFolder) -> None:
-    """One would spoil the mean of its stop, and with it everything."""
+def test_detections_of_a_stop_are_averaged_without_what_is_no_number(run: RunFolder) -> None:
+    """One would spoil the mean; and those on the move are left out."""
     path = record_targets(run, count=5, more=[np.array([np.nan, 0.0, 1.0])])
     pairs = recorded_pairs([Episode.open(path)], "wrist", "tool0")
     assert len(pairs) == 5
     assert np.isfinite(pairs.Ts_camera_target).all()
-
-
-def test_detections_of_one_stop_are_averaged_and_those_on_the_move_left_out(run: RunFolder) -> None:
-    record_targets(run, count=5)
-    pairs = recorded_pairs([Episode.open(path) for path in run.episodes()], "wrist", "tool0")
-    assert len(pairs) == 5
 
 
 def test_a_calibrated_camera_in_the_hand_follows_the_joints(run: RunFolder) -> None:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
+from bridge.errors import UsageError
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
@@ -21,8 +23,6 @@ from twin.calibrate.posterior import (
     FRICTION,
     WRONG,
     Ended,
-    NoTrialsError,
-    Record,
     Trial,
     Trials,
     calibrate_posterior,
@@ -31,6 +31,7 @@ from twin.calibrate.posterior import (
     effective,
     log_nearness,
     rigid_movers,
+    trusted,
     weighed,
 )
 from twin.replay import monte_carlo, rebuilt_scene
@@ -71,7 +72,7 @@ def scene() -> ReplayScene:
 
 def trial(*, success: bool, end_m: tuple[float, float] = (0.5, 0.2)) -> Trial:
     return Trial(
-        episode=f"trial_{success}",
+        info=EpisodeInfo(id=f"trial_{success}", kind="trial"),
         sha256="0",
         plan=PLAN,
         scene=scene(),
@@ -119,9 +120,9 @@ def test_how_far_an_answer_is_trusted_is_the_integral_over_all_rates(
             )[0]
         )
 
-    record = Record(right=right, wrong=wrong)
-    assert np.exp(record.log_likelihood) == pytest.approx(weigh(0), rel=1e-4)
-    assert record.probability_wrong == pytest.approx(weigh(1) / weigh(0), rel=1e-4)
+    likelihood, next_wrong = trusted(right, wrong)
+    assert np.exp(likelihood) == pytest.approx(weigh(0), rel=1e-4)
+    assert next_wrong == pytest.approx(weigh(1) / weigh(0), rel=1e-4)
 
 
 def test_draws_that_end_as_the_trials_did_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,11 +243,11 @@ def record_of(tasks: Mapping[str, Sequence[PosteriorDraw]]) -> dict[str, object]
 def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
     run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
     record = record_of({TASK.name: draws})
-    before = write_part(run, "posterior", record)["calibration_id"]
+    _, before = write_part(run, "posterior", record)
     known = read_calibration(run)
     assert known is not None
     assert rebuilt_scene.calibrated(ReplayConfig(), known, TASK).variation.posterior == tuple(draws)
-    told = describe_posterior(record, str(before))
+    told = describe_posterior(record, before)
     assert f"{TASK.name}: 4 draws weighed by 1 trials, 1 of which succeeded" in told
     assert "cube_into_box: no trial of it can be used" in told
     assert "trial_0002 not used" in told
@@ -282,7 +283,7 @@ def test_a_task_is_weighed_by_its_own_trials_alone(
     start = scene().Ts_base_object["block"][:2, 3]
     fell = [trial(success=False, end_m=tuple(start)) for _ in range(3)]
     held = [
-        replace(each, episode="held", scene=replace(each.scene, task=other))
+        replace(each, info=replace(each.info, id="held"), scene=replace(each.scene, task=other))
         for each in [trial(success=True)] * 3
     ]
     found = Trials(usable=[*held, *fell], skipped={}, tasks=frozenset({TASK.name, "unused"}))
@@ -303,6 +304,6 @@ def test_a_task_is_weighed_by_its_own_trials_alone(
 
 def test_a_run_without_executed_trials_says_so(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
-    with pytest.raises(NoTrialsError, match="no executed trial"):
+    with pytest.raises(UsageError, match="no executed trial"):
         calibrate_posterior(run, num_draws=2, workers=1, output=QUIET)
     assert not (run.scene_dir / "calibration.json").exists()

@@ -33,7 +33,7 @@ PLAN = Plan(
 
 
 JUDGED = JudgedTasks(only=TASK_FILE)
-HOME = SimpleNamespace(names=ARM_JOINTS, position_rad=np.zeros(6), stamp_ns=42, received_ns=1)
+HOME = SimpleNamespace(names=ARM_JOINTS, position=np.zeros(6), stamp_ns=42, received_ns=1)
 
 
 @dataclass
@@ -49,7 +49,7 @@ class FakePerception:
         return self.description
 
     def joints(self) -> Any:
-        return self.arm
+        return self.arm and (self.arm, self.arm.received_ns)
 
     def executing(self) -> str | None:
         return self.running
@@ -103,3 +103,25 @@ def raising(error: Exception) -> Callable[..., Any]:
         raise error
 
     return call
+
+
+@dataclass
+class FakeSession:
+    published: list[tuple[str, bytes, int]] = field(default_factory=list)
+    services: dict[str, Callable[[bytes], bytes]] = field(default_factory=dict)
+    subscriptions: dict[str, Callable[[Any], None]] = field(default_factory=dict)
+
+    def now_ns(self) -> int:
+        return 7
+
+    def publisher(self, topic: str, type_name: str) -> Any:
+        def put(data: bytes, *, source_ns: int) -> None:
+            self.published.append((topic, data, source_ns))
+
+        return SimpleNamespace(put=put)
+
+    def serve(self, key: str, handler: Callable[[bytes], bytes], *, side_by_side: int = 1) -> None:
+        self.services[key] = handler
+
+    def subscribe(self, key: str, callback: Callable[[Any], None]) -> None:
+        self.subscriptions[key] = callback

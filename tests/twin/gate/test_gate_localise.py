@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gate_fakes import TASK, FakePerception, gate_with, raising
+from gate_fakes import TASK, FakePerception, FakeSession, gate_with, raising
 
-from bridge.episode import schema
 from bridge.sources.standin.gate_sight import GateSight
 from bridge.task.record import parse_record
 from bridge.terminal import Output
@@ -87,42 +86,22 @@ def test_a_look_waits_no_longer_than_the_deadline_for_a_plan_that_is_judged() ->
     assert gate.localise("").found is True
 
 
-class Wire:
-    """Keeps the handler, and what is published."""
-
-    def __init__(self) -> None:
-        """Nothing yet."""
-        self.published: list[tuple[str, str, dict[str, Any], int]] = []
-        self.services: dict[str, Any] = {}
-
-    def publisher(self, topic: str, type_name: str) -> Any:
-        wire = self
-
-        class Publisher:
-            def put(self, data: bytes, *, source_ns: int) -> None:
-                record = parse_record(data, name="localisation")
-                wire.published.append((topic, type_name, dict(record), source_ns))
-
-        return Publisher()
-
-    def serve(self, key: str, handler: Any) -> None:
-        self.services[key] = handler
-
-
 def test_the_answer_is_what_is_published_and_what_a_planner_reads() -> None:
-    wire = Wire()
+    wire = FakeSession()
     serve_localisation(wire, sees(), FakePerception(), GateConfig(cell="lab"), Output(quiet=True))
     answer = wire.services["lab/gate/localise"](b'{"task": "cube_into_box"}')
     records = json.loads(answer)["objects"]
-    assert [row[:2] for row in wire.published] == [("/lab/localisation", schema.LOCALISATION)] * 2
-    assert [row[2] for row in wire.published] == records
-    assert {row[3] for row in wire.published} == {42}
+    assert {(topic, stamp_ns) for topic, _, stamp_ns in wire.published} == {
+        ("/lab/localisation", 42)
+    }
+    published = [data for _, data, _ in wire.published]
+    assert [dict(parse_record(data, name="localisation")) for data in published] == records
     assert GateSight.from_json(answer, TASK).found is True
 
 
 @pytest.mark.parametrize("payload", [b"[1]", b"no json", b"\xff", b"[" * 100_000])
 def test_another_question_is_refused(payload: bytes) -> None:
-    wire = Wire()
+    wire = FakeSession()
     serve_localisation(wire, sees(), FakePerception(), GateConfig(), Output(quiet=True))
     with pytest.raises(GateError, match="is JSON"):
         wire.services["standin/gate/localise"](payload)

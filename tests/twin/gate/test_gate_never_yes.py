@@ -1,30 +1,19 @@
 """Everything that can go wrong between a plan and its execution: never a yes by default."""
 
-import threading
-import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import gate_fakes
 import numpy as np
 import pytest
-from gate_fakes import HOME, JUDGED, TASK, accept
+from gate_fakes import HOME, PLAN, TASK, FakePerception, accept, gate_with
 
-from bridge.episode.run_folder import RunFolder
 from bridge.errors import OptionError, UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
-from bridge.terminal import Output
-from twin.gate import twin_process
 from twin.gate.config import GateConfig
-from twin.gate.gate import Gate, UndecidedError, turn_between, who_moved
-from twin.gate.twin_process import TwinProcess
-
-PLAN = replace(gate_fakes.PLAN, robot="arm")
+from twin.gate.gate import turn_between, who_moved
 
 
 def frame(stamp_ns: int) -> Any:
@@ -32,27 +21,19 @@ def frame(stamp_ns: int) -> Any:
 
 
 @dataclass
-class ChangingPerception:
+class ChangingPerception(FakePerception):
     """What is seen first, and what is seen when one looks again."""
 
     looks: list[list[Any]] = field(default_factory=lambda: [[frame(1)]])
-    running: list[str | None] = field(default_factory=lambda: [None])
+    executed: list[str | None] = field(default_factory=lambda: [None])
     postures: list[Any] = field(default_factory=lambda: [HOME])
 
-    def urdf(self) -> str:
-        return '<robot name="arm"/>'
-
     def joints(self) -> Any:
-        return self.postures.pop(0) if len(self.postures) > 1 else self.postures[0]
+        self.arm = self.postures.pop(0) if len(self.postures) > 1 else self.postures[0]
+        return super().joints()
 
     def executing(self) -> str | None:
-        return self.running.pop(0) if len(self.running) > 1 else self.running[0]
-
-    def newest_ns(self) -> int:
-        return 1
-
-    def heard_ns(self) -> int:
-        return 0
+        return self.executed.pop(0) if len(self.executed) > 1 else self.executed[0]
 
     def frames(self, **_: Any) -> Any:
         frames = self.looks.pop(0) if len(self.looks) > 1 else self.looks[0]
@@ -88,13 +69,11 @@ def judged(
     **settings: Any,
 ) -> Verdict:
     answers = found or [seen(pose())]
-    gate = Gate(
-        tasks=JUDGED,
-        config=GateConfig(**{"deadline_s": 5.0, "frame_wait_s": 0.0, **settings}),
-        perception=perception or ChangingPerception(),
-        localise=lambda *_: answers.pop(0) if len(answers) > 1 else answers[0],
-        replay=lambda *_: verdict or accepted(),
-        now_ns=lambda: 0,
+    gate = gate_with(
+        perception or ChangingPerception(),
+        lambda *_: answers.pop(0) if len(answers) > 1 else answers[0],
+        lambda *_: verdict or accepted(),
+        **settings,
     )
     return gate.judge(PLAN.to_json())
 
@@ -103,7 +82,7 @@ LOOKS = [[frame(1)], [frame(2)]]
 
 
 def at(joints_rad: list[float]) -> Any:
-    return SimpleNamespace(**{**vars(HOME), "position_rad": np.array(joints_rad)})
+    return SimpleNamespace(**{**vars(HOME), "position": np.array(joints_rad)})
 
 
 def test_a_yes_needs_the_cell_to_be_as_it_was_judged() -> None:
@@ -122,7 +101,7 @@ BENT = at([0.0, 0.0, 0.06, 0.0, 0.0, 0.0])
         ({"looks": LOOKS}, seen(pose(yaw_rad=0.6)), "cube by 0 mm and 34 degrees"),
         ({"looks": LOOKS}, LOST, "not every object was found: cube (0 points)"),
         ({"looks": [[frame(1)], []]}, None, "lost from sight while the plan was judged"),
-        ({"running": [None, "plan_0"]}, None, "plan_0 was started while the plan was"),
+        ({"executed": [None, "plan_0"]}, None, "plan_0 was started while the plan was"),
         ({"postures": [HOME, BENT]}, None, "the arm moved while the plan was being judged: "
          "elbow_joint by 0.060 rad"),
         ({"postures": [HOME, at([np.nan] * 6)]}, None, "/standin/joint_states hold no numbers for "
@@ -185,69 +164,9 @@ def test_settings_with_which_no_gate_works_are_refused() -> None:
         GateConfig(deadline_s=-1.0)
 
 
-@pytest.fixture
-def twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TwinProcess]:
-    """A process that imports nothing, and does what it is told instead of replaying."""
-    monkeypatch.setattr(twin_process, "get_ready", id)
-    run = RunFolder.create(tmp_path / "run")
-    with TwinProcess(run.path, GateConfig(), Output(quiet=True)) as process:
-        yield process
-
-
-FOREVER = "__import__('threading').Event().wait()"
-"""A replay that never ends: a test that waited for it would hang, and be named by the limit."""
-
-
-def soon(seconds: float) -> float:
-    return time.monotonic() + seconds
-
-
-def test_a_replay_that_hangs_is_stopped_and_the_next_one_is_judged(twin: TwinProcess) -> None:
-    assert twin._do("replay", eval, "1 + 1", soon(20)) == 2
-    with pytest.raises(UndecidedError, match="the replay was not done before the wall-clock limit"):
-        twin._do("replay", eval, FOREVER, soon(0.1))
-    assert twin._do("replay", eval, "2 + 2", soon(20)) == 4
-
-
-def test_a_replay_that_dies_takes_nobody_with_it(twin: TwinProcess) -> None:
-    suicide = "__import__('os').kill(__import__('os').getpid(), 11)"
-    with pytest.raises(UndecidedError, match="no replay: the process that did it ended by SIGSEGV"):
-        twin._do("replay", eval, suicide, soon(20))
-    assert twin._do("replay", eval, "2 + 2", soon(20)) == 4
-
-
-def test_a_replay_that_raises_is_no_verdict_with_its_sentence(twin: TwinProcess) -> None:
-    raising = "(_ for _ in ()).throw(__import__('twin.errors').errors.TwinError('no waypoints'))"
-    with pytest.raises(UndecidedError, match=r"^no waypoints$"):
-        twin._do("replay", eval, raising, soon(20))
-    with pytest.raises(UndecidedError, match="internal error: ZeroDivisionError"):
-        twin._do("replay", eval, "1 / 0", soon(20))
-
-
-def test_a_gate_that_is_being_stopped_says_so(twin: TwinProcess) -> None:
-    said: list[Exception] = []
-
-    def ask() -> None:
-        try:
-            twin._do("replay", eval, FOREVER, soon(60))
-        except UndecidedError as error:
-            said.append(error)
-
-    asking = threading.Thread(target=ask)
-    asking.start()
-    while twin._worker is None or not twin._worker.busy:
-        threading.Event().wait(0.005)
-    twin.close()
-    asking.join(10)
-    assert not asking.is_alive()
-    assert len(said) == 1
-    with pytest.raises(UndecidedError, match="is being stopped"):
-        twin._do("replay", eval, "1", soon(1))
-
-
 def test_a_no_is_a_no_whatever_happens_meanwhile() -> None:
     no = Factor(value=False, cause="inside", detail="beside the box")
-    perception = ChangingPerception(running=[None, "plan_0"])
+    perception = ChangingPerception(executed=[None, "plan_0"])
     assert judged(perception, verdict=replace(accepted(), terminal=no)).accepted is False
 
 

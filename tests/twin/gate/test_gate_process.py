@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +23,10 @@ def twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TwinProces
     monkeypatch.setattr(twin_process, "get_ready", id)
     with TwinProcess(tmp_path, GateConfig(), Output(quiet=True)) as process:
         yield process
+
+
+FOREVER = "__import__('threading').Event().wait()"
+"""A replay that never ends: a test that waited for it would hang, and be named by the limit."""
 
 
 def asked(twin: TwinProcess, expression: str, *, within_s: float = 20.0) -> object:
@@ -60,3 +65,39 @@ def test_a_process_killed_while_it_is_started_is_replaced(
     assert asked(twin, "2 + 2") == 4
     with pytest.raises(WorkerDiedError):
         starts[0].begin(len, b"")
+
+
+def test_a_replay_that_hangs_is_stopped_and_the_next_one_is_judged(twin: TwinProcess) -> None:
+    assert asked(twin, "1 + 1") == 2
+    with pytest.raises(UndecidedError, match="the replay was not done before the wall-clock limit"):
+        asked(twin, FOREVER, within_s=0.1)
+    assert asked(twin, "2 + 2") == 4
+
+
+def test_a_replay_that_raises_is_no_verdict_with_its_sentence(twin: TwinProcess) -> None:
+    raising = "(_ for _ in ()).throw(__import__('twin.errors').errors.TwinError('no waypoints'))"
+    with pytest.raises(UndecidedError, match=r"^no waypoints$"):
+        asked(twin, raising)
+    with pytest.raises(UndecidedError, match="internal error: ZeroDivisionError"):
+        asked(twin, "1 / 0")
+
+
+def test_a_gate_that_is_being_stopped_says_so(twin: TwinProcess) -> None:
+    said: list[Exception] = []
+
+    def ask() -> None:
+        try:
+            asked(twin, FOREVER, within_s=60)
+        except UndecidedError as error:
+            said.append(error)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    while twin._worker is None or not twin._worker.busy:
+        threading.Event().wait(0.005)
+    twin.close()
+    asking.join(10)
+    assert not asking.is_alive()
+    assert len(said) == 1
+    with pytest.raises(UndecidedError, match="is being stopped"):
+        asked(twin, "1", within_s=1)

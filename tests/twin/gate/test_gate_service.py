@@ -1,14 +1,12 @@
 """The gate as a service of a cell: what it answers, publishes and subscribes, and how it ends."""
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
-from gate_fakes import PLAN, FakePerception, accept, gate_with
+from gate_fakes import PLAN, FakePerception, FakeSession, accept, gate_with
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import InvalidRecordError
@@ -17,28 +15,6 @@ from bridge.terminal import Output
 from twin.gate.config import GateConfig
 from twin.gate.service import GateError, run_gate, serve_gate, watch_cell
 from twin.robot import collision
-
-
-@dataclass
-class FakeSession:
-    published: list[tuple[str, bytes, int]] = field(default_factory=list)
-    services: dict[str, Callable[[bytes], bytes]] = field(default_factory=dict)
-    subscriptions: dict[str, Callable[[Any], None]] = field(default_factory=dict)
-
-    def now_ns(self) -> int:
-        return 7
-
-    def publisher(self, topic: str, type_name: str) -> Any:
-        def put(data: bytes, *, source_ns: int) -> None:
-            self.published.append((topic, data, source_ns))
-
-        return SimpleNamespace(put=put)
-
-    def serve(self, key: str, handler: Callable[[bytes], bytes], *, side_by_side: int) -> None:
-        self.services[key] = handler
-
-    def subscribe(self, key: str, callback: Callable[[Any], None]) -> None:
-        self.subscriptions[key] = callback
 
 
 def test_the_service_answers_and_publishes_with_the_cells_own_time() -> None:

@@ -152,17 +152,12 @@ def test_a_plan_that_alone_needs_too_many_steps_gets_no_verdict(
         answer(replace(question, plan=replace(question.plan, tau=(late,))))
 
 
-def test_a_gate_without_a_calibration_presses_as_the_task_says(
+def test_a_gate_presses_as_the_task_says_until_a_calibration_knows_better(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, config = asked(run, monkeypatch)
     assert config.physics.grip_force_N == 9.0
     assert scene.Ts_base_object["sloth"][:3, 3] == pytest.approx([0.5, -0.1, 0.03])
-
-
-def test_a_gate_presses_as_the_calibration_says(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
     force = {"grip_force_N": {"value": 11.0, "low": 10.0, "high": 12.0, "sigma_log": 0.05}}
     write_physics(run, {"promoted": True, "identified": force, "id": "x"})
     scene, config = asked(run, monkeypatch)

@@ -86,6 +86,8 @@ def test_frames_from_before_the_end_of_an_execution_do_not_count() -> None:
     event(view, "execution_ended", 3 * S)
     assert view.executing() is None
     assert "at rest since the last motion" in look(view).reasons[0]
+    shoot(view, 3 * S + 1)  # may still show it: a camera counts as stationary over a while only
+    assert "at rest since the last motion" in look(view).reasons[0]
     shoot(view, 3 * S + S // 5)
     assert [frame.stamp_ns for frame in look(view).frames] == [3 * S + S // 5]
 
@@ -191,7 +193,7 @@ def test_late_joint_states_and_those_of_another_publisher_do_not_set_the_clock_b
     feel(view, S, SET_BACK_SAMPLES - 1)
     heard = view.joints()
     assert heard is not None
-    assert view.newest_ns() - heard.stamp_ns > 40 * S  # the gate refuses joints of that age
+    assert view.newest_ns() - heard[0].stamp_ns > 40 * S  # the gate refuses joints of that age
 
 
 def test_an_execution_goes_on_when_the_clock_is_set_back() -> None:
@@ -200,12 +202,3 @@ def test_an_execution_goes_on_when_the_clock_is_set_back() -> None:
     event(view, "execution_started", 50 * S)
     feel(view, S, 2 * SET_BACK_SAMPLES)
     assert view.executing() == "plan_1"
-
-
-def test_an_image_of_the_very_end_of_an_execution_does_not_count() -> None:
-    """It may still show the motion: a camera counts as stationary over a while only."""
-    view = ready()
-    event(view, "execution_started", 2 * S)
-    event(view, "execution_ended", 3 * S)
-    shoot(view, 3 * S + 1)
-    assert "at rest since the last motion" in look(view).reasons[0]

@@ -33,10 +33,9 @@ def push(world: PhysicsWorld, name: str, linear_m_s: object, angular_rad_s: obje
 
 
 def _push_pybullet(world: World, name: str, v: np.ndarray, omega: np.ndarray) -> None:
-    from twin.physics.engine import pybullet
 
     body = world.free_ids[name]
-    pybullet.resetBaseVelocity(body, v.tolist(), omega.tolist(), physicsClientId=world.client)
+    world.client.resetBaseVelocity(body, v.tolist(), omega.tolist())
 
 
 def _push_mujoco(world: MujocoWorld, name: str, v: np.ndarray, omega: np.ndarray) -> None:

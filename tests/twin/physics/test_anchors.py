@@ -8,7 +8,6 @@ import pytest
 from bridge.geometry import se3
 from twin.physics import world as world_module
 from twin.physics.config import PhysicsConfig
-from twin.physics.engine import pybullet
 from twin.physics.world import World
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
@@ -21,7 +20,7 @@ CARRIED_KG = 2 * WEAK.object_friction * WEAK.finger_friction * WEAK.grip_force_N
 
 def gripping(world: World, mass_kg: float) -> None:
     """Hold a cube between the fingers, weightless."""
-    pybullet.setGravity(0, 0, 0, physicsClientId=world.client)
+    world.client.setGravity(0, 0, 0)
     world.reset_robot(HOME, 0.041)
     world.add_free("cube", SIZE, mass_kg, world.robot.T_base_link("tcp"))
     for _ in range(60):
@@ -44,7 +43,7 @@ def turning(world: World, angle_rad: float, speed_rad_s: float = 2.0) -> Iterato
 
 def weigh_down(world: World, joints: np.ndarray, steps: int) -> float:
     """Switch gravity on; how far the cube has moved in the tool's frame [m]."""
-    pybullet.setGravity(0, 0, -G, physicsClientId=world.client)
+    world.client.setGravity(0, 0, -G)
     start = se3.invert(world.robot.T_base_link("tcp")) @ world.T_base_object("cube")
     for _ in range(steps):
         world.robot.command(joints, STILL, 0.0)
@@ -57,9 +56,7 @@ def normal_error_rad(world: World) -> float:
     """Angle between the fingers' closing direction and contact normals, weighted by force."""
     finger = world.robot.T_base_link("gripper_left_finger")[:3, :3]
     axis = finger @ np.array([0.0, 1.0, 0.0])
-    points = pybullet.getContactPoints(
-        world.robot.id, world.free_ids["cube"], physicsClientId=world.client
-    )
+    points = world.client.getContactPoints(world.robot.id, world.free_ids["cube"])
     angles = [np.arccos(min(1.0, abs(axis @ np.array(point[7])))) for point in points]
     return float(np.average(angles, weights=[point[9] for point in points]))
 

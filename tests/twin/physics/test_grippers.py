@@ -9,7 +9,6 @@ import pytest
 from bridge.geometry import se3
 from bridge.robots.robot import Finger, Gripper, Robot, read_robot
 from twin.physics.config import PhysicsConfig
-from twin.physics.engine import pybullet
 from twin.physics.world import World
 from twin.replay.dynamics import mesh_hulls
 from twin.robot.collision import RobotHulls
@@ -61,9 +60,7 @@ def squeezed_N(robot: Robot, thickness_m: float = 0.03) -> float:
         forces = [
             sum(
                 point[9]
-                for point in pybullet.getContactPoints(
-                    world.robot.id, body, linkIndexA=link, physicsClientId=world.client
-                )
+                for point in world.client.getContactPoints(world.robot.id, body, linkIndexA=link)
             )
             for link in world.robot.finger_links
         ]

@@ -5,7 +5,6 @@ import pytest
 
 from bridge.geometry import se3
 from twin.physics.config import PhysicsConfig
-from twin.physics.engine import pybullet
 from twin.physics.world import World
 
 SIZE = np.array([0.04, 0.04, 0.04])
@@ -22,11 +21,8 @@ def test_a_wall_reaches_as_far_as_its_pose_says(urdf: str, seed: int) -> None:
         for axis in range(3):
             centre = np.array([0.05, 0.0, 0.0])
             start = centre + np.eye(3)[axis]
-            hit = pybullet.rayTest(
-                se3.apply(T, start).tolist(),
-                se3.apply(T, centre).tolist(),
-                physicsClientId=world.client,
-            )[0]
+            ends = (se3.apply(T, point).tolist() for point in (start, centre))
+            (hit,) = world.client.rayTest(*ends)
             assert hit[2] == pytest.approx(1.0 - extents[axis] / 2, abs=1e-3)
 
 

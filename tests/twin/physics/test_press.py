@@ -8,7 +8,6 @@ import pytest
 from bridge.robots.default import FINGER_JOINTS
 from twin.physics import arm
 from twin.physics.config import FINGER_SPEED_M_S, PhysicsConfig
-from twin.physics.engine import pybullet
 from twin.physics.world import World
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
@@ -21,14 +20,10 @@ OPEN_M, CLOSED_M = 0.06, 0.0
 def fingers(world: World) -> np.ndarray:
     """Speed [m/s] and force [N] of each finger."""
     names = {
-        pybullet.getJointInfo(world.robot.id, index, physicsClientId=world.client)[1].decode(): (
-            index
-        )
-        for index in range(pybullet.getNumJoints(world.robot.id, physicsClientId=world.client))
+        world.client.getJointInfo(world.robot.id, index)[1].decode(): (index)
+        for index in range(world.client.getNumJoints(world.robot.id))
     }
-    states = pybullet.getJointStates(
-        world.robot.id, [names[name] for name in FINGER_JOINTS], physicsClientId=world.client
-    )
+    states = world.client.getJointStates(world.robot.id, [names[name] for name in FINGER_JOINTS])
     return np.array([[state[1], state[3]] for state in states])
 
 
@@ -44,7 +39,7 @@ def run(world: World, steps: int, width_m: float) -> np.ndarray:
 
 def holding(world: World) -> np.ndarray:
     """Close on a cube that floats between the fingers."""
-    pybullet.setGravity(0, 0, 0, physicsClientId=world.client)
+    world.client.setGravity(0, 0, 0)
     world.reset_robot(HOME, OPEN_M)
     world.add_free("cube", SIZE, 0.05, world.robot.T_base_link("tcp"))
     run(world, 10, OPEN_M)
@@ -75,8 +70,8 @@ def test_fingers_whose_cube_is_gone_are_slow_again_after_a_few_steps(urdf: str) 
     with World(urdf, {}, STRONG) as world:
         holding(world)
         width_m = world.robot.width_m()
-        pybullet.resetBasePositionAndOrientation(
-            world.free_ids["cube"], [2.0, 0.0, 1.0], [0, 0, 0, 1], physicsClientId=world.client
+        world.client.resetBasePositionAndOrientation(
+            world.free_ids["cube"], [2.0, 0.0, 1.0], [0, 0, 0, 1]
         )
         speeds = np.abs(run(world, 12, CLOSED_M)[:, :, 0])
         free_m_s = 1.05 * FINGER_SPEED_M_S

@@ -9,7 +9,6 @@ import pytest
 
 import robot_gst
 from bridge.data_files import datasets_folder
-from bridge.errors import GstError, UsageError
 from bridge.robots.robot import Robot, read_robot
 from twin.robot.check import check_robot
 from twin.robot.collision import RobotHulls
@@ -159,7 +158,6 @@ def test_the_check_command_ends_with_2_and_the_reason(
         path.write_text(changed)
         assert robot_gst.run(["robot", "check", str(path)]) == 2
         assert found in capsys.readouterr().err
-    assert issubclass(UsageError, GstError)
 
 
 def test_links_said_to_overlap_are_not_watched() -> None:

@@ -4,14 +4,13 @@ Of the runs of each task in the order of their numbers the first, third, fifth .
 tasks together; the others are held out and say whether *planned* comes nearer.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from statistics import median
 from typing import Any
 
 import numpy as np
 
-from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.terminal import Output
@@ -19,6 +18,8 @@ from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.motion import Motion, find_motion
 from twin.calibrate.physics.push_fit import calibrate_pushes, describe_pushes, recordings, split
 from twin.calibrate.physics.pushes import Push, UnusablePushError, arm_of, described, seen_of
+from twin.calibrate.weights import calibrate_weights, describe_weights
+from twin.replay.rebuilt_scene import MASSES
 from twin.scene.store.calibration import write_part
 
 PART = "motion"
@@ -62,8 +63,7 @@ def calibrate_motion(run: RunFolder) -> tuple[dict[str, Any], str]:
         "sources": {push.episode: push.sha256 for push in pushes},
         "skipped": skipped,
     }
-    record["id"] = provenance.hash_settings(record)
-    return record, str(write_part(run, PART, record)["calibration_id"])
+    return write_part(run, PART, record)
 
 
 def end_point_m(push: Push, motion: Motion) -> float:
@@ -99,22 +99,22 @@ def describe_motion(record: Mapping[str, Any], calibration_id: str) -> str:
     return "\n".join([*lines, *(f"  {name}: {why}" for name, why in record["skipped"].items())])
 
 
-def calibrate_imported(
+def calibrate_physics(
     run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[dict[str, Any], str]:
-    """Find the arm's motion and its pushes' friction where a run has them; record and words."""
-    record: dict[str, Any] = {}
-    words = []
-    try:
-        record[PART], record["calibration_id"] = calibrate_motion(run)
-        words.append(describe_motion(record[PART], record["calibration_id"]))
-    except (UsageError, UnusablePushError) as error:
-        words.append(f"motion: {error}")
-    try:
-        record["physics"], record["calibration_id"] = calibrate_pushes(run, config, output)
-        words.append(describe_pushes(record["physics"], record["calibration_id"]))
-    except UnusablePushError as error:
-        words.append(f"friction: {error}")
+    """Find the arm's motion, its pushes' friction and what it weighed, where a run has them."""
+    parts: dict[str, tuple[Callable[[], tuple[Any, str]], Callable[[Any, str], str]]] = {
+        PART: (lambda: calibrate_motion(run), describe_motion),
+        "physics": (lambda: calibrate_pushes(run, config, output), describe_pushes),
+        MASSES: (lambda: calibrate_weights(run), describe_weights),
+    }
+    record, words = dict[str, Any](), []
+    for name, (calibrate, describe) in parts.items():
+        try:
+            record[name], record["calibration_id"] = calibrate()
+            words.append(describe(record[name], record["calibration_id"]))
+        except (UsageError, UnusablePushError) as error:
+            words.append(f"{name}: {error}")
     if not record:
         raise UnusablePushError(" ".join(words))
     return record, "\n".join(words)

@@ -120,11 +120,10 @@ def calibrate_pushes(
     pushes, skipped = _pushes(run)
     fitted, held_out = split(list(pushes))
     if len(fitted) < FEWEST or not held_out:
-        message = (
+        raise UnusablePushError(
             f"{len(pushes)} pushes in {run.path}; at least {2 * FEWEST} are needed. Trials of a "
             "cell teach through --posterior."
         )
-        raise UnusablePushError(message)
     output.say(f"{len(pushes)} pushes: {len(fitted)} identify, {len(held_out)} are held out")
     with runner_of(config.workers) as runner:
         grid = _simulate(run, fitted, runner, output)
@@ -165,10 +164,9 @@ def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
     found = {push.episode: push for push in every if push.T_world_box is not None}
     tasks = sorted({push.task for push in found.values()})
     if len(tasks) > 1:
-        message = (
+        raise UnusablePushError(
             f"pushes of several tasks in {run.path}: {', '.join(tasks)}; calibrate them apart."
         )
-        raise UnusablePushError(message)
     return found, skipped
 
 

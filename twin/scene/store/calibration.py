@@ -138,9 +138,10 @@ def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
     return _store(run, {**kept, "physics": current, "physics_history": history})
 
 
-def write_part(run: RunFolder, name: str, part: Mapping[str, Any]) -> dict[str, Any]:
-    """Write the ``posterior`` of trials or the ``motion`` of an arm; an earlier one is replaced."""
-    return _store(run, {**_kept(run), name: part})
+def write_part(run: RunFolder, name: str, part: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """Write what was learned, in place of an earlier one; returns it and the calibration's id."""
+    named = {**part, "id": provenance.hash_settings(dict(part))}
+    return named, str(_store(run, {**_kept(run), name: named})["calibration_id"])
 
 
 def _kept(run: RunFolder) -> dict[str, Any]:
@@ -150,11 +151,7 @@ def _kept(run: RunFolder) -> dict[str, Any]:
 
 def _store(run: RunFolder, content: Mapping[str, Any]) -> dict[str, Any]:
     """Name the content and put it in place."""
-    record = {
-        **content,
-        "schema_version": CALIBRATION_VERSION,
-        "software": provenance.software(),
-    }
+    record = {**content, "schema_version": CALIBRATION_VERSION, "software": provenance.software()}
     named = {key: value for key, value in record.items() if key not in UNNAMED}
     record["calibration_id"] = provenance.hash_settings(named)
     run.scene_dir.mkdir(parents=True, exist_ok=True)

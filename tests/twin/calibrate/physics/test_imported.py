@@ -14,7 +14,7 @@ from bridge.episode.streams import pose_track
 from bridge.terminal import Output
 from evaluator.compare import compare_run
 from twin.calibrate.config import CalibrateConfig
-from twin.calibrate.physics.arm_motion import calibrate_imported
+from twin.calibrate.physics.arm_motion import calibrate_physics
 from twin.calibrate.physics.imported import ENGINE, replay_imported
 from twin.calibrate.physics.push_fit import METHOD, frictions, load_push
 from twin.physics.config import PhysicsConfig
@@ -118,10 +118,10 @@ def test_planned_replays_follow_the_arm_as_it_was_seen_to_move(tmp_path: Path) -
     for number in range(1, 5):
         pushed_boxes.write_turning(run, f"turn_{number}", number)
     nominal = [Path(row["path"]) for row in replay(run)["imported"]]
-    record, words = calibrate_imported(run, CalibrateConfig(physics=True), QUIET)
+    record, words = calibrate_physics(run, CalibrateConfig(physics=True), QUIET)
     assert record["motion"]["delay_s"]["push"] == pytest.approx(pushed_boxes.DELAY_S, abs=0.02)
     assert "physics" not in record
-    assert "friction: 0 pushes" in words
+    assert "physics: 0 pushes" in words
     assert re.search(r"zero of turn .* not determined: only together with (base|tool)", words)
     rows = replay(run)["imported"]
     for row, before in zip(rows, nominal, strict=True):

@@ -1,0 +1,303 @@
+"""What a run's trials weighed: the objects that were held, by the efforts of the arm's joints.
+
+Effort = inverse dynamics of the arm as described + bias, drift, friction and motor inertia of each
+joint + what the description is off (joint zeros, links) + a weight at the tool while something is
+held, all a little late. That is linear in what is unknown, so all is fitted at once with normal
+priors: free motion tells the arm from the weight, and what it leaves open widens the interval.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter1d
+from scipy.stats import chi2
+
+from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import JointSample
+from bridge.episode.executions import executed_events
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import JOINT_STATES
+from bridge.errors import GstError, UsageError
+from bridge.task.task_file import Task
+from twin.calibrate.motion import Z_95, stays_alike
+from twin.errors import TwinError
+from twin.replay.execution import stages_as_executed
+from twin.replay.grasps import grasped
+from twin.replay.observed import find_grips
+from twin.replay.rebuilt_scene import MASSES
+from twin.robot.model import RobotModel, load_robot, without_dynamics
+from twin.robot.posture import width_track
+from twin.scene.store.calibration import write_part
+
+STEP_S, SMOOTH_S, SLOWEST_S = 0.02, 0.04, 0.05
+"""Spacing of what is compared; spread of the Gaussian that smooths joints and efforts alike; time
+between two readings, at most."""
+NEAR_M, ABOVE_M, AROUND_S = 0.05, 0.03, 0.5
+"""The hand touches nothing so far from where it closed and opens, the object not what it stood on;
+nor is the arm free so shortly about a grasp."""
+OF_EFFORT = (0.05, 0.02, 0.2, 0.1, 0.02)
+"""Standard deviations beforehand in parts of a joint's largest effort: of its sensor's bias, of
+that one's drift, of dry friction, of friction a rad/s and of the motor's inertia."""
+ZERO_RAD, LATE_S, LINK, CENTRE_M = 0.003, 0.01, 0.05, 0.01
+"""Of joints' zeros, of the delay, of links' masses and inertias in parts of them, of centres."""
+MASS_KG, HAND_M, LEVER = 5.0, 0.05, 0.005
+"""Of the weight, of where it lies from the tool along each axis, of levers in parts of them."""
+CREEP_RAD_S, LEAST_NM = 0.01, 1e-3
+"""A joint that is slower may be held by dry friction, either way; none is known better."""
+TAILS, ROUNDS, FEWEST = 4, 8, 20
+"""Degrees of freedom of Student's t, which residuals have, for fingers touch things; fits, each
+with weights from the one before; samples, at least."""
+ALIKE, KNOWN, KNOWN_KG, AGREE = (0.7, 1.4), 0.2, 0.02, 0.99
+"""Efforts in parts of those described; half intervals, in parts of the mass or this, above which it
+is not determined; share of trials of one object that agree better."""
+
+Rows = Float[np.ndarray, "_ num_joints"]
+Which = Bool[np.ndarray, " _"]
+
+
+class NoWeightError(TwinError):
+    """Efforts do not say what is held; the message says why."""
+
+
+def smoothed(times_s: Float[np.ndarray, " _"], joints_rad: Rows, efforts: Rows) -> np.ndarray:
+    """Time, joints, speeds, accelerations, efforts and their changes, evenly in time."""
+    if not np.isfinite(efforts).all():
+        raise NoWeightError("efforts are no numbers")
+    if np.ptp(efforts, axis=0).max(initial=0.0) < LEAST_NM:
+        raise NoWeightError("efforts do not change: nobody measured them")
+    step_s = float(np.median(np.diff(times_s)))
+    if not 0 < step_s <= SLOWEST_S:
+        raise NoWeightError(f"joints are read every {step_s:.2g} s only")
+    even_s = np.arange(times_s[0], times_s[-1], step_s)
+    both = [np.interp(even_s, times_s, each) for each in np.hstack([joints_rad, efforts]).T]
+    rows = gaussian_filter1d(np.stack(both, axis=1), SMOOTH_S / step_s, axis=0)
+    first = np.gradient(rows, step_s, axis=0)
+    count = joints_rad.shape[1]
+    q, v, tau, changes = rows[:, :count], first[:, :count], rows[:, count:], first[:, count:]
+    a = np.gradient(v, step_s, axis=0)
+    return np.hstack([even_s[:, None], q, v, a, tau, changes])[:: max(1, round(STEP_S / step_s))]
+
+
+def weight_of(robot: RobotModel, moved: np.ndarray, free: Which, held: Which) -> dict[str, Any]:
+    """Find what is held in some rows of ``smoothed``, given others in which the arm moves freely.
+
+    Returns mass and centre (from the tool, along its axes), each with half of its 95 % interval.
+    NoWeightError says why it is not determined.
+    """
+    for lacking in without_dynamics(robot):
+        raise NoWeightError(f"the robot's description gives {lacking}")
+    if min(free.sum(), held.sum()) < FEWEST:
+        raise NoWeightError("too little free motion, or too little with it in the hand")
+    used = free | held
+    time, (q, v, a, tau, changes) = moved[used, 0], np.split(moved[used, 1:], 5, axis=1)
+    model, data, at = robot.model, robot.model.createData(), robot.arm_velocity_ids
+    links, tool = [model.getJointId(name) for name in robot.joints], model.frames[robot.tcp_id]
+    last, to_link = 10 * (tool.parentJoint - 1), np.zeros((10, 4))
+    ball = pin.Inertia(1.0, tool.placement.translation, np.zeros((3, 3)))
+    to_link[:, 0], to_link[1:4, 1:] = ball.toDynamicParameters(), tool.placement.rotation
+    speed, rise, one = np.zeros(model.nv), np.zeros(model.nv), np.eye(len(at))
+    described, columns, dry = np.zeros_like(q), [], np.tanh(v / CREEP_RAD_S)
+    share = (time - moved[0, 0]) / np.ptp(moved[:, 0]) - 0.5
+    for row, carries in enumerate(held[used].tolist()):
+        speed[at], rise[at] = v[row], a[row]
+        state = (model, data, robot.configuration(q[row]), speed, rise)
+        described[row] = pin.rnea(*state)[at]
+        zeros = pin.computeRNEADerivatives(*state)[0]
+        links_off = pin.computeJointTorqueRegressor(*state)
+        own = [links_off[at, 10 * (link - 1) : 10 * link] for link in links]
+        joints = (one, share[row] * one, *(np.diag(x[row]) for x in (dry, v, a)))
+        weight = carries * links_off[at, last : last + 10] @ to_link
+        late = changes[row][:, None]
+        columns.append(np.hstack([*joints, zeros[np.ix_(at, at)], late, *own, weight]))
+    _refuse_other_efforts(described[free[used]], tau[free[used]])
+    most = model.effortLimit[at]
+    spreads = [*(part * most for part in OF_EFFORT), np.full(len(at), ZERO_RAD), [LATE_S]]
+    for inertia in (model.inertias[link] for link in links):
+        each = [LINK * inertia.mass, CENTRE_M * inertia.mass, LINK * np.trace(inertia.inertia)]
+        spreads.append(np.repeat(each, (1, 3, 6)))
+    beforehand = np.concatenate([*spreads, MASS_KG * np.array([1.0, *[HAND_M] * 3])])
+    x, sigma = _fitted(np.array(columns), tau - described, beforehand, 1 - np.abs(dry))
+    mass_kg, half_kg = float(x[-4]), Z_95 * float(np.hypot(sigma[-4], LEVER * x[-4]))
+    if mass_kg <= half_kg:
+        raise NoWeightError(f"nothing that weighs is held: {mass_kg:.3f} +- {half_kg:.3f} kg")
+    if half_kg > max(KNOWN * mass_kg, KNOWN_KG):
+        raise NoWeightError(f"known to {half_kg:.2g} kg only: {mass_kg:.3f} kg")
+    centre, halves = (x[-3:] / mass_kg).tolist(), (Z_95 * sigma[-3:] / mass_kg).tolist()
+    known = {"mass_kg": mass_kg, "half_kg": half_kg}
+    return {**known, "centre_m": centre, "centre_half_m": halves}
+
+
+def _refuse_other_efforts(described: Rows, measured: Rows) -> None:
+    """An arm's own weight is in its efforts, in Nm and with the sign of its joints."""
+    power = (described**2).sum(axis=0)
+    each = (measured * described).sum(axis=0) / (power + LEAST_NM)
+    turned = np.flatnonzero((each < -ALIKE[0]) & (power > 0.05 * power.max())) + 1
+    if len(turned):
+        raise NoWeightError(f"efforts have the other sign at joint {', '.join(map(str, turned))}")
+    times = float(np.average(each, weights=power))
+    if not ALIKE[0] <= times <= ALIKE[1]:
+        words = "another unit than Nm, or without the arm's own weight"
+        raise NoWeightError(f"efforts are {times:.3g} times the described arm's: {words}")
+
+
+def _fitted(
+    X: Float[np.ndarray, "n j k"], y: Rows, beforehand: np.ndarray, slow: Rows
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unknowns and their spreads; of residuals that are near in time some count as one."""
+    count, joints = X.shape[2], y.shape[1]
+    left, alike, x = y, 1.0, np.zeros(count)
+    covariance = np.eye(count)
+    for _ in range(ROUNDS):
+        spread = np.maximum(1.4826 * np.median(np.abs(left), axis=0), LEAST_NM)
+        square = spread**2 + (slow * x[2 * joints : 3 * joints]) ** 2
+        alike = stays_alike([np.clip(left / np.sqrt(square), -3, 3)]) * (TAILS + 3) / (TAILS + 1)
+        fitted = count - float((np.diag(covariance) * beforehand**-2.0).sum()) if x.any() else 0.0
+        alike /= max(1 - fitted * alike / y.size, 0.1)
+        noise = np.sqrt(alike * (TAILS * square + left**2) / (TAILS + 1))
+        rows, values = (X / noise[:, :, None]).reshape(-1, count), (y / noise).ravel()
+        covariance = np.linalg.inv(rows.T @ rows + np.diag(beforehand**-2.0))
+        x = covariance @ (rows.T @ values)
+        left = y - np.einsum("njk,k->nj", X, x)
+        beforehand[-3:] = HAND_M * max(x[-4], KNOWN_KG)
+    return x, np.sqrt(np.diag(covariance))
+
+
+def calibrate_weights(run: RunFolder) -> tuple[dict[str, Any], str]:
+    """Weigh what trials held and write it; UsageError, with the reasons, where none says it."""
+    found, reasons = dict[str, dict[str, Any]](), dict[str, str]()
+    rows, tasks = list[dict[str, Any]](), dict[str, Task]()
+    for path in run.episodes():
+        try:
+            episode = Episode.open(path)
+            if episode.info.kind == "trial":
+                task = streams.task_file(episode).task()
+                tasks[task.name] = task
+                rows += weighed(episode, task)
+        except GstError as error:
+            reasons[path.stem] = str(error)
+    if not rows:
+        why = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+        raise UsageError(f"no trial of {run.path} says what it held. {why}".rstrip())
+    for task, name in sorted({(row["task"], row["object"]) for row in rows}):
+        mine = [row for row in rows if (row["task"], row["object"]) == (task, name)]
+        found.setdefault(task, {})[name] = together(mine)
+    notes = [note for task, objects in found.items() for note in unlike(tasks[task], objects)]
+    record: dict[str, Any] = {"tasks": found, "notes": notes, "not_determined": reasons}
+    return write_part(run, MASSES, record)
+
+
+def weighed(episode: Episode, task: Task) -> list[dict[str, Any]]:
+    """What each grasp of a trial says; NoWeightError, with the reasons, where none says anything.
+
+    Seconds count from the episode's first sample.
+    """
+    urdf = streams.robot_description(episode)
+    if urdf is None:
+        raise NoWeightError("no robot description was recorded")
+    robot, rows, reasons = load_robot(urdf), list[dict[str, Any]](), list[str]()
+    stamps_ns, joints, efforts = _readings(episode, robot.joints)
+    begun_ns = streams.first_stamp_ns(episode) or 0
+    moved = smoothed((stamps_ns - begun_ns) * 1e-9, joints, efforts)
+    times_s, widths = moved[:, 0], width_track(episode, robot.record)
+    p_tool_m = robot.Ts_base_tcp(moved[:, 1 : 1 + len(robot.joints)])[:, :3, 3]
+    free, grasps = np.ones(len(times_s), dtype=bool), []
+    for grip in find_grips(widths.stamps_ns, widths.position[:, 0]):
+        closing_s, held_s, opening_s = ((at_ns - begun_ns) * 1e-9 for at_ns in grip)
+        held = (times_s >= held_s) & (times_s <= opening_s)
+        ends_m = p_tool_m[np.flatnonzero(held)[[0, -1]]] if held.any() else p_tool_m[:1]
+        away = np.linalg.norm(p_tool_m[:, None] - ends_m, axis=2).min(axis=1) > NEAR_M
+        free &= away & ((times_s < closing_s - AROUND_S) | (times_s > opening_s + AROUND_S))
+        grasps.append((grip[1], held & away & (p_tool_m[:, 2] > ends_m[0, 2] + ABOVE_M)))
+    for held_ns, held in grasps:
+        try:
+            row = {"task": task.name, "object": _object_at(episode, task, held_ns)}
+            rows.append(row | weight_of(robot, moved, free, held))
+        except NoWeightError as error:
+            reasons.append(str(error))
+            continue
+        from_s, to_s = times_s[held][[0, -1]].round(2).tolist()
+        rows[-1] |= {"episode": episode.info.id, "sha256": episode.sha256()}
+        rows[-1] |= {"from_s": from_s, "to_s": to_s}
+    if not rows:
+        raise NoWeightError("; ".join(reasons) or "the fingers close on nothing")
+    return rows
+
+
+def _readings(episode: Episode, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stamps, joints and efforts of the readings that have them for every joint of an arm."""
+    topics = [t for t in episode.topics_of_type(schema.JOINT_STATE) if t.endswith(JOINT_STATES)]
+    rows: dict[int, np.ndarray] = {}
+    for message in episode.messages(topics):
+        sample = JointSample.from_cdr(message.data)
+        if set(names) <= set(sample.names) and len(sample.position) == len(sample.effort):
+            order = [sample.names.index(name) for name in names]
+            rows[sample.stamp_ns] = np.array([sample.position[order], sample.effort[order]])
+    if len(rows) < FEWEST:
+        raise NoWeightError("no efforts of the arm's joints were recorded")
+    stamps_ns = np.array(sorted(rows), dtype=np.int64)
+    joints, efforts = np.swapaxes([rows[at] for at in stamps_ns.tolist()], 0, 1)
+    return stamps_ns, joints, efforts
+
+
+def _object_at(episode: Episode, task: Task, at_ns: int) -> str:
+    """What is grasped at an instant, by a plan's stages; else the only one that the task moves."""
+    events = executed_events(episode)
+    for _, plan in streams.plans(episode):
+        start_ns, end_ns = streams.execution_ns(events, plan.id)
+        if start_ns is not None and start_ns <= at_ns <= (end_ns or at_ns):
+            stages = stages_as_executed(plan, events, start_ns)
+            name = grasped(replace(plan, stages=stages), at_ns - start_ns)
+            if name in task.objects:
+                return name
+    if len(task.manipulated) != 1:
+        raise NoWeightError("nobody said which object was grasped")
+    return task.manipulated[0]
+
+
+def together(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What trials say of one object: ``value``, its interval, and ``why`` it is not used."""
+    masses = np.array([row["mass_kg"] for row in rows])
+    weights = (np.array([row["half_kg"] for row in rows]) / Z_95) ** -2.0
+    value, why = float(np.average(masses, weights=weights)), ""
+    if float((weights * (masses - value) ** 2).sum()) > chi2.ppf(AGREE, len(rows) - 1):
+        each = ", ".join(f"{row['mass_kg']:.3f} kg in {row['episode']}" for row in rows)
+        why = f"trials do not agree ({each}): another object, or its look-alike, was held"
+    sigma = max(float(weights.sum()) ** -0.5, LEVER * value)
+    ends = {"low": value - Z_95 * sigma, "high": value + Z_95 * sigma, "why": why}
+    return {"value": value, **ends, "sigma_log": sigma / value, "sources": list(rows)}
+
+
+def unlike(task: Task, found: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Name objects of a task that look alike and do not weigh the same."""
+    notes = []
+    for one, other in combinations(found, 2):
+        first, second = (replace(task.objects[key], id="", mass_kg=0.0) for key in (one, other))
+        a, b = found[one], found[other]
+        if first == second and max(a["low"], b["low"]) > min(a["high"], b["high"]):
+            told = f"{a['value']:.3f} and {b['value']:.3f} kg: mixed up, so are their masses"
+            notes.append(f"{one} and {other} of {task.name} look alike and weigh {told}")
+    return notes
+
+
+def describe_weights(record: Mapping[str, Any], calibration_id: str) -> str:
+    """Say what each object weighs, and from which seconds of which episodes."""
+    lines = [f"masses: calibration {calibration_id}", *record["notes"]]
+    for task, objects in record["tasks"].items():
+        for name, item in objects.items():
+            used = f"not used: {item['why']}" if item["why"] else "replays and the gate use it"
+            ends = f"[{item['low']:.3f}, {item['high']:.3f}]"
+            lines.append(f"  {task} {name}: {item['value']:.3f} kg {ends}, {used}")
+            for row in item["sources"]:
+                pairs = zip(row["centre_m"], row["centre_half_m"], strict=True)
+                centre = ", ".join(f"{1e3 * x:.0f} +- {1e3 * half:.0f}" for x, half in pairs)
+                when = f"{row['episode']}, {row['from_s']:.2f} to {row['to_s']:.2f} s"
+                told = f"{row['mass_kg']:.3f} +- {row['half_kg']:.3f} kg"
+                lines.append(f"    {when}: {told}, centre ({centre}) mm from the tool")
+    reasons = record["not_determined"].items()
+    return "\n".join([*lines, *(f"  {name}: not determined: {why}" for name, why in reasons)])
