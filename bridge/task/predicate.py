@@ -104,8 +104,7 @@ def already_true_at_start(task: Task, rollout: Rollout) -> bool:
 
 
 def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
-    kind = spec["kind"]
-    rule = _RULES.get(kind)
+    kind, rule = spec["kind"], _RULES.get(spec["kind"])
     if rule is None:
         raise UsageError(f"success predicate {kind!r} is unknown. Known: {', '.join(_RULES)}.")
     asked = [] if kind == ALLOWED_CONTACTS else bodies_of(spec)
@@ -130,7 +129,10 @@ def _told(found: Sequence[Measured]) -> Found:
     told = []
     for each in found:
         factor, unit = SHOWN[each.unit]
-        told.append(f"{each.what} is {round(float(each.value) * factor)} {unit}")
+        what, _, edge = each.what.partition(" beyond ")
+        value = round(float(each.value) * factor)
+        where = f" {'within' if value < 0 else 'beyond'} {edge}" if edge else ""
+        told.append(f"{what} is {abs(value) if edge else value} {unit}{where}")
     return all(bool(each.excess <= 0) for each in found), "; ".join(told)
 
 

@@ -155,8 +155,7 @@ def footprint_gap_m(a: Box, b: Box) -> Numbers:
 
 def direction_of(value: str | Sequence[int | float]) -> Float[np.ndarray, "3"]:
     """The unit vector in the base frame of a direction that is a word or three numbers."""
-    named = {**SIDES, **WAYS}
-    vector = np.array(named[value] if isinstance(value, str) else value, dtype=np.float64)
+    vector = np.array((SIDES | WAYS)[value] if isinstance(value, str) else value, dtype=np.float64)
     return np.asarray(vector / np.linalg.norm(vector))
 
 
@@ -302,8 +301,7 @@ def moved(spec: Spec, boxes: Boxes) -> Found:
     if "at_least_m" in spec or "at_most_m" in spec:
         length = np.linalg.norm(way, axis=-1) if direction is None else way @ direction
         low, high = spec.get("at_least_m", -np.inf), spec.get("at_most_m", np.inf)
-        what = f"the way {name} was moved"
-        found.append(Measured(what, length, low=low, high=high))
+        found.append(Measured(f"the way {name} was moved", length, low=low, high=high))
     targets = [np.array(spec["target_m"], dtype=np.float64)] if "target_m" in spec else []
     if "by_m" in spec and direction is not None:
         targets.append((p_before + spec["by_m"] * direction)[:2])

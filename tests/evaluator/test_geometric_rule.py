@@ -77,7 +77,7 @@ def answer(made: Plan, *, yaw_rad: float = 0.0, moved: Pose | None = None) -> Ru
 def test_a_centred_grasp_and_a_release_over_the_box_is_a_yes() -> None:
     found = answer(plan())
     assert found.value is True
-    assert "within box" in found.detail
+    assert "20 mm within the cavity of box" in found.detail
 
 
 @pytest.mark.parametrize(
