@@ -45,7 +45,7 @@ def test_a_rejection_names_what_failed_and_nothing_that_held(script: SimpleNames
     scene = script.scene()
     factor = terminal(scene, at_rest(script, scene))
     assert (factor.value, factor.cause) == (False, "inside")
-    assert "outside box" in str(factor.detail)
+    assert "mm beyond the cavity of box" in str(factor.detail)
     assert "finger" not in str(factor.detail)
     assert "mm/s" not in str(factor.detail)
 
@@ -54,7 +54,7 @@ def test_everything_that_failed_is_named(script: SimpleNamespace) -> None:
     scene = script.scene()
     touching = {"cube": np.ones(STEPS, dtype=bool)}
     factor = terminal(scene, replace(at_rest(script, scene), finger_contact=touching))
-    assert "outside box" in str(factor.detail)
+    assert "mm beyond the cavity of box" in str(factor.detail)
     assert "a finger touches cube" in str(factor.detail)
 
 
