@@ -86,7 +86,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Laboratory]
 def test_what_a_policy_sends_moves_the_arm_and_says_who_acted(laboratory: Laboratory) -> None:
     with laboratory.acting(NODDING):
         _, episode, label, _ = laboratory.trial(max_s=3.0)
-    assert label.startswith("failure: the middle of cube beyond")
+    assert label.startswith("failure: the middle of cube is ")
     assert episode.info.policy == "mine"
     assert tagged(episode.info.tags, "checkpoint:").startswith(f"code={NODDING} map=")
     assert len(tagged(episode.info.tags, "mapping:")) > 6
