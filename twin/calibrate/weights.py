@@ -261,14 +261,17 @@ def _object_at(episode: Episode, task: Task, at_ns: int) -> str:
 
 
 def together(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What trials say of one object: ``value``, its interval, and ``why`` it is not used."""
+    """What trials say of one object: ``value``, its interval, and ``why`` it is not used.
+
+    What the arm's description gets wrong they share: several are no surer than the surest of them.
+    """
     masses = np.array([row["mass_kg"] for row in rows])
     weights = (np.array([row["half_kg"] for row in rows]) / Z_95) ** -2.0
     value, why = float(np.average(masses, weights=weights)), ""
     if float((weights * (masses - value) ** 2).sum()) > chi2.ppf(AGREE, len(rows) - 1):
         each = ", ".join(f"{row['mass_kg']:.3f} kg in {row['episode']}" for row in rows)
         why = f"trials do not agree ({each}): another object, or its look-alike, was held"
-    sigma = max(float(weights.sum()) ** -0.5, LEVER * value)
+    sigma = float(weights.max()) ** -0.5
     ends = {"low": value - Z_95 * sigma, "high": value + Z_95 * sigma, "why": why}
     return {"value": value, **ends, "sigma_log": sigma / value, "sources": list(rows)}
 
@@ -291,13 +294,13 @@ def describe_weights(record: Mapping[str, Any], calibration_id: str) -> str:
     for task, objects in record["tasks"].items():
         for name, item in objects.items():
             used = f"not used: {item['why']}" if item["why"] else "replays and the gate use it"
-            ends = f"[{item['low']:.3f}, {item['high']:.3f}]"
-            lines.append(f"  {task} {name}: {item['value']:.3f} kg {ends}, {used}")
+            ends = f"[{item['low']:.4f}, {item['high']:.4f}]"
+            lines.append(f"  {task} {name}: {item['value']:.4f} kg {ends}, {used}")
             for row in item["sources"]:
                 pairs = zip(row["centre_m"], row["centre_half_m"], strict=True)
                 centre = ", ".join(f"{1e3 * x:.0f} +- {1e3 * half:.0f}" for x, half in pairs)
                 when = f"{row['episode']}, {row['from_s']:.2f} to {row['to_s']:.2f} s"
-                told = f"{row['mass_kg']:.3f} +- {row['half_kg']:.3f} kg"
+                told = f"{row['mass_kg']:.4f} +- {row['half_kg']:.4f} kg"
                 lines.append(f"    {when}: {told}, centre ({centre}) mm from the tool")
     reasons = record["not_determined"].items()
     return "\n".join([*lines, *(f"  {name}: not determined: {why}" for name, why in reasons)])
