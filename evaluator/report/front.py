@@ -119,8 +119,11 @@ def _compared(results: Results) -> list[str]:
         f"{text[0].upper() if text.startswith(heads) else text[0]}{text[1:]}."
         for text in sentences[: SHOWN_ANSWERS - len(standing) - SHOWN_ANSWERS * len(split)]
     ]
-    if len({row["task"] for row in rows}) > 1 and found:
-        found[0] = f"Over all tasks together: {found[0]}"
+    tasks = [name for name in dict.fromkeys(str(row["task"]) for row in rows) if name != ALL_TASKS]
+    if tasks and found:
+        is_all = {row["task"] for row in rows_of(results, "conclusions")} <= {*tasks}
+        which = "all tasks" if is_all else f"the compared tasks ({', '.join(tasks[:SHOWN_TASKS])})"
+        found[0] = f"Over {which} together: {found[0]}"
     cannot = _all_alike(results)[0]
     if not rows and _lacks_n(results):
         cannot = f"Cannot be told: {NO_TRIALS}."
@@ -146,7 +149,7 @@ def _regret(results: Results) -> list[str]:
     name = regret.definition.partition("ranks first (")[2].partition("), mean")[0]
     if regret.value == 0:
         return [
-            f"The twin and the recorded rates both rank {name} first: chance alone may do that."
+            f"The twin and the recorded rates both rank {name} first: that agreement may be chance."
         ]
     taken = "one of them by chance" if " or " in name else "its recorded rate"
     words = f"The twin ranks {name} first; {taken} is {_points(regret.value)}"
@@ -262,14 +265,14 @@ def next_trials(results: Results) -> str:
         won = {str(row["candidate"]): _number(row["k"]) or 0.0 for row in standing}
         names = sorted({n for _, each in wanted for n in each}, key=lambda n: (-won.get(n, 0), n))
         whom = "them" if len(names) == 2 else "even two of them"
-        words = f"each may be best; if what was seen stays, to tell {whom} apart takes about"
+        words = f"each may be best; if the rates stay as seen, to tell {whom} apart takes about"
         first = " (most successes)" if won else ""
         words = f"{words} {2 * more} more trials in all, which is seldom worth it."
         return f"{TAKE}{names[0]}{first} or {' or '.join(names[1:])}: {words}"
     tasks = [str(row["task"]) for row, each in asked if each == pair and row["task"] != ALL_TASKS]
     named = [" against ".join(_differing(each)[0]) for _, each in others[:SHOWN_ANSWERS]]
-    rest = f"; open then, too: {', '.join(named)}" if named else ""
-    likely = "if what was seen stays, that is likely to tell these two apart"
+    rest = f"; undecided then, too: {', '.join(named)}" if named else ""
+    likely = "if the rates stay as seen, that is likely to tell these two apart"
     return f"{_more_trials(more, pair, tasks)}; {likely}{rest}."
 
 
@@ -457,7 +460,7 @@ def _all_alike(results: Results) -> tuple[str, str]:
         return "", ""
     words, task = ("nothing", "an easier") if k == 0 else ("everything", "a harder")
     each, ends = f"record {SAYS_LITTLE} trials or more of each policy on", wilson(k, n)
-    told = f"{words} succeeded, {k} of {n} recorded {noun('trial', n)}; the rate lies between "
+    told = f"{words} succeeded, {k} of {n} recorded {noun('trial', n)}; the pooled rate is between "
     told = f"{told}{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
     cannot = "Nothing to compare: there is one policy on one task; " if len(rates) == 1 else ""
     few = f"{each} each task; to compare, at least 2 policies; to judge the twin, at least "

@@ -121,14 +121,12 @@ def test_the_comparison_that_the_fewest_trials_decide_is_worth_running_next() ->
     ]
     table = Table(id="comparisons", title="t", columns=columns, rows=tuple(rows))
     results = Results(run="r", source="trials", stand_in=None, tables=(table,))
-    words = (
-        "make 1 more trial of C and 1 of B; if what was seen stays, that is likely to tell these "
-    )
-    assert next_trials(results) == f"{words}two apart; open then, too: A against B."
+    words = "make 1 more trial of C and 1 of B; if the rates stay as seen, that is likely to tell "
+    assert next_trials(results) == f"{words}these two apart; undecided then, too: A against B."
     made = Measurement(id="rate.recorded.a", value=0.5, unit="1", definition="d", k=1, n=2)
     few = replace(table, rows=(compared(ALL_TASKS, "A", "no", 4),))
     told = next_trials(replace(results, tables=(few,), measurements=(made,)))
-    assert told.startswith("take A or B: each may be best; if what was seen stays, to tell them")
+    assert told.startswith("take A or B: each may be best; if the rates stay as seen, to tell them")
     assert "about 8 more trials" in told
     in_tasks = replace(
         table, rows=(rows[0], *(compared(t, "A", "no", 9) for t in ("pour", "stir")))
@@ -198,6 +196,11 @@ def test_rates_without_n_ask_for_it_and_claim_no_interval(tmp_path: Path) -> Non
     for text in (page_text, terminal):
         assert re.search(r"r .*0\.9", text)
         assert not re.search(r"\[[-+.\d]+, ", text)
+
+
+def test_tasks_that_are_not_compared_are_not_claimed(tmp_path: Path) -> None:
+    told = shown(tmp_path, PAPER.read_text())[0]  # its ducks are counted one by one
+    assert "Over the compared tasks (cube_into_box, sloth_into_basket) together: " in told
 
 
 def test_a_table_without_a_twin_is_told_nothing_about_one(tmp_path: Path) -> None:
