@@ -17,8 +17,8 @@ from evaluator.measurements import BLIND_GROUP
 from evaluator.result import Measurement, Table
 from evaluator.run_reader.episodes import MADE_BY, DerivedFile
 from evaluator.statistics.agreement import within_and_between
-from evaluator.statistics.intervals import LEVEL, normal_quantile
-from evaluator.statistics.sequential import Evidence
+from evaluator.statistics.differences import points_of
+from evaluator.statistics.intervals import LEVEL
 
 Note = tuple[str, str]
 """About what, and the sentence."""
@@ -28,9 +28,9 @@ FAR_HERE = "the twin's rate is far from the recorded one here"
 def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> list[Note]:
     """Collect what follows from the groups and the numbers alone."""
     by_id = {measurement.id: measurement for measurement in measurements}
-    z = normal_quantile(1 - (1 - LEVEL) / (2 * max(1, len(groups))))  # one error in all of them
-    why = {group.label: _points_off(group, z) or _blind(group, by_id) for group in groups}
-    far = [(label, f"{FAR_HERE}: {words}") for label, words in why.items() if words]
+    level = 1 - (1 - LEVEL) / max(1, len(groups))  # one error in all of them
+    why = [(group.label, _points_off(group, level) or _blind(group, by_id)) for group in groups]
+    far = [(label, f"{FAR_HERE}: {words}") for label, words in why if words]
     return [*_opposed(groups, by_id), *_units(groups), *far]
 
 
@@ -39,14 +39,14 @@ def _blind(group: RateGroup, by_id: Mapping[str, Measurement]) -> str:
     return "" if m is None or m.value is None else f"blind with probability {m.value:.2f}"
 
 
-def _points_off(group: RateGroup, z: float) -> str:
+def _points_off(group: RateGroup, level: float) -> str:
     """Say how far off, where it is surely more than ``CLOSE_PP``."""
     stratum, sim, recorded = counted(group), group.sim_rate, group.recorded_rate
     if stratum is None or group.unit != "trial" or sim is None or recorded is None:
         return ""
-    found = Evidence(strata=(stratum,)).interval(z)
+    _, found = points_of([stratum], level=level)
     shown = f"{100 * float(sim):.0f} against {100 * float(recorded):.0f} %"
-    return shown if 100 * max(found.low, -found.high) > CLOSE_PP else ""
+    return shown if max(found.low, -found.high) > CLOSE_PP else ""
 
 
 def notes_table(found: Iterable[Note]) -> tuple[Table, ...]:

@@ -322,7 +322,7 @@ def _trust(results: Results) -> list[str]:
     r, bias = by_id.get("agreement.pearson_r"), by_id.get("agreement.bias_pp")
     if r is None or bias is None or not bias.n:
         return []
-    found = [*_blind(results, bias.n), *_followed(r, bias.n), *_near(results, bias)]
+    found = [*_far(results, bias.n), *_followed(r, bias.n), *_near(results, bias)]
     if results.stand_in:
         found.insert(0, (False, "the recorded side is a simulation, too"))
     against = [words for is_sure, words in found if is_sure]
@@ -339,13 +339,10 @@ Against = Iterator[tuple[bool, str]]
 """What speaks against the twin, and whether it is sure."""
 
 
-def _blind(results: Results, num_groups: int) -> Against:
+def _far(results: Results, num_groups: int) -> Against:
     notes = rows_of(results, "notes")
-    if far := [
-        str(row["note"]).replace(FAR_HERE, str(row["about"]))
-        for row in notes
-        if FAR_HERE in str(row["note"])
-    ]:
+    told = [(str(row["note"]), str(row["about"])) for row in notes]
+    if far := [text.replace(FAR_HERE, about) for text, about in told if FAR_HERE in text]:
         named = [*far[:SHOWN_ANSWERS], *["..."] * (len(far) > SHOWN_ANSWERS)]
         words = f"in {len(far)} of {num_groups} groups its rate is far from the recorded one"
         yield True, f"{words}, unlike in the others ({'; '.join(named)})"
@@ -462,12 +459,13 @@ def _all_alike(results: Results) -> tuple[str, str]:
     each, ends = f"record {SAYS_LITTLE} trials or more of each policy on", wilson(k, n)
     told = f"{words} succeeded, {k} of {n} recorded {noun('trial', n)}; the pooled rate is between "
     told = f"{told}{100 * ends.low:.0f} and {100 * ends.high:.0f} %."
-    cannot = "Nothing to compare: there is one policy on one task; " if len(rates) == 1 else ""
+    alone = "Nothing to compare: there is one policy on one task; "
+    cannot = alone if len(rates) == 1 else "Cannot be told: "
     few = f"{each} each task; to compare, at least 2 policies; to judge the twin, at least "
     few = f"{few}{GROUPS_FOR_R} groups (a group: one policy on one task)."
     why = f"while {words} succeeds, no policy can be shown to be better"
     alike = f"check how success is scored; if that is right, {each} {task} task: {why}."
-    return (cannot or "Cannot be told: ") + told, few if n < SAYS_LITTLE else alike
+    return cannot + told, few if n < SAYS_LITTLE else alike
 
 
 def _ends(measurement: Measurement, digits: str = "+.0f") -> str:
