@@ -19,9 +19,7 @@ _TOLD = {
     "export catalogue": "robot-gst ls RUN --json lists all of it.",
     "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
     "export corrected": "export csv, tum and lerobot take --clock corrected.",
-    "label --flag --unflag|ls --flagged --no-flagged": (
-        "Flag trials in the dashboard, on the page label (key f); /queue?show=flagged lists them."
-    ),
+    "label --flag --unflag|ls --flagged --no-flagged": "The dashboard's page Label has flags (f).",
     "dashboard --console": "Use robot-gst ctl start and stop, and the dashboard's page label.",
     "prune": "robot-gst ls RUN --json lists age, size and outcome for a script of yours.",
     "export lerobot --depth": "Depth stays in the episodes; robot-gst export tum writes it.",
@@ -65,6 +63,7 @@ _TOLD = {
     "evaluate --lpips-alex": "--lpips-vgg makes LPIPS as papers on splatting compute it.",
     "evaluate --against": "Evaluate each run; trials.csv has the same trials in both.",
     "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
+    "trials --rate-hz --image-scale": "Pictures of a study are those of the cell file, 5 a second.",
     "render --rate-hz": "One frame is drawn for each recorded image.",
     "replay --grasp|gate --grasp": "A grasp holds by friction, as in life.",
     "replay --engines-must-agree|gate --engines-must-agree": (

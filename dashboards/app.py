@@ -1,48 +1,57 @@
 """The application: addresses to pages. All state is in the address but labels."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlencode
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError
+from bridge.errors import GstError, MissingDependencyError, UsageError
 from bridge.media.palette import style_sheet
 from dashboards import wording
-from dashboards.answers import kept
+from dashboards.clips import clip, drawn_once, picture
 from dashboards.comparison import judge
-from dashboards.config import DashboardConfig
+from dashboards.config import DashboardConfig, ShareConfig
 from dashboards.episode_page import build_page
 from dashboards.errors import NotHereError
+from dashboards.failures_page import PART_WORDS, build_failures
 from dashboards.frames import RENDERED, pack_frames, read_frame
 from dashboards.guard import Admission, Guard
+from dashboards.label_routes import LabelPages
 from dashboards.library import Library, derived_path, episode_path, scene_stamps
 from dashboards.loading import LOADING
 from dashboards.overview_page import build_overview
-from dashboards.queue_page import drawn_once
 from dashboards.recording import PageClock, read_recording
-from dashboards.review_routes import review_routes
-from dashboards.study_routes import StudyPages
+from dashboards.share_file import build_share
 from dashboards.twin_page import build_twin, view_image
 from evaluator.report.wording import minus
-from evaluator.review_index import SHOW, Selection
+from evaluator.review_index import SHOW, FailureSelection, Selection
+from evaluator.trial_row import TrialRow
+
+if TYPE_CHECKING:
+    from dashboards.live_page import LiveFeed
 
 HERE = Path(__file__).parent
 PICTURES = "scene_pictures"
 """Folder in the run's ``results/``."""
 SMALL = [Middleware(GZipMiddleware, minimum_size=2000, compresslevel=5)]
 """Text is compressed; images and episodes are already."""
+LIVE_PARTS = ("summary", "topics", "clocks", "verdicts")
+"""Of the page Live that change by themselves."""
+_SHARING = Lock()
 
 
 def create_app(
@@ -69,8 +78,14 @@ def create_app(
         Route("/episode/{id}/scene.jpg", pages.scene_picture),
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
-        *pages.reviews,
-        *pages.studies.routes(),
+        Route("/failures", pages.failures),
+        Route("/failures/picture/{id}", pages.failure_picture),
+        Route("/failures/clip/{id}", pages.failure_clip),
+        Route("/share", pages.share),
+        *pages.labels.routes(),
+        Route("/live", pages.live),
+        Route("/live/events", pages.live_events),
+        Route("/live/preview/{camera}", pages.live_preview),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
         Route("/static/colours.css", colours, middleware=SMALL),
@@ -84,7 +99,7 @@ def create_app(
             HTTPException: pages.http_failed,
         },
     )
-    app.state.studies = pages.studies
+    app.state.pages = pages
     return app
 
 
@@ -137,6 +152,12 @@ def colours(_request: Request) -> Response:
     return Response(style_sheet(), media_type="text/css")
 
 
+def kept(data: bytes, media_type: str) -> Response:
+    """Return what the browser may keep for ten minutes, for its address says which it is."""
+    headers = {"Cache-Control": "private, max-age=600"}
+    return Response(data, media_type=media_type, headers=headers)
+
+
 def _seconds(request: Request) -> float | None:
     text = request.query_params.get("t")
     try:
@@ -153,13 +174,16 @@ def _download(path: Path) -> Response:
 class Pages:
     """Answers for one library of runs. Plain functions: Starlette runs them in threads."""
 
-    def __init__(self, library: Library, live: DashboardConfig) -> None:
+    def __init__(self, library: Library, config: DashboardConfig) -> None:
         """Remember the runs and load the templates."""
         self._library = library
         self._environment = _environment()
-        self.studies = StudyPages(self._run, self._page, self._part, live)
-        self.reviews = review_routes(self._run, self._page)
-        """``/queue``, ``/label`` and ``/reviews``: which trial first, labels, what raters said."""
+        self.labels = LabelPages(self._run, self._page)
+        self._config = config
+        self._feed: LiveFeed | None = None
+        self._making = Lock()
+        self.is_ending: Callable[[], bool] = lambda: False
+        """Whether the server ends: a viewer of the page Live would hold it up."""
 
     def _part(self, name: str, state: object) -> str:
         return self._environment.get_template(f"live_{name}.html").render(state=state)
@@ -281,12 +305,99 @@ class Pages:
         )
         return kept(data, media_type)
 
-    def failed(self, request: Request, error: Exception) -> Response:
-        """Show one of our errors as a page.
+    def failures(self, request: Request) -> Response:
+        """``/failures?cause=&stage=&bodies=&start=&by=``: what goes wrong, and its pictures."""
+        run = self._run(request)
+        known = judge(run)
+        found = build_failures(run, known, FailureSelection.of(request.query_params))
+        return self._page("failures.html", request, page=found, known=known, part_words=PART_WORDS)
 
-        Args:
-            error: What went wrong; something that is not there gives 404, anything else 500.
-        """
+    def failure_picture(self, request: Request) -> Response:
+        """``/failures/picture/<id>``: a trial at its moment, recorded beside twin."""
+        return kept(picture(self._run(request), self._trial(request)), "image/jpeg")
+
+    def failure_clip(self, request: Request) -> Response:
+        """``/failures/clip/<id>``: a trial around its moment, as MP4."""
+        try:
+            data = clip(self._run(request), self._trial(request))
+        except MissingDependencyError as error:
+            raise NotHereError(str(error)) from error
+        return kept(data, "video/mp4")
+
+    def share(self, request: Request) -> Response:
+        """``/share?trial=ID&trial=ID``: these trials in one file, to be saved and sent."""
+        named = tuple(request.query_params.getlist("trial"))
+        try:
+            with _SHARING:  # it takes seconds: one at a time
+                made = build_share(self._run(request), ShareConfig(trials=named))
+        except UsageError as error:
+            raise NotHereError(str(error)) from error
+        headers = {"Content-Disposition": 'attachment; filename="trials.html"'}
+        return Response(made.text, media_type="text/html", headers=headers)
+
+    def _trial(self, request: Request) -> TrialRow:
+        row = judge(self._run(request)).row(request.path_params["id"])
+        if row is None or not row.file:
+            message = "no such recorded trial in this run."
+            raise NotHereError(message)
+        return row
+
+    def end_live(self) -> None:
+        """Stop listening to a recorder."""
+        with self._making:
+            if self._feed is not None:
+                self._feed.end()
+
+    def _heard(self) -> "LiveFeed":
+        with LOADING:
+            from dashboards.live_page import feed_of  # noqa: PLC0415  # loads zenoh
+
+        with self._making:
+            self._feed = self._feed or feed_of(self._config)
+            return self._feed
+
+    def live(self, request: Request) -> Response:
+        """``/live``: the recording under way."""
+        feed, why = None, ""
+        try:
+            feed = self._heard()
+        except GstError as error:
+            why = f"Nothing can be heard here: {error}"
+        state = None if feed is None else feed.state()
+        return self._page(
+            "live.html",
+            request,
+            state=state,
+            why=why,
+            config=self._config,
+            parts={} if state is None else {name: self._part(name, state) for name in LIVE_PARTS},
+        )
+
+    async def live_events(self, request: Request) -> Response:
+        """``/live/events``: parts of the page that changed, as server-sent events."""
+        with LOADING:
+            from dashboards.live_page import LiveState, told  # noqa: PLC0415  # loads zenoh
+
+        def render(state: LiveState) -> dict[str, object]:
+            parts: dict[str, object] = {name: self._part(name, state) for name in LIVE_PARTS}
+            return parts | {"previews": state.previews}
+
+        async def is_gone() -> bool:
+            return self.is_ending() or await request.is_disconnected()
+
+        feed = await run_in_threadpool(self._heard)
+        return StreamingResponse(told(feed, render, is_gone), media_type="text/event-stream")
+
+    def live_preview(self, request: Request) -> Response:
+        """``/live/preview/<camera>``: its last picture."""
+        data = self._heard().preview(request.path_params["camera"])
+        if data is None:
+            message = "no picture of that camera was heard."
+            raise NotHereError(message)
+        return Response(data, media_type="image/jpeg")
+
+    def failed(self, request: Request, error: Exception) -> Response:
+        """Show one of our errors as a page: 404 for what is not there, else 500."""
         missing = isinstance(error, NotHereError)
         title = "Not found" if missing else "This cannot be read"
         return self._page(
@@ -294,11 +405,7 @@ class Pages:
         )
 
     def http_failed(self, request: Request, error: Exception) -> Response:
-        """Show a wrong address as a page.
-
-        Args:
-            error: Carries the HTTP status; one without gives 500.
-        """
+        """Show a wrong address as a page."""
         status = error.status_code if isinstance(error, HTTPException) else 500
         title = "Not found" if status == 404 else f"Request refused ({status})"
         message = "No page of this dashboard has that address."

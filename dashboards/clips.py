@@ -1,6 +1,8 @@
 """Recorded beside twin around the moment of a trial: one picture, a short clip, or a strip."""
 
-from collections.abc import Iterable, Sequence
+import hashlib
+import threading
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,17 +16,12 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.media.color import encode_jpeg
+from bridge.whole_file import write_whole
 from dashboards.errors import NotHereError
-from dashboards.frames import RENDERED, camera_tracks, read_span
+from dashboards.frames import RENDERED, camera_tracks, main_camera, read_span
 from dashboards.library import derived_paths, episode_path
 from dashboards.loading import LOADING
-from dashboards.queue_page import (
-    SUBSAMPLING,
-    drawn_once,
-    main_camera,
-    moment_of,
-    recorded_ns,
-)
+from dashboards.moments import moment_of, recorded_ns
 from evaluator.review_index import stamp_of
 from evaluator.trial_row import TrialRow
 
@@ -38,6 +35,9 @@ APART_S = 0.15
 NOTHING_U8 = 40
 """Grey where the twin has no picture."""
 KEYFRAME_EVERY = 30
+SUBSAMPLING = "420"
+"""Of small pictures: colour half as fine as brightness, as in the videos."""
+_DRAWING = threading.Lock()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,3 +255,28 @@ def _what(run: RunFolder, row: TrialRow) -> tuple[object, ...]:
     path = episode_path(run, row.file.removesuffix(".mcap") or row.episode)
     replays = derived_paths(run, path.stem, "replay")
     return stamp_of(path), moment_of(run, row), *map(stamp_of, replays), CONFIG
+
+
+def drawn_once(
+    folder: Path, episode: str, what: object, draw: Callable[[], bytes], ending: str = "jpg"
+) -> bytes:
+    """Return a picture of a trial that is drawn once and kept; one of something else goes.
+
+    Args:
+        what: Everything that it depends on; equal text stands for an equal picture.
+    """
+    name = hashlib.sha256(episode.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+    key = hashlib.sha256(repr(what).encode("utf-8", "surrogatepass")).hexdigest()[:16]
+    kept = folder / f"{name}-{key}.{ending}"
+    with _DRAWING:
+        if kept.is_file():
+            return kept.read_bytes()
+        data = draw()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for old in folder.glob(f"{name}-*.{ending}"):
+                old.unlink()
+            write_whole(kept, data)
+        except OSError:  # a run that only can be read is drawn anew each time
+            pass
+    return data

@@ -14,7 +14,7 @@ from bridge.task.verdict import Factor, Verdict
 from dashboards.figures import StageChart, TimePlot
 from dashboards.frames import RENDERED, CameraTrack
 from dashboards.library import derived_paths, episode_path
-from dashboards.queue_page import Moment, moment_of
+from dashboards.moments import Moment, moment_of
 from dashboards.recording import PageClock, Problems, Recording, read_recording
 from dashboards.trial_lanes import Replanned, replans, trial_lanes
 from dashboards.trial_plots import PLANNED, main_plots, plots_of_joints, shown_replays

@@ -7,8 +7,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards.clips import can_film
 from dashboards.comparison import Judgement
+from dashboards.moments import Moment, moment_of
 from dashboards.overview_page import Facet, group_facets
-from dashboards.queue_page import Moment, moment_of
 from evaluator.review_index import (
     FAILED,
     FAILURE_PARTS,

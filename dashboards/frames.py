@@ -178,3 +178,17 @@ def media_type(data: bytes, path: Path) -> str:
             return name
     message = f"a frame of {path.name} is neither JPEG nor PNG; the page cannot show it."
     raise NotHereError(message)
+
+
+def main_camera(path: Path) -> CameraTrack:
+    """Return the recorded camera that shows most: the first that is not on the wrist.
+
+    Raises:
+        NotHereError: When the recording has no picture.
+    """
+    tracks = camera_tracks(path)
+    names = sorted(name for name in tracks if not name.startswith(RENDERED))
+    if not names:
+        message = f"no camera images in {path.name}."
+        raise NotHereError(message)
+    return tracks[min(names, key=lambda name: ("wrist" in name or "hand" in name, name))]

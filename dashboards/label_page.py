@@ -1,4 +1,4 @@
-"""Blind labelling: which trials a rater sees in which order, what they see, and what was said."""
+"""Blind labelling: which trials a rater sees in which order, and what they see of them."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -18,12 +18,9 @@ from bridge.exchange.reviews import (
 )
 from dashboards.comparison import Judgement
 from dashboards.episode_page import CameraView, camera_view
-from dashboards.frames import RENDERED
+from dashboards.frames import RENDERED, main_camera
 from dashboards.library import episode_path
-from dashboards.queue_page import is_label, main_camera, recorded_trials
 from dashboards.recording import PageClock, read_recording
-from evaluator.compare.raters import with_reviews
-from evaluator.result import Table
 
 CAUSES = (
     "missed the object",
@@ -37,12 +34,6 @@ CAUSES = (
     "other",
 )
 """What the digits 1 to 9 stand for."""
-WORST = 50
-"""Trials of the set ``worst`` that head the queue; as many others are mixed with them."""
-SETS = {
-    "": "all trials",
-    "worst": f"the {WORST} worst, mixed with {WORST} others",
-}
 STRIP = 6
 """Pictures that sum a recording up, from first to last."""
 MAX_LENGTH = {"rater": 80, "cause": 200, "note": 4000}
@@ -50,7 +41,7 @@ MAX_LENGTH = {"rater": 80, "cause": 200, "note": 4000}
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far one rater came in a set of trials."""
+    """How far one rater came."""
 
     rater: str
     done: int
@@ -78,19 +69,6 @@ class LabelPage:
     after: str | None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Summary:
-    """What the raters said, for after the labelling."""
-
-    progress: tuple[Progress, ...]
-    held_back: tuple[str, ...]
-    """Who is still labelling; while there is anybody, no agreement is shown."""
-    tables: tuple[Table, ...]
-    missing: tuple[str, ...]
-    notes: tuple[Review, ...]
-    problems: tuple[str, ...]
-
-
 def rater_name(text: str) -> str:
     """Return a rater's name without needless blanks.
 
@@ -107,37 +85,45 @@ def rater_name(text: str) -> str:
     return name
 
 
-def _shuffled(ids: Sequence[str], salt: str) -> list[str]:
-    """Order ids by a hash: the same each time, whatever their order was."""
-    return sorted(
-        ids, key=lambda name: hashlib.sha256(f"{salt}\0{name}".encode(errors="replace")).digest()
-    )
+def trials_to_label(judgement: Judgement, rater: str) -> list[str]:
+    """Return the trials that have a recording, in the order of one rater.
 
-
-def trials_to_label(judgement: Judgement, chosen: str, rater: str) -> list[str]:
-    """Return the trials of a set in the order of one rater.
-
-    The set is the same for all raters. The order is each rater's own and by chance, so that a
-    trial's place says nothing of twin or operator.
-
-    Args:
-        chosen: One of ``SETS``.
+    It is each rater's own and by chance, so that a trial's place says nothing of twin or operator.
     """
-    ids = [row.episode for row in recorded_trials(judgement)]
-    if chosen == "worst":
-        ids = [*ids[:WORST], *_shuffled(ids[WORST:], "others")[:WORST]]
-    return _shuffled(ids, rater)
+    ids = [row.episode for row in judgement.rows if row.file]
+    salted = {name: f"{rater}\0{name}".encode(errors="replace") for name in ids}
+    return sorted(ids, key=lambda name: hashlib.sha256(salted[name]).digest())
 
 
-def next_unrated(order: Sequence[str], rated: set[str], after: str | None) -> str | None:
-    """Return the first trial without a label behind another one, else the first of all."""
+def next_trial(
+    order: Sequence[str], reviews: Sequence[Review], rater: str, after: str | None = None
+) -> str | None:
+    """Return the next trial that nobody labelled, else the next that this rater did not.
+
+    Next is behind another one, or else from the first on.
+    """
+    mine = rated_by(reviews, rater)
+    anybody = {review.trial_id for review in reviews if _is_label(review)}
     start = order.index(after) + 1 if after in order else 0
-    return next((name for name in [*order[start:], *order[:start]] if name not in rated), None)
+    left = [name for name in [*order[start:], *order[:start]] if name not in mine]
+    return next((name for name in left if name not in anybody), next(iter(left), None))
 
 
 def rated_by(reviews: Sequence[Review], rater: str) -> set[str]:
     """Return the trials that a rater gave an answer to."""
-    return {r.trial_id for r in reviews if r.rater == rater and is_label(r)}
+    return {r.trial_id for r in reviews if r.rater == rater and _is_label(r)}
+
+
+def _is_label(review: Review) -> bool:
+    """Whether a review holds an answer, if only that it cannot be told."""
+    return review.result in ("success", "failure", "unknown")
+
+
+def progress_of(judgement: Judgement, reviews: Sequence[Review]) -> list[Progress]:
+    """How far each rater is."""
+    ids = set(trials_to_label(judgement, ""))
+    done = {r.rater: len(rated_by(reviews, r.rater) & ids) for r in reviews}
+    return [Progress(rater=name, done=n, left=len(ids) - n) for name, n in sorted(done.items())]
 
 
 def build_label_page(
@@ -189,7 +175,7 @@ def save_label(run: RunFolder, record: Mapping[str, Any], *, rater: str) -> Save
         NotHereError: When the run has no such trial.
         ReviewConflictError: When another tab changed the label meanwhile.
     """
-    trial_id, seen = (text_of(record, name, 1000) for name in ("trial_id", "seen"))
+    trial_id, seen = (_text_of(record, name, 1000) for name in ("trial_id", "seen"))
     episode_path(run, trial_id)
     result = record.get("result", "")
     flag = record.get("flag", False)
@@ -203,14 +189,14 @@ def save_label(run: RunFolder, record: Mapping[str, Any], *, rater: str) -> Save
         rater=rater,
         time=datetime.now(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z"),
         result=result,
-        cause=text_of(record, "cause", MAX_LENGTH["cause"]) if result == "failure" else "",
-        note=text_of(record, "note", MAX_LENGTH["note"]),
+        cause=_text_of(record, "cause", MAX_LENGTH["cause"]) if result == "failure" else "",
+        note=_text_of(record, "note", MAX_LENGTH["note"]),
         flag=flag,
     )
     return save_review(run.path, trial_id, rater, review, seen=seen)
 
 
-def text_of(record: Mapping[str, Any], name: str, longest: int) -> str:
+def _text_of(record: Mapping[str, Any], name: str, longest: int) -> str:
     """Read a text that a page sent; empty where it sent none.
 
     Raises:
@@ -226,43 +212,3 @@ def text_of(record: Mapping[str, Any], name: str, longest: int) -> str:
         message = f"{name} holds characters that no file can hold."
         raise UsageError(message) from error
     return text
-
-
-def summarise(
-    judgement: Judgement,
-    reviews: tuple[Sequence[Review], Sequence[str]],
-    *,
-    chosen: str,
-    show: bool,
-) -> Summary:
-    """Gather how far the raters are and, when nobody is labelling any more, how far they agree.
-
-    Args:
-        reviews: The labels in the run, and what is wrong with files that hold none.
-        chosen: The set of trials, one of ``SETS``.
-    """
-    found, problems = reviews
-    ids = set(trials_to_label(judgement, chosen, ""))
-    progress = []
-    for rater in sorted({review.rater for review in found}):
-        done = len(rated_by(found, rater) & ids)
-        progress.append(Progress(rater=rater, done=done, left=len(ids) - done))
-    working = () if show else tuple(p.rater for p in progress if p.left)
-    released = bool(progress) and not working and judgement.comparison is not None
-    tables: tuple[Table, ...] = ()
-    missing: tuple[str, ...] = ()
-    if released and judgement.comparison is not None:
-        before = judgement.comparison
-        after = with_reviews(before, found)
-        tables = tuple(table for table in after.tables if table.id == "raters")
-        missing = tuple(text for text in after.missing if text not in before.missing)
-    elif progress and judgement.comparison_reason is not None:
-        missing = (f"The trials cannot be compared: {judgement.comparison_reason}",)
-    return Summary(
-        progress=tuple(progress),
-        held_back=working,
-        tables=tables,
-        missing=missing,
-        notes=tuple(r for r in found if r.note or r.flag) if released else (),
-        problems=tuple(problems),
-    )

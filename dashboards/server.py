@@ -102,11 +102,11 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
     others = set(threading.enumerate())
     # The evaluator reads the first run while the reader is still opening the page.
     threading.Thread(target=judge, args=(library.pick(None),), daemon=True).start()
-    app.state.studies.is_ending = lambda: server.should_exit
+    app.state.pages.is_ending = lambda: server.should_exit
     with listener, _ending_on_signals(server):
         output.result(record, text)
         server.run(sockets=[listener])
-    app.state.studies.end()
+    app.state.pages.end_live()
     stop_updates()
     if _are_at_work(set(threading.enumerate()) - others):
         # Python waits for threads that make a page, a minute for a large run, and ends others by

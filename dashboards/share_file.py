@@ -16,6 +16,7 @@ from bridge.media.color import encode_jpeg
 from bridge.whole_file import write_whole
 from dashboards import wording
 from dashboards.clips import (
+    SUBSAMPLING,
     ClipConfig,
     Footage,
     as_video,
@@ -28,7 +29,6 @@ from dashboards.config import SHARE_LIMITS, ShareConfig
 from dashboards.episode_page import build_page
 from dashboards.figures import TimePlot
 from dashboards.library import episode_path
-from dashboards.queue_page import SUBSAMPLING
 from evaluator.compare.rows import Comparison
 from evaluator.report.figures import DARK, LIGHT, Drawing, drawings_of
 from evaluator.report.front import FIGURES, front

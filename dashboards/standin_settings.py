@@ -61,10 +61,6 @@ class TrialsConfig:
     """Cells at work at once, each with its recorder, gate and planner; 0: one per core."""
     samples: int = 0
     """Varied replays behind each verdict of the replay afterwards."""
-    rate_hz: Annotated[float, RARE] = 5.0
-    """Frames per second of each camera."""
-    image_scale: Annotated[float, RARE] = 1.0
-    """Resize the images of the cell file."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that no study can have."""

@@ -318,7 +318,7 @@ def _number(path: Path) -> int:
 
 
 def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Output) -> None:
-    """Record a scan of each task that has none, before its first trial, if pictures are taken."""
+    """Record a scan of each task that has none, before its first trial."""
     there = set()
     for path in run.episodes():
         with suppress(GstError):
@@ -326,7 +326,7 @@ def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Out
             if episode.info.kind == "scan" and not cut_short(episode, episode.outcome):
                 there.add(episode.info.task)
     wanted = {job.task: job for job in reversed(jobs) if job.task not in there}
-    if not wanted or config.rate_hz <= 0:
+    if not wanted:
         return
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     log = run.notes_dir / "logs" / "record_scans.log"
@@ -336,7 +336,6 @@ def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Out
         for job in wanted.values():
             standin = ["publish", "standin", "--connect", endpoint]
             standin += ["--seed", str(job.session_seed), "--first-start", str(job.start)]
-            standin += ["--image-scale", str(config.image_scale)]
             scan_task(job.chosen, standin, output, recorder)
 
 
@@ -466,8 +465,6 @@ def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
         "--policy": job.policy,
         "--rounds": config.rounds,
         "--study-seed": config.study_seed,
-        "--rate-hz": config.rate_hz,
-        "--image-scale": config.image_scale,
     }
     if job.coin is not None:
         options["--coin"] = job.coin

@@ -110,7 +110,7 @@ async function save(change, { onward = false, words = "" } = {}) {
 
 function go(trial) {
   busy = true; // no key belongs to the page that is left
-  const address = new URL(form.dataset.onward, location.href);
+  const address = new URL(form.dataset.action, location.href);
   if (trial) address.searchParams.set("at", trial);
   location.assign(address);
 }

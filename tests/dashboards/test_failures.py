@@ -164,7 +164,7 @@ def test_the_page_groups_the_run_and_leads_to_each_trial(browser: Any) -> None:
     assert "2 failures 1 kind" in seen
     assert "dropped × carry × cube and table" in seen
     assert "failed: 1 recorded, 2 in the twin" in seen
-    assert re.findall(r'class="shot pair" href="(.*?)"', text) == [
+    assert re.findall(r'class="pair" href="(.*?)"', text) == [
         "/episode/trial_0002",
         "/episode/trial_0001",
     ]

@@ -17,9 +17,8 @@ from bridge.errors import UsageError
 from bridge.exchange import reviews
 from dashboards.comparison import judge
 from dashboards.guard import Admission
-from dashboards.label_page import OPERATOR, next_unrated, rater_name, trials_to_label
-from dashboards.review_routes import MAX_BODY
-from evaluator.compare.raters import with_reviews
+from dashboards.label_page import OPERATOR, next_trial, rater_name, trials_to_label
+from dashboards.label_routes import MAX_BODY
 
 ANN = "/label?rater=Ann"
 
@@ -96,23 +95,24 @@ def test_nothing_that_anybody_else_said_changes_what_a_rater_sees(
 
 def test_each_rater_has_an_order_of_their_own_over_the_same_trials(shared_run: RunFolder) -> None:
     judgement = judge(shared_run)
-    orders = {name: trials_to_label(judgement, "", name) for name in ("Ann", "Bob", "Cleo", "Di")}
+    orders = {name: trials_to_label(judgement, name) for name in ("Ann", "Bob", "Cleo", "Di")}
     assert len({tuple(order) for order in orders.values()}) > 1
     assert len({frozenset(order) for order in orders.values()}) == 1
-    assert orders["Ann"] == trials_to_label(judgement, "", "Ann")
-    assert next_unrated(["a", "b", "c"], {"b"}, "a") == "c"
-    assert next_unrated(["a", "b", "c"], {"b", "c"}, "b") == "a"
-    assert next_unrated(["a"], {"a"}, None) is None
+    assert orders["Ann"] == trials_to_label(judgement, "Ann")
 
 
-def test_the_worst_are_mixed_with_as_many_others(
-    shared_run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dashboards.label_page.WORST", 1)
-    judgement = judge(shared_run)
-    chosen = {name: trials_to_label(judgement, "worst", name) for name in ("Ann", "Bob", "Cleo")}
-    assert all(len(order) == 2 and "trial_0002" in order for order in chosen.values())
-    assert len({frozenset(order) for order in chosen.values()}) == 1
+def test_what_nobody_labelled_comes_next_and_then_what_only_others_did() -> None:
+    def said(rater: str, *trials: str, result: str = "success") -> list[reviews.Review]:
+        return [reviews.Review(trial_id=name, rater=rater, result=result) for name in trials]
+
+    order = ["a", "b", "c", "d"]
+    assert next_trial(order, said("Ann", "b"), "Ann", "a") == "c"
+    assert next_trial(order, said("Ann", "b", "c", "d"), "Ann", "b") == "a"
+    assert next_trial(order, said("Bob", "a", "b"), "Ann") == "c"
+    assert next_trial(order, said("Bob", "a", "b"), "Ann", "d") == "c"
+    assert next_trial(order, [*said("Bob", *"abcd"), *said("Ann", "a")], "Ann") == "b"
+    assert next_trial(order, said("Bob", "a", result="unrated"), "Ann") == "a"
+    assert next_trial(["a"], said("Ann", "a"), "Ann") is None
 
 
 def test_the_second_of_two_tabs_is_told_and_may_replace(pages: Any, run: RunFolder) -> None:
@@ -166,41 +166,26 @@ def test_undo_brings_back_what_was_there_even_nothing(pages: Any, run: RunFolder
 
 def test_a_flag_without_an_answer_is_no_label(pages: Any, run: RunFolder) -> None:
     pages.post(ANN, json=label(result="unrated", flag=True, note="look again"))
-    assert "Ann 0 4" in words(pages.get("/reviews").text)
-    assert "flagged 1" in words(pages.get("/queue").text)
-    assert "look again" not in pages.get("/queue").text
-    comparison = judge(run).comparison
-    assert comparison is not None
-    missing = with_reviews(comparison, reviews.read_reviews(run.path / "reviews")).missing
-    assert "raters: no trial has two known labels" in missing
+    shown = words(pages.get("/label").text)
+    assert "Ann 0 4" in shown
+    assert "look again" not in shown
+    assert "⚑ look again" in words(pages.get("/label?show=1").text)
 
 
-def test_agreement_is_held_back_until_everybody_is_done(pages: Any, run: RunFolder) -> None:
+def test_notes_are_held_back_until_everybody_is_done(pages: Any) -> None:
     for rater, last in (("Ann", 5), ("Bob", 4)):
         for number in range(1, last):
             result = "success" if number % 2 else "failure"
             body = label(f"trial_000{number}", result, note=f"says {rater}")
             assert pages.post(f"/label?rater={rater}", json=body).status_code == 200
-    held = words(pages.get("/reviews").text)
+    held = words(pages.get("/label").text)
     assert "Bob has trials left" in held
-    assert "kappa" not in held.lower()
     assert "says Ann" not in held
-    assert "kappa" in words(pages.get("/reviews?show=1").text).lower()
+    assert "says Ann" not in words(pages.get(ANN).text)
+    assert "says Ann" in words(pages.get("/label?show=1").text)
     pages.post("/label?rater=Bob", json=label("trial_0004"))
-    shown = words(pages.get("/reviews").text)
-    assert "says Ann" in shown
-    comparison = judge(run).comparison
-    assert comparison is not None
-    tables = {
-        table.id: table
-        for table in with_reviews(comparison, reviews.read_reviews(run.path / "reviews")).tables
-    }
-    at = tables["raters"].columns.index("kappa")
-    assert len(tables["raters"].rows) == 3  # the operator is a rater, too
-    for row in tables["raters"].rows:
-        assert row[at] is None or f"{row[at]:.3f}" in shown
-    done = words(pages.get(ANN).text)
-    assert "All 4 trials are labelled" in done
+    assert "says Ann" in words(pages.get("/label").text)
+    assert "All 4 trials are labelled" in words(pages.get(ANN).text)
 
 
 def test_a_label_from_a_table_is_shown_to_its_rater_and_can_be_replaced(
@@ -219,7 +204,7 @@ def test_a_label_from_a_table_is_shown_to_its_rater_and_can_be_replaced(
 def test_a_broken_label_file_is_named_and_hides_no_other(pages: Any, run: RunFolder) -> None:
     pages.post(ANN, json=label())
     (run.path / "reviews" / "broken.json").write_text("{")
-    assert "broken.json" in words(pages.get("/queue").text)
+    assert "broken.json" in words(pages.get("/label").text)
     found, problems = reviews.readable_reviews(run.path)
     assert ([r.rater for r in found], len(problems)) == (["Ann"], 1)
 

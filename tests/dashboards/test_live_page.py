@@ -230,7 +230,7 @@ def test_the_page_is_there_without_a_recorder_and_hostile_words_are_text(
     assert answer.status_code == 200
     assert "no recorder heard" in answer.text
     assert browser.get("/live/preview/side").status_code == 404
-    feed = app.state.studies._live()
+    feed = app.state.pages._heard()
     assert feed.enter()
     try:
         status = {"state": HOSTILE, "seen": {HOSTILE: 1}, "episode": HOSTILE, "warnings": [HOSTILE]}
@@ -240,4 +240,4 @@ def test_the_page_is_there_without_a_recorder_and_hostile_words_are_text(
         assert "<script>alert" not in text
         assert "&lt;script&gt;" in text
     finally:
-        app.state.studies.end()
+        app.state.pages.end_live()

@@ -51,7 +51,7 @@ def test_the_results_of_a_table_ask_for_no_recording(tmp_path: Path, synthetic: 
     place = RunFolder(tmp_path / "study")
     assert type_here(["evaluate", f"{place.path}.csv", "--out", str(place.results_dir)]) == 0
     pages = synthetic.browser_of(place)
-    for address in ("/", "/queue", "/failures"):
+    for address in ("/", "/label", "/failures"):
         shown = words(pages.get(address).text)
         assert "from a table" in shown
         assert "robot-gst record" not in shown
@@ -286,6 +286,6 @@ def test_nothing_but_labels_can_be_asked_to_write(shared_run: RunFolder, browser
     assert [path for path, methods in routes if methods - {"GET", "HEAD"}] == [
         "/label",
     ]
-    for path in ("/", "/queue", "/label", "/reviews", "/episode/trial_0001"):
+    for path in ("/", "/label", "/episode/trial_0001"):
         foreign = browser.post(path, headers={"Origin": "http://evil.example"}, content=b"")
         assert foreign.status_code == 403

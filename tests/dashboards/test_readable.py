@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_C
 PAGES = (
     *("", "?show=disagree&sort=-name", "?q=nothing+is+called+that", "?task=elsewhere"),
     *("?condition=with_replanning", "numbers", "twin"),
-    *("queue", "queue?show=flagged", "label", "label?rater=Ann", "reviews"),
+    *("label", "label?rater=Ann", "label?show=1"),
     *("failures", "failures?failed=wrong_no", "live"),
     *("episode/trial_0001", "episode/trial_0002?t=1", "episode/trial_0004", "nowhere"),
 )

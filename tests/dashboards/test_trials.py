@@ -231,8 +231,6 @@ def test_each_task_is_scanned_once_before_its_first_trial(
         writer.describe(EpisodeInfo(id="scan_0001", kind="scan", task="cube_into_box"))
     trials._scan(run, STUDY, both, QUIET)
     assert asked == ["stack_two_cubes"]
-    trials._scan(run, replace(STUDY, rate_hz=0.0), both, QUIET)  # without pictures
-    assert asked == ["stack_two_cubes"]
 
 
 def test_who_acts_is_tried_without_replanning_and_rolled_out(tmp_path: Path) -> None:

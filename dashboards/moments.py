@@ -1,0 +1,71 @@
+"""The moment at which recording and twin of a trial first differ."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from bridge.clock import NS_PER_S
+from bridge.episode import schema, streams
+from bridge.episode.executions import executed_events
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError
+from bridge.task.record import parse_record
+from evaluator.trial_row import TrialRow
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """When recording and twin first differ, as the replays of the plan sent tell it."""
+
+    plan_id: str
+    t_ns: int
+    """Since the start of the plan."""
+    text: str
+    """What differs then."""
+
+    @property
+    def t_s(self) -> float:
+        """Seconds into the plan."""
+        return self.t_ns / NS_PER_S
+
+
+def moment_of(run: RunFolder, row: TrialRow) -> Moment | None:
+    """Find the first divergence that the replays of a trial tell, or the first failing factor."""
+    for name in (row.executed_replay, row.planned_replay):
+        path = run.derived_dir / name if name else None
+        if path is None or not path.is_file():
+            continue
+        status = path.stat()
+        moment = _moment(path, status.st_mtime_ns, status.st_size)
+        if moment is not None:
+            return moment
+    return None
+
+
+@lru_cache(maxsize=4096)
+def _moment(path: Path, _mtime_ns: int, _size: int) -> Moment | None:
+    try:
+        episode = Episode.open(path)
+        messages = episode.messages(episode.topics_of_type(schema.DIVERGENCE))
+        for message in messages:
+            record = parse_record(message.data, name="divergence")
+            if first := record["first"]:
+                return Moment(
+                    plan_id=record["plan_id"], t_ns=first["first_t_ns"], text=first["detail"]
+                )
+        for _, verdict in streams.verdicts(episode):
+            name = verdict.first_failing
+            factor = verdict.factors()[name] if name else None
+            if factor is not None and factor.first_t_ns is not None:
+                text = factor.detail or factor.cause or f"{name} fails in the twin"
+                return Moment(plan_id=verdict.plan_id, t_ns=factor.first_t_ns, text=text)
+    except GstError:
+        return None  # the trial's own page says what is wrong with the file
+    return None
+
+
+def recorded_ns(path: Path, moment: Moment) -> int | None:
+    """Return when a moment is on the recording's clock; None where its plan was not executed."""
+    start_ns, _ = streams.execution_ns(executed_events(Episode.open(path)), moment.plan_id)
+    return None if start_ns is None else start_ns + moment.t_ns
