@@ -64,6 +64,7 @@ _TOLD = {
     "evaluate --against": "Evaluate each run; trials.csv has the same trials in both.",
     "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
     "trials --rate-hz --image-scale": "Pictures of a study are those of the cell file, 5 a second.",
+    "share --before-s --after-s": "A clip shows 3 s before the moment of divergence and 2 s after.",
     "render --rate-hz": "One frame is drawn for each recorded image.",
     "replay --grasp|gate --grasp": "A grasp holds by friction, as in life.",
     "replay --engines-must-agree|gate --engines-must-agree": (

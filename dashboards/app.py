@@ -22,7 +22,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, MissingDependencyError, UsageError
 from bridge.media.palette import style_sheet
 from dashboards import wording
-from dashboards.clips import clip, drawn_once, picture
+from dashboards.clips import clip, picture
 from dashboards.comparison import judge
 from dashboards.config import DashboardConfig, ShareConfig
 from dashboards.episode_page import build_page
@@ -38,6 +38,7 @@ from dashboards.recording import PageClock, read_recording
 from dashboards.share_file import build_share
 from dashboards.twin_page import build_twin, view_image
 from evaluator.report.wording import minus
+from evaluator.result import Measurement
 from evaluator.review_index import SHOW, FailureSelection, Selection
 from evaluator.trial_row import TrialRow
 
@@ -45,8 +46,6 @@ if TYPE_CHECKING:
     from dashboards.live_page import LiveFeed
 
 HERE = Path(__file__).parent
-PICTURES = "scene_pictures"
-"""Folder in the run's ``results/``."""
 SMALL = [Middleware(GZipMiddleware, minimum_size=2000, compresslevel=5)]
 """Text is compressed; images and episodes are already."""
 LIVE_PARTS = ("summary", "topics", "clocks", "verdicts")
@@ -75,7 +74,6 @@ def create_app(
         Route("/episode/{id}/frame/{camera}", pages.frame),
         Route("/episode/{id}/frames/{camera}", pages.frames),
         Route("/episode/{id}/scene", pages.scene, middleware=SMALL),
-        Route("/episode/{id}/scene.jpg", pages.scene_picture),
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
         Route("/failures", pages.failures),
@@ -114,11 +112,11 @@ def _environment() -> Environment:
     for function in (
         wording.outcome_word,
         wording.verdict_word,
+        wording.verdict_text,
         wording.factor_word,
         wording.tone,
         wording.measured,
         wording.evidence,
-        wording.short_evidence,
         wording.size_text,
         wording.condition_word,
         wording.image_title,
@@ -129,9 +127,7 @@ def _environment() -> Environment:
     ):
         environment.filters[function.__name__] = function
     environment.filters |= {"minus": minus, "quoted": lambda path: shlex.quote(str(path))}
-    environment.globals["link"] = link
-    environment.globals["share"] = share_link
-    environment.globals["SHOW"] = SHOW
+    environment.globals |= {"link": link, "share": share_link, "SHOW": SHOW}
     return environment
 
 
@@ -212,9 +208,12 @@ class Pages:
         return self._page("overview.html", request, page=page, known=known)
 
     def numbers(self, request: Request) -> Response:
-        """``/numbers``: every measurement of the evaluation."""
+        """``/numbers``: every measurement of the evaluation, by what it is about."""
         run = self._run(request)
-        return self._page("numbers.html", request, numbers=judge(run).measurements, run=run)
+        parts: dict[str, list[Measurement]] = {}
+        for each in judge(run).measurements:
+            parts.setdefault(each.id.partition(".")[0], []).append(each)
+        return self._page("numbers.html", request, parts=parts, run=run)
 
     def episode(self, request: Request) -> Response:
         """``/episode/<id>``: one trial and its replays."""
@@ -261,22 +260,6 @@ class Pages:
         path = episode_path(run, request.path_params["id"])
         data = packed(path, run.path, scene_stamps(run, path))
         return Response(data, media_type="application/octet-stream")
-
-    def scene_picture(self, request: Request) -> Response:
-        """``/episode/<id>/scene.jpg?t=``: the recorded state, before or without the 3D view."""
-        run = self._run(request)
-        path = episode_path(run, request.path_params["id"])
-        t_s = round(_seconds(request) or 0.0, 2)
-        stamps = scene_stamps(run, path)
-
-        def draw() -> bytes:
-            with LOADING:
-                from dashboards.scene_file import drawn  # noqa: PLC0415  # loads the twin
-
-            return drawn(path, run.path, stamps, t_s)
-
-        what = (path.stem, stamps, t_s)
-        return kept(drawn_once(run.results_dir / PICTURES, path.stem, what, draw), "image/jpeg")
 
     def episode_file(self, request: Request) -> Response:
         """``/episode/<id>/file``: the recorded file itself."""

@@ -1,5 +1,7 @@
 """Commands of the package ``dashboards``; imports stay late so that --help is quick."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -28,18 +30,12 @@ def dashboard(
         runs: Run folders; the first one is shown first.
         config: Where to listen.
     """
-    from bridge.errors import MissingDependencyError, UsageError
+    from bridge.errors import UsageError
 
     if not runs:
         raise UsageError("which run? For example: robot-gst dashboard runs/demo.")
-    try:
+    with _needing("starlette", "uvicorn", "jinja2", purpose="the dashboard"):
         from dashboards.server import serve
-    except ModuleNotFoundError as error:
-        if error.name not in ("starlette", "uvicorn", "jinja2"):
-            raise
-        raise MissingDependencyError(
-            package=error.name, extra="dashboard", purpose="the dashboard"
-        ) from error
     return serve(runs, config, output)
 
 
@@ -53,17 +49,10 @@ def share(run: Path, /, *, config: ShareConfig = SHARE, output: Output = OUTPUT)
         config: Which trials, and how large the file may be.
     """
     from bridge.episode.run_folder import RunFolder
-    from bridge.errors import MissingDependencyError
 
-    try:
+    with _needing("jinja2", "markupsafe", purpose="a file to share"):
         from dashboards.share_file import MB
         from dashboards.share_file import share as write
-    except ModuleNotFoundError as error:
-        if error.name not in ("jinja2", "markupsafe"):
-            raise
-        raise MissingDependencyError(
-            package=str(error.name), extra="dashboard", purpose="a file to share"
-        ) from error
     path, made = write(RunFolder.open(run), config)
     for note in made.notes:
         output.say(f"Without a clip: {note}")
@@ -103,17 +92,9 @@ def view(target: Path, /, *, out: Path | None = None, output: Output = OUTPUT) -
 
 
 def _export(episode: Path, out: Path, output: Output) -> Path:
-    from bridge.errors import MissingDependencyError
-
-    try:
+    with _needing("rerun", "rerun_bindings", package="rerun-sdk", purpose="the Rerun view"):
         from dashboards.rerun_view import export_rrd as export
         from dashboards.rerun_view import run_of
-    except ModuleNotFoundError as error:
-        if error.name not in ("rerun", "rerun_bindings"):
-            raise
-        raise MissingDependencyError(
-            package="rerun-sdk", extra="dashboard", purpose="the Rerun view"
-        ) from error
     done = export(episode, out, run_of(episode))
     for note in done.notes:
         output.say(f"Note: {note}")
@@ -128,3 +109,18 @@ def _export(episode: Path, out: Path, output: Output) -> Path:
     }
     output.result(data, text)
     return done.path
+
+
+@contextmanager
+def _needing(*modules: str, purpose: str, package: str = "") -> Iterator[None]:
+    """Name the extra where one of these modules is not there."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name not in modules:
+            raise
+        from bridge.errors import MissingDependencyError
+
+        raise MissingDependencyError(
+            package=package or error.name, extra="dashboard", purpose=purpose
+        ) from error

@@ -180,22 +180,6 @@ def _beside(sides: Sequence[Image]) -> Image:
     return np.concatenate([sides[0], gap, sides[1]], axis=1)
 
 
-def contact_sheet(frames: Sequence[Image], columns: int) -> Image:
-    """Lay frames of one size out in rows, in reading order."""
-    height, width = frames[0].shape[:2]
-    rows = -(-len(frames) // columns)
-    columns = min(columns, len(frames))
-    sheet = np.full(
-        (rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3),
-        255,
-        dtype=np.uint8,
-    )
-    for place, frame in enumerate(frames):
-        top, left = (place // columns) * (height + GAP_PX), (place % columns) * (width + GAP_PX)
-        sheet[top : top + height, left : left + width] = frame
-    return sheet
-
-
 def as_video(found: Footage, config: ClipConfig) -> bytes:
     """Make an MP4 file (H.264) of the frames.
 

@@ -10,8 +10,6 @@ from threading import Lock
 from typing import Any
 
 from bridge.episode.run_folder import RunFolder
-from evaluator.cache import FOLDER, SummaryCache
-from evaluator.compare import Comparison, compare_run
 from evaluator.report.review import refresh
 from evaluator.result import Measurement, Results, load_results
 from evaluator.review_index import (
@@ -32,8 +30,13 @@ IMPORTED = "imported"
 """Kind of an episode that is a motion from elsewhere."""
 RENDERS = "image."
 """Begins the ids of numbers about folders of renders."""
-LISTS = ("exclusions", "missing", "answers", "notes", "tasks", "failures", "tables")
-NOTHING: dict[str, Any] = {**dict.fromkeys(LISTS, ()), "num_exclusions": 0, "close_pp": 0.0}
+LISTS = ("exclusions", "missing", "answers", "notes", "tasks", "tables")
+NOTHING: dict[str, Any] = {
+    **dict.fromkeys(LISTS, ()),
+    "num_exclusions": 0,
+    "close_pp": 0.0,
+    "worst_view": None,
+}
 """What an index says at least."""
 LOOKED_AT_S = 5.0
 """A larger run's files are looked at again after this; its folders at each page."""
@@ -95,13 +98,6 @@ class Judgement:
         return _results(self.run, stamp_of(self.run.path / RESULTS)) if self.has_results else None
 
     @property
-    def comparison(self) -> Comparison | None:
-        """Everything the evaluator finds now, for pages that ask it more; None where it cannot."""
-        if self.index is None or self.comparison_reason is not None:
-            return None
-        return _comparison(self.run, self.about["state"])
-
-    @property
     def comparison_reason(self) -> str | None:
         """Why the trials cannot be compared."""
         found = self.about.get("comparison_reason")
@@ -126,12 +122,6 @@ class Judgement:
 @lru_cache(maxsize=2)
 def _results(run: RunFolder, _stamp: str) -> Results:
     return load_results(run.path)
-
-
-@lru_cache(maxsize=2)
-def _comparison(run: RunFolder, _state: str) -> Comparison:
-    with SummaryCache(run.results_dir / FOLDER) as cache:
-        return compare_run(run, cache=cache)
 
 
 @dataclass

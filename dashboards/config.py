@@ -31,7 +31,7 @@ class DashboardConfig:
         refuse_outside(self, PORTS)
 
 
-SHARE_LIMITS = {"max_mb": (0.01, 20.0), "before_s": (0.0, 30.0), "after_s": (0.0, 30.0)}
+SHARE_LIMITS = {"max_mb": (0.01, 20.0)}
 
 
 @Parameter(name="*")
@@ -45,10 +45,6 @@ class ShareConfig:
     """File to write; RUN/results/shared/trials.html, which the report then names, without it."""
     max_mb: float = 20.0
     """Size of the file; clips get fewer and smaller frames until it fits."""
-    before_s: float = 3.0
-    """Clips begin so long before the moment of divergence."""
-    after_s: float = 2.0
-    """They end so long after it."""
 
     def __post_init__(self) -> None:
         """Refuse what no file can be."""

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.metadata import Outcome, why_not_counted
@@ -16,20 +15,11 @@ from dashboards.frames import RENDERED, CameraTrack
 from dashboards.library import derived_paths, episode_path
 from dashboards.moments import Moment, moment_of
 from dashboards.recording import PageClock, Problems, Recording, read_recording
-from dashboards.trial_lanes import Replanned, replans, trial_lanes
+from dashboards.trial_lanes import trial_lanes
 from dashboards.trial_plots import PLANNED, main_plots, plots_of_joints, shown_replays
+from dashboards.wording import event_words
 from evaluator.trial_row import TrialRow
 from twin.scene.store.library import not_scanned_in
-
-
-@dataclass(frozen=True, kw_only=True)
-class FactorView:
-    """One factor of a verdict; ``t_s`` is the page's time of the first failing instant."""
-
-    name: str
-    meaning: str
-    factor: Factor
-    t_s: float | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +29,8 @@ class VerdictView:
     title: str
     subtitle: str
     verdict: Verdict
-    factors: tuple[FactorView, ...]
+    factors: tuple[tuple[str, str, Factor, float | None], ...]
+    """Name, meaning, the factor, and the page's time of its first failing instant."""
     of_sent_plan: bool
     counts: bool
     """False for a replay that was redone since, with other settings or in another scene, and for
@@ -89,7 +80,6 @@ class EpisodePage:
     gated: bool
     """The plan that was sent had a verdict before motion."""
     stages: StageChart | None
-    replans: tuple[Replanned, ...]
     plots: tuple[TimePlot, ...]
     joint_plots: tuple[TimePlot, ...]
     cameras: tuple[CameraView, ...]
@@ -108,11 +98,11 @@ class EpisodePage:
 
 
 GATE_BEFORE = "Gate, before motion"
-FACTORS = (
-    ("ik", "the arm can reach every pose"),
-    ("clearance", "nothing is touched that should not be"),
-    ("terminal", "the task ends in success"),
-)
+FACTORS = {
+    "ik": "the arm can reach every pose",
+    "clearance": "nothing is touched that should not be",
+    "terminal": "the task ends in success",
+}
 
 
 def build_page(
@@ -136,9 +126,9 @@ def build_page(
     sent_plan = sent_plan_of(recording)
     clock = PageClock.of(recording)
     verdicts = _verdicts(recording, replays, sent_plan, clock)
-    factors = [f for view in verdicts if view.of_sent_plan and view.counts for f in view.factors]
-    failures_s = [f.t_s for f in factors if f.factor.value is False and f.t_s is not None]
-    failure_t_s = next(iter(failures_s), None)
+    factors = (each for view in verdicts if view.is_main for each in view.factors)
+    failures_s = (t for *_, factor, t in factors if factor.value is False and t is not None)
+    failure_t_s = next(failures_s, None)
     moment = None if row is None else moment_of(run, row)
     divergence_t_s = None if moment is None else clock.of_plan_time(moment.plan_id, moment.t_ns)
     shown = shown_replays(replays, sent_plan)
@@ -154,7 +144,6 @@ def build_page(
         verdicts=verdicts,
         gated=any(view.title == GATE_BEFORE and view.of_sent_plan for view in verdicts),
         stages=trial_lanes(recording, shown, clock, failure_t_s, failed),
-        replans=replans(recording, clock),
         plots=main_plots(recording, replays, sent_plan, row, clock),
         joint_plots=plots_of_joints(recording, shown, clock),
         cameras=tuple(
@@ -162,7 +151,7 @@ def build_page(
             for name, track in recording.cameras.items()
             if not name.startswith(RENDERED)
         ),
-        events=tuple(_event(event, clock) for event in recording.events),
+        events=tuple((clock.seconds(e["stamp_ns"]), *event_words(e)) for e in recording.events),
         clock=clock,
         t_s=cursor,
         failure_t_s=failure_t_s,
@@ -250,22 +239,15 @@ def _view(
     *,
     counts: bool = True,
 ) -> VerdictView:
-    factors = []
-    for name, meaning in FACTORS:
-        factor: Factor = getattr(verdict, name)
-        factors.append(
-            FactorView(
-                name=name,
-                meaning=meaning,
-                factor=factor,
-                t_s=clock.of_plan_time(verdict.plan_id, factor.first_t_ns),
-            )
-        )
+    factors: dict[str, Factor] = {name: getattr(verdict, name) for name in FACTORS}
     return VerdictView(
         title=title,
         subtitle=subtitle,
         verdict=verdict,
-        factors=tuple(factors),
+        factors=tuple(
+            (name, FACTORS[name], each, clock.of_plan_time(verdict.plan_id, each.first_t_ns))
+            for name, each in factors.items()
+        ),
         of_sent_plan=sent_id is None or verdict.plan_id == sent_id,
         counts=counts,
         nearest=_nearest_words(verdict),
@@ -320,11 +302,3 @@ def _twin_view(
         stamps_ns=track.stamps_ns,
         shown=track.nearest(clock.stamp_ns(t_s)),
     )
-
-
-def _event(event: dict[str, Any], clock: PageClock) -> tuple[float, str, str]:
-    parts = [str(event[name]) for name in ("stage_id", "plan_id", "text") if event.get(name)]
-    for name in ("outcome", "data"):
-        if event.get(name):
-            parts.append(", ".join(f"{key} {value}" for key, value in event[name].items()))
-    return clock.seconds(event["stamp_ns"]), event["type"].replace("_", " "), " · ".join(parts)

@@ -1,17 +1,14 @@
 """Failures by cause, stage, bodies and start region, with a wall of pictures and short clips."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError
 from dashboards.clips import can_film
 from dashboards.comparison import Judgement
 from dashboards.moments import Moment, moment_of
-from dashboards.overview_page import Facet, group_facets
+from dashboards.overview_page import group_facets, has_picture
 from evaluator.review_index import (
     FAILED,
-    FAILURE_PARTS,
     NOT_KNOWN,
     FailureGroup,
     FailureSelection,
@@ -22,7 +19,6 @@ from evaluator.trial_row import TrialRow
 
 GROUPS, SHOWN, ALONE = 12, 4, 24
 """Kinds on one screen; trials of each; trials on one screen where there is one kind alone."""
-MOST_VALUES = 100
 PART_WORDS = {
     "cause": "cause in the twin",
     "stage": "stage",
@@ -37,6 +33,7 @@ class Shot:
 
     row: TrialRow
     moment: Moment | None
+    has_picture: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +61,8 @@ class FailuresPage:
     of: int = 0
     """Failures in the run."""
     num_trials: int = 0
-    facets: tuple[Facet, ...] = ()
+    facets: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = ()
+    """What to filter by, each with values and their labels."""
     failed: tuple[tuple[str, str, int], ...] = ()
     """Value, words and number of each choice of who failed."""
     page: int = 1
@@ -92,7 +90,7 @@ def build_failures(
         count=count,
         of=_count(index, FailureSelection()),
         num_trials=index.count(Selection()),
-        facets=(*group_facets(index, counted=False), *_parts(index, selection)),
+        facets=tuple(group_facets(index)),
         failed=tuple(
             (value, words, _count(index, FailureSelection(**selection.query(failed=value))))
             for value, words in FAILED.items()
@@ -123,25 +121,8 @@ def _kind(
             (PART_WORDS[name], text.replace("_", " ")) for name, text in group.parts.items() if text
         ),
         narrowed=narrowed,
-        shots=tuple(Shot(row=row, moment=_moment(run, row)) for row in trials),
+        shots=tuple(
+            Shot(row=row, moment=moment_of(run, row), has_picture=has_picture(run, row))
+            for row in trials
+        ),
     )
-
-
-def _moment(run: RunFolder, row: TrialRow) -> Moment | None:
-    try:
-        return moment_of(run, row)
-    except GstError:  # the trial's own page says what is wrong
-        return None
-
-
-def _parts(index: ReviewIndex, selection: FailureSelection) -> Sequence[Facet]:
-    found = []
-    for name in FAILURE_PARTS:
-        values = index.failure_values(selection, name)
-        if len(values) > 1 or getattr(selection, name):
-            labelled = [
-                (text or NOT_KNOWN, f"{text.replace('_', ' ') or 'not known'} ({count})")
-                for text, count in values[:MOST_VALUES]
-            ]
-            found.append(Facet(name=name, values=(("", "all"), *labelled)))
-    return found

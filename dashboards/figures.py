@@ -5,7 +5,7 @@ Only the layout of a drawing is worked out here; every number that is shown come
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -37,10 +37,6 @@ class Axis:
         """Return the pixel of a value."""
         share = (value - self.low) / (self.high - self.low)
         return round(self.px_low + share * (self.px_high - self.px_low), 2)
-
-    def inside(self, value: float) -> bool:
-        """Say whether a value lies on the axis."""
-        return self.low <= value <= self.high
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,44 +87,22 @@ class Span:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bar:
-    """A drawn span [px]."""
-
-    x: float
-    width: float
-    label: str
-    style: str
-    title: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lane:
-    """A row of bars under one name."""
-
-    name: str
-    y: float
-    bars: tuple[Bar, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Mark:
-    """One instant worth a line across the lanes."""
-
-    t_s: float
-    px: float
-    label: str
-    style: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class StageChart:
-    """Stages as bars in lanes over time, with marks."""
+    """Stages in lanes over time, with instants worth a line across the lanes."""
 
     width: int
-    height: int
     x: Axis
-    lanes: tuple[Lane, ...]
-    marks: tuple[Mark, ...] = field(default=())
+    lanes: tuple[tuple[str, tuple[Span, ...]], ...]
+    """Name and stages of each, from top to bottom."""
+    marks: tuple[tuple[float, str, str], ...]
+    """Page time [s], text and style."""
+
+    def bar(self, span: Span) -> tuple[float, float, str]:
+        """Where a stretch begins and how wide it is [px], and its label where that fits."""
+        ends_s = (min(max(t_s, self.x.low), self.x.high) for t_s in (span.start_s, span.end_s))
+        start, end = map(self.x.px, ends_s)
+        width = max(round(end - start - 1.5, 2), 1.5)
+        return start, width, span.label if width > 7.2 * len(span.label) + 8 else ""
 
 
 def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
@@ -213,13 +187,8 @@ def time_plot(
     The value axis covers ``least_span`` at least, so that noise is not blown up to a motion.
 
     Args:
-        signals: One for each line; gaps where values are not finite.
-        span_s: First and last page time of the horizontal axis [s].
         level: Value of a horizontal line, for example a safety distance; None draws none.
-        least_span: Least range of the value axis, in ``unit``.
-        note: A sentence below the plot; empty leaves it out.
-        width: Of the whole plot [px].
-        height: Of the whole plot [px].
+        width: Of the whole plot [px]; its height too.
     """
     finite = [signal.values[np.isfinite(signal.values)] for signal in signals]
     finite = [values for values in finite if len(values)]
@@ -250,7 +219,6 @@ def time_plot(
     )
 
 
-LANE_HEIGHT = 23
 LANE_LABEL_WIDTH = 92
 
 
@@ -263,46 +231,11 @@ def stage_chart(
 ) -> StageChart | None:
     """Lay out stages in named lanes; None when no lane holds any.
 
-    Args:
-        lanes: Name and stages of each lane, from top to bottom; a lane without stages is left out.
-        marks: Page time [s], text and style of each vertical mark; those outside the span are left
-            out.
-        span_s: First and last page time of the chart [s].
-        width: Of the whole chart [px].
+    Empty lanes, and marks outside of the span, are left out.
     """
-    filled = [(name, spans) for name, spans in lanes if spans]
+    filled = tuple((name, tuple(spans)) for name, spans in lanes if spans)
     if not filled:
         return None
     x = axis(span_s[0], span_s[1], LANE_LABEL_WIDTH, width - 8, wanted=10)
-    drawn = tuple(
-        Lane(
-            name=name,
-            y=6 + row * LANE_HEIGHT,
-            bars=tuple(_bar(span, x) for span in spans),
-        )
-        for row, (name, spans) in enumerate(filled)
-    )
-    return StageChart(
-        width=width,
-        height=6 + len(filled) * LANE_HEIGHT + 22,
-        x=x,
-        lanes=drawn,
-        marks=tuple(
-            Mark(t_s=t_s, px=x.px(t_s), label=label, style=style)
-            for t_s, label, style in marks
-            if x.inside(t_s)
-        ),
-    )
-
-
-def _bar(span: Span, x: Axis) -> Bar:
-    start, end = x.px(max(span.start_s, x.low)), x.px(min(span.end_s, x.high))
-    width = max(round(end - start - 1.5, 2), 1.5)
-    fits = width > 7.2 * len(span.label) + 8
-    return Bar(
-        x=start,
-        width=width,
-        label=span.label if fits else "",
-        style=span.style,
-        title=span.title or f"{span.label}: {span.start_s:.2f} s to {span.end_s:.2f} s",
-    )
+    inside = tuple(mark for mark in marks if x.low <= mark[0] <= x.high)
+    return StageChart(width=width, x=x, lanes=filled, marks=inside)

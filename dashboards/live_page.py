@@ -8,7 +8,7 @@ import json
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
@@ -28,8 +28,6 @@ STATUS_BYTES, PREVIEW_BYTES = 2_000_000, 1_000_000
 """Larger messages are left out."""
 MOST_CAMERAS, MOST_TOPICS, MOST_VERDICTS = 16, 200, 8
 MOST_VIEWERS = 16
-REMEMBERED_S = 60
-"""Rates are drawn over so long."""
 CONNECT_S, RETRY_S = 1.0, 1.0
 QUIET_S = 6.0
 """A recorder that says nothing for so long is looked for again."""
@@ -37,8 +35,6 @@ LINGER_S = 10.0
 """The session stays open so long after the last viewer left."""
 PERIOD_S = 1.0
 """Viewers are told at most so often."""
-SPARK = (120, 22)
-"""Width and height of the drawing of a rate [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,22 +43,10 @@ class TopicLine:
 
     topic: str
     rate_hz: float
-    spark: str
-    """Points of a polyline of the last minute."""
     lost: int | None
     """Messages of the episode that were sent and are not in it; None while nothing is recorded."""
     trouble: str
     """Why a person should look; empty where nothing is wrong."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class VerdictLine:
-    """One verdict of the gate."""
-
-    plan_id: str
-    accepted: bool | None
-    text: str
-    age_s: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +61,8 @@ class LiveState:
     state: str
     status: Mapping[str, Any]
     topics: tuple[TopicLine, ...]
-    more_topics: int
-    verdicts: tuple[VerdictLine, ...]
+    verdicts: tuple[tuple[float, Verdict], ...]
+    """How long ago [s], the last first."""
     previews: tuple[tuple[str, int], ...]
     """Camera, and a number that changes with its picture."""
     malformed: int
@@ -90,7 +74,6 @@ class _Heard:
 
     status: dict[str, Any] = field(default_factory=dict)
     status_s: float = 0.0
-    rates: dict[str, deque[float]] = field(default_factory=dict)
     previews: dict[str, tuple[int, bytes]] = field(default_factory=dict)
     verdicts: deque[tuple[float, Verdict]] = field(
         default_factory=lambda: deque(maxlen=MOST_VERDICTS)
@@ -167,8 +150,8 @@ class LiveFeed:
             heard, now_s = self._heard, self._now_s()
             status = dict(heard.status)
             is_heard = bool(status) and now_s - heard.status_s < QUIET_S
-            topics = _topics(status, heard.rates) if is_heard else []
-            verdicts = tuple(_verdict(v, now_s - at_s) for at_s, v in reversed(heard.verdicts))
+            topics = _topics(status) if is_heard else []
+            verdicts = tuple((now_s - at_s, v) for at_s, v in reversed(heard.verdicts))
             return LiveState(
                 is_heard=is_heard,
                 problem="" if is_heard else self._why_not(),
@@ -176,7 +159,6 @@ class LiveFeed:
                 state=str(status.get("state", "")) if is_heard else "",
                 status=status if is_heard else {},
                 topics=tuple(topics[:MOST_TOPICS]),
-                more_topics=max(0, len(topics) - MOST_TOPICS),
                 verdicts=verdicts,
                 previews=tuple((name, n) for name, (n, _) in sorted(heard.previews.items())),
                 malformed=heard.malformed,
@@ -232,9 +214,6 @@ class LiveFeed:
                 self._heard.malformed += 1
                 return
             self._heard.status, self._heard.status_s = record, self._now_s()
-            for topic, rate_hz in _numbers(record.get("rates_hz")).items():
-                kept = self._heard.rates.setdefault(topic, deque(maxlen=REMEMBERED_S))
-                kept.append(rate_hz)
 
     def _hear_verdict(self, sample: WireSample) -> None:
         if sample.type_name not in ("", schema.VERDICT):
@@ -323,7 +302,7 @@ def _words(status: Mapping[str, Any]) -> str:
         return "This recorder's status cannot be put into words; its numbers are below."
 
 
-def _topics(status: Mapping[str, Any], rates: Mapping[str, deque[float]]) -> list[TopicLine]:
+def _topics(status: Mapping[str, Any]) -> list[TopicLine]:
     """Lay out the topics: those with trouble first, then by name."""
     silent = status.get("silent")
     quiet = {
@@ -346,7 +325,6 @@ def _topics(status: Mapping[str, Any], rates: Mapping[str, deque[float]]) -> lis
             TopicLine(
                 topic=topic,
                 rate_hz=rate_hz.get(topic, 0.0),
-                spark=_spark(rates.get(topic, ())),
                 lost=lost,
                 trouble=trouble or (f"{lost} lost" if lost else ""),
             )
@@ -360,24 +338,3 @@ def _lost(status: Mapping[str, Any], topic: str) -> int | None:
         return None
     counts = _numbers(tallies.get(topic))
     return int(sum(counts.get(name, 0) for name in ("gaps", "queue_drops", "shed")))
-
-
-def _spark(rates_hz: Sequence[float]) -> str:
-    most = max(rates_hz, default=0.0)
-    if most <= 0 or len(rates_hz) < 2:
-        return ""
-    width, height = SPARK
-    step = width / (REMEMBERED_S - 1)
-    left = width - step * (len(rates_hz) - 1)
-    return " ".join(
-        f"{left + step * place:g},{1 + (height - 2) * (1 - rate / most):.1f}"
-        for place, rate in enumerate(rates_hz)
-    )
-
-
-def _verdict(verdict: Verdict, age_s: float) -> VerdictLine:
-    name = verdict.first_failing
-    factor = None if name is None else verdict.factors()[name]
-    parts = [name, factor.cause, " and ".join(factor.bodies), factor.detail] if factor else []
-    text = ": ".join(str(part) for part in parts if part) or verdict.reason or ""
-    return VerdictLine(plan_id=verdict.plan_id, accepted=verdict.accepted, text=text, age_s=age_s)

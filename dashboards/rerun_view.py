@@ -8,7 +8,6 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -23,14 +22,13 @@ from bridge.errors import UsageError
 from bridge.media.palette import Rgb, rgb
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
-from bridge.task.verdict import Verdict
 from dashboards.episode_page import read_replays, sent_plan_of
 from dashboards.library import derived_paths
 from dashboards.recording import PageClock, Problems, Recording, read_recording
 from dashboards.rerun_entities import log_cameras, log_robot
 from dashboards.rerun_file import TIMELINE, RerunFile
 from dashboards.trial_plots import shown_replays
-from dashboards.wording import condition_word, factor_word, outcome_word, verdict_word
+from dashboards.wording import condition_word, event_words, outcome_word, verdict_text
 from twin.scene.store.library import FROM_TASK, NOT_SCANNED, not_scanned_in
 
 EYE_M, TARGET_M = (1.5, -1.1, 0.9), (0.35, 0.0, 0.15)
@@ -190,7 +188,9 @@ def log_side(
         file.always(f"{prefix}/objects/{name}", _shape(name, task, side.color, name in not_scanned))
     for event in recording.events:
         stamp_ns = int(event["stamp_ns"]) + side.shift_ns
-        file.at(f"{prefix}/events", stamp_ns, rr.TextLog(event_text(event)))
+        file.at(
+            f"{prefix}/events", stamp_ns, rr.TextLog(": ".join(filter(None, event_words(event))))
+        )
     for stamp_ns, verdict in recording.verdicts:
         level = rr.TextLogLevel.INFO if verdict.accepted else rr.TextLogLevel.WARN
         text = rr.TextLog(verdict_text(verdict), level=level)
@@ -215,28 +215,6 @@ def _shape(
         show_labels=not_scanned,
         fill_mode=rr.components.FillMode.MajorWireframe,
     )
-
-
-def event_text(event: dict[str, Any]) -> str:
-    """Write an event as one line: what happened, to which stage and plan, and the note."""
-    parts = [str(event["type"]).replace("_", " ")]
-    parts += [str(event[name]) for name in ("stage_id", "plan_id") if event.get(name)]
-    text = ", ".join(parts)
-    return f"{text}: {event['text']}" if event.get("text") else text
-
-
-def verdict_text(verdict: Verdict) -> str:
-    """Write a verdict as one line, with the first factor that fails and why."""
-    text = f"{verdict_word(verdict.accepted)}: {verdict.plan_id}, {verdict.trajectory}"
-    text += f", {verdict.mode}, {verdict.engine}"
-    name = verdict.first_failing
-    if name is not None:
-        factor = verdict.factors()[name]
-        why = factor.detail or factor.cause
-        text += f"; {name} {factor_word(factor)}" + (f" ({why})" if why else "")
-    elif verdict.accepted is None and verdict.reason:
-        text += f"; {verdict.reason}"
-    return text
 
 
 def _log_plans(file: RerunFile, recording: Recording) -> None:

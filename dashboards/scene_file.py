@@ -1,4 +1,4 @@
-"""The file that the page's 3D view reads, and the picture that stands there before it.
+"""The file that the page's 3D view reads.
 
 ``GS3D``, version and length of the header, each a little-endian uint32; the header, JSON padded
 with blanks; then ``splats`` (48 bytes each, see ``SPLAT``), ``poses`` (position and quaternion
@@ -22,17 +22,14 @@ from scipy.spatial import cKDTree
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.media.color import encode_jpeg
 from dashboards.episode_page import read_replays, sent_plan_of
 from dashboards.library import Stamps, derived_paths
 from dashboards.recording import Problems, read_recording
 from dashboards.trial_plots import shown_replays
 from dashboards.trial_scene import RECORDED, Side, TrialScene, gather_scene
-from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.harmonics import NUM_FIRST
 from twin.scene.movable_scene import MovableScene
-from twin.scene.raster.backend import open_rasteriser
-from twin.scene.standpoint import sized_camera
 
 MAGIC, VERSION = b"GS3D", 1
 HEAD = 16
@@ -64,23 +61,17 @@ EYE_M, TARGET_M = np.array([1.5, -1.1, 0.9]), np.array([0.4, 0.0, 0.1])
 UP = np.array([0.0, 0.0, 1.0])
 ASIDE_RAD, ABOVE_M = 0.35, 0.12
 """How far the first view stands from that of the recorded camera, around what is looked at."""
-PICTURE_SIZE = "960x600"
 _GATHERING = threading.Lock()
 """Robot models keep scratch memory: one answer at a time uses them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FirstView:
-    """Where the 3D view and its picture begin."""
+    """Where the 3D view begins."""
 
     camera: Camera
     eye_m: Float[np.ndarray, "3"]
     target_m: Float[np.ndarray, "3"]
-
-    @property
-    def T_root_camera(self) -> Float[np.ndarray, "4 4"]:
-        """The pose of a camera that looks so."""
-        return se3.look_at(self.eye_m, self.target_m, UP)
 
 
 def first_view(scene: TrialScene) -> FirstView:
@@ -104,50 +95,15 @@ def first_view(scene: TrialScene) -> FirstView:
 
 
 @lru_cache(maxsize=2)
-def packed(path: Path, run_path: Path, stamps: Stamps) -> bytes:
-    """The file of a recorded episode's scene.
-
-    Args:
-        stamps: Of what the scene is made of; another one is gathered anew.
-    """
-    with _GATHERING:
-        return pack_scene(_gathered(path, run_path, stamps))
-
-
-def drawn(path: Path, run_path: Path, stamps: Stamps, t_s: float) -> bytes:
-    """The picture of a recorded episode's scene at a page time [s], as JPEG; else as ``packed``."""
-    with _GATHERING:
-        return draw_picture(_gathered(path, run_path, stamps), t_s)
-
-
-@lru_cache(maxsize=1)
-def _gathered(path: Path, run_path: Path, _stamps: Stamps) -> TrialScene:
-    """Gather once for the picture and for the 3D view, which are asked for together."""
+def packed(path: Path, run_path: Path, _stamps: Stamps) -> bytes:
+    """The file of a recorded episode's scene; gathered anew where what it is made of changed."""
     run = RunFolder(run_path)
-    recording = read_recording(path)
-    replays = read_replays(derived_paths(run, path.stem, "replay"), recording, Problems())
-    sent_plan = sent_plan_of(recording)
-    return gather_scene(run, recording, shown_replays(replays, sent_plan), sent_plan)
-
-
-def draw_picture(scene: TrialScene, t_s: float) -> bytes:
-    """Draw the recorded state of a trial from the first view, as JPEG.
-
-    Args:
-        scene: What there is; without a rebuilt scene the picture is black.
-        t_s: Page time.
-    """
-    view = first_view(scene)
-    camera = sized_camera(view.camera, PICTURE_SIZE)
-    parts = scene.parts
-    if parts is None:
-        return encode_jpeg(np.zeros((camera.height, camera.width, 3), dtype=np.uint8))
-    at = scene.nearest(t_s)
-    recorded = scene.sides[0].Ts_base_object
-    places = {name: Ts[at] for name, Ts in recorded.items() if name in parts.objects}
-    links = [moved_cloud(parts.links[k], Ts[at]) for k, Ts in scene.Ts_root_link.items()]
-    cloud = concatenate([parts.at(places), *links])
-    return encode_jpeg(parts.draw(open_rasteriser(), cloud, camera, view.T_root_camera).marked_u8())
+    with _GATHERING:
+        recording = read_recording(path)
+        replays = read_replays(derived_paths(run, path.stem, "replay"), recording, Problems())
+        sent_plan = sent_plan_of(recording)
+        shown = shown_replays(replays, sent_plan)
+        return pack_scene(gather_scene(run, recording, shown, sent_plan))
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""One file to send: chosen trials with clips, figures and tables; offline, readable unscripted."""
+"""One file to send: chosen trials with clips and plots; offline, readable unscripted."""
 
 import base64
 import difflib
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, PrefixLoader
 
@@ -15,26 +14,13 @@ from bridge.errors import GstError, UsageError
 from bridge.media.color import encode_jpeg
 from bridge.whole_file import write_whole
 from dashboards import wording
-from dashboards.clips import (
-    SUBSAMPLING,
-    ClipConfig,
-    Footage,
-    as_video,
-    can_film,
-    contact_sheet,
-    footage,
-)
+from dashboards.clips import SUBSAMPLING, ClipConfig, as_video, can_film, footage
 from dashboards.comparison import Judgement, judge
 from dashboards.config import SHARE_LIMITS, ShareConfig
-from dashboards.episode_page import build_page
-from dashboards.figures import TimePlot
-from dashboards.library import episode_path
-from evaluator.compare.rows import Comparison
-from evaluator.report.figures import DARK, LIGHT, Drawing, drawings_of
-from evaluator.report.front import FIGURES, front
+from dashboards.episode_page import EpisodePage, build_page
+from evaluator.report.figures import DARK, LIGHT
 from evaluator.report.page import SHARED, environment, name_shared
 from evaluator.report.wording import stand_in_sentence
-from evaluator.result import Table
 from evaluator.review_index import Selection
 from evaluator.trial_row import TrialRow
 
@@ -45,28 +31,26 @@ BY_ITSELF = 8
 MOST_TRIALS = 60
 PLOTS = 4
 """Of a trial: how far the tool was from the twin's, and what comes after it on its page."""
-STRIP_FRAMES = 6
 MB = 1_000_000
-
-
-STRIPS = "strips"
+PICTURES = "pictures"
+_AROUND = ClipConfig(before_s=3.0, after_s=2.0)
 LEVELS = {
-    "288 lines, 15 Hz": ClipConfig(height_px=288, rate_hz=15, crf=24, quality=82),
-    "216 lines, 10 Hz": ClipConfig(height_px=216, rate_hz=10, crf=28, quality=78),
-    "144 lines, 6 Hz": ClipConfig(height_px=144, rate_hz=6, crf=32, quality=70),
-    STRIPS: ClipConfig(height_px=120, rate_hz=3, quality=65),
+    "288 lines, 15 Hz": replace(_AROUND, height_px=288, rate_hz=15, crf=24, quality=82),
+    "216 lines, 10 Hz": replace(_AROUND, height_px=216, rate_hz=10, crf=28, quality=78),
+    "144 lines, 6 Hz": replace(_AROUND, height_px=144, rate_hz=6, crf=32, quality=70),
+    PICTURES: replace(_AROUND, height_px=144, rate_hz=6, quality=65),
 }
 """How well clips are shown; the next one is smaller, and the last ones are pictures."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clip:
-    """What the file shows of a trial: a video with its picture, or a strip of pictures."""
+    """What the file shows of a trial: a video with its picture, or the picture alone."""
 
     picture: str
-    """JPEG as a data address: of the moment, or the strip."""
+    """JPEG of the moment, as a data address."""
     video: str
-    """MP4 as a data address; empty for a strip."""
+    """MP4 as a data address; empty for a picture alone."""
     words: str
     """What is seen, for those who cannot."""
     width: int
@@ -78,14 +62,10 @@ class SharedTrial:
     """One trial of the file."""
 
     row: TrialRow
-    clip: Clip | None
-    why_no_clip: str
-    plots: tuple[TimePlot, ...]
-    not_scanned: tuple[str, ...]
-    """Objects that the twin draws from the task's shape."""
-    t_s: float
-    """Where the plots have their mark: the moment, in seconds since the first sample."""
-    moment_text: str
+    page: EpisodePage | None = None
+    """None where nothing was recorded, or it cannot be read."""
+    clip: Clip | None = None
+    why_no_clip: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,29 +115,35 @@ def build_share(run: RunFolder, config: ShareConfig, *, report: str = "") -> Sha
         UsageError: When a trial is not there, none can be chosen, or they do not fit.
     """
     judgement = judge(run)
-    rows = chosen_trials(judgement, config.trials)
-    shared = _shared_parts(run, judgement, report)
-    trials = [_trial(run, row) for row in rows]
-    levels = LEVELS if can_film() else (STRIPS,)
-    limit = round(config.max_mb * MB)
-    least = 0
-    for level in levels:
-        shown, notes = _with_clips(run, trials, level, config, limit)
-        if shown is None:
-            continue
-        text = _environment().get_template("pages/share.html").render(**shared, trials=shown)
-        named = tuple(row.episode for row in rows)
-        made = Shared(text=text, trials=named, clips=level, notes=notes)
-        least = made.size_bytes
-        if least <= limit:
+    trials = [_trial(run, row) for row in chosen_trials(judgement, config.trials)]
+    template = _environment().get_template("pages/share.html")
+    results, size = judgement.results, 0
+    for level in LEVELS if can_film() else (PICTURES,):
+        shown = [_with_clip(run, trial, level) for trial in trials]
+        text = template.render(
+            title=f"Trials of {run.path.resolve().name}",
+            policy=POLICY,
+            light=LIGHT,
+            dark=DARK,
+            banner=None if results is None else stand_in_sentence(results),
+            report=report,
+            trials=shown,
+            plots=PLOTS,
+        )
+        made = Shared(
+            text=text,
+            trials=tuple(trial.row.episode for trial in trials),
+            clips=level,
+            notes=tuple(f"{t.row.episode}: {t.why_no_clip}" for t in shown if t.why_no_clip),
+        )
+        size = made.size_bytes
+        if size <= config.max_mb * MB:
             return made
-    size = f"take {least / MB:.1f} MB" if least else f"take more than {config.max_mb:g} MB"
-    message = (
-        f"{len(rows)} trials {size} even as strips of pictures; the limit is "
+    raise UsageError(
+        f"{len(trials)} trials take {size / MB:.1f} MB even with pictures for clips; the limit is "
         f"{config.max_mb:g} MB. Name fewer with --trials, or raise --max-mb (at most "
         f"{SHARE_LIMITS['max_mb'][1]:g})."
     )
-    raise UsageError(message)
 
 
 def chosen_trials(judgement: Judgement, names: Sequence[str]) -> list[TrialRow]:
@@ -192,117 +178,39 @@ def chosen_trials(judgement: Judgement, names: Sequence[str]) -> list[TrialRow]:
     return found
 
 
-def _shared_parts(run: RunFolder, judgement: Judgement, report: str) -> dict[str, Any]:
-    """What the file says of the whole run."""
-    results = judgement.results
-    success = None if results is None else _table(results.tables, "success")
-    drawing = _figure(judgement.comparison)
-    return {
-        "name": run.path.resolve().name,
-        "title": f"Trials of {run.path.resolve().name}",
-        "policy": POLICY,
-        "light": LIGHT,
-        "dark": DARK,
-        "banner": None if results is None else stand_in_sentence(results),
-        "first": None if results is None else front(results),
-        "success": success,
-        "drawing": drawing,
-        "report": report,
-    }
-
-
-def _table(tables: Sequence[Table], name: str) -> Table | None:
-    return next((table for table in tables if table.id == name and table.rows), None)
-
-
-def _figure(comparison: Comparison | None) -> Drawing | None:
-    """Draw the report's first figure; none without groups."""
-    drawn = [] if comparison is None else drawings_of(comparison)
-    return next((each for name in FIGURES for each in drawn if each.id == name), None)
-
-
 def _trial(run: RunFolder, row: TrialRow) -> SharedTrial:
     """Everything of a trial but its clip."""
-    plots: tuple[TimePlot, ...] = ()
-    not_scanned: tuple[str, ...] = ()
-    t_s, text, why = 0.0, "", ""
-    if row.file:
-        try:
-            page = build_page(run, row.file.removesuffix(".mcap"), row, None)
-            plots, t_s, not_scanned = page.plots[:PLOTS], page.t_s, page.not_scanned
-            text = "" if page.divergence is None else page.divergence.text
-        except GstError as error:
-            why = str(error).replace(str(run.path), run.path.name)
-    else:
-        why = "from a table: nothing was recorded"
-    return SharedTrial(
-        row=row,
-        clip=None,
-        why_no_clip=why,
-        plots=plots,
-        not_scanned=not_scanned,
-        t_s=t_s,
-        moment_text=text,
-    )
+    if not row.file:
+        return SharedTrial(row=row, why_no_clip="from a table: nothing was recorded")
+    try:
+        return SharedTrial(row=row, page=build_page(run, row.file.removesuffix(".mcap"), row, None))
+    except GstError as error:
+        return SharedTrial(row=row, why_no_clip=_without_path(error, run))
 
 
-def _with_clips(
-    run: RunFolder,
-    trials: Sequence[SharedTrial],
-    level: str,
-    config: ShareConfig,
-    limit: int,
-) -> tuple[list[SharedTrial] | None, tuple[str, ...]]:
-    """Add clips of one quality; None as soon as they alone are too large."""
-    shown, notes, size = list[SharedTrial](), list[str](), 0
-    clip_config = replace(LEVELS[level], before_s=config.before_s, after_s=config.after_s)
-    for trial in trials:
-        if trial.why_no_clip:
-            shown.append(trial)
-            notes.append(f"{trial.row.episode}: {trial.why_no_clip}")
-            continue
-        try:
-            episode_path(run, trial.row.file.removesuffix(".mcap"))
-            found = footage(run, trial.row, clip_config)
-            clip = _clip(found, clip_config, trial, is_video=level != STRIPS)
-        except GstError as error:
-            why = str(error).replace(str(run.path), run.path.name)
-            shown.append(replace(trial, why_no_clip=why))
-            notes.append(f"{trial.row.episode}: {why}")
-            continue
-        size += len(clip.picture) + len(clip.video)
-        if size > limit:
-            return None, ()
-        shown.append(replace(trial, clip=clip))
-    return shown, tuple(notes)
-
-
-def _clip(found: Footage, config: ClipConfig, trial: SharedTrial, *, is_video: bool) -> Clip:
+def _with_clip(run: RunFolder, trial: SharedTrial, level: str) -> SharedTrial:
+    """Add the clip, or say why there is none."""
+    if trial.page is None:
+        return trial
+    config, moment = LEVELS[level], trial.page.divergence
+    try:
+        found = footage(run, trial.row, config)
+        key = encode_jpeg(found.frames[found.key], config.quality, subsampling=SUBSAMPLING)
+        is_video = level != PICTURES and len(found.frames) > 1
+        video = _data("video/mp4", as_video(found, config)) if is_video else ""
+    except GstError as error:
+        return replace(trial, why_no_clip=_without_path(error, run))
     height, width = found.frames[0].shape[:2]
     sides = "recorded, and the twin beside it," if found.has_twin else "recorded"
-    at = f"around the moment when {trial.moment_text}" if trial.moment_text else "at the end"
+    at = f"around the moment when {moment.text}" if moment else "at the end"
     words = f"{trial.row.episode} {sides} {at}"
-    if is_video and len(found.frames) > 1:
-        key = encode_jpeg(found.frames[found.key], config.quality, subsampling=SUBSAMPLING)
-        return Clip(
-            picture=_data("image/jpeg", key),
-            video=_data("video/mp4", as_video(found, config)),
-            words=words,
-            width=width,
-            height=height,
-        )
-    last = len(found.frames) - 1
-    num = min(STRIP_FRAMES, len(found.frames))
-    places = sorted({round(last * step / max(1, num - 1)) for step in range(num)} | {found.key})
-    frames = [found.frames[place] for place in places]
-    picture = contact_sheet(frames, columns=2 if found.has_twin else 3)
-    return Clip(
-        picture=_data("image/jpeg", encode_jpeg(picture, config.quality, subsampling=SUBSAMPLING)),
-        video="",
-        words=f"{words}, {len(frames)} pictures in reading order",
-        width=picture.shape[1],
-        height=picture.shape[0],
-    )
+    picture = _data("image/jpeg", key)
+    clip = Clip(picture=picture, video=video, words=words, width=width, height=height)
+    return replace(trial, clip=clip)
+
+
+def _without_path(error: GstError, run: RunFolder) -> str:
+    return str(error).replace(str(run.path), run.path.name)
 
 
 def _data(media_type: str, data: bytes) -> str:

@@ -1,7 +1,6 @@
 """Lanes of a trial on the page's clock: stages, what the hand touches, and what is apart."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,15 +21,6 @@ APART = {
 """Lane of each quantity of a divergence; further ones get a lane of their own name."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Replanned:
-    """One plan that was not sent, and why."""
-
-    t_s: float
-    plan_id: str
-    reason: str
-
-
 def trial_lanes(
     recording: Recording,
     replays: Mapping[str, Recording],
@@ -39,7 +29,11 @@ def trial_lanes(
     failed: Collection[str] = (),
 ) -> StageChart | None:
     """Draw stages, touches, divergences; marks at replanning and the twin's failure (page time)."""
-    marks = [(each.t_s, f"replan: {each.reason}", "replan") for each in replans(recording, clock)]
+    marks = [
+        (clock.seconds(event["stamp_ns"]), f"replan: {event.get('text') or 'no reason'}", "replan")
+        for event in recording.events
+        if event["type"] == "replan"
+    ]
     if failure_t_s is not None:
         marks.append((failure_t_s, "first failure in the twin", "failure"))
     touches = [
@@ -54,19 +48,6 @@ def trial_lanes(
         ],
         marks,
         span_s=clock.span_s,
-    )
-
-
-def replans(recording: Recording, clock: PageClock) -> tuple[Replanned, ...]:
-    """Plans that the gate sent back, in their order, with its reasons."""
-    return tuple(
-        Replanned(
-            t_s=clock.seconds(event["stamp_ns"]),
-            plan_id=str(event.get("plan_id") or ""),
-            reason=str(event.get("text") or "no reason recorded"),
-        )
-        for event in recording.events
-        if event["type"] == "replan"
     )
 
 

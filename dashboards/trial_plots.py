@@ -10,7 +10,6 @@ import numpy as np
 from bridge.clock import NS_PER_S
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.streams import JointTrack
-from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
 from dashboards.figures import Signal, TimePlot, time_plot
 from dashboards.recording import PageClock, Recording
@@ -43,7 +42,7 @@ def main_plots(
     row: TrialRow | None,
     clock: PageClock,
 ) -> tuple[TimePlot, ...]:
-    """Tool error, tool position, gripper, clearance and objects; only those that have data.
+    """Tool error, clearance, gripper and objects; only those that have data.
 
     Args:
         sent_plan: Only its replays are drawn; None where no plan was sent.
@@ -53,7 +52,6 @@ def main_plots(
     plots = [
         _error_plot(recording, replays, row, clock),
         _clearance_plot(shown, clock),
-        *(_tool_plot(recording, shown, axis, clock) for axis in range(3)),
         _width_plot(recording, shown, clock),
         *_object_plots(shown, clock),
     ]
@@ -92,17 +90,6 @@ def _error_plot(
             signals.append(Signal(name=name, style=style, t_s=t_s, values=MM * found[1]))
     title, note = "Tool: recorded to replayed distance", "computed by the evaluator"
     return _plot(title, "mm", signals, clock, level=0.0, note=note)
-
-
-def _tool_plot(
-    recording: Recording, shown: dict[str, Recording], axis: int, clock: PageClock
-) -> TimePlot | None:
-    signals = [
-        _plan_signal(recording, clock, lambda plan: plan.positions_m()[:, axis]),
-        *_twin_signals(shown, clock, lambda replay: _position(replay.tcp, axis)),
-        _recorded_signal(_position(recording.tcp, axis), clock),
-    ]
-    return _plot(f"Tool {'xyz'[axis]}", "m", signals, clock)
 
 
 def _width_plot(
@@ -153,7 +140,8 @@ def _object_plots(shown: dict[str, Recording], clock: PageClock) -> list[TimePlo
 
 
 def _height(replay: Recording, name: str) -> Samples | None:
-    return _position(replay.objects.get(name), 2, scale=MM)
+    track = replay.objects.get(name)
+    return None if track is None else (track.stamps_ns, MM * track.p_m[:, 2])
 
 
 def plots_of_joints(
@@ -233,10 +221,6 @@ def _planned_joint(plan: Plan, name: str) -> np.ndarray:
         return np.full(len(plan.tau), np.nan)
     column = plan.joint_names.index(name)
     return np.array([np.nan if w.joints_rad is None else w.joints_rad[column] for w in plan.tau])
-
-
-def _position(track: PoseTrajectory | None, axis: int, scale: float = 1.0) -> Samples | None:
-    return None if track is None else (track.stamps_ns, scale * track.p_m[:, axis])
 
 
 def _column(track: JointTrack | None, column: int = 0, scale: float = 1.0) -> Samples | None:

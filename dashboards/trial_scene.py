@@ -104,10 +104,6 @@ class TrialScene:
     """By object: centre and half extents of the box around it, in its own frame."""
     notes: tuple[str, ...]
 
-    def nearest(self, t_s: float) -> int:
-        """Index of the sample nearest to a page time."""
-        return int(np.abs(self.times_s - t_s).argmin())
-
 
 @dataclass(frozen=True, kw_only=True)
 class _Gathering:

@@ -11,10 +11,8 @@ from dashboards.comparison import Judgement
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, camera_tracks, read_frame
 from dashboards.library import episode_path
+from evaluator.compare.images.views import VIEWS_TITLE
 from evaluator.result import Cell, Measurement, Table
-
-VIEWS_TITLE = "Held-out views: "
-"""Before the file's name in the title of the table that rates its images."""
 
 FIRST = tuple(
     f"views.all.{name}" for name in ("psnr_db", "psnr_gain_db", "ssim", "depth_median_abs_m")
@@ -26,7 +24,7 @@ class HeldOutView:
     """One recorded image with its rendering; the scores are the evaluator's."""
 
     file: str
-    camera_id: str
+    camera: str
     stamp_ns: int
     psnr_db: float | None
     ssim: float | None
@@ -41,8 +39,6 @@ class TwinPage:
     rated: bool
     first: tuple[Measurement, ...]
     """The numbers to read first."""
-    measurements: tuple[Measurement, ...]
-    """All others."""
     problems: tuple[str, ...]
     next_command: str
     """Empty where there is no recording to rebuild from."""
@@ -63,13 +59,11 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
         except GstError as error:
             problems.append(str(error))
     views.sort(key=lambda v: (v.psnr_db is None, v.psnr_db or 0.0, v.stamp_ns))
-    numbers = [m for m in judgement.measurements if m.id.startswith("views.")]
     return TwinPage(
         files=tuple(path.name for path in paths),
         views=tuple(views),
         rated=any(view.psnr_db is not None for view in views),
-        first=tuple(m for m in numbers if m.id in FIRST),
-        measurements=tuple(m for m in numbers if m.id not in FIRST),
+        first=tuple(m for m in judgement.measurements if m.id in FIRST),
         problems=tuple(problems),
         next_command=""
         if judgement.only_motions or not run.episodes()
@@ -89,7 +83,7 @@ def _views(path: Path, scores: dict[tuple[Cell, Cell], dict[str, Cell]]) -> list
             views.append(
                 HeldOutView(
                     file=path.name,
-                    camera_id=camera_id,
+                    camera=camera_id,
                     stamp_ns=stamp_ns,
                     psnr_db=_number(score.get("PSNR (dB)")),
                     ssim=_number(score.get("SSIM")),

@@ -2,10 +2,11 @@
 
 import re
 from collections.abc import Mapping
+from typing import Any
 
 from markupsafe import Markup, escape
 
-from bridge.task.verdict import Factor
+from bridge.task.verdict import Factor, Verdict
 from evaluator.report.wording import (
     count_text,
     ends_text,
@@ -34,6 +35,29 @@ def verdict_word(value: bool | None) -> str:
 def factor_word(factor: Factor) -> str:
     """Name one factor of the acceptance indicator with a sign."""
     return {True: "✓ holds", False: "✗ fails", None: "? undecided"}[factor.value]
+
+
+def event_words(event: Mapping[str, Any]) -> tuple[str, str]:
+    """Say what happened, and to which stage and plan, with its note, outcome and data."""
+    parts = [str(event[name]) for name in ("stage_id", "plan_id", "text") if event.get(name)]
+    for name in ("outcome", "data"):
+        if event.get(name):
+            parts.append(", ".join(f"{key} {value}" for key, value in event[name].items()))
+    return str(event["type"]).replace("_", " "), " · ".join(parts)
+
+
+def verdict_text(verdict: Verdict) -> str:
+    """Write a verdict as one line, with the first factor that fails and why."""
+    text = f"{verdict_word(verdict.accepted)}: {verdict.plan_id}, {verdict.trajectory}"
+    text += f", {verdict.mode}, {verdict.engine}"
+    name = verdict.first_failing
+    if name is not None:
+        factor = verdict.factors()[name]
+        why = factor.detail or factor.cause
+        text += f"; {name} {factor_word(factor)}" + (f" ({why})" if why else "")
+    elif verdict.accepted is None and verdict.reason:
+        text += f"; {verdict.reason}"
+    return text
 
 
 def tone(value: bool | None) -> str:
@@ -67,15 +91,15 @@ def unbroken(text: str) -> str:
     return minus(text).replace(" ", NARROW)
 
 
-def measured(measurement: Measurement | None) -> str:
-    """Print a value as the report does, or that it is missing or undefined."""
-    return MISSING if measurement is None else unbroken(value_text(measurement))
+def measured(measurement: Measurement) -> str:
+    """Print a value as the report does, or that it is undefined."""
+    return unbroken(value_text(measurement))
 
 
-def evidence(measurement: Measurement | None) -> str:
+def evidence(measurement: Measurement) -> str:
     """Print what a value rests on: its count, its interval, or why there is none."""
-    if measurement is None or measurement.value is None:
-        return "" if measurement is None else measurement.reason_if_undefined or ""
+    if measurement.value is None:
+        return measurement.reason_if_undefined or ""
     parts = [count_text(measurement)]
     if measurement.interval is not None:
         lies = "without the noise of counting " if measurement.is_beyond else ""
@@ -83,15 +107,6 @@ def evidence(measurement: Measurement | None) -> str:
     elif measurement.reason_without_interval:
         parts.append(f"no interval: {measurement.reason_without_interval}")
     return ", ".join(filter(None, parts))
-
-
-def short_evidence(measurement: Measurement | None) -> str:
-    """Print count and interval for a narrow column; the method stands elsewhere."""
-    if measurement is None or measurement.value is None:
-        return evidence(measurement)
-    count = count_text(measurement)
-    count = count.partition(" ")[0] if "/" in count else count
-    return ", ".join(filter(None, (count, minus(ends_text(measurement)))))
 
 
 def success_share(p_success: Mapping[str, float]) -> str:

@@ -24,7 +24,7 @@ from evaluator.result import Measurement
 from evaluator.trial_row import TrialRow
 
 FILE_NAME = "review_index.msgpack"
-VERSION = 9
+VERSION = 10
 """Raise it whenever what a field holds changes."""
 NO_RESULTS = "no results yet"
 """Why there are no numbers of a run that was never evaluated."""
@@ -102,11 +102,6 @@ class _Selected:
         """Return this selection as a query, with some fields changed, from its first page."""
         return {**vars(self), "page": "", **changes}
 
-    def takes_group(self, task: str, condition: str, policy: str) -> bool:
-        """Say whether a group is selected, given by its slugs."""
-        wanted = ((self.task, task), (self.condition, condition), (self.policy, policy))
-        return all(chosen in ("", name) for chosen, name in wanted)
-
     def takes(self, trial: TrialRow) -> bool:
         """Say whether a trial is selected."""
         asked = ((wanted, name) for name in FACETS if (wanted := getattr(self, name)))
@@ -122,12 +117,6 @@ class Selection(_Selected):
     """Which trials are listed, and in which order."""
 
     show: str = ""
-    clause: str = ""
-    """The first factor that failed in the twin."""
-    cause: str = ""
-    """And its cause."""
-    stage: str = ""
-    """The first stage labelled a failure."""
     q: str = ""
     """Words, in whatever order and case."""
     sort: str = ""
@@ -146,14 +135,7 @@ class Selection(_Selected):
             return False
         if self.show not in _SHOW or not _SHOW[self.show][1](trial):
             return False
-        if (self.clause or self.cause) and trial.twin is not False:
-            return False
-        asked = (
-            (self.clause, trial.first_failing),
-            (self.cause, trial.failing_cause),
-            (self.stage, trial.failed_stage),
-        )
-        return all(wanted in ("", found) for wanted, found in asked) and self._is_found(trial)
+        return self._is_found(trial)
 
     def _is_found(self, trial: TrialRow) -> bool:
         if not self.q:
@@ -414,13 +396,6 @@ class ReviewIndex:
             )
             for kind, trials in sorted(groups.items(), key=lambda item: -len(item[1]))
         )
-
-    def failure_values(self, selection: FailureSelection, name: str) -> tuple[tuple[str, int], ...]:
-        """Return what one part can be under the other filters, and how often it is."""
-        field = FAILURE_PARTS[name]
-        others = replace(selection, **{name: ""})
-        counts = Counter(getattr(trial, field) for trial in self.trials(others))
-        return tuple(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
     def files(
         self, *, broken: bool, limit: int | None = None

@@ -375,7 +375,7 @@ const panel = document.querySelector("details.space");
 const clock = document.getElementById("clock");
 let opened = false;
 function refuse(why) {
-  panel.querySelector(".space-state").textContent = `The picture stays as it is: ${why}.`;
+  panel.querySelector(".space-state").textContent = `No 3D view: ${why}.`;
   panel.classList.remove("drawn");
   panel.classList.add("refused");
 }

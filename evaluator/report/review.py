@@ -17,6 +17,7 @@ from evaluator import review_index
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare.conclusions import CLOSE_PP
 from evaluator.compare.failures import failure_kind, start_regions
+from evaluator.compare.images.views import VIEWS_TITLE
 from evaluator.compare.measure import refuse_alike
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
@@ -157,9 +158,20 @@ def _about(results: Results | None, *, has_trials: bool) -> dict[str, Any]:
             }
             for line in rows_of(results, "conclusions")
         ],
-        "failures": [list(row.values()) for row in rows_of(results, "failures")],
+        "worst_view": _worst_view(results),
         "tables": [] if has_trials else [_shown(t) for t in results.tables if t.rows],
     }
+
+
+def _worst_view(results: Results) -> dict[str, Any] | None:
+    """Find the held-out view that is drawn worst, as the tables of views rate it."""
+    found: list[dict[str, Any]] = []
+    for table in (each for each in results.tables if each.title.startswith(VIEWS_TITLE)):
+        file = f"{table.title.removeprefix(VIEWS_TITLE)}.mcap"
+        for camera, stamp_ns, psnr_db, ssim, *_ in table.rows:
+            rated = {"camera": camera, "stamp_ns": stamp_ns, "psnr_db": psnr_db, "ssim": ssim}
+            found += [{"file": file, **rated}] if psnr_db is not None else []
+    return min(found, key=lambda view: view["psnr_db"], default=None)
 
 
 def _shown(table: Table) -> dict[str, Any]:

@@ -97,16 +97,15 @@ def test_lanes_say_what_is_apart_from_when_on_and_why_plans_were_sent_back(
     failed = replace(row, stages=(("carry", False), ("release", None)))
     chart = build_page(run, ID, failed, None).stages
     assert chart is not None
-    lanes = {lane.name: lane for lane in chart.lanes}
-    assert [(b.label, b.style) for b in lanes["recorded"].bars if b.style == "apart"] == [
-        ("✗ carry", "apart")
-    ]
-    (bar,) = lanes["object apart"].bars
-    assert bar.x == pytest.approx(chart.x.px(1 + 2.0))  # the plan starts after one second
-    assert bar.label == "planned – recorded: 69.00\u00a0mm"
+    lanes = dict(chart.lanes)
+    assert [span.label for span in lanes["recorded"] if span.style == "apart"] == ["✗ carry"]
+    (apart,) = lanes["object apart"]
+    assert apart.start_s == pytest.approx(1 + 2.0)  # the plan starts after one second
+    assert chart.bar(apart)[0] == pytest.approx(chart.x.px(3.0))
+    assert apart.label == "planned – recorded: 69.00\u00a0mm"
     assert "grip apart" not in lanes
-    (touch,) = lanes["touch, planned"].bars
-    assert (touch.label, touch.x) == ("cube", pytest.approx(chart.x.px(1 + 1.5), abs=1.0))
+    (touch,) = lanes["touch, planned"]
+    assert (touch.label, touch.start_s) == ("cube", pytest.approx(1 + 1.5, abs=0.01))
 
 
 def write_touches(planned: Path, synthetic: ModuleType) -> None:

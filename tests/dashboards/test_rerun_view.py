@@ -27,7 +27,8 @@ from dashboards.errors import DashboardError
 from dashboards.recording import read_recording
 from dashboards.rerun_entities import drawable, log_robot
 from dashboards.rerun_file import RerunFile
-from dashboards.rerun_view import Exported, event_text, export_rrd, run_of
+from dashboards.rerun_view import Exported, export_rrd, run_of
+from dashboards.wording import event_words
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +148,8 @@ def test_events_and_verdicts_are_lines_of_text_at_their_instants(
     recorded = events(Episode.open(cell_run.episodes()[0]))
     lines = content["/recorded/events"]
     assert sorted(lines["source_time"]) == sorted(event["stamp_ns"] for event in recorded)
-    assert {row[0] for row in lines["TextLog:text"]} == {event_text(event) for event in recorded}
+    said = {": ".join(filter(None, event_words(event))) for event in recorded}
+    assert {row[0] for row in lines["TextLog:text"]} == said
     assert content["/recorded/verdicts"]["TextLog:text"]
 
 

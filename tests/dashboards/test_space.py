@@ -281,13 +281,7 @@ def test_without_a_scene_the_ways_are_shown_and_why_there_is_no_more(
     t_s = found.points[first : first + count, 3]
     assert t_s[0] == 0
     assert np.all(np.diff(t_s) > 0)
-    picture = browser.get(f"/episode/{ID}/scene.jpg?t=soon")
-    assert picture.headers["content-type"] == "image/jpeg"
-    kept = list((own_run.results_dir / "scene_pictures").iterdir())
-    assert browser.get(f"/episode/{ID}/scene.jpg?t=1").content
-    assert len(kept) == len(list((own_run.results_dir / "scene_pictures").iterdir())) == 1
-    for path in ("scene", "scene.jpg"):
-        assert browser.get(f"/episode/nobody/{path}").status_code == 404
+    assert browser.get("/episode/nobody/scene").status_code == 404
 
 
 def canvas(tab: Browser) -> np.ndarray:

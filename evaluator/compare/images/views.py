@@ -27,6 +27,8 @@ from evaluator.run_reader.episodes import DerivedFile, RunFile
 
 TWIN = "twin"
 """What the run's own renders are called beside other methods."""
+VIEWS_TITLE = "Held-out views: "
+"""Before the file's name in the title of the table that rates its images."""
 
 
 def compare_views(
@@ -62,7 +64,7 @@ def compare_views(
             if each.reason
         ]
         found[source] = tuple(each for each in scores if not each.reason)
-        tables.append(_table(f"views_{len(tables)}", f"Held-out views: {name}", found[source]))
+        tables.append(_table(f"views_{len(tables)}", VIEWS_TITLE + name, found[source]))
     kept = [file for file in views if file.derived.source_episode in found]
     return Part(
         measurements=tuple(_measure(found, [file.derived.settings for file in kept], net)),
