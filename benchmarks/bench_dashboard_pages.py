@@ -26,7 +26,7 @@ FILTERS = (
     "/?show=disagree",
     "/?q=trial_0012+without&task=cube_into_box",
     "/?sort=-name&page=120",
-    "/?clause=clearance&cause=collision&show=wrong_yes",
+    "/?show=wrong_yes",
 )
 PROGRAM = """
 import asyncio, json, resource, sys, time

@@ -37,6 +37,7 @@ from dashboards.overview_page import build_overview
 from dashboards.recording import PageClock, read_recording
 from dashboards.share_file import build_share
 from dashboards.twin_page import build_twin, view_image
+from evaluator.report.page import breakable
 from evaluator.report.wording import minus
 from evaluator.result import Measurement
 from evaluator.review_index import SHOW, FailureSelection, Selection
@@ -123,7 +124,7 @@ def _environment() -> Environment:
         wording.success_share,
         wording.answer_tone,
         wording.length_text,
-        wording.breakable,
+        breakable,
     ):
         environment.filters[function.__name__] = function
     environment.filters |= {"minus": minus, "quoted": lambda path: shlex.quote(str(path))}

@@ -6,7 +6,7 @@ from bridge.episode.run_folder import RunFolder
 from dashboards.clips import can_film
 from dashboards.comparison import Judgement
 from dashboards.moments import Moment, moment_of
-from dashboards.overview_page import group_facets, has_picture
+from dashboards.overview_page import Facets, group_facets, has_picture
 from evaluator.review_index import (
     FAILED,
     NOT_KNOWN,
@@ -61,8 +61,7 @@ class FailuresPage:
     of: int = 0
     """Failures in the run."""
     num_trials: int = 0
-    facets: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = ()
-    """What to filter by, each with values and their labels."""
+    facets: Facets = ()
     failed: tuple[tuple[str, str, int], ...] = ()
     """Value, words and number of each choice of who failed."""
     page: int = 1
@@ -90,7 +89,7 @@ def build_failures(
         count=count,
         of=_count(index, FailureSelection()),
         num_trials=index.count(Selection()),
-        facets=tuple(group_facets(index)),
+        facets=group_facets(index),
         failed=tuple(
             (value, words, _count(index, FailureSelection(**selection.query(failed=value))))
             for value, words in FAILED.items()

@@ -14,7 +14,6 @@ from bridge.errors import GstError
 from dashboards.comparison import Judgement
 from dashboards.library import episode_path
 from dashboards.moments import moment_of
-from evaluator.quantity import noun
 from evaluator.report.wording import SIM_SIDE, agreeing_side
 from evaluator.result import Measurement
 from evaluator.review_index import FACETS, NO_RESULTS, IndexedFile, ReviewIndex, Selection
@@ -38,8 +37,6 @@ COLUMNS = (
     ("distance", "Tool path, lag"),
     ("cause", "Cause in the twin"),
 )
-LONGEST = 60
-"""Characters of a name in a list to choose from."""
 MOST_WORDS = 20
 """Of the cause of the worst disagreement."""
 NUMBERS = {
@@ -49,6 +46,8 @@ NUMBERS = {
 }
 """The numbers to read first, by id, with their titles."""
 UNPLANNED = "Executed in the twin, agrees with the outcome"
+Facets = tuple[tuple[str, tuple[tuple[str, str, int], ...]], ...]
+"""What to filter by, each with slugs, names and numbers of trials."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +71,7 @@ class TrialList:
     """How many the run holds."""
     page: int = 1
     pages: int = 1
-    facets: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = ()
-    """What to filter by, each with values and their labels."""
+    facets: Facets = ()
 
     @property
     def columns(self) -> tuple[tuple[str, str], ...]:
@@ -206,25 +204,14 @@ def trial_list(judgement: Judgement, selection: Selection) -> TrialList:
         of=of,
         page=page,
         pages=pages,
-        facets=tuple(group_facets(index)),
+        facets=group_facets(index),
     )
 
 
-def group_facets(index: ReviewIndex) -> Iterator[tuple[str, tuple[tuple[str, str], ...]]]:
+def group_facets(index: ReviewIndex) -> Facets:
     """Task, condition and policy to choose from, each with how many trials it has."""
-    for name in FACETS:
-        found = index.values(name)
-        if len(found) > 1:
-            labelled = [
-                (slug, f"{_words(label)} ({count} {noun('trial', count)})")
-                for slug, label, count in found
-            ]
-            yield name, (("", "all"), *labelled[:MOST_VALUES])
-
-
-def _words(label: str) -> str:
-    text = label.replace("_", " ")
-    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+    values = ((name, index.values(name)) for name in FACETS)
+    return tuple((name, found[:MOST_VALUES]) for name, found in values if len(found) > 1)
 
 
 def _notices(judgement: Judgement) -> Iterator[str]:

@@ -19,7 +19,6 @@ from evaluator.metrics.trajectory import JointErrors, joint_errors
 from evaluator.trial_row import TrialRow
 
 RECORDED, PLANNED = "recorded", "planned"
-REPLAY_STYLES = {"planned": "twin-planned", "executed": "twin-executed"}
 LEAST_SPAN = {"m": 0.02, "mm": 5.0, "rad": 0.05, "mrad": 5.0}
 """A value axis covers at least this much of its unit."""
 MARGIN_SETTING = "eps_col_m"
@@ -85,8 +84,8 @@ def _error_plot(
     for against, path in compared.items():
         found = distance_over_time(recording.path, path, row.plan_id)
         if found is not None:
-            style = REPLAY_STYLES.get(against, "twin-executed")
             name, t_s = f"to twin, {against}", found[0] + start
+            style = f"twin-{against}"
             signals.append(Signal(name=name, style=style, t_s=t_s, values=MM * found[1]))
     title, note = "Tool: recorded to replayed distance", "computed by the evaluator"
     return _plot(title, "mm", signals, clock, level=0.0, note=note)
@@ -170,7 +169,7 @@ def plots_of_joints(
     apart = [
         Signal(
             name=f"to twin, {trajectory}",
-            style=REPLAY_STYLES.get(trajectory, "twin-executed"),
+            style=f"twin-{trajectory}",
             t_s=clock.all_seconds(each.stamps_ns),
             values=MRAD * np.sqrt((each.error_rad**2).mean(axis=1)),
         )
@@ -261,8 +260,7 @@ def _twin_signals(
         samples = samples_of(replay)
         t_s = None if samples is None else clock.replay_seconds(replay, samples[0])
         if samples is not None and t_s is not None:
-            style = REPLAY_STYLES.get(trajectory, "twin-executed")
-            name = f"twin, {trajectory}"
+            name, style = f"twin, {trajectory}", f"twin-{trajectory}"
             signals.append(Signal(name=name, style=style, t_s=t_s, values=samples[1]))
     return signals
 

@@ -100,7 +100,7 @@ class TrialScene:
     """Links that the scene has Gaussians of, as recorded; empty: the robot is not drawn."""
     paths: tuple[ToolPath, ...]
     cameras: tuple[SceneCamera, ...]
-    boxes_m: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]]
+    boxes_m: Mapping[str, tuple[list[float], list[float]]]
     """By object: centre and half extents of the box around it, in its own frame."""
     notes: tuple[str, ...]
 
@@ -348,7 +348,7 @@ def _camera(gathering: _Gathering, scene: Scene | None, camera_id: str) -> Scene
 
 def _boxes(
     gathering: _Gathering, sides: Sequence[Side]
-) -> dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]]:
+) -> dict[str, tuple[list[float], list[float]]]:
     """From the task's sizes, else around the Gaussians."""
     boxes = {}
     splats = {} if gathering.parts is None else gathering.parts.objects
@@ -363,10 +363,5 @@ def _boxes(
             centre, half = (low + high) / 2, (high - low) / 2
         else:
             continue
-        boxes[name] = (_triple(centre), _triple(half))
+        boxes[name] = (centre.tolist(), half.tolist())
     return boxes
-
-
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z

@@ -1,10 +1,7 @@
 """Numbers and outcomes as words: what a page prints, and nothing it computes."""
 
-import re
 from collections.abc import Mapping
 from typing import Any
-
-from markupsafe import Markup, escape
 
 from bridge.task.verdict import Factor, Verdict
 from evaluator.report.wording import (
@@ -68,17 +65,6 @@ def tone(value: bool | None) -> str:
 def answer_tone(answer: str) -> str:
     """Return the CSS class of an answer on whether the twin can stand for the recordings."""
     return {"yes": "good", "not for this": "bad"}.get(answer, "unknown")
-
-
-SHORT = 24
-"""Characters of a name that fits any column."""
-
-
-def breakable(text: str) -> Markup:
-    """Let a long name break behind its joints, so that it never widens a page; a number stays."""
-    if len(text) <= SHORT:
-        return escape(text)
-    return Markup("<wbr>").join(re.split(r"(?<=[^\W\d][_./-])(?=\w)", text))
 
 
 def length_text(length_m: float | None) -> str:

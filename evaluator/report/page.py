@@ -4,6 +4,7 @@ What the page says stands in ``templates/``; here is what it says it about, in r
 """
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -194,9 +195,15 @@ def environment() -> Environment:
     return environment
 
 
+SHORT = 24
+"""Characters of a name that fits any column."""
+
+
 def breakable(text: str) -> Markup:
-    """Escape text; a long name may break after an underscore."""
-    return escape(text).replace("_", Markup("_<wbr>"))
+    """Let a long name break behind its joints, so that it never widens a page; a number stays."""
+    if len(text) <= SHORT:
+        return escape(text)
+    return Markup("<wbr>").join(re.split(r"(?<=[^\W\d][_./-])(?=\w)", text))
 
 
 def thousands(count: int) -> str:

@@ -142,7 +142,7 @@ def test_groups_count_every_failure_once(num_parts: int) -> None:
             assert list(shown) == [t for t in trials if t in shown]
 
 
-def test_who_failed_parts_the_failures_and_a_filter_offers_what_the_others_leave() -> None:
+def test_who_failed_parts_the_failures() -> None:
     index = made(failures())
     counts = {
         failed: sum(g.count for g in index.failure_groups(FailureSelection(failed=failed)))
@@ -152,10 +152,6 @@ def test_who_failed_parts_the_failures_and_a_filter_offers_what_the_others_leave
     assert counts[""] == sum(parts)
     assert all(parts)
     assert counts["nonsense"] == 0
-    chosen = FailureSelection(cause=HOSTILE, stage="grasp")
-    offered = dict(index.failure_values(chosen, "cause"))
-    assert len(offered) == 3
-    assert offered[HOSTILE] == sum(g.count for g in index.failure_groups(chosen))
 
 
 def test_the_page_groups_the_run_and_leads_to_each_trial(browser: Any) -> None:

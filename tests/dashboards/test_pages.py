@@ -10,12 +10,15 @@ import pytest
 from visible import words
 
 from bridge.episode.run_folder import RunFolder
+from dashboards import overview_page
 from dashboards.app import create_app
+from dashboards.comparison import judge
 from dashboards.errors import NotHereError
 from dashboards.guard import COOKIE, Admission
 from dashboards.library import Library, derived_path, episode_path
-from evaluator.compare import compare_run
-from evaluator.report.figures import drawings_of
+from dashboards.moments import Moment
+from dashboards.twin_page import build_twin
+from evaluator.report.front import front
 from evaluator.result import load_results
 from robot_gst import run as type_here
 
@@ -33,16 +36,50 @@ def test_the_overview_shows_the_numbers_of_results_json(
     assert "Stand-in cell" in text
 
 
-def test_the_first_page_draws_the_rates_as_the_report_does(
-    browser: Any, shared_run: RunFolder
+def test_the_first_page_begins_with_the_answer_and_the_worst(
+    synthetic: ModuleType, shared_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn = next(each for each in drawings_of(compare_run(shared_run)) if each.id == "scatter")
-    page = browser.get("/").text
-    assert drawn.inline.count("<circle") == 2
-    shown = page[page.index('<svg class="fig"') :]
-    assert shown[: shown.index("</svg>")].count("<circle") == 2
-    for mark in drawn.marks:
-        assert mark.partition("fill=")[0].partition("stroke=")[0] in shown
+    run = RunFolder(shutil.copytree(shared_run.path, tmp_path / "run"))
+    monkeypatch.setattr(overview_page, "not_scanned_in", lambda *_: ["cube", "lid"])
+    page = synthetic.browser_of(run).get("/").text
+    seen = words(page)
+    answer = dict(front(load_results(run.path)).answers)["Trust the twin"]
+    at = [
+        seen.index(part)
+        for part in (
+            f"Trust the twin? {answer.split('.')[0]}.",
+            "No scan saw cube, lid",
+            "Worst disagreement: trial_0002",
+            "Worst held-out picture",
+            "Twin predicts the outcome",
+        )
+    ]
+    assert at == sorted(at)
+    assert "First divergence : the cube left the gripper during carry" in seen
+    (picture,) = re.findall(r'src="(/failures/picture/[^"]*)"', page)
+    assert picture == "/failures/picture/trial_0002"
+    found = build_twin(run, judge(run)).views[0]  # the worst first
+    assert f"PSNR {found.psnr_db:.2f} dB · SSIM {found.ssim:.3f}" in seen
+    for side in ("recorded", "rendered"):
+        address = f"/twin/{found.file}/{side}/{found.camera}?stamp={found.stamp_ns}"
+        assert page.count(address) == 2  # by itself, and in the difference
+
+
+def test_a_cause_has_few_words_and_a_trial_without_a_camera_no_picture(
+    synthetic: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    synthetic.write_trial(run, synthetic.TRIALS[1], images=False)
+    synthetic.write_replay(run, synthetic.TRIALS[1], "planned", False)
+    long = Moment(plan_id="p", t_ns=0, text="a " * 21)
+    monkeypatch.setattr(overview_page, "moment_of", lambda *_: long)
+    worst = overview_page.worst_disagreement(run, judge(run))
+    assert worst is not None
+    assert worst.cause == "a " * 20 + "…"
+    browser = synthetic.browser_of(run)
+    for address in ("/", "/failures"):
+        assert "trial_0002" in browser.get(address).text
+        assert "/failures/picture" not in browser.get(address).text
 
 
 def test_the_results_of_a_table_ask_for_no_recording(tmp_path: Path, synthetic: ModuleType) -> None:
@@ -142,7 +179,6 @@ def test_a_missing_part_names_the_next_command(
     answer = synthetic.browser_of(run).get("/")
     assert answer.status_code == 200
     assert command in words(answer.text)
-    assert "missing no results yet" in words(answer.text) or part == "episodes"
 
 
 def test_broken_files_are_named_and_the_rest_is_shown(

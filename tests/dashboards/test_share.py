@@ -87,11 +87,8 @@ def test_without_names_the_worst_are_taken_and_a_wrong_name_says_the_nearest(
     assert "report.html" not in report.text
 
 
-def test_a_smaller_limit_takes_quality_and_then_refuses(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_smaller_limit_takes_quality_and_then_refuses(run: RunFolder) -> None:
     pytest.importorskip("av")
-    monkeypatch.setattr(share_file, "_figure", lambda _: None)
     names = ("trial_0001", "trial_0002")
     full = build_share(run, ShareConfig(trials=names))
     assert full.clips == next(iter(LEVELS))
@@ -100,27 +97,24 @@ def test_a_smaller_limit_takes_quality_and_then_refuses(
     assert less.size_bytes <= 0.9 * full.size_bytes
     assert less.trials == names
     many = tuple(f"trial_000{number}" for number in (1, 2, 3, 4))
-    with pytest.raises(UsageError, match=r"4 trials take .* MB even as strips .* limit is 0.01 MB"):
+    with pytest.raises(
+        UsageError, match=r"4 trials take .* MB even with pictures .* limit is 0.01 MB"
+    ):
         build_share(run, ShareConfig(trials=many, max_mb=0.01))
 
 
-def test_without_pyav_a_strip_of_pictures_stands_for_the_clip(
+def test_without_pyav_a_picture_stands_for_the_clip(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(share_file, "_figure", lambda _: None)
     monkeypatch.setattr(share_file, "can_film", lambda: False)
     made = build_share(run, ShareConfig(trials=("trial_0002",)))
     assert "<video" not in made.text
-    (strip,) = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', made.text)
-    image = decode_color(base64.b64decode(strip))
-    assert image.shape[1] > image.shape[0]
-    assert "pictures in reading order" in made.text
+    (picture,) = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', made.text)
+    assert decode_color(base64.b64decode(picture)).shape[0] == LEVELS[made.clips].height_px
+    assert "trial_0002 recorded around the moment when the cube left the gripper" in made.text
 
 
-def test_hostile_names_stay_text(
-    synthetic: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(share_file, "_figure", lambda _: None)
+def test_hostile_names_stay_text(synthetic: ModuleType, tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
     with synthetic.EpisodeWriter(run.episodes_dir / "x.mcap") as writer:
         writer.describe(
@@ -141,10 +135,7 @@ def test_hostile_names_stay_text(
     assert "a&lt;b&gt;" in report.read_text()
 
 
-def test_the_page_of_failures_offers_the_file(
-    browser: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(share_file, "_figure", lambda _: None)
+def test_the_page_of_failures_offers_the_file(browser: Any) -> None:
     (address,) = re.findall(r'href="(/share[^"]*)"', browser.get("/failures").text)
     assert address == "/share?trial=trial_0002&amp;trial=trial_0001"
     answer = browser.get(address.replace("&amp;", "&"))
