@@ -33,7 +33,6 @@ COLUMNS = (
     ("planned", "Twin, planned"),
     ("executed", "Twin, executed"),
     ("gate", "Gate"),
-    ("agreement", "Agreement"),
     ("distance", "Tool path, lag"),
     ("cause", "Cause in the twin"),
 )
@@ -80,7 +79,6 @@ class TrialList:
             "planned": any(t.planned_replay or t.sim_planned is not None for t in self.trials),
             "executed": any(t.executed_replay or t.sim_executed is not None for t in self.trials),
             "gate": any(t.verdict is not None for t in self.trials),
-            "agreement": any(t.twin is not None for t in self.trials),
             "distance": any(t.distance_m is not None for t in self.trials),
             "cause": any(t.first_failing for t in self.trials),
         }

@@ -97,7 +97,7 @@ def test_the_results_of_a_table_ask_for_no_recording(tmp_path: Path, synthetic: 
 
 
 def test_disagreements_come_first_and_outcomes_have_words(browser: Any) -> None:
-    page = browser.get("/").text
+    page = browser.get("/").text.partition('id="trials"')[2]
     ids = re.findall(r'href="/episode/(trial_\d+)', page)
     assert ids == ["trial_0002", "trial_0004", "trial_0001", "trial_0003"]
     for word in ("✓ success", "✗ failure", "≠ disagree", "= agree", "✗ refused"):
@@ -108,7 +108,8 @@ def test_a_selection_in_the_address_filters_the_list_and_keeps_the_headline(
     browser: Any,
 ) -> None:
     page = browser.get("/?show=disagree").text
-    assert re.findall(r'href="/episode/(trial_\d+)', page) == ["trial_0002"]
+    listed = page.partition('id="trials"')[2]
+    assert re.findall(r'href="/episode/(trial_\d+)', listed) == ["trial_0002"]
     assert "2 of 3" in words(page)
     none = words(browser.get("/?condition=nonsense").text)
     assert "No trial matches this selection" in none

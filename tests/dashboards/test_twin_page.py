@@ -26,7 +26,7 @@ def rate(run: RunFolder, psnr_db: list[float | None]) -> None:
     results = load_results(run.path)
     (path,) = run.derived("*.views.*")
     views = sorted(build_twin(run, judge(run)).views, key=lambda view: view.stamp_ns)
-    rows = tuple((v.camera_id, v.stamp_ns, db, 0.8) for v, db in zip(views, psnr_db, strict=False))
+    rows = tuple((v.camera, v.stamp_ns, db, 0.8) for v, db in zip(views, psnr_db, strict=False))
     title = VIEWS_TITLE + path.stem
     table = Table(id="views_0", title=title, columns=COLUMNS, rows=rows)
     tables = (table,) if psnr_db else ()
@@ -47,7 +47,7 @@ def test_views_without_scores_are_shown_in_recorded_order(copy: RunFolder) -> No
     assert not page.rated
     stamps_ns = [view.stamp_ns for view in page.views]
     assert stamps_ns == sorted(stamps_ns)
-    assert {view.camera_id for view in page.views} == {"side"}
+    assert {view.camera for view in page.views} == {"side"}
 
 
 def test_both_sides_of_a_view_are_images_and_a_third_side_is_refused(
@@ -56,11 +56,11 @@ def test_both_sides_of_a_view_are_images_and_a_third_side_is_refused(
     view = build_twin(shared_run, judge(shared_run)).views[0]
     path = shared_run.derived_dir / view.file
     for side in ("recorded", "rendered"):
-        data, kind = view_image(shared_run, path, side, view.camera_id, view.stamp_ns)
+        data, kind = view_image(shared_run, path, side, view.camera, view.stamp_ns)
         assert data.startswith(b"\xff\xd8")
         assert kind == "image/jpeg"
     with pytest.raises(NotHereError, match="neither recorded nor rendered"):
-        view_image(shared_run, path, "top", view.camera_id, view.stamp_ns)
+        view_image(shared_run, path, "top", view.camera, view.stamp_ns)
 
 
 def test_a_view_whose_recording_is_gone_says_so(own_run: RunFolder, synthetic: ModuleType) -> None:
