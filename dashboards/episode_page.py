@@ -15,8 +15,13 @@ from dashboards.frames import RENDERED, CameraTrack
 from dashboards.library import derived_paths, episode_path
 from dashboards.moments import Moment, moment_of
 from dashboards.recording import PageClock, Problems, Recording, read_recording
-from dashboards.trial_lanes import trial_lanes
-from dashboards.trial_plots import PLANNED, main_plots, plots_of_joints, shown_replays
+from dashboards.trial_plots import (
+    PLANNED,
+    main_plots,
+    plots_of_joints,
+    shown_replays,
+    trial_lanes,
+)
 from dashboards.wording import event_words
 from evaluator.trial_row import TrialRow
 from twin.scene.store.library import not_scanned_in

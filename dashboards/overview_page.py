@@ -6,17 +6,24 @@ Measurements are chosen by id; nothing is computed.
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards.comparison import Judgement
-from dashboards.library import episode_path
 from dashboards.moments import moment_of
 from evaluator.report.wording import SIM_SIDE, agreeing_side
 from evaluator.result import Measurement
-from evaluator.review_index import FACETS, NO_RESULTS, IndexedFile, ReviewIndex, Selection
+from evaluator.review_index import (
+    FACETS,
+    NO_RESULTS,
+    IndexedFile,
+    ReviewIndex,
+    Selection,
+    stamp_of,
+)
 from evaluator.trial_row import TrialRow
 from twin.scene.store.library import not_scanned_in
 
@@ -96,6 +103,8 @@ class Overview:
     numbers: tuple[tuple[str, Measurement], ...]
     """The numbers to read first, those that are there, with their titles."""
     disagreement: Disagreement | None
+    worst_view: Mapping[str, Any] | None
+    """The held-out view that is drawn worst, where its file is still there."""
     not_scanned: tuple[str, ...]
     """Objects of the trials that no scan saw."""
     list: TrialList
@@ -120,13 +129,14 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
     others, num_others = index.files(broken=False, limit=MOST_FILES) if index else nothing
     broken, num_broken = index.files(broken=True, limit=MOST_FILES) if index else nothing
     tasks = judgement.about["tasks"]
-    older = judgement.outdated()
+    older, view = judgement.outdated(), judgement.about["worst_view"]
     return Overview(
         selection=selection,
         tasks=tuple(tasks[:MOST_TASKS]),
         more_tasks=max(0, len(tasks) - MOST_TASKS),
         numbers=tuple(first_numbers(judgement)),
         disagreement=worst_disagreement(run, judgement),
+        worst_view=view if view and stamp_of(run.derived_dir / view["file"]) else None,
         not_scanned=tuple(not_scanned(run, judgement)),
         list=trial_list(judgement, selection),
         others=others,
@@ -166,7 +176,8 @@ def worst_disagreement(run: RunFolder, judgement: Judgement) -> Disagreement | N
 def has_picture(run: RunFolder, row: TrialRow) -> bool:
     """Whether a trial was recorded by a camera."""
     try:
-        return bool(streams.camera_ids(Episode.open(episode_path(run, _stem(row)))))
+        path = run.episodes_dir / row.file
+        return bool(row.file and streams.camera_ids(Episode.open(path)))
     except GstError:  # its own page says what is wrong
         return False
 
@@ -177,15 +188,11 @@ def not_scanned(run: RunFolder, judgement: Judgement) -> list[str]:
     names: dict[str, None] = {}
     for row in [*of_task.values()][:MOST_TASKS]:
         try:
-            episode = Episode.open(episode_path(run, _stem(row)))
+            episode = Episode.open(run.episodes_dir / row.file)
             names |= dict.fromkeys(not_scanned_in(run, episode))
         except GstError:
             continue
     return list(names)
-
-
-def _stem(row: TrialRow) -> str:
-    return row.file.removesuffix(".mcap")
 
 
 def trial_list(judgement: Judgement, selection: Selection) -> TrialList:

@@ -63,6 +63,8 @@ def test_the_first_page_begins_with_the_answer_and_the_worst(
     for side in ("recorded", "rendered"):
         address = f"/twin/{found.file}/{side}/{found.camera}?stamp={found.stamp_ns}"
         assert page.count(address) == 2  # by itself, and in the difference
+    (run.derived_dir / found.file).unlink()
+    assert "held-out" not in synthetic.browser_of(run).get("/").text
 
 
 def test_a_cause_has_few_words_and_a_trial_without_a_camera_no_picture(
