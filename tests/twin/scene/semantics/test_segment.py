@@ -1,19 +1,7 @@
 import numpy as np
 import pytest
 import table_scene
-from table_scene import (
-    BLUE,
-    GREEN,
-    RED,
-    YELLOW,
-    World,
-    box,
-    duck,
-    ellipsoid,
-    iou,
-    make_world,
-    table,
-)
+from table_scene import BLUE, GREEN, RED, World, box, duck, ellipsoid, iou, make_world, table
 
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics import segment as segmenter
@@ -101,7 +89,7 @@ def test_a_thing_in_a_box_is_not_the_box() -> None:
 def test_cubes_in_a_bin_are_not_the_bin() -> None:
     cubes = [
         box(2, [0.03, 0.02, 0.028], [0.04, 0.04, 0.044], RED),
-        box(3, [-0.03, -0.02, 0.028], [0.04, 0.04, 0.044], YELLOW),
+        box(3, [-0.03, -0.02, 0.028], [0.04, 0.04, 0.044], table_scene.YELLOW),
     ]
     world, found = segmented([table(), *table_scene.open_box(1, 0, 0, BLUE), *cubes])
     best = matched(world, found)
