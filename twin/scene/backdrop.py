@@ -2,8 +2,8 @@
 
 No training view says what lies in a corner that none of them looked at. Drawn black it is a hole
 in every picture; drawn in the colours seen beside it, it is a wall or a floor out of focus. The
-shell is a picture on a sphere, not Gaussians: other viewers, distances and hashes know nothing of
-it. Pixels that show it count as unseen.
+shell is a picture by direction alone, as far away as can be, not Gaussians: other viewers,
+distances and hashes know nothing of it. Pixels that show it count as unseen.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,6 @@ from bridge.whole_file import write_whole
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser, View
-from twin.scene.store.folder import SCENE_FILE, UnreadableSceneError
 
 BACKDROP = "backdrop.png"
 """In the scene folder: the shell, heading along its width, straight up in the first row."""
@@ -39,19 +38,15 @@ OPAQUE = 0.7
 """Pixels with this much drawn are left alone, however little is missing: the fit saw black there
 and has made up for it."""
 FADES = 0.4
-MARGIN = 1.2
-"""Radius of the shell, in the distance of nearly all Gaussians."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Backdrop:
-    """A sphere seen from inside."""
+    """A sphere seen from its middle."""
 
     colors: Float32[np.ndarray, "num_rows num_columns 3"]
-    """0..1, rows from straight up to straight down, columns by heading from -pi on."""
-    centre_m: Float[np.ndarray, "3"]
-    """In the scene's frame, whose z axis points up."""
-    radius_m: float
+    """0..1, rows from straight up to straight down, columns by heading from -pi on, in the scene's
+    frame, whose z axis points up."""
 
     def behind(self, view: View, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> View:
         """The same view, with the shell where nothing was drawn; depth and alpha do not change."""
@@ -60,8 +55,7 @@ class Backdrop:
         if not len(rows):
             return view
         rays = camera.rays()[rows, columns] @ T_base_camera[:3, :3].T
-        seen = directions_on_sphere(rays, T_base_camera[:3, 3], self.centre_m, self.radius_m)
-        places = _places(seen, self.colors.shape[:2])
+        places = _places(rays, self.colors.shape[:2])
         image = view.image.copy()
         for channel in range(3):
             # With a column more on either side, for headings near the seam.
@@ -74,35 +68,15 @@ class Backdrop:
         """Write the picture; returns what ``scene.json`` says of it."""
         pixels = np.rint(np.clip(self.colors, 0.0, 1.0) * 255.0).astype(np.uint8)
         write_whole(folder / BACKDROP, encode_png(pixels))
-        return {"file": BACKDROP, "centre_m": self.centre_m.tolist(), "radius_m": self.radius_m}
-
-
-def directions_on_sphere(
-    rays: Float[np.ndarray, "num_rays 3"],
-    eye_m: Float[np.ndarray, "3"],
-    centre_m: Float[np.ndarray, "3"],
-    radius_m: float,
-) -> Float[np.ndarray, "num_rays 3"]:
-    """Where rays leave a sphere, as unit vectors from its centre.
-
-    An eye outside of it sees what it would see from the centre.
-    """
-    d = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    from_centre = eye_m - centre_m
-    inside = radius_m**2 - from_centre @ from_centre
-    if inside <= 0:
-        return np.asarray(d)
-    along = d @ from_centre
-    far_m = -along + np.sqrt(along**2 + inside)
-    return np.asarray((from_centre + far_m[:, None] * d) / radius_m)
+        return {"file": BACKDROP}
 
 
 def _places(
-    directions: Float[np.ndarray, "num_rays 3"], shape: tuple[int, ...]
+    rays: Float[np.ndarray, "num_rays 3"], shape: tuple[int, ...]
 ) -> Float[np.ndarray, "2 num_rays"]:
     """Rows and columns, fractional, of a picture that has one more column on either side."""
-    heading = np.arctan2(directions[:, 1], directions[:, 0])
-    down = np.arccos(np.clip(directions[:, 2], -1.0, 1.0))
+    heading = np.arctan2(rays[:, 1], rays[:, 0])
+    down = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     rows, columns = shape
     return np.stack([down / np.pi * rows - 0.5, (heading / (2 * np.pi) + 0.5) * columns + 0.5])
 
@@ -111,11 +85,6 @@ def backdrop_of(
     cloud: GaussianCloud, views: Sequence[TrainingView], rasteriser: Rasteriser
 ) -> Backdrop:
     """Colour the shell after the training views."""
-    centres = np.array([view.T_base_color[:3, 3] for view in views])
-    centre = np.median(centres, axis=0)
-    away = np.linalg.norm(cloud.means_m - centre, axis=1)
-    reach = max(float(np.quantile(away, 0.995)) if len(away) else 1.0, 1e-3)
-    radius = MARGIN * max(reach, float(np.linalg.norm(centres - centre, axis=1).max()))
     total, weights = np.zeros((ROWS * COLUMNS, 3)), np.zeros(ROWS * COLUMNS)
     for view in views:
         target, T = view.half, view.T_base_color
@@ -123,7 +92,7 @@ def backdrop_of(
         part = (slice(None, None, STEP_PX), slice(None, None, STEP_PX))
         static = target.static_mask[part]
         rays = target.camera.rays()[part][static] @ T[:3, :3].T
-        places = _places(directions_on_sphere(rays, T[:3, 3], centre, radius), (ROWS, COLUMNS))
+        places = _places(rays, (ROWS, COLUMNS))
         row = np.clip(np.rint(places[0]).astype(int), 0, ROWS - 1)
         column = (np.rint(places[1]).astype(int) - 1) % COLUMNS
         weight = SEEN_WEIGHT + np.clip(1 - drawn.alpha[part][static], 0.0, 1.0)
@@ -131,7 +100,7 @@ def backdrop_of(
         np.add.at(total, row * COLUMNS + column, weight[:, None] * colors)
         np.add.at(weights, row * COLUMNS + column, weight)
     colors = _spread(total, weights).reshape(ROWS, COLUMNS, 3)
-    return Backdrop(colors=colors.astype(np.float32), centre_m=centre, radius_m=radius)
+    return Backdrop(colors=colors.astype(np.float32))
 
 
 def _spread(
@@ -157,15 +126,7 @@ def _spread(
 
 def read_backdrop(run: RunFolder, record: Mapping[str, Any]) -> Backdrop | None:
     """The shell of a scene; None where ``scene.json`` names none, or its picture is gone."""
-    about = record.get("backdrop")
     path = run.scene_dir / BACKDROP
-    if not isinstance(about, dict) or not path.is_file():
+    if not record.get("backdrop") or not path.is_file():
         return None
-    try:
-        centre_m = np.array(about["centre_m"], dtype=np.float64).reshape(3)
-        radius_m = float(about["radius_m"])
-    except (KeyError, TypeError, ValueError) as error:
-        found = f"a backdrop without a centre and a radius ({error!r})"
-        raise UnreadableSceneError(path=run.scene_dir / SCENE_FILE, found=found) from error
-    colors = decode_color(path.read_bytes()).astype(np.float32) / np.float32(255.0)
-    return Backdrop(colors=colors, centre_m=centre_m, radius_m=radius_m)
+    return Backdrop(colors=decode_color(path.read_bytes()).astype(np.float32) / np.float32(255.0))

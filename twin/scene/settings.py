@@ -38,7 +38,7 @@ class FrameConfig:
     """Frames to fit, shared evenly by episodes and cameras."""
     train_every: Annotated[int, RARE] = 0
     """Learn from every this many frames, whatever they show: a fixed protocol. 0: from the
-    sharpest and stillest frame of each stretch of the camera's path."""
+    stillest frame of each stretch of the camera's path."""
     holdout_every: int = 8
     """Every this many frames of a camera, one is kept out of everything: initialisation, poses,
     exposure, fit, objects."""

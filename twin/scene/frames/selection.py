@@ -2,18 +2,16 @@
 
 A scan holds far more frames than a fit can use. Frames a camera took while it moved fast are
 smeared, and their pose is as wrong as the clocks of camera and robot differ: of each stretch of the
-camera's path the slowest and sharpest frame is taken.
+camera's path the slowest frame is taken.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
-from scipy import ndimage
+from jaxtyping import Float, Int
 
 from bridge.episode import streams
-from bridge.episode.cdr.messages import color_from_message
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
@@ -47,16 +45,6 @@ SMEAR_PX = 0.5
 """Smear in one exposure below this cannot be seen."""
 UNKNOWN_PX = 1e6
 """Instead of a smear that cannot be known."""
-MOTION_SLACK = 1.5
-"""Frames this many times as fast as the slowest of a stretch are still considered."""
-MAX_LOOKS = 3
-"""Images decoded per stretch."""
-BLURRED = 0.25
-"""A frame with less than this share of its neighbours' sharpness is left out."""
-MIN_KEPT = 5
-
-Sharpness = Callable[[Collection[int]], Mapping[int, float]]
-"""Stamps [ns] in, sharpness of each image out."""
 
 
 def pick(
@@ -64,28 +52,20 @@ def pick(
     path_m: Float[np.ndarray, " num_frames"],
     smear_px: Float[np.ndarray, " num_frames"],
     count: int,
-    sharpness_of: Sharpness,
 ) -> Int[np.ndarray, " num_picked"]:
     """Return the stamps of at most ``count`` frames, in order; the same input picks the same.
 
     The path is cut into stretches of equal length, as many as give at most ``count`` that hold
-    a frame. Of the frames of a stretch that smear least, the sharpest is taken: seen from nearly
-    the same place, texture does not decide. Frames far blurrier than their neighbours are left
-    out, unless hardly any would remain.
+    a frame. Of the frames of a stretch the first that smears least is taken.
 
     Args:
         path_m: Distance the camera has come since the first frame, see ``path_length_m``.
     """
     if len(stamps_ns) == 0 or count < 1:
         return stamps_ns[:0]
-    stretch = _stretches(path_m, count)
-    looks = [_shortlist(np.flatnonzero(stretch == k), smear_px) for k in np.unique(stretch)]
-    sharpness = sharpness_of([int(stamps_ns[i]) for look in looks for i in look])
-    best = [max(look, key=lambda i: (sharpness[int(stamps_ns[i])], -i)) for look in looks]
-    values = np.array([sharpness[int(stamps_ns[i])] for i in best])
-    sharp = np.asarray(values >= BLURRED * ndimage.median_filter(values, 5, mode="nearest"))
-    kept = np.array(best)[sharp if sharp.sum() >= min(MIN_KEPT, len(best)) else slice(None)]
-    return np.asarray(stamps_ns[kept])
+    stretch, seen_px = _stretches(path_m, count), np.maximum(smear_px, SMEAR_PX)
+    groups = [np.flatnonzero(stretch == k) for k in np.unique(stretch)]
+    return np.asarray(stamps_ns[[ids[np.argmin(seen_px[ids])] for ids in groups]])
 
 
 def path_length_m(
@@ -130,27 +110,6 @@ def robot_smear_px(
     return np.asarray(focal_px * fastest * EXPOSURE_S / (2e-9 * MOTION_WINDOW_NS))
 
 
-def sharpness_at(episode: Episode, camera_id: str, stamps_ns: Collection[int]) -> dict[int, float]:
-    """Decode the colour images with these stamps and rate each."""
-    topic = streams.find_camera_topic(episode, camera_id, "color/image")
-    wanted = set(stamps_ns)
-    found: dict[int, float] = {}
-    for message in episode.messages([topic] if topic else []):
-        image = color_from_message(message.type_name, message.data)
-        if image.stamp_ns in wanted:
-            found[image.stamp_ns] = sharpness(image.image_u8())
-    return found
-
-
-def sharpness(image_u8: UInt8[np.ndarray, "height width 3"]) -> float:
-    """Variance of the Laplacian at half size, where noise and compression count less."""
-    height, width = (side // 2 * 2 for side in image_u8.shape[:2])
-    grey = image_u8[:height, :width].astype(np.float32).mean(axis=2)
-    grey = grey.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
-    laplacian = ndimage.laplace(grey)[1:-1, 1:-1]
-    return float(laplacian.var()) if laplacian.size else 0.0
-
-
 def _stretches(path_m: np.ndarray, count: int) -> np.ndarray:
     """Number the stretch of each frame, so that at most ``count`` stretches hold any."""
     total = max(float(path_m[-1]), 1e-12)
@@ -163,13 +122,6 @@ def _stretches(path_m: np.ndarray, count: int) -> np.ndarray:
             break
         best = stretch
     return best
-
-
-def _shortlist(members: np.ndarray, smear_px: np.ndarray) -> Sequence[int]:
-    """Frames of one stretch that are still enough, a few of them."""
-    limit = max(SMEAR_PX, MOTION_SLACK * float(smear_px[members].min()))
-    calm = members[smear_px[members] <= limit]
-    return [int(index) for index in spread(calm, MAX_LOOKS)]
 
 
 STATIONARY_TRAIN_FRAMES = 4
@@ -396,13 +348,7 @@ def _pick(
     else:
         smear = smear_px(poses.tree, info.frame_id, stamps, info.camera.fx)
     path = path_length_m(poses.tree.Ts_root_frame(info.frame_id, stamps))
-    return pick(
-        stamps,
-        path,
-        smear,
-        count,
-        lambda wanted: sharpness_at(episode, camera_id, wanted),
-    )
+    return pick(stamps, path, smear, count)
 
 
 def spread(values: np.ndarray, count: int) -> np.ndarray:

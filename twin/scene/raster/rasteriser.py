@@ -212,18 +212,15 @@ class FitSession:
             serial_s=serial_s,
         )
 
-    def rearrange(
-        self, cloud: GaussianCloud, parents: Int64[np.ndarray, " num_splats"] | None = None
-    ) -> None:
+    def rearrange(self, cloud: GaussianCloud, parents: Int64[np.ndarray, " num_splats"]) -> None:
         """Go on with another cloud.
 
         Args:
             parents: For each of its Gaussians the row of the present cloud whose moments it goes
-                on with, or -1 for none; nothing given: none for all.
+                on with.
         """
-        rows_from = np.full(len(cloud), -1) if parents is None else parents
-        self._first = _carried(self._first, cloud, rows_from)
-        self._second = _carried(self._second, cloud, rows_from)
+        for moments in (self._first, self._second):
+            moments |= {name: rows[parents] for name, rows in moments.items()}
         self._cloud = _own_copy(cloud)
 
     @staticmethod
@@ -233,17 +230,6 @@ class FitSession:
 
 def _own_copy(cloud: GaussianCloud) -> GaussianCloud:
     return GaussianCloud(**{name: as_float32(rows).copy() for name, rows in arrays(cloud)})
-
-
-def _carried(
-    moments: Mapping[str, np.ndarray], cloud: GaussianCloud, parents: np.ndarray
-) -> dict[str, np.ndarray]:
-    carried = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
-    known = parents >= 0
-    for name, rows in carried.items():
-        if name in moments:
-            rows[known] = moments[name][parents[known]]
-    return carried
 
 
 @dataclass(frozen=True, kw_only=True)

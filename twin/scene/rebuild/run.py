@@ -42,7 +42,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 27
+METHOD_VERSION = 28
 """Counts changes of method that make older scenes out of date."""
 COMPLETION = 0.1
 """Gaussians for what was seen in colour and never measured, at most, in those of the fit."""

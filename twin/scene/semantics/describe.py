@@ -19,12 +19,8 @@ from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.lift import Viewpoint, lifted
 from twin.scene.semantics.masks import associate, observe
-from twin.scene.semantics.segment import (
-    SOURCE,
-    points_of,
-    segment,
-    solid_splats,
-)
+from twin.scene.semantics.points import points_of, solid_splats
+from twin.scene.semantics.segment import SOURCE, segment
 from twin.scene.semantics.shape_descriptors import CONTAINER, find_parts, measure_shape
 from twin.scene.semantics.support import (
     NoSupportError,

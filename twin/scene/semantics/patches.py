@@ -1,11 +1,14 @@
-"""Cut what hangs together but is too large for a thing: a shelf with what stands and leans in it.
+"""Cut what hangs together into things: by shape and colour, joined again where they touch.
 
 Neighbouring voxels that face the same way and have one colour grow into patches, cheapest border
 first, as long as a border is not clearly more than what varies within (Felzenszwalb and
-Huttenlocher 2004, on the graph of voxels instead of pixels). What is then still large is structure
-(walls, cupboards), and so is what touches it and has its colour. The rest is joined over outward
-bends, and what stands out is a thing: most of its border is an edge, not a line drawn on a surface
-that goes on.
+Huttenlocher 2004, on the graph of voxels instead of pixels). Patches are joined over outward bends,
+the sharpest first: things bend outwards, and meet others at inward bends.
+
+On a plane, which is taken away first, a thing stands: what does not, and what lies over or within
+its neighbour and has its colour, belongs to that. Without one, in a shelf, what is large is
+structure (walls, cupboards), and so is what touches it and has its colour; of the rest a thing is
+what most of whose border is an edge, not a line drawn on a surface that goes on.
 """
 
 from dataclasses import dataclass
@@ -13,20 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from twin.naming.colours import LIGHTNESS_WEIGHT, without_shading
-from twin.scene.semantics.cluster import (
-    SurfacePoints,
-    Voxels,
-    make_voxels,
-    neighbour_pairs,
-    numbered,
-)
+from twin.naming.colours import LIGHTNESS_WEIGHT, lab_from_srgb, without_shading
+from twin.scene.semantics.points import SurfacePoints
 from twin.scene.semantics.shape_descriptors import sides_m
 
-VOXEL_M = 0.008
-"""Least size of the voxels: on finer ones noise of depth bends every surface."""
 MAX_VOXEL_M = 0.04
 """Sparser points show no surface."""
 COLOUR_GAP = 12.0
@@ -41,16 +36,16 @@ STEP_SLOPE = 0.4
 """Neighbours of one surface are not farther apart across it than this share along it."""
 LOOSENESS = 6.0
 """Cost times voxels up to which small patches join (k of the paper)."""
+MIN_PATCH = 12
+"""Patches of fewer voxels join the neighbour with the cheapest border."""
 MIN_VOXELS = 25
-"""Smaller patches join the neighbour with the cheapest border."""
+"""Things of fewer are noise."""
 LEAST_BEND = -0.1
 """Mean (n_j - n_i) . d over a border from which two patches are one thing."""
 LEAST_CONTACT = 0.2
 """And which is at least this share of the whole border of one of the two."""
 MAX_SIZE_M = 0.45
-"""Larger is no thing."""
-MIN_AREA_M2 = 0.01
-"""Smaller surfaces are fragments."""
+"""Larger is furniture, the robot, a wall."""
 DARK = 18.0
 """Below this lightness (L) a colour says nothing: what is so dark and near structure is its
 shadow."""
@@ -58,50 +53,129 @@ WALL_M = (0.25, 0.2)
 """What is at least this long and wide is structure."""
 NEAR_WALL_M = 0.05
 """What is this near to structure and has its colour is structure, hidden in between."""
-MIN_WIDTH_M = 0.03
+MIN_AREA_M2 = 0.01
+"""Before a wall smaller surfaces are fragments."""
+MIN_WIDTH_M, MIN_WIDTH_ON_PLANE_M = 0.03, 0.012
 """Things have at least this extent in two directions."""
 MAX_DRAWN_SHARE = 0.7
 """Of a thing's border, where the surface just goes on."""
+MIN_COLOUR_GAP = 20.0
+"""Distance of two colours on a plane that are two things, unless one is a marking."""
+MARKING = 0.25
+"""Of a neighbour of another colour: what is smaller, and does not bend inwards, is its marking."""
+TOUCH_M, MAX_LIFT_M = 0.015, 0.2
+"""What begins higher over the plane stands on something, or hangs."""
+MIN_SHARE = 0.15
+"""Of what touches and has its colour: smaller is a part."""
+MAX_OVERLAP = 0.35
+"""Of one outline seen from above within another of its colour: more is one thing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Voxels:
+    """Means of the points of each occupied voxel."""
+
+    p_m: Float[np.ndarray, "num_voxels 3"]
+    normals: Float[np.ndarray, "num_voxels 3"]
+    """Unit length where the normals of a voxel agree at all, else zero."""
+    colour: Float[np.ndarray, "num_voxels 3"]
+    """Lab, shading taken out."""
+    of_point: Int[np.ndarray, " num_points"]
+    """The voxel of each point."""
+
+    def __len__(self) -> int:
+        """Return the number of voxels."""
+        return len(self.p_m)
+
+
+def make_voxels(points: SurfacePoints, voxel_m: float) -> Voxels:
+    """Average the points of each occupied voxel."""
+    cells = np.floor(points.p_m / voxel_m).astype(np.int64)
+    _, index = np.unique(cells, axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    normals = _means_of(points.normals, index)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return Voxels(
+        p_m=_means_of(points.p_m, index),
+        normals=np.where(length > 0.1, normals / np.maximum(length, 1e-9), 0.0),
+        colour=without_shading(_means_of(lab_from_srgb(points.colors), index)),
+        of_point=index,
+    )
+
+
+def _means_of(
+    values: Float[np.ndarray, "num_rows num_columns"], group: Int[np.ndarray, " num_rows"]
+) -> Float[np.ndarray, "num_groups num_columns"]:
+    """Average the rows of each group."""
+    sums = np.stack([np.bincount(group, weights=column) for column in values.T], axis=1)
+    return np.asarray(sums / np.bincount(group)[:, None])
+
+
+def neighbour_pairs(
+    p_m: Float[np.ndarray, "num_voxels 3"], reach_m: float
+) -> Int[np.ndarray, "num_pairs 2"]:
+    """Pairs of points nearer than a distance, each once."""
+    if len(p_m) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    pairs = cKDTree(p_m).query_pairs(reach_m, output_type="ndarray")
+    return np.asarray(pairs, dtype=np.int64)
 
 
 def cut_into_patches(
-    points: SurfacePoints, spacing_m: float, scale: float = 1.0
+    points: SurfacePoints,
+    voxel_m: float,
+    height_m: Float[np.ndarray, " num_points"] | None = None,
+    furniture: float = 1.0,
 ) -> Int[np.ndarray, " num_points"]:
-    """Number the things in one large group from 1; 0 is the rest."""
-    voxel_m = scale * max(VOXEL_M, 2.0 * spacing_m)
-    if voxel_m > MAX_VOXEL_M:
-        return np.zeros(len(points), dtype=np.int64)
+    """Number the things among points from 1; 0 is the rest.
+
+    Args:
+        height_m: Over the plane that was taken away from under them; None where there is none.
+        furniture: Things are so many times larger than on a table.
+    """
+    labels = np.zeros(len(points), dtype=np.int64)
+    if voxel_m > MAX_VOXEL_M or not len(points):
+        return labels
     voxels = make_voxels(points, voxel_m)
     pairs = neighbour_pairs(voxels.p_m, REACH_VOXELS * voxel_m)
-    labels = np.zeros(len(voxels), dtype=np.int64)
     if len(voxels) < MIN_VOXELS or not len(pairs):
-        return np.asarray(labels[voxels.of_point])
+        return labels
+    p_m, max_size_m = voxels.p_m, furniture * MAX_SIZE_M
     normals, colour = _smoothed(voxels, voxel_m)
-    border = _borders(voxels.p_m, normals, colour, pairs)
+    border = _borders(p_m, normals, colour, pairs)
     patch = _grown(len(voxels), pairs, border.cost)
-    num = int(patch.max(initial=-1)) + 1
-    middle = np.array([np.median(colour[patch == k], axis=0) for k in range(num)])
-    structure = _structure(patch, num, middle, voxels.p_m)
-    joined = _joined_outwards(patch, structure, voxels.p_m, pairs, border)
-    links = joined[pairs]
-    found = 0
-    for number in np.unique(joined[~structure[patch]]):
-        ids = np.flatnonzero(joined == number)
-        around = (links == number).sum(axis=1) == 1
-        drawn = float(border.is_flat[around].mean()) if around.any() else 0.0
-        wide = sides_m(voxels.p_m[ids])[1] >= MIN_WIDTH_M
-        large = len(ids) * voxel_m**2 >= MIN_AREA_M2
-        if large and wide and drawn <= MAX_DRAWN_SHARE:
-            found += 1
-            labels[ids] = found
-    return np.asarray(labels[voxels.of_point])
+    height = np.zeros(len(voxels))
+    if height_m is None:
+        walls = _walls(patch, colour, p_m)[patch]
+        piece = _joined_outwards(patch, ~walls, p_m, pairs, border, None, max_size_m)
+    else:
+        height = _means_of(height_m[:, None], voxels.of_point)[:, 0]
+        sizes_m = np.array([sides_m(p_m[patch == k])[0] for k in range(int(patch.max()) + 1)])
+        walls = sizes_m[patch] > max_size_m
+        piece = _joined_outwards(patch, ~walls, p_m, pairs, border, colour, max_size_m)
+        piece = _with_parts(piece, ~walls, p_m, height, pairs, colour)
+    number = np.zeros(len(voxels), dtype=np.int64)
+    for key in np.unique(piece[~walls]):
+        ids = np.flatnonzero(piece == key)
+        wide_m = sides_m(p_m[ids])[1]
+        if height_m is None:
+            around = (piece[pairs] == key).sum(axis=1) == 1
+            drawn = float(border.is_flat[around].mean()) if around.any() else 0.0
+            is_large = len(ids) * voxel_m**2 >= MIN_AREA_M2 and wide_m >= MIN_WIDTH_M
+            is_thing = is_large and drawn <= MAX_DRAWN_SHARE
+        else:
+            stands = np.quantile(height[ids], 0.03) < furniture * MAX_LIFT_M
+            is_thing = stands and wide_m >= MIN_WIDTH_ON_PLANE_M
+        if is_thing and len(ids) >= MIN_VOXELS:
+            number[ids] = number.max() + 1
+    return np.asarray(number[voxels.of_point])
 
 
 def _smoothed(
     voxels: Voxels, voxel_m: float
 ) -> tuple[Float[np.ndarray, "num_voxels 3"], Float[np.ndarray, "num_voxels 3"]]:
     """Normals and colours averaged over neighbours that face the same way and look alike."""
-    normals, colour = voxels.normals, without_shading(voxels.lab)
+    normals, colour = voxels.normals, voxels.colour
     pairs, itself = neighbour_pairs(voxels.p_m, 2.6 * voxel_m), np.arange(len(voxels))
     a = np.concatenate([pairs[:, 0], pairs[:, 1], itself])
     b = np.concatenate([pairs[:, 1], pairs[:, 0], itself])
@@ -171,24 +245,27 @@ def _grown(num: int, pairs: np.ndarray, cost: np.ndarray) -> np.ndarray:
             limit[a] = value + LOOSENESS / size[a]
     for left, right in links:
         a, b = root(left), root(right)
-        if a != b and min(size[a], size[b]) < MIN_VOXELS:
+        if a != b and min(size[a], size[b]) < MIN_PATCH:
             owner[b] = a
             size[a] += size[b]
-    return numbered(np.array([root(node) for node in range(num)], dtype=np.int64))
+    roots = np.array([root(node) for node in range(num)], dtype=np.int64)
+    return np.unique(roots, return_inverse=True)[1].reshape(-1)
 
 
-def _structure(
-    patch: np.ndarray, num: int, colour: np.ndarray, p_m: np.ndarray
+def _walls(
+    patch: np.ndarray, colour: np.ndarray, p_m: np.ndarray
 ) -> Bool[np.ndarray, " num_patches"]:
     """Patches that are walls, or near one and of its colour."""
-    extents = np.array([sides_m(p_m[patch == k])[:2] for k in range(num)]).reshape(num, 2)
+    num = int(patch.max()) + 1
+    middle = np.array([np.median(colour[patch == k], axis=0) for k in range(num)])
+    extents = np.array([sides_m(p_m[patch == k])[:2] for k in range(num)])
     found = np.all(extents >= WALL_M, axis=1)
     trees = [cKDTree(p_m[patch == k]) for k in range(num)]
-    is_dark = colour[:, 0] < LIGHTNESS_WEIGHT * DARK
+    is_dark = middle[:, 0] < LIGHTNESS_WEIGHT * DARK
     todo = list(np.flatnonzero(found))
     while todo:
         wall = todo.pop()
-        alike = np.linalg.norm(colour - colour[wall], axis=1) < COLOUR_GAP
+        alike = np.linalg.norm(middle - middle[wall], axis=1) < COLOUR_GAP
         for other in np.flatnonzero((alike | is_dark) & ~found):
             small, large = sorted((trees[wall], trees[other]), key=lambda tree: tree.n)
             gap = large.query(small.data, distance_upper_bound=NEAR_WALL_M)[0].min()
@@ -199,11 +276,21 @@ def _structure(
 
 
 def _joined_outwards(
-    patch: np.ndarray, structure: np.ndarray, p_m: np.ndarray, pairs: np.ndarray, border: _Borders
+    patch: np.ndarray,
+    free: np.ndarray,
+    p_m: np.ndarray,
+    pairs: np.ndarray,
+    border: _Borders,
+    colour: np.ndarray | None,
+    max_size_m: float,
 ) -> Int[np.ndarray, " num_voxels"]:
-    """Join patches that are no structure where their border bends outwards, the sharpest first."""
+    """Join free patches where their border bends outwards, the sharpest first.
+
+    Args:
+        colour: Keep pieces of two colours apart, unless one is a marking; None: a bag in a shelf
+            has many.
+    """
     joined = patch.copy()
-    free = ~structure[patch]
     while True:
         links = joined[pairs]
         open_ = (links[:, 0] != links[:, 1]) & free[pairs].all(axis=1)
@@ -218,8 +305,79 @@ def _joined_outwards(
         fits &= bend > LEAST_BEND
         for number in np.argsort(-bend, kind="stable"):
             a, b = keys[number]
-            if fits[number] and (sides_m(p_m[(joined == a) | (joined == b)])[0] <= MAX_SIZE_M):
-                joined = np.where(joined == b, a, joined)
+            both = (joined == a) | (joined == b)
+            if fits[number] and sides_m(p_m[both])[0] <= max_size_m:
+                if colour is not None and _are_two(joined == a, joined == b, colour):
+                    continue
+                joined[both] = a
                 break
         else:
-            return np.asarray(joined)
+            return joined
+
+
+def _are_two(a: np.ndarray, b: np.ndarray, colour: np.ndarray) -> bool:
+    """Whether two pieces differ in colour, and none is small enough to be a marking."""
+    small, large = sorted((int(a.sum()), int(b.sum())))
+    return small >= MARKING * large and _colour_gap(a, b, colour) >= MIN_COLOUR_GAP
+
+
+def _colour_gap(a: np.ndarray, b: np.ndarray, colour: np.ndarray) -> float:
+    return float(np.linalg.norm(np.median(colour[a], axis=0) - np.median(colour[b], axis=0)))
+
+
+def _with_parts(
+    pieces: np.ndarray,
+    free: np.ndarray,
+    p_m: np.ndarray,
+    height_m: np.ndarray,
+    pairs: np.ndarray,
+    colour: np.ndarray,
+) -> Int[np.ndarray, " num_voxels"]:
+    """Join pieces that are no things of their own with what they touch, the smallest first.
+
+    A neck, an armpit and the foot of a handle are inward bends, too.
+    """
+    open_ = pairs[free[pairs].all(axis=1)]
+    while True:
+        part = _smallest_part(pieces, p_m, height_m, open_, colour)
+        if part is None:
+            return pieces
+        pieces = np.where(pieces == part[0], part[1], pieces)
+
+
+def _smallest_part(
+    pieces: np.ndarray, p_m: np.ndarray, height_m: np.ndarray, pairs: np.ndarray, colour: np.ndarray
+) -> tuple[int, int] | None:
+    """The smallest piece that is part of a neighbour of its colour, and that neighbour."""
+    counts, links = np.bincount(pieces), pieces[pairs]
+    for piece in np.argsort(counts, kind="stable"):
+        own = pieces == piece
+        mine = links[(links == piece).sum(axis=1) == 1]
+        others, strength = np.unique(mine[mine != piece], return_counts=True)
+        alike = [_colour_gap(own, pieces == other, colour) < MIN_COLOUR_GAP for other in others]
+        others, strength = others[alike], strength[alike]
+        if not len(others):
+            continue
+        all_ = own | np.isin(pieces, others)
+        touch_m = max(TOUCH_M, 0.25 * float(height_m[all_].max()))
+        is_small = counts[piece] < MIN_SHARE * all_.sum()
+        if is_small or np.quantile(height_m[own], 0.03) > touch_m:
+            return int(piece), int(others[np.argmax(strength)])
+        for other in others:
+            if _overlap(p_m[own], p_m[pieces == other]) > MAX_OVERLAP:
+                return int(piece), int(other)
+    return None
+
+
+def _overlap(a_m: np.ndarray, b_m: np.ndarray) -> float:
+    """Share of one set of points within the other's outline seen from above, the larger."""
+    return max(float(within_outline(a_m, b_m).mean()), float(within_outline(b_m, a_m).mean()))
+
+
+def within_outline(points: np.ndarray, outline: np.ndarray) -> Bool[np.ndarray, " num_points"]:
+    """Which points lie within the convex outline of others, seen from above."""
+    try:
+        hull = Delaunay(outline[:, :2])
+    except (QhullError, ValueError):
+        return np.zeros(len(points), dtype=bool)
+    return np.asarray(hull.find_simplex(points[:, :2]) >= 0)

@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from bridge.geometry import se3
 from twin.naming.things import SemanticsError
-from twin.scene.semantics.cluster import SurfacePoints
+from twin.scene.semantics.points import SurfacePoints
 
 UP = np.array([0.0, 0.0, 1.0])
 """Against gravity in the root frame of a robot cell."""

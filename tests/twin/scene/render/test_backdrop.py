@@ -16,7 +16,7 @@ from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
 from twin.scene.render import render
 from twin.scene.settings import RenderConfig
-from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene
+from twin.scene.store.folder import read_record, read_scene
 
 CAMERA = Camera(width=64, height=48, fx=40.0, fy=40.0, cx=32.0, cy=24.0)
 
@@ -49,7 +49,7 @@ def shell() -> backdrop.Backdrop:
         axis=-1,
     )
     colors = painted(directions).astype(np.float32)
-    return backdrop.Backdrop(colors=colors, centre_m=np.zeros(3), radius_m=2.0)
+    return backdrop.Backdrop(colors=colors)
 
 
 def nothing(alpha: float = 0.0) -> View:
@@ -137,10 +137,7 @@ def test_it_comes_back_as_it_was_written_and_is_missing_without_harm(tmp_path: P
     back = backdrop.read_backdrop(run, {"backdrop": about})
     assert back is not None
     np.testing.assert_allclose(back.colors, shell().colors, atol=0.5 / 255 + 1e-6)
-    assert back.radius_m == 2.0
     assert backdrop.read_backdrop(run, {}) is None
-    with pytest.raises(UnreadableSceneError, match="centre"):
-        backdrop.read_backdrop(run, {"backdrop": {"radius_m": 1.0}})
     (run.scene_dir / backdrop.BACKDROP).unlink()
     assert backdrop.read_backdrop(run, {"backdrop": about}) is None
 
@@ -148,7 +145,7 @@ def test_it_comes_back_as_it_was_written_and_is_missing_without_harm(tmp_path: P
 def test_a_corner_that_nobody_saw_is_drawn_and_counts_as_unseen(room: RunFolder) -> None:
     record = read_record(room)
     assert record is not None
-    assert record["backdrop"]["radius_m"] > 0
+    assert record["backdrop"] == {"file": backdrop.BACKDROP}
     away = read_scene(room).background.means_m.max(axis=0) + 0.05
     out = room.results_dir / "corner.png"
     config = RenderConfig(

@@ -5,10 +5,10 @@ from table_scene import BLUE, GREEN, RED, World, box, duck, ellipsoid, iou, make
 
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics import segment as segmenter
-from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.describe import scene_by_default
 from twin.scene.semantics.lift import render_labels
-from twin.scene.semantics.segment import Segmentation, points_of, segment
+from twin.scene.semantics.points import SurfacePoints, points_of
+from twin.scene.semantics.segment import Segmentation, segment
 
 
 def segmented(pieces: list[table_scene.Piece], num: int = 8) -> tuple[World, Segmentation]:
@@ -83,6 +83,19 @@ def test_a_thing_in_a_box_is_not_the_box() -> None:
     best = matched(world, found)
     assert [label for label, _ in best.values()] == ["blue open container", "red ball"]
     assert all(score > 0.75 for _, score in best.values())
+
+
+@pytest.mark.slow
+def test_cubes_in_a_bin_are_not_the_bin() -> None:
+    cubes = [
+        box(2, [0.03, 0.02, 0.028], [0.04, 0.04, 0.044], RED),
+        box(3, [-0.03, -0.02, 0.028], [0.04, 0.04, 0.044], table_scene.YELLOW),
+    ]
+    world, found = segmented([table(), *table_scene.open_box(1, 0, 0, BLUE), *cubes])
+    best = matched(world, found)
+    assert len(found.things) == 3
+    assert [label.split()[0] for label, _ in best.values()] == ["blue", "red", "yellow"]
+    assert all(score > 0.9 for _, score in best.values())
 
 
 def test_an_empty_table_gives_one_sentence() -> None:

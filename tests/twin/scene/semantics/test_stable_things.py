@@ -8,7 +8,8 @@ from table_scene import World, iou
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
-from twin.scene.semantics.segment import Look, points_of, segment, stable
+from twin.scene.semantics.points import points_of
+from twin.scene.semantics.segment import Look, segment, stable
 
 
 def looked(*found: list[range]) -> list[Look]:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from twin.scene.semantics import support
-from twin.scene.semantics.cluster import SurfacePoints
+from twin.scene.semantics.points import SurfacePoints
 
 UP = np.array([0.0, 0.0, 1.0])
 
