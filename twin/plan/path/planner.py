@@ -238,7 +238,7 @@ def _searched(
     refusals: tuple[PathRefusal, ...],
 ) -> Postures:
     """One native search; adds its work."""
-    outcome, pair, _, knots, spent = world.motion.find(
+    outcome, pair, knots, postures = world.motion.find(
         np.ascontiguousarray(start_rad, dtype=np.float64),
         np.ascontiguousarray(goals_rad, dtype=np.float64),
         config.seed + turn,
@@ -247,8 +247,7 @@ def _searched(
         config.max_postures,
         SHORTCUTS,
     )
-    for name, value in spent.items():
-        work[name] = work.get(name, 0.0) + float(value)
+    work["postures"] = work.get("postures", 0.0) + float(postures)
     if outcome:
         bodies = world.names[pair] if pair >= 0 else ()
         detail = f"after a refusal: {refusals[0].detail}" if refusals else ""

@@ -28,19 +28,19 @@ def straight(pairs: Pairs, index: int) -> TimedPath:
 
 
 def found(pairs: Pairs, index: int, seed: int = 0, shortcuts: int = 60) -> tuple:
-    """Native search alone: outcome, pair, goal, knots, work."""
+    """Native search alone: outcome, pair, knots, postures."""
     start, goals = pairs.starts[index], pairs.goals[index][None]
     return pairs.world.motion.find(start, goals, seed, 1.0, 5000, 150_000, shortcuts)
 
 
 def test_a_way_is_found_around_box_post_wall_and_the_arm_itself(pairs: Pairs) -> None:
     for index in range(len(pairs.kinds)):
-        outcome, _, _, knots, work = found(pairs, index)
+        outcome, _, knots, postures = found(pairs, index)
         assert outcome == 0
         assert np.array_equal(knots[0], pairs.starts[index])
         assert np.array_equal(knots[-1], pairs.goals[index])
         assert pairs.world.motion.blocked(knots) < 0
-        assert 0 < work["postures"] < 20_000
+        assert 0 < postures < 20_000
 
 
 def test_where_going_straight_is_refused_the_planned_way_is_not(pairs: Pairs) -> None:
@@ -52,13 +52,13 @@ def test_where_going_straight_is_refused_the_planned_way_is_not(pairs: Pairs) ->
 
 def test_the_same_seed_gives_the_same_bytes_and_another_one_another_way(pairs: Pairs) -> None:
     first, again, other = found(pairs, 4), found(pairs, 4), found(pairs, 4, seed=5)
-    assert first[3].tobytes() == again[3].tobytes()
-    assert first[4] == again[4]
-    assert other[3].tobytes() != first[3].tobytes()
+    assert first[2].tobytes() == again[2].tobytes()
+    assert first[3] == again[3]
+    assert other[2].tobytes() != first[2].tobytes()
     fresh = build_world(pairs.problem, width_m=WIDTH_M, eps_col_m=EPS_M)
     anew = found(replace(pairs, world=fresh), 4)
-    assert anew[3].tobytes() == first[3].tobytes()
-    assert anew[4] == first[4]
+    assert anew[2].tobytes() == first[2].tobytes()
+    assert anew[3] == first[3]
 
 
 def length_of(knots: np.ndarray) -> float:
@@ -67,7 +67,7 @@ def length_of(knots: np.ndarray) -> float:
 
 def test_shortcuts_make_a_way_shorter(pairs: Pairs) -> None:
     lengths = [
-        sum(length_of(found(pairs, i, shortcuts=count)[3]) for i in range(len(pairs.kinds)))
+        sum(length_of(found(pairs, i, shortcuts=count)[2]) for i in range(len(pairs.kinds)))
         for count in (0, 200)
     ]
     assert lengths[1] < 0.97 * lengths[0]
