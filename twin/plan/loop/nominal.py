@@ -31,7 +31,7 @@ from twin.plan.loop.tau import (
     stages_of,
 )
 from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, Mover, NoPathError, PathConfig
-from twin.plan.path.transfer import LEGS, LIFT_M, Leg, plan_transfer
+from twin.plan.path.transfer import LEGS, LIFT_M, Leg, PickAndPlace, left_with
 from twin.plan.problem import (
     Grasp,
     Joints,
@@ -141,7 +141,7 @@ def _pushes(problem: Problem, search: "_Search") -> Iterator[Offer]:
         except NoPathError as error:
             search.why = _why_not_moved(problem, key, error)
             continue
-        yield choice.cost, trajectory, after, ("pushed straight, tool down",)
+        yield choice[0], trajectory, after, ("pushed straight, tool down",)
 
 
 def _transfers(problem: Problem, search: "_Search") -> Iterator[Offer]:
@@ -245,10 +245,10 @@ class _Search:
         for way in ways:
             config = replace(base, seed=base.seed + self._seed % 2**31 + way.more_seed)
             try:
-                legs = plan_transfer(
-                    problem, grasp, release, start_rad, config,
+                legs = PickAndPlace(
+                    problem=problem, grasp=grasp, release=release, config=config,
                     lift_m=way.lift_m, straight=way.straight, tool_m_s=limits,
-                )  # fmt: skip
+                ).legs(start_rad)  # fmt: skip
                 kept(legs)
             except NoPathError as error:
                 failures.append(error)
@@ -256,19 +256,14 @@ class _Search:
                     break  # where nothing is free, another height is not either
                 continue
             lies = lying_there(problem, release, options.miss_with(grasp))
-            scene = replace(
-                problem.scene,
-                Ts_base_object={**problem.scene.Ts_base_object, grasp.object_id: lies},
-                start_rad=legs[-1].path.joints_rad[-1],
-            )
             return Transfer(
                 key=grasp.object_id,
                 grasp=grasp,
                 release=release,
                 legs=legs,
-                after=replace(problem, scene=scene),
+                after=left_with(problem, grasp.object_id, lies, legs[-1].path.joints_rad[-1]),
                 cost=release.cost + erfc(grasp.margin / sqrt(2.0)) / 2,
-                remarks=options.remarks_of(grasp, release, legs),
+                remarks=options.remarks_of(grasp, release),
             )
         raise failures[0]
 
@@ -395,15 +390,13 @@ class _Options:
             miss=self.miss_with(grasp), seed=self._seed,
         )  # fmt: skip
 
-    def remarks_of(self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]) -> tuple[str, ...]:
+    def remarks_of(self, grasp: Grasp, release: Release) -> tuple[str, ...]:
         """Where the numbers of a transfer come from, in words."""
-        postures = sum(leg.path.work.get("postures", 0.0) for leg in legs)
         return (
             f"{self._key}: grasp of {self.num_grasps}, {grasp.width_m * 1e3:.0f} mm wide, bears "
             f"{grasp.margin:.1f} standard deviations",
             *(f"{self._key}: {text}" for text in self._remarks),
             f"{self._key}: final state of J {release.cost:.4f}",
-            f"{self._key}: {postures:.0f} postures looked at on the way",
         )
 
 
