@@ -194,7 +194,7 @@ class Mover:
         )
 
 
-def _refused(bodies: tuple[str, str], detail: str, lacking_m: float) -> NoPathError:
+def _refused(bodies: tuple[str, ...], detail: str, lacking_m: float) -> NoPathError:
     return NoPathError(reason="refused", bodies=bodies, detail=detail, lacking_m=lacking_m)
 
 
@@ -253,6 +253,7 @@ def timed_path(
     rows = np.ascontiguousarray(knots_rad, dtype=np.float64)
     tool = min(wanted, default=0.0)
 
+    times, joints = np.zeros(len(rows)), rows
     for share, rounding in _LAWS:
         step_s = share * STEP_S
         times, joints, *_ = world.motion.time(rows, speed, acceleration, tool, step_s, rounding)
