@@ -47,7 +47,6 @@ MOST_TRIED = 16
 """Pairs of grasp and final state of one object that a way is sought for."""
 _PLACED = ("inside", "on")
 """Relations that final states are found for without a place to begin at."""
-_HOPELESS = ("nowhere_said", "not_localised")
 _OF_GRASP = ("approach", "around", "lift")
 
 
@@ -306,8 +305,6 @@ class _Moves:
             releases = self._final_states(grasp)
         except NoPlanError as error:
             self._why = str(error)
-            if error.cause in _HOPELESS:
-                raise
             return ()
         steer = self._steer
         if steer is None or steer.change != "release" or self._miss_with(grasp) is not None:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from bridge.task.plan import Plan
 from bridge.task.plan_request import Refusal
@@ -24,6 +24,7 @@ class Candidate:
     remarks: tuple[str, ...] = ()
 
 
+@runtime_checkable
 class Proposer(Protocol):
     """Makes plans for a problem."""
 
