@@ -16,6 +16,7 @@ from twin.robot.model import RobotModel
 _SAME_M = 0.001
 """A hand whose pieces differ by less from themselves turned half about the approach is the same."""
 
+
 @dataclass(frozen=True, kw_only=True)
 class SweptPiece:
     """One convex piece of the hand and all places it passes on the approach, tool frame."""

@@ -188,15 +188,11 @@ def pairs_along(
 
 def thinned(pairs: Pairs, *, cell_m: float, cell_rad: float) -> Ids:
     """Number the pairs that differ: the best of each cell of middles and directions."""
-    axes = pairs.axes * np.where(_first_sign(pairs.axes) < 0, -1.0, 1.0)[:, None]
+    largest = pairs.axes[np.arange(len(pairs.axes)), np.abs(pairs.axes).argmax(axis=1)]
+    axes = pairs.axes * np.where(largest < 0, -1.0, 1.0)[:, None]
     cells = np.concatenate(
         [np.rint(pairs.middles_m / cell_m), np.rint(axes / cell_rad)], axis=1
     ).astype(np.int64)
     order = np.argsort(-pairs.cosines, kind="stable")
     _, first = np.unique(cells[order], axis=0, return_index=True)
     return np.sort(order[first])
-
-
-def _first_sign(axes: Points) -> Numbers:
-    """Sign of the largest component."""
-    return np.asarray(np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)]))

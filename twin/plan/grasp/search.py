@@ -156,8 +156,12 @@ class GraspSearcher:
         pairs, rejected = self._pairs(object_id)
         found = self._hands_on(pairs, T, rejected)
         points = self._surface(object_id).points(_TARGET_POINTS, SEED)
-        self._past_table(found, T)
-        self._past_object(found, points)
+        table_m = self.problem.scene.table_height_m + self.config.clearance_m
+        found.keep(self._hand.lowest_m(T @ found.lines.Ts_object_tcp) >= table_m, "table")
+        hits = self._hand.hits(in_tools(found.lines, points), self.config.clearance_m / 2)
+        fingers = hits["fingers"][~hits["palm"]]
+        found.keep(~hits["palm"], "palm")
+        found.keep(~fingers, "fingers")
         self._past_neighbours(found, object_id, T)
         margin = self._margins(found, object_id, points)
         grasps = self._choose(found, margin, object_id)
@@ -269,17 +273,6 @@ class GraspSearcher:
         level = (Ts_all[:, :3, 2] @ down >= np.cos(MOST_TILT_RAD)) & (length[ids] > 1e-6)
         found.keep(level, "tilt")
         return found
-
-    def _past_table(self, found: _Candidates, T: Pose) -> None:
-        low_m = self._hand.lowest_m(T @ found.lines.Ts_object_tcp)
-        table_m = self.problem.scene.table_height_m + self.config.clearance_m
-        found.keep(low_m >= table_m, "table")
-
-    def _past_object(self, found: _Candidates, points_m: Points) -> None:
-        hits = self._hand.hits(in_tools(found.lines, points_m), self.config.clearance_m / 2)
-        fingers = hits["fingers"][~hits["palm"]]
-        found.keep(~hits["palm"], "palm")
-        found.keep(~fingers, "fingers")
 
     def _past_neighbours(self, found: _Candidates, object_id: str, T_base_object: Pose) -> None:
         """Reject hands that another object is in the way of, wherever it may be off to."""

@@ -103,7 +103,7 @@ class Mover:
         for turn in range(config.rounds):
             world = self._world(wider)
             _let_ends_be(world, np.vstack([start_rad[None], goals_rad]), wider)
-            knots = _searched(world, start_rad, goals_rad, config, turn, refusals)
+            knots = self._searched(world, start_rad, goals_rad, turn, refusals)
             # A margin grows with speed: what was refused is searched again wider, driven slower.
             slower = replace(config, speed_share=config.speed_share * 0.75**turn)
             path = timed_path(world, knots, slower)
@@ -128,6 +128,30 @@ class Mover:
         if refusals := self.refused(path):
             raise refusals[0]
         return path
+
+    def _searched(
+        self,
+        world: World,
+        start_rad: Joints,
+        goals_rad: Postures,
+        turn: int,
+        refusals: tuple[NoPathError, ...],
+    ) -> Postures:
+        """One native search."""
+        outcome, pair, knots, _ = world.motion.find(
+            np.ascontiguousarray(start_rad, dtype=np.float64),
+            np.ascontiguousarray(goals_rad, dtype=np.float64),
+            self.config.seed + turn,
+            RANGE_RAD,
+            self.config.max_nodes,
+            self.config.max_postures,
+            SHORTCUTS,
+        )
+        if outcome:
+            bodies = world.names[pair] if pair >= 0 else ()
+            detail = f"after a refusal: {refusals[0].detail}" if refusals else ""
+            raise NoPathError(reason=REASONS[outcome], bodies=bodies, detail=detail)
+        return np.asarray(knots)
 
     def _world(self, wider_m: Mapping[frozenset[str], float]) -> World:
         """What the search keeps clear of, refused pairs farther."""
@@ -219,31 +243,6 @@ def _let_ends_be(world: World, ends_rad: Postures, wider_m: Mapping[frozenset[st
             world.motion.set_limit(number, limit_m)
 
 
-def _searched(
-    world: World,
-    start_rad: Joints,
-    goals_rad: Postures,
-    config: PathConfig,
-    turn: int,
-    refusals: tuple[NoPathError, ...],
-) -> Postures:
-    """One native search."""
-    outcome, pair, knots, _ = world.motion.find(
-        np.ascontiguousarray(start_rad, dtype=np.float64),
-        np.ascontiguousarray(goals_rad, dtype=np.float64),
-        config.seed + turn,
-        RANGE_RAD,
-        config.max_nodes,
-        config.max_postures,
-        SHORTCUTS,
-    )
-    if outcome:
-        bodies = world.names[pair] if pair >= 0 else ()
-        detail = f"after a refusal: {refusals[0].detail}" if refusals else ""
-        raise NoPathError(reason=REASONS[outcome], bodies=bodies, detail=detail)
-    return np.asarray(knots)
-
-
 def timed_path(
     world: World, knots_rad: Postures, config: PathConfig, *, tool_m_s: float | None = None
 ) -> TimedPath:
@@ -252,7 +251,6 @@ def timed_path(
     wanted = [value for value in (limit_m_s, tool_m_s, config.tool_m_s) if value]
     rows = np.ascontiguousarray(knots_rad, dtype=np.float64)
     tool = min(wanted, default=0.0)
-
     times, joints = np.zeros(len(rows)), rows
     for share, rounding in _LAWS:
         step_s = share * STEP_S

@@ -1,6 +1,6 @@
 """The arm, what it carries and what stands around it, as the native search wants them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -109,47 +109,25 @@ def _arm(hulls: RobotHulls, width_m: float, *, has_grid: bool) -> tuple[Motion, 
     return motion, bodies, T_last_tcp
 
 
-def _add_pairs(
-    motion: Motion,
-    hulls: RobotHulls,
-    boxes: list[str],
-    carried: Carried | None,
-    *,
-    has_grid: bool,
-    eps_m: float,
-    allowed: Allowed,
-    wider_m: Mapping[frozenset[str], float],
-) -> tuple[list[Names], list[float]]:
-    """Add the pairs that are kept apart; return their names, and how far."""
-    names: list[Names] = []
-    limits_m: list[float] = []
-
-    def pair(body: int, kind: int, other: int, named: Names, least_m: float = eps_m) -> None:
-        """Add one, unless it may touch: what was refused before may not."""
-        more = wider_m.get(frozenset(named))
-        known = names_of(named[0], hulls.robot.record.gripper)
-        if more is None and any(frozenset((name, named[1])) in allowed for name in known):
-            return
-        limits_m.append(least_m + SPARE_M + (more or 0.0))
-        motion.add_pair(body, kind, other, limits_m[-1])
-        names.append(named)
-
+def _pairs(
+    hulls: RobotHulls, boxes: list[str], carried: Carried | None, *, has_grid: bool
+) -> Iterator[tuple[int, int, int, Names]]:
+    """Pairs that are kept apart: number of a body, kind and number of the other, their names."""
     stationary, _ = stationary_links(hulls)
     links = [hull.link for hull in hulls.hulls]
     held = [] if carried is None else [carried.object_id]
     for body, name in enumerate([*links, *held]):
         for number, other in enumerate(boxes):
-            pair(body, BOX, number, (name, other))
+            yield body, BOX, number, (name, other)
         if name not in stationary:
-            pair(body, PLANE, 0, (name, TABLE))
+            yield body, PLANE, 0, (name, TABLE)
             if has_grid:
-                pair(body, GRID, 0, (name, SCENE))
+                yield body, GRID, 0, (name, SCENE)
     for one, two in hulls.pairs:
-        pair(one, BODY, two, (links[one], links[two]), 0.0)
+        yield one, BODY, two, (links[one], links[two])
     for name in held:  # those links that do not hold it
         for index, link in enumerate(links):
-            pair(len(links), BODY, index, (link, name))
-    return names, limits_m
+            yield len(links), BODY, index, (link, name)
 
 
 def build_world(
@@ -179,16 +157,18 @@ def build_world(
     motion.set_table(problem.scene.table_height_m)
     for _, T, size in obstacles:
         motion.add_box(T, np.asarray(size, dtype=np.float64) / 2)
-    names, limits_m = _add_pairs(
-        motion,
-        hulls,
-        [name for name, *_ in obstacles],
-        carried,
-        has_grid=lookup is not None,
-        eps_m=eps_col_m,
-        allowed=allowed,
-        wider_m=wider_m or {},
-    )
+    names: list[Names] = []
+    limits_m: list[float] = []
+    boxes = [name for name, *_ in obstacles]
+    for body, kind, other, named in _pairs(hulls, boxes, carried, has_grid=lookup is not None):
+        more_m = (wider_m or {}).get(frozenset(named))
+        known = names_of(named[0], problem.robot.record.gripper)
+        if more_m is None and any(frozenset((name, named[1])) in allowed for name in known):
+            continue  # what was refused before may not touch
+        is_own = kind == BODY and body < len(hulls.hulls)
+        limits_m.append((0.0 if is_own else eps_col_m) + SPARE_M + (more_m or 0.0))
+        motion.add_pair(body, kind, other, limits_m[-1])
+        names.append(named)
     motion.prepare()
     return World(motion=motion, names=names, robot=problem.robot, limits_m=limits_m)
 
@@ -212,14 +192,10 @@ def _add_bodies(motion: Motion, bodies: list[_Body], lookup: GridLookup | None) 
         motion.set_grid(*grid, *map(np.concatenate, (points, radii, children)))
 
 
-PlacedBox = tuple[str, Pose, Vector]
-"""Its name, ``T_base_box`` and extents [m]."""
-
-
-def _obstacles(problem: Problem, carried: Carried | None) -> list[PlacedBox]:
-    """Panels of what stands still, and a box for each other object."""
+def _obstacles(problem: Problem, carried: Carried | None) -> list[tuple[str, Pose, Vector]]:
+    """Panels of what stands still, and a box for each other object: name, pose and extents [m]."""
     scene = problem.scene
-    found: list[PlacedBox] = [
+    found = [
         (name, T_base_panel, extents)
         for name, T in scene.containers().items()
         for T_base_panel, extents in placed_panels(scene.task.objects[name], T)
