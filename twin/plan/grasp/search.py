@@ -155,7 +155,7 @@ class GraspSearcher:
         T = self.problem.scene.Ts_base_object[object_id]
         pairs, rejected = self._pairs(object_id)
         found = self._hands_on(pairs, T, rejected)
-        points = self._surface(object_id).points(_TARGET_POINTS, SEED)
+        points = self._surface(object_id).points(_TARGET_POINTS, SEED)[0]
         table_m = self.problem.scene.table_height_m + self.config.clearance_m
         found.keep(self._hand.lowest_m(T @ found.lines.Ts_object_tcp) >= table_m, "table")
         hits = self._hand.hits(in_tools(found.lines, points), self.config.clearance_m / 2)
@@ -182,7 +182,7 @@ class GraspSearcher:
         for name, T in scene.movable().items():
             if name == object_id:
                 continue
-            other = se3.apply(T, self._surface(name).points(_NEIGHBOUR_POINTS, 0))
+            other = se3.apply(T, self._surface(name).points(_NEIGHBOUR_POINTS, 0)[0])
             over = other[(other[:, :2] @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)]
             if len(over) and over[:, 2].min() > top_m - _COVERED_M:
                 found, hint = f"{name} is on top of it", f"Move {name} away first."
@@ -282,7 +282,7 @@ class GraspSearcher:
                 continue
             sigma_m = float(np.sqrt(np.abs(np.diag(self._covariance(name))[:3]).max()))
             margin_m = self.config.clearance_m + sigma_m
-            points = self._surface(name).points(_NEIGHBOUR_POINTS, SEED)
+            points = self._surface(name).points(_NEIGHBOUR_POINTS, SEED)[0]
             points = in_tools(found.lines, se3.apply(T_object_base @ T, points))
             hits = self._hand.hits(points, margin_m)
             found.keep(~(hits["fingers"] | hits["palm"]), "neighbour")

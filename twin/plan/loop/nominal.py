@@ -43,6 +43,10 @@ WIDER_M = 0.003
 SLOWER = 0.7
 """Share of speeds and accelerations that is kept where a limit was passed."""
 NOT_KEPT = "not kept on the way"
+_HINTS = {
+    NOT_KEPT: "Ask less of the way, or put the objects elsewhere.",
+    BUDGET_SPENT: "Clear the way from where it lies to where it goes.",
+}
 MOST_TRIED = 16
 """Pairs of grasp and final state of one object that a way is sought for."""
 _PLACED = ("inside", "on")
@@ -163,16 +167,13 @@ def _why_not_moved(problem: Problem, key: str, error: NoPathError) -> str:
             "record the start again: robot-gst record RUN."
         )
     around = {*problem.scene.task.objects, TABLE, SCENE}
-    if error.reason == NOT_KEPT:
-        hint = "Ask less of the way, or put the objects elsewhere."
-    elif error.reason == BUDGET_SPENT:
-        hint = "Clear the way from where it lies to where it goes."
+    hint = "Move apart what touches, or put the objects elsewhere."
+    if error.reason in _HINTS:
+        hint = _HINTS[error.reason]
     elif not error.bodies:
         hint = "Move the object, or where it goes, nearer to the arm."
     elif around.isdisjoint(error.bodies):
         hint = "The arm is in its own way: move the object, or where it goes."
-    else:
-        hint = "Move apart what touches, or put the objects elsewhere."
     return f"{key}: {error}. {hint}"
 
 
