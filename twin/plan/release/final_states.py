@@ -125,7 +125,7 @@ class ReleaseSearch:
         self._width_m = min(max(grasp.open_m, grasp.width_m + OPEN_MORE_M), gripper.max_width_m)
         self._points_m = surface_points(problem, grasp.object_id)
         self._outline_m = self._points_m[ConvexHull(self._points_m).vertices]
-        self._hand_m = hand_points(hulls, self._width_m, HAND_POINTS)
+        self._hand_m = hand_points(problem.robot, self._width_m, HAND_POINTS)
         self._obstacles = obstacles_of(problem, hulls, {grasp.object_id})
         self._pairs = problem.contacts_of("release", grasp.object_id)
         self._T_tcp_object = se3.invert(grasp.T_object_tcp)

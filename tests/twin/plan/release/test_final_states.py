@@ -282,8 +282,8 @@ def test_a_known_miss_is_made_up_for() -> None:
 
 
 def test_the_hand_is_as_wide_as_it_opens() -> None:
-    hulls = hulls_of(load_robot(ROBOT.urdf_text()))
-    closed, opened = (hand_points(hulls, width, 400) for width in (0.0, 0.08))
+    robot = load_robot(ROBOT.urdf_text())
+    closed, opened = (hand_points(robot, width, 400) for width in (0.0, 0.08))
     assert np.ptp(opened[:, 1]) >= np.ptp(closed[:, 1])
     tips = opened[opened[:, 2] > -0.01]
     assert np.abs(tips[:, 1]).min() >= 0.039
