@@ -124,7 +124,7 @@ def search_rows(pairs: Pairs) -> list[Target]:
     mover = Mover(problem=pairs.problem, config=config, width_m=WIDTH_M)
     decisions = []
     for index in range(len(pairs.kinds)):
-        outcome, _, _, found, _ = native(pairs, index)
+        outcome, _, found, _ = native(pairs, index)
         if outcome:
             continue
         path = timed_path(pairs.world, found, config)
@@ -209,12 +209,12 @@ def timing_rows(pairs: Pairs) -> list[Target]:
     ours, stops, curve, spline, cost, theirs, over = [], [], [], [], [], [], []
     has_toppra = importlib.util.find_spec("toppra") is not None
     for index in range(len(pairs.kinds)):
-        knots = native(pairs, index)[3]
+        knots = native(pairs, index)[2]
 
         def law(rounding: bool = True, knots: np.ndarray = knots) -> Any:
             return pairs.world.motion.time(knots, speed, acceleration, 0.0, 0.02, rounding)
 
-        times, rows, _, _, at, points = law()
+        times, rows, at, points = law()
         cost.append(cpu_ms(law))
         ours.append(times[-1])
         stops.append(law(rounding=False)[0][-1])

@@ -183,5 +183,3 @@ class TimedPath:
 
     times_s: Numbers
     joints_rad: Postures
-    work: Mapping[str, float] = field(default_factory=dict)
-    """Counted steps: nodes, checks, halvings; never seconds."""

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -201,8 +202,8 @@ def test_live_with_a_task_is_wrong_use(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_when_no_candidate_is_left_the_reason_says_how_many_there_were(tmp_path: Path) -> None:
     class Few(PlanProposer):
-        def propose(self, problem: Any, *, count: int, **more: Any) -> Any:
-            return super().propose(problem, count=1, **more)
+        def propose(self, problem: Any, **more: Any) -> Any:
+            return islice(super().propose(problem, **more), 1)
 
     run = RunFolder.create(tmp_path / "run")
     planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, Few)

@@ -1,5 +1,6 @@
 """Propose, have it judged, steer: deterministic, never the same twice, ends when it should."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from scripted_plans import pick_and_place
 from verdicts import verdict_of
 
 from bridge.geometry import se3
-from bridge.task.plan import Plan
+from bridge.task.plan import Plan, Ranking, SteeredBy
 from bridge.task.plan_request import Refusal
 from bridge.task.verdict import Factor, Verdict
 from twin.plan.loop.nominal import PlanProposer
@@ -32,14 +33,18 @@ class Listed:
         self.plans = [replace(plan, entities=entities) for plan in made]
 
     def propose(
-        self, problem: Problem, *, plan_id: str, seed: int, count: int, steer: Steer | None
-    ) -> list[Candidate]:
+        self, problem: Problem, *, plan_id: str, seed: int, steer: Steer | None
+    ) -> Iterator[Candidate]:
         fresh = [
             plan
             for plan in self.plans
             if steer is None or not steer.has_grasp_like("cube", tried_in(plan)[0].T_object_tcp)
         ]
-        return [Candidate(plan=p, rank=k, cost=0.1 * k) for k, p in enumerate(fresh[:count])]
+        by = steer and SteeredBy(clause=steer.clause, bodies=steer.bodies)
+        for k, plan in enumerate(fresh):
+            ranking = Ranking(rank=k, cost=0.1 * k, seed=seed)
+            named = replace(plan, candidate=ranking, steered_by=by)
+            yield Candidate(plan=named, rank=k, cost=0.1 * k)
 
 
 @pytest.fixture(scope="module")

@@ -90,7 +90,7 @@ def test_a_start_that_cannot_be_used_is_refused_in_one_sentence(
 
     def plan() -> None:
         refuse_unusable(bad)
-        PlanProposer().propose(bad, plan_id="p", seed=0, count=1, steer=None)
+        next(PlanProposer().propose(bad, plan_id="p", seed=0, steer=None))
 
     with pytest.raises(NoPlanError, match=said) as caught:
         plan()

@@ -9,7 +9,7 @@ of missing are added up, and their sum is told as the standard deviations of one
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from twin.plan.grasp.open_hand import OpenHand
@@ -80,12 +80,8 @@ def reaches_along(
     across_m, second = surface.leave(inside, directions)
     good &= np.einsum("ni,ni->n", second, directions) >= least
     good &= np.abs(entry_m + across_m - _OUTSIDE_M - np.repeat(lines.widths_m, count)) <= _STEP_M
-    return _first_lost(good.reshape(num, count))
-
-
-def _first_lost(good: Bool[np.ndarray, "num_grasps num_shifts"]) -> Numbers:
-    """The last shift before the first that fails."""
-    kept = np.logical_and.accumulate(good, axis=1).sum(axis=1)
+    # The last shift before the first that fails.
+    kept = np.logical_and.accumulate(good.reshape(num, count), axis=1).sum(axis=1)
     return np.asarray(np.array([0.0, *SHIFTS_M])[kept])
 
 
@@ -143,16 +139,12 @@ def margins(
     angle = np.sqrt(np.maximum(*turn)) + _ANGLE_FLOOR_RAD
     ones = np.ones(len(R))
     sigma = [y, x, z, z, ones * doubt.robot_m, angle, ones * doubt.middle_m]
-    return _together(slack / np.maximum(np.stack(sigma, axis=1), _LEAST_SIGMA_M))
+    each = slack / np.maximum(np.stack(sigma, axis=1), _LEAST_SIGMA_M)
+    missing_log = np.minimum(logsumexp(log_ndtr(-each), axis=1), 0.0)  # the chances add up
+    return np.asarray(-ndtri_exp(missing_log))
 
 
 def _variance(u: Points, arm_m: Points, covariance: Covariance) -> Numbers:
     """Of the place of a point of the object along directions."""
     row = np.concatenate([u, np.cross(arm_m, u)], axis=1)
     return np.asarray(np.einsum("ni,ij,nj->n", row, covariance, row))
-
-
-def _together(each: Float[np.ndarray, "num_grasps num_ways"]) -> Numbers:
-    """Add the chances of missing up."""
-    missing_log = np.minimum(logsumexp(log_ndtr(-each), axis=1), 0.0)
-    return np.asarray(-ndtri_exp(missing_log))

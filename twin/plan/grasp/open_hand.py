@@ -16,9 +16,6 @@ from twin.robot.model import RobotModel
 _SAME_M = 0.001
 """A hand whose pieces differ by less from themselves turned half about the approach is the same."""
 
-_BETWEEN = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])
-"""Shares of half the opening at which it is looked whether a finger fills it."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SweptPiece:
@@ -49,8 +46,6 @@ class OpenHand:
     """Half the breadth of the narrowest finger piece at the tips, along the tool's x axis."""
     symmetric: bool
     """Whether it is the same after half a turn about the approach."""
-    closed_in: bool
-    """Whether the fingers' hulls fill the space between the pads: then they say nothing of it."""
 
     def hits(
         self, points_m: Float[np.ndarray, "3 num_poses num_points"], margin_m: float
@@ -66,8 +61,6 @@ class OpenHand:
         num = points_m.shape[1]
         found = {"fingers": np.zeros(num, dtype=bool), "palm": np.zeros(num, dtype=bool)}
         for piece in self.pieces:
-            if piece.finger and self.closed_in:
-                continue
             low, high = piece.low_m - margin_m, piece.high_m + margin_m
             near = points_m[2] > low[2]
             near &= points_m[2] < high[2]
@@ -114,9 +107,6 @@ def open_hand(robot: RobotModel, open_m: float, pregrasp_m: float) -> OpenHand:
     closing = [piece for piece in pieces if piece.finger]
     palm = [piece for piece in pieces if not piece.finger]
     tips = [piece for piece in closing if piece.corners_m[:, 2].max() > 0] or closing
-    between = np.zeros((_BETWEEN.size, 3))
-    between[:, 1] = _BETWEEN * open_m / 2
-    filled = any((between @ p.normals.T + p.offsets_m < 0).all(axis=1).any() for p in closing)
     return OpenHand(
         pieces=tuple(pieces),
         open_m=open_m,
@@ -124,7 +114,6 @@ def open_hand(robot: RobotModel, open_m: float, pregrasp_m: float) -> OpenHand:
         depth_m=-max((float(piece.corners_m[:, 2].max()) for piece in palm), default=-np.inf),
         pad_half_m=min(float(np.abs(piece.corners_m[:, 0]).max()) for piece in tips),
         symmetric=_is_symmetric(pieces),
-        closed_in=filled,
     )
 
 

@@ -51,7 +51,7 @@ class SampledSurface:
         return face_normals(self.shape.vertices_m, self.shape.triangles)
 
     @cached_property
-    def _normals(self) -> Points:
+    def normals(self) -> Points:
         """Normals of the triangles as a pad feels them."""
         normals, areas = self._facets
         if self.shape.error_m <= 0:
@@ -72,16 +72,8 @@ class SampledSurface:
             found *= (areas / np.maximum(np.linalg.norm(found, axis=1), 1e-12))[:, None]
         return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1), 1e-12)[:, None])
 
-    def samples(self, count: int, seed: int) -> tuple[Points, Points]:
-        """Points spread evenly over the surface, and their normals."""
-        points, chosen = self._sampled(count, seed)
-        return points, self._normals[chosen]
-
-    def points(self, count: int, seed: int) -> Points:
-        """The same points alone: of what is only kept clear of, nobody asks the normals."""
-        return self._sampled(count, seed)[0]
-
-    def _sampled(self, count: int, seed: int) -> tuple[Points, Ids]:
+    def points(self, count: int, seed: int) -> tuple[Points, Ids]:
+        """Points spread evenly over the surface, and their triangles."""
         shape, rng = self.shape, np.random.default_rng(seed)
         chosen, u, v = sample_triangles(self._facets[1], count, rng, in_order=True)
         a, b, c = (shape.vertices_m[shape.triangles[chosen, k]] for k in range(3))
@@ -94,7 +86,7 @@ class SampledSurface:
         away = found["t_hit"].numpy().astype(np.float64)
         ids = found["primitive_ids"].numpy().astype(np.int64)
         hit = np.isfinite(away)
-        return away, np.where(hit[:, None], self._normals[np.where(hit, ids, 0)], 0.0)
+        return away, np.where(hit[:, None], self.normals[np.where(hit, ids, 0)], 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +127,8 @@ def antipodal_pairs(
     cone; and a line along the object's y axis through the hint. Which pairs hold, and which are too
     wide, is for the caller to say.
     """
-    points, normals = surface.samples(count, seed)
+    points, triangles = surface.points(count, seed)
+    normals = surface.normals[triangles]
     rng = np.random.default_rng([seed, 1])
     level = normals * [1.0, 1.0, 0.0]
     length = np.linalg.norm(level, axis=1)
@@ -188,15 +181,11 @@ def pairs_along(
 
 def thinned(pairs: Pairs, *, cell_m: float, cell_rad: float) -> Ids:
     """Number the pairs that differ: the best of each cell of middles and directions."""
-    axes = pairs.axes * np.where(_first_sign(pairs.axes) < 0, -1.0, 1.0)[:, None]
+    largest = pairs.axes[np.arange(len(pairs.axes)), np.abs(pairs.axes).argmax(axis=1)]
+    axes = pairs.axes * np.where(largest < 0, -1.0, 1.0)[:, None]
     cells = np.concatenate(
         [np.rint(pairs.middles_m / cell_m), np.rint(axes / cell_rad)], axis=1
     ).astype(np.int64)
     order = np.argsort(-pairs.cosines, kind="stable")
     _, first = np.unique(cells[order], axis=0, return_index=True)
     return np.sort(order[first])
-
-
-def _first_sign(axes: Points) -> Numbers:
-    """Sign of the largest component."""
-    return np.asarray(np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)]))

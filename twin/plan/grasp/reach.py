@@ -1,7 +1,5 @@
 """Whether the arm brings its hand to a grasp, on which branch, and along a straight approach."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from twin.plan.grasp.open_hand import OpenHand
@@ -19,14 +17,8 @@ MOST_TURN_RAD = 0.8
 _MOST_BRANCHES = 4
 _TURN = 2 * np.pi
 
-
-@dataclass(frozen=True, kw_only=True)
-class Reached:
-    """How the arm stands at a grasp."""
-
-    joints_rad: Joints
-    turned: bool
-    """Whether with the hand turned half about its approach."""
+Reached = tuple[Joints, bool]
+"""How the arm stands at a grasp, and whether with the hand turned half about its approach."""
 
 
 class ArmReach:
@@ -66,12 +58,12 @@ class ArmReach:
                 befores = _turned(robot, rows, at)
                 befores = befores[np.abs(befores - at).max(axis=1) <= MOST_TURN_RAD]
                 for before in befores[:1]:
-                    way = Reached(joints_rad=at, turned=sign < 0)
-                    found.append((float(np.abs(before - start_rad).max()), way, before))
+                    far_rad = float(np.abs(before - start_rad).max())
+                    found.append((far_rad, (at, sign < 0), before))
         for _, way, before in sorted(found, key=lambda each: each[0])[:_MOST_BRANCHES]:
             why = "arm"
             # At the grasp and where its approach begins; the hand was looked at all the way.
-            if all(self.is_clear(row, hand.open_m) for row in (way.joints_rad, before)):
+            if all(self.is_clear(row, hand.open_m) for row in (way[0], before)):
                 return way
         return why
 

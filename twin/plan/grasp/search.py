@@ -11,9 +11,9 @@ from scipy.spatial import ConvexHull, QhullError
 from bridge.geometry import se3
 from twin.physics.config import PhysicsConfig
 from twin.plan.grasp.margin import Doubt, Lines, margins, slacks
-from twin.plan.grasp.open_hand import OpenHand, has_fingers, open_hand
+from twin.plan.grasp.open_hand import has_fingers, open_hand
 from twin.plan.grasp.pairs import Pairs, SampledSurface, antipodal_pairs, thinned
-from twin.plan.grasp.reach import ArmReach, Reached
+from twin.plan.grasp.reach import ArmReach
 from twin.plan.problem import (
     Covariance,
     Flags,
@@ -26,6 +26,7 @@ from twin.plan.problem import (
     Poses,
     Problem,
 )
+from twin.plan.stage.solver import alike
 from twin.replay.config import UNKNOWN_POSE_M, UNKNOWN_POSE_RAD
 
 CAUSES: Mapping[str, str] = {
@@ -72,8 +73,6 @@ DEPTHS_M = (0.0, -0.005, 0.012)
 PREGRASP_M = 0.08
 ROBOT_ERROR_M = 0.0015
 """Standard deviation of the tool in any direction."""
-SAME_M, SAME_RAD = 0.01, 0.1745
-"""Grasps nearer than this to a better one, and turned by less than ten degrees, are it."""
 SEED = 0
 
 
@@ -129,10 +128,6 @@ _SAFETY = 1.5
 """On the weight that friction must hold: the arm accelerates too."""
 _MIDDLE_SHARE = 0.05
 """Of its largest extent, how far the middle of an object's mass may be off."""
-_OPENINGS = (0.75, 0.55)
-"""Shares of its width to which the hand opens where the whole of it finds no way past what is
-beside the object."""
-_IN_THE_WAY = ("neighbour", "arm")
 _COVERED_M = 0.006
 """Something whose underside is no more than this under the top of what it covers lies on it."""
 
@@ -149,7 +144,7 @@ class GraspSearcher:
             found = f"{robot.record.name} has no fingers that close"
             hint = "Give its gripper in the robot file (docs/robots.md)."
             raise no_grasp("anything", "no_gripper", found, hint)
-        self.max_width_m = robot.record.gripper.max_width_m
+        self._hand = open_hand(robot, robot.record.gripper.max_width_m, PREGRASP_M)
         self._reach = ArmReach(problem)
         self._surfaces: dict[str, SampledSurface] = {}
 
@@ -157,33 +152,23 @@ class GraspSearcher:
         """Find grasps of an object."""
         self._refuse_covered(object_id)
         self._refuse_too_heavy(object_id)
-        hand, found, grasps = self._opened(object_id, self.max_width_m)
-        first = found, hand
-        for share in _OPENINGS:
-            if grasps or not any(found.rejected.get(cause) for cause in _IN_THE_WAY):
-                break
-            open_m = share * self.max_width_m
-            hand, found, grasps = self._opened(object_id, open_m)
-        if not grasps:
-            raise self._none(object_id, first[0].rejected, first[1])
-        return GraspSearch(
-            grasps=grasps, rejected=+found.rejected, remarks=self._remarks(object_id, hand)
-        )
-
-    def _opened(
-        self, object_id: str, open_m: float
-    ) -> tuple[OpenHand, _Candidates, tuple[Grasp, ...]]:
-        """Search with the hand opened so far."""
         T = self.problem.scene.Ts_base_object[object_id]
-        pairs, rejected = self._pairs(object_id, open_m)
-        hand = open_hand(self.problem.robot, open_m, PREGRASP_M)
-        found = self._hands_on(pairs, T, hand, rejected)
-        points = self._surface(object_id).points(_TARGET_POINTS, SEED)
-        self._past_table(found, T, hand)
-        self._past_object(found, points, hand)
-        self._past_neighbours(found, object_id, T, hand)
-        margin = self._margins(found, object_id, points, hand)
-        return hand, found, self._choose(found, margin, object_id, hand)
+        pairs, rejected = self._pairs(object_id)
+        found = self._hands_on(pairs, T, rejected)
+        points = self._surface(object_id).points(_TARGET_POINTS, SEED)[0]
+        table_m = self.problem.scene.table_height_m + self.config.clearance_m
+        found.keep(self._hand.lowest_m(T @ found.lines.Ts_object_tcp) >= table_m, "table")
+        hits = self._hand.hits(in_tools(found.lines, points), self.config.clearance_m / 2)
+        fingers = hits["fingers"][~hits["palm"]]
+        found.keep(~hits["palm"], "palm")
+        found.keep(~fingers, "fingers")
+        self._past_neighbours(found, object_id, T)
+        margin = self._margins(found, object_id, points)
+        grasps = self._choose(found, margin, object_id)
+        if not grasps:
+            raise self._none(object_id, found.rejected)
+        remarks = self._remarks(object_id)
+        return GraspSearch(grasps=grasps, rejected=+found.rejected, remarks=remarks)
 
     def _refuse_covered(self, object_id: str) -> None:
         """Refuse what something lies on: lifting it would throw that down."""
@@ -197,7 +182,7 @@ class GraspSearcher:
         for name, T in scene.movable().items():
             if name == object_id:
                 continue
-            other = se3.apply(T, self._surface(name).points(_NEIGHBOUR_POINTS, 0))
+            other = se3.apply(T, self._surface(name).points(_NEIGHBOUR_POINTS, 0)[0])
             over = other[(other[:, :2] @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)]
             if len(over) and over[:, 2].min() > top_m - _COVERED_M:
                 found, hint = f"{name} is on top of it", f"Move {name} away first."
@@ -229,7 +214,7 @@ class GraspSearcher:
             self._surfaces[object_id] = SampledSurface(self.problem.shapes[object_id])
         return self._surfaces[object_id]
 
-    def _pairs(self, object_id: str, open_m: float) -> tuple[Pairs, Counter[str]]:
+    def _pairs(self, object_id: str) -> tuple[Pairs, Counter[str]]:
         """Closing lines that hold, fit between the pads, and are on what was seen."""
         config, shape = self.config, self.problem.shapes[object_id]
         rejected: Counter[str] = Counter()
@@ -247,7 +232,7 @@ class GraspSearcher:
             return pairs.chosen(mask)
 
         pairs = keep(pairs, pairs.cosines >= np.cos(CONE_RAD), "cone")
-        pairs = keep(pairs, pairs.widths_m <= open_m - 2 * config.clearance_m, "width")
+        pairs = keep(pairs, pairs.widths_m <= self._hand.open_m - 2 * config.clearance_m, "width")
         seen = pairs.lowest_m >= shape.trusted_from_m
         if np.isfinite(shape.trusted_from_m):
             seen &= pairs.downward <= _UNDERSIDE
@@ -258,9 +243,7 @@ class GraspSearcher:
                 break
         return pairs.chosen(kept), rejected
 
-    def _hands_on(
-        self, pairs: Pairs, T_base_object: Pose, hand: OpenHand, rejected: Counter[str]
-    ) -> _Candidates:
+    def _hands_on(self, pairs: Pairs, T_base_object: Pose, rejected: Counter[str]) -> _Candidates:
         """Put hands onto closing lines, from several directions and at several depths."""
         down = -T_base_object[2, :3]
         y = pairs.axes
@@ -278,7 +261,7 @@ class GraspSearcher:
                 rows.append((Ts, np.arange(len(y))))
         Ts_all = np.concatenate([Ts for Ts, _ in rows])
         ids = np.concatenate([numbers for _, numbers in rows])
-        if not hand.symmetric:
+        if not self._hand.symmetric:
             Ts_all, ids = np.concatenate([Ts_all, turned(Ts_all)]), np.concatenate([ids, ids])
         lines = Lines(
             Ts_object_tcp=Ts_all,
@@ -291,20 +274,7 @@ class GraspSearcher:
         found.keep(level, "tilt")
         return found
 
-    def _past_table(self, found: _Candidates, T: Pose, hand: OpenHand) -> None:
-        low_m = hand.lowest_m(T @ found.lines.Ts_object_tcp)
-        table_m = self.problem.scene.table_height_m + self.config.clearance_m
-        found.keep(low_m >= table_m, "table")
-
-    def _past_object(self, found: _Candidates, points_m: Points, hand: OpenHand) -> None:
-        hits = hand.hits(in_tools(found.lines, points_m), self.config.clearance_m / 2)
-        fingers = hits["fingers"][~hits["palm"]]
-        found.keep(~hits["palm"], "palm")
-        found.keep(~fingers, "fingers")
-
-    def _past_neighbours(
-        self, found: _Candidates, object_id: str, T_base_object: Pose, hand: OpenHand
-    ) -> None:
+    def _past_neighbours(self, found: _Candidates, object_id: str, T_base_object: Pose) -> None:
         """Reject hands that another object is in the way of, wherever it may be off to."""
         scene, T_object_base = self.problem.scene, se3.invert(T_base_object)
         for name, T in scene.Ts_base_object.items():
@@ -312,15 +282,14 @@ class GraspSearcher:
                 continue
             sigma_m = float(np.sqrt(np.abs(np.diag(self._covariance(name))[:3]).max()))
             margin_m = self.config.clearance_m + sigma_m
-            points = self._surface(name).points(_NEIGHBOUR_POINTS, SEED)
-            hits = hand.hits(in_tools(found.lines, se3.apply(T_object_base @ T, points)), margin_m)
+            points = self._surface(name).points(_NEIGHBOUR_POINTS, SEED)[0]
+            points = in_tools(found.lines, se3.apply(T_object_base @ T, points))
+            hits = self._hand.hits(points, margin_m)
             found.keep(~(hits["fingers"] | hits["palm"]), "neighbour")
 
-    def _margins(
-        self, found: _Candidates, object_id: str, points_m: Points, hand: OpenHand
-    ) -> Numbers:
+    def _margins(self, found: _Candidates, object_id: str, points_m: Points) -> Numbers:
         """How much each grasp bears; those that bear too little are rejected."""
-        config, model = self.config, self.problem.model(object_id)
+        hand, config, model = self._hand, self.config, self.problem.model(object_id)
         T = self.problem.scene.Ts_base_object[object_id]
         twist_Nm = 2 * FRICTION * self._grip_N() * _TWIST_SHARE * hand.pad_half_m
         weight_N = max(model.mass_kg * PhysicsConfig().gravity_m_s2, 1e-9)
@@ -346,32 +315,32 @@ class GraspSearcher:
         found.keep(enough, "margin")
         return margin[enough]
 
-    def _choose(
-        self, found: _Candidates, margin: Numbers, object_id: str, hand: OpenHand
-    ) -> tuple[Grasp, ...]:
+    def _choose(self, found: _Candidates, margin: Numbers, object_id: str) -> tuple[Grasp, ...]:
         """Take the surest that the arm reaches, leaving out what is like one that was taken."""
-        config, lines = self.config, found.lines
-        T = self.problem.scene.Ts_base_object[object_id]
-        Ts = T @ lines.Ts_object_tcp
+        hand, config, lines = self._hand, self.config, found.lines
+        Ts = self.problem.scene.Ts_base_object[object_id] @ lines.Ts_object_tcp
         taken: list[Grasp] = []
         kept: list[int] = []
         for index in np.argsort(-margin, kind="stable").tolist():
-            if kept and _is_like(lines, index, kept, hand.symmetric):
+            mine = lines.Ts_object_tcp[[index]]
+            hands = [*mine, *turned(mine)] if hand.symmetric else [*mine]
+            if any(alike(lines.Ts_object_tcp[kept], T).any() for T in hands):
                 continue
             way = self._reach.first(Ts[index], hand, PREGRASP_M)
-            if not isinstance(way, Reached):
+            if isinstance(way, str):
                 found.rejected[way] += 1
                 continue
+            joints_rad, is_turned = way
             kept.append(index)
             T_object_tcp = lines.Ts_object_tcp[index]
             taken.append(
                 Grasp(
                     object_id=object_id,
-                    T_object_tcp=turned(T_object_tcp[None])[0] if way.turned else T_object_tcp,
+                    T_object_tcp=turned(T_object_tcp[None])[0] if is_turned else T_object_tcp,
                     width_m=float(lines.widths_m[index]),
                     open_m=hand.open_m,
                     margin=float(margin[index]),
-                    joints_rad=way.joints_rad,
+                    joints_rad=joints_rad,
                     pregrasp_m=PREGRASP_M,
                 )
             )
@@ -379,31 +348,22 @@ class GraspSearcher:
                 break
         return tuple(taken)
 
-    def _remarks(self, object_id: str, hand: OpenHand) -> tuple[str, ...]:
+    def _remarks(self, object_id: str) -> tuple[str, ...]:
         scene = self.problem.scene
         remarks = [f"surface: {self.problem.shapes[object_id].source}"]
         if object_id not in scene.covariances:
             sigma_m = UNKNOWN_POSE_M
             remarks.append(f"nobody says how sure its pose is: {sigma_m * 1e3:.0f} mm assumed")
-        if hand.open_m < self.max_width_m:
-            remarks.append(
-                f"the hand opens to {hand.open_m * 1e3:.0f} mm only, to pass what is beside it"
-            )
-        if hand.closed_in:
-            remarks.append("the fingers' hulls fill the hand: they were not kept clear of it")
-        unseen = [name for name in scene.missing() if name != object_id]
-        if unseen:
-            remarks.append(f"not localised, so not kept clear of: {', '.join(unseen)}")
         return tuple(remarks)
 
-    def _none(self, object_id: str, rejected: Mapping[str, int], hand: OpenHand) -> NoPlanError:
+    def _none(self, object_id: str, rejected: Mapping[str, int]) -> NoPlanError:
         """Name what rejected the candidates that came furthest."""
         cause = [name for name in CAUSES if rejected.get(name)][-1:] or ["cone"]
         found = CAUSES[cause[0]]
         if cause[0] == "width":
-            found += f" ({self.max_width_m * 1e3:.0f} mm)"
+            found += f" ({self._hand.open_m * 1e3:.0f} mm)"
         if cause[0] == "palm":
-            found += f" ({hand.depth_m * 1e3:.0f} mm)"
+            found += f" ({self._hand.depth_m * 1e3:.0f} mm)"
         counted = ", ".join(f"{name} {rejected[name]}" for name in CAUSES if rejected.get(name))
         found += f" (rejected: {counted or 'nothing was found'})"
         hint = HINTS.get(cause[0], "Turn the object, or take another one.")
@@ -423,19 +383,3 @@ def in_tools(lines: Lines, points_m: Points) -> Float[np.ndarray, "3 num_grasps 
     found = turned_all.reshape(3, len(R), len(points_m))
     found -= np.einsum("nij,ni->jn", R, p)[..., None]
     return np.asarray(found)
-
-
-def _is_like(lines: Lines, index: int, kept: list[int], symmetric: bool) -> bool:
-    """Whether a grasp is near one that was taken; of a symmetric hand also turned half."""
-    Ts = lines.Ts_object_tcp
-    near = np.linalg.norm(Ts[kept, :3, 3] - Ts[index, :3, 3], axis=1) < SAME_M
-    if not near.any():
-        return False
-    R = Ts[np.array(kept)[near], :3, :3]
-    one = Ts[index, :3, :3]
-    hands = [one, one * np.array([-1.0, -1.0, 1.0])] if symmetric else [one]
-    for hand in hands:
-        cosine = (np.einsum("nij,ij->n", R, hand) - 1) / 2
-        if (cosine > np.cos(SAME_RAD)).any():
-            return True
-    return False

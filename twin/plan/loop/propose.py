@@ -1,10 +1,12 @@
 """The loop: propose, have it judged, steer, propose again; nothing of it looks at a clock."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Protocol, runtime_checkable
 
-from bridge.task.plan import Plan, Ranking, SteeredBy
+from bridge.task.plan import Plan
 from bridge.task.plan_request import Refusal
 from bridge.task.verdict import Verdict
 from twin.plan.loop.steer import Steer, steer_by
@@ -27,8 +29,8 @@ class Proposer(Protocol):
     """Makes plans for a problem."""
 
     def propose(
-        self, problem: Problem, *, plan_id: str, seed: int, count: int, steer: Steer | None
-    ) -> list[Candidate]:
+        self, problem: Problem, *, plan_id: str, seed: int, steer: Steer | None
+    ) -> Iterator[Candidate]:
         """Offer plans, the best first; the same arguments give the same plans."""
 
 
@@ -55,51 +57,28 @@ def choose(
 ) -> Candidate:
     """Return the candidate of a round: by rank, or steered by what was refused."""
     if not refused:
-        ranked = proposer.propose(problem, plan_id=plan_id, seed=seed, count=round_ + 1, steer=None)
+        offers = proposer.propose(problem, plan_id=plan_id, seed=seed, steer=None)
+        ranked = list(islice(offers, round_ + 1))
         if round_ >= len(ranked):
             raise NoPlanError(
                 f"there are {len(ranked)} candidates, and {round_} were tried. Ask for fewer "
                 "rounds, or begin from another start."
             )
-        return named(ranked[round_], problem, seed=seed)
+        return ranked[round_]
     steer = steer_by(refused, problem)
     known = [refusal.plan.tau for refusal in refused]
-
-    def fresh_of(steer: Steer | None, counts: Sequence[int]) -> Candidate | None:
-        """The first that was not refused; plans take time, so few are asked for at first."""
-        for count in counts:
-            try:
-                found = proposer.propose(
-                    problem, plan_id=plan_id, seed=seed, count=count, steer=steer
-                )
-            except NoPlanError:
-                return None
-            if fresh := next((each for each in found if each.plan.tau not in known), None):
+    for by, count in ((steer, most), (None, most + len(refused))):
+        with suppress(NoPlanError):
+            offers = proposer.propose(problem, plan_id=plan_id, seed=seed, steer=by)
+            fresh = next((one for one in islice(offers, count) if one.plan.tau not in known), None)
+            if fresh is not None and by is None:
+                remark = f"nothing else answers {steer.clause}: the next by rank"
+                return replace(fresh, remarks=(*fresh.remarks, remark))
+            if fresh is not None:
                 return fresh
-        return None
-
-    if fresh := fresh_of(steer, (1, most)):
-        return named(fresh, problem, seed=seed, steer=steer)
-    if fresh := fresh_of(None, (len(refused) + 1, most + len(refused))):
-        remark = f"nothing else answers {steer.clause}: the next by rank"
-        return named(replace(fresh, remarks=(*fresh.remarks, remark)), problem, seed=seed)
     raise NoPlanError(
         f"every candidate was refused, the last by {steer.clause}. Begin from another start."
     )
-
-
-def named(
-    candidate: Candidate, problem: Problem, *, seed: int, steer: Steer | None = None
-) -> Candidate:
-    """Write into a plan which candidate it is, what steered it and in which scene it was made."""
-    by = None if steer is None else SteeredBy(clause=steer.clause, bodies=steer.bodies)
-    plan = replace(
-        candidate.plan,
-        candidate=Ranking(rank=candidate.rank, cost=candidate.cost, seed=seed),
-        steered_by=by,
-        scene_hash=problem.scene.scene_hash,
-    )
-    return replace(candidate, plan=plan)
 
 
 @dataclass(frozen=True, kw_only=True)

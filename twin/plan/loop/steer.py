@@ -14,13 +14,10 @@ from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from twin.plan.problem import Grasp, Miss, Pose, Problem, Release
+from twin.plan.stage.solver import alike
 from twin.replay.config import ReplayConfig
 
 Change = Literal["grasp", "grasp_shift", "release", "path", "slower", "any"]
-ALIKE_M = 0.01
-ALIKE_RAD = np.radians(10.0)
-"""Two grasps or releases nearer than both are one."""
-
 MOST_MISS_M, MOST_MISS_RAD = 0.04, np.radians(30.0)
 """An object that ends farther from where it was let go fell, or was knocked over."""
 _SQUEEZED = (Cause.EXPLODED, Cause.SHAPE, Cause.PROBABILITY)
@@ -68,27 +65,21 @@ class Steer:
     def miss_with(self, grasp: Grasp) -> Miss | None:
         """The miss that was measured with a grasp; None: with this one none was."""
         newest = [tried for tried in self.refused if tried.object_id == grasp.object_id][-1:]
-        is_same = newest and alike(newest[0].T_object_tcp, grasp.T_object_tcp)
+        is_same = newest and alike(newest[0].T_object_tcp[None], grasp.T_object_tcp)[0]
         return self.miss if is_same else None
 
     def has_grasp_like(self, object_id: str, T_object_tcp: Pose) -> bool:
         """Whether a grasp was refused that is the same within 1 cm and 10 degrees."""
-        mine = [tried for tried in self.refused if tried.object_id == object_id]
-        return any(alike(tried.T_object_tcp, T_object_tcp) for tried in mine)
+        mine = [tried.T_object_tcp for tried in self.refused if tried.object_id == object_id]
+        return bool(mine) and bool(alike(np.array(mine), T_object_tcp).any())
 
     def has_end_like(self, release: Release) -> bool:
         """Whether a release was refused that leaves the object within 1 cm and 10 degrees of it."""
         mine = [
             tried.T_base_object for tried in self.refused if tried.object_id == release.object_id
         ]
-        return any(T is not None and alike(T, release.T_base_object) for T in mine)
-
-
-def alike(T_first: Pose, T_second: Pose) -> bool:
-    """Whether two poses are one within 1 cm and 10 degrees."""
-    near = float(np.linalg.norm(T_first[:3, 3] - T_second[:3, 3])) < ALIKE_M
-    turned_rad = float(se3.rotation_angle_rad(T_first[:3, :3].T @ T_second[:3, :3]))
-    return near and bool(turned_rad < ALIKE_RAD)
+        there = [T for T in mine if T is not None]
+        return bool(there) and bool(alike(np.array(there), release.T_base_object).any())
 
 
 def steer_by(refusals: Sequence[Refusal], problem: Problem) -> Steer:
@@ -128,7 +119,7 @@ def _miss_of(refusals: Sequence[Refusal], object_id: str | None) -> Miss | None:
                 found.append((tried.T_object_tcp, _measured(tried, refusal.verdict)))
     if not found or found[-1][1] is None:
         return None
-    same = [miss for T, miss in found if miss is not None and alike(T, found[-1][0])][-2:]
+    same = [miss for T, miss in found if miss is not None and alike(T[None], found[-1][0])[0]][-2:]
     shift_m = np.mean([miss.shift_m for miss in same], axis=0)
     return Miss(shift_m=shift_m, turn_rad=float(np.mean([miss.turn_rad for miss in same])))
 

@@ -1,11 +1,10 @@
 """Plan one movement: around what is in the way, made short, timed, and checked exactly."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.task.causes import Cause
@@ -30,8 +29,8 @@ _STRAIGHT_M, _STRAIGHT_RAD = 0.005, 0.05
 _JUMP = 6.0
 """A joint that moves more than so many times the median of its steps leaves its branch."""
 _LEAST_JUMP_RAD = 0.2
-_OTHERWISE = ((0.25, True), (1.0, False))
-"""Where chords are not free: share of the spacing, and whether corners are still rounded."""
+_LAWS = ((1.0, True), (0.25, True), (1.0, False))
+"""The first whose chords are free: share of the spacing, and whether corners are rounded."""
 
 
 RANGE_RAD = 1.0
@@ -41,6 +40,9 @@ CONTACT_M_S = 0.1
 ACCELERATION_RAD_S2 = 5.0
 """Limit of joints whose acceleration the robot file does not limit."""
 STEP_S = 0.02
+
+Way = TypeVar("Way")
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +67,10 @@ class NoPathError(TwinError):
     """There is no path, or none was found with the work that was allowed."""
 
     def __init__(
-        self, *, reason: str, bodies: tuple[str, ...] = (), detail: str = "", work: int = 0
+        self, *, reason: str, bodies: tuple[str, ...] = (), detail: str = "", lacking_m: float = 0.0
     ) -> None:
-        """Remember what is in the way."""
-        self.reason, self.bodies, self.detail, self.work = reason, bodies, detail, work
+        """Remember what is in the way, and how much farther apart it should have been."""
+        self.reason, self.bodies, self.detail, self.lacking_m = reason, bodies, detail, lacking_m
         self.leg = ""
         """Which movement of several it was; whoever plans several says so."""
         super().__init__(reason)
@@ -79,16 +81,6 @@ class NoPathError(TwinError):
         pair = f": {self.bodies[0]} and {self.bodies[1]}" if len(self.bodies) > 1 else ""
         more = f" ({self.detail})" if self.detail else ""
         return f"no path{leg}: {self.reason}{pair}{more}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class PathRefusal:
-    """Two bodies that come too near on a movement."""
-
-    bodies: tuple[str, str]
-    lacking_m: float
-    """How much farther apart they should have been."""
-    detail: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,26 +97,23 @@ class Mover:
 
     def around(self, start_rad: Joints, goals_rad: Postures) -> TimedPath:
         """Find a collision-free, short, timed movement to one of some postures."""
-        check_numbers(start_rad, goals_rad)
         config = self.config
         wider: dict[frozenset[str], float] = {}
-        work: dict[str, float] = {}
-        refusals: tuple[PathRefusal, ...] = ()
+        refusals: tuple[NoPathError, ...] = ()
         for turn in range(config.rounds):
             world = self._world(wider)
             _let_ends_be(world, np.vstack([start_rad[None], goals_rad]), wider)
-            knots = _searched(world, start_rad, goals_rad, config, turn, work, refusals)
+            knots = self._searched(world, start_rad, goals_rad, turn, refusals)
             # A margin grows with speed: what was refused is searched again wider, driven slower.
             slower = replace(config, speed_share=config.speed_share * 0.75**turn)
             path = timed_path(world, knots, slower)
             refusals = self.refused(path)
-            work["rounds"] = float(turn + 1)
             if not refusals:
-                return replace(path, work=work)
+                return path
             for refusal in refusals:
                 pair = frozenset(refusal.bodies)
                 wider[pair] = wider.get(pair, 0.0) + max(refusal.lacking_m, 0.0) + _WIDER_M
-        raise _refused(refusals[0], int(work["postures"]))
+        raise refusals[0]
 
     def straight(
         self, start_rad: Joints, T_base_goal: Pose, *, tool_m_s: float = CONTACT_M_S
@@ -134,12 +123,35 @@ class Mover:
         For the last centimetres, where contact is wanted: pairs that may touch are left to the
         exact check.
         """
-        check_numbers(start_rad, T_base_goal)
         knots = _straight_knots(self.problem.robot, start_rad, T_base_goal)
         path = timed_path(self._world({}), knots, self.config, tool_m_s=tool_m_s)
         if refusals := self.refused(path):
-            raise _refused(refusals[0])
-        return replace(path, work={"postures": float(len(knots))})
+            raise refusals[0]
+        return path
+
+    def _searched(
+        self,
+        world: World,
+        start_rad: Joints,
+        goals_rad: Postures,
+        turn: int,
+        refusals: tuple[NoPathError, ...],
+    ) -> Postures:
+        """One native search."""
+        outcome, pair, knots, _ = world.motion.find(
+            np.ascontiguousarray(start_rad, dtype=np.float64),
+            np.ascontiguousarray(goals_rad, dtype=np.float64),
+            self.config.seed + turn,
+            RANGE_RAD,
+            self.config.max_nodes,
+            self.config.max_postures,
+            SHORTCUTS,
+        )
+        if outcome:
+            bodies = world.names[pair] if pair >= 0 else ()
+            detail = f"after a refusal: {refusals[0].detail}" if refusals else ""
+            raise NoPathError(reason=REASONS[outcome], bodies=bodies, detail=detail)
+        return np.asarray(knots)
 
     def _world(self, wider_m: Mapping[frozenset[str], float]) -> World:
         """What the search keeps clear of, refused pairs farther."""
@@ -152,21 +164,21 @@ class Mover:
             wider_m=wider_m,
         )
 
-    def refused(self, path: TimedPath) -> tuple[PathRefusal, ...]:
+    def refused(self, path: TimedPath) -> tuple[NoPathError, ...]:
         """Return what the monitor's exact clearance, the last word, refuses of a movement."""
-        hulls, links = hulls_of(self.problem.robot), own_links(hulls_of(self.problem.robot))
+        hulls = hulls_of(self.problem.robot)
+        links = own_links(hulls)
         monitor = ClearanceMonitor(self.problem.scene, self._plan(), hulls, self.config.replay)
         poses = self._object_poses(path.joints_rad)
         stamps = np.round(path.times_s * 1e9).astype(np.int64)
-        refusals: list[PathRefusal] = []
+        refusals: list[NoPathError] = []
         for index, joints in enumerate(path.joints_rad):
             Ts = {name: rows[index] for name, rows in poses.items()}
             monitor.measure(int(stamps[index]), joints, self.width_m, Ts)
             if links.touch():
                 closest = hulls.self_distance()
                 told = f"{closest.links[0]} touches {closest.links[1]}"
-                lacking_m = -closest.distance_m
-                refusals.append(PathRefusal(bodies=closest.links, lacking_m=lacking_m, detail=told))
+                refusals.append(_refused(closest.links, told, -closest.distance_m))
                 break
         for failure in monitor.failures:
             one, other = failure.bodies
@@ -176,9 +188,7 @@ class Mover:
                 lacking_m = -MAX_CONTACT_DEPTH_M - least_m
             else:
                 lacking_m = monitor.lacking_m[failure.bodies]
-            refusals.append(
-                PathRefusal(bodies=(one, other), lacking_m=lacking_m, detail=failure.detail)
-            )
+            refusals.append(_refused(failure.bodies, failure.detail, lacking_m))
         return tuple(refusals)
 
     def _object_poses(self, joints_rad: Postures) -> dict[str, Poses]:
@@ -208,14 +218,19 @@ class Mover:
         )
 
 
-def _refused(refusal: PathRefusal, work: int = 0) -> NoPathError:
-    return NoPathError(reason="refused", bodies=refusal.bodies, detail=refusal.detail, work=work)
+def _refused(bodies: tuple[str, ...], detail: str, lacking_m: float) -> NoPathError:
+    return NoPathError(reason="refused", bodies=bodies, detail=detail, lacking_m=lacking_m)
 
 
-def check_numbers(*postures: Float[np.ndarray, "..."]) -> None:
-    """Refuse postures that are no numbers."""
-    if not all(np.isfinite(rows).all() for rows in postures):
-        raise NoPathError(reason="not a posture", detail="joints that are not finite")
+def first_free(ways: Iterable[Way], move: Callable[[Way], Found], nothing: str = "") -> Found:
+    """Move the first way that is free; where none is, say why the last one is not."""
+    failure = NoPathError(reason="unreachable", detail=nothing)
+    for way in ways:
+        try:
+            return move(way)
+        except NoPathError as error:
+            failure = error
+    raise failure
 
 
 def _let_ends_be(world: World, ends_rad: Postures, wider_m: Mapping[frozenset[str], float]) -> None:
@@ -228,36 +243,6 @@ def _let_ends_be(world: World, ends_rad: Postures, wider_m: Mapping[frozenset[st
             world.motion.set_limit(number, limit_m)
 
 
-def _searched(
-    world: World,
-    start_rad: Joints,
-    goals_rad: Postures,
-    config: PathConfig,
-    turn: int,
-    work: dict[str, float],
-    refusals: tuple[PathRefusal, ...],
-) -> Postures:
-    """One native search; adds its work."""
-    outcome, pair, _, knots, spent = world.motion.find(
-        np.ascontiguousarray(start_rad, dtype=np.float64),
-        np.ascontiguousarray(goals_rad, dtype=np.float64),
-        config.seed + turn,
-        RANGE_RAD,
-        config.max_nodes,
-        config.max_postures,
-        SHORTCUTS,
-    )
-    for name, value in spent.items():
-        work[name] = work.get(name, 0.0) + float(value)
-    if outcome:
-        bodies = world.names[pair] if pair >= 0 else ()
-        detail = f"after a refusal: {refusals[0].detail}" if refusals else ""
-        raise NoPathError(
-            reason=REASONS[outcome], bodies=bodies, detail=detail, work=int(work["postures"])
-        )
-    return np.asarray(knots)
-
-
 def timed_path(
     world: World, knots_rad: Postures, config: PathConfig, *, tool_m_s: float | None = None
 ) -> TimedPath:
@@ -266,19 +251,12 @@ def timed_path(
     wanted = [value for value in (limit_m_s, tool_m_s, config.tool_m_s) if value]
     rows = np.ascontiguousarray(knots_rad, dtype=np.float64)
     tool = min(wanted, default=0.0)
-
-    def law(share: float, *, rounding: bool) -> tuple[Any, ...]:
+    times, joints = np.zeros(len(rows)), rows
+    for share, rounding in _LAWS:
         step_s = share * STEP_S
-        found: tuple[Any, ...] = world.motion.time(
-            rows, speed, acceleration, tool, step_s, rounding
-        )
-        return found
-
-    times, joints, *_ = law(1.0, rounding=True)
-    for share, rounding in _OTHERWISE:
+        times, joints, *_ = world.motion.time(rows, speed, acceleration, tool, step_s, rounding)
         if world.motion.blocked(joints) < 0:
             break
-        times, joints, *_ = law(share, rounding=rounding)
     return TimedPath(times_s=times, joints_rad=joints)
 
 
@@ -330,23 +308,16 @@ def waypoints_of(
     robot: RobotModel, path: TimedPath, *, g: int, width_m: float, begin_s: float = 0.0
 ) -> tuple[Waypoint, ...]:
     """The movement as a plan's tau = {(p_t, q_t, g_t)} with its joints."""
+    q, p = se3.split(robot.Ts_base_tcp(path.joints_rad))
+    rows = zip(path.times_s.tolist(), p.tolist(), q.tolist(), path.joints_rad.tolist(), strict=True)
     return tuple(
-        waypoint(begin_s + t_s, robot.T_base_tcp(joints), joints, g=g, width_m=width_m)
-        for t_s, joints in zip(path.times_s.tolist(), path.joints_rad, strict=True)
-    )
-
-
-def waypoint(
-    t_s: float, T_base_tcp: Pose, joints_rad: Joints, *, g: int, width_m: float | None = None
-) -> Waypoint:
-    """One commanded instant."""
-    q, p = se3.split(T_base_tcp)
-    (w, i, j, k), (x, y, z) = q.tolist(), p.tolist()
-    return Waypoint(
-        t_ns=round(t_s * 1e9),
-        p_m=(x, y, z),
-        q_wxyz=(w, i, j, k),
-        g=g,
-        width_m=width_m,
-        joints_rad=tuple(joints_rad.tolist()),
+        Waypoint(
+            t_ns=round((begin_s + t_s) * 1e9),
+            p_m=(x, y, z),
+            q_wxyz=(w, i, j, k),
+            g=g,
+            width_m=width_m,
+            joints_rad=tuple(joints_rad),
+        )
+        for t_s, (x, y, z), (w, i, j, k), joints_rad in rows
     )

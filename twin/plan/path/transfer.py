@@ -2,17 +2,16 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bridge.geometry import se3
 from twin.plan.grasp.reach import nearest_solutions
-from twin.plan.path.planner import Mover, NoPathError, PathConfig, reversed_path
+from twin.plan.path.planner import Mover, NoPathError, PathConfig, first_free, reversed_path
 from twin.plan.path.world import Carried
 from twin.plan.problem import Grasp, Joints, Pose, Problem, Release, TimedPath
 from twin.replay.clearance.bodies import GRIPPER
-from twin.replay.clearance.monitor import Allowed
 
 LEGS = ("around", "approach", "lift", "carry", "lower", "leave")
 LIFT_M = 0.06
@@ -35,101 +34,68 @@ class Leg:
     """Between the pads."""
 
 
-def plan_transfer(
-    problem: Problem,
-    grasp: Grasp,
-    release: Release,
-    start_rad: Joints,
-    config: PathConfig,
-    *,
-    lift_m: float = LIFT_M,
-    straight: bool = False,
-    tool_m_s: Mapping[str, float] | None = None,
-) -> tuple[Leg, ...]:
-    """Plan all movements from where the arm stands to where it has let go and left.
-
-    Args:
-        lift_m: How far the object is lifted, and let down, straight; less where that is not free.
-        straight: Carry it along a straight line of the tool, turned evenly; else around.
-        tool_m_s: How fast the tool may be on some legs.
-    """
-    transfer = _Transfer(
-        problem=problem,
-        grasp=grasp,
-        release=release,
-        config=config,
-        lift_m=lift_m,
-        straight=straight,
-        tool_m_s=tool_m_s or {},
-    )
-    taken = transfer.take(start_rad)
-    lifted_rad = taken[-1].path.joints_rad[-1]
-    failure = NoPathError(reason="unreachable", detail="no joints reach the release pose")
-    for joints_rad in nearest_solutions(problem.robot, release.T_base_tcp, lifted_rad):
-        try:
-            return (*taken, *transfer.put(lifted_rad, joints_rad))
-        except NoPathError as error:
-            failure = error
-    raise failure
-
-
 @dataclass(frozen=True, kw_only=True)
-class _Transfer:
+class PickAndPlace:
     """One object from where it is to where it is let go."""
 
     problem: Problem
     grasp: Grasp
     release: Release
     config: PathConfig
-    lift_m: float
-    straight: bool
-    tool_m_s: Mapping[str, float]
+    lift_m: float = LIFT_M
+    """How far the object is lifted, and let down, straight; less where that is not free."""
+    straight: bool = False
+    """Carry it along a straight line of the tool, turned evenly; else around."""
+    tool_m_s: Mapping[str, float] = field(default_factory=dict)
+    """How fast the tool may be on some legs."""
 
-    def _open(self, leg: str, verb: str = "") -> Mover:
-        """What an open hand moves with on a leg; it may touch what a verb's stages let touch."""
-        return self._mover(leg, self.grasp.open_m, self._touching(verb) if verb else frozenset())
+    def legs(self, start_rad: Joints) -> tuple[Leg, ...]:
+        """Plan all movements from where the arm stands to where it has let go and left."""
+        taken = self._take(start_rad)
+        lifted_rad = taken[-1].path.joints_rad[-1]
+        ends = nearest_solutions(self.problem.robot, self.release.T_base_tcp, lifted_rad)
+        nothing = "no joints reach the release pose"
+        return first_free(ends, lambda rad: (*taken, *self._put(lifted_rad, rad)), nothing)
 
-    def _holding(self, leg: str, verb: str = "") -> Mover:
-        """What the hand moves with that holds the object."""
-        held = Carried(
-            object_id=self.grasp.object_id, T_tcp_object=se3.invert(self.grasp.T_object_tcp)
-        )
-        allowed = self._touching(verb) if verb else self._grip
-        return self._mover(leg, self.grasp.width_m, allowed, held)
-
-    def _mover(
-        self, leg: str, width_m: float, allowed: Allowed, held: Carried | None = None
-    ) -> Mover:
-        config = replace(self.config, tool_m_s=self.tool_m_s.get(leg, 0.0))
+    def _mover(self, leg: str, verb: str = "", *, holding: bool = False) -> Mover:
+        """What moves on a leg, the hand open or holding; it may touch what a verb's stages let."""
+        grasp = self.grasp
+        grip = {frozenset((GRIPPER, grasp.object_id))} if verb or holding else set()
+        held = Carried(object_id=grasp.object_id, T_tcp_object=se3.invert(grasp.T_object_tcp))
         return Mover(
-            problem=self.problem, config=config, width_m=width_m, carried=held, allowed=allowed
+            problem=self.problem,
+            config=replace(self.config, tool_m_s=self.tool_m_s.get(leg, 0.0)),
+            width_m=grasp.width_m if holding else grasp.open_m,
+            carried=held if holding else None,
+            allowed=self.problem.contacts_of(verb, grasp.object_id) | grip,
         )
 
-    def take(self, start_rad: Joints) -> tuple[Leg, Leg, Leg]:
+    def _take(self, start_rad: Joints) -> tuple[Leg, Leg, Leg]:
         """From where the arm stands to the lifted object."""
         grasp = self.grasp
         with _named("approach"):
             T_base_tcp = self.problem.robot.T_base_tcp(grasp.joints_rad)
             back = T_base_tcp @ _along_z(-grasp.pregrasp_m)
-            out = self._open("approach", "grasp").straight(grasp.joints_rad, back)
+            out = self._mover("approach", "grasp").straight(grasp.joints_rad, back)
         with _named("around"):
-            around = self._open("around").around(start_rad, out.joints_rad[-1:])
+            around = self._mover("around").around(start_rad, out.joints_rad[-1:])
         with _named("lift"):
-            lift = self._straight_up(grasp.joints_rad, self._holding("lift", "grasp"))
+            mover = self._mover("lift", "grasp", holding=True)
+            lift = self._straight_up(grasp.joints_rad, mover)
         return (
             Leg(name="around", path=around, g=0, width_m=grasp.open_m),
             Leg(name="approach", path=reversed_path(out), g=0, width_m=grasp.open_m),
             Leg(name="lift", path=lift, g=1, width_m=grasp.width_m),
         )
 
-    def put(self, lifted_rad: Joints, joints_rad: Joints) -> tuple[Leg, Leg, Leg]:
+    def _put(self, lifted_rad: Joints, joints_rad: Joints) -> tuple[Leg, Leg, Leg]:
         """From the lifted object to where the arm has left, let go with these joints."""
         grasp = self.grasp
         with _named("lower"):
-            rise = self._straight_up(joints_rad, self._holding("lower", "release"))
+            rise = self._straight_up(joints_rad, self._mover("lower", "release", holding=True))
         with _named("carry"):
             over_rad = rise.joints_rad[-1]
-            mover = self._holding("carry")
+            mover = self._mover("carry", holding=True)
             if self.straight:
                 carry = self._carry_straight(mover, lifted_rad, over_rad)
             else:
@@ -142,25 +108,11 @@ class _Transfer:
             Leg(name="leave", path=leave, g=0, width_m=grasp.open_m),
         )
 
-    @property
-    def _grip(self) -> Allowed:
-        return frozenset({frozenset((GRIPPER, self.grasp.object_id))})
-
-    def _touching(self, verb: str) -> Allowed:
-        return self.problem.contacts_of(verb, self.grasp.object_id) | self._grip
-
     def _straight_up(self, joints_rad: Joints, mover: Mover) -> TimedPath:
         """Lift as far as is free and within reach, at least two centimetres."""
-        rise_m = self.lift_m
-        while True:
-            T = self.problem.robot.T_base_tcp(joints_rad)
-            T[2, 3] += rise_m
-            try:
-                return mover.straight(joints_rad, T)
-            except NoPathError:
-                if rise_m / 2 < _LEAST_LIFT_M:
-                    raise
-            rise_m /= 2
+        T = self.problem.robot.T_base_tcp(joints_rad)
+        rises = [rise_m for k in range(3) if (rise_m := self.lift_m / 2**k) >= _LEAST_LIFT_M]
+        return first_free(rises, lambda rise_m: mover.straight(joints_rad, _along_z(rise_m) @ T))
 
     def _carry_straight(self, mover: Mover, start_rad: Joints, goal_rad: Joints) -> TimedPath:
         """Carry along a straight line that ends on the branch on which the object is let down."""
@@ -173,18 +125,21 @@ class _Transfer:
 
     def _leave(self, joints_rad: Joints) -> TimedPath:
         """Straight back; the farther the better, for next to a rim nothing else may be planned."""
-        scene, release = self.problem.scene, self.release
-        poses = {**scene.Ts_base_object, self.grasp.object_id: release.T_base_object}
-        placed = replace(self.problem, scene=replace(scene, Ts_base_object=poses))
-        mover = replace(self._open("leave", "release"), problem=placed)
-        failure = NoPathError(reason="unreachable")
-        for more_m in _LEAVE_MORE_M:
-            away = release.T_base_tcp @ _along_z(-self.grasp.pregrasp_m - more_m)
-            try:
-                return mover.straight(joints_rad, away)
-            except NoPathError as error:
-                failure = error
-        raise failure
+        release = self.release
+        placed = left_with(self.problem, release.object_id, release.T_base_object)
+        mover = replace(self._mover("leave", "release"), problem=placed)
+        ways = [release.T_base_tcp @ _along_z(-self.grasp.pregrasp_m - m) for m in _LEAVE_MORE_M]
+        return first_free(ways, lambda T: mover.straight(joints_rad, T))
+
+
+def left_with(
+    problem: Problem, key: str, T_base_object: Pose, start_rad: Joints | None = None
+) -> Problem:
+    """The problem after an object was moved; with where the arm then stands."""
+    scene = problem.scene
+    start = scene.start_rad if start_rad is None else start_rad
+    Ts = {**scene.Ts_base_object, key: T_base_object}
+    return replace(problem, scene=replace(scene, Ts_base_object=Ts, start_rad=start))
 
 
 @contextmanager

@@ -17,7 +17,6 @@ from twin.plan.problem import (
     Grasp,
     Miss,
     NoPlanError,
-    Numbers,
     Pose,
     Poses,
     Problem,
@@ -126,7 +125,7 @@ class ReleaseSearch:
         self._width_m = min(max(grasp.open_m, grasp.width_m + OPEN_MORE_M), gripper.max_width_m)
         self._points_m = surface_points(problem, grasp.object_id)
         self._outline_m = self._points_m[ConvexHull(self._points_m).vertices]
-        self._hand_m = hand_points(hulls, self._width_m, HAND_POINTS)
+        self._hand_m = hand_points(problem.robot, self._width_m, HAND_POINTS)
         self._obstacles = obstacles_of(problem, hulls, {grasp.object_id})
         self._pairs = problem.contacts_of("release", grasp.object_id)
         self._T_tcp_object = se3.invert(grasp.T_object_tcp)
@@ -243,19 +242,15 @@ class ReleaseSearch:
             free, J = stage.judged(drawn)
             Ts.append(drawn[free])
             costs.append(J[free])
-        return self._releases(np.concatenate(Ts), np.concatenate(costs))
-
-    def _releases(self, Ts: Poses, costs: Numbers) -> tuple[Release, ...]:
-        order = np.argsort(costs, kind="stable")
-        chosen = distinct(Ts, order, MAX_RELEASES)
+        every, J = np.concatenate(Ts), np.concatenate(costs)
         return tuple(
             Release(
                 object_id=self._grasp.object_id,
-                T_base_object=Ts[index] @ self._T_tcp_object,
-                T_base_tcp=Ts[index],
-                cost=float(costs[index]),
+                T_base_object=every[index] @ self._T_tcp_object,
+                T_base_tcp=every[index],
+                cost=float(J[index]),
             )
-            for index in chosen
+            for index in distinct(every, np.argsort(J, kind="stable"), MAX_RELEASES)
         )
 
     def _nothing(self, stage: StageProblem, nearest: StageState) -> NoPlanError:

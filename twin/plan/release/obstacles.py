@@ -5,11 +5,13 @@ from collections.abc import Collection
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from bridge.geometry import se3
 from twin.plan.constrain.distances import Away, boxes_clearance, grid_clearance, scene_grid
+from twin.plan.grasp.open_hand import open_hand
+from twin.plan.grasp.search import PREGRASP_M
 from twin.plan.problem import Points, Problem
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.robot.collision import RobotHulls
+from twin.robot.model import RobotModel
 
 TABLE_SIDE_M = 20.0
 
@@ -28,17 +30,10 @@ def obstacles_of(problem: Problem, hulls: RobotHulls, carried: Collection[str]) 
     return found
 
 
-def hand_points(hulls: RobotHulls, width_m: float, num_points: int) -> Points:
+def hand_points(robot: RobotModel, width_m: float, num_points: int) -> Points:
     """Points of the hand's hulls in the tool's frame, with this width between the pads [m]."""
-    robot = hulls.robot
-    hulls.place(robot.home_rad, width_m)
-    T_tcp_base = se3.invert(robot.T_base_link(robot.record.tool_frame, robot.home_rad, width_m))
-    hulls.place(robot.home_rad, width_m)
-    found = []
-    for hull, R, t in zip(hulls.hulls, hulls.rotations, hulls.translations, strict=True):
-        if hull.link in robot.record.gripper.links:
-            found.append(se3.apply(T_tcp_base, _dense(hull.points_m) @ R.T + t))
-    return spread_points(np.concatenate(found), num_points)
+    pieces = open_hand(robot, width_m, PREGRASP_M).pieces
+    return spread_points(np.concatenate([_dense(each.corners_m) for each in pieces]), num_points)
 
 
 def _dense(corners_m: Points) -> Points:

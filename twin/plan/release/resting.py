@@ -48,23 +48,18 @@ def target_of(problem: Problem, object_id: str) -> Target:
     """Find where the success predicates want an object."""
     scene = problem.scene
     goal = scene.task.goal_of(object_id)
-    if goal is None and (mark := scene.task.mark_of(object_id)) is not None:
+    if goal is None:
+        mark = scene.task.mark_of(object_id)
+        if mark is None:
+            message = f"no success predicate of task {scene.task.name} says where {object_id} goes."
+            raise NoPlanError(message, cause="nowhere_said")
         T = np.eye(4)
         T[:3, 3] = (*mark, scene.table_height_m)
         return Target(
             relation="at", name="table", T_base=T, half_m=(0.0, 0.0), rim_m=0.0, sigma_m=0.0
         )
-    if goal is None:
-        message = (
-            f"no success predicate of task {scene.task.name} says what {object_id} is to be "
-            "inside or on: give the final state's constraints and where to begin."
-        )
-        raise NoPlanError(message, cause="nowhere_said")
     relation, name = goal
-    T_found = scene.Ts_base_object.get(name)
-    if T_found is None:
-        message = f"{name} was not localised: nobody knows where {object_id} is to be put."
-        raise NoPlanError(message, cause="not_localised")
+    T_found = scene.Ts_base_object[name]
     model = problem.model(name)
     inside = relation == "inside"
     x, y, _ = model.inner_m if inside else model.size_m
@@ -154,10 +149,7 @@ def resting_poses(
     problem: Problem, grasp: Grasp, target: Target, *, drop_m: float, most_tilted_rad: float
 ) -> list[Pose]:
     """Poses ``T_base_object`` a little above where the object would lie, in the middle."""
-    T_now = problem.scene.Ts_base_object.get(grasp.object_id)
-    if T_now is None:
-        message = f"{grasp.object_id} was not localised: nobody knows which way up it is."
-        raise NoPlanError(message, cause="not_localised")
+    T_now = problem.scene.Ts_base_object[grasp.object_id]
     points = surface_points(problem, grasp.object_id)
     found = []
     model = problem.model(grasp.object_id)

@@ -150,6 +150,12 @@ def _followed(problem: StageProblem, T: Pose, steps: int) -> Pose:
     return np.asarray(at(found.x[None])[0])
 
 
+def alike(Ts: Poses, T: Pose) -> Flags:
+    """Which poses are one with another, within 1 cm and 10 degrees."""
+    near = np.linalg.norm(Ts[:, :3, 3] - T[:3, 3], axis=1) <= LENGTH_M
+    return np.asarray(near & (se3.rotation_angle_rad(T[:3, :3].T @ Ts[:, :3, :3]) <= ANGLE_RAD))
+
+
 def distinct(Ts: Poses, order: np.ndarray, most: int) -> list[int]:
     """Go through poses in an order and keep those that differ from all that are kept."""
     kept: list[int] = []
@@ -157,9 +163,7 @@ def distinct(Ts: Poses, order: np.ndarray, most: int) -> list[int]:
     while len(rest) and len(kept) < most:
         first = int(rest[0])
         kept.append(first)
-        near = np.linalg.norm(Ts[rest, :3, 3] - Ts[first, :3, 3], axis=1) <= LENGTH_M
-        angle = se3.rotation_angle_rad(Ts[first, :3, :3].T @ Ts[rest, :3, :3])
-        near &= angle <= ANGLE_RAD
+        near = alike(Ts[rest], Ts[first])
         near[0] = True
         rest = rest[~near]
     return kept

@@ -49,13 +49,10 @@ def test_the_ur5s_hand_has_its_own_measures() -> None:
     measured = (hand.tip_m, hand.depth_m, hand.pad_half_m)
     np.testing.assert_allclose(measured, (0.01, 0.06, 0.01), atol=1e-9)
     assert hand.symmetric
-    assert not hand.closed_in
 
 
-def test_fingers_whose_hulls_fill_the_hand_are_known() -> None:
-    hand = open_hand(robot_of_name("z1"), 0.07, APPROACH_M)
-    assert hand.closed_in
-    assert not hand.symmetric
+def test_a_hand_whose_sides_differ_is_not_the_same_turned_half() -> None:
+    assert not open_hand(robot_of_name("z1"), 0.07, APPROACH_M).symmetric
 
 
 def test_an_arm_without_fingers_has_none() -> None:

@@ -30,7 +30,8 @@ def scanned_duck() -> Shape:
 
 def test_straight_through_a_box_is_as_long_as_its_side() -> None:
     surface = SampledSurface(box())
-    points, normals = surface.samples(200, 0)
+    points, triangles = surface.points(200, 0)
+    normals = surface.normals[triangles]
     pairs = pairs_along(surface, points, normals, -normals)
     along = np.abs(pairs.axes).argmax(axis=1)
     assert len(pairs.widths_m) == 200
@@ -83,8 +84,9 @@ def test_a_hint_beside_the_object_adds_nothing(hint: tuple[float, float, float])
 
 def test_normals_of_a_scan_are_those_of_the_thing() -> None:
     shape = scanned_duck()
-    points, rough = SampledSurface(Shape(**{**vars(shape), "error_m": 0.0})).samples(400, 0)
-    _, averaged = SampledSurface(shape).samples(400, 0)
+    points, triangles = SampledSurface(shape).points(400, 0)
+    exact = Shape(**{**vars(shape), "error_m": 0.0})
+    rough, averaged = (SampledSurface(each).normals[triangles] for each in (exact, shape))
     toy = toy_mesh("duck", (0.07, 0.05, 0.06))
     step = 1e-4
     gradient = np.stack(

@@ -23,7 +23,7 @@ def timed(pairs: Pairs, rows: np.ndarray, *, tool: float = 0.0, rounding: bool =
 def knots_of(pairs: Pairs, index: int) -> np.ndarray:
     return pairs.world.motion.find(
         pairs.starts[index], pairs.goals[index][None], 3, 1.0, 5000, 150_000, 60
-    )[3]
+    )[2]
 
 
 @pytest.mark.parametrize("length_rad", [0.05, 0.3, 1.4])

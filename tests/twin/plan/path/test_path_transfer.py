@@ -9,7 +9,7 @@ from path_scene import Pairs, at, joints_at, tool_down
 from bridge.geometry import se3
 from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.path import planner
-from twin.plan.path.transfer import plan_transfer
+from twin.plan.path.transfer import Leg, PickAndPlace
 from twin.plan.problem import Grasp, Problem, Release
 
 CONFIG = planner.PathConfig()
@@ -31,6 +31,11 @@ def release_of(grasp: Grasp, T_base_object: np.ndarray) -> Release:
         object_id="cube", T_base_object=T_base_object, cost=0.0,
         T_base_tcp=T_base_object @ grasp.T_object_tcp,
     )  # fmt: skip
+
+
+def planned(problem: Problem, grasp: Grasp, release: Release) -> tuple[Leg, ...]:
+    move = PickAndPlace(problem=problem, grasp=grasp, release=release, config=CONFIG)
+    return move.legs(problem.robot.home_rad)
 
 
 def test_a_straight_line_is_straight_on_one_branch_and_slow(pairs: Pairs) -> None:
@@ -71,7 +76,7 @@ def test_a_cube_is_taken_into_the_box_around_what_stands_between(pairs: Pairs) -
     problem, robot = pairs.problem, pairs.problem.robot
     grasp = grasp_of(problem)
     release = release_of(grasp, at(0.5, 0.25, 0.027, 0.1))
-    legs = plan_transfer(problem, grasp, release, robot.home_rad, CONFIG)
+    legs = planned(problem, grasp, release)
     assert [leg.name for leg in legs] == ["around", "approach", "lift", "carry", "lower", "leave"]
     assert [leg.g for leg in legs] == [0, 0, 1, 1, 1, 0]
     assert np.array_equal(legs[0].path.joints_rad[0], robot.home_rad)
@@ -88,10 +93,10 @@ def test_the_movement_that_does_not_exist_is_named(pairs: Pairs) -> None:
     grasp = grasp_of(problem)
     beyond = release_of(grasp, at(1.6, 0.2, 0.03))
     with pytest.raises(planner.NoPathError, match="unreachable"):
-        plan_transfer(problem, grasp, beyond, problem.robot.home_rad, CONFIG)
+        planned(problem, grasp, beyond)
     in_wall = release_of(grasp, at(0.42, 0.05, 0.03))
     with pytest.raises(planner.NoPathError, match="for 'lower'") as caught:
-        plan_transfer(problem, grasp, in_wall, problem.robot.home_rad, CONFIG)
+        planned(problem, grasp, in_wall)
     assert caught.value.leg == "lower"
 
 

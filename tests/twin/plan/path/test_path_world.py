@@ -11,7 +11,7 @@ from twin.plan.path._motion import Motion
 
 from bridge.robots.robot import read_robot
 from bridge.task.plan import Plan
-from twin.plan.path.world import BOX, Carried, build_world, covering_spheres
+from twin.plan.path.world import BOX, Carried, build_world
 from twin.plan.problem import Problem
 from twin.replay.clearance.bodies import SCENE
 from twin.replay.clearance.monitor import ClearanceMonitor
@@ -74,19 +74,6 @@ def test_poses_are_pinocchios_and_distances_coals_for_every_arm(name: str) -> No
                 assert min(spheres[names]) <= min(distances) + 1e-6
 
 
-def test_spheres_hold_every_point_of_what_they_cover() -> None:
-    rng = np.random.default_rng(2)
-    for count in (1, 4, 16):
-        corners = rng.normal(size=(30, 3)) * [0.3, 0.1, 0.05]
-        spheres = covering_spheres(corners, count)
-        assert len(spheres) == count
-        weights = rng.dirichlet(np.full(30, 0.1), size=3000)
-        points = weights @ corners
-        away = np.linalg.norm(points[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]
-        assert away.min(axis=1).max() <= 1e-9
-    assert covering_spheres(corners, 16)[:, 3].max() < covering_spheres(corners, 4)[:, 3].max()
-
-
 def test_a_way_that_is_called_free_is_free_by_coal_all_along(pairs: Pairs) -> None:
     problem, world = pairs.problem, pairs.world
     hulls = hulls_of(problem.robot)
@@ -117,9 +104,8 @@ def slider(*, axis: tuple[float, float, float], slides: bool) -> Motion:
         np.array([0.3, 0.0, 0.0]),
     )  # fmt: skip
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.01
-    spheres = covering_spheres(corners)
     shift = np.array([0.3, 0.0, 0.0])
-    motion.add_body(1, corners + shift, spheres + np.append(shift, 0.0), 0.01, 0.0, 0, 0)
+    motion.add_body(1, corners + shift, 0.0, 0, 0)
     return motion
 
 
@@ -197,7 +183,7 @@ def test_what_only_a_scenes_grid_shows_is_kept_away_from(pairs: Pairs) -> None:
     assert start is not None
     assert goal is not None
     assert world.motion.blocked(np.stack([start, goal])) == 0
-    outcome, _, _, knots, _ = world.motion.find(start, goal[None], 0, 1.0, 5000, 150_000, 60)
+    outcome, _, knots, _ = world.motion.find(start, goal[None], 0, 1.0, 5000, 150_000, 60)
     assert outcome == 0
     monitor = ClearanceMonitor(problem.scene, empty_plan(problem), hulls, ReplayConfig())
     for index, joints in enumerate(dense(knots)):

@@ -47,14 +47,11 @@ nb::ndarray<nb::numpy, double> array_of(const std::vector<double>& values, std::
     return {kept->data(), {kept->size() / columns, columns}, owner};
 }
 
-// Up to the next multiple of the kernels' lanes.
+// Up to the next multiple of kLanes.
 std::size_t filled(std::size_t count) {
     constexpr std::size_t kEach = kLanes;
     return (count + kEach - 1) / kEach * kEach;
 }
-
-// Radius of what fills up: as if it were a kilometre away.
-constexpr float kNowhere = -1e3F;
 
 class Motion {
 public:
@@ -80,12 +77,10 @@ public:
         world_.tool = into(static_cast<int>(n), {tool.data()[0], tool.data()[1], tool.data()[2]});
     }
 
-    void add_body(int joint, const Matrix& corners, const Matrix& spheres, double excess,
-                  double cover, std::int32_t root_begin, std::int32_t root_end) {
+    void add_body(int joint, const Matrix& corners, double cover, std::int32_t root_begin,
+                  std::int32_t root_end) {
         require(joint >= 0 && joint <= world_.num_joints(), "a body's joint is not there");
-        require(corners.shape(1) == 3 && spheres.shape(1) == 4 && corners.shape(0) > 0 &&
-                    spheres.shape(0) > 0,
-                "corners have three columns and spheres four");
+        require(corners.shape(1) == 3 && corners.shape(0) > 0, "corners have three columns");
         Body body;
         body.joint = joint;
         Vec low{1e9, 1e9, 1e9}, high{-1e9, -1e9, -1e9};
@@ -104,16 +99,6 @@ public:
             body.corner_y.push_back(static_cast<float>(p.y));
             body.corner_z.push_back(static_cast<float>(p.z));
         }
-        for (std::size_t i = 0; i < filled(spheres.shape(0)); ++i) {
-            const bool real = i < spheres.shape(0);
-            const double* row = spheres.data() + 4 * (real ? i : 0);
-            const Vec p = into(joint, {row[0], row[1], row[2]});
-            body.sphere_x.push_back(static_cast<float>(p.x));
-            body.sphere_y.push_back(static_cast<float>(p.y));
-            body.sphere_z.push_back(static_cast<float>(p.z));
-            body.sphere_r.push_back(real ? static_cast<float>(row[3]) : kNowhere);
-        }
-        body.excess = excess;
         body.cover = cover;
         body.root_begin = root_begin;
         body.root_end = root_end;
@@ -146,12 +131,6 @@ public:
         Box box;
         box.pose = pose_of(T.data());
         box.half = {half.data()[0], half.data()[1], half.data()[2]};
-        for (int i = 0; i < 9; ++i) box.R[i] = static_cast<float>(box.pose.R[i]);
-        const double place[3] = {box.pose.t.x, box.pose.t.y, box.pose.t.z};
-        for (int i = 0; i < 3; ++i) {
-            box.t[i] = static_cast<float>(place[i]);
-            box.size[i] = static_cast<float>(half.data()[i]);
-        }
         world_.boxes.push_back(box);
     }
 
@@ -205,8 +184,7 @@ public:
         require(pair >= 0 && pair < static_cast<std::int32_t>(world_.pairs.size()), "no such pair");
         world_.place(q.data());
         const Separation found = world_.hulls(pair);
-        const Separation spheres = world_.spheres(pair);
-        return nb::make_tuple(found.least, found.most, spheres.least);
+        return nb::make_tuple(found.least, found.most, world_.sphere_bound(pair));
     }
 
     nb::ndarray<nb::numpy, double> tool(const Doubles& q) {
@@ -224,18 +202,13 @@ public:
         budget.postures = postures;
         budget.shortcuts = shortcuts;
         Found found;
-        world_.counts = {};
         {
             const nb::gil_scoped_release alone;
             found = search(world_, start.data(), goals.data(), static_cast<std::int32_t>(goals.shape(0)),
                            seed, range, budget);
         }
-        nb::dict work = spent();
-        work["nodes"] = found.nodes;
-        work["search_postures"] = found.search_postures;
-        work["shortcuts"] = found.shortened;
-        return nb::make_tuple(static_cast<int>(found.outcome), found.pair, found.goal,
-                              array_of(found.path, world_.joints.size()), work);
+        return nb::make_tuple(static_cast<int>(found.outcome), found.pair,
+                              array_of(found.path, world_.joints.size()), world_.postures);
     }
 
     nb::tuple time(const Matrix& path, const Doubles& speed, const Doubles& acceleration,
@@ -253,17 +226,8 @@ public:
             const std::vector<double> rows(path.data(), path.data() + path.size());
             timed = time_path(world_, rows, limits, step_s, round);
         }
-        return nb::make_tuple(array_of(timed.times, 0), array_of(timed.rows, n), timed.corners,
-                              timed.rounded, array_of(timed.curve_at, 0), array_of(timed.curve, n));
-    }
-
-    nb::dict spent() const {
-        nb::dict work;
-        work["postures"] = world_.counts.postures;
-        work["bounds"] = world_.counts.bounds;
-        work["exact"] = world_.counts.exact;
-        work["ways"] = world_.counts.ways;
-        return work;
+        return nb::make_tuple(array_of(timed.times, 0), array_of(timed.rows, n),
+                              array_of(timed.curve_at, 0), array_of(timed.curve, n));
     }
 
 private:
@@ -313,8 +277,8 @@ NB_MODULE(_motion, module) {  // NOLINT(performance-unnecessary-value-param): na
         .def(nb::init<const Frames&, const Matrix&, const Flags&, const Doubles&, const Doubles&,
                       const Doubles&>(),
              "placements"_a, "axes"_a, "slides"_a, "lower"_a, "upper"_a, "tool"_a)
-        .def("add_body", &Motion::add_body, "joint"_a, "corners"_a, "spheres"_a, "excess"_a,
-             "cover"_a, "root_begin"_a, "root_end"_a)
+        .def("add_body", &Motion::add_body, "joint"_a, "corners"_a, "cover"_a,
+             "root_begin"_a, "root_end"_a)
         .def("set_grid", &Motion::set_grid, "values"_a, "origin"_a, "voxel"_a, "points"_a, "radii"_a,
              "children"_a)
         .def("add_box", &Motion::add_box, "T"_a, "half"_a)
@@ -324,11 +288,10 @@ NB_MODULE(_motion, module) {  // NOLINT(performance-unnecessary-value-param): na
         .def("set_limit", &Motion::set_limit, "pair"_a, "limit"_a)
         .def("touching", &Motion::touching, "q"_a, "The first pair too near at a posture, or -1.")
         .def("blocked", &Motion::blocked, "path"_a, "The first leg of a path that is not free, or -1.")
-        .def("distance", &Motion::distance, "q"_a, "pair"_a, "Least, most, and what spheres say.")
+        .def("distance", &Motion::distance, "q"_a, "pair"_a, "Least, most, and what the spheres around say.")
         .def("tool", &Motion::tool, "q"_a)
         .def("find", &Motion::find, "start"_a, "goals"_a, "seed"_a, "range"_a, "nodes"_a,
              "postures"_a, "shortcuts"_a)
         .def("time", &Motion::time, "path"_a, "speed"_a, "acceleration"_a, "tool_speed"_a,
-             "step_s"_a, "round"_a)
-        .def("spent", &Motion::spent);
+             "step_s"_a, "round"_a);
 }

@@ -82,13 +82,9 @@ public:
           budget_(budget) {}
 
     Found run() {
-        const std::int64_t before = world_.counts.postures;
-        spent_from_ = before;
+        world_.postures = 0;
         if (ends_free()) {
             connect();
-            found_.nodes = static_cast<std::int64_t>(trees_[0].parents.size() +
-                                                     trees_[1].parents.size());
-            found_.search_postures = world_.counts.postures - before;
             if (found_.outcome == Outcome::kFound) shorten();
         }
         return found_;
@@ -104,7 +100,7 @@ private:
     }
 
     bool spent() const {
-        return world_.counts.postures - spent_from_ >= budget_.postures ||
+        return world_.postures >= budget_.postures ||
                static_cast<std::int64_t>(trees_[0].parents.size() + trees_[1].parents.size()) >=
                    budget_.nodes;
     }
@@ -134,7 +130,6 @@ private:
                 continue;
             }
             trees_[1].add(goal, n_, -1);
-            goal_of_root_.push_back(g);
         }
         if (trees_[1].parents.empty()) return false;
         found_.outcome = Outcome::kBudget;
@@ -147,7 +142,8 @@ private:
     }
 
     void connect() {
-        for (std::size_t root = 0; root < goal_of_root_.size(); ++root)
+        // The goals are still all that the second tree has.
+        for (std::size_t root = 0; root < trees_[1].parents.size(); ++root)
             if (free(start_, trees_[1].row(static_cast<std::int32_t>(root), n_))) {
                 finish(0, static_cast<std::int32_t>(root));
                 return;
@@ -197,13 +193,10 @@ private:
         for (std::int32_t i = first; i >= 0; i = trees_[0].parents[static_cast<std::size_t>(i)])
             rows.push_back(trees_[0].row(i, n_));
         std::reverse(rows.begin(), rows.end());
-        std::int32_t root = second;
         for (std::int32_t i = second; i >= 0; i = trees_[1].parents[static_cast<std::size_t>(i)]) {
             const double* row = trees_[1].row(i, n_);
             if (rows.empty() || distance(rows.back(), row, n_) > 0.0) rows.push_back(row);
-            root = i;
         }
-        found_.goal = goal_of_root_[static_cast<std::size_t>(root)];
         found_.outcome = Outcome::kFound;
         for (const double* row : rows) found_.path.insert(found_.path.end(), row, row + n_);
     }
@@ -217,13 +210,12 @@ private:
             for (std::size_t last = count() - 1; last > first + 1; --last)
                 if (free(at(first), at(last))) {
                     erase(first + 1, last);
-                    ++found_.shortened;
                     break;
                 }
         constexpr std::int64_t kInVain = 12;
         std::int64_t in_vain = 0;
         for (std::int64_t k = 0; k < budget_.shortcuts && count() > 2 && in_vain < kInVain; ++k) {
-            if (world_.counts.postures - spent_from_ >= budget_.postures) return;
+            if (world_.postures >= budget_.postures) return;
             in_vain = cut() ? 0 : in_vain + 1;
         }
     }
@@ -253,7 +245,6 @@ private:
         found_.path.insert(found_.path.begin() + static_cast<std::ptrdiff_t>(a + 1) * n_,
                            from.begin(), from.end());
         drop_repeated();
-        ++found_.shortened;
         return saved > 10 * kWorth * lengths.back();
     }
 
@@ -286,9 +277,7 @@ private:
     double range_;
     Budget budget_;
     Tree trees_[2];
-    std::vector<std::int32_t> goal_of_root_;
     Found found_;
-    std::int64_t spent_from_ = 0;
 };
 
 }  // namespace

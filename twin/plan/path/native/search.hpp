@@ -27,13 +27,8 @@ struct Found {
     Outcome outcome = Outcome::kBudget;
     std::int32_t pair = -1;
     // Which one touches, at start or goal.
-    std::int32_t goal = -1;
-    // Which of the goals was reached.
     std::vector<double> path;
     // Postures one after the other.
-    std::int64_t nodes = 0;
-    std::int64_t search_postures = 0;
-    std::int64_t shortened = 0;
 };
 
 // RRT-Connect (Kuffner, LaValle 2000) from a start to any of some goals, then shortcuts.

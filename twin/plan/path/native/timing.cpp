@@ -61,7 +61,7 @@ bool free_arc(World& world, const Piece& arc) {
     return true;
 }
 
-std::vector<Piece> rounded(World& world, const std::vector<Row>& knots, bool round, Timed& timed) {
+std::vector<Piece> rounded(World& world, const std::vector<Row>& knots, bool round) {
     constexpr int kHalvings = 5;
     constexpr double kShortest = 1e-6;
     std::vector<double> lengths;
@@ -70,7 +70,6 @@ std::vector<Piece> rounded(World& world, const std::vector<Row>& knots, bool rou
     std::vector<Piece> pieces;
     Row from = knots.front();
     for (std::size_t i = 1; i + 1 < knots.size(); ++i) {
-        ++timed.corners;
         // The first and the last line are one corner's alone; others are shared by two.
         const double before = i == 1 ? lengths[0] : lengths[i - 1] - cut[i - 1];
         const double after = i + 2 == knots.size() ? lengths[i] : 0.5 * lengths[i];
@@ -94,7 +93,6 @@ std::vector<Piece> rounded(World& world, const std::vector<Row>& knots, bool rou
         if (free) {
             pieces.push_back(arc);
             cut[i] = reach;
-            ++timed.rounded;
         } else {
             pieces.push_back(Piece{});  // stop here
         }
@@ -214,7 +212,6 @@ public:
             begun += whole;
             note(begun, last - 1, steps_[last - 1].width);
         }
-        timed.duration = begun;
         double place = 0.0;
         for (std::size_t i = 0; i < steps_.size(); ++i) {
             pieces_[owner_[i]].at(offset_[i], q.data());
@@ -332,7 +329,7 @@ Timed time_path(World& world, const std::vector<double>& path, const Limits& lim
         timed.curve_at = {0.0};
         return timed;
     }
-    const std::vector<Piece> pieces = rounded(world, knots, round, timed);
+    const std::vector<Piece> pieces = rounded(world, knots, round);
     Law law(world, pieces, limits);
     law.solve();
     law.sample(step_s, timed);

@@ -16,12 +16,10 @@ struct Limits {
 struct Timed {
     std::vector<double> times;
     std::vector<double> rows;
-    double duration = 0.0;
     std::vector<double> curve;
     // The rounded way at its grid points, for whoever times it otherwise.
     std::vector<double> curve_at;
     // Their places along it.
-    std::int32_t corners = 0, rounded = 0;
 };
 
 // Pass a path (rows of postures) as fast as the limits allow, its corners rounded as far as nothing

@@ -1,9 +1,9 @@
 // A serial arm among obstacles: where its bodies are, what they keep from what, and whether a
 // straight way between two postures is free all along.
 //
-// Each body is a convex hull with spheres that together hold it. Spheres are asked first; where they
-// are not enough, the hulls are. A way is divided until everything that moves is farther from
-// everything else than it can come within its part, so nothing is missed between two postures.
+// Each body is a convex hull. The sphere around it is asked first; where that is not enough, the hull
+// is. A way is divided until everything that moves is farther from everything else than it can come
+// within its part, so nothing is missed between two postures.
 #pragma once
 
 #include <cstdint>
@@ -14,16 +14,9 @@
 #include "twin/robot/native/geometry.hpp"
 #include "twin/robot/native/grid_search.hpp"
 #include "twin/robot/native/separation.hpp"
-#include "kernels.hpp"
 
-struct Counts {
-    std::int64_t postures = 0;
-    std::int64_t bounds = 0;
-    // Pairs whose spheres were asked.
-    std::int64_t exact = 0;
-    // Pairs whose hulls were asked.
-    std::int64_t ways = 0;
-};
+constexpr int kLanes = 16;
+// So many corners are looked at together.
 
 struct Joint {
     Pose before;
@@ -38,14 +31,10 @@ struct Body {
     std::vector<Vec> corners;
     // Of its hull, frame of its joint.
     std::vector<float> corner_x, corner_y, corner_z;
-    // The same, filled up by repeating the last one.
-    std::vector<float> sphere_x, sphere_y, sphere_z, sphere_r;
-    // Filled up by spheres that nothing is near to.
+    // The same, filled up to a multiple of kLanes by repeating the last one.
     Vec centre;
     double radius = 0.0;
     // One sphere around all of it.
-    double excess = 0.0;
-    // About how far spheres stand out of the hull; decides only what is asked, never an answer.
     std::vector<double> reach;
     // How far each joint moves any of its points at most, wherever the others stand [m/rad].
     std::int32_t root_begin = 0, root_end = 0;
@@ -56,8 +45,6 @@ struct Body {
 struct Box {
     Pose pose;
     Vec half;
-    float R[9] = {}, t[3] = {}, size[3] = {};
-    // The same for the kernels; half of the size.
 };
 
 enum class Other : std::int32_t { kBox = 0, kTable = 1, kGrid = 2, kBody = 3 };
@@ -90,7 +77,8 @@ public:
     std::vector<Pair> pairs;
     Vec tool;
     // In the frame of the last joint.
-    Counts counts;
+    std::int64_t postures = 0;
+    // Looked at since it was last set.
 
     int num_joints() const { return static_cast<int>(joints.size()); }
 
@@ -114,17 +102,13 @@ public:
     // A distance that a pair keeps at the placed posture, and an upper one; as exact as asked.
     Separation distance(std::int32_t pair, double enough, double too_little);
 
+    // A distance that the spheres around both of a pair say it keeps.
+    double sphere_bound(std::int32_t pair);
+
     // As exact as the hulls are.
     Separation hulls(std::int32_t pair) {
         constexpr double kAll = std::numeric_limits<double>::infinity();
         return exact(pair, kAll, -kAll);
-    }
-
-    // What spheres alone say of a pair, for tests.
-    Separation spheres(std::int32_t pair) {
-        Separation found;
-        found.least = sphere_bound(pairs[static_cast<std::size_t>(pair)]);
-        return found;
     }
 
 private:
@@ -134,17 +118,13 @@ private:
         // Its pairs in open_.
     };
 
-    double sphere_bound(const Pair& pair);
     Separation exact(std::int32_t index, double enough, double too_little);
     Vec support(const Body& body, const Pose& pose, Vec direction) const;
     double body_reach(const Body& body, int joint) const;
     void place_travel(std::int32_t body, const double* turned);
-    Spheres placed_spheres(std::int32_t body);
 
     std::vector<Pose> frames_;
-    std::vector<std::vector<float>> placed_;
-    // Spheres of each body in the base frame: all x, then y, then z.
-    std::vector<std::int64_t> placed_at_, centred_at_, travelled_at_;
+    std::vector<std::int64_t> centred_at_, travelled_at_;
     std::vector<Vec> centres_;
     std::vector<std::vector<double>> travels_;
     // Of each body, against the frame of each joint before it.
@@ -155,5 +135,4 @@ private:
     std::vector<std::int32_t> order_;
     // Pairs, those first that blocked a way last.
     std::vector<double> turned_, half_turns_, middle_;
-    const Kernels* kernels_ = nullptr;
 };
