@@ -213,7 +213,7 @@ class ReleaseSearch:
 
         def placed(state: State) -> list[Measured]:
             return [
-                Measured(f"the reach of {name} beyond {target.name}", beyond(state), high=0.0),
+                Measured(f"the reach of {name}", beyond(state), high=0.0, beyond=target.name),
                 Measured(
                     f"the height of {name} over {target.name}",
                     over(state),
