@@ -38,7 +38,7 @@ def describe_predicate(spec: Mapping[str, Any]) -> str:
 
 def describe_way(way: Mapping[str, Any]) -> str:
     """Say in words what one constraint asks while its stage lasts."""
-    return _filled("{obj} " + _WAYS[way["kind"]], {"obj": "the tool", **way})
+    return _filled("{object} " + _WAYS[way["kind"]], {"object": "the tool", **way})
 
 
 def _filled(words: str, spec: Mapping[str, Any]) -> str:
@@ -63,7 +63,7 @@ _WORDS = {
 }
 _WAYS = {
     "clearance": "stays away from {against}",
-    "keepout": "never passes over {region[over]}",
+    "keepout": "never passes over {over}",
     "upright": "stays upright",
     "height": "stays at such a height over the table",
     "speed": "moves no faster",

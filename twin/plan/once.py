@@ -35,7 +35,7 @@ from twin.plan.loop.propose import Attempt, plan_and_verify
 from twin.plan.loop.steer import tool_at, tried_in
 from twin.plan.loop.tau import goals_of
 from twin.plan.missed import missed_before
-from twin.plan.model_goals import Asked, ask_for_goals, client_of
+from twin.plan.model_goals import Asked, ask_for_goals
 from twin.plan.problem import NoPlanError, Pose, Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
@@ -179,8 +179,6 @@ class Begun:
 
 def begin(run: RunFolder, words: str, config: PlanConfig, robot: str = "") -> Begun:
     """Find out what is to be done and from where; a model is asked first where one is given."""
-    if config.model:
-        client_of(run, config)
     understood = None if config.model and not names_task(words) else understand(run, words)
     file = shown_task_file(run, config.episode) if understood is None else understood.file
     start = start_of(run, file.task(), config, robot)
@@ -343,7 +341,7 @@ def _attempts(
         rounds=config.rounds,
         refused=before,
         task_sha256=begun.understood.file.sha256,
-        grounding_source="" if begun.asked is None else begun.asked.answered_by,
+        grounding_source="" if begun.asked is None else begun.asked.source,
     )
 
 

@@ -128,14 +128,14 @@ def test_a_scene_of_another_robot_is_not_planned_in(tmp_path: Path) -> None:
     assert LivePlanner(run, named, ROBOT.urdf_text).answer(asked).plan is not None
 
 
-LOW = {"kind": "height", "a": {"obj": "cube", "anchor": "top"}, "min": -0.01, "max": 0.5}
-NEVER = {"kind": "height", "a": {"obj": "cube", "anchor": "top"}, "min": 0.9}
+LOW = {"kind": "height", "a": {"object": "cube", "anchor": "top"}, "min": -0.01, "max": 0.5}
+NEVER = {"kind": "height", "a": {"object": "cube", "anchor": "top"}, "min": 0.9}
 
 
 def adds(constraint: dict[str, Any]) -> str:
     """A reply that wants this on the way to the box."""
     wish = {"when": "carry", "moving": "cube", "keep": constraint}
-    return json.dumps({"version": 2, "goals": [INSIDE], "constraints": [wish]})
+    return json.dumps({"version": 3, "goals": [INSIDE], "constraints": [wish]})
 
 
 def asking(run: RunFolder, server: Server) -> LivePlanner:

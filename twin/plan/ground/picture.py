@@ -15,7 +15,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.palette import rgb
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.constrain.reply import Keypoint
+from twin.plan.constrain.reply import Keypoints, keypoint
 from twin.plan.problem import Flags, Points, Pose, Problem
 from twin.plan.release.obstacles import spread_points
 
@@ -34,7 +34,7 @@ class MarkedPicture:
     """A picture with its marks."""
 
     jpeg: bytes
-    keypoints: Mapping[str, Keypoint]
+    keypoints: Keypoints
     """By what stands beside them: ``cube.1``."""
 
 
@@ -61,7 +61,7 @@ def marked_picture(problem: Problem, frames: Sequence[RgbdFrame]) -> MarkedPictu
     if not seen:
         return None
     keypoints = {
-        f"{key}.{number}": Keypoint(obj=key, p_object_m=p)
+        f"{key}.{number}": keypoint(key, p)
         for key, each in seen.items()
         for number, p in enumerate(each.points_m, start=1)
     }

@@ -286,7 +286,7 @@ def places_on_table(
     named = {name for goal in goals for name in values_of(goal.record, ("reference", "against"))}
     gaps = [
         compile_constraint(
-            {"kind": "clearance", "obj": key, "against": name, "min": gap_m}, problem
+            {"kind": "clearance", "object": key, "against": name, "min": gap_m}, problem
         )
         for name in problem.scene.Ts_base_object
         if name != key
