@@ -22,20 +22,20 @@ from bridge.task.relations import RELATIONS
 from bridge.task.task_file import Task, TaskFile
 from bridge.whole_file import write_whole
 from twin.plan.config import PlanConfig
+from twin.plan.constrain.bodies import Record
 from twin.plan.constrain.kinds import compile_constraint
-from twin.plan.constrain.reply import VERSION, Reply, ReplyError, Wish, read_reply
+from twin.plan.constrain.reply import VERSION, ReplyError, read_reply
 from twin.plan.constrain.schema import Vocabulary, printable
 from twin.plan.ground.derive import derive_task
-from twin.plan.ground.goals import Goals, Grounding, ordered
+from twin.plan.ground.goals import Goals
 from twin.plan.ground.model_client import Question, ask_model
 from twin.plan.ground.picture import MarkedPicture, marked_picture
-from twin.plan.ground.run_tasks import UnderstoodTask
+from twin.plan.ground.run_tasks import UnderstoodTask, instances_of
 from twin.plan.ground.vocabulary import Vocabulary as Things
 from twin.plan.ground.vocabulary import vocabulary_of
 from twin.plan.loop.tau import stages_of
 from twin.plan.problem import Problem, State
 from twin.plan.usable_start import refuse_unusable
-from twin.scene.store.folder import read_record
 
 PICTURES = "model_pictures"
 """Folder of the run's ``derived/`` with the pictures that were sent."""
@@ -131,27 +131,33 @@ def ask_for_goals(
         frames: What cameras saw of the start; without any no picture is sent.
     """
     picture = marked_picture(problem, frames) if frames else None
-    things = vocabulary_of(problem.scene.task, _instances(run))
+    things = vocabulary_of(problem.scene.task, instances_of(run))
     vocabulary = Vocabulary.of_task(problem.scene.task, objects_alone=not is_fixed)
 
     def judge(text: str) -> Asked:
-        reply = read_reply(text, vocabulary, problem, {} if picture is None else picture.keypoints)
-        if reply.cannot:
-            message = f"{config.model_name} says that it cannot be done: {reply.cannot}"
-            raise UsageError(f"{message.rstrip('. ')}. Nothing was planned.")
+        marks = {} if picture is None else picture.keypoints
+        reply, remarks = read_reply(text, vocabulary, problem, marks)
+        if "cannot" in reply:
+            why = printable(reply["cannot"]).rstrip(". ")
+            message = (
+                f"{config.model_name} says that it cannot be done: {why}. Nothing was planned."
+            )
+            raise UsageError(message)
         understood = UnderstoodTask(file=file, grounding=None)
         if is_fixed:
             _refuse_other_goals(reply, file.task())
         else:
             understood = _understood(reply, words, things, file, f"{config.model_name} said so")
-        joined, told = _with_wishes(_retasked(problem, understood.file.task()), reply.wishes)
+        joined, told = _with_wishes(
+            _retasked(problem, understood.file.task()), reply["constraints"]
+        )
         return Asked(
             problem=joined,
             config=config,
             understood=understood,
             constraints=told,
             reply=text,
-            remarks=reply.remarks,
+            remarks=remarks,
             picture=None if picture is None else _kept(run, picture),
         )
 
@@ -173,12 +179,6 @@ def _kept(run: RunFolder, picture: MarkedPicture) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, picture.jpeg)
     return path
-
-
-def _instances(run: RunFolder) -> Sequence[Mapping[str, Any]]:
-    """What the run's scene says its objects look like."""
-    semantics: Mapping[str, Any] = (read_record(run) or {}).get("semantics") or {}
-    return list(semantics.get("instances", ()))
 
 
 def _question(
@@ -233,73 +233,66 @@ def _rounded(lengths_m: Any) -> list[float]:
 
 
 def _understood(
-    reply: Reply, words: str, things: Things, base: TaskFile, explanation: str
+    reply: Record, words: str, things: Things, base: TaskFile, explanation: str
 ) -> UnderstoodTask:
     """The task that a reply's goals make."""
     goals = Goals(things)
     try:
-        for record in reply.goals:
+        for record in reply["goals"]:
             goals.add_clause([dict(record)])
-        if reply.in_order:
+        if reply.get("in_order"):
             goals.edges += [(number, number + 1) for number in range(len(goals.steps) - 1)]
             goals.is_order_given = len(goals.steps) > 1
-        found = goals.checked()
-        grounding = Grounding(
-            text=words,
-            goals=tuple(found),
-            order=ordered(goals, found),
-            is_order_given=goals.is_order_given,
-            explanation=(explanation,),
-        )
+        grounding = goals.grounding(words, [explanation])
         file = derive_task(grounding, [base], by="model")
     except GstError as error:
         raise ReplyError(problems=(f"goals: {error}",)) from error
     return UnderstoodTask(file=file, grounding=grounding)
 
 
-def _refuse_other_goals(reply: Reply, task: Task) -> None:
+def _refuse_other_goals(reply: Record, task: Task) -> None:
     """Goals of a task that exists are its file's to say."""
 
     def names(spec: Mapping[str, Any]) -> set[tuple[str, str]]:
         return {(key, value) for key, value in spec.items() if isinstance(value, str)}
 
     known = [names(spec) for spec in task.success]
-    for number, record in enumerate(reply.goals):
+    for number, record in enumerate(reply["goals"]):
         if names(record) not in known:
             problem = f"goals[{number}]: is no goal of task {task.name}"
             raise ReplyError(problems=(problem,))
 
 
-def _with_wishes(problem: Problem, wishes: Sequence[Wish]) -> tuple[Problem, tuple[str, ...]]:
+def _with_wishes(problem: Problem, wishes: Sequence[Record]) -> tuple[Problem, tuple[str, ...]]:
     """Let constraints join the stages of the task; say each in words."""
     tables = {str(table["id"]): dict(table) for table in problem.scene.task.stages}
     told, now = [], State.single(problem.scene.Ts_base_object, np.eye(4), 0.0)
     for number, wish in enumerate(wishes):
         try:
-            words = compile_constraint(wish.keep, problem).wanted(now)
+            words = compile_constraint(wish["keep"], problem).wanted(now)
             places = list(_places(problem.scene.task, wish))
         except GstError as error:
             raise ReplyError(problems=(f"constraints[{number}]: {error}",)) from error
         for stage, kind in places:
             before = tables[stage].get(kind, [])
-            if wish.keep not in before:
-                tables[stage][kind] = [*before, dict(wish.keep)]
-        told.append(f"{_WHEN[wish.when].format(wish.moving or 'anything')}: {words}")
+            if wish["keep"] not in before:
+                tables[stage][kind] = [*before, wish["keep"]]
+        told.append(f"{_WHEN[wish['when']].format(wish.get('moving', 'anything'))}: {words}")
     task = replace(problem.scene.task, stages=tuple(tables.values()))
     return replace(problem, scene=replace(problem.scene, task=task)), tuple(told)
 
 
-def _places(task: Task, wish: Wish) -> Iterator[tuple[str, str]]:
+def _places(task: Task, wish: Record) -> Iterator[tuple[str, str]]:
     """Stages in which a constraint is kept, and whether at their end or on their way."""
-    movers = task.manipulated if wish.moving is None else (wish.moving,)
+    movers = (wish["moving"],) if "moving" in wish else task.manipulated
     for key in movers:
         ids = stages_of(task, key)
         if "release" not in ids:
             raise UsageError(f"{key} is not carried here, so nothing can be kept while it is.")
-        match wish.when:
-            case "grasp" | "release":
-                yield ids[wish.when], "subgoal"
+        match wish["when"]:
+            case "grasp" | "release" as verb:
+                yield ids[verb], "subgoal"
             case "carry":
                 yield ids.get("carry", ids["release"]), "path"
             case _:
-                yield from ((ids[verb], "path") for verb in ids)
+                yield from ((stage, "path") for stage in ids.values())

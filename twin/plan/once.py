@@ -243,13 +243,8 @@ class Planned:
             "attempts": [
                 {
                     "id": each.candidate.plan.id,
-                    "rank": each.candidate.rank,
                     "cost": each.candidate.cost,
                     "remarks": list(each.candidate.remarks),
-                    "steered_by": None
-                    if each.candidate.plan.steered_by is None
-                    else each.candidate.plan.steered_by.clause,
-                    "duration_s": each.candidate.plan.tau[-1].t_ns * 1e-9,
                     "verdict": json.loads(each.verdict.to_json()),
                 }
                 for each in self.attempts

@@ -62,20 +62,14 @@ def _relation(record: Record, problem: Problem) -> Constraint:
 
 def _distance(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (point_of(record[key], problem) for key in "ab")
-    limits = []
-    if "target" in record:
-        target, tol = record["target"], record["tolerance_m"]
-        limits.append((target - tol if target > tol else -np.inf, target + tol))
-    if "min" in record or "max" in record:
-        limits.append((record.get("min", -np.inf), record.get("max", np.inf)))
+    what, low, high = f"the distance from {a_name} to {b_name}", *_limits(record)
+    return _one(
+        record, what, lambda state: np.linalg.norm(a(state) - b(state), axis=-1), low=low, high=high
+    )
 
-    def measured(state: State) -> list[Measured]:
-        value, what = np.linalg.norm(a(state) - b(state), axis=-1), f"{a_name} to {b_name}"
-        return [
-            Measured(f"the distance from {what}", value, low=low, high=high) for low, high in limits
-        ]
 
-    return Constraint(record=record, measured=measured)
+def _limits(record: Record) -> tuple[float, float]:
+    return record.get("min", -np.inf), record.get("max", np.inf)
 
 
 def _above(record: Record, problem: Problem) -> Constraint:
@@ -175,7 +169,7 @@ def _keepout(record: Record, problem: Problem) -> Constraint:
 
 def _height(record: Record, problem: Problem) -> Constraint:
     table = problem.scene.table_height_m
-    low, high = record.get("min", -np.inf), record.get("max", np.inf)
+    low, high = _limits(record)
     if "object" in record:
         obj = record["object"]
         what = f"the height of the lowest point of {obj} over the table"

@@ -8,7 +8,6 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
@@ -22,7 +21,6 @@ from twin.plan.constrain.schema import (
     find_problems,
     listed,
     meaning_problems,
-    printable,
     shown,
     values_of,
 )
@@ -55,35 +53,10 @@ Keypoints = Mapping[str, Record]
 """Named points of objects, as constraints say points."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Wish:
-    """A constraint, and when it is to be kept."""
-
-    when: str
-    """``grasp``, ``carry``, ``release`` or ``always``."""
-    moving: str | None
-    """While this object is moved; None: while any is."""
-    keep: Record
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reply:
-    """What a model asks for."""
-
-    goals: tuple[Record, ...] = ()
-    """Success predicates of a task file."""
-    in_order: bool = False
-    wishes: tuple[Wish, ...] = ()
-    cannot: str = ""
-    """Why it says that it cannot be done; empty: there are goals."""
-    remarks: tuple[str, ...] = ()
-    """What was passed over in the text."""
-
-
 def read_reply(
     text: str | bytes, vocabulary: Vocabulary, problem: Problem, marks: Keypoints
-) -> Reply:
-    """Read what a reply asks for, if nothing in it is wrong.
+) -> tuple[Record, tuple[str, ...]]:
+    """Read what a reply asks for, if nothing in it is wrong, and say what was passed over.
 
     Prose and fences around it are passed over; of several answers the last one counts. Keypoints
     become points of their objects.
@@ -96,18 +69,9 @@ def read_reply(
     known, odd = _keypoints(record, problem, marks)
     if problems := listed([*odd, *_contradictions(record, known)]):
         raise ReplyError(problems=problems)
-    if "cannot" in record:
-        return Reply(cannot=printable(record["cannot"]))
-    wishes = (
-        Wish(when=each["when"], moving=each.get("moving"), keep=_resolved(each["keep"], known))
-        for each in record.get("constraints", ())
-    )
-    return Reply(
-        goals=tuple(record["goals"]),
-        in_order=record.get("in_order", False),
-        wishes=tuple(wishes),
-        remarks=remarks,
-    )
+    wishes = record.get("constraints", ())
+    kept = [{**wish, "keep": _resolved(wish["keep"], known)} for wish in wishes]
+    return {**record, "constraints": kept}, remarks
 
 
 def _answer_in(text: str | bytes) -> tuple[dict[str, Any], tuple[str, ...]]:

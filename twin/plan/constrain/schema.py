@@ -155,12 +155,8 @@ def printable(text: str) -> str:
 
 def shown(value: Any) -> str:
     """A value in an error: short, on a single line, in ASCII."""
-    if isinstance(value, str):
-        cut = "..." if len(value) > MOST_SHOWN else ""
-        return json.dumps(value[:MOST_SHOWN]) + cut
-    if isinstance(value, dict | list):
-        return "an object" if isinstance(value, dict) else "a list"
-    return f"{json.dumps(value):.60}"
+    text = json.dumps(value)
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
 
 
 def meaning_problems(record: Mapping[str, Any], place: str) -> Iterator[str]:

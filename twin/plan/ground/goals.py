@@ -38,20 +38,6 @@ class Grounding:
             *(f"  {line}" for line in self.explanation),
         ]
 
-    def to_json(self) -> dict[str, Any]:
-        """The same as data."""
-        return {
-            "instruction": self.text,
-            "goals": [dict(goal) for goal in self.goals],
-            "order": list(self.order),
-            "is_order_given": self.is_order_given,
-            "choices": [
-                {"count": item.count, "among": list(item.among), "chosen": list(item.chosen)}
-                for item in self.choices
-            ],
-            "explanation": list(self.explanation),
-        }
-
 
 @dataclass
 class Goals:
@@ -112,6 +98,22 @@ class Goals:
         for key, goals in by_object.items():
             self._refuse_contradiction(key, goals)
         return self.found
+
+    def grounding(
+        self, text: str, explanation: Iterable[str], choices: Iterable[Choice] = ()
+    ) -> Grounding:
+        """What an instruction asks for whose clauses were all taken."""
+        found = self.checked()
+        if not found:
+            refuse("empty", "the instruction asks for nothing.")
+        return Grounding(
+            text=text,
+            goals=tuple(found),
+            order=ordered(self, found),
+            is_order_given=self.is_order_given,
+            choices=tuple(choices),
+            explanation=tuple(dict.fromkeys(explanation)),
+        )
 
     def _refuse_contradiction(self, key: str, goals: Sequence[Mapping[str, Any]]) -> None:
         kinds = {goal["kind"] for goal in goals}
