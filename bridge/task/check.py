@@ -101,18 +101,16 @@ def _sentence(error: "ValidationError") -> str:
         case "additionalProperties":
             known = reduce(getitem, error.schema_path[:-1], schema_of("task"))["properties"]
             wrong = about["unexpected"]
-            said = "; ".join(f"unknown key {key!r}.{_meant(key, known)}" for key in wrong)
+            meant = [nearest(RENAMED.get(key, key), known) for key in wrong]
+            said = "; ".join(
+                f"unknown key {key!r}.{m}" for key, m in zip(wrong, meant, strict=True)
+            )
             return f"{place}: {said} Allowed: {_names(known)}."
         case "enum":
             known = about["options"]
             near = nearest(value, known) if isinstance(value, str) else ""
             return f"{place}: {value!r} is unknown. Known: {_names(known)}.{near}"
     return f"{place}: {error.message:.200}"
-
-
-def _meant(key: str, known: Iterable[str]) -> str:
-    new = RENAMED.get(key, "")
-    return f" It is called {new!r} now." if new in known else nearest(key, known)
 
 
 def _is_no_object(place: str, name: str, table: Mapping[str, Any]) -> Iterator[str]:
@@ -173,7 +171,6 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
             yield from _is_no_object(f"{place}.{verb}", name, table)
             if name in table["objects"] and name not in table["manipulated"]:
                 yield f"{place}.{verb}: {name} is not in manipulated"
-        yield from _push(place, stage, table)
         yield from _on_the_way(place, stage, table)
         for number, pair in enumerate(stage.get("allowed_contacts", [])):
             where = f"{place}.allowed_contacts[{number}]"
@@ -186,26 +183,12 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _on_the_way(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
-    """What belongs to one verb of a stage, and what holds while the stage lasts."""
+    """What belongs to one verb, what holds meanwhile, and where a push goes."""
     for key, verb in (("part", "grasp"), ("clearance_m", "carry"), ("speed_m_s", "push")):
         if key in stage and verb not in stage:
             yield f"{place}.{key}: belongs to {verb}"
     for number, way in enumerate(stage.get("path", [])):
-        yield from _way(f"{place}.path[{number}]", way, table)
-
-
-def _way(place: str, way: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
-    """What holds while a stage lasts: the objects exist, and there is a limit."""
-    for key in REFERENCES:
-        if key in way and way[key] != TABLE:
-            yield from _is_no_object(f"{place}.{key}", way[key], table)
-    if way["kind"] == "height" and not {"min", "max"} & way.keys():
-        yield f"{place}: says no limit. Give one or both of max, min."
-    yield from contradictions(place, way)
-
-
-def _push(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
-    """A push goes towards a mark, which a predicate names."""
+        yield from _named(f"{place}.path[{number}]", way, table)
     pushed = stage.get("push")
     if pushed is None:
         return
@@ -221,17 +204,21 @@ def _push(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Ite
 def _predicates(table: Mapping[str, Any]) -> Iterator[str]:
     for index, spec in enumerate(table["success"]):
         place = f"success[{index}]"
-        for key in REFERENCES:
-            if key in spec and (key, spec[key]) != ("support", TABLE):
-                yield from _is_no_object(f"{place}.{key}", spec[key], table)
+        yield from _named(place, spec, table)
         if "container" in spec:
             yield from _has_no_cavity(f"{place}.container", spec["container"], table)
-        yield from contradictions(place, spec)
         if "support" in spec:
             model = table["objects"].get(spec["support"], {})
             if CAVITIES[0] in model.values() or CAVITIES[1] in model.values():
                 said = "is open above; what is put there is inside, not on it"
                 yield f"{place}.support: {spec['support']} {said}"
+
+
+def _named(place: str, spec: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
+    for key in REFERENCES:
+        if key in spec and (key, spec[key]) not in (("support", TABLE), ("against", TABLE)):
+            yield from _is_no_object(f"{place}.{key}", spec[key], table)
+    yield from contradictions(place, spec)
 
 
 def contradictions(place: str, spec: Mapping[str, Any]) -> Iterator[str]:
@@ -242,6 +229,8 @@ def contradictions(place: str, spec: Mapping[str, Any]) -> Iterator[str]:
             yield f"{place}.{key}: {name} cannot be in, on or beside itself"
     if spec.get("min", -math.inf) > spec.get("max", math.inf):
         yield f"{place}: min {spec['min']} is above max {spec['max']}"
+    if spec["kind"] == "height" and not {"min", "max"} & spec.keys():
+        yield f"{place}: says no limit. Give one or both of max, min."
     yield from _direction(place, spec)
     if spec["kind"] == "moved":
         yield from _moved(place, spec)

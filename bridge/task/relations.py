@@ -73,13 +73,13 @@ class Measured:
         side = "within" if value < 0 else "beyond"
         return f"{self.what} is {shown(abs(value), self.unit, digits)} {side} {self.beyond}"
 
-    def wanted(self, digits: int = 1) -> str:
+    def wanted(self) -> str:
         """Where it should be, in words."""
-        low, high = (shown(each, self.unit, digits) for each in (self.low, self.high))
+        low, high, margin = (
+            shown(each, self.unit, 1) for each in (self.low, self.high, -self.high)
+        )
         if self.beyond:
-            margin = shown(abs(self.high), self.unit, digits)
-            at = f"at least {margin} within" if self.high < 0 else f"at most {margin} beyond"
-            return f"{at if self.high else 'within'} {self.beyond}"
+            return f"{f'at least {margin} ' if self.high else ''}within {self.beyond}"
         if np.isneginf(self.low):
             return f"at most {high}"
         return f"at least {low}" if np.isposinf(self.high) else f"{low.split()[0]} to {high}"

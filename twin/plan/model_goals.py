@@ -28,14 +28,13 @@ from twin.plan.constrain.reply import VERSION, ReplyError, read_reply
 from twin.plan.constrain.schema import Vocabulary, printable
 from twin.plan.ground.derive import derive_task
 from twin.plan.ground.goals import Goals
-from twin.plan.ground.model_client import Question, ask_model
+from twin.plan.ground.model_client import Messages, ask_model, chat
 from twin.plan.ground.picture import MarkedPicture, marked_picture
 from twin.plan.ground.run_tasks import UnderstoodTask, instances_of
 from twin.plan.ground.vocabulary import Vocabulary as Things
 from twin.plan.ground.vocabulary import vocabulary_of
 from twin.plan.loop.tau import stages_of
 from twin.plan.problem import Problem, State
-from twin.plan.usable_start import refuse_unusable
 
 PICTURES = "model_pictures"
 """Folder of the run's ``derived/`` with the pictures that were sent."""
@@ -132,7 +131,7 @@ def ask_for_goals(
     """
     picture = marked_picture(problem, frames) if frames else None
     things = vocabulary_of(problem.scene.task, instances_of(run))
-    vocabulary = Vocabulary.of_task(problem.scene.task, objects_alone=not is_fixed)
+    vocabulary = Vocabulary.of_task(problem.scene.task)
 
     def judge(text: str) -> Asked:
         marks = {} if picture is None else picture.keypoints
@@ -163,7 +162,6 @@ def ask_for_goals(
 
     question = _question(problem, things, vocabulary, words, picture, is_fixed=is_fixed)
     asked, refused = ask_model(question, config, judge)
-    refuse_unusable(asked.problem)
     return replace(asked, remarks=(*refused, *asked.remarks))
 
 
@@ -189,7 +187,7 @@ def _question(
     picture: MarkedPicture | None,
     *,
     is_fixed: bool,
-) -> Question:
+) -> Messages:
     scene, objects = problem.scene, []
     for key, thing in things.things.items():
         T = scene.Ts_base_object.get(key)
@@ -225,7 +223,7 @@ def _question(
     rules = f"{_RULES}\nSchema: {json.dumps(defs, separators=(',', ':'))}"
     if is_fixed:
         rules += "\nThe goals are those of the task; repeat them and add constraints alone."
-    return Question(rules=rules, data=data, picture_jpeg=None if picture is None else picture.jpeg)
+    return chat(rules, data, None if picture is None else picture.jpeg)
 
 
 def _rounded(lengths_m: Any) -> list[float]:

@@ -89,10 +89,6 @@ class Start:
         found.append(f"  scene: {'none was rebuilt' if scene is None else scene[:12]}")
         return found
 
-    def to_json(self) -> dict[str, Any]:
-        """The same as data, without the objects."""
-        return {"episode": self.episode.path.stem, "arm": self.arm}
-
 
 def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") -> Start:
     """Localise a task's objects at the start of the newest episode that shows them all."""
@@ -172,7 +168,7 @@ class Begun:
         """The same as data."""
         return {
             **self.understood.to_json(),
-            "start": self.start.to_json(),
+            "start": {"episode": self.start.episode.path.stem, "arm": self.start.arm},
             "model": None if self.asked is None else self.asked.to_json(),
         }
 
@@ -356,7 +352,7 @@ def _attempt_line(attempt: Attempt) -> str:
 
 
 def _explained(problem: Problem, plan: Plan, stage: Stage) -> list[str]:
-    """A stage with its constraints: now, and at the instant that each of them speaks of."""
+    """A stage with its constraints, at the instant that each of them speaks of."""
     told = [f"  {stage.id}: {stage.text}"]
     goals = goals_of(problem.scene.task, str(stage.release or stage.push))
     then = "as the hand closes" if stage.grasp else "as the hand opens" if stage.release else "then"
@@ -371,7 +367,6 @@ def _explained(problem: Problem, plan: Plan, stage: Stage) -> list[str]:
             told.append(f"    kept on the way: {constraint.wanted(start)}")
             continue
         at_rest = number < len(goals)
-        told.append(f"    now: {constraint.explain(start)}")
         state = _state(problem, plan, stage, at_rest=at_rest)
         told.append(f"    {'at rest' if at_rest else then}: {constraint.explain(state)}")
     return told

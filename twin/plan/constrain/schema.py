@@ -26,8 +26,8 @@ KINDS = (
     *RELATIONS,
 )
 MOST_PROBLEMS = 12
-MOST_SHOWN, MOST_TEXT = 60, 240
-"""Characters of a value, and of a library's words, in an error."""
+MOST_SHOWN, MOST_TEXT = 60, 480
+"""Characters of a value, and of an error."""
 SCENE, BASE = "scene", "world"
 """What stands for all that stands still, and for the base frame."""
 
@@ -41,19 +41,12 @@ class Vocabulary:
     containers: tuple[str, ...] = ()
 
     @staticmethod
-    def of_task(task: Task, *, objects_alone: bool = False) -> "Vocabulary":
-        """Read off a task file what may be named.
-
-        Args:
-            objects_alone: What the task does with its objects is not asked for: whatever is not
-                fixed may be moved.
-        """
+    def of_task(task: Task) -> "Vocabulary":
+        """Read off a task file what may be named; whatever is not fixed may be moved."""
         hollow = (key for key, m in task.objects.items() if {m.shape, m.mesh} & set(CAVITIES))
-        free = tuple(key for key, model in task.objects.items() if not model.fixed)
+        free = (key for key, model in task.objects.items() if not model.fixed)
         return Vocabulary(
-            objects=tuple(task.objects),
-            movable=free if objects_alone else task.manipulated,
-            containers=tuple(hollow),
+            objects=tuple(task.objects), movable=tuple(free), containers=tuple(hollow)
         )
 
     @cache  # noqa: B019  # as many as there are tasks
@@ -86,7 +79,7 @@ class Vocabulary:
             "allOf": ways,
         }
         found = {name: {"enum": list(known)} for name, known in ids.items()}
-        keypoint = {"type": "string", "maxLength": 80}
+        keypoint = {"type": "string", "minLength": 1, "maxLength": 80}
         return {**shared, **own, **found, "constraint": constraint, "keypoint_id": keypoint}
 
     @cache  # noqa: B019
@@ -138,12 +131,9 @@ def _what(error: Any) -> str:
 
 def listed(problems: Iterable[str]) -> tuple[str, ...]:
     """The first problems, each once, short and in ASCII."""
-    lines = (_ascii(text)[: 2 * MOST_TEXT] for text in islice(problems, MOST_PROBLEMS))
+    plain = (printable(text[:MOST_TEXT]) for text in islice(problems, MOST_PROBLEMS))
+    lines = (text.encode("ascii", "backslashreplace").decode()[:MOST_TEXT] for text in plain)
     return tuple(dict.fromkeys(lines))
-
-
-def _ascii(text: str) -> str:
-    return printable(text[: 4 * MOST_TEXT]).encode("ascii", "backslashreplace").decode()
 
 
 def printable(text: str) -> str:

@@ -118,8 +118,7 @@ class Goals:
     def _refuse_contradiction(self, key: str, goals: Sequence[Mapping[str, Any]]) -> None:
         kinds = {goal["kind"] for goal in goals}
         places = {(g["kind"], g[PLACES[g["kind"]]]) for g in goals if g["kind"] in PLACES}
-        inside = {goal["container"] for goal in goals if goal["kind"] == "inside"}
-        supports = {goal["support"] for goal in goals if goal["kind"] == "on"}
+        held_by = {name for _, name in places}
         outside = {goal["container"] for goal in goals if goal["kind"] == "outside"}
         sides: dict[str, set[str]] = {}
         for goal in goals:
@@ -127,9 +126,9 @@ class Goals:
                 sides.setdefault(goal["reference"], set()).add(str(goal.get("direction", "")))
         if (
             len(places) > 1
-            or inside & outside
+            or held_by & outside
             or ("moved" in kinds and places - {("on", TABLE)})
-            or (inside | supports) & set(sides)
+            or held_by & set(sides)
             or any(len(found - {""}) > 1 for found in sides.values())
             or sum(goal["kind"] == "moved" for goal in goals) > 1
         ):

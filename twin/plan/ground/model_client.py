@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from bridge.errors import UsageError
@@ -37,23 +36,14 @@ _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 _HINT = "Nothing was planned. Leave --model out to have the words read by fixed rules."
 
 
-@dataclass(frozen=True, kw_only=True)
-class Question:
-    """What a model is asked."""
-
-    rules: str
-    data: Mapping[str, Any]
-    """Instruction and scene: data, whoever wrote it."""
-    picture_jpeg: bytes | None = None
-
-    def messages(self) -> Messages:
-        """As a chat."""
-        parts: list[dict[str, Any]] = [{"type": "text", "text": json.dumps(self.data)}]
-        if self.picture_jpeg is not None:
-            coded = base64.b64encode(self.picture_jpeg).decode()
-            address = {"url": f"data:image/jpeg;base64,{coded}"}
-            parts.append({"type": "image_url", "image_url": address})
-        return [{"role": "system", "content": self.rules}, {"role": "user", "content": parts}]
+def chat(rules: str, data: Mapping[str, Any], picture_jpeg: bytes | None = None) -> Messages:
+    """A question: the rules, and instruction and scene, which are data, whoever wrote them."""
+    parts: list[dict[str, Any]] = [{"type": "text", "text": json.dumps(data)}]
+    if picture_jpeg is not None:
+        coded = base64.b64encode(picture_jpeg).decode()
+        address = {"url": f"data:image/jpeg;base64,{coded}"}
+        parts.append({"type": "image_url", "image_url": address})
+    return [{"role": "system", "content": rules}, {"role": "user", "content": parts}]
 
 
 class EndpointError(TwinError):
@@ -66,22 +56,21 @@ class EndpointError(TwinError):
 
 
 def ask_model(
-    question: Question, config: PlanConfig, judge: Callable[[str], Read]
+    question: Messages, config: PlanConfig, judge: Callable[[str], Read]
 ) -> tuple[Read, tuple[str, ...]]:
     """Get what a judge reads in a model's reply, or in its next ones, and why others were refused.
 
     Args:
         config: Its address and its name.
     """
-    first = messages = question.messages()
-    refused: list[str] = []
+    messages, refused = question, list[str]()
     for _ in range(1 + REPAIRS):
         reply = _reply(messages, config)
         try:
             return judge(reply), tuple(refused)
         except ReplyError as error:
             refused.append(f"refused a reply: {'; '.join(error.problems)}")
-            messages = _repair(first, reply, error)
+            messages = _repair(question, reply, error)
     found = f"gave no answer that can be used in {REPAIRS + 1} replies; {refused[-1]}"
     raise UsageError(f"{config.model_name} {found}. {_HINT}")
 

@@ -51,13 +51,9 @@ class _Seen:
 def marked_picture(problem: Problem, frames: Sequence[RgbdFrame]) -> MarkedPicture | None:
     """Mark the frame that shows the most points of the objects; None: none shows any."""
     views = [(frame, _views(problem, frame)) for frame in frames]
-
-    def shown(view: tuple[RgbdFrame, Mapping[str, _Seen]]) -> tuple[int, float]:
-        """How many objects, and how large."""
-        areas = [np.ptp(each.outline_px, axis=0).prod() for each in view[1].values()]
-        return len(areas), float(sum(areas))
-
-    frame, seen = max(views, key=shown)
+    outlines = [[each.outline_px for each in seen.values()] for _, seen in views]
+    sizes = [(len(each), sum(np.ptp(px, axis=0).prod() for px in each)) for each in outlines]
+    frame, seen = views[sizes.index(max(sizes))]
     if not seen:
         return None
     keypoints = {

@@ -167,7 +167,7 @@ RIGHT = state(cube=pose(0.45, -0.07, 0.02, 0.2))
 AWAY = state(tcp=pose(0.5, 0.1, 0.3) @ LOOKING_DOWN)
 TEN = math.radians(10)
 _EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
-    "distance": ({"a": TOOL, "b": MIDDLE, "target": 0.2, "tolerance_m": 0.01}, START, AWAY),
+    "distance": ({"a": TOOL, "b": MIDDLE, "min": 0.19, "max": 0.21}, START, AWAY),
     "distance at least": (
         {"a": MIDDLE, "b": {"xyz": [0.5, 0.1, 0.1]}, "min": 0.1}, START, state(cube=POINT),
     ),

@@ -41,14 +41,12 @@ def judged(reply: str | bytes) -> tuple[str, ...]:
 
 
 def test_a_valid_reply_becomes_goals_and_constraints() -> None:
-    reply = read_reply(json.dumps(valid_reply()), CUBE, PROBLEM, {})
-    assert (reply.goals, reply.in_order, reply.cannot) == ((INSIDE,), False, "")
-    assert [(each.when, each.moving) for each in reply.wishes] == [
-        ("release", "cube"),
-        ("carry", "cube"),
-    ]
-    assert reply.wishes[0].keep == ABOVE
-    point = reply.wishes[1].keep["a"]
+    reply, _ = read_reply(json.dumps(valid_reply()), CUBE, PROBLEM, {})
+    assert reply["goals"] == [INSIDE]
+    first, second = reply["constraints"]
+    assert first == {"when": "release", "moving": "cube", "keep": ABOVE}
+    assert (second["when"], second["moving"]) == ("carry", "cube")
+    point = second["keep"]["a"]
     T = PROBLEM.scene.Ts_base_object["cube"]
     there = T[:3, :3] @ point["offset"] + T[:3, 3]
     assert (point["object"], point["anchor"]) == ("cube", "origin")
@@ -73,14 +71,14 @@ def test_talk_around_an_answer_is_passed_over(form: str) -> None:
 
 def test_of_two_answers_the_last_is_read_and_that_is_said() -> None:
     first, last = valid_reply(), put(GOAL, {"kind": "on", "object": "cube", "support": "table"})
-    reply = read_reply(f"{json.dumps(first)} No: {json.dumps(last)}", CUBE, PROBLEM, {})
-    assert reply.goals[0]["kind"] == "on"
-    assert "the last of 2 answers in one reply was read" in reply.remarks
+    reply, remarks = read_reply(f"{json.dumps(first)} No: {json.dumps(last)}", CUBE, PROBLEM, {})
+    assert reply["goals"][0]["kind"] == "on"
+    assert "the last of 2 answers in one reply was read" in remarks
 
 
 def test_a_model_may_say_that_it_cannot() -> None:
-    text = json.dumps({"version": 3, "cannot": "There is no \x1b[31mmug."})
-    assert read_reply(text, CUBE, PROBLEM, {}).cannot == "There is no \\x1b[31mmug."
+    text = json.dumps({"version": 3, "cannot": "There is no mug."})
+    assert read_reply(text, CUBE, PROBLEM, {})[0]["cannot"] == "There is no mug."
 
 
 def test_hostile_replies_are_refused_with_their_place() -> None:

@@ -5,7 +5,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -16,11 +15,13 @@ from planned_start import problem_of_test
 from bridge.errors import UsageError
 from bridge.task.task_file import load_task
 from twin.plan.config import PlanConfig
-from twin.plan.constrain.reply import Reply, read_reply
+from twin.plan.constrain.bodies import Record
+from twin.plan.constrain.reply import read_reply
 from twin.plan.constrain.schema import Vocabulary
-from twin.plan.ground.model_client import EndpointError, Question, ask_model
+from twin.plan.ground.model_client import EndpointError, Messages, ask_model, chat
 
-QUESTION = Question(rules="Reply with JSON.", data={"instruction": "put the cube away"})
+DATA = {"instruction": "put the cube away"}
+QUESTION = chat("Reply with JSON.", DATA)
 CUBE = Vocabulary.of_task(load_task("cube_into_box"))
 PROBLEM = problem_of_test()
 SECRET = "sk-very-secret-0123456789"
@@ -107,16 +108,16 @@ def sends(data: bytes, **options: Any) -> Handler:
     return lambda request, _: send(request, data, **options)
 
 
-def ask(server: Server, question: Question = QUESTION) -> tuple[Reply, tuple[str, ...]]:
+def ask(server: Server, question: Messages = QUESTION) -> tuple[Record, tuple[str, ...]]:
     config = PlanConfig(model=server.url, model_name="stub")
-    return ask_model(question, config, lambda text: read_reply(text, CUBE, PROBLEM, {}))
+    return ask_model(question, config, lambda text: read_reply(text, CUBE, PROBLEM, {})[0])
 
 
 def test_a_good_reply_is_the_models_answer() -> None:
     with serving(says(f"Here:\n```json\n{GOOD}\n```")) as server:
         reply, refused = ask(server)
     assert refused == ()
-    assert [goal["kind"] for goal in reply.goals] == ["inside"]
+    assert [goal["kind"] for goal in reply["goals"]] == ["inside"]
     assert server.paths == ["/v1/chat/completions"]
     (body,) = server.asked
     assert (body["model"], body["temperature"]) == ("stub", 0)
@@ -124,11 +125,10 @@ def test_a_good_reply_is_the_models_answer() -> None:
 
 
 def test_a_picture_goes_along() -> None:
-    question = replace(QUESTION, picture_jpeg=b"\xff\xd8 picture")
     with serving(says(GOOD)) as server:
-        ask(server, question)
+        ask(server, chat("Reply with JSON.", DATA, b"\xff\xd8 picture"))
     words, picture = server.asked[0]["messages"][1]["content"]
-    assert json.loads(words["text"]) == QUESTION.data
+    assert json.loads(words["text"]) == DATA
     assert picture["image_url"]["url"] == "data:image/jpeg;base64,/9ggcGljdHVyZQ=="
 
 
