@@ -103,8 +103,8 @@ def _reply(messages: Messages, config: PlanConfig) -> str:
     except (ValueError, RecursionError, LookupError, TypeError) as error:
         raise EndpointError(config, f"sent no chat completion: {begin}") from error
     if not isinstance(text, str):
-        said = f": its model refuses: {refusal[:200]}" if isinstance(refusal, str) else ""
-        raise EndpointError(config, f"sent a chat completion without text{said}")
+        why = f": its model refuses: {refusal[:200]}" if isinstance(refusal, str) else ""
+        raise EndpointError(config, f"sent a chat completion without text{why}")
     return _redacted(text)
 
 
