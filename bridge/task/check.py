@@ -25,8 +25,12 @@ BODIES = (GRIPPER, TABLE)
 CAVITIES = ("open_box", "basket")
 VERBS = ("grasp", "carry", "release", "push")
 MOST_LISTED = 40
-REFERENCES = ("object", "container", "support", "reference", "first", "second")
-"""Keys of a success predicate that name an object; the first is the one that moves."""
+REFERENCES = ("object", "container", "support", "reference", "first", "second", "against", "over")
+"""Keys of a predicate or a constraint that name an object; the first is the one that moves."""
+_TOOK_PLACE = {"object": "obj", "tolerance_rad": "max_deg", "tolerance_m": "tol", "over": "region"}
+_TOOK_PLACE |= {"aside_m": "xy_tol", "direction": "way vector", "gap_m": "min_gap max_gap"}
+RENAMED = {old: new for new, names in _TOOK_PLACE.items() for old in names.split()}
+"""Keys of constraints of earlier editions, and what they are called now."""
 
 
 class TaskFileError(UsageError):
@@ -51,7 +55,7 @@ def task_problems(table: Mapping[str, Any]) -> list[str]:
             f"schema_version: {version} is newer than the {SCHEMA_VERSION} this version reads. "
             "Upgrade robot-gst."
         ]
-    if odd := [f"{_place(path)}: {what}" for path, what in _odd(table)]:
+    if odd := [f"{place_of(path)}: {what}" for path, what in _odd(table)]:
         return odd
     found = sorted(_sentence(error) for error in find_problems(table, name="task"))
     checks = (_object_lists, _starts, _stages, _predicates)  # what a good form names and has not
@@ -64,7 +68,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" Did you mean {found[0]!r}?" if found else ""
 
 
-def _place(path: Iterable[str | int]) -> str:
+def place_of(path: Iterable[str | int]) -> str:
+    """A place in a record as text, such as ``stages[1].path[0].max``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -91,12 +96,15 @@ def _odd(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[Any, st
 
 def _sentence(error: "ValidationError") -> str:
     """One finding, with the names that are known where one is not."""
-    place, value, about = _place(error.instance_path), error.instance, error.kind.as_dict()
+    place, value, about = place_of(error.instance_path), error.instance, error.kind.as_dict()
     match error.kind.name:
         case "additionalProperties":
             known = reduce(getitem, error.schema_path[:-1], schema_of("task"))["properties"]
             wrong = about["unexpected"]
-            said = "; ".join(f"unknown key {key!r}.{nearest(key, known)}" for key in wrong)
+            meant = [nearest(RENAMED.get(key, key), known) for key in wrong]
+            said = "; ".join(
+                f"unknown key {key!r}.{m}" for key, m in zip(wrong, meant, strict=True)
+            )
             return f"{place}: {said} Allowed: {_names(known)}."
         case "enum":
             known = about["options"]
@@ -163,7 +171,6 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
             yield from _is_no_object(f"{place}.{verb}", name, table)
             if name in table["objects"] and name not in table["manipulated"]:
                 yield f"{place}.{verb}: {name} is not in manipulated"
-        yield from _push(place, stage, table)
         yield from _on_the_way(place, stage, table)
         for number, pair in enumerate(stage.get("allowed_contacts", [])):
             where = f"{place}.allowed_contacts[{number}]"
@@ -176,30 +183,12 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _on_the_way(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
-    """What belongs to one verb of a stage, and what holds while the stage lasts."""
+    """What belongs to one verb, what holds meanwhile, and where a push goes."""
     for key, verb in (("part", "grasp"), ("clearance_m", "carry"), ("speed_m_s", "push")):
         if key in stage and verb not in stage:
             yield f"{place}.{key}: belongs to {verb}"
     for number, way in enumerate(stage.get("path", [])):
-        yield from _way(f"{place}.path[{number}]", way, table)
-
-
-def _way(place: str, way: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
-    """What holds while a stage lasts: the objects exist, and there is a limit."""
-    named = {"obj": way.get("obj"), "region.over": way.get("region", {}).get("over")}
-    if way.get("against") != TABLE:
-        named["against"] = way.get("against")
-    for key, name in named.items():
-        if name is not None:
-            yield from _is_no_object(f"{place}.{key}", name, table)
-    if way["kind"] == "height" and not {"min", "max"} & way.keys():
-        yield f"{place}: says no limit. Give one or both of max, min."
-    if way.get("min", -math.inf) > way.get("max", math.inf):
-        yield f"{place}: min {way['min']} is above max {way['max']}"
-
-
-def _push(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
-    """A push goes towards a mark, which a predicate names."""
+        yield from _named(f"{place}.path[{number}]", way, table)
     pushed = stage.get("push")
     if pushed is None:
         return
@@ -215,23 +204,36 @@ def _push(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Ite
 def _predicates(table: Mapping[str, Any]) -> Iterator[str]:
     for index, spec in enumerate(table["success"]):
         place = f"success[{index}]"
-        for key in REFERENCES:
-            if key in spec and (key, spec[key]) != ("support", TABLE):
-                yield from _is_no_object(f"{place}.{key}", spec[key], table)
+        yield from _named(place, spec, table)
         if "container" in spec:
             yield from _has_no_cavity(f"{place}.container", spec["container"], table)
-        named = [(key, spec[key]) for key in REFERENCES if key in spec]
-        for number, (key, name) in enumerate(named):
-            if name in (before for _, before in named[:number]):
-                yield f"{place}.{key}: {name} cannot be in, on or beside itself"
-        yield from _direction(place, spec)
         if "support" in spec:
             model = table["objects"].get(spec["support"], {})
             if CAVITIES[0] in model.values() or CAVITIES[1] in model.values():
                 said = "is open above; what is put there is inside, not on it"
                 yield f"{place}.support: {spec['support']} {said}"
-        if spec["kind"] == "moved":
-            yield from _moved(place, spec)
+
+
+def _named(place: str, spec: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
+    for key in REFERENCES:
+        if key in spec and (key, spec[key]) not in (("support", TABLE), ("against", TABLE)):
+            yield from _is_no_object(f"{place}.{key}", spec[key], table)
+    yield from contradictions(place, spec)
+
+
+def contradictions(place: str, spec: Mapping[str, Any]) -> Iterator[str]:
+    """What is at odds with itself in a predicate or a constraint of the right form."""
+    named = [(key, spec[key]) for key in REFERENCES if key in spec]
+    for number, (key, name) in enumerate(named):
+        if name in (before for _, before in named[:number]):
+            yield f"{place}.{key}: {name} cannot be in, on or beside itself"
+    if spec.get("min", -math.inf) > spec.get("max", math.inf):
+        yield f"{place}: min {spec['min']} is above max {spec['max']}"
+    if spec["kind"] == "height" and not {"min", "max"} & spec.keys():
+        yield f"{place}: says no limit. Give one or both of max, min."
+    yield from _direction(place, spec)
+    if spec["kind"] == "moved":
+        yield from _moved(place, spec)
 
 
 def _direction(place: str, spec: Mapping[str, Any]) -> Iterator[str]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.errors import UsageError
 from bridge.task.check import REFERENCES, TABLE
-from bridge.task.relations import RELATIONS, SHOWN, Box, Measured
+from bridge.task.relations import RELATIONS, Box
 from bridge.task.task_file import Task
 
 
@@ -124,18 +124,6 @@ def bodies_of(spec: Mapping[str, Any]) -> list[str]:
     return [spec[key] for key in REFERENCES if key in spec and spec[key] != TABLE]
 
 
-def _told(found: Sequence[Measured]) -> Found:
-    """Whether all that was measured is as it should be, and what it is."""
-    told = []
-    for each in found:
-        factor, unit = SHOWN[each.unit]
-        what, _, edge = each.what.partition(" beyond ")
-        value = round(float(each.value) * factor)
-        where = f" {'within' if value < 0 else 'beyond'} {edge}" if edge else ""
-        told.append(f"{what} is {abs(value) if edge else value} {unit}{where}")
-    return all(bool(each.excess <= 0) for each in found), "; ".join(told)
-
-
 def _relation(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
     """Whether objects stand to each other, and to where they were, as asked at the end."""
     boxes, said = {TABLE: Box(T_base_box=np.eye(4), half_m=np.zeros(3))}, ""
@@ -151,8 +139,9 @@ def _relation(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
                 return None, f"{key} was not localised before"
             said = f"{key} moved {np.linalg.norm(T[:3, 3] - first[:3, 3]) * 1e3:.0f} mm; "
         boxes[key] = box
-    value, detail = _told(RELATIONS[spec["kind"]](spec, boxes))
-    return value, said + detail
+    found = RELATIONS[spec["kind"]](spec, boxes)
+    holds = all(bool(each.excess <= 0) for each in found)
+    return holds, said + "; ".join(each.told() for each in found)
 
 
 def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:

@@ -57,11 +57,38 @@ class Measured:
     high: float = np.inf
     unit: str = "m"
     """``m``, ``rad`` or ``m/s``."""
+    beyond: str = ""
+    """What it is beyond where it is above 0, and within where it is below: said for the sign."""
 
     @property
     def excess(self) -> Numbers:
         """How far it is outside of the interval; negative inside."""
         return np.asarray(np.maximum(self.low - self.value, self.value - self.high))
+
+    def told(self, digits: int = 0) -> str:
+        """What it is in the first state, in words."""
+        value = float(np.ravel(self.value)[0])
+        if not self.beyond:
+            return f"{self.what} is {shown(value, self.unit, digits)}"
+        side = "within" if value < 0 else "beyond"
+        return f"{self.what} is {shown(abs(value), self.unit, digits)} {side} {self.beyond}"
+
+    def wanted(self) -> str:
+        """Where it should be, in words."""
+        low, high, margin = (
+            shown(each, self.unit, 1) for each in (self.low, self.high, -self.high)
+        )
+        if self.beyond:
+            return f"{f'at least {margin} ' if self.high else ''}within {self.beyond}"
+        if np.isneginf(self.low):
+            return f"at most {high}"
+        return f"at least {low}" if np.isposinf(self.high) else f"{low.split()[0]} to {high}"
+
+
+def shown(value: float, unit: str, digits: int = 0) -> str:
+    """A number with its unit, for a person."""
+    factor, name = SHOWN[unit]
+    return f"{round(value * factor, digits) + 0.0:.15g} {name}"  # never -0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,8 +209,8 @@ def on(spec: Spec, boxes: Boxes) -> Found:
         up = np.abs(support.T_base_box[..., 2, :3])
         upward = up == np.amax(up, axis=-1, keepdims=True)  # the face that looks up is no edge
         over_m = np.where(upward, -np.inf, support.beyond_m(contact)).max(axis=-1)
-        what = f"the middle of {name} beyond the edge of {under}"
-        found.append(Measured(what, over_m, high=-float(spec.get("margin_m", 0.0))))
+        high_m, edge = -float(spec.get("margin_m", 0.0)), f"the edge of {under}"
+        found.append(Measured(f"the middle of {name}", over_m, high=high_m, beyond=edge))
     return found
 
 
@@ -281,8 +308,8 @@ def inside(spec: Spec, boxes: Boxes) -> Found:
     """The origin of an object is in a container's cavity, ``margin_m`` away from its walls."""
     cavity, middle = boxes[spec["container"]].cavity, boxes[spec["object"]].origin_m
     excess = cavity.beyond_m(middle).max(axis=-1)
-    what = f"the middle of {spec['object']} beyond the cavity of {spec['container']}"
-    return [Measured(what, excess, high=-float(spec.get("margin_m", 0.0)))]
+    high_m, edge = -float(spec.get("margin_m", 0.0)), f"the cavity of {spec['container']}"
+    return [Measured(f"the middle of {spec['object']}", excess, high=high_m, beyond=edge)]
 
 
 def moved(spec: Spec, boxes: Boxes) -> Found:
@@ -313,13 +340,6 @@ def moved(spec: Spec, boxes: Boxes) -> Found:
 
 
 RELATIONS: dict[str, Callable[[Spec, Boxes], Found]] = {
-    "on": on,
-    "inside": inside,
-    "moved": moved,
-    "outside": outside,
-    "beside": beside,
-    "between": between,
-    "upright": upright,
-    "aligned": aligned,
+    rule.__name__: rule for rule in (on, inside, moved, outside, beside, between, upright, aligned)
 }
 """By the kind of the success predicate."""

@@ -11,7 +11,7 @@ def describe_task(task: Task) -> str:
     """Return some lines for a person who wants to know whether the file says what they mean."""
     stages = [
         f"  {number}. {stage['id']}: {_handled(stage)}; may touch: {_pairs(stage)}"
-        + "".join(f"; {describe_way(way)}" for way in stage.get("path", []))
+        + "".join(f"; meanwhile {describe_predicate(way)}" for way in stage.get("path", []))
         for number, stage in enumerate(task.stages, start=1)
     ]
     about = task.derived
@@ -32,17 +32,8 @@ def describe_task(task: Task) -> str:
 
 
 def describe_predicate(spec: Mapping[str, Any]) -> str:
-    """Say in words when one success predicate holds, its limits with their names in the file."""
-    return _filled(_WORDS[spec["kind"]], spec)
-
-
-def describe_way(way: Mapping[str, Any]) -> str:
-    """Say in words what one constraint asks while its stage lasts."""
-    return _filled("{obj} " + _WAYS[way["kind"]], {"obj": "the tool", **way})
-
-
-def _filled(words: str, spec: Mapping[str, Any]) -> str:
-    """Put names into their places; what has no place follows."""
+    """Say in words when one predicate holds, its limits with their names in the file."""
+    words = _WORDS[spec["kind"]]
     others = [f"{key} {spec[key]}" for key in spec if f"{{{key}" not in words and key != "kind"]
     return words.format_map(spec) + (f" ({', '.join(others)})" if others else "")
 
@@ -60,13 +51,10 @@ _WORDS = {
     "no_finger_contact": "no finger touches {object}",
     "shape": "{object} has its shape",
     "allowed_contacts": "nothing touched what its stage does not allow",
-}
-_WAYS = {
-    "clearance": "stays away from {against}",
-    "keepout": "never passes over {region[over]}",
-    "upright": "stays upright",
-    "height": "stays at such a height over the table",
-    "speed": "moves no faster",
+    "clearance": "{object} is away from {against}",
+    "keepout": "{object} is not over {over}",
+    "height": "{object} is at such a height over the table",
+    "speed": "the tool moves no faster",
 }
 
 

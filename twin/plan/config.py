@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
+from bridge.task.model_policy import server_of
 from bridge.wire.config import LOOPBACK
 
 
@@ -52,3 +53,5 @@ class PlanConfig:
         if bool(self.model) != bool(self.model_name):
             message = "a model is asked by its address and its name: --model URL --model-name NAME."
             raise UsageError(message)
+        if self.model:
+            server_of(self.model)

@@ -23,7 +23,7 @@ from bridge.wire.config import WireConfig
 from twin.plan.config import LivePlanConfig, PlanConfig
 from twin.plan.loop.nominal import POLICIES, PlanProposer
 from twin.plan.loop.propose import Proposer, choose
-from twin.plan.model_goals import ask_for_goals, client_of
+from twin.plan.model_goals import ask_for_goals
 from twin.plan.problem import NoPlanError, Problem
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
@@ -185,8 +185,6 @@ def run_planner(
         if not config.robot:
             heard["urdf"] = string_from_cdr(sample.data)
 
-    if words is not None and words.model:
-        client_of(run, words)
     planner = LivePlanner(run, config, lambda: heard.get("urdf"), words=words)
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with stop_signals() as stopped, open_session(wire) as session:

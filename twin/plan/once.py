@@ -35,7 +35,7 @@ from twin.plan.loop.propose import Attempt, plan_and_verify
 from twin.plan.loop.steer import tool_at, tried_in
 from twin.plan.loop.tau import goals_of
 from twin.plan.missed import missed_before
-from twin.plan.model_goals import Asked, ask_for_goals, client_of
+from twin.plan.model_goals import Asked, ask_for_goals
 from twin.plan.problem import NoPlanError, Pose, Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
@@ -88,10 +88,6 @@ class Start:
         scene = self.problem.scene.scene_hash
         found.append(f"  scene: {'none was rebuilt' if scene is None else scene[:12]}")
         return found
-
-    def to_json(self) -> dict[str, Any]:
-        """The same as data, without the objects."""
-        return {"episode": self.episode.path.stem, "arm": self.arm}
 
 
 def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") -> Start:
@@ -172,15 +168,13 @@ class Begun:
         """The same as data."""
         return {
             **self.understood.to_json(),
-            "start": self.start.to_json(),
+            "start": {"episode": self.start.episode.path.stem, "arm": self.start.arm},
             "model": None if self.asked is None else self.asked.to_json(),
         }
 
 
 def begin(run: RunFolder, words: str, config: PlanConfig, robot: str = "") -> Begun:
     """Find out what is to be done and from where; a model is asked first where one is given."""
-    if config.model:
-        client_of(run, config)
     understood = None if config.model and not names_task(words) else understand(run, words)
     file = shown_task_file(run, config.episode) if understood is None else understood.file
     start = start_of(run, file.task(), config, robot)
@@ -245,13 +239,8 @@ class Planned:
             "attempts": [
                 {
                     "id": each.candidate.plan.id,
-                    "rank": each.candidate.rank,
                     "cost": each.candidate.cost,
                     "remarks": list(each.candidate.remarks),
-                    "steered_by": None
-                    if each.candidate.plan.steered_by is None
-                    else each.candidate.plan.steered_by.clause,
-                    "duration_s": each.candidate.plan.tau[-1].t_ns * 1e-9,
                     "verdict": json.loads(each.verdict.to_json()),
                 }
                 for each in self.attempts
@@ -343,7 +332,7 @@ def _attempts(
         rounds=config.rounds,
         refused=before,
         task_sha256=begun.understood.file.sha256,
-        grounding_source="" if begun.asked is None else begun.asked.answered_by,
+        grounding_source="" if begun.asked is None else begun.asked.source,
     )
 
 
@@ -363,7 +352,7 @@ def _attempt_line(attempt: Attempt) -> str:
 
 
 def _explained(problem: Problem, plan: Plan, stage: Stage) -> list[str]:
-    """A stage with its constraints: now, and at the instant that each of them speaks of."""
+    """A stage with its constraints, at the instant that each of them speaks of."""
     told = [f"  {stage.id}: {stage.text}"]
     goals = goals_of(problem.scene.task, str(stage.release or stage.push))
     then = "as the hand closes" if stage.grasp else "as the hand opens" if stage.release else "then"
@@ -378,7 +367,6 @@ def _explained(problem: Problem, plan: Plan, stage: Stage) -> list[str]:
             told.append(f"    kept on the way: {constraint.wanted(start)}")
             continue
         at_rest = number < len(goals)
-        told.append(f"    now: {constraint.explain(start)}")
         state = _state(problem, plan, stage, at_rest=at_rest)
         told.append(f"    {'at rest' if at_rest else then}: {constraint.explain(state)}")
     return told

@@ -15,7 +15,6 @@ from bridge.task.plan_request import Refusal
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor
 from twin.plan.constrain.kinds import compile_constraint
-from twin.plan.constrain.relations import constraint_of
 from twin.plan.loop.nominal import PlanProposer
 from twin.plan.loop.propose import NoPlanError, choose
 from twin.plan.loop.steer import tried_in
@@ -161,7 +160,7 @@ def test_a_gap_of_one_millimetre_beside_an_object_is_planned(problem: Problem) -
     found = next(PlanProposer().propose(asked, plan_id="p", seed=1, steer=None))
     Ts = {key: T[None] for key, T in problem.scene.Ts_base_object.items()}
     Ts["cube"] = se3.pose_from_record(found.plan.stages[-1].predicted_objects["cube"])[None]
-    goal = compile_constraint(constraint_of(spec, task) or {}, asked)
+    goal = compile_constraint(spec, asked)
     state = State(Ts_base_object=Ts, T_base_tcp=np.eye(4)[None], width_m=np.zeros(1))
     assert goal.violation(state)[0] <= 0, goal.explain(state)
 

@@ -58,8 +58,8 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
     aside = f" offset by {millimetres(offset)}" if offset.any() else ""
     if "ee" in spec:
         return lambda state: _at(state.T_base_tcp, offset), f"the tool{aside}"
-    if "obj" in spec:
-        name, anchor = spec["obj"], spec.get("anchor", "centroid")
+    if "object" in spec:
+        name, anchor = spec["object"], spec.get("anchor", "centroid")
         p_object = _anchor_m(problem.model(name), anchor) + offset
         return lambda state: _at(pose_of(state, name), p_object), f"{name}'s {anchor}{aside}"
     p, frame = np.array(spec["xyz"], dtype=np.float64) + offset, spec.get("frame", BASE)
@@ -94,17 +94,17 @@ def directions_of(spec: Record, problem: Problem) -> tuple[Point, str]:
             lambda state: state.T_base_tcp[:, None, :3, column],
             f"the tool's {spec['ee']} direction",
         )
-    name = spec["axis"] if "obj" in spec else spec["world"]
+    name = spec["axis"] if "object" in spec else spec["world"]
     if name == "any":
         return (
-            lambda state: pose_of(state, spec["obj"])[:, :3, :3].swapaxes(1, 2),
-            f"the nearest axis of {spec['obj']}",
+            lambda state: pose_of(state, spec["object"])[:, :3, :3].swapaxes(1, 2),
+            f"the nearest axis of {spec['object']}",
         )
     sign, column = (-1.0 if name[0] == "-" else 1.0), AXES.index(name[-1])
-    if "obj" in spec:
+    if "object" in spec:
         return (
-            lambda state: sign * pose_of(state, spec["obj"])[:, None, :3, column],
-            f"{spec['obj']}'s {name} axis",
+            lambda state: sign * pose_of(state, spec["object"])[:, None, :3, column],
+            f"{spec['object']}'s {name} axis",
         )
     axis = sign * np.eye(3)[column]
     return lambda state: axis[None, None], f"the base frame's {name} axis"

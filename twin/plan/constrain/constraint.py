@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bridge.task.relations import SHOWN, Measured
+from bridge.task.relations import Measured, shown
 from twin.plan.problem import Array, Numbers, State
 
 SCALES = {"m": 0.01, "rad": np.radians(10.0), "m/s": 0.1}
@@ -41,8 +41,7 @@ class Constraint:
 
     def wanted(self, state: State) -> str:
         """What is asked, in words; a state says what that is about."""
-        found = self.measured(state)
-        return "; ".join(f"{each.what} {_wanted(each)} {SHOWN[each.unit][1]}" for each in found)
+        return "; ".join(f"{each.what} {each.wanted()}" for each in self.measured(state))
 
     def parts(self, state: State) -> Array:
         """Return f of each number, in the unit of the kind, ``(num_states, num_numbers)``.
@@ -73,24 +72,11 @@ class Constraint:
         return f"{self.kind} {'holds' if holds else 'is violated'}: {told}"
 
 
-def _wanted(asked: Measured) -> str:
-    """The interval in words, without the unit."""
-    factor, _ = SHOWN[asked.unit]
-    low, high = asked.low * factor + 0.0, asked.high * factor + 0.0  # never -0
-    if np.isneginf(low):
-        return f"at most {high:.4g}"
-    if np.isposinf(low) or np.isposinf(high):
-        return f"at least {low:.4g}"
-    return f"{low:.4g} to {high:.4g}"
-
-
 def _sentence(asked: Measured) -> str:
     """What is measured in the first state, what is wanted, and by how much it misses."""
-    factor, unit = SHOWN[asked.unit]
-    value = float(np.ravel(asked.value)[0])
-    missed = max(value - asked.high, asked.low - value) * factor
-    verdict = f", missed by {missed:.3g}" if missed > 0 else ""
-    return f"{asked.what} is {value * factor:.4g} {unit} (wanted {_wanted(asked)}{verdict})"
+    missed = float(np.ravel(asked.excess)[0])
+    verdict = f", missed by {shown(missed, asked.unit, 1)}" if missed > 0 else ""
+    return f"{asked.told(1)} (wanted {asked.wanted()}{verdict})"
 
 
 def violated(constraints: Sequence[Constraint], state: State) -> list[str]:

@@ -1,7 +1,7 @@
 """The kinds of constraints: from a record to the numbers it is about.
 
-Here are points and directions, distances and regions, and what is asked of a path; relations
-between bodies, which predicates decide too, are beside this in ``relations``.
+Relations between bodies are the success predicates of task files and are measured by the same
+rules (``bridge/task/relations.py``); here are points, directions, distances and speeds besides.
 """
 
 from collections.abc import Callable
@@ -11,8 +11,9 @@ import numpy as np
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.task.check import TABLE
-from bridge.task.relations import Measured
+from bridge.task.check import REFERENCES, TABLE
+from bridge.task.predicate import bodies_of
+from bridge.task.relations import RELATIONS, Box, Measured
 from twin.plan.constrain.bodies import (
     Record,
     box_of,
@@ -24,7 +25,6 @@ from twin.plan.constrain.bodies import (
 )
 from twin.plan.constrain.constraint import Constraint
 from twin.plan.constrain.distances import boxes_clearance
-from twin.plan.constrain.relations import RELATIONS, relation_of
 from twin.plan.constrain.schema import SCENE, Vocabulary, check_constraint, values_of
 from twin.plan.problem import Array, Numbers, Problem, State
 
@@ -32,7 +32,7 @@ from twin.plan.problem import Array, Numbers, Problem, State
 def compile_constraint(record: Record, problem: Problem) -> Constraint:
     """Make a constraint of a record that fits the schema of constraints."""
     check_constraint(record, Vocabulary.of_task(problem.scene.task))
-    for name in values_of(record, _ID_KEYS):
+    for name in values_of(record, (*REFERENCES, "frame")):
         if name in problem.scene.missing():
             reason = problem.scene.reasons.get(name, "not found")
             message = f"{record['kind']}: {name} was not localised ({reason}). Look again."
@@ -41,37 +41,47 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
 
 
 _STRAIGHT = np.eye(1, 4)[0]
-_ID_KEYS = ("obj", "container", "support", "reference", "against", "over", "frame")
+
+
+def _relation(record: Record, problem: Problem) -> Constraint:
+    """Measure what the success predicate of that kind measures."""
+    kind, names = record["kind"], bodies_of(record)
+    if kind == "moved" and names[0] not in problem.scene.Ts_base_object:
+        message = f"moved {names[0]}: it was not localised, so nobody knows where it was before."
+        raise UsageError(message)
+    top = se3.transform_from(_STRAIGHT, np.array([0, 0, problem.scene.table_height_m]))
+    table = {TABLE: Box(T_base_box=top, half_m=np.zeros(3))}
+
+    def measured(state: State) -> list[Measured]:
+        boxes = {name: box_of(state, name, problem) for name in names}
+        return RELATIONS[kind](record, table | boxes)
+
+    unit = "rad" if kind in ("upright", "aligned") else "m"
+    return Constraint(record=record, measured=measured, unit=unit)
 
 
 def _distance(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (point_of(record[key], problem) for key in "ab")
-    limits = []
-    if "target" in record:
-        target, tol = record["target"], record["tol"]
-        limits.append((target - tol if target > tol else -np.inf, target + tol))
-    if "min" in record or "max" in record:
-        limits.append((record.get("min", -np.inf), record.get("max", np.inf)))
+    what, low, high = f"the distance from {a_name} to {b_name}", *_limits(record)
+    return _one(
+        record, what, lambda state: np.linalg.norm(a(state) - b(state), axis=-1), low=low, high=high
+    )
 
-    def measured(state: State) -> list[Measured]:
-        value, what = np.linalg.norm(a(state) - b(state), axis=-1), f"{a_name} to {b_name}"
-        return [
-            Measured(f"the distance from {what}", value, low=low, high=high) for low, high in limits
-        ]
 
-    return Constraint(record=record, measured=measured)
+def _limits(record: Record) -> tuple[float, float]:
+    return record.get("min", -np.inf), record.get("max", np.inf)
 
 
 def _above(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (point_of(record[key], problem) for key in "ab")
-    height, tol = record["height"], record["tol"]
+    height, tol = record["height"], record["tolerance_m"]
 
     def measured(state: State) -> list[Measured]:
         way, what = a(state) - b(state), f"the height of {a_name} over {b_name}"
         aside = np.linalg.norm(way[:, :2], axis=-1)
         return [
             Measured(what, way[:, 2], low=height - tol, high=height + tol),
-            Measured(f"its distance aside from {b_name}", aside, high=record["xy_tol"]),
+            Measured(f"its distance aside from {b_name}", aside, high=record["aside_m"]),
         ]
 
     return Constraint(record=record, measured=measured)
@@ -81,7 +91,7 @@ def _align(record: Record, problem: Problem) -> Constraint:
     (a, a_name), (b, b_name) = (directions_of(record[key], problem) for key in "ab")
     either = any(record[key].get("axis") == "any" for key in "ab")
     undirected = either or record.get("undirected", False)
-    most_rad = float(np.radians(record["max_deg"]))
+    most_rad = float(record["tolerance_rad"])
 
     def measured(state: State) -> list[Measured]:
         one, other = a(state)[:, :, None], b(state)[:, None]
@@ -109,7 +119,7 @@ def _one(
 
 
 def _clearance(record: Record, problem: Problem) -> Constraint:
-    obj, against = record["obj"], record["against"]
+    obj, against = record["object"], record["against"]
     what = f"the least distance between {obj} and {against}"
     return _one(record, what, _least_distance(obj, against, problem), low=record["min"])
 
@@ -144,7 +154,7 @@ def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State
 
 def _keepout(record: Record, problem: Problem) -> Constraint:
     """Out of the upright column over the box around an object that stands upright."""
-    obj, over = record["obj"], record["region"]["over"]
+    obj, over = record["object"], record["over"]
     points = surface_points(problem, obj)
 
     def least(state: State) -> Array:
@@ -154,14 +164,14 @@ def _keepout(record: Record, problem: Problem) -> Constraint:
         return np.amin(outside + np.minimum(beyond.max(axis=-1), 0.0), axis=-1)
 
     what = f"the distance of {obj} from what is over {over}"
-    return _one(record, what, least, low=record.get("margin", 0.0))
+    return _one(record, what, least, low=record.get("margin_m", 0.0))
 
 
 def _height(record: Record, problem: Problem) -> Constraint:
     table = problem.scene.table_height_m
-    low, high = record.get("min", -np.inf), record.get("max", np.inf)
-    if "obj" in record:
-        obj = record["obj"]
+    low, high = _limits(record)
+    if "object" in record:
+        obj = record["object"]
         what = f"the height of the lowest point of {obj} over the table"
 
         def lowest(state: State) -> Array:
@@ -192,7 +202,7 @@ def _speed(record: Record, problem: Problem) -> Constraint:
 
 
 _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
-    **dict.fromkeys(RELATIONS, relation_of),
+    **dict.fromkeys(RELATIONS, _relation),
     "distance": _distance,
     "above": _above,
     "align": _align,
@@ -201,4 +211,3 @@ _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
     "height": _height,
     "speed": _speed,
 }
-KINDS = tuple(_KINDS)

@@ -99,26 +99,15 @@ def stages_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[str
             lands.append([GRIPPER, target])
         end = f"_{key}" if len(grounding.order) > 1 else ""
         where = " and ".join(describe_predicate(goal) for goal in goals)
-        stages += [
-            {
-                "id": f"grasp{end}",
-                "text": f"Grasp {key}.",
-                "grasp": key,
-                "allowed_contacts": [*others, *starts_on, hand],
-            },
-            {
-                "id": f"carry{end}",
-                "text": f"Carry {key}, so that {where}.",
-                "carry": key,
-                "allowed_contacts": [*others, hand],
-            },
-            {
-                "id": f"release{end}",
-                "text": f"Let {key} go, so that {where}.",
-                "release": key,
-                "allowed_contacts": [*others, hand, *lands],
-            },
-        ]
+        for verb, text, pairs in (
+            ("grasp", f"Grasp {key}.", [*starts_on, hand]),
+            ("carry", f"Carry {key}, so that {where}.", [hand]),
+            ("release", f"Let {key} go, so that {where}.", [hand, *lands]),
+        ):
+            allowed = [*others, *pairs]
+            stages.append(
+                {"id": f"{verb}{end}", "text": text, verb: key, "allowed_contacts": allowed}
+            )
     return stages
 
 

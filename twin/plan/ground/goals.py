@@ -38,20 +38,6 @@ class Grounding:
             *(f"  {line}" for line in self.explanation),
         ]
 
-    def to_json(self) -> dict[str, Any]:
-        """The same as data."""
-        return {
-            "instruction": self.text,
-            "goals": [dict(goal) for goal in self.goals],
-            "order": list(self.order),
-            "is_order_given": self.is_order_given,
-            "choices": [
-                {"count": item.count, "among": list(item.among), "chosen": list(item.chosen)}
-                for item in self.choices
-            ],
-            "explanation": list(self.explanation),
-        }
-
 
 @dataclass
 class Goals:
@@ -113,11 +99,26 @@ class Goals:
             self._refuse_contradiction(key, goals)
         return self.found
 
+    def grounding(
+        self, text: str, explanation: Iterable[str], choices: Iterable[Choice] = ()
+    ) -> Grounding:
+        """What an instruction asks for whose clauses were all taken."""
+        found = self.checked()
+        if not found:
+            refuse("empty", "the instruction asks for nothing.")
+        return Grounding(
+            text=text,
+            goals=tuple(found),
+            order=ordered(self, found),
+            is_order_given=self.is_order_given,
+            choices=tuple(choices),
+            explanation=tuple(dict.fromkeys(explanation)),
+        )
+
     def _refuse_contradiction(self, key: str, goals: Sequence[Mapping[str, Any]]) -> None:
         kinds = {goal["kind"] for goal in goals}
         places = {(g["kind"], g[PLACES[g["kind"]]]) for g in goals if g["kind"] in PLACES}
-        inside = {goal["container"] for goal in goals if goal["kind"] == "inside"}
-        supports = {goal["support"] for goal in goals if goal["kind"] == "on"}
+        held_by = {name for _, name in places}
         outside = {goal["container"] for goal in goals if goal["kind"] == "outside"}
         sides: dict[str, set[str]] = {}
         for goal in goals:
@@ -125,9 +126,9 @@ class Goals:
                 sides.setdefault(goal["reference"], set()).add(str(goal.get("direction", "")))
         if (
             len(places) > 1
-            or inside & outside
+            or held_by & outside
             or ("moved" in kinds and places - {("on", TABLE)})
-            or (inside | supports) & set(sides)
+            or held_by & set(sides)
             or any(len(found - {""}) > 1 for found in sides.values())
             or sum(goal["kind"] == "moved" for goal in goals) > 1
         ):

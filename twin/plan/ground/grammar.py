@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bridge.task.relations import SIDES
-from twin.plan.ground.goals import PLACES, Goals, Grounding, ordered
+from twin.plan.ground.goals import PLACES, Goals, Grounding
 from twin.plan.ground.nouns import NounPhrase, Nouns, with_shared_noun
 from twin.plan.ground.vocabulary import GroundingError, Ids, Vocabulary, refuse
 from twin.plan.ground.words import CARRIED, NEGATIONS, PHRASES, RELATIONS, VERBS, WAYS, tokens_of
@@ -76,17 +76,7 @@ class _Reader:
         for key, words in self.held.items():
             message = f"'{words}': say where {key} is to go; holding it is no end."
             refuse("unsupported_verb", message)
-        goals = self.goals.checked()
-        if not goals:
-            refuse("empty", "the instruction asks for nothing.")
-        return Grounding(
-            text=self.text,
-            goals=tuple(goals),
-            order=ordered(self.goals, goals),
-            is_order_given=self.goals.is_order_given,
-            choices=tuple(self.nouns.choices),
-            explanation=tuple(dict.fromkeys(self.nouns.explanation)),
-        )
+        return self.goals.grounding(self.text, self.nouns.explanation, self.nouns.choices)
 
     def _refuse_words(self) -> None:
         """Words that turn what is said round; whatever they stand beside, it is not read."""

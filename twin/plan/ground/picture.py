@@ -15,7 +15,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.palette import rgb
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.constrain.reply import Keypoint
+from twin.plan.constrain.reply import Keypoints, keypoint
 from twin.plan.problem import Flags, Points, Pose, Problem
 from twin.plan.release.obstacles import spread_points
 
@@ -34,7 +34,7 @@ class MarkedPicture:
     """A picture with its marks."""
 
     jpeg: bytes
-    keypoints: Mapping[str, Keypoint]
+    keypoints: Keypoints
     """By what stands beside them: ``cube.1``."""
 
 
@@ -51,17 +51,13 @@ class _Seen:
 def marked_picture(problem: Problem, frames: Sequence[RgbdFrame]) -> MarkedPicture | None:
     """Mark the frame that shows the most points of the objects; None: none shows any."""
     views = [(frame, _views(problem, frame)) for frame in frames]
-
-    def shown(view: tuple[RgbdFrame, Mapping[str, _Seen]]) -> tuple[int, float]:
-        """How many objects, and how large."""
-        areas = [np.ptp(each.outline_px, axis=0).prod() for each in view[1].values()]
-        return len(areas), float(sum(areas))
-
-    frame, seen = max(views, key=shown)
+    outlines = [[each.outline_px for each in seen.values()] for _, seen in views]
+    sizes = [(len(each), sum(np.ptp(px, axis=0).prod() for px in each)) for each in outlines]
+    frame, seen = views[sizes.index(max(sizes))]
     if not seen:
         return None
     keypoints = {
-        f"{key}.{number}": Keypoint(obj=key, p_object_m=p)
+        f"{key}.{number}": keypoint(key, p)
         for key, each in seen.items()
         for number, p in enumerate(each.points_m, start=1)
     }

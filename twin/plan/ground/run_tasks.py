@@ -2,10 +2,12 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
@@ -17,7 +19,7 @@ from bridge.task.task_file import TaskFile
 from twin.plan.ground.derive import derive_task
 from twin.plan.ground.goals import Grounding
 from twin.plan.ground.grammar import ground
-from twin.plan.ground.vocabulary import Vocabulary, vocabulary_of
+from twin.plan.ground.vocabulary import vocabulary_of
 from twin.scene.store.folder import read_record
 
 MAX_NAME = 400
@@ -47,7 +49,7 @@ class UnderstoodTask:
             "derived": task.derived,
             "stages": list(task.stages),
             "success": list(task.success),
-            "grounding": None if self.grounding is None else self.grounding.to_json(),
+            "grounding": msgspec.to_builtins(self.grounding),
         }
 
 
@@ -63,7 +65,9 @@ def understand(run: RunFolder, words: str) -> UnderstoodTask:
         file.task()
         return UnderstoodTask(file=file, grounding=None)
     base = task_files_of(run)
-    grounding = ground(words, vocabulary_of_run(run, base))
+    task = union_of(base)
+    assert task is not None  # noqa: S101  # there is at least one file
+    grounding = ground(words, vocabulary_of(task, instances_of(run)))
     return UnderstoodTask(file=derive_task(grounding, _shown(grounding, base)), grounding=grounding)
 
 
@@ -127,11 +131,7 @@ def shown_task_file(run: RunFolder, episode: str) -> TaskFile:
     return files[0]
 
 
-def vocabulary_of_run(run: RunFolder, base: Sequence[TaskFile]) -> Vocabulary:
-    """What the objects of task files are called in a run's scene; without one, in the files."""
-    task = union_of(base)
-    if task is None:
-        raise UsageError("no task file to take objects from.")
-    record = read_record(run) or {}
-    instances = (record.get("semantics") or {}).get("instances", ())
-    return vocabulary_of(task, instances)
+def instances_of(run: RunFolder) -> Sequence[Mapping[str, Any]]:
+    """What a run's scene says its objects look like; nothing where there is none."""
+    semantics: Mapping[str, Any] = (read_record(run) or {}).get("semantics") or {}
+    return list(semantics.get("instances", ()))

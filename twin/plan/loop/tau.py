@@ -9,8 +9,8 @@ import numpy as np
 
 from bridge.geometry import se3
 from bridge.task.plan import Stage, Waypoint
+from bridge.task.relations import RELATIONS
 from bridge.task.task_file import Task
-from twin.plan.constrain.relations import constraint_of
 from twin.plan.path.planner import STEP_S, waypoints_of
 from twin.plan.path.transfer import Leg
 from twin.plan.problem import Grasp, NoPlanError, Pose
@@ -163,6 +163,6 @@ def plan_stage(
 
 
 def goals_of(task: Task, key: str) -> list[dict[str, Any]]:
-    """The success predicates about where an object is, as constraints."""
+    """The success predicates about where an object is, which constraints say in the same words."""
     mine = (spec for spec in task.success if spec.get("object") == key)
-    return [record for spec in mine if (record := constraint_of(spec, task)) is not None]
+    return [dict(spec) for spec in mine if spec["kind"] in RELATIONS]

@@ -212,7 +212,7 @@ class ReleaseSearch:
 
         def placed(state: State) -> list[Measured]:
             return [
-                Measured(f"the reach of {name} beyond {target.name}", beyond(state), high=0.0),
+                Measured(f"the reach of {name}", beyond(state), high=0.0, beyond=target.name),
                 Measured(
                     f"the height of {name} over {target.name}",
                     over(state),
@@ -281,7 +281,7 @@ def places_on_table(
     named = {name for goal in goals for name in values_of(goal.record, ("reference", "against"))}
     gaps = [
         compile_constraint(
-            {"kind": "clearance", "obj": key, "against": name, "min": gap_m}, problem
+            {"kind": "clearance", "object": key, "against": name, "min": gap_m}, problem
         )
         for name in problem.scene.Ts_base_object
         if name != key

@@ -1,5 +1,6 @@
 """A scene of a cube, a brick, an open box and a fixed post, and states around good ones."""
 
+import math
 from functools import cache
 from typing import Any
 
@@ -145,7 +146,7 @@ def around(
     )
 
 
-CUBE, OPENING = {"obj": "cube", "anchor": "bottom"}, {"obj": "box", "anchor": "opening"}
+CUBE, OPENING = {"object": "cube", "anchor": "bottom"}, {"object": "box", "anchor": "opening"}
 IN_BOX = state(cube=pose(0.5, 0.2, 0.03, 0.3))
 ON_BRICK = state(cube=pose(0.46, 0.01, 0.07, 0.5))
 OVER_BOX = state(cube=pose(0.51, 0.2, 0.096, 0.5))
@@ -157,42 +158,48 @@ TILTED = state(
     brick=PLACES["brick"] @ se3.transform_from(np.array([0.9, 0.3, 0.2, 0.1]), np.zeros(3))
 )
 
-TOOL, MIDDLE = {"ee": True}, {"obj": "cube"}
-FROM_BRICK = {"from": {"obj": "brick"}, "to": {"obj": "post"}}
+TOOL, MIDDLE = {"ee": True}, {"object": "cube"}
+FROM_BRICK = {"from": {"object": "brick"}, "to": {"object": "post"}}
 DOWN, ASKEW = {"a": {"ee": "approach"}, "b": {"world": "-z"}}, pose(0.5, -0.2, 0.02, 0.7)
-OVER = {"a": CUBE, "b": OPENING, "height": 0.02, "tol": 0.01, "xy_tol": 0.03}
+OVER = {"a": CUBE, "b": OPENING, "height": 0.02, "tolerance_m": 0.01, "aside_m": 0.03}
 POINT = pose(0.5, 0.1, 0.1)
 RIGHT = state(cube=pose(0.45, -0.07, 0.02, 0.2))
 AWAY = state(tcp=pose(0.5, 0.1, 0.3) @ LOOKING_DOWN)
+TEN = math.radians(10)
 _EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
-    "distance": ({"a": TOOL, "b": MIDDLE, "target": 0.2, "tol": 0.01}, START, AWAY),
+    "distance": ({"a": TOOL, "b": MIDDLE, "min": 0.19, "max": 0.21}, START, AWAY),
     "distance at least": (
         {"a": MIDDLE, "b": {"xyz": [0.5, 0.1, 0.1]}, "min": 0.1}, START, state(cube=POINT),
     ),
     "above": (OVER, OVER_BOX, START),
-    "on": ({"obj": "cube", "support": "brick"}, ON_BRICK, START),
-    "on table": ({"obj": "cube", "support": "table"}, START, ON_BRICK),
-    "inside": ({"obj": "cube", "container": "box"}, IN_BOX, START),
-    "outside": ({"obj": "cube", "container": "box"}, OUT, IN_BOX),
-    "beside": ({"obj": "cube", "reference": "brick"}, BESIDE, ON_BRICK),
-    "beside left": ({"obj": "cube", "reference": "brick", "direction": "left"}, BESIDE, RIGHT),
-    "align": ({**DOWN, "max_deg": 10}, START, state(tcp=np.eye(4))),
+    "on": ({"object": "cube", "support": "brick"}, ON_BRICK, START),
+    "on table": ({"object": "cube", "support": "table"}, START, ON_BRICK),
+    "inside": ({"object": "cube", "container": "box"}, IN_BOX, START),
+    "outside": ({"object": "cube", "container": "box"}, OUT, IN_BOX),
+    "beside": ({"object": "cube", "reference": "brick"}, BESIDE, ON_BRICK),
+    "beside left": ({"object": "cube", "reference": "brick", "direction": "left"}, BESIDE, RIGHT),
+    "align": ({**DOWN, "tolerance_rad": TEN}, START, state(tcp=np.eye(4))),
     "align bodies": (
-        {"a": {"obj": "cube", "axis": "any"}, "b": FROM_BRICK, "max_deg": 20},
+        {"a": {"object": "cube", "axis": "any"}, "b": FROM_BRICK, "tolerance_rad": 2 * TEN},
         BETWEEN, state(cube=ASKEW),
     ),
-    "upright": ({"obj": "brick", "max_deg": 10}, START, TILTED),
+    "upright": ({"object": "brick", "tolerance_rad": TEN}, START, TILTED),
     "upright cube": (
-        {"obj": "cube", "max_deg": 10}, START, state(cube=TILTED.Ts_base_object["brick"][0]),
+        {"object": "cube", "tolerance_rad": TEN},
+        START, state(cube=TILTED.Ts_base_object["brick"][0]),
     ),
-    "clearance": ({"obj": "cube", "against": "box", "min": 0.02}, START, IN_BOX),
-    "clearance table": ({"obj": "cube", "against": "table", "min": 0.02}, ON_BRICK, START),
-    "keepout over": ({"obj": "cube", "region": {"over": "box"}, "margin": 0.01}, START, OVER_BOX),
+    "clearance": ({"object": "cube", "against": "box", "min": 0.02}, START, IN_BOX),
+    "clearance table": ({"object": "cube", "against": "table", "min": 0.02}, ON_BRICK, START),
+    "keepout over": ({"object": "cube", "over": "box", "margin_m": 0.01}, START, OVER_BOX),
     "height": ({"a": CUBE, "min": 0.04}, ON_BRICK, START),
-    "height of a body": ({"obj": "cube", "max": 0.03}, START, ON_BRICK),
-    "moved": ({"obj": "cube", "at_least": 0.05, "vector": [0.0, 1.0, 0.0]}, ON_BRICK, START),
-    "moved to": ({"obj": "cube", "target": [0.45, 0.0], "tol": 0.03}, ON_BRICK, START),
-    "moved by": ({"obj": "cube", "by": 0.16, "way": "left", "tol": 0.03}, ON_BRICK, START),
+    "height of a body": ({"object": "cube", "max": 0.03}, START, ON_BRICK),
+    "moved": (
+        {"object": "cube", "at_least_m": 0.05, "direction": [0.0, 1.0, 0.0]}, ON_BRICK, START,
+    ),
+    "moved to": ({"object": "cube", "target_m": [0.45, 0.0], "tolerance_m": 0.03}, ON_BRICK, START),
+    "moved by": (
+        {"object": "cube", "by_m": 0.16, "direction": "left", "tolerance_m": 0.03}, ON_BRICK, START,
+    ),
 }  # fmt: skip
 EXAMPLES = {
     name: ({"kind": name.split()[0], **record}, good, bad)

@@ -6,19 +6,26 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-BOTTOM, OPENING = {"obj": "cube", "anchor": "bottom"}, {"obj": "box", "anchor": "opening"}
-ABOVE = {"kind": "above", "a": BOTTOM, "b": OPENING, "height": 0.02, "tol": 0.01, "xy_tol": 0.03}
+BOTTOM, OPENING = {"object": "cube", "anchor": "bottom"}, {"object": "box", "anchor": "opening"}
+ABOVE = {
+    "kind": "above",
+    "a": BOTTOM,
+    "b": OPENING,
+    "height": 0.02,
+    "tolerance_m": 0.01,
+    "aside_m": 0.03,
+}
 
 
-INSIDE = {"kind": "inside", "obj": "cube", "container": "box"}
+INSIDE = {"kind": "inside", "object": "cube", "container": "box"}
 
 
 def valid_reply() -> dict[str, Any]:
     return copy.deepcopy(
         {
-            "version": 2,
+            "version": 3,
             "goals": [INSIDE],
-            "keypoints": [{"name": "corner", "obj": "cube", "xyz": [0.52, -0.13, 0.04]}],
+            "keypoints": [{"name": "corner", "object": "cube", "xyz": [0.52, -0.13, 0.04]}],
             "constraints": [
                 {"when": "release", "moving": "cube", "keep": ABOVE},
                 {
@@ -61,7 +68,7 @@ def hostile_replies() -> Iterator[tuple[str, str, str]]:
 
 
 def _numbers() -> Iterator[tuple[str, str, str]]:
-    places = [(*KEEP, key) for key in ("height", "tol", "xy_tol")]
+    places = [(*KEEP, key) for key in ("height", "tolerance_m", "aside_m")]
     places += [(*LOW, "min"), ("keypoints", 0, "xyz", 2)]
     for path in places:
         for value in NO_NUMBERS:
@@ -72,7 +79,11 @@ def _numbers() -> Iterator[tuple[str, str, str]]:
         for number in (100.0, -7, 1e300):
             yield f"{path[-1]} is {number}", json.dumps(put(path, number)), text_of(path)
     for value in (0, -0.01, 0.6):
-        yield f"tolerance {value}", json.dumps(put((*KEEP, "tol"), value)), text_of((*KEEP, "tol"))
+        yield (
+            f"tolerance {value}",
+            json.dumps(put((*KEEP, "tolerance_m"), value)),
+            text_of((*KEEP, "tolerance_m")),
+        )
 
 
 def _sizes() -> Iterator[tuple[str, str, str]]:
@@ -80,7 +91,7 @@ def _sizes() -> Iterator[tuple[str, str, str]]:
     yield "a megabyte", json.dumps(put(name, "a" * 1_000_000)), "top level"
     yield "a megabyte of prose", "word " * 200_000 + json.dumps(valid_reply()), "top level"
     yield "a long name", json.dumps(put(name, "a" * 1000)), text_of(name)
-    yield "a long reason", json.dumps({"version": 2, "cannot": "a" * 301}), "cannot"
+    yield "a long reason", json.dumps({"version": 3, "cannot": "a" * 301}), "cannot"
     for depth in (13, 100, 5000, 30_000):
         yield f"{depth} lists", "[" * depth + "]" * depth, "top level"
         yield f"{depth} objects", '{"a":' * depth + "1" + "}" * depth, "top level"

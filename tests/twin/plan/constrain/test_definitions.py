@@ -204,7 +204,7 @@ def test_a_scene_is_kept_clear_of_as_far_as_its_grid_says() -> None:
     values = np.broadcast_to((0.02 * np.arange(40) - 0.25).astype("f4"), (60, 60, 40)).copy()
     grid = SdfGrid(values_m=values, origin_m=np.array([0.0, -0.6, -0.2]), voxel_m=0.02)
     scene = replace(blocks().scene, static_sdf=StaticSdf(conservative=grid, observed=grid))
-    record = {"kind": "clearance", "obj": "cube", "against": "scene", "min": 0.03}
+    record = {"kind": "clearance", "object": "cube", "against": "scene", "min": 0.03}
     constraint = compile_constraint(record, replace(blocks(), scene=scene))
     states = around(BETWEEN, 10, np.random.default_rng(12))
     for index, f in enumerate(constraint.violation(states)):
@@ -213,7 +213,9 @@ def test_a_scene_is_kept_clear_of_as_far_as_its_grid_says() -> None:
 
 
 def test_a_speed_is_the_way_over_the_time_at_its_fastest() -> None:
-    constraint = compile_constraint({"kind": "speed", "max": 0.25, "a": {"obj": "cube"}}, blocks())
+    constraint = compile_constraint(
+        {"kind": "speed", "max": 0.25, "a": {"object": "cube"}}, blocks()
+    )
     rng = np.random.default_rng(13)
     for _ in range(10):
         ways = around(START, 6, rng)

@@ -154,7 +154,7 @@ def every_pose(releases: tuple[Release, ...], problem: Problem) -> State:
 def test_a_cube_is_let_go_inside_of_the_box_and_touches_nothing(found: tuple[Release, ...]) -> None:
     problem, grasp = cube_problem(), from_above()
     assert len(found) >= 5
-    inside = compile_constraint({"kind": "inside", "obj": "cube", "container": "box"}, problem)
+    inside = compile_constraint({"kind": "inside", "object": "cube", "container": "box"}, problem)
     assert (inside.violation(every_pose(found, problem)) <= 0).all()
     costs = [release.cost for release in found]
     assert costs == sorted(costs)
@@ -235,11 +235,10 @@ def test_constraints_alone_say_where() -> None:
     problem = cube_problem()
     record = {
         "kind": "beside",
-        "obj": "cube",
+        "object": "cube",
         "reference": "box",
         "direction": "right",
-        "min_gap": 0.02,
-        "max_gap": 0.05,
+        "gap_m": [0.02, 0.05],
     }
     constraint = compile_constraint(record, problem)
     found = final_states(
@@ -252,7 +251,12 @@ def test_constraints_alone_say_where() -> None:
 def test_a_height_asked_of_the_release_holds_there_whatever_the_usual_drop() -> None:
     """Higher than 30 mm over the rim, which is the most where nothing is asked."""
     problem = cube_problem()
-    record = {"kind": "height", "a": {"obj": "cube", "anchor": "bottom"}, "min": 0.13, "max": 0.14}
+    record = {
+        "kind": "height",
+        "a": {"object": "cube", "anchor": "bottom"},
+        "min": 0.13,
+        "max": 0.14,
+    }
     wish = compile_constraint(record, problem)
     found = final_states(problem, from_above(), wishes=[wish])
     assert (wish.violation(every_pose(found, problem)) <= 0).all()
@@ -262,13 +266,7 @@ def test_a_height_asked_of_the_release_holds_there_whatever_the_usual_drop() -> 
 def test_a_known_miss_is_made_up_for() -> None:
     """Where it will lie, not where it is let go, is in the gap of one millimetre."""
     problem, miss = cube_problem(), Miss(shift_m=np.array([0.004, -0.003, 0.0]), turn_rad=0.1)
-    record = {
-        "kind": "beside",
-        "obj": "cube",
-        "reference": "box",
-        "min_gap": 0.02,
-        "max_gap": 0.021,
-    }
+    record = {"kind": "beside", "object": "cube", "reference": "box", "gap_m": [0.02, 0.021]}
     goal = compile_constraint(record, problem)
     near = [upright(0.5, 0.05, 0.024)]
     found = final_states(problem, from_above(), goals=[goal], near=near, miss=miss)
