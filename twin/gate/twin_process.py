@@ -72,7 +72,7 @@ def answer(question: Question) -> Verdict:
     from twin.replay.agreement import in_each_engine  # noqa: PLC0415
     from twin.replay.audit import audit  # noqa: PLC0415
     from twin.replay.checks import limited_to_task  # noqa: PLC0415
-    from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
+    from twin.replay.monte_carlo import with_samples  # noqa: PLC0415
     from twin.replay.rebuilt_scene import for_task  # noqa: PLC0415
     from twin.replay.result import ReplayResult  # noqa: PLC0415
     from twin.replay.verdict import reason_of, replay_plan  # noqa: PLC0415
@@ -102,14 +102,13 @@ def answer(question: Question) -> Verdict:
         audited = audit(made[0], kept, scene, config)
         verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
         verdict = replace(verdict, reason=reason_of(verdict))
-    samples = replay_samples(
+    verdict = with_samples(
+        verdict,
         judge,
         scene,
         replace(config, samples=min(config.samples, most_samples)),
-        plan_id=plan.id,
         identity=plan.start_id or plan.id,
     )
-    verdict = with_probability(verdict, samples)
     if not notes:
         return verdict
     warnings = (*verdict.warnings, *notes)  # a yes that knows less than it might says so first

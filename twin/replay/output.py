@@ -27,7 +27,6 @@ from bridge.episode.topics import (
     ROBOT_DESCRIPTION,
     TCP_POSE,
     VERDICT,
-    VERDICT_SAMPLE,
     camera_topic,
     cell_topic,
     object_topic,
@@ -115,9 +114,6 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
         yield _Message(image.stamp_ns, topic, schema.COMPRESSED_IMAGE, image.to_cdr())
     end = start + int(result.stamps_ns[-1])
     yield _Message(end, f"{prefix}{VERDICT}", schema.VERDICT, result.verdict.to_json())
-    for sample in result.samples:
-        data = json.dumps(sample.to_record(), separators=(",", ":")).encode()
-        yield _Message(end, f"{prefix}{VERDICT_SAMPLE}", schema.SAMPLE, data)
     if origin.divergence is not None:
         data = json.dumps(origin.divergence, separators=(",", ":")).encode()
         yield _Message(end, f"{prefix}{DIVERGENCE}", schema.DIVERGENCE, data)

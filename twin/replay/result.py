@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Float32, Int
 from bridge.geometry.signals import runs_of_true
 from bridge.task.predicate import Contact, Rollout
 from bridge.task.verdict import Verdict
-from twin.replay.monte_carlo import Sample
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +25,6 @@ class ReplayResult:
     clearance_m: Float[np.ndarray, " num_steps"]
     """Smallest signed distance over the pairs that may not touch [m]."""
     contacts: list[Contact]
-    samples: tuple[Sample, ...] = ()
-    """Varied replays behind the verdict's probability."""
     nodes_m: dict[str, Float32[np.ndarray, "num_steps _ 3"]] = field(default_factory=dict)
     """Soft objects: where their nodes are, base frame [m]."""
     extents_m: dict[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)

@@ -31,7 +31,7 @@ from twin.replay.execution import (
 )
 from twin.replay.job import WITHOUT, ReplayJob
 from twin.replay.job_row import judged, row_of_failure
-from twin.replay.monte_carlo import replay_samples, with_probability
+from twin.replay.monte_carlo import with_samples
 from twin.replay.observed import in_order, observed_plan
 from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import RebuiltScene, read_rebuilt_scene
@@ -228,14 +228,14 @@ def _with_samples(source: _Source, config: ReplayConfig, result: ReplayResult) -
     """Ask varied replays too; plans of one episode are tried against the same variations."""
     if not config.samples or source.scene.missing():
         return result
-    samples = replay_samples(
+    verdict = with_samples(
+        result.verdict,
         lambda there, varied: _run(source, there, varied).verdict,
         source.scene,
         config,
-        plan_id=source.plan.id,
         identity=source.job.episode_sha256,
     )
-    return replace(result, verdict=with_probability(result.verdict, samples), samples=samples)
+    return replace(result, verdict=verdict)
 
 
 def _images(source: _Source, result: ReplayResult) -> tuple[tuple[str, CompressedColor], ...]:
