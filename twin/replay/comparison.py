@@ -3,11 +3,9 @@
 from typing import Any
 
 from bridge.episode import streams
-from bridge.episode.executions import NO_PLAN
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
 from bridge.task.predicate import evaluate_success
-from twin.physics.config import Engine
 from twin.replay.config import ReplayConfig
 from twin.replay.divergence import Divergence, diverge
 from twin.replay.job import ReplayJob
@@ -37,9 +35,7 @@ def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[
     return tuple(findings_of(task, rollout, "recorded", tolerance_m=CONTACT_M))
 
 
-def compare(
-    job: ReplayJob, engine: Engine, result: ReplayResult, recording: Recording, end_ns: int
-) -> Divergence:
+def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: int) -> Divergence:
     """Lay the executed replay over the planned one, if it is there, and over the recording."""
     robot = load_robot(recording.scene.urdf)
     executed = trace_of_result(result, "executed", end_ns)
@@ -47,38 +43,27 @@ def compare(
     traces = [executed, recorded]
     task = job.task
     findings = {
-        "executed": _findings(findings_of(task, result.rollout(), "replayed")),
+        "executed": _findings(findings_of(task, result, "replayed")),
         "recorded": {
             (finding.kind, finding.object_id): finding.value
             for finding in evaluate_success(task, states_of_recording(recording, robot))
         },
     }
-    planned, planned_findings = _planned(job, engine, recording)
-    if isinstance(planned, str):
-        missing = [planned]
-    else:
-        traces.append(planned)
-        findings["planned"] = planned_findings
-        missing = []
-    missing += [
-        f"{name} was not localised after the execution: {reason}"
-        for name, reason in recording.end.reasons.items()
-        if name in recording.scene.movable()
-    ]
-    return diverge(job.plan_id, traces, findings=findings, not_compared=missing)
+    planned = _planned(job, recording)
+    if planned is not None:
+        trace, findings["planned"] = planned
+        traces.append(trace)
+    return diverge(job.plan_id, traces, findings=findings)
 
 
-def _planned(job: ReplayJob, engine: Engine, recording: Recording) -> tuple[Trace | str, Findings]:
-    if job.plan_id == NO_PLAN:
-        return "nothing was planned", {}
-    path = job.planned().path(engine)
-    if not path.is_file():
-        return "the plan was not replayed: nothing planned to compare with", {}
+def _planned(job: ReplayJob, recording: Recording) -> tuple[Trace, Findings] | None:
+    """The planned replay, if there is one that can be read."""
     try:
+        path = job.planned().path()
         trace = trace_of_file(path, "planned", job.start_ns, recording.plan.tau[-1].t_ns)
         verdict = streams.verdicts(Episode.open(path))[-1][1]
-    except (GstError, IndexError, StopIteration) as error:
-        return f"{path.name} cannot be read: {error}", {}
+    except (GstError, IndexError, StopIteration):
+        return None
     return trace, _findings([f for f in verdict.findings if f["side"] == "replayed"])
 
 

@@ -5,12 +5,12 @@ overlap with a kick, and what follows says nothing about the plan.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import coal
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
@@ -23,6 +23,7 @@ from twin.replay.clearance.bodies import placed_panels, placement_of
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import NotEvaluatedError
 from twin.replay.path import JointPath
+from twin.replay.result import Burst, States
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, convex_hull, signed_distance
 from twin.robot.model import check_dynamics
@@ -79,43 +80,10 @@ def lifted(
     return T
 
 
-@dataclass(frozen=True, kw_only=True)
-class Burst:
-    """A soft body that stopped being one."""
-
-    object_id: str
-    t_ns: int
-    found: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class States:
-    """What a replay saw, settling at the end included."""
-
-    stamps_ns: Int[np.ndarray, " num_steps"]
-    joints_rad: Float[np.ndarray, "num_steps num_joints"]
-    width_m: Float[np.ndarray, " num_steps"]
-    Ts_base_object: dict[str, Float[np.ndarray, "num_steps 4 4"]]
-    finger_contact: dict[str, Bool[np.ndarray, " num_steps"]]
-    nodes_m: dict[str, Float32[np.ndarray, "num_steps _ 3"]] = field(default_factory=dict)
-    """Of soft objects, base frame [m]."""
-    extents_m: dict[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)
-    """Of soft objects, along their own axes [m]."""
-    broken: dict[str, str] = field(default_factory=dict)
-    """Soft objects that are no bodies any more at the end, and what was found."""
-    burst: Burst | None = None
-    """The first that burst; the replay ended there."""
-    arm_force_N: Float[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0))
-    """What rigid bodies press the arm with, where physics was asked."""
-
-
 def num_steps(end_ns: int, config: ReplayConfig) -> int:
-    """Physics steps of a replay whose trajectory ends then, settling before and after included.
-
-    Each engine takes them.
-    """
+    """Physics steps of a replay whose trajectory ends then, settling before and after included."""
     settling = round(config.settle_before_s * config.physics.rate_hz)
-    return len(config.engines()) * (settling + _steps_kept(end_ns, config))
+    return settling + _steps_kept(end_ns, config)
 
 
 def _steps_kept(end_ns: int, config: ReplayConfig) -> int:
@@ -132,8 +100,7 @@ def simulate(
     """Follow a path with position-controlled motors and free objects.
 
     Every run of the same inputs gives the same bits: one fresh world, fixed steps. A soft body
-    that bursts ends it: what comes after would be noise. Of several engines the first moves it;
-    ``twin.replay.agreement`` asks the others.
+    that bursts ends it: what comes after would be noise.
     """
     check_dynamics(hulls.robot)
     rate = config.physics.rate_hz
@@ -147,8 +114,7 @@ def simulate(
     stamps = times_ns.tolist()
     soft = soft_models(scene)
     samples = Samples(scene, soft)
-    engine = config.engines()[0]
-    with open_world(engine, hulls.robot.urdf, mesh_hulls(hulls), config.physics) as world:
+    with open_world(config.engine, hulls.robot.urdf, mesh_hulls(hulls), config.physics) as world:
         spawn(world, scene, soft)
         world.reset_robot(postures[0], widths[0])
         world.robot.command(targets[0], [0.0] * len(targets[0]), widths[0])

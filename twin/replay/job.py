@@ -9,7 +9,6 @@ from typing import Any
 from bridge.episode.provenance import hash_settings
 from bridge.robots.robot import read_robot
 from bridge.task.task_file import Task
-from twin.physics.config import Engine
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import StartState
 from twin.replay.verdict import KINEMATIC_ENGINE, engine_of
@@ -83,23 +82,17 @@ class ReplayJob:
         robot = (Path(self.robot).resolve(),) if self.robot.endswith(".toml") else ()
         return (self.episode_path, self.folder, *scene, *robot)
 
-    def engines(self) -> tuple[Engine, ...]:
-        """What replays it, the engine that decides first; a kinematic replay moves no bodies."""
-        return self.config.engines()[: None if self.config.mode == "dynamic" else 1]
-
-    def path(self, engine: Engine | None = None) -> Path:
-        """Where the derived episode goes, of an engine or of the one that decides."""
+    def path(self) -> Path:
+        """Where the derived episode goes."""
         plan = re.sub(r"[^A-Za-z0-9_-]", "-", self.plan_id)[:60] or "plan"
-        name: str = self.engines()[0] if engine is None else engine
-        if self.config.mode == "kinematic":
-            name = KINEMATIC_ENGINE
+        kinematic = self.config.mode == "kinematic"
         parts = (
             self.episode_path.stem,
             "replay",
             self.trajectory,
             self.config.mode,
             plan,
-            name,
+            KINEMATIC_ENGINE if kinematic else self.config.engine,
             hash_settings(self.settings()),
             "mcap",
         )
@@ -113,9 +106,7 @@ class ReplayJob:
         """What the settings hash covers: settings, inputs, engine and code version."""
         found: dict[str, Any] = {
             "replay_version": REPLAY_VERSION,
-            "engine": " and ".join(
-                engine_of(self.task, replace(self.config, engine=each)) for each in self.engines()
-            ),
+            "engine": engine_of(self.task, self.config),
             "episode_sha256": self.episode_sha256,
             "plan_index": self.plan_index,
             "start_ns": self.start_ns,

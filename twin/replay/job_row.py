@@ -8,7 +8,6 @@ from bridge.episode.reader import Episode
 from bridge.errors import GstError
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
-from twin.replay.agreement import disagreement_of
 from twin.replay.failure import NOT_EVALUATED
 from twin.replay.job import ReplayJob
 
@@ -18,16 +17,14 @@ MAY_STAY_OPEN = ("settled", "shape")
 
 def row_of_existing(job: ReplayJob) -> dict[str, Any] | None:
     """Return the row of a replay that is there already, None when it must be made."""
-    found = []
+    if not job.path().is_file():
+        return None
     try:
-        for engine in job.engines():
-            if not job.path(engine).is_file():
-                return None
-            episode = Episode.open(job.path(engine))
-            found.append((streams.verdicts(episode)[-1][1], divergence_of(episode)))
+        episode = Episode.open(job.path())
+        verdict, divergence = streams.verdicts(episode)[-1][1], divergence_of(episode)
     except (GstError, IndexError):
         return None
-    return judged(job, *found[0], skipped=True)
+    return judged(job, verdict, divergence, skipped=True)
 
 
 def divergence_of(episode: Episode) -> dict[str, Any] | None:
@@ -60,8 +57,6 @@ def _row(job: ReplayJob) -> dict[str, Any]:
         "reason": None,
         "error": None,
         "engine": None,
-        "engines": list(job.engines()) if job.config.mode == "dynamic" else [],
-        "engines_disagree": None,
         "warnings": [],
         "predicates": None,
         "divergence": None,
@@ -83,7 +78,6 @@ def judged(
         "first_failing": verdict.first_failing,
         "reason": verdict.reason,
         "engine": verdict.engine,
-        "engines_disagree": disagreement_of(verdict),
         "warnings": list(verdict.warnings),
         "predicates": predicates_hold(verdict),
         "p_success": verdict.p_success,

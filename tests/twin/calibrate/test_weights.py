@@ -157,7 +157,8 @@ def test_what_a_trial_weighed_turns_the_next_verdict(
     starts = {key: track.transforms()[0] for key, track in tracks.items()}
 
     def scene() -> Any:
-        return read_rebuilt_scene(run, task).scene(task, ROBOT.urdf_text(), starts)
+        known = read_rebuilt_scene(run, task)
+        return replace(known, urdf=ROBOT.urdf_text(), Ts_base_object=starts)
 
     assert judge_of(run.path, scene())(plan).accepted is True
     assert cli.calibrate(run.path, config=CalibrateConfig(physics=True)) == 0

@@ -11,7 +11,6 @@ from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
-from twin.plan.constrain.distances import scene_grid
 from twin.plan.path._motion import Motion
 from twin.plan.problem import Flags, Numbers, Points, Pose, Poses, Problem, Spheres, Vector
 from twin.replay.clearance.bodies import SCENE, TABLE, names_of, placed_panels
@@ -21,11 +20,12 @@ from twin.replay.clearance.bounding_spheres import (
     BoundingSphereTree,
     bounding_spheres_of,
 )
-from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.monitor import Allowed
 from twin.replay.clearance.static_obstacles import stationary_links
+from twin.replay.clearance.surroundings import scene_grid
 from twin.robot.collision import RobotHulls, hulls_of
 from twin.robot.model import RobotModel
+from twin.scene.shape.sdf import SdfGrid
 
 SPARE_M = 0.0003
 """A path keeps this much more than was asked: what the search may overlook is less."""
@@ -222,10 +222,10 @@ def build_world(
         chain.T_last_tcp[:3, 3],
     )
     obstacles = _obstacles(problem, carried)
-    lookup = scene_grid(problem, hulls)
-    points = _add_bodies(problem, hulls, chain, motion, carried, lookup)
-    if lookup is not None:
-        _set_grid(motion, lookup, points)
+    grid = scene_grid(problem.scene, hulls)
+    points = _add_bodies(problem, hulls, chain, motion, carried, grid)
+    if grid is not None:
+        _set_grid(motion, grid, points)
     motion.set_table(problem.scene.table_height_m)
     for _, T, size in obstacles:
         motion.add_box(T, np.asarray(size, dtype=np.float64) / 2)
@@ -234,7 +234,7 @@ def build_world(
         hulls,
         [name for name, *_ in obstacles],
         carried,
-        has_grid=lookup is not None,
+        has_grid=grid is not None,
         eps_m=eps_col_m,
         allowed=allowed,
         wider_m=wider_m or {},
@@ -288,17 +288,17 @@ def _add_bodies(
     chain: Chain,
     motion: Motion,
     carried: Carried | None,
-    lookup: GridLookup | None,
+    grid: SdfGrid | None,
 ) -> _Points:
     """Add the links, then what is carried."""
-    points, trees = _Points(), [None] * len(hulls.hulls) if lookup is None else _link_trees(hulls)
+    points, trees = _Points(), [None] * len(hulls.hulls) if grid is None else _link_trees(hulls)
     corners = [hull.points_m for hull in hulls.hulls]
     fitted = _link_spheres(hulls)
     bodies = [*zip(chain.joint_of, chain.Ts_joint_hull, corners, fitted, trees, strict=True)]
     if carried is not None:
         box = box_corners(np.array(problem.model(carried.object_id).size_m))
         spheres = covering_spheres(box)
-        tree = None if lookup is None else bounding_spheres_of(box)
+        tree = None if grid is None else bounding_spheres_of(box)
         T = chain.T_last_tcp @ carried.T_tcp_object
         bodies.append((len(chain.placements), T, box, (spheres, excess_m(box, spheres)), tree))
     for joint, T, own, (spheres, excess), tree in bodies:
@@ -310,11 +310,11 @@ def _add_bodies(
     return points
 
 
-def _set_grid(motion: Motion, lookup: GridLookup, points: _Points) -> None:
+def _set_grid(motion: Motion, grid: SdfGrid, points: _Points) -> None:
     motion.set_grid(
-        lookup.values_m,
-        lookup.origin_m,
-        lookup.voxel_m,
+        grid.values_m,
+        grid.origin_m,
+        grid.voxel_m,
         np.ascontiguousarray(np.concatenate(points.points)),
         np.concatenate(points.radii),
         np.ascontiguousarray(np.concatenate(points.children).astype(np.int32)),

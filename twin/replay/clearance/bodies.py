@@ -14,10 +14,12 @@ from bridge.geometry.mesh import box_corners
 from bridge.robots.robot import Gripper
 from bridge.task.meshes.toys import basket_parts, basket_rim_parts
 from bridge.task.task_file import BASKET, ObjectModel
-from twin.replay._clearance import Bounds
+from twin.replay._clearance import Bounds, surface_to_boxes
 from twin.robot.collision import RobotHulls, convex_hull
 
 TABLE = "table"
+PanelBox = tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]
+"""Pose ``T_base_box`` of the middle, and extents of a box [m]."""
 GRIPPER = "gripper"
 """What task files call the links of any robot's gripper."""
 SCENE = "scene"
@@ -76,9 +78,7 @@ def placement_of(T: Float[np.ndarray, "4 4"]) -> coal.Transform3s:
     return coal.Transform3s(T[:3, :3], T[:3, 3])
 
 
-def placed_panels(
-    model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
-) -> list[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]]:
+def placed_panels(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> list[PanelBox]:
     """An object's boxes (walls, a basket's corners, rim, handles): pose of centre, extents [m]."""
     if model.mesh == BASKET:
         shape = model.inner_m, model.wall_m
@@ -200,13 +200,13 @@ def planes_of(hulls: RobotHulls) -> tuple[Planes, ...]:
 
 def distances_to_boxes_m(
     points_m: Float[np.ndarray, "num_points 3"],  # base frame
-    R_box_base: Float[np.ndarray, "num_boxes 3 3"],
-    p_box_base: Float[np.ndarray, "num_boxes 3"],
-    half_m: Float[np.ndarray, "num_boxes 3"],  # half the edges
+    boxes: Sequence[PanelBox],
 ) -> Float[np.ndarray, " num_boxes"]:
-    """Smallest signed distance of points to each box around the origin of its frame [m]."""
-    local = R_box_base @ points_m.T + p_box_base[:, :, None]
-    q = np.abs(local) - half_m[:, :, None]
-    out = np.maximum(q, 0.0)
-    outside = np.sqrt(np.einsum("bcn,bcn->bn", out, out))
-    return np.asarray((outside + np.minimum(q.max(axis=1), 0.0)).min(axis=1))
+    """Smallest signed distance of points to each box [m]."""
+    Ts = np.array([T for T, _ in boxes]).reshape(-1, 4, 4)
+    halves_m = np.array([extents / 2 for _, extents in boxes]).reshape(-1, 3)
+    where = np.ascontiguousarray(Ts[:, :3, :3]), np.ascontiguousarray(Ts[:, :3, 3]), halves_m
+    here = np.eye(3)[None], np.zeros((1, 3)), np.ascontiguousarray(points_m)
+    answers = np.empty((1, len(boxes)))
+    surface_to_boxes(*where, *here, answers)
+    return answers[0]

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int, Int32
 from scipy.spatial import ConvexHull, cKDTree
 
-from twin.replay._clearance import least, nearest
-from twin.replay.clearance.distance_grid import GridLookup
+from twin.replay._clearance import least, nearest, surface_to_grid
 from twin.robot.collision import RobotHulls
+from twin.scene.shape.sdf import SdfGrid
 
 FINE_M, ARM_FINE_M = 0.002, 0.004
 """For the gripper and what it carries, and for the arm."""
@@ -67,7 +67,7 @@ class BoundingSpheres:
 
     def distances_m(
         self,
-        lookup: GridLookup,
+        grid: SdfGrid,
         R: Float[np.ndarray, "num_pieces 3 3"],
         t: Float[np.ndarray, "num_pieces 3"],  # origin of each piece's link, grid's frame [m]
     ) -> Float[np.ndarray, " num_pieces"]:
@@ -77,9 +77,9 @@ class BoundingSpheres:
         """
         answers = np.empty(len(R))
         nearest(
-            lookup.values_m,
-            lookup.origin_m,
-            lookup.voxel_m,
+            grid.values_m,
+            grid.origin_m,
+            grid.voxel_m,
             R,
             t,
             self._points,
@@ -92,16 +92,16 @@ class BoundingSpheres:
 
     def least_m(
         self,
-        lookup: GridLookup,
+        grid: SdfGrid,
         R: Float[np.ndarray, "num_pieces 3 3"],
         t: Float[np.ndarray, "num_pieces 3"],  # origin of each piece's link, grid's frame [m]
         below_m: float,  # that number; the smaller, the less is looked at
     ) -> float:
         """Return the smallest of ``distances_m``, or a number where none is below it [m]."""
         found: float = least(
-            lookup.values_m,
-            lookup.origin_m,
-            lookup.voxel_m,
+            grid.values_m,
+            grid.origin_m,
+            grid.voxel_m,
             R,
             t,
             self._points,
@@ -114,6 +114,21 @@ class BoundingSpheres:
             below_m,
         )
         return found
+
+
+def grid_distances_m(
+    grid: SdfGrid, points_m: Float[np.ndarray, "num_points 3"]
+) -> Float[np.ndarray, " num_points"]:
+    """Signed distances of points in a grid's frame [m].
+
+    All solid lies inside the grid or nobody knows of it: beyond the grid, the nearest grid point at
+    distance e with d bounds them by sqrt(d^2 + e^2); solid that reaches the edge is taken to end
+    behind it as deep as it was.
+    """
+    answers, unturned = np.empty(len(points_m)), np.tile(np.eye(3), (len(points_m), 1, 1))
+    values = grid.values_m, grid.origin_m, grid.voxel_m
+    surface_to_grid(*values, unturned, np.ascontiguousarray(points_m), np.zeros((1, 3)), answers)
+    return answers
 
 
 def bounding_spheres_of(

@@ -11,8 +11,7 @@ from scripted_plans import joints_over
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, own_links, planes_of
-from twin.replay.clearance.bounding_spheres import bounding_spheres_of
-from twin.replay.clearance.distance_grid import GridLookup
+from twin.replay.clearance.bounding_spheres import bounding_spheres_of, grid_distances_m
 from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
 from twin.replay.clearance.static_obstacles import unmodelled_obstacles
 from twin.replay.clearance.surroundings import Surroundings, posture_clearance
@@ -274,15 +273,14 @@ def test_a_finger_in_a_soft_body_is_as_deep_as_its_nodes_say(
 
 def test_distances_of_points_to_a_box_are_exact() -> None:
     T = se3.transform_from(np.array([0.9, 0.1, 0.2, 0.3]), np.array([0.1, 0.2, 0.3]))
-    T_box_base = np.stack([se3.invert(T), np.eye(4)])
-    half = np.array([[0.1, 0.05, 0.2], [1.0, 1.0, 1.0]])
+    boxes = [(T, np.array([0.2, 0.1, 0.4])), (np.eye(4), np.full(3, 2.0))]
     for local, expected in (
         ([0.2, 0.0, 0.0], 0.1),
         ([0.13, 0.09, 0.0], 0.05),
         ([0.0, 0.03, 0.0], -0.02),
     ):
         points = se3.apply(T, np.array([local, [5.0, 5.0, 5.0]]))
-        found = distances_to_boxes_m(points, T_box_base[:, :3, :3], T_box_base[:, :3, 3], half)
+        found = distances_to_boxes_m(points, boxes)
         assert found[0] == pytest.approx(expected)
         assert found[1] == pytest.approx(np.abs(points[0]).max() - 1.0), "the box at the base"
 
@@ -366,7 +364,7 @@ def test_lookups_are_those_of_the_grid_and_beyond_it_never_too_large() -> None:
     rng = np.random.default_rng(4)
     grid = replace(static_of(POST).observed, closed=True)
     points = rng.uniform([-0.6, -0.8, -0.1], [1.0, 0.8, 0.7], (4000, 3))
-    found, known = GridLookup(grid).distance(points), grid.distance(points)
+    found, known = grid_distances_m(grid, points), grid.distance(points)
     end = grid.origin_m + VOXEL_M * (np.array(grid.values_m.shape) - 1)
     held = np.clip(points, grid.origin_m, end)
     alike = (grid.distance(held) > 0) | (held == points).all(axis=1)

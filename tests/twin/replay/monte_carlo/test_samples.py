@@ -35,7 +35,7 @@ CORRELATED[0, 1] = CORRELATED[1, 0] = 4e-6
 
 
 def scene_with(script: SimpleNamespace, covariance: np.ndarray | None = CORRELATED) -> ReplayScene:
-    scene = script.scene()
+    scene: ReplayScene = script.scene()
     spreads = {} if covariance is None else dict.fromkeys(scene.Ts_base_object, covariance)
     return replace(scene, covariances=spreads)
 
