@@ -21,7 +21,6 @@ from bridge.terminal import Output
 from twin.gate.config import GateConfig
 from twin.gate.gate import UndecidedError
 from twin.replay.config import ReplayConfig
-from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 
 
@@ -82,10 +81,7 @@ def answer(question: Question) -> Verdict:
     config = for_task(question.config, read_calibration(run), question.task)
     most_samples = question.max_steps // _steps_of(question, config) - 1
 
-    def judge(there: ReplayScene, settings: ReplayConfig) -> ReplayResult:
-        return replay_plan(plan, there, settings, refuse_early=True)
-
-    nominal = judge(scene, config)
+    nominal = replay_plan(plan, scene, config, refuse_early=True)
     verdict = nominal.verdict
     if verdict.accepted is True:
         kept = limited_to_task(plan, scene.task)
@@ -94,7 +90,7 @@ def answer(question: Question) -> Verdict:
         verdict = replace(verdict, reason=reason_of(verdict))
     verdict = with_samples(
         verdict,
-        lambda there, settings: judge(there, settings).verdict,
+        lambda there, varied: replay_plan(plan, there, varied, refuse_early=True).verdict,
         scene,
         replace(config, samples=min(config.samples, most_samples)),
         identity=plan.start_id or plan.id,

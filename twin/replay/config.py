@@ -114,6 +114,7 @@ MOVED_M = 0.005
 """An object counts as carried or pushed once it is this far from its start [m]."""
 PATH_STEP_S = 0.04
 """Spacing at which the path between waypoints is checked [s]."""
+PATH_RATE_HZ = 1 / PATH_STEP_S
 
 
 @dataclass(frozen=True, kw_only=True)

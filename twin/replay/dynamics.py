@@ -4,13 +4,14 @@ Objects that were localised into each other are moved apart first, or refused: p
 overlap with a kick, and what follows says nothing about the plan.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import coal
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
@@ -144,19 +145,11 @@ class Samples:
 
     def __init__(self, scene: ReplayScene, soft: dict[str, SoftShape]) -> None:
         """Begin without any."""
-        self._objects = list(scene.movable())
-        self._soft = list(soft)
-        self._fixed = scene.containers()
-        self._stamps: list[int] = []
-        self._joints: list[Float[np.ndarray, " num_joints"]] = []
-        self._widths: list[float] = []
-        self._forces: list[float] = []
-        self._rigid = [name for name in self._objects if name not in soft]
-        self._poses: dict[str, list[tuple[float, ...]]] = {name: [] for name in self._rigid}
-        self._fits: dict[str, list[Float[np.ndarray, "4 4"]]] = {name: [] for name in soft}
-        self._touch: dict[str, list[bool]] = {name: [] for name in self._objects}
-        self._nodes: dict[str, list[Float32[np.ndarray, "num_nodes 3"]]] = {n: [] for n in soft}
-        self._extents: dict[str, list[np.ndarray]] = {name: [] for name in soft}
+        self._soft, self._fixed = list(soft), scene.containers()
+        self._rows: list[tuple[int, Float[np.ndarray, " num_joints"], float, float]] = []
+        """Stamp, joints, width and force on the arm."""
+        self._seen: dict[str, list[tuple[Any, ...]]] = {name: [] for name in scene.movable()}
+        """Place and touch of each object; of soft ones nodes and extents too."""
         self._burst: Burst | None = None
 
     def take(self, world: PhysicsWorld, t_ns: int) -> bool:
@@ -165,47 +158,45 @@ class Samples:
             found = burst_of(world.soft_bodies().health(name))
             if found is not None:
                 self._burst = Burst(object_id=name, t_ns=t_ns, found=found)
-                if self._stamps:
+                if self._rows:
                     return False
                 raise NotEvaluatedError(f"{name} before anything moved: {found}")
-        self._stamps.append(t_ns)
-        joints, width = world.robot.posture()
-        self._joints.append(joints)
-        self._widths.append(width)
-        self._forces.append(world.arm_force_N())
-        for name in self._objects:
-            self._touch[name].append(world.finger_touches(name))
-        for name in self._rigid:
-            self._poses[name].append(world.object_pose(name))
-        for name in self._soft:
-            self._fits[name].append(world.T_base_object(name))
-            self._nodes[name].append(world.soft_bodies().nodes_m(name).astype(np.float32))
-            self._extents[name].append(world.soft_bodies().extents_m(name))
+        self._rows.append((t_ns, *world.robot.posture(), world.arm_force_N()))
+        for name, rows in self._seen.items():
+            touch = world.finger_touches(name)
+            if name in self._soft:
+                soft = world.soft_bodies()
+                nodes_m = soft.nodes_m(name).astype(np.float32)
+                rows.append((world.T_base_object(name), touch, nodes_m, soft.extents_m(name)))
+            else:
+                rows.append((world.object_pose(name), touch))
         return True
 
     def states(self, world: PhysicsWorld) -> States:
         """All that was kept."""
-        poses = {name: self._Ts_base_object(name) for name in self._objects}
-        poses |= {
-            name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._fixed.items()
-        }
+        stamps, joints, widths, forces = zip(*self._rows, strict=True)
+        seen = {name: list(zip(*rows, strict=True)) for name, rows in self._seen.items()}
+        poses = {name: self._Ts_base_object(name, columns[0]) for name, columns in seen.items()}
+        poses |= {name: np.repeat(T[None], len(stamps), axis=0) for name, T in self._fixed.items()}
         return States(
-            stamps_ns=np.array(self._stamps, dtype=np.int64),
-            joints_rad=np.stack(self._joints),
-            width_m=np.array(self._widths),
+            stamps_ns=np.array(stamps, dtype=np.int64),
+            joints_rad=np.stack(joints),
+            width_m=np.array(widths),
             Ts_base_object=poses,
-            finger_contact={name: np.array(items) for name, items in self._touch.items()},
-            nodes_m={name: np.stack(items) for name, items in self._nodes.items()},
-            extents_m={name: np.array(rows, dtype=float) for name, rows in self._extents.items()},
+            finger_contact={name: np.array(columns[1]) for name, columns in seen.items()},
+            nodes_m={name: np.stack(seen[name][2]) for name in self._soft},
+            extents_m={name: np.array(seen[name][3], dtype=float) for name in self._soft},
             broken=self._broken(world),
             burst=self._burst,
-            arm_force_N=np.array(self._forces),
+            arm_force_N=np.array(forces),
         )
 
-    def _Ts_base_object(self, name: str) -> Float[np.ndarray, "num_steps 4 4"]:
-        if name in self._fits:
-            return np.stack(self._fits[name])
-        rows = np.array(self._poses[name])
+    def _Ts_base_object(
+        self, name: str, places: Sequence[Any]
+    ) -> Float[np.ndarray, "num_steps 4 4"]:
+        rows = np.array(places)
+        if name in self._soft:
+            return rows
         if not np.isfinite(rows).all():
             raise NotEvaluatedError(f"physics lost {name}: its place is not a number any more")
         return se3.transform_from(rows[:, 3:], rows[:, :3])

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.episode.streams import JointTrack
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES
+from bridge.geometry.signals import runs_of_true
 from bridge.robots.robot import GRIPPER_WIDTH, Robot
 from bridge.task.plan import Plan, Stage
 from twin.replay.config import ReplayConfig
@@ -207,14 +208,7 @@ def closed_mask(
 
 
 def _closed_intervals(plan: Plan) -> list[tuple[int, int]]:
-    intervals = []
-    start = None
-    for waypoint in plan.tau:
-        if waypoint.g == 1 and start is None:
-            start = waypoint.t_ns
-        elif waypoint.g == 0 and start is not None:
-            intervals.append((start, waypoint.t_ns))
-            start = None
-    if start is not None:
-        intervals.append((start, plan.tau[-1].t_ns + 1))
-    return intervals
+    """From when to when a plan wants the gripper closed; without an end, just past its own."""
+    stamps = [*(waypoint.t_ns for waypoint in plan.tau), plan.tau[-1].t_ns + 1]
+    wanted = np.array([waypoint.g == 1 for waypoint in plan.tau])
+    return [(stamps[first], stamps[end]) for first, end in runs_of_true(wanted)]

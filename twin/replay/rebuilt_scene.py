@@ -52,7 +52,8 @@ def calibrated(
     if calibration is None:
         return config
     wanted, nominal = config.physics, PhysicsConfig()
-    known = physics_of(calibration.record)
+    names = {item.name for item in fields(PhysicsConfig)}
+    known = {k: v for k, v in _identified(calibration.record, "value").items() if k in names}
     free = {
         name: type(getattr(nominal, name))(value)
         for name, value in known.items()
@@ -108,13 +109,6 @@ def for_task(config: ReplayConfig, calibration: Calibration | None, task: Task) 
     if task.grip_force_N is None or known.physics.grip_force_N != PhysicsConfig().grip_force_N:
         return known
     return replace(known, physics=replace(known.physics, grip_force_N=task.grip_force_N))
-
-
-def physics_of(calibration: Mapping[str, Any]) -> dict[str, float]:
-    """Fields of ``PhysicsConfig`` that a calibration record says were identified."""
-    known = {item.name for item in fields(PhysicsConfig)}
-    found = _identified(calibration, "value")
-    return {name: value for name, value in found.items() if name in known}
 
 
 def _identified(record: Mapping[str, Any], key: str) -> dict[str, float]:

@@ -17,9 +17,10 @@ from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, GstError
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.plan import Plan
+from bridge.task.predicate import evaluate_success
 from bridge.task.verdict import SAME_ENGINE, Verdict, is_same_engine
-from twin.replay.comparison import compare, recorded_findings
 from twin.replay.config import ReplayConfig
+from twin.replay.divergence import Divergence, diverge
 from twin.replay.execution import (
     check_covers,
     check_length,
@@ -35,8 +36,18 @@ from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
-from twin.replay.trace import Recording
-from twin.replay.verdict import replay_joints, replay_plan
+from twin.replay.trace import (
+    CONTACT_M,
+    Recording,
+    Trace,
+    rollout_of_recording,
+    states_of_recording,
+    trace_of_file,
+    trace_of_recording,
+    trace_of_result,
+)
+from twin.replay.verdict import findings_of, replay_joints, replay_plan
+from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 from twin.robot.posture import check_clock, width_track
 
@@ -64,7 +75,6 @@ class _Source:
     """As it was sent; without one, what was observed, in a plan's words."""
     plan_as_executed: Plan
     """With the stages at the times at which they were executed."""
-    events: list[dict[str, Any]]
     scene: ReplayScene
 
     @property
@@ -143,7 +153,6 @@ def _open(job: ReplayJob) -> _Source:
         episode=episode,
         plan=plan,
         plan_as_executed=plan_as_executed,
-        events=events,
         scene=scene,
     )
 
@@ -260,33 +269,59 @@ def _origin(
         start_ns=job.start_ns,
         urdf=source.scene.urdf,
         stages=source.plan_as_executed.stages,
-        gripper=_recorded_grips(plan, source.events, job.start_ns)
-        if source.executed
-        else planned_grips(plan),
         end_ns=source.end_ns,
         divergence=divergence,
         images=images,
     )
 
 
-def planned_grips(plan: Plan) -> tuple[tuple[int, str], ...]:
-    """When the plan changes its mind about the gripper; it starts open."""
-    before = [0, *(waypoint.g for waypoint in plan.tau)]
-    return tuple(
-        (waypoint.t_ns, "close" if waypoint.g else "open")
-        for waypoint, g in zip(plan.tau, before, strict=False)
-        if waypoint.g != g
-    )
+# An executed replay laid over the planned one and over the recording.
+
+Findings = dict[tuple[str, str], bool | None]
 
 
-def _recorded_grips(
-    plan: Plan, events: list[dict[str, Any]], start_ns: int
-) -> tuple[tuple[int, str], ...]:
-    return tuple(
-        (int(event["stamp_ns"]) - start_ns, str(event.get("text") or ""))
-        for event in events
-        if event["type"] == "gripper" and event.get("plan_id") == plan.id
-    )
+def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[str, Any], ...]:
+    """What the success predicates, and the one on contacts, say of the recording itself."""
+    robot = load_robot(recording.scene.urdf)
+    rollout = rollout_of_recording(recording, robot, hulls_of(robot), config)
+    task = recording.scene.task
+    return tuple(findings_of(task, rollout, "recorded", tolerance_m=CONTACT_M))
+
+
+def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: int) -> Divergence:
+    """Lay the executed replay over the planned one, if it is there, and over the recording."""
+    robot = load_robot(recording.scene.urdf)
+    executed = trace_of_result(result, "executed", end_ns)
+    recorded = trace_of_recording(recording, robot, job.config.sample_rate_hz)
+    traces = [executed, recorded]
+    task = job.task
+    findings = {
+        "executed": _findings(findings_of(task, result, "replayed")),
+        "recorded": {
+            (finding.kind, finding.object_id): finding.value
+            for finding in evaluate_success(task, states_of_recording(recording, robot))
+        },
+    }
+    planned = _planned(job, recording)
+    if planned is not None:
+        trace, findings["planned"] = planned
+        traces.append(trace)
+    return diverge(job.plan_id, traces, findings=findings)
+
+
+def _planned(job: ReplayJob, recording: Recording) -> tuple[Trace, Findings] | None:
+    """The planned replay, if there is one that can be read."""
+    try:
+        path = job.planned().path()
+        trace = trace_of_file(path, "planned", job.start_ns, recording.plan.tau[-1].t_ns)
+        verdict = streams.verdicts(Episode.open(path))[-1][1]
+    except (GstError, IndexError, StopIteration):
+        return None
+    return trace, _findings([f for f in verdict.findings if f["side"] == "replayed"])
+
+
+def _findings(found: list[dict[str, Any]]) -> Findings:
+    return {(item["kind"], str(item.get("object", ""))): item["value"] for item in found}
 
 
 def cell_of(episode: Episode) -> str:

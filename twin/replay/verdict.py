@@ -32,7 +32,7 @@ from twin.replay.checks import (
 )
 from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.clearance.surroundings import posture_clearance
-from twin.replay.config import PATH_STEP_S, ReplayConfig
+from twin.replay.config import ReplayConfig
 from twin.replay.dynamics import free_start, simulate, soft_models
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import Failure, factor_from
@@ -281,21 +281,19 @@ def _move(
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     _pre_grasp(monitor, path)
     dynamic = config.mode == "dynamic"
-    states, by_physics, measured = None, dynamic, True
+    by_physics, measured = dynamic, True
+    stamps_ns = path.dense_times_ns(config.sample_rate_hz)
     if dynamic and refuse_early:
         found = commanded.failures or monitor.failures or any(commanded.checks.values())
         measured = not found
-        states = follow(path, scene, config)
         ahead = ClearanceMonitor(scene, plan, hulls, config)
         if measured:
-            _clearance_m(ahead, states, [])
+            _clearance_m(ahead, follow(path, scene, stamps_ns), [])
         by_physics = measured and not ahead.failures
     if by_physics:
         states = simulate(path, scene, hulls, config)
-    elif states is None:
-        states = follow(path, scene, config)
-    if not measured:
-        states = first_of(states)
+    else:
+        states = follow(path, scene, stamps_ns if measured else stamps_ns[:1])
     return Moved(
         states=states,
         clearance_m=_clearance_m(monitor, states, list(scene.movable())),
@@ -372,37 +370,22 @@ def _clearance_m(
     )
 
 
-def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
+def follow(path: JointPath, scene: ReplayScene, stamps_ns: Int[np.ndarray, " num_steps"]) -> States:
     """Follow the joints exactly; no physics, so nothing is known of objects that can move."""
-    count = int(np.ceil(path.end_ns() * 1e-9 * config.sample_rate_hz)) + 1
-    stamps: Int[np.ndarray, " num_steps"] = (
-        np.linspace(0, path.end_ns(), count).round().astype(np.int64)
-    )
-    fixed: dict[str, Float[np.ndarray, "num_steps 4 4"]] = {
-        name: np.repeat(T[None], count, axis=0) for name, T in scene.containers().items()
+    fixed = {
+        name: np.repeat(T[None], len(stamps_ns), axis=0) for name, T in scene.containers().items()
     }
     return States(
-        stamps_ns=stamps,
-        joints_rad=path.joints_at(stamps),
-        width_m=path.width_at(stamps),
+        stamps_ns=stamps_ns,
+        joints_rad=path.joints_at(stamps_ns),
+        width_m=path.width_at(stamps_ns),
         Ts_base_object=fixed,
         finger_contact={},
     )
 
 
-def first_of(states: States) -> States:
-    """The first of several states alone."""
-    return replace(
-        states,
-        stamps_ns=states.stamps_ns[:1],
-        joints_rad=states.joints_rad[:1],
-        width_m=states.width_m[:1],
-        Ts_base_object={name: Ts[:1] for name, Ts in states.Ts_base_object.items()},
-    )
-
-
 def _pre_grasp(monitor: ClearanceMonitor, path: JointPath) -> None:
-    times = path.dense_times_ns(PATH_STEP_S)
+    times = path.dense_times_ns()
     if path.first_close_ns is not None:
         times = times[times < path.first_close_ns]
     for t_ns, joints, width in zip(times, path.joints_at(times), path.width_at(times), strict=True):

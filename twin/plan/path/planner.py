@@ -13,7 +13,7 @@ from bridge.task.plan import Plan, Stage, Waypoint
 from twin.errors import TwinError
 from twin.plan.path.world import SPARE_M, Carried, World, build_world
 from twin.plan.problem import Joints, Pose, Poses, Postures, Problem, TimedPath
-from twin.replay.clearance.bodies import own_links
+from twin.replay.clearance.bodies import own_links_touch
 from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
@@ -154,7 +154,8 @@ class Mover:
 
     def refused(self, path: TimedPath) -> tuple[PathRefusal, ...]:
         """Return what the monitor's exact clearance, the last word, refuses of a movement."""
-        hulls, links = hulls_of(self.problem.robot), own_links(hulls_of(self.problem.robot))
+        hulls = hulls_of(self.problem.robot)
+        links_touch = own_links_touch(hulls)
         monitor = ClearanceMonitor(self.problem.scene, self._plan(), hulls, self.config.replay)
         poses = self._object_poses(path.joints_rad)
         stamps = np.round(path.times_s * 1e9).astype(np.int64)
@@ -162,7 +163,7 @@ class Mover:
         for index, joints in enumerate(path.joints_rad):
             Ts = {name: rows[index] for name, rows in poses.items()}
             monitor.measure(int(stamps[index]), joints, self.width_m, Ts)
-            if links.touch():
+            if links_touch():
                 closest = hulls.self_distance()
                 told = f"{closest.links[0]} touches {closest.links[1]}"
                 lacking_m = -closest.distance_m

@@ -1,6 +1,6 @@
 """Convex pieces with what holds them, and the names bodies have in contacts and failures."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -139,28 +139,14 @@ class NearPairs:
         return zip(bounds.tolist(), self._order[:count].tolist(), strict=True)
 
 
-class OwnLinks:
-    """The robot's links against each other."""
-
-    def __init__(self, hulls: RobotHulls) -> None:
-        """Choose the pairs that must stay apart."""
-        self._hulls = hulls
-        solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
-        self._near = NearPairs(solids, hulls.pairs)
-        # The same memory: the pairs are where the hulls have been placed last.
-        self._near.R, self._near.t = hulls.rotations, hulls.translations
-
-    def touch(self) -> bool:
-        """Whether any touch where the hulls have been placed."""
-        return any(
-            self._hulls.pair_distance_m(index) <= 0 for _, index in self._near.nearest_first(0.0)
-        )
-
-
 @lru_cache(maxsize=4)
-def own_links(hulls: RobotHulls) -> OwnLinks:
-    """Return the pairs of a robot, made once."""
-    return OwnLinks(hulls)
+def own_links_touch(hulls: RobotHulls) -> Callable[[], bool]:
+    """Say whether links of the robot touch where its hulls have been placed; made once."""
+    solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
+    near = NearPairs(solids, hulls.pairs)
+    # The same memory: the pairs are where the hulls have been placed last.
+    near.R, near.t = hulls.rotations, hulls.translations
+    return lambda: any(hulls.pair_distance_m(index) <= 0 for _, index in near.nearest_first(0.0))
 
 
 # Distances of soft bodies, which are given by their nodes.
@@ -169,33 +155,26 @@ def own_links(hulls: RobotHulls) -> OwnLinks:
 # body is as large as its nodes say.
 
 
-@dataclass(frozen=True, kw_only=True)
-class Planes:
-    """The faces of a convex piece, in the frame of its link."""
+Planes = Float[np.ndarray, "num_planes 4"]
+"""The faces of a convex piece in the frame of its link: outward normals of unit length, offsets."""
 
-    normals: Float[np.ndarray, "num_planes 3"]
-    """Outward, unit length."""
-    offsets_m: Float[np.ndarray, " num_planes"]
 
-    def distance_m(
-        self,
-        points_m: Float[np.ndarray, "num_points 3"],  # base frame
-        R: Float[np.ndarray, "3 3"],  # of the piece's link in the base frame
-        t: Float[np.ndarray, "3"],  # that link's origin, base frame [m]
-    ) -> float:
-        """Smallest signed distance of points to the placed piece [m], never too large outside."""
-        local = (points_m - t) @ R
-        return float((local @ self.normals.T + self.offsets_m).max(axis=1).min())
+def distance_to_planes_m(
+    planes: Planes,
+    points_m: Float[np.ndarray, "num_points 3"],  # base frame
+    R: Float[np.ndarray, "3 3"],  # of the piece's link in the base frame
+    t: Float[np.ndarray, "3"],  # that link's origin, base frame [m]
+) -> float:
+    """Smallest signed distance of points to the placed piece [m], never too large outside."""
+    local = (points_m - t) @ R
+    return float((local @ planes[:, :3].T + planes[:, 3]).max(axis=1).min())
 
 
 @lru_cache(maxsize=4)
 def planes_of(hulls: RobotHulls) -> tuple[Planes, ...]:
     """Return the planes of each of a robot's hulls."""
-    found = []
-    for hull in hulls.hulls:
-        equations = np.unique(ConvexHull(hull.points_m).equations.round(9), axis=0)
-        found.append(Planes(normals=equations[:, :3], offsets_m=equations[:, 3]))
-    return tuple(found)
+    faces = (ConvexHull(hull.points_m).equations.round(9) for hull in hulls.hulls)
+    return tuple(np.unique(each, axis=0) for each in faces)
 
 
 def distances_to_boxes_m(

@@ -47,13 +47,13 @@ class BoundingSpheres:
 
     def __init__(self, trees: list[BoundingSphereTree]) -> None:
         """Put their trees into one."""
-        self._points = np.concatenate([tree.points_m for tree in trees])
-        self._radius = np.concatenate([tree.radius_m for tree in trees])
+        points = np.concatenate([tree.points_m for tree in trees])
+        radius = np.concatenate([tree.radius_m for tree in trees])
         starts = np.concatenate([[0], np.cumsum([len(tree.points_m) for tree in trees])])
         children = [tree.children + start for tree, start in zip(trees, starts, strict=False)]
-        self._children = np.concatenate(children).astype(np.int32)
         ends = starts[:-1] + [tree.num_roots for tree in trees]
-        self._roots = np.stack([starts[:-1], ends], axis=1).astype(np.int32)
+        roots = np.stack([starts[:-1], ends], axis=1).astype(np.int32)
+        self._trees = points, radius, np.concatenate(children).astype(np.int32), roots
         self._cover = np.array([tree.cover_m for tree in trees])
         middles = [(tree.points_m.min(axis=0) + tree.points_m.max(axis=0)) / 2 for tree in trees]
         self._centres = np.stack(middles)
@@ -76,18 +76,7 @@ class BoundingSpheres:
         Never too large; too small by what the finest points leave uncovered, and by 2 % of it.
         """
         answers = np.empty(len(R))
-        nearest(
-            grid.values_m,
-            grid.origin_m,
-            grid.voxel_m,
-            R,
-            t,
-            self._points,
-            self._radius,
-            self._children,
-            self._roots,
-            answers,
-        )
+        nearest(*_values(grid), R, t, *self._trees, answers)
         return np.asarray(answers - self._cover)
 
     def least_m(
@@ -98,22 +87,13 @@ class BoundingSpheres:
         below_m: float,  # that number; the smaller, the less is looked at
     ) -> float:
         """Return the smallest of ``distances_m``, or a number where none is below it [m]."""
-        found: float = least(
-            grid.values_m,
-            grid.origin_m,
-            grid.voxel_m,
-            R,
-            t,
-            self._points,
-            self._radius,
-            self._children,
-            self._roots,
-            self._cover,
-            self._centres,
-            self._reaches,
-            below_m,
-        )
+        bounds = self._cover, self._centres, self._reaches, below_m
+        found: float = least(*_values(grid), R, t, *self._trees, *bounds)
         return found
+
+
+def _values(grid: SdfGrid) -> tuple[np.ndarray, np.ndarray, float]:
+    return grid.values_m, grid.origin_m, grid.voxel_m
 
 
 def grid_distances_m(
@@ -126,8 +106,9 @@ def grid_distances_m(
     behind it as deep as it was.
     """
     answers, unturned = np.empty(len(points_m)), np.tile(np.eye(3), (len(points_m), 1, 1))
-    values = grid.values_m, grid.origin_m, grid.voxel_m
-    surface_to_grid(*values, unturned, np.ascontiguousarray(points_m), np.zeros((1, 3)), answers)
+    surface_to_grid(
+        *_values(grid), unturned, np.ascontiguousarray(points_m), np.zeros((1, 3)), answers
+    )
     return answers
 
 

@@ -22,7 +22,13 @@ from bridge.task.causes import Cause
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
 from bridge.task.predicate import Contact
-from twin.replay.clearance.bodies import GRIPPER, names_of, placement_of, planes_of
+from twin.replay.clearance.bodies import (
+    GRIPPER,
+    distance_to_planes_m,
+    names_of,
+    placement_of,
+    planes_of,
+)
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.config import MOVED_M, ReplayConfig
 from twin.replay.failure import Failure
@@ -375,8 +381,11 @@ class ClearanceMonitor:
             for index in np.flatnonzero(away <= self._radii + solid.radius_m).tolist():
                 link = self._links[index]
                 distance = (
-                    planes_of(self.hulls)[index].distance_m(
-                        se3.apply(T, object_mesh(model).vertices_m), R[index], t[index]
+                    distance_to_planes_m(
+                        planes_of(self.hulls)[index],
+                        se3.apply(T, object_mesh(model).vertices_m),
+                        R[index],
+                        t[index],
                     )
                     if model.mesh is not None
                     else signed_distance(

@@ -41,32 +41,13 @@ def unmodelled_obstacles(
 
     What nobody saw counts as free, as in the observed grid, and what lies beyond the grid too.
     """
-    grid = _without_table(static, table_height_m, foot)
+    grid = _cleared(static, table_height_m, foot)
     return None if grid is None else _without_panels(grid, panels)
 
 
-@dataclass
-class _Remembered:
-    """The last scene a process took the table out of: replays of a run share it."""
-
-    key: tuple[int, float, Foot | None] | None = None
-    static: StaticSdf | None = None
-    grid: SdfGrid | None = None
-
-
-_LAST = _Remembered()
-
-
-def _without_table(static: StaticSdf, table_height_m: float, foot: Foot | None) -> SdfGrid | None:
-    key = (id(static), table_height_m, foot)
-    if _LAST.key != key:
-        # The scene is kept with its grid, so that its id stays its own.
-        _LAST.key, _LAST.static = key, static
-        _LAST.grid = _cleared(static, table_height_m, foot)
-    return _LAST.grid
-
-
+@lru_cache(maxsize=1)
 def _cleared(static: StaticSdf, table_height_m: float, foot: Foot | None) -> SdfGrid | None:
+    """Without table and foot; replays of a run share it."""
     grid = static.observed
     solid = grid.values_m < 0
     margin = OBJECT_MARGIN_VOXELS * grid.voxel_m
@@ -137,16 +118,8 @@ _STILL_M = 1e-9
 _SAMPLES = 4
 
 
-@dataclass(frozen=True, kw_only=True)
-class StaticObstacle:
-    """A panel of a container, or the table."""
-
-    body: str
-    piece: int
-    """Which of the body's it is."""
-    solid: Solid
-    T: Float[np.ndarray, "4 4"]
-    """``T_base_solid``."""
+StaticObstacle = tuple[Solid, int, Float[np.ndarray, "4 4"]]
+"""The table or a panel of a container, which of the body's it is, and ``T_base_solid``."""
 
 
 def static_obstacles(
@@ -156,10 +129,9 @@ def static_obstacles(
     """The table and the panels, each in its own frame."""
     T_base_table = np.eye(4)
     T_base_table[2, 3] = table_height_m
-    found = [StaticObstacle(body=TABLE, piece=0, solid=half_space_solid(TABLE), T=T_base_table)]
+    found: list[StaticObstacle] = [(half_space_solid(TABLE), 0, T_base_table)]
     for name, piece, (T, extents) in panels:
-        solid = solid_of(name, coal.Box(*extents), box_corners(extents))
-        found.append(StaticObstacle(body=name, piece=piece, solid=solid, T=T))
+        found.append((solid_of(name, coal.Box(*extents), box_corners(extents)), piece, T))
     return found
 
 

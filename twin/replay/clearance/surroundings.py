@@ -17,8 +17,9 @@ from twin.replay.clearance.bodies import (
     NearPairs,
     Solid,
     box_solid,
+    distance_to_planes_m,
     distances_to_boxes_m,
-    own_links,
+    own_links_touch,
     placed_panels,
     placement_of,
     planes_of,
@@ -201,28 +202,28 @@ class Surroundings:
         solids = [
             *self.links,
             *(self.objects[name] for name in known),
-            *(item.solid for item in self.static),
+            *(solid for solid, _, _ in self.static),
         ]
         names: list[Pair] = []
         bodies: list[tuple[int, int]] = []
-        for other, item in enumerate(self.static, start=first):
-            links = self._mobile if item.body == TABLE else range(num_links)
+        for other, (solid, number, _) in enumerate(self.static, start=first):
+            links = self._mobile if solid.body == TABLE else range(num_links)
             for index in (*links, *movers):
                 piece = index if index < num_links else -1
-                names.append((solids[index].body, piece, item.body, item.piece))
+                names.append((solids[index].body, piece, solid.body, number))
                 bodies.append((index, other))
         for other, name in enumerate(known, start=num_links):
             names += [(link.body, index, name, 0) for index, link in enumerate(self.links)]
             bodies += [(index, other) for index in range(num_links)]
         near = NearPairs(solids, bodies)
-        for index, item in enumerate(self.static, start=first):
-            near.R[index], near.t[index] = item.T[:3, :3], item.T[:3, 3]
+        for index, (_, _, T) in enumerate(self.static, start=first):
+            near.R[index], near.t[index] = T[:3, :3], T[:3, 3]
         pairing = _Pairing(
             near=near,
             names=names,
             bodies=bodies,
             shapes=[solid.shape for solid in solids],
-            placements=[None] * first + [placement_of(item.T) for item in self.static],
+            placements=[None] * first + [placement_of(T) for _, _, T in self.static],
         )
         self._pairings[known, moved] = pairing
         return pairing
@@ -242,10 +243,8 @@ class Surroundings:
                 R, t = self._hulls.rotations[index], self._hulls.translations[index]
                 gap = float(np.linalg.norm(R @ link.centre + t - centre)) - radius - link.radius_m
                 if gap < self._eps_m:
-                    planes = planes_of(self._hulls)[index]
-                    found[link.body, index, name, 0] = planes.distance_m(nodes, R, t)
-                else:
-                    found[link.body, index, name, 0] = gap
+                    gap = distance_to_planes_m(planes_of(self._hulls)[index], nodes, R, t)
+                found[link.body, index, name, 0] = gap
         for name, nodes in moved_m.items():
             found[name, -1, TABLE, 0] = float(nodes[:, 2].min()) - self._table_height_m
             distances = distances_to_boxes_m(nodes, [panel for _, _, panel in self._panels])
@@ -368,7 +367,7 @@ def posture_clearance(
     hulls, and says ``up_to_m`` of what is farther: 0 is enough for the sign, and much faster.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
-    links, gripper = own_links(hulls), hulls.robot.record.gripper
+    links_touch, gripper = own_links_touch(hulls), hulls.robot.record.gripper
     hand = frozenset(gripper.links)
 
     def margin_m(
@@ -378,7 +377,7 @@ def posture_clearance(
 
     def one(joints_rad: Float[np.ndarray, " num_joints"]) -> float:
         hulls.place(joints_rad, gripper.max_width_m)
-        if links.touch():
+        if links_touch():
             return hulls.self_distance().distance_m
         return around.least_m(hand, config.eps_col_m + up_to_m) - config.eps_col_m
 

@@ -10,7 +10,13 @@ from scripted_plans import joints_over
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, own_links, planes_of
+from twin.replay.clearance.bodies import (
+    SCENE,
+    distance_to_planes_m,
+    distances_to_boxes_m,
+    own_links_touch,
+    planes_of,
+)
 from twin.replay.clearance.bounding_spheres import bounding_spheres_of, grid_distances_m
 from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
 from twin.replay.clearance.static_obstacles import unmodelled_obstacles
@@ -268,7 +274,8 @@ def test_a_finger_in_a_soft_body_is_as_deep_as_its_nodes_say(
     index = next(i for i, hull in enumerate(hulls.hulls) if hull.link == "gripper_base")
     lone = np.array([[0.0, 0.0, 0.2]])  # above the box of the gripper's base, in its own frame
     R, t = hulls.rotations[index], hulls.translations[index]
-    assert planes_of(hulls)[index].distance_m(lone @ R.T + t, R, t) == pytest.approx(0.12)
+    planes = planes_of(hulls)[index]
+    assert distance_to_planes_m(planes, lone @ R.T + t, R, t) == pytest.approx(0.12)
 
 
 def test_distances_of_points_to_a_box_are_exact() -> None:
@@ -324,7 +331,7 @@ def test_a_posture_is_as_clear_as_the_nearest_of_all_its_distances(
     post: Box = ((0.45, -0.25, 0.3), (0.06, 0.06, 0.6))
     scene = replace(script.scene(), static_sdf=static_of(POST, post))
     gripper = hulls.robot.record.gripper.links
-    around, links = Surroundings(scene, hulls, config.eps_col_m), own_links(hulls)
+    around, links_touch = Surroundings(scene, hulls, config.eps_col_m), own_links_touch(hulls)
     margin_m = posture_clearance(scene, hulls, config)
     capped_m = posture_clearance(scene, hulls, config, up_to_m=0.03)
     sign = posture_clearance(scene, hulls, config, up_to_m=0.0)
@@ -334,7 +341,7 @@ def test_a_posture_is_as_clear_as_the_nearest_of_all_its_distances(
         assert (float(sign(joints[None])[0]) < 0) == (found < 0)
         assert float(capped_m(joints[None])[0]) == pytest.approx(min(found, 0.03), abs=1e-12)
         hulls.place(joints, hulls.robot.record.gripper.max_width_m)
-        if links.touch():
+        if links_touch():
             continue
         distances, _ = around.measure({}, [], near_m=9.0, counts=lambda body, other: True)
         arm = [d for (body, *_), d in distances.items() if body not in gripper]
