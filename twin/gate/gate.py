@@ -384,7 +384,7 @@ class Gate:
 
     def _check(self, plan: Plan) -> str:
         """Refuse plans this gate cannot judge; return the robot description."""
-        urdf = self._perception.urdf()
+        urdf: str | None = self._perception.urdf()
         if urdf is None:
             raise UndecidedError(f"no robot description has arrived on {ROBOT_DESCRIPTION}")
         robot = robot_name(urdf)

@@ -13,7 +13,7 @@ no inside: a body wholly inside a link's mesh is not found.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from typing import Any
@@ -85,6 +85,18 @@ class _Placed:
         """The corners of its box."""
         local = self.body.centre_m + _CORNERS * self.body.half_m
         return np.asarray(np.einsum("sij,cj->sci", self.R, local) + self.t[:, None])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _States:
+    """The states that are asked about."""
+
+    stamps_ns: Int[np.ndarray, " num_states"]
+    joints_rad: Float[np.ndarray, "num_states num_joints"]
+    width_m: Float[np.ndarray, " num_states"]
+    claimed_m: Float[np.ndarray, " num_states"]
+    """What the clearance said; between two states of the replay what it promised."""
+    Ts_base_object: dict[str, Float[np.ndarray, "num_states 4 4"]]
 
 
 def audit(
@@ -165,7 +177,7 @@ class _Audit:
         return Factor(value=None, detail=detail)
 
     def _ask(
-        self, first: _Placed, second: _Placed, states: ReplayResult, where: Bool[np.ndarray, " n"]
+        self, first: _Placed, second: _Placed, states: _States, where: Bool[np.ndarray, " n"]
     ) -> list[_Excess]:
         """Distances of a pair that are less than was said: by how much, and in words."""
         tolerance = max(first.body.tolerance_m, second.body.tolerance_m)
@@ -174,7 +186,7 @@ class _Audit:
         gap = np.linalg.norm(
             np.maximum(0.0, np.maximum(other_low - high, low - other_high)), axis=1
         )
-        ask = where & (gap < NEAR_M) & (gap < states.clearance_m - tolerance)
+        ask = where & (gap < NEAR_M) & (gap < states.claimed_m - tolerance)
         names = names_of(first.body.name, self._robot.record.gripper)
         pairs = {frozenset((name, second.body.name)) for name in names}
         found: list[_Excess] = []
@@ -185,9 +197,9 @@ class _Audit:
             if self._left < 0:
                 return found
             distance = self._distance_m(first, second, index)
-            excess = float(states.clearance_m[index]) - distance
+            excess = float(states.claimed_m[index]) - distance
             if not excess <= tolerance:
-                claimed_mm, t_s = states.clearance_m[index] * 1e3, states.stamps_ns[index] * 1e-9
+                claimed_mm, t_s = states.claimed_m[index] * 1e3, states.stamps_ns[index] * 1e-9
                 detail = (
                     f"{first.body.name} is {distance * 1e3:.1f} mm from {second.body.name} at "
                     f"{t_s:.2f} s by python-fcl, the clearance said {claimed_mm:.1f} mm"
@@ -209,7 +221,7 @@ class _Audit:
         away = np.linalg.norm(Ts[:, :3, 3] - Ts[0, :3, 3], axis=1)
         return np.asarray(away > MOVED_M + 0.001)
 
-    def _placed_links(self, states: ReplayResult) -> list[_Placed]:
+    def _placed_links(self, states: _States) -> list[_Placed]:
         robot = self._robot
         R = np.zeros((len(self._links), len(states.width_m), 3, 3))
         t = np.zeros((len(self._links), len(states.width_m), 3))
@@ -222,10 +234,16 @@ class _Audit:
                 R[number, index], t[number, index] = placement.rotation, placement.translation
         return [_Placed(body, R[n], t[n]) for n, (_, _, body) in enumerate(self._links)]
 
-    def _dense(self, result: ReplayResult) -> ReplayResult | None:
+    def _dense(self, result: ReplayResult) -> _States | None:
         """The replay's states and others between them; None when they are too many."""
         known = {n: Ts for n, Ts in result.Ts_base_object.items() if n in self._objects}
-        sampled = replace(result, Ts_base_object=known)
+        sampled = _States(
+            stamps_ns=result.stamps_ns,
+            joints_rad=result.joints_rad,
+            width_m=result.width_m,
+            claimed_m=result.clearance_m,
+            Ts_base_object=known,
+        )
         travel = np.zeros(len(result.stamps_ns) - 1)
         movers = self._placed_links(sampled) + [
             _Placed(self._objects[name], Ts[:, :3, :3], Ts[:, :3, 3]) for name, Ts in known.items()
@@ -275,16 +293,13 @@ class _Audit:
 
 
 def _between(
-    states: ReplayResult,
+    states: _States,
     first: Int[np.ndarray, " n"],
     second: Int[np.ndarray, " n"],
     share: Float[np.ndarray, " n"],
     eps_m: float,
-) -> ReplayResult:
-    """States a share of the way from one to another, straight in joints, positions and turns.
-
-    Between two states the clearance is what was promised there.
-    """
+) -> _States:
+    """States a share of the way from one to another, straight in joints, positions and turns."""
 
     def mixed(values: Float[np.ndarray, "num ..."]) -> Any:
         weight = share.reshape(-1, *[1] * (values.ndim - 1))
@@ -296,13 +311,12 @@ def _between(
         q, p = se3.split(Ts)
         turned = se3.interpolate_quaternion(q[first], q[second], share)
         poses[name] = se3.transform_from(turned, mixed(p))
-    claimed_m = np.minimum(states.clearance_m[second], eps_m)
-    return replace(
-        states,
+    claimed_m = np.minimum(states.claimed_m[second], eps_m)
+    return _States(
         stamps_ns=stamps,
         joints_rad=mixed(states.joints_rad),
         width_m=mixed(states.width_m),
-        clearance_m=np.where(share == 0.0, states.clearance_m[first], claimed_m),
+        claimed_m=np.where(share == 0.0, states.claimed_m[first], claimed_m),
         Ts_base_object=poses,
     )
 

@@ -112,9 +112,9 @@ START_RAD, START_M = 0.05, 0.01
 """A plan starts no farther than this from where each joint of the robot is, nor its tool."""
 MOVED_M = 0.005
 """An object counts as carried or pushed once it is this far from its start [m]."""
-PATH_STEP_S = 0.04
+PATH_RATE_HZ = 25
+PATH_STEP_S = 1 / PATH_RATE_HZ
 """Spacing at which the path between waypoints is checked [s]."""
-PATH_RATE_HZ = 1 / PATH_STEP_S
 
 
 @dataclass(frozen=True, kw_only=True)

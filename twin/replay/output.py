@@ -132,7 +132,7 @@ def _nodes(result: ReplayResult, cell: str, start_ns: int, frame_id: str) -> Ite
 def _contacts(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Message]:
     """Measured distances below the margin, and what physics says of the fingers."""
     topic = f"{prefix}{CONTACT}"
-    for contact in result.contacts:
+    for contact in result.contacts or ():
         record = _contact_record(
             start_ns, contact.start_ns, contact.end_ns, contact.bodies, source="distance"
         ) | {"allowed": contact.allowed, "min_distance_m": contact.min_distance_m}

@@ -256,7 +256,7 @@ class JointPath:
         """Time of the last knot."""
         return int(self.times_ns[-1])
 
-    def dense_times_ns(self, rate_hz: float = PATH_RATE_HZ) -> Int[np.ndarray, " num_times"]:
+    def dense_times_ns(self, rate_hz: int = PATH_RATE_HZ) -> Int[np.ndarray, " num_times"]:
         """Evenly spaced times from start to end, at least so many a second."""
         count = int(np.ceil(self.end_ns() * 1e-9 * rate_hz)) + 1
         return np.unique(np.linspace(0, self.end_ns(), count).round().astype(np.int64))

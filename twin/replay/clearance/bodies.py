@@ -188,4 +188,4 @@ def distances_to_boxes_m(
     here = np.eye(3)[None], np.zeros((1, 3)), np.ascontiguousarray(points_m)
     answers = np.empty((1, len(boxes)))
     surface_to_boxes(*where, *here, answers)
-    return answers[0]
+    return np.asarray(answers[0])

@@ -9,6 +9,7 @@ import pytest
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from twin.gate.gate import no_verdict
+from twin.replay.grasps import grasps_seen
 from twin.replay.path import JointPath
 from twin.replay.result import ReplayResult
 
