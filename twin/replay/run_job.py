@@ -28,8 +28,7 @@ from twin.replay.execution import (
     path_of_execution,
     stages_as_executed,
 )
-from twin.replay.job import WITHOUT, ReplayJob
-from twin.replay.job_row import judged, row_of_failure
+from twin.replay.job import WITHOUT, ReplayJob, judged, row_of_failure
 from twin.replay.monte_carlo import with_samples
 from twin.replay.observed import in_order, observed_plan
 from twin.replay.output import ReplayOrigin, write_replay

@@ -22,8 +22,7 @@ from bridge.task.task_file import Task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.failure import with_reasons
-from twin.replay.job import WITHOUT, ReplayJob
-from twin.replay.job_row import row_of_existing, row_of_failure
+from twin.replay.job import WITHOUT, ReplayJob, row_of_existing, row_of_failure
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene, shape_hashes
 from twin.replay.run_job import run_job
 from twin.replay.scene import localised_starts

@@ -92,7 +92,7 @@ def test_corners_of_a_placed_hull_lie_on_it_and_its_middle_inside() -> None:
             assert found == pytest.approx(0.0, abs=1e-6)
         middle = hull.points_m.mean(axis=0)
         assert distance_to_planes_m(planes, (R @ middle + t)[None], R, t) < 0
-        normal, offset = planes.normals[0], planes.offsets_m[0]
+        normal, offset = planes[0, :3], planes[0, 3]
         face = middle - (normal @ middle + offset) * normal  # above the face, seen from the middle
         outside = R @ (face + 0.05 * normal) + t
         assert distance_to_planes_m(planes, outside[None], R, t) >= 0.05 - 1e-9

@@ -11,8 +11,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from twin.replay import runner
 from twin.replay.config import ReplayConfig
-from twin.replay.job import ReplayJob
-from twin.replay.job_row import row_of_existing
+from twin.replay.job import ReplayJob, row_of_existing
 from twin.replay.run_job import run_job
 from twin.replay.runner import there_already
 from twin.replay.summary import count_verdicts, describe_run

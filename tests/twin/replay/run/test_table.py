@@ -3,7 +3,7 @@
 from typing import Any
 
 from bridge.task.verdict import Factor, Verdict
-from twin.replay.job_row import predicates_hold
+from twin.replay.job import predicates_hold
 from twin.replay.summary import against_recorded, count_verdicts, describe_run
 
 

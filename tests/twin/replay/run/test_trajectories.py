@@ -23,8 +23,7 @@ from bridge.terminal import Output
 from twin.replay import run_job as run_job_module
 from twin.replay import runner as runner_module
 from twin.replay.config import ReplayConfig, ReplayRunConfig
-from twin.replay.job import ReplayJob
-from twin.replay.job_row import divergence_of, row_of_failure
+from twin.replay.job import ReplayJob, divergence_of, row_of_failure
 from twin.replay.result import ReplayResult
 from twin.replay.runner import execution_of, replay_run
 from twin.replay.scene import StartState, StartStates
