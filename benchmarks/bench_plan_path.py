@@ -30,7 +30,7 @@ from path_scene import EPS_M, WIDTH_M, Pairs, pairs_of_test
 
 from bridge.robots.default import ROBOT
 from twin.plan.path.planner import Mover, PathConfig, limits_of, timed_path
-from twin.replay.clearance.bodies import own_links
+from twin.replay.clearance.bodies import own_links_touch
 from twin.replay.clearance.surroundings import Surroundings, posture_clearance
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
@@ -61,11 +61,11 @@ def native(pairs: Pairs, index: int, seed: int = SEED, shortcuts: int = 60) -> A
 def exact_check(pairs: Pairs) -> Callable[[np.ndarray], bool]:
     """The project's exact clearance of one posture: links, what stands, objects."""
     hulls, scene = hulls_of(pairs.problem.robot), pairs.problem.scene
-    surroundings, links = Surroundings(scene, hulls, EPS_M), own_links(hulls)
+    surroundings, links_touch = Surroundings(scene, hulls, EPS_M), own_links_touch(hulls)
 
     def free(joints: np.ndarray) -> bool:
         hulls.place(joints, WIDTH_M)
-        if links.touch():
+        if links_touch():
             return False
         distances, _ = surroundings.measure(
             scene.movable(), [], near_m=EPS_M, counts=lambda body, other: True

@@ -227,10 +227,10 @@ def clearance_rows(num_states: int) -> list[Target]:
                unit="mm", reference=f"{len(off_mm)} states against coal, median "
                f"{np.median(off_mm):.1f} mm; grid of {VOXEL_M * 1e3:g} mm"),
     ]  # fmt: skip
-    return rows + candidate_rows(around.lookup)
+    return rows + candidate_rows(around.grid)
 
 
-def candidate_rows(lookup: object) -> list[Target]:
+def candidate_rows(grid: object) -> list[Target]:
     from bridge.geometry import se3
     from twin.plan.constrain.distances import grid_clearance
 
@@ -243,9 +243,9 @@ def candidate_rows(lookup: object) -> list[Target]:
         [se3.rotation_from_vector(v) for v in rng.uniform(-0.2, 0.2, (count, 3))]
     )
     Ts[:, :3, 3] = np.array([0.55, 0.3, 0.12]) + rng.uniform(-0.08, 0.08, (count, 3))
-    us = cpu_us(lambda: grid_clearance(lookup, points, Ts), repeats=5, each=count)
+    us = cpu_us(lambda: grid_clearance(grid, points, Ts), repeats=5, each=count)
     one_by_one = cpu_us(
-        lambda: [lookup.distance(se3.apply(T, points)).min() for T in Ts[:500]],  # type: ignore[attr-defined]
+        lambda: [grid.distance(se3.apply(T, points)).min() for T in Ts[:500]],  # type: ignore[attr-defined]
         repeats=3,
         each=500,
     )

@@ -125,7 +125,6 @@ _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.STRING: string_from_cdr,
     schema.PLAN: Plan.from_json,
     schema.VERDICT: Verdict.from_json,
-    schema.SAMPLE: lambda data: parse_record(data, name="sample"),
     schema.CONTACT: lambda data: parse_record(data, name="contact"),
     schema.DIVERGENCE: lambda data: parse_record(data, name="divergence"),
     schema.LOCALISATION: lambda data: parse_record(data, name="localisation"),

@@ -116,10 +116,9 @@ BY_DISK = "disk: "
 """How ``stopped_by`` in the record ``recorder`` begins where a disk refused what came."""
 IN_RESERVE = "disk reserve: "
 """The same where a recording was ended while the disk still took everything."""
-SAME_ENGINE_KEY = "same_engine_as_cell"
-"""Among the settings of a replay whose engine moved the cell itself: shown, never counted."""
 SECOND_ENGINE_KEY = "second_engine"
-"""Among the settings of a replay beside the one that decides: shown, never counted."""
+"""Among the settings of a replay that an earlier edition made beside the one that decides: shown,
+never counted."""
 ROLLOUT = "rollout"
 """Kind of a derived episode in which a policy acted in the twin, and where its row lies."""
 

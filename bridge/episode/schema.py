@@ -133,7 +133,6 @@ IMU = "sensor_msgs/msg/Imu"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PLAN = "gst/Plan"
 VERDICT = "gst/Verdict"
-SAMPLE = "gst/Sample"
 CONTACT = "gst/Contact"
 DIVERGENCE = "gst/Divergence"
 LOCALISATION = "gst/Localisation"
@@ -147,7 +146,6 @@ COMPRESSED_VIDEO = "foxglove.CompressedVideo"
 _JSON_SCHEMAS = {
     PLAN: ("bridge.task", "schemas/plan.schema.json"),
     VERDICT: ("bridge.task", "schemas/verdict.schema.json"),
-    SAMPLE: ("bridge.task", "schemas/sample.schema.json"),
     CONTACT: ("bridge.task", "schemas/contact.schema.json"),
     DIVERGENCE: ("bridge.task", "schemas/divergence.schema.json"),
     LOCALISATION: ("bridge.task", "schemas/localisation.schema.json"),

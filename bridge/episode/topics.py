@@ -39,7 +39,6 @@ PLAN_TRAJECTORY = "/plan/trajectory"
 PLAN_PATH = "/plan/path"
 EVENT = "/event"
 VERDICT = "/verdict"
-VERDICT_SAMPLE = "/verdict/sample"
 GATE = "/gate/verdict"
 """A service, not a topic: a plan is asked, a verdict is answered."""
 LOCALISE = "/gate/localise"
@@ -86,7 +85,6 @@ _TYPES: tuple[tuple[str, str], ...] = (
     (f"{PLAN_PATH}$", schema.POSES_IN_FRAME),
     (f"{EVENT}$", schema.EVENT),
     (f"{VERDICT}$", schema.VERDICT),
-    (f"{VERDICT_SAMPLE}$", schema.SAMPLE),
     (f"{CONTACT}$", schema.CONTACT),
     (f"{DIVERGENCE}$", schema.DIVERGENCE),
     (f"{OBJECTS}[^/]+/pose$", schema.POSE_STAMPED),

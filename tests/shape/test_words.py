@@ -49,7 +49,7 @@ WORDS = {
         text=r"\bpartings?\b|\bpart(s|ed)? from (the|each|its|what|reality|real)\b",
     ),
     "telling": Word(use="trajectory", files="tellings?", names="tellings?", text=r"\btellings?\b"),
-    "place": Word(use="scene, RebuiltScene", files="place", whole="Place", text=r"rebuilt place"),
+    "place": Word(use="scene", files="place", whole="Place", text=r"rebuilt place"),
     "chance": Word(use="monte_carlo", files="chance", names="chances?", under=("twin",)),
     "furnish": Word(use="spawn", files="furnish", names="furnish(ed)?", text=r"\bfurnish"),
     "clearance": Word(

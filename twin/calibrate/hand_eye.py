@@ -15,7 +15,6 @@ from scipy.optimize import least_squares
 
 from bridge.geometry import se3
 from twin.calibrate.config import Mount
-from twin.calibrate.pairs import PosePairs
 from twin.errors import TwinError
 
 MAX_MOTIONS = 2000
@@ -212,6 +211,20 @@ CLEARLY = 3.0
 MAX_RESIDUAL_M = 0.02
 MAX_RESIDUAL_RAD = 0.05
 """Pairs that disagree by more belong to no one mounting."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosePairs:
+    """What robot and camera said at the same instants."""
+
+    Ts_base_effector: Float[np.ndarray, "num_pairs 4 4"]
+    Ts_camera_target: Float[np.ndarray, "num_pairs 4 4"]
+    source: str
+    """Episode ids."""
+
+    def __len__(self) -> int:
+        """Return the number of pairs."""
+        return len(self.Ts_base_effector)
 
 
 def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> tuple[RobotWorld, Mount]:

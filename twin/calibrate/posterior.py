@@ -26,7 +26,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.process_pool import Failed, runner_of
 from bridge.task.plan import Plan
-from bridge.task.predicate import Rollout, all_hold, evaluate_success
+from bridge.task.predicate import all_hold, evaluate_success
 from bridge.task.task_file import Task
 from bridge.terminal import Output
 from twin.replay.config import BoxDraw, PosteriorDraw, ReplayConfig
@@ -189,14 +189,15 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     task = streams.task_file(episode, plan.task).task()
     states = localised_starts(run, episode, task, scene_hash=scene_hash_of(run))
     start, after = states.at(stamp_ns), states.after(plan.id)
-    scene = read_rebuilt_scene(run, task).scene(task, urdf, start.Ts_base_object)
+    known = read_rebuilt_scene(run, task)
+    scene = replace(known, urdf=urdf, Ts_base_object=start.Ts_base_object)
     if scene.missing():
         raise UsageError(f"at its start {scene.describe_missing()}")
-    known = read_calibration(run)
-    if known is not None:  # all but what is made anew
-        record = {key: value for key, value in known.record.items() if key != "posterior"}
-        known = replace(known, record=record)
-    config = for_task(ReplayConfig(), known, task)
+    calibration = read_calibration(run)
+    if calibration is not None:  # all but what is made anew
+        record = {key: value for key, value in calibration.record.items() if key != "posterior"}
+        calibration = replace(calibration, record=record)
+    config = for_task(ReplayConfig(), calibration, task)
     return Trial(
         info=episode.info,
         sha256=episode.sha256(),
@@ -217,16 +218,9 @@ def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
     scene = free_start(scene, soft_models(scene))
     path, _, _ = path_of_plan(trial.plan, robot)
     states = simulate(path, scene, hulls_of(robot), config)
-    rollout = Rollout(
-        stamps_ns=states.stamps_ns,
-        Ts_base_object=states.Ts_base_object,
-        finger_contact=states.finger_contact,
-        extents_m=states.extents_m,
-        broken=states.broken,
-    )
     back = np.array(draw.bias_m)
     return Ended(
-        success=not states.broken and all_hold(evaluate_success(scene.task, rollout)) is True,
+        success=not states.broken and all_hold(evaluate_success(scene.task, states)) is True,
         ends_m={name: states.Ts_base_object[name][-1][:2, 3] - back for name in trial.ends_m},
     )
 

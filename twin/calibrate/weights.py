@@ -35,27 +35,35 @@ from twin.robot.model import RobotModel, load_robot, without_dynamics
 from twin.robot.posture import width_track
 from twin.scene.store.calibration import write_part
 
-STEP_S, SMOOTH_S, SLOWEST_S = 0.02, 0.04, 0.05
-"""Spacing of what is compared; spread of the Gaussian that smooths joints and efforts alike; time
-between two readings, at most."""
-NEAR_M, ABOVE_M, AROUND_S = 0.05, 0.03, 0.5
-"""The hand touches nothing so far from where it closed and opens, the object not what it stood on;
-nor is the arm free so shortly about a grasp."""
-OF_EFFORT = (0.05, 0.02, 0.2, 0.1, 0.02)
-"""Standard deviations beforehand in parts of a joint's largest effort: of its sensor's bias, of
-that one's drift, of dry friction, of friction a rad/s and of the motor's inertia."""
-ZERO_RAD, LATE_S, LINK, CENTRE_M = 0.003, 0.01, 0.05, 0.01
-"""Of joints' zeros, of the delay, of links' masses and inertias in parts of them, of centres."""
-MASS_KG, HAND_M, LEVER = 5.0, 0.05, 0.005
-"""Of the weight, of where it lies from the tool along each axis, of levers in parts of them."""
-CREEP_RAD_S, LEAST_NM = 0.01, 1e-3
-"""A joint that is slower may be held by dry friction, either way; none is known better."""
-TAILS, ROUNDS, FEWEST = 4, 8, 20
-"""Degrees of freedom of Student's t, which residuals have, for fingers touch things; fits, each
-with weights from the one before; samples, at least."""
-ALIKE, KNOWN, KNOWN_KG, AGREE = (0.7, 1.4), 0.2, 0.02, 0.99
-"""Efforts in parts of those described; half intervals, in parts of the mass or this, above which it
-is not determined; share of trials of one object that agree better."""
+# How efforts are read.
+STEP_S = 0.02  # spacing of what is compared
+SMOOTH_S = 0.04  # spread of the Gaussian that smooths joints and efforts alike
+SLOWEST_S = 0.05  # time between two readings, at most
+FEWEST = 20  # samples, at least
+NEAR_M = 0.05  # so far from where it closed and opens the hand touches nothing
+ABOVE_M = 0.03  # so far above that the object does not touch what it stood on
+AROUND_S = 0.5  # so shortly before and after a grasp the arm is not free
+# Standard deviations beforehand.
+BIAS_SHARE = 0.05  # of a sensor's bias, in parts of the joint's largest effort
+DRIFT_SHARE = 0.02  # of that bias's drift, in the same parts
+DRY_SHARE = 0.2  # of dry friction, in the same parts
+VISCOUS_SHARE = 0.1  # of friction a rad/s, in the same parts
+INERTIA_SHARE = 0.02  # of the motor's inertia a rad/s^2, in the same parts
+ZERO_RAD = 0.003  # of joints' zeros
+LATE_S = 0.01  # of the delay
+LINK_SHARE = 0.05  # of links' masses and inertias, in parts of them
+CENTRE_M = 0.01  # of links' centres of mass
+MASS_KG = 5.0  # of the weight
+HAND_M = 0.05  # of where it lies from the tool, along each axis
+LEVER_SHARE = 0.005  # of levers, in parts of them
+# How efforts are fitted and judged.
+CREEP_RAD_S = 0.01  # a slower joint may be held by dry friction, either way
+LEAST_NM = 1e-3  # no effort is known better
+TAILS = 4  # degrees of freedom of Student's t, which residuals have: fingers touch things
+ROUNDS = 8  # fits, each with weights from the one before
+LEAST_ALIKE, MOST_ALIKE = 0.7, 1.4  # efforts, in parts of those described
+KNOWN_SHARE, KNOWN_KG = 0.2, 0.02  # a larger half interval is not determined; parts of the mass
+AGREE_SHARE = 0.99  # of trials of one object agree better
 
 Rows = Float[np.ndarray, "_ num_joints"]
 Which = Bool[np.ndarray, " _"]
@@ -117,16 +125,18 @@ def weight_of(robot: RobotModel, moved: np.ndarray, free: Which, held: Which) ->
         columns.append(np.hstack([*joints, zeros[np.ix_(at, at)], late, *own, weight]))
     _refuse_other_efforts(described[free[used]], tau[free[used]])
     most = model.effortLimit[at]
-    spreads = [*(part * most for part in OF_EFFORT), np.full(len(at), ZERO_RAD), [LATE_S]]
+    of_effort = (BIAS_SHARE, DRIFT_SHARE, DRY_SHARE, VISCOUS_SHARE, INERTIA_SHARE)
+    spreads = [*(part * most for part in of_effort), np.full(len(at), ZERO_RAD), [LATE_S]]
     for inertia in (model.inertias[link] for link in links):
-        each = [LINK * inertia.mass, CENTRE_M * inertia.mass, LINK * np.trace(inertia.inertia)]
+        parts = inertia.mass, inertia.mass, np.trace(inertia.inertia)
+        each = np.multiply((LINK_SHARE, CENTRE_M, LINK_SHARE), parts)
         spreads.append(np.repeat(each, (1, 3, 6)))
     beforehand = np.concatenate([*spreads, MASS_KG * np.array([1.0, *[HAND_M] * 3])])
     x, sigma = _fitted(np.array(columns), tau - described, beforehand, 1 - np.abs(dry))
-    mass_kg, half_kg = float(x[-4]), Z_95 * float(np.hypot(sigma[-4], LEVER * x[-4]))
+    mass_kg, half_kg = float(x[-4]), Z_95 * float(np.hypot(sigma[-4], LEVER_SHARE * x[-4]))
     if mass_kg <= half_kg:
         raise NoWeightError(f"nothing that weighs is held: {mass_kg:.3f} +- {half_kg:.3f} kg")
-    if half_kg > max(KNOWN * mass_kg, KNOWN_KG):
+    if half_kg > max(KNOWN_SHARE * mass_kg, KNOWN_KG):
         raise NoWeightError(f"known to {half_kg:.2g} kg only: {mass_kg:.3f} kg")
     centre, halves = (x[-3:] / mass_kg).tolist(), (Z_95 * sigma[-3:] / mass_kg).tolist()
     known = {"mass_kg": mass_kg, "half_kg": half_kg}
@@ -137,11 +147,11 @@ def _refuse_other_efforts(described: Rows, measured: Rows) -> None:
     """An arm's own weight is in its efforts, in Nm and with the sign of its joints."""
     power = (described**2).sum(axis=0)
     each = (measured * described).sum(axis=0) / (power + LEAST_NM)
-    turned = np.flatnonzero((each < -ALIKE[0]) & (power > 0.05 * power.max())) + 1
+    turned = np.flatnonzero((each < -LEAST_ALIKE) & (power > 0.05 * power.max())) + 1
     if len(turned):
         raise NoWeightError(f"efforts have the other sign at joint {', '.join(map(str, turned))}")
     times = float(np.average(each, weights=power))
-    if not ALIKE[0] <= times <= ALIKE[1]:
+    if not LEAST_ALIKE <= times <= MOST_ALIKE:
         words = "another unit than Nm, or without the arm's own weight"
         raise NoWeightError(f"efforts are {times:.3g} times the described arm's: {words}")
 
@@ -268,7 +278,7 @@ def together(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     masses = np.array([row["mass_kg"] for row in rows])
     weights = (np.array([row["half_kg"] for row in rows]) / Z_95) ** -2.0
     value, why = float(np.average(masses, weights=weights)), ""
-    if float((weights * (masses - value) ** 2).sum()) > chi2.ppf(AGREE, len(rows) - 1):
+    if float((weights * (masses - value) ** 2).sum()) > chi2.ppf(AGREE_SHARE, len(rows) - 1):
         each = ", ".join(f"{row['mass_kg']:.3f} kg in {row['episode']}" for row in rows)
         why = f"trials do not agree ({each}): another object, or its look-alike, was held"
     sigma = float(weights.max()) ** -0.5

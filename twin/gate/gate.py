@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -123,29 +123,6 @@ class UndecidedError(TwinError):
     """There is no basis for a verdict; the message says what is missing."""
 
 
-@runtime_checkable
-class Perception(Protocol):
-    """What the gate sees of the cell: ``twin.gate.live.LiveView``, or a fake."""
-
-    def urdf(self) -> str | None:
-        """The robot description."""
-
-    def joints(self) -> Any:
-        """The latest ``JointSample``, and when it arrived; None before any."""
-
-    def executing(self) -> str | None:
-        """The plan being executed right now."""
-
-    def newest_ns(self) -> int:
-        """The latest time on the cell's own clock."""
-
-    def heard_ns(self) -> int:
-        """When the last message arrived."""
-
-    def frames(self, *, max_age_ns: int, max_per_camera: int) -> Any:
-        """The latest frames at rest; none of a camera whose last image is older than the age."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class JudgedTasks:
     """Which task files a gate judges by: one alone, or whichever a plan names with its hash."""
@@ -212,7 +189,7 @@ class Gate:
         *,
         tasks: JudgedTasks,
         config: GateConfig,
-        perception: Perception,
+        perception: Any,  # a ``LiveView``, or what answers as one
         localise: Localise,
         replay: Replay,
         now_ns: Callable[[], int],
@@ -407,7 +384,7 @@ class Gate:
 
     def _check(self, plan: Plan) -> str:
         """Refuse plans this gate cannot judge; return the robot description."""
-        urdf = self._perception.urdf()
+        urdf: str | None = self._perception.urdf()
         if urdf is None:
             raise UndecidedError(f"no robot description has arrived on {ROBOT_DESCRIPTION}")
         robot = robot_name(urdf)

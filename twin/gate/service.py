@@ -30,9 +30,9 @@ from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
-from twin.gate.gate import Gate, JudgedTasks, Perception
+from twin.gate.gate import Gate, JudgedTasks
 from twin.gate.twin_process import TwinProcess
-from twin.replay.agreement import WORDS
+from twin.replay.failure import WORDS
 
 CELL_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
 
@@ -42,7 +42,7 @@ class GateError(TwinError):
 
 
 def serve_gate(
-    session: Any, gate: Gate, perception: Perception, config: GateConfig, output: Output
+    session: Any, gate: Gate, perception: Any, config: GateConfig, output: Output
 ) -> None:
     """Answer on ``<cell>/gate/verdict`` and publish every verdict on ``/<cell>/verdict``.
 
@@ -73,7 +73,7 @@ def serve_gate(
 
 
 def serve_localisation(
-    session: Any, gate: Gate, perception: Perception, config: GateConfig, output: Output
+    session: Any, gate: Gate, perception: Any, config: GateConfig, output: Output
 ) -> None:
     """Answer on ``<cell>/gate/localise`` where the objects are, and publish each record.
 

@@ -69,55 +69,40 @@ def answer(question: Question) -> Verdict:
     Rounds of one start are tried against the same variations: their identity is the start's name.
     Raises UndecidedError for another robot or scene, or a nominal replay of too many steps.
     """
-    from twin.replay.agreement import in_each_engine  # noqa: PLC0415
     from twin.replay.audit import audit  # noqa: PLC0415
     from twin.replay.checks import limited_to_task  # noqa: PLC0415
-    from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
+    from twin.replay.monte_carlo import with_samples  # noqa: PLC0415
     from twin.replay.rebuilt_scene import for_task  # noqa: PLC0415
-    from twin.replay.result import ReplayResult  # noqa: PLC0415
     from twin.replay.verdict import reason_of, replay_plan  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     run, plan = RunFolder.open(question.run_path), question.plan
-    scene, notes = _scene_of(question, run)
+    scene = _scene_of(question, run)
     config = for_task(question.config, read_calibration(run), question.task)
     most_samples = question.max_steps // _steps_of(question, config) - 1
 
-    def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
-        return in_each_engine(
-            there.task,
-            settings,
-            lambda each: replay_plan(plan, there, each, refuse_early=True).verdict,
-        )[0]
-
-    made: list[ReplayResult] = []
-
-    def judge_nominal(settings: ReplayConfig) -> Verdict:
-        made.append(replay_plan(plan, scene, settings, refuse_early=True))
-        return made[-1].verdict
-
-    verdict = in_each_engine(scene.task, config, judge_nominal)[0]
+    nominal = replay_plan(plan, scene, config, refuse_early=True)
+    verdict = nominal.verdict
     if verdict.accepted is True:
         kept = limited_to_task(plan, scene.task)
-        audited = audit(made[0], kept, scene, config)
+        audited = audit(nominal, kept, scene, config)
         verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
         verdict = replace(verdict, reason=reason_of(verdict))
-    samples = replay_samples(
-        judge,
+    verdict = with_samples(
+        verdict,
+        lambda there, varied: replay_plan(plan, there, varied, refuse_early=True).verdict,
         scene,
         replace(config, samples=min(config.samples, most_samples)),
-        plan_id=plan.id,
         identity=plan.start_id or plan.id,
     )
-    verdict = with_probability(verdict, samples)
-    if not notes:
+    if not scene.notes:
         return verdict
-    warnings = (*verdict.warnings, *notes)  # a yes that knows less than it might says so first
+    warnings = (*verdict.warnings, *scene.notes)  # a yes that knows less than it might says so
     return replace(verdict, warnings=warnings, reason=verdict.reason or warnings[0])
 
 
-def _scene_of(question: Question, run: RunFolder) -> tuple[ReplayScene, tuple[str, ...]]:
-    """Where the plan is tried, and what the rebuilt scene could not tell."""
+def _scene_of(question: Question, run: RunFolder) -> ReplayScene:
+    """Where the plan is tried."""
     from twin.replay.rebuilt_scene import (  # noqa: PLC0415
         read_rebuilt_scene,
         scene_of_other_robot,
@@ -130,16 +115,19 @@ def _scene_of(question: Question, run: RunFolder) -> tuple[ReplayScene, tuple[st
             f"{other}, and plan {plan.id} is for {plan.robot}. Scan the cell with the robot that "
             "is to act and rebuild it: robot-gst rebuild RUN, or name the robot: --robot"
         )
-    rebuilt = read_rebuilt_scene(run, question.task)
-    scene = rebuilt.scene(
-        question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
-    )
+    scene = read_rebuilt_scene(run, question.task)
     if plan.scene_hash not in (None, scene.scene_hash):
         raise UndecidedError(
             f"plan {plan.id} was made in scene {str(plan.scene_hash)[:12]}; the run now has "
             f"{str(scene.scene_hash or 'none')[:12]}. Start its planner again."
         )
-    return replace(scene, start_rad=question.start_rad), rebuilt.notes
+    return replace(
+        scene,
+        urdf=question.urdf,
+        Ts_base_object=question.Ts_base_object,
+        covariances=question.covariances,
+        start_rad=question.start_rad,
+    )
 
 
 def _steps_of(question: Question, config: ReplayConfig) -> int:

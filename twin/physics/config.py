@@ -9,7 +9,6 @@ from bridge.errors import MissingDependencyError, refuse_outside
 Engine = Literal["pybullet", "mujoco"]
 """What moves rigid bodies."""
 ENGINES: tuple[Engine, ...] = ("pybullet", "mujoco")
-"""All of them; where several replay, the first decides."""
 
 RIGID_ONLY = (
     "the engine mujoco replays rigid objects only. Soft ones take --engine pybullet, beside which "

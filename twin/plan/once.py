@@ -42,7 +42,7 @@ from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_po
 from twin.replay.config import ReplayConfig
 from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import for_task
-from twin.replay.run_job import cell_of, planned_grips
+from twin.replay.run_job import cell_of
 from twin.replay.verdict import replay_plan
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces
@@ -304,7 +304,6 @@ def _kept(run: RunFolder, start: Start, attempt: Attempt) -> Path:
         start_ns=start.seen_ns,
         urdf=scene.urdf,
         stages=plan.stages,
-        gripper=planned_grips(plan),
         end_ns=plan.tau[-1].t_ns,
     )
     write_replay(replay_path, result, plan, origin)

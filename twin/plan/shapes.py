@@ -31,9 +31,14 @@ def problem_of(
     start_rad: Joints | None,
 ) -> Problem:
     """Put together what the planner knows when it plans; no joints where nobody knows them."""
-    scene = read_rebuilt_scene(run, task).scene(task, urdf, Ts_base_object, covariances=covariances)
     return Problem(
-        scene=replace(scene, start_rad=start_rad),
+        scene=replace(
+            read_rebuilt_scene(run, task),
+            urdf=urdf,
+            Ts_base_object=dict(Ts_base_object),
+            covariances=covariances,
+            start_rad=start_rad,
+        ),
         robot=load_robot(urdf),
         shapes=shapes_of(Library.of(run, read_record(run)), task),
     )

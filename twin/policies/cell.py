@@ -9,7 +9,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.streams import JointTrack
 from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.task.plan import Plan
-from bridge.task.predicate import Rollout, all_hold, evaluate_success
+from bridge.task.predicate import all_hold, evaluate_success
 from twin.physics.engines import PhysicsWorld, open_world
 from twin.policies.errors import StoppedError
 from twin.policies.limits import refuse_target
@@ -41,7 +41,7 @@ class TwinCell:
         self._rate_hz = start.config.physics.rate_hz
         self._stride = self._rate_hz // start.config.sample_rate_hz
         self._world: PhysicsWorld = open_world(
-            start.config.engines()[0],
+            start.config.engine,
             self._hulls.robot.urdf,
             mesh_hulls(self._hulls),
             start.config.physics,
@@ -139,14 +139,7 @@ class TwinCell:
     def succeeds(self) -> bool:
         """Whether the task is done, as far as the states up to now tell."""
         states = self._samples.states(self._world)
-        rollout = Rollout(
-            stamps_ns=states.stamps_ns,
-            Ts_base_object=states.Ts_base_object,
-            finger_contact=states.finger_contact,
-            extents_m=states.extents_m,
-            broken=states.broken,
-        )
-        return all_hold(evaluate_success(self.scene.task, rollout)) is True
+        return all_hold(evaluate_success(self.scene.task, states)) is True
 
     def judged(self, info: EpisodeInfo) -> tuple[ReplayResult, Plan]:
         """Judge all that happened, and tell it in a plan's words."""

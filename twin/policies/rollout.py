@@ -25,7 +25,7 @@ from twin.policies.starts import Start, drawn_starts, open_start
 from twin.policies.views import Pictures, TwinCameras
 from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.result import ReplayResult
-from twin.replay.run_job import cell_of, planned_grips
+from twin.replay.run_job import cell_of
 
 ROLLOUT_VERSION = 1
 """Raise it when the same inputs give another rollout, so that old files are redone."""
@@ -252,7 +252,6 @@ def _write(
         start_ns=start.stamp_ns,
         urdf=start.scene.urdf,
         stages=plan.stages,
-        gripper=planned_grips(plan),
         end_ns=plan.tau[-1].t_ns,
         images=tuple(
             (

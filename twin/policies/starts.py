@@ -75,8 +75,12 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
     begun_ns = first_execution_ns(episode)
     stamp_ns = begun_ns or streams.first_stamp_ns(episode) or episode.start_ns
     found = localised_starts(run, episode, task, scene_hash=scene_hash_of(run)).at(0)  # at first
-    rebuilt = read_rebuilt_scene(run, task)
-    scene = rebuilt.scene(task, urdf, found.Ts_base_object, reasons=found.reasons)
+    scene = replace(
+        read_rebuilt_scene(run, task),
+        urdf=urdf,
+        Ts_base_object=found.Ts_base_object,
+        reasons=found.reasons,
+    )
     if scene.missing():
         raise PolicyError(f"{episode.info.id} gives no start: {scene.describe_missing()}")
     robot = load_robot(urdf)

@@ -13,7 +13,7 @@ no inside: a body wholly inside a link's mesh is not found.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from typing import Any
@@ -28,8 +28,8 @@ from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan
 from bridge.task.task_file import BASKET
 from bridge.task.verdict import Factor
-from twin.replay.clearance.bodies import SCENE, TABLE, names_of, placed_panels
-from twin.replay.clearance.monitor import MAX_LEAP_M, Allowed, active_stage, allowed_pairs
+from twin.replay.clearance.bodies import SCENE, TABLE, PanelBox, names_of, placed_panels
+from twin.replay.clearance.monitor import MAX_LEAP_M, allowed_at
 from twin.replay.clearance.static_obstacles import stationary_links
 from twin.replay.config import MOVED_M, ReplayConfig
 from twin.replay.result import ReplayResult
@@ -97,10 +97,6 @@ class _States:
     claimed_m: Float[np.ndarray, " num_states"]
     """What the clearance said; between two states of the replay what it promised."""
     Ts_base_object: dict[str, Float[np.ndarray, "num_states 4 4"]]
-    allowed: list[Allowed] = field(default_factory=list)
-    """What may touch, for each stage that there is."""
-    stage: Int[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Which of those each state is in."""
 
 
 def audit(
@@ -132,7 +128,8 @@ class _Audit:
     def __init__(
         self, fcl: Any, plan: Plan, scene: ReplayScene, config: ReplayConfig, max_queries: int
     ) -> None:
-        self._fcl, self._plan, self._scene, self._config = fcl, plan, scene, config
+        self._fcl, self._scene, self._config = fcl, scene, config
+        self._allowed_at = allowed_at(plan.stages)
         self._robot = load_robot(scene.urdf)
         self._links = _link_bodies(self._robot)
         self._stationary, _ = stationary_links(hulls_of(self._robot))
@@ -190,11 +187,12 @@ class _Audit:
             np.maximum(0.0, np.maximum(other_low - high, low - other_high)), axis=1
         )
         ask = where & (gap < NEAR_M) & (gap < states.claimed_m - tolerance)
-        if not ask.any():
-            return []
-        ask &= ~self._may_touch(first.body.name, second.body.name, states)
+        names = names_of(first.body.name, self._robot.record.gripper)
+        pairs = {frozenset((name, second.body.name)) for name in names}
         found: list[_Excess] = []
         for index in np.flatnonzero(ask).tolist():
+            if pairs & self._allowed_at(int(states.stamps_ns[index])):
+                continue
             self._left -= 1
             if self._left < 0:
                 return found
@@ -218,13 +216,6 @@ class _Audit:
         found = self._fcl.distance(first.body.shape, second.body.shape, self._request, answer)
         return max(0.0, float(found))
 
-    def _may_touch(self, body: str, other: str, states: _States) -> Bool[np.ndarray, " n"]:
-        """At which states the stage allows the pair."""
-        names = names_of(body, self._robot.record.gripper)
-        pairs = {frozenset((name, other)) for name in names}
-        allowed = np.array([bool(pairs & item) for item in states.allowed], dtype=bool)
-        return np.asarray(allowed[states.stage])
-
     def _moved(self, Ts: Float[np.ndarray, "num_states 4 4"]) -> Bool[np.ndarray, " num_states"]:
         """Whether an object belongs to somebody's motion; a millimetre later than the monitor."""
         away = np.linalg.norm(Ts[:, :3, 3] - Ts[0, :3, 3], axis=1)
@@ -232,17 +223,16 @@ class _Audit:
 
     def _placed_links(self, states: _States) -> list[_Placed]:
         robot = self._robot
-        frames = [robot.model.getFrameId(link.name) for link in self._links]
-        R = np.zeros((len(frames), len(states.width_m), 3, 3))
-        t = np.zeros((len(frames), len(states.width_m), 3))
+        R = np.zeros((len(self._links), len(states.width_m), 3, 3))
+        t = np.zeros((len(self._links), len(states.width_m), 3))
         rows = zip(states.joints_rad, states.width_m.tolist(), strict=True)
         for index, (joints_rad, width_m) in enumerate(rows):
             q = robot.configuration(joints_rad, width_m)
             pin.framesForwardKinematics(robot.model, robot.data, q)
-            for number, frame in enumerate(frames):
-                placement = robot.data.oMf[frame]
+            for number, (frame, T_link_shape, _) in enumerate(self._links):
+                placement = robot.data.oMf[frame] * T_link_shape
                 R[number, index], t[number, index] = placement.rotation, placement.translation
-        return [_Placed(link, R[n], t[n]) for n, link in enumerate(self._links)]
+        return [_Placed(body, R[n], t[n]) for n, (_, _, body) in enumerate(self._links)]
 
     def _dense(self, result: ReplayResult) -> _States | None:
         """The replay's states and others between them; None when they are too many."""
@@ -270,18 +260,7 @@ class _Audit:
         share = np.concatenate([np.arange(n) / n for n in parts] or [np.zeros(0)])
         first, share = np.append(first, len(parts)), np.append(share, 0.0)
         second = np.minimum(first + 1, len(parts))
-        states = _between(sampled, first, second, share, self._config.eps_col_m)
-        stages = self._plan.stages
-        number: dict[int, int] = {}
-        allowed: list[Allowed] = []
-        stage = np.zeros(len(states.stamps_ns), dtype=np.int64)
-        for index, t_ns in enumerate(states.stamps_ns.tolist()):
-            active = id(active_stage(stages, t_ns))
-            if active not in number:
-                number[active] = len(allowed)
-                allowed.append(allowed_pairs(stages, t_ns))
-            stage[index] = number[active]
-        return replace(states, allowed=allowed, stage=stage)
+        return _between(sampled, first, second, share, self._config.eps_col_m)
 
     def _fixed(self) -> list[_Placed]:
         fcl, scene = self._fcl, self._scene
@@ -332,13 +311,12 @@ def _between(
         q, p = se3.split(Ts)
         turned = se3.interpolate_quaternion(q[first], q[second], share)
         poses[name] = se3.transform_from(turned, mixed(p))
+    claimed_m = np.minimum(states.claimed_m[second], eps_m)
     return _States(
         stamps_ns=stamps,
         joints_rad=mixed(states.joints_rad),
         width_m=mixed(states.width_m),
-        claimed_m=np.where(
-            share == 0.0, states.claimed_m[first], np.minimum(states.claimed_m[second], eps_m)
-        ),
+        claimed_m=np.where(share == 0.0, states.claimed_m[first], claimed_m),
         Ts_base_object=poses,
     )
 
@@ -364,58 +342,42 @@ def _mesh_body(
 
 
 @lru_cache(maxsize=4)
-def _link_bodies(robot: RobotModel) -> tuple[_Body, ...]:
-    """The collision shapes of a robot as its description has them, in their links' frames."""
+def _link_bodies(robot: RobotModel) -> tuple[tuple[int, pin.SE3, _Body], ...]:
+    """The collision shapes of a robot as its description has them, each with its frame and place.
+
+    Meshes by their triangles; boxes, spheres, cylinders and capsules are python-fcl's own.
+    """
     import fcl  # noqa: PLC0415
 
-    bodies = []
+    found = []
     for item in collision_geometry(robot.model, robot.urdf).geometryObjects:
-        frame = robot.model.frames[item.parentFrame]
-        T_link_shape = frame.placement.inverse() * item.placement
-        shape = item.geometry
+        frame, shape = robot.model.frames[item.parentFrame], item.geometry
         if isinstance(shape, coal.BVHModelBase):
-            points = np.array(shape.vertices())
-            triangles = _triangles_of(shape)
+            corners = [shape.tri_indices(number) for number in range(shape.num_tris)]
+            triangles = np.array([(each[0], each[1], each[2]) for each in corners], dtype=np.int64)
+            body = _mesh_body(fcl, frame.name, np.array(shape.vertices()), triangles)
+        elif isinstance(shape, coal.Box):
+            body = _box_body(fcl, frame.name, 2 * np.array(shape.halfSide))
         else:
-            points, triangles = _surface_of(shape)
-        points = points @ T_link_shape.rotation.T + T_link_shape.translation
-        bodies.append(_mesh_body(fcl, frame.name, points, triangles))
-    return tuple(bodies)
+            shape.computeLocalAABB()
+            high = np.array(shape.aabb_local.max_)  # about the middle
+            body = _Body(frame.name, fcl.CollisionObject(_round(fcl, shape)), np.zeros(3), high)
+        found.append((item.parentFrame, frame.placement.inverse() * item.placement, body))
+    return tuple(found)
 
 
-def _triangles_of(shape: Any) -> Int[np.ndarray, "num_triangles 3"]:
-    triangles = (shape.tri_indices(number) for number in range(shape.num_tris))
-    return np.array([(item[0], item[1], item[2]) for item in triangles], dtype=np.int64)
-
-
-def _surface_of(shape: Any) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """Triangles of a box or a cylinder, which ``link_hulls`` has let through."""
-    half = np.array(shape.halfSide) if isinstance(shape, coal.Box) else None
-    if half is not None:
-        points = _CORNERS * half
-        quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-        return points, np.array(
-            [(a, b, c) for a, b, c, _ in quads] + [(a, c, d) for a, _, c, d in quads]
-        )
-    turns = np.arange(48) * 2 * np.pi / 48
-    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1) * shape.radius
-    ends = [np.column_stack([ring, np.full(48, s * shape.halfLength)]) for s in (-1.0, 1.0)]
-    points = np.vstack([*ends, [[0, 0, -shape.halfLength], [0, 0, shape.halfLength]]])
-    faces = []
-    for k in range(48):
-        n = (k + 1) % 48
-        faces += [(k, n, 48 + n), (k, 48 + n, 48 + k), (96, n, k), (97, 48 + k, 48 + n)]
-    return points, np.array(faces)
-
-
-Panel = tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]
+def _round(fcl: Any, shape: Any) -> Any:
+    if isinstance(shape, coal.Sphere):
+        return fcl.Sphere(shape.radius)
+    kind = fcl.Capsule if isinstance(shape, coal.Capsule) else fcl.Cylinder
+    return kind(shape.radius, 2 * shape.halfLength)
 
 
 def _scene_blocks(
     static: StaticSdf,
     table_height_m: float,
     foot: tuple[float, float] | None,
-    panels: Sequence[Panel],
+    panels: Sequence[PanelBox],
 ) -> list[tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]]:
     """The surface of what has no name in a scene, in blocks.
 

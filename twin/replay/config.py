@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
 from bridge.terminal import RARE
-from twin.physics.config import ENGINES, RIGID_ONLY, Engine, PhysicsConfig, require_engine
+from twin.physics.config import RIGID_ONLY, Engine, PhysicsConfig, require_engine
 
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
 """Fields of ``PhysicsConfig`` that are frictions."""
@@ -112,7 +112,8 @@ START_RAD, START_M = 0.05, 0.01
 """A plan starts no farther than this from where each joint of the robot is, nor its tool."""
 MOVED_M = 0.005
 """An object counts as carried or pushed once it is this far from its start [m]."""
-PATH_STEP_S = 0.04
+PATH_RATE_HZ = 25
+PATH_STEP_S = 1 / PATH_RATE_HZ
 """Spacing at which the path between waypoints is checked [s]."""
 
 
@@ -123,11 +124,8 @@ class ReplayConfig:
     mode: Annotated[Mode, Parameter(parse=False)] = "dynamic"
     """kinematic follows the joints exactly; dynamic lets physics answer. No flag: the commands
     choose it for each trajectory."""
-    engine: Annotated[
-        Literal["pybullet", "mujoco", "both"], Parameter(name="--engine", show=True)
-    ] = "pybullet"
-    """What moves rigid bodies: pybullet, mujoco, or both, of which pybullet decides and mujoco is
-    reported where it says something else. Soft bodies are pybullet's alone."""
+    engine: Annotated[Engine, Parameter(name="--engine", show=True)] = "pybullet"
+    """What moves rigid bodies; soft ones are pybullet's alone."""
     eps_col_m: float = 0.002
     """Smallest distance between bodies that may not touch, the paper's epsilon_col [m]."""
     sample_rate_hz: int = 60
@@ -162,8 +160,7 @@ class ReplayConfig:
                 "grip_delay_s": second,
             },
         )
-        for engine in self.engines():
-            require_engine(engine)
+        require_engine(self.engine)
         if self.sample_rate_hz < 1 or self.physics.rate_hz % self.sample_rate_hz:
             message = (
                 f"sample_rate_hz {self.sample_rate_hz} does not divide the physics rate "
@@ -171,13 +168,9 @@ class ReplayConfig:
             )
             raise UsageError(message)
 
-    def engines(self) -> tuple[Engine, ...]:
-        """What replays a trajectory, the one that decides first."""
-        return ENGINES if self.engine == "both" else (self.engine,)
-
     def refuse_soft(self, soft_objects: Sequence[str]) -> None:
         """Refuse soft objects in an engine that has none."""
-        if soft_objects and self.mode == "dynamic" and "mujoco" in self.engines():
+        if soft_objects and self.mode == "dynamic" and self.engine == "mujoco":
             raise UsageError(f"{', '.join(soft_objects)} cannot be replayed: {RIGID_ONLY}")
 
 

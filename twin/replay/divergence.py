@@ -120,7 +120,6 @@ class Divergence:
     lag_s: float | None
     """How far the recorded tool lags behind the planned one."""
     quantities: tuple[DivergedQuantity, ...]
-    not_compared: tuple[str, ...] = ()
 
     @property
     def first(self) -> DivergedQuantity | None:
@@ -135,7 +134,6 @@ class Divergence:
             "lag_s": self.lag_s,
             "first": None if self.first is None else _plain(self.first),
             "quantities": [_plain(one) for one in self.quantities],
-            "not_compared": list(self.not_compared),
         }
         check_record(record, name="divergence")
         return record
@@ -146,7 +144,6 @@ def diverge(
     traces: Sequence[Trace],
     *,
     findings: Mapping[str, Mapping[tuple[str, str], bool | None]] | None = None,
-    not_compared: Sequence[str] = (),  # why a side is missing
 ) -> Divergence:
     """Compare every two trajectories, what each predicate (kind, object) said only if all agree."""
     quantities: list[DivergedQuantity] = []
@@ -165,7 +162,6 @@ def diverge(
         plan_id=plan_id,
         lag_s=lags.get(("planned", "recorded")),
         quantities=tuple(quantities),
-        not_compared=tuple(not_compared),
     )
 
 

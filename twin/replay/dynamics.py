@@ -4,13 +4,14 @@ Objects that were localised into each other are moved apart first, or refused: p
 overlap with a kick, and what follows says nothing about the plan.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import coal
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
@@ -23,6 +24,7 @@ from twin.replay.clearance.bodies import placed_panels, placement_of
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import NotEvaluatedError
 from twin.replay.path import JointPath
+from twin.replay.result import Burst, States
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, convex_hull, signed_distance
 from twin.robot.model import check_dynamics
@@ -79,43 +81,10 @@ def lifted(
     return T
 
 
-@dataclass(frozen=True, kw_only=True)
-class Burst:
-    """A soft body that stopped being one."""
-
-    object_id: str
-    t_ns: int
-    found: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class States:
-    """What a replay saw, settling at the end included."""
-
-    stamps_ns: Int[np.ndarray, " num_steps"]
-    joints_rad: Float[np.ndarray, "num_steps num_joints"]
-    width_m: Float[np.ndarray, " num_steps"]
-    Ts_base_object: dict[str, Float[np.ndarray, "num_steps 4 4"]]
-    finger_contact: dict[str, Bool[np.ndarray, " num_steps"]]
-    nodes_m: dict[str, Float32[np.ndarray, "num_steps _ 3"]] = field(default_factory=dict)
-    """Of soft objects, base frame [m]."""
-    extents_m: dict[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)
-    """Of soft objects, along their own axes [m]."""
-    broken: dict[str, str] = field(default_factory=dict)
-    """Soft objects that are no bodies any more at the end, and what was found."""
-    burst: Burst | None = None
-    """The first that burst; the replay ended there."""
-    arm_force_N: Float[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0))
-    """What rigid bodies press the arm with, where physics was asked."""
-
-
 def num_steps(end_ns: int, config: ReplayConfig) -> int:
-    """Physics steps of a replay whose trajectory ends then, settling before and after included.
-
-    Each engine takes them.
-    """
+    """Physics steps of a replay whose trajectory ends then, settling before and after included."""
     settling = round(config.settle_before_s * config.physics.rate_hz)
-    return len(config.engines()) * (settling + _steps_kept(end_ns, config))
+    return settling + _steps_kept(end_ns, config)
 
 
 def _steps_kept(end_ns: int, config: ReplayConfig) -> int:
@@ -132,8 +101,7 @@ def simulate(
     """Follow a path with position-controlled motors and free objects.
 
     Every run of the same inputs gives the same bits: one fresh world, fixed steps. A soft body
-    that bursts ends it: what comes after would be noise. Of several engines the first moves it;
-    ``twin.replay.agreement`` asks the others.
+    that bursts ends it: what comes after would be noise.
     """
     check_dynamics(hulls.robot)
     rate = config.physics.rate_hz
@@ -147,8 +115,7 @@ def simulate(
     stamps = times_ns.tolist()
     soft = soft_models(scene)
     samples = Samples(scene, soft)
-    engine = config.engines()[0]
-    with open_world(engine, hulls.robot.urdf, mesh_hulls(hulls), config.physics) as world:
+    with open_world(config.engine, hulls.robot.urdf, mesh_hulls(hulls), config.physics) as world:
         spawn(world, scene, soft)
         world.reset_robot(postures[0], widths[0])
         world.robot.command(targets[0], [0.0] * len(targets[0]), widths[0])
@@ -178,19 +145,11 @@ class Samples:
 
     def __init__(self, scene: ReplayScene, soft: dict[str, SoftShape]) -> None:
         """Begin without any."""
-        self._objects = list(scene.movable())
-        self._soft = list(soft)
-        self._fixed = scene.containers()
-        self._stamps: list[int] = []
-        self._joints: list[Float[np.ndarray, " num_joints"]] = []
-        self._widths: list[float] = []
-        self._forces: list[float] = []
-        self._rigid = [name for name in self._objects if name not in soft]
-        self._poses: dict[str, list[tuple[float, ...]]] = {name: [] for name in self._rigid}
-        self._fits: dict[str, list[Float[np.ndarray, "4 4"]]] = {name: [] for name in soft}
-        self._touch: dict[str, list[bool]] = {name: [] for name in self._objects}
-        self._nodes: dict[str, list[Float32[np.ndarray, "num_nodes 3"]]] = {n: [] for n in soft}
-        self._extents: dict[str, list[np.ndarray]] = {name: [] for name in soft}
+        self._soft, self._fixed = list(soft), scene.containers()
+        self._rows: list[tuple[int, Float[np.ndarray, " num_joints"], float, float]] = []
+        """Stamp, joints, width and force on the arm."""
+        self._seen: dict[str, list[tuple[Any, ...]]] = {name: [] for name in scene.movable()}
+        """Place and touch of each object; of soft ones nodes and extents too."""
         self._burst: Burst | None = None
 
     def take(self, world: PhysicsWorld, t_ns: int) -> bool:
@@ -199,47 +158,45 @@ class Samples:
             found = burst_of(world.soft_bodies().health(name))
             if found is not None:
                 self._burst = Burst(object_id=name, t_ns=t_ns, found=found)
-                if self._stamps:
+                if self._rows:
                     return False
                 raise NotEvaluatedError(f"{name} before anything moved: {found}")
-        self._stamps.append(t_ns)
-        joints, width = world.robot.posture()
-        self._joints.append(joints)
-        self._widths.append(width)
-        self._forces.append(world.arm_force_N())
-        for name in self._objects:
-            self._touch[name].append(world.finger_touches(name))
-        for name in self._rigid:
-            self._poses[name].append(world.object_pose(name))
-        for name in self._soft:
-            self._fits[name].append(world.T_base_object(name))
-            self._nodes[name].append(world.soft_bodies().nodes_m(name).astype(np.float32))
-            self._extents[name].append(world.soft_bodies().extents_m(name))
+        self._rows.append((t_ns, *world.robot.posture(), world.arm_force_N()))
+        for name, rows in self._seen.items():
+            touch = world.finger_touches(name)
+            if name in self._soft:
+                soft = world.soft_bodies()
+                nodes_m = soft.nodes_m(name).astype(np.float32)
+                rows.append((world.T_base_object(name), touch, nodes_m, soft.extents_m(name)))
+            else:
+                rows.append((world.object_pose(name), touch))
         return True
 
     def states(self, world: PhysicsWorld) -> States:
         """All that was kept."""
-        poses = {name: self._Ts_base_object(name) for name in self._objects}
-        poses |= {
-            name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._fixed.items()
-        }
+        stamps, joints, widths, forces = zip(*self._rows, strict=True)
+        seen = {name: list(zip(*rows, strict=True)) for name, rows in self._seen.items()}
+        poses = {name: self._Ts_base_object(name, columns[0]) for name, columns in seen.items()}
+        poses |= {name: np.repeat(T[None], len(stamps), axis=0) for name, T in self._fixed.items()}
         return States(
-            stamps_ns=np.array(self._stamps, dtype=np.int64),
-            joints_rad=np.stack(self._joints),
-            width_m=np.array(self._widths),
+            stamps_ns=np.array(stamps, dtype=np.int64),
+            joints_rad=np.stack(joints),
+            width_m=np.array(widths),
             Ts_base_object=poses,
-            finger_contact={name: np.array(items) for name, items in self._touch.items()},
-            nodes_m={name: np.stack(items) for name, items in self._nodes.items()},
-            extents_m={name: np.array(rows, dtype=float) for name, rows in self._extents.items()},
+            finger_contact={name: np.array(columns[1]) for name, columns in seen.items()},
+            nodes_m={name: np.stack(seen[name][2]) for name in self._soft},
+            extents_m={name: np.array(seen[name][3], dtype=float) for name in self._soft},
             broken=self._broken(world),
             burst=self._burst,
-            arm_force_N=np.array(self._forces),
+            arm_force_N=np.array(forces),
         )
 
-    def _Ts_base_object(self, name: str) -> Float[np.ndarray, "num_steps 4 4"]:
-        if name in self._fits:
-            return np.stack(self._fits[name])
-        rows = np.array(self._poses[name])
+    def _Ts_base_object(
+        self, name: str, places: Sequence[Any]
+    ) -> Float[np.ndarray, "num_steps 4 4"]:
+        rows = np.array(places)
+        if name in self._soft:
+            return rows
         if not np.isfinite(rows).all():
             raise NotEvaluatedError(f"physics lost {name}: its place is not a number any more")
         return se3.transform_from(rows[:, 3:], rows[:, :3])

@@ -9,10 +9,11 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.episode.streams import JointTrack
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES
+from bridge.geometry.signals import runs_of_true
 from bridge.robots.robot import GRIPPER_WIDTH, Robot
 from bridge.task.plan import Plan, Stage
 from twin.replay.config import ReplayConfig
-from twin.replay.observed import PLATEAU_M, in_order
+from twin.replay.observed import PLATEAU_M, find_grips, in_order
 from twin.replay.path import MAX_DURATION_S, WIDTH_SLACK_M, JointPath, UnusablePlanError
 
 SQUEEZE_M = 0.01
@@ -147,7 +148,7 @@ def path_of_execution(
         joints_rad=arm.position[keep].astype(np.float64),
         width_times_ns=width_times,
         width_m=np.where(closed, np.maximum(width - squeeze_m, 0.0), width),
-        first_close_ns=_first_close(width_times, width),
+        first_close_ns=next((closing for closing, _, _ in find_grips(width_times, width)), None),
     )
 
 
@@ -207,22 +208,7 @@ def closed_mask(
 
 
 def _closed_intervals(plan: Plan) -> list[tuple[int, int]]:
-    intervals = []
-    start = None
-    for waypoint in plan.tau:
-        if waypoint.g == 1 and start is None:
-            start = waypoint.t_ns
-        elif waypoint.g == 0 and start is not None:
-            intervals.append((start, waypoint.t_ns))
-            start = None
-    if start is not None:
-        intervals.append((start, plan.tau[-1].t_ns + 1))
-    return intervals
-
-
-def _first_close(
-    times_ns: Int[np.ndarray, " num_samples"], width_m: Float[np.ndarray, " num_samples"]
-) -> int | None:
-    """When the fingers first begin to close."""
-    closing = np.flatnonzero(width_m < np.maximum.accumulate(width_m) - PLATEAU_M)
-    return int(times_ns[closing[0]]) if len(closing) else None
+    """From when to when a plan wants the gripper closed; without an end, just past its own."""
+    stamps = [*(waypoint.t_ns for waypoint in plan.tau), plan.tau[-1].t_ns + 1]
+    wanted = np.array([waypoint.g == 1 for waypoint in plan.tau])
+    return [(stamps[first], stamps[end]) for first, end in runs_of_true(wanted)]

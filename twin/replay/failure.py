@@ -9,6 +9,7 @@ from twin.errors import TwinError
 
 NOT_EVALUATED = "not evaluated: "
 """What tables and verdicts look for."""
+WORDS = {True: "accepted", False: "rejected", None: "undecided"}
 
 
 class NotEvaluatedError(TwinError):

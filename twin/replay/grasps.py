@@ -1,35 +1,41 @@
 """What became of each grasp of a plan: touched, and carried along when the hand left."""
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from bridge.geometry import se3
 from bridge.geometry.signals import runs_of_true
 from bridge.task.plan import Plan
 from twin.replay.path import JointPath
-from twin.replay.result import ReplayResult
+from twin.replay.result import States
 
 LEAVES_M = 0.002
 """The hand carries once its tool is this far from where it was told to close."""
 
 
-def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict[str, object], ...]:
+def grasps_seen(
+    plan: Plan, path: JointPath, states: States, Ts_base_tcp: Float[np.ndarray, "num_steps 4 4"]
+) -> tuple[dict[str, object], ...]:
     """What became of each grasp of a plan, for whoever plans again; as verdicts keep it."""
     stretches = []
-    for first, end in _closed(plan, path, result.stamps_ns):
-        name = grasped(plan, int(result.stamps_ns[first]))
-        if name is not None and name in result.finger_contact:
+    for first, end in _closed(plan, path, states.stamps_ns):
+        name = grasped(plan, int(states.stamps_ns[first]))
+        if name is not None and name in states.finger_contact:
             stretches.append((name, first, end))
-    held = {name for name, first, end in stretches if _carries(result, name, first, end)}
+    held = {
+        name
+        for name, first, end in stretches
+        if _carries(Ts_base_tcp[first:end, :3, 3], states.finger_contact[name][first:end])
+    }
     seen = []
     for name, first, end in stretches:
-        contact = result.finger_contact[name][first:end]
+        contact = states.finger_contact[name][first:end]
         p_object_m = None
         if contact.any():
             T_object_base = se3.invert(
-                result.Ts_base_object[name][when := first + contact.argmax()]
+                states.Ts_base_object[name][when := first + contact.argmax()]
             )
-            tool_m = se3.apply(T_object_base, result.Ts_base_tcp[when][None, :3, 3])[0]
+            tool_m = se3.apply(T_object_base, Ts_base_tcp[when][None, :3, 3])[0]
             p_object_m = tool_m.round(6).tolist()
         seen.append(
             {
@@ -37,17 +43,18 @@ def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict
                 "touched": bool(contact.any()),
                 "held": name in held,
                 "p_object_m": p_object_m,
-                "T_base_object": se3.pose_record(result.Ts_base_object[name][-1]),
+                "T_base_object": se3.pose_record(states.Ts_base_object[name][-1]),
             }
         )
     return tuple(seen)
 
 
-def _carries(result: ReplayResult, name: str, first: int, end: int) -> bool:
+def _carries(
+    tool_m: Float[np.ndarray, "num_closed 3"], contact: Bool[np.ndarray, " num_closed"]
+) -> bool:
     """Whether a finger touches the object as the hand leaves; a grasp that misses carries none."""
-    tool_m = result.Ts_base_tcp[first:end, :3, 3]
     left = np.linalg.norm(tool_m - tool_m[0], axis=1) > LEAVES_M
-    return bool(left.any() and result.finger_contact[name][first + int(left.argmax())])
+    return bool(left.any() and contact[int(left.argmax())])
 
 
 def _closed(

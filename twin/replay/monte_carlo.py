@@ -6,19 +6,16 @@ order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
 """
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
-from bridge.task.record import check_record
 from bridge.task.task_file import ObjectModel
 from bridge.task.verdict import Verdict
-from twin.physics.config import PhysicsConfig
 from twin.physics.unseen import Unseen
 from twin.replay.config import (
     UNKNOWN_POSE_M,
@@ -40,46 +37,6 @@ RESTS_M = 1e-4
 """Localisation puts what stands exactly onto the table; within this counts as exactly [m]."""
 UNSURE_AXES = (0, 1, 5)
 """What is unsure of an object that stands: x, y and the turn about the vertical."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Variation:
-    """One draw of everything that is not known exactly."""
-
-    Ts_base_object: dict[str, Float[np.ndarray, "4 4"]]
-    physics: PhysicsConfig
-    grip_delay_s: float
-    """How much later than the arm the gripper acts."""
-    objects: dict[str, ObjectModel]
-    """The task's, with the drawn masses and stiffnesses."""
-    unseen: Mapping[str, Unseen] = field(default_factory=dict)
-    """Edges and centres of mass of rigid objects, where a posterior has draws of them."""
-
-    def scene(self, scene: ReplayScene) -> ReplayScene:
-        """The varied start."""
-        task = replace(scene.task, objects=self.objects)
-        return replace(scene, task=task, Ts_base_object=self.Ts_base_object, unseen=self.unseen)
-
-    def config(self, config: ReplayConfig) -> ReplayConfig:
-        """The varied settings; a varied replay has no samples of its own."""
-        return replace(config, physics=self.physics, grip_delay_s=self.grip_delay_s, samples=0)
-
-    def to_record(self, config: ReplayConfig) -> dict[str, Any]:
-        """What was drawn, as plain numbers."""
-        spreads = config.variation.physics_spreads()
-        soft = {key: model.soft for key, model in self.objects.items() if model.soft is not None}
-        return {
-            "T_base_object": {
-                name: se3.pose_record(T) for name, T in sorted(self.Ts_base_object.items())
-            },
-            "physics": {name: getattr(self.physics, name) for name in spreads},
-            "grip_delay_s": self.grip_delay_s,
-            "mass_kg": {
-                name: model.mass_kg for name, model in self.objects.items() if not model.fixed
-            },
-            "young_pa": {name: material.young_pa for name, material in soft.items()},
-            "unseen": {name: asdict(unseen) for name, unseen in sorted(self.unseen.items())},
-        }
 
 
 def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
@@ -138,11 +95,11 @@ def halving(index: int) -> float:
 
 def draw_variation(
     rng: np.random.Generator, scene: ReplayScene, config: ReplayConfig, *, index: int = 0
-) -> Variation:
+) -> tuple[ReplayScene, ReplayConfig]:
     """Draw poses from the localisation's covariance and physics from the priors.
 
     Where there is a posterior, what it knows of comes from its draws: the samples take turns (by
-    index), so that each has as many as its weight says.
+    index), so that each has as many as its weight says. A varied replay has no samples of its own.
 
     Poses of different objects are drawn independently, although they share the cameras' errors.
     What stands on the table goes on standing: its height and tilt are known, so the rest is drawn
@@ -171,12 +128,10 @@ def draw_variation(
             T = scene.Ts_base_object[name]
             root = _root(T, model, scene, name)
             poses[name] = _moved(T, root @ z[:6], model)
-    return Variation(
-        Ts_base_object=poses,
-        physics=physics,
-        grip_delay_s=delay_s,
-        objects={name: objects[name] for name in scene.task.objects},
-        unseen=scene.unseen,
+    task = replace(scene.task, objects={name: objects[name] for name in scene.task.objects})
+    return (
+        replace(scene, task=task, Ts_base_object=poses),
+        replace(config, physics=physics, grip_delay_s=delay_s, samples=0),
     )
 
 
@@ -233,95 +188,34 @@ def _moved(
     return moved
 
 
-SCHEMA_VERSION = 1
 LEVEL = 0.95
 
-Replay = Callable[[ReplayScene, ReplayConfig], Verdict]
 
-
-@dataclass(frozen=True, kw_only=True)
-class Sample:
-    """What one varied replay said."""
-
-    plan_id: str
-    index: int
-    variation: Mapping[str, Any]
-    accepted: bool | None
-    first_failing: str | None
-    reason: str | None
-    probability: float | None = None
-    """Of success in the real cell now that this replay has said so; None: taken at its word."""
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the gst sample v1 record, checked against its schema."""
-        record = {
-            "schema_version": SCHEMA_VERSION,
-            "plan_id": self.plan_id,
-            "index": self.index,
-            "variation": dict(self.variation),
-            "accepted": self.accepted,
-            "first_failing": self.first_failing,
-            "reason": self.reason,
-        }
-        check_record(record, name="sample")
-        return record
-
-
-def replay_samples(
-    replay: Replay, scene: ReplayScene, config: ReplayConfig, *, plan_id: str, identity: str
-) -> tuple[Sample, ...]:
-    """Run ``config.samples`` varied replays; UsageError if kinematic, which moves no objects."""
-    if config.samples and config.mode != "dynamic":
-        message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
-        raise UsageError(message)
-    samples: list[Sample] = []
-    for index in range(config.samples):
-        rng = sample_rng(config.seed, identity, index)
-        variation = draw_variation(rng, scene, config, index=index)
-        samples.append(_sample(replay, scene, config, variation, plan_id, index))
-    return tuple(samples)
-
-
-def _sample(
-    replay: Replay,
+def with_samples(
+    verdict: Verdict,
+    replay: Callable[[ReplayScene, ReplayConfig], Verdict],
     scene: ReplayScene,
     config: ReplayConfig,
-    variation: Variation,
-    plan_id: str,
-    index: int,
-) -> Sample:
-    accepted, failing, reason = None, None, None
-    try:
-        verdict = replay(variation.scene(scene), variation.config(config))
-        accepted, failing, reason = verdict.accepted, verdict.first_failing, verdict.reason
-    except GstError as error:  # this variation cannot be replayed; the others can
-        reason = str(error)
-    drawn, probability = config.variation.draw_at(halving(index)), None
-    if drawn is not None:
-        probability = 1.0 - drawn.wrong_yes if accepted is True else drawn.wrong_no
-    return Sample(
-        plan_id=plan_id,
-        index=index,
-        variation=variation.to_record(config),
-        accepted=accepted,
-        first_failing=failing,
-        reason=reason,
-        probability=probability,
-    )
+    *,
+    identity: str,
+) -> Verdict:
+    """Add the share of ``config.samples`` varied replays that succeed, with its Wilson interval.
 
-
-def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
-    """Add the share of accepted samples with its Wilson interval; without samples nothing.
-
-    A sample that could not be decided counts among those that were not accepted. Where there is a
-    posterior, each sample counts with the chance that its answer is right in this session.
+    A sample that could not be decided or replayed counts among those that were not accepted. Where
+    there is a posterior, each sample counts with the chance that its answer is right in this
+    session. UsageError for kinematic replays, which move no objects.
     """
-    if not samples:
+    n = config.samples
+    if not n:
         return verdict
+    if config.mode != "dynamic":
+        message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
+        raise UsageError(message)
     from scipy.stats import norm  # noqa: PLC0415  # half a second, and only with samples
 
-    k, n = sum(sample.accepted is True for sample in samples), len(samples)
-    value = sum(_probability(sample) for sample in samples) / n
+    accepted = [_accepts(replay, scene, config, identity, index) for index in range(n)]
+    k = sum(accepted)
+    value = sum(_probability(yes, config, index) for index, yes in enumerate(accepted)) / n
     z = float(norm.ppf(0.5 + LEVEL / 2))
     centre = (value + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * float(np.sqrt(value * (1 - value) / n + (z / (2 * n)) ** 2))
@@ -329,5 +223,23 @@ def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
     return replace(verdict, p_success={"value": value, "low": low, "high": high, "k": k, "n": n})
 
 
-def _probability(sample: Sample) -> float:
-    return float(sample.accepted is True) if sample.probability is None else sample.probability
+def _accepts(
+    replay: Callable[[ReplayScene, ReplayConfig], Verdict],
+    scene: ReplayScene,
+    config: ReplayConfig,
+    identity: str,
+    index: int,
+) -> bool:
+    rng = sample_rng(config.seed, identity, index)
+    try:
+        return replay(*draw_variation(rng, scene, config, index=index)).accepted is True
+    except GstError:  # this variation cannot be replayed; the others can
+        return False
+
+
+def _probability(accepted: bool, config: ReplayConfig, index: int) -> float:
+    """Of success in the real cell now that a sample has said so."""
+    drawn = config.variation.draw_at(halving(index))
+    if drawn is None:
+        return float(accepted)
+    return 1.0 - drawn.wrong_yes if accepted else drawn.wrong_no

@@ -16,7 +16,6 @@ from jaxtyping import Int
 from bridge.task.causes import Cause
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
-from twin.replay.config import PATH_STEP_S
 from twin.replay.failure import Failure
 from twin.replay.path import JointPath
 from twin.robot.loads import Load, Loads, Rows, Times
@@ -200,7 +199,7 @@ _SETTINGS = {
 
 def _samples(path: JointPath) -> tuple[Times, Rows, Rows, Rows]:
     """Joints, their speeds and accelerations at each knot and at most a step apart [s, rad]."""
-    dense_ns = path.dense_times_ns(PATH_STEP_S)
+    dense_ns = path.dense_times_ns()
     times_ns = np.union1d(path.times_ns, dense_ns[dense_ns > path.times_ns[0]])  # at rest before
     times_s = times_ns * 1e-9
     if path.curve is not None:

@@ -27,7 +27,6 @@ from bridge.episode.topics import (
     ROBOT_DESCRIPTION,
     TCP_POSE,
     VERDICT,
-    VERDICT_SAMPLE,
     camera_topic,
     cell_topic,
     object_topic,
@@ -63,8 +62,6 @@ class ReplayOrigin:
     urdf: str
     stages: tuple[Stage, ...]
     """With the times at which they were executed: the plan's, or the execution's."""
-    gripper: tuple[tuple[int, str], ...]
-    """When, from time 0, the gripper was told to close or open."""
     end_ns: int
     """When, from time 0, the trajectory ended and settling began."""
     divergence: Mapping[str, Any] | None = None
@@ -115,9 +112,6 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
         yield _Message(image.stamp_ns, topic, schema.COMPRESSED_IMAGE, image.to_cdr())
     end = start + int(result.stamps_ns[-1])
     yield _Message(end, f"{prefix}{VERDICT}", schema.VERDICT, result.verdict.to_json())
-    for sample in result.samples:
-        data = json.dumps(sample.to_record(), separators=(",", ":")).encode()
-        yield _Message(end, f"{prefix}{VERDICT_SAMPLE}", schema.SAMPLE, data)
     if origin.divergence is not None:
         data = json.dumps(origin.divergence, separators=(",", ":")).encode()
         yield _Message(end, f"{prefix}{DIVERGENCE}", schema.DIVERGENCE, data)
@@ -138,7 +132,7 @@ def _nodes(result: ReplayResult, cell: str, start_ns: int, frame_id: str) -> Ite
 def _contacts(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Message]:
     """Measured distances below the margin, and what physics says of the fingers."""
     topic = f"{prefix}{CONTACT}"
-    for contact in result.contacts:
+    for contact in result.contacts or ():
         record = _contact_record(
             start_ns, contact.start_ns, contact.end_ns, contact.bodies, source="distance"
         ) | {"allowed": contact.allowed, "min_distance_m": contact.min_distance_m}
@@ -176,7 +170,7 @@ def _stamped(
 
 
 def _events(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
-    """Events: execution, stages, gripper, contacts that were not allowed."""
+    """Events: execution and stages."""
     topic = cell_topic(origin.cell, EVENT)
     end_ns = int(result.stamps_ns[-1])
     events: list[tuple[int, dict[str, object]]] = [(0, {"type": "execution_started"})]
@@ -185,14 +179,6 @@ def _events(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[
             events.append((stage.t_start_ns, {"type": "stage_started", "stage_id": stage.id}))
         if stage.t_end_ns <= end_ns:
             events.append((stage.t_end_ns, {"type": "stage_ended", "stage_id": stage.id}))
-    for t_ns, text in origin.gripper:
-        if t_ns <= end_ns:
-            events.append((t_ns, {"type": "gripper", "text": text}))
-    for contact in result.contacts:
-        if not contact.allowed:
-            body, other = contact.bodies
-            text = f"{body} within {contact.min_distance_m * 1e3:.1f} mm of {other}"
-            events.append((contact.start_ns, {"type": "note", "text": text}))
     events.append((min(end_ns, origin.end_ns), {"type": "execution_ended"}))
     for t_ns, fields in sorted(events, key=lambda event: event[0]):
         stamp = origin.start_ns + t_ns

@@ -22,8 +22,8 @@ from bridge.robots.robot import Robot
 from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Waypoint
 from twin.errors import TwinError
-from twin.replay.clearance.bodies import own_links
-from twin.replay.config import PATH_STEP_S
+from twin.replay.clearance.bodies import own_links_touch
+from twin.replay.config import PATH_RATE_HZ, PATH_STEP_S
 from twin.replay.failure import Failure
 from twin.robot.collision import RobotHulls
 from twin.robot.config import IkConfig
@@ -256,9 +256,9 @@ class JointPath:
         """Time of the last knot."""
         return int(self.times_ns[-1])
 
-    def dense_times_ns(self, step_s: float) -> Int[np.ndarray, " num_times"]:
-        """Evenly spaced times from start to end, at most one step apart."""
-        count = int(np.ceil(self.end_ns() * 1e-9 / step_s)) + 1
+    def dense_times_ns(self, rate_hz: int = PATH_RATE_HZ) -> Int[np.ndarray, " num_times"]:
+        """Evenly spaced times from start to end, at least so many a second."""
+        count = int(np.ceil(self.end_ns() * 1e-9 * rate_hz)) + 1
         return np.unique(np.linspace(0, self.end_ns(), count).round().astype(np.int64))
 
 
@@ -454,17 +454,17 @@ def _check_given(
 
 def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Failure]:
     """Find joint limits, jumps, self-collision on an interpolated path; the hulls are moved."""
-    times = path.dense_times_ns(PATH_STEP_S)
+    times = path.dense_times_ns()
     joints = path.joints_at(times)
     failures = outside_limits(robot, path.times_ns, path.joints_rad)
     if path.curve is not None and not failures:  # it may swing out between its knots
         failures = outside_limits(robot, times, joints)
     failures += jumps(times, joints, robot)
     widths = path.width_at(times)
-    links = own_links(hulls)
+    links_touch = own_links_touch(hulls)
     for t_ns, row, width in zip(times, joints, widths, strict=True):
         hulls.place(row, float(width))
-        if links.touch():
+        if links_touch():
             closest = hulls.self_distance()
             failures.append(
                 Failure(

@@ -7,14 +7,13 @@ error: somebody saw what stands in the way, and a yes without it would not be an
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 
 from bridge.episode import provenance, streams
 from bridge.episode.reader import Episode
@@ -53,7 +52,8 @@ def calibrated(
     if calibration is None:
         return config
     wanted, nominal = config.physics, PhysicsConfig()
-    known = physics_of(calibration.record)
+    names = {item.name for item in fields(PhysicsConfig)}
+    known = {k: v for k, v in _identified(calibration.record, "value").items() if k in names}
     free = {
         name: type(getattr(nominal, name))(value)
         for name, value in known.items()
@@ -111,13 +111,6 @@ def for_task(config: ReplayConfig, calibration: Calibration | None, task: Task) 
     return replace(known, physics=replace(known.physics, grip_force_N=task.grip_force_N))
 
 
-def physics_of(calibration: Mapping[str, Any]) -> dict[str, float]:
-    """Fields of ``PhysicsConfig`` that a calibration record says were identified."""
-    known = {item.name for item in fields(PhysicsConfig)}
-    found = _identified(calibration, "value")
-    return {name: value for name, value in found.items() if name in known}
-
-
 def _identified(record: Mapping[str, Any], key: str) -> dict[str, float]:
     """A number of each identified quantity, where it has one."""
     found = {}
@@ -139,86 +132,39 @@ MOST_OFF = 0.25
 NO_DISTANCES = "the scene has no sdf.npz: only the table and the containers are in the way"
 
 
-@dataclass(frozen=True, kw_only=True)
-class RebuiltScene:
-    """The rebuilt scene as far as replays use it."""
+def read_rebuilt_scene(run: RunFolder, task: Task) -> ReplayScene:
+    """Read what a run knows of a task's objects; without ``scene.json`` its calibration only.
 
-    scene_hash: str | None = None
-    static_sdf: StaticSdf | None = None
-    """Distances to what stands still; None: only the table and the containers are known."""
-    lattices: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
-    """Soft objects by the arrays of their ``soft.npz``, object frame."""
-    shape_sources: Mapping[str, str] = field(default_factory=dict)
-    """Per object: where its shape comes from."""
-    calibration_id: str | None = None
-    masses_kg: Mapping[str, float] = field(default_factory=dict)
-    """Of objects that were weighed in the hand; the task file's stand in for others."""
-    rim_heights_m: Mapping[str, float] = field(default_factory=dict)
-    """Of containers as the scan shows them; published sizes stand in for others."""
-    notes: tuple[str, ...] = ()
-    """What the scene does not have, or has in a state in which it is not used."""
-
-    def scene(
-        self,
-        task: Task,
-        urdf: str,
-        Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
-        *,
-        reasons: Mapping[str, str] | None = None,  # why other objects were not localised
-        covariances: Mapping[str, Float[np.ndarray, "6 6"]] | None = None,
-    ) -> ReplayScene:
-        """Put objects into the scene: where a replay happens."""
-        weighed = {
-            key: replace(task.objects[key], mass_kg=mass) for key, mass in self.masses_kg.items()
-        }
-        task = replace(task, objects={**task.objects, **weighed})
-        return ReplayScene(
-            task=with_heights(task, self.rim_heights_m),
-            urdf=urdf,
-            Ts_base_object=dict(Ts_base_object),
-            reasons=reasons or {},
-            covariances=covariances or {},
-            scene_hash=self.scene_hash,
-            calibration_id=self.calibration_id,
-            static_sdf=self.static_sdf,
-            lattices=self.lattices,
-            shape_sources=self.shape_sources,
-        )
-
-
-def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
-    """Read what a run knows of a task's objects; without ``scene.json`` its calibration only."""
-    sources = dict.fromkeys(task.objects, TASK_SHAPE)
-    calibration = read_calibration(run)
-    rebuilt = RebuiltScene(
-        shape_sources=sources,
-        calibration_id=None if calibration is None else calibration.calibration_id,
-        masses_kg={key: mass for key, (mass, _) in masses_of(calibration, task).items()},
-        notes=calibration_notes(calibration, task),
-    )
-    record = read_record(run)
+    Objects weigh what they weighed in the hand, and containers are as high as the scan shows them;
+    the task file stands in for others. Robot and poses are left to whoever knows them.
+    """
+    calibration, record = read_calibration(run), read_record(run)
+    notes = list(calibration_notes(calibration, task))
+    weighed = {
+        key: replace(task.objects[key], mass_kg=mass)
+        for key, (mass, _) in masses_of(calibration, task).items()
+    }
+    task = replace(task, objects={**task.objects, **weighed})
+    calibration_id = None if calibration is None else calibration.calibration_id
     if record is None:
-        return rebuilt
-    lattices, notes, library = {}, list(rebuilt.notes), Library.of(run, record)
+        return ReplayScene(task=task, calibration_id=calibration_id, notes=tuple(notes))
+    lattices, library = {}, Library.of(run, record)
     for key in task.soft_objects:
-        arrays, sources[key] = _lattice(library.place(key), task.objects[key])
-        if arrays is None:
-            notes.append(f"{key}: {sources[key]}")
+        found = _lattice(library.place(key), task.objects[key])
+        if isinstance(found, str):
+            notes.append(f"{key}: {found}")
         else:
-            lattices[key] = arrays
+            lattices[key] = found
     static = _static(run.scene_dir / "sdf.npz")
     if static is None:
         notes.append(NO_DISTANCES)
-    return replace(
-        rebuilt,
+    heights = _mapping(_mapping(record, "sdf"), "rim_height_m")
+    return ReplayScene(
+        task=with_heights(task, {key: float(height_m) for key, height_m in heights.items()}),
+        calibration_id=calibration_id,
         scene_hash=str(record["scene_hash"]),
         static_sdf=static,
         lattices=lattices,
-        rim_heights_m={
-            key: float(height_m)
-            for key, height_m in _mapping(_mapping(record, "sdf"), "rim_height_m").items()
-            if key in task.objects
-        },
         notes=tuple(notes),
     )
 
@@ -259,31 +205,28 @@ def shape_hashes(run: RunFolder) -> dict[str, str]:
     }
 
 
-def _lattice(
-    folder: Path | None, model: ObjectModel
-) -> tuple[Mapping[str, np.ndarray] | None, str]:
-    """The scene's lattice of one object, or None; and where its shape comes from, in words."""
+def _lattice(folder: Path | None, model: ObjectModel) -> Mapping[str, np.ndarray] | str:
+    """The scene's lattice of one object; or why the task file's shape stands in, in words."""
     if folder is None:
-        return None, f"{TASK_SHAPE} ({NOT_SCANNED})"
+        return f"{TASK_SHAPE} ({NOT_SCANNED})"
     path = folder / "soft.npz"
     if not path.is_file():
-        return None, f"{TASK_SHAPE} (the scene has no lattice of it)"
+        return f"{TASK_SHAPE} (the scene has no lattice of it)"
     if not _watertight(folder / "object.json"):
-        return None, f"{TASK_SHAPE} (the scene's mesh of it is not watertight)"
+        return f"{TASK_SHAPE} (the scene's mesh of it is not watertight)"
     try:
         found = _load_lattice(path, path.stat().st_mtime_ns)
     except UnreadableArraysError as error:
-        return None, f"{TASK_SHAPE} ({error})"
+        return f"{TASK_SHAPE} ({error})"
     off = float(np.max(np.abs(np.ptp(found.nodes_m, axis=0) / np.array(model.size_m) - 1.0)))
     if off > MOST_OFF:
-        return None, f"{TASK_SHAPE} (an extent of the scene's lattice is {off:.0%} off)"
-    arrays = {
+        return f"{TASK_SHAPE} (an extent of the scene's lattice is {off:.0%} off)"
+    return {
         "nodes_m": found.nodes_m,
         "tets": found.tets,
         "mass_fraction": found.mass_fraction,
         "spacing_m": np.array(found.spacing_m),
     }
-    return arrays, f"lattice of the scene ({len(found.nodes_m)} nodes)"
 
 
 @lru_cache(maxsize=16)

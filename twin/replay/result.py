@@ -6,45 +6,44 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from bridge.geometry.signals import runs_of_true
-from bridge.task.predicate import Contact, Rollout
+from bridge.task.predicate import Rollout
 from bridge.task.verdict import Verdict
-from twin.replay.monte_carlo import Sample
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayResult:
-    """States at ``stamps_ns`` after the start of the trajectory, settling included."""
+class Burst:
+    """A soft body that stopped being one."""
 
-    verdict: Verdict
-    stamps_ns: Int[np.ndarray, " num_steps"]
+    object_id: str
+    t_ns: int
+    found: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class States(Rollout):
+    """What a replay saw from the start of the trajectory on, settling included.
+
+    Objects are those whose motion it knows; a kinematic replay knows none that can move.
+    """
+
     joints_rad: Float[np.ndarray, "num_steps num_joints"]
     width_m: Float[np.ndarray, " num_steps"]
+    nodes_m: dict[str, Float32[np.ndarray, "num_steps _ 3"]] = field(default_factory=dict)
+    """Of soft objects, base frame [m]."""
+    burst: Burst | None = None
+    """The first that burst; the replay ended there."""
+    arm_force_N: Float[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0))
+    """What rigid bodies press the arm with, where physics was asked."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayResult(States):
+    """States with what was made of them."""
+
+    verdict: Verdict
     Ts_base_tcp: Float[np.ndarray, "num_steps 4 4"]
-    Ts_base_object: dict[str, Float[np.ndarray, "num_steps 4 4"]]
-    """Objects whose motion the replay knows; a kinematic replay knows none that can move."""
-    finger_contact: dict[str, Bool[np.ndarray, " num_steps"]]
     clearance_m: Float[np.ndarray, " num_steps"]
     """Smallest signed distance over the pairs that may not touch [m]."""
-    contacts: list[Contact]
-    samples: tuple[Sample, ...] = ()
-    """Varied replays behind the verdict's probability."""
-    nodes_m: dict[str, Float32[np.ndarray, "num_steps _ 3"]] = field(default_factory=dict)
-    """Soft objects: where their nodes are, base frame [m]."""
-    extents_m: dict[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)
-    """Soft objects: outer extents along their own axes [m]."""
-    broken: dict[str, str] = field(default_factory=dict)
-    """Soft objects that burst or turned inside out, and what was found."""
-
-    def rollout(self) -> Rollout:
-        """The states the success predicate reads."""
-        return Rollout(
-            stamps_ns=self.stamps_ns,
-            Ts_base_object=self.Ts_base_object,
-            finger_contact=self.finger_contact,
-            extents_m=self.extents_m,
-            broken=self.broken,
-            contacts=self.contacts,
-        )
 
 
 def stretches_ns(

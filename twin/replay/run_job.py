@@ -10,18 +10,17 @@ from jaxtyping import Float
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.executions import executed_events
-from bridge.episode.metadata import SAME_ENGINE_KEY, SECOND_ENGINE_KEY, Derived
+from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, GstError
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.plan import Plan
+from bridge.task.predicate import evaluate_success
 from bridge.task.verdict import SAME_ENGINE, Verdict, is_same_engine
-from twin.physics.config import Engine
-from twin.replay.agreement import in_each_engine
-from twin.replay.comparison import compare, recorded_findings
 from twin.replay.config import ReplayConfig
+from twin.replay.divergence import Divergence, diverge
 from twin.replay.execution import (
     check_covers,
     check_length,
@@ -29,16 +28,25 @@ from twin.replay.execution import (
     path_of_execution,
     stages_as_executed,
 )
-from twin.replay.job import WITHOUT, ReplayJob
-from twin.replay.job_row import judged, row_of_failure
-from twin.replay.monte_carlo import replay_samples, with_probability
+from twin.replay.job import WITHOUT, ReplayJob, judged, row_of_failure
+from twin.replay.monte_carlo import with_samples
 from twin.replay.observed import in_order, observed_plan
 from twin.replay.output import ReplayOrigin, write_replay
-from twin.replay.rebuilt_scene import RebuiltScene, read_rebuilt_scene
+from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
-from twin.replay.trace import Recording
-from twin.replay.verdict import replay_joints, replay_plan
+from twin.replay.trace import (
+    CONTACT_M,
+    Recording,
+    Trace,
+    rollout_of_recording,
+    states_of_recording,
+    trace_of_file,
+    trace_of_recording,
+    trace_of_result,
+)
+from twin.replay.verdict import findings_of, replay_joints, replay_plan
+from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 from twin.robot.posture import check_clock, width_track
 
@@ -51,7 +59,7 @@ def run_job(job: ReplayJob) -> dict[str, Any]:
     if job.problem and job.trajectory == "executed":
         return row_of_failure(job, job.problem)
     try:
-        return judged(job, *_replay(job)[0])
+        return judged(job, *_replay(job))
     except GstError as error:
         return row_of_failure(job, str(error))
 
@@ -66,7 +74,6 @@ class _Source:
     """As it was sent; without one, what was observed, in a plan's words."""
     plan_as_executed: Plan
     """With the stages at the times at which they were executed."""
-    events: list[dict[str, Any]]
     scene: ReplayScene
 
     @property
@@ -84,40 +91,24 @@ class _Source:
         return self.job.length_ns() if self.executed else self.plan.tau[-1].t_ns
 
 
-def _replay(job: ReplayJob) -> list[tuple[Verdict, dict[str, Any] | None]]:
-    """Replay in each engine and write an episode for each: verdicts, and where they diverge."""
-    source = _open(job)
-
-    results: list[ReplayResult] = []
-
-    def judge(config: ReplayConfig) -> Verdict:
-        results.append(_with_samples(source, config, _run(source, source.scene, config)))
-        return results[-1].verdict
-
-    verdicts = in_each_engine(source.scene.task, job.config, judge)
-    return [
-        _write(source, engine, replace(result, verdict=verdict))
-        for engine, result, verdict in zip(job.engines(), results, verdicts, strict=True)
-    ]
-
-
-def _write(
-    source: _Source, engine: Engine, result: ReplayResult
-) -> tuple[Verdict, dict[str, Any] | None]:
-    job, divergence = source.job, None
+def _replay(job: ReplayJob) -> tuple[Verdict, dict[str, Any] | None]:
+    """Replay and write an episode: the verdict, and where it diverges from the others."""
+    source, divergence = _open(job), None
+    job.config.refuse_soft(source.scene.task.soft_objects)
+    result = _with_samples(source, _run(source, source.scene, job.config))
     if source.executed and job.config.mode == "kinematic":
         found = recorded_findings(_recording(source), job.config)
         result = replace(result, verdict=replace(result.verdict, findings=found))
     elif source.executed:
-        compared = compare(job, engine, result, _recording(source), source.end_ns)
+        compared = compare(job, result, _recording(source), source.end_ns)
         divergence = compared.to_record()
     if source.is_same_engine(result):
         told, why = (*result.verdict.warnings, SAME_ENGINE), result.verdict.reason or SAME_ENGINE
         result = replace(result, verdict=replace(result.verdict, warnings=told, reason=why))
     images = _images(source, result) if job.render else ()
-    path = job.path(engine)
+    path = job.path()
     path.unlink(missing_ok=True)
-    write_replay(path, result, source.plan, _origin(source, engine, result, divergence, images))
+    write_replay(path, result, source.plan, _origin(source, result, divergence, images))
     return result.verdict, divergence
 
 
@@ -134,20 +125,19 @@ def _open(job: ReplayJob) -> _Source:
         )
     task = job.task
     if job.plan_index == WITHOUT:
-        arm, widths = _cut_tracks(job, episode, urdf)
+        arm, widths = _tracks(job, episode, urdf)
         robot = load_robot(urdf)
         plan = observed_plan(in_order(arm, robot.record), widths, robot, task, episode.info)
     else:
         plan = streams.plans(episode)[job.plan_index][1]
-    rebuilt = (
-        RebuiltScene()
-        if job.run_path is None
-        else read_rebuilt_scene(RunFolder(job.run_path), task)
-    )
-    scene = replace(rebuilt, scene_hash=job.scene_hash).scene(
-        task,
-        urdf,
-        job.start.Ts_base_object,
+    known = ReplayScene(task=task)
+    if job.run_path is not None:
+        known = read_rebuilt_scene(RunFolder(job.run_path), task)
+    scene = replace(
+        known,
+        urdf=urdf,
+        scene_hash=job.scene_hash,
+        Ts_base_object=job.start.Ts_base_object,
         reasons=job.start.reasons,
         covariances=job.start.covariances,
     )
@@ -162,7 +152,6 @@ def _open(job: ReplayJob) -> _Source:
         episode=episode,
         plan=plan,
         plan_as_executed=plan_as_executed,
-        events=events,
         scene=scene,
     )
 
@@ -186,15 +175,11 @@ def recorded_start(
 def _run(source: _Source, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
     if not source.executed:
         return replay_plan(source.plan_as_executed, scene, config)
-    arm, widths = _tracks(source)
+    arm, widths = _tracks(source.job, source.episode, source.scene.urdf)
     return replay_joints(arm, widths, scene, config, plan=source.plan_as_executed)
 
 
-def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
-    return _cut_tracks(source.job, source.episode, source.scene.urdf)
-
-
-def _cut_tracks(
+def _tracks(
     job: ReplayJob, episode: Episode, urdf: str
 ) -> tuple[streams.JointTrack, streams.JointTrack]:
     """Recorded joints and widths, cut to the execution."""
@@ -210,7 +195,7 @@ def _cut_tracks(
 
 def _recording(source: _Source) -> Recording:
     job = source.job
-    arm, widths = _tracks(source)
+    arm, widths = _tracks(source.job, source.episode, source.scene.urdf)
     kinematic = replace(job.config, mode="kinematic")
     seen_ns = job.end.seen_ns
     return Recording(
@@ -224,18 +209,18 @@ def _recording(source: _Source) -> Recording:
     )
 
 
-def _with_samples(source: _Source, config: ReplayConfig, result: ReplayResult) -> ReplayResult:
+def _with_samples(source: _Source, result: ReplayResult) -> ReplayResult:
     """Ask varied replays too; plans of one episode are tried against the same variations."""
-    if not config.samples or source.scene.missing():
+    if source.scene.missing():
         return result
-    samples = replay_samples(
+    verdict = with_samples(
+        result.verdict,
         lambda there, varied: _run(source, there, varied).verdict,
         source.scene,
-        config,
-        plan_id=source.plan.id,
+        source.job.config,
         identity=source.job.episode_sha256,
     )
-    return replace(result, verdict=with_probability(result.verdict, samples), samples=samples)
+    return replace(result, verdict=verdict)
 
 
 def _images(source: _Source, result: ReplayResult) -> tuple[tuple[str, CompressedColor], ...]:
@@ -258,16 +243,11 @@ def _images(source: _Source, result: ReplayResult) -> tuple[tuple[str, Compresse
 
 def _origin(
     source: _Source,
-    engine: Engine,
     result: ReplayResult,
     divergence: dict[str, Any] | None,
     images: tuple[tuple[str, CompressedColor], ...],
 ) -> ReplayOrigin:
     job, episode, plan = source.job, source.episode, source.plan
-    marks = {
-        SAME_ENGINE_KEY: source.is_same_engine(result),
-        SECOND_ENGINE_KEY: engine != job.engines()[0],
-    }
     derived = Derived(
         kind="replay",
         source_episode=episode.info.id,
@@ -279,11 +259,7 @@ def _origin(
         engine=result.verdict.engine,
         seed=job.config.seed,
         calibration_id=source.scene.calibration_id,
-        settings={
-            **job.settings(),
-            "shape_sources": dict(source.scene.shape_sources),
-            **{name: True for name, holds in marks.items() if holds},
-        },
+        settings=job.settings(),
     )
     return ReplayOrigin(
         info=episode.info,
@@ -292,33 +268,59 @@ def _origin(
         start_ns=job.start_ns,
         urdf=source.scene.urdf,
         stages=source.plan_as_executed.stages,
-        gripper=_recorded_grips(plan, source.events, job.start_ns)
-        if source.executed
-        else planned_grips(plan),
         end_ns=source.end_ns,
         divergence=divergence,
         images=images,
     )
 
 
-def planned_grips(plan: Plan) -> tuple[tuple[int, str], ...]:
-    """When the plan changes its mind about the gripper; it starts open."""
-    before = [0, *(waypoint.g for waypoint in plan.tau)]
-    return tuple(
-        (waypoint.t_ns, "close" if waypoint.g else "open")
-        for waypoint, g in zip(plan.tau, before, strict=False)
-        if waypoint.g != g
-    )
+# An executed replay laid over the planned one and over the recording.
+
+Findings = dict[tuple[str, str], bool | None]
 
 
-def _recorded_grips(
-    plan: Plan, events: list[dict[str, Any]], start_ns: int
-) -> tuple[tuple[int, str], ...]:
-    return tuple(
-        (int(event["stamp_ns"]) - start_ns, str(event.get("text") or ""))
-        for event in events
-        if event["type"] == "gripper" and event.get("plan_id") == plan.id
-    )
+def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[str, Any], ...]:
+    """What the success predicates, and the one on contacts, say of the recording itself."""
+    robot = load_robot(recording.scene.urdf)
+    rollout = rollout_of_recording(recording, robot, hulls_of(robot), config)
+    task = recording.scene.task
+    return tuple(findings_of(task, rollout, "recorded", tolerance_m=CONTACT_M))
+
+
+def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: int) -> Divergence:
+    """Lay the executed replay over the planned one, if it is there, and over the recording."""
+    robot = load_robot(recording.scene.urdf)
+    executed = trace_of_result(result, "executed", end_ns)
+    recorded = trace_of_recording(recording, robot, job.config.sample_rate_hz)
+    traces = [executed, recorded]
+    task = job.task
+    findings = {
+        "executed": _findings(findings_of(task, result, "replayed")),
+        "recorded": {
+            (finding.kind, finding.object_id): finding.value
+            for finding in evaluate_success(task, states_of_recording(recording, robot))
+        },
+    }
+    planned = _planned(job, recording)
+    if planned is not None:
+        trace, findings["planned"] = planned
+        traces.append(trace)
+    return diverge(job.plan_id, traces, findings=findings)
+
+
+def _planned(job: ReplayJob, recording: Recording) -> tuple[Trace, Findings] | None:
+    """The planned replay, if there is one that can be read."""
+    try:
+        path = job.planned().path()
+        trace = trace_of_file(path, "planned", job.start_ns, recording.plan.tau[-1].t_ns)
+        verdict = streams.verdicts(Episode.open(path))[-1][1]
+    except (GstError, IndexError, StopIteration):
+        return None
+    return trace, _findings([f for f in verdict.findings if f["side"] == "replayed"])
+
+
+def _findings(found: list[dict[str, Any]]) -> Findings:
+    return {(item["kind"], str(item.get("object", ""))): item["value"] for item in found}
 
 
 def cell_of(episode: Episode) -> str:

@@ -22,12 +22,11 @@ from bridge.task.task_file import Task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.failure import with_reasons
-from twin.replay.job import WITHOUT, ReplayJob
-from twin.replay.job_row import row_of_existing, row_of_failure
+from twin.replay.job import WITHOUT, ReplayJob, row_of_existing, row_of_failure
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene, shape_hashes
 from twin.replay.run_job import run_job
 from twin.replay.scene import localised_starts
-from twin.replay.summary import against_recorded, count_verdicts, executions_of, recorded_labels
+from twin.replay.summary import against_recorded, count_verdicts, recorded_labels
 from twin.robot.posture import check_joints, width_track
 from twin.scene.localise.episode import MOTION_MARGIN_NS
 from twin.scene.store.calibration import read_calibration
@@ -35,31 +34,26 @@ from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
 from twin.scene.store.library import Library
 
 
-@dataclass(frozen=True, kw_only=True)
-class Execution:
-    """What the events of an episode say of one plan."""
+def execution_of(
+    events: Iterable[Mapping[str, Any]], plan_id: str
+) -> tuple[tuple[int, int] | None, str]:
+    """Source times between which a plan was executed whole, and why it cannot be replayed, if so.
 
-    interval_ns: tuple[int, int] | None
-    """Source times of start and end; None when it was not executed from beginning to end."""
-    problem: str = ""
-    """Why the execution cannot be replayed, although there was one."""
-
-
-def execution_of(events: Iterable[Mapping[str, Any]], plan_id: str) -> Execution:
-    """Find the execution of a plan."""
+    None where it was not executed from beginning to end.
+    """
     mine = [event for event in events if event.get("plan_id") == plan_id]
     count = sum(event["type"] == "execution_started" for event in mine)
     start, end = execution_ns(mine, plan_id)
-    interval = None if start is None or end is None else (start, end)
+    if start is None or end is None:
+        began = f"the execution of {whose(plan_id)} began, and nobody recorded that it ended"
+        return None, began if count else ""
     problem = ""
-    if count and interval is None:
-        problem = f"the execution of {whose(plan_id)} began, and nobody recorded that it ended"
-    elif count > 1:
+    if count > 1:
         problem = (
             f"{whose(plan_id)} was executed {count} times, and which end belongs to which nobody "
             "can tell; give each execution a plan with an id of its own"
         )
-    return Execution(interval_ns=interval, problem=problem)
+    return (start, end), problem
 
 
 LABEL = "robot-gst label RUN EPISODE --task NAME"
@@ -129,8 +123,7 @@ def jobs_of(item: Preparation) -> Prepared:
         for index, (stamp_ns, plan) in enumerate(plans)
     ]
     for plan_id, index, stamp_ns, length_ns in [*listed, *((i, WITHOUT, 0, 0) for i in without)]:
-        execution = execution_of(events, plan_id)
-        interval = execution.interval_ns
+        interval, problem = execution_of(events, plan_id)
         start_ns = stamp_ns if interval is None else interval[0]
         common = ReplayJob(
             episode_path=path,
@@ -151,7 +144,7 @@ def jobs_of(item: Preparation) -> Prepared:
             calibration_id=None if calibration is None else calibration.calibration_id,
             render=config.render,
             robot=config.robot,
-            problem=execution.problem,
+            problem=problem,
         )
         if index != WITHOUT:
             jobs.append(common)
@@ -319,13 +312,12 @@ def _replay_trajectories(
                 told.add(what)
                 output.say(f"{row['episode']} {row['plan']}: {row['error']}")
     rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
-    executions = executions_of(rows, recorded_labels(run, sorted({row["episode"] for row in rows})))
+    labels = recorded_labels(run, sorted({row["episode"] for row in rows}))
     return {
         "run": str(run.path),
         "scene_hash": scene_hash,
         "counts": count_verdicts(rows),
-        "executions": executions,
-        "against_recorded": against_recorded(executions),
+        "against_recorded": against_recorded(rows, labels),
         "skipped_episodes": skipped,
         "nothing_to_replay": {
             name: each.why_not

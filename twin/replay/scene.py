@@ -23,9 +23,9 @@ class ReplayScene:
     """One start state. Objects that were not found are absent, never guessed."""
 
     task: Task
-    Ts_base_object: dict[str, Float[np.ndarray, "4 4"]]
+    Ts_base_object: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Start poses of the objects that were localised, containers included."""
-    urdf: str
+    urdf: str = ""
     """The robot description, package URIs allowed."""
     scene_hash: str | None = None
     """Content hash of the rebuilt scene; None when there is none."""
@@ -46,8 +46,8 @@ class ReplayScene:
     others."""
     unseen: Mapping[str, Unseen] = field(default_factory=dict)
     """Of rigid objects: edges and centre of mass as a draw has them; full and even where absent."""
-    shape_sources: Mapping[str, str] = field(default_factory=dict)
-    """Per object: where its shape comes from."""
+    notes: tuple[str, ...] = ()
+    """What the rebuilt scene does not have, or has in a state in which it is not used."""
     start_rad: Float[np.ndarray, " num_joints"] | None = None
     """Where the arm stands before the plan, as its encoders say; None: not known, not asked."""
 

@@ -9,17 +9,17 @@ from typing import Any
 
 from bridge.episode import streams
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.executions import NO_PLAN
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.task.verdict import SAME_ENGINE
-from twin.replay.agreement import WORDS
-from twin.replay.failure import NOT_EVALUATED
+from twin.replay.failure import NOT_EVALUATED, WORDS
 
-LABELS = ("success", "failure", "unknown")
-PLANNED, EXECUTED, SEEN = "planned in twin", "executed in twin", "executed as seen"
-TRAJECTORIES = ((PLANNED, "planned"), (EXECUTED, "executed"), (SEEN, "recorded_predicates"))
+SIDES = {
+    ("planned", "dynamic"): "planned in twin",
+    ("executed", "dynamic"): "executed in twin",
+    ("executed", "kinematic"): "executed as seen",
+}
 """What is held against the operator's label: two replays, and the success predicates on the objects
 as they were localised before and after the execution."""
 
@@ -34,8 +34,6 @@ def count_verdicts(rows: Rows) -> dict[str, dict[str, int]]:
         key = f"{row['trajectory']} {row['mode']}"
         if key == "planned dynamic" and not row["executed"]:
             key = "planned dynamic, never executed"
-        if row.get("engines") == ["mujoco"]:
-            key += ", mujoco"
         counts.setdefault(key, Counter())["failed" if row["error"] else WORDS[row["accepted"]]] += 1
         counts[key]["n"] += 1
     words = ("n", "accepted", "rejected", "undecided", "failed")
@@ -63,80 +61,18 @@ def _label(run: RunFolder, episode_id: str) -> str:
     return str(last.get("result", "unknown")) if isinstance(last, dict) else "unknown"
 
 
-def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]:
-    """One entry per executed plan: what each side says, and where they diverge first."""
-    found: dict[tuple[str, str], dict[str, Any]] = {}
+def against_recorded(rows: Rows, labels: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """By task and side, how often what was said is the label, of those where both are decided."""
+    found: dict[str, dict[str, Any]] = {}
     for row in rows:
-        if not row["executed"]:
-            continue
-        key = (row["episode"], row["plan"])
-        entry = found.setdefault(
-            key,
-            {
-                "episode": row["episode"],
-                "plan": row["plan"],
-                "task": row.get("task", ""),
-                "recorded": labels.get(row["episode"], "unknown"),
-                "recorded_predicates": None,
-                "planned": None,
-                "executed": None,
-                "lag_s": None,
-                "divergence": None,
-            },
-        )
-        if row["mode"] == "kinematic":
-            entry["recorded_predicates"] = row.get("predicates")
-        else:
-            entry[row["trajectory"]] = row["accepted"]
-        if row.get("divergence"):
-            entry["divergence"] = row["divergence"]["first"]
-            entry["lag_s"] = row["divergence"]["lag_s"]
-    return list(found.values())
-
-
-def _asked(executions: Rows) -> dict[str, tuple[str, Rows]]:
-    """What is held against the labels, its key, and of whom; nobody planned what has no plan."""
-    planned = [entry for entry in executions if entry["plan"] != NO_PLAN]
-    asked = {name: (key, planned if key == "planned" else executions) for name, key in TRAJECTORIES}
-    return {name: (key, rows) for name, (key, rows) in asked.items() if rows}
-
-
-def cross_table(executions: Rows) -> dict[str, dict[str, dict[str, int]]]:
-    """Planned, executed and seen, by their verdict, against the recorded label."""
-    return {
-        name: {
-            word: {
-                label: sum(entry[key] is value and entry["recorded"] == label for entry in rows)
-                for label in LABELS
-            }
-            for value, word in WORDS.items()
-        }
-        for name, (key, rows) in _asked(executions).items()
-    }
-
-
-def agreement_of(executions: Rows) -> dict[str, dict[str, int]]:
-    """How often what was said is the operator's label, of the executions where both are decided."""
-    found = {}
-    for name, (key, rows) in _asked(executions).items():
-        both = [
-            entry[key] is (entry["recorded"] == "success")
-            for entry in rows
-            if entry[key] is not None and entry["recorded"] in ("success", "failure")
-        ]
-        found[name] = {"k": sum(both), "n": len(both)}
+        label = labels.get(row["episode"])
+        said = row["predicates" if row["mode"] == "kinematic" else "accepted"]
+        if row["executed"] and said is not None and label in ("success", "failure"):
+            sides = found.setdefault(row["task"], {})
+            side = sides.setdefault(SIDES[row["trajectory"], row["mode"]], {"k": 0, "n": 0})
+            side["k"] += said is (label == "success")
+            side["n"] += 1
     return found
-
-
-def against_recorded(executions: Rows) -> dict[str, dict[str, Any]]:
-    """Per task what was said against the recorded label: counts, and how often they agree."""
-    by_task: dict[str, list[Mapping[str, Any]]] = {}
-    for entry in executions:
-        by_task.setdefault(entry["task"], []).append(entry)
-    return {
-        task: {"counts": cross_table(mine), "agreement": agreement_of(mine)}
-        for task, mine in sorted(by_task.items())
-    }
 
 
 def describe_run(summary: Mapping[str, Any]) -> str:
@@ -147,10 +83,12 @@ def describe_run(summary: Mapping[str, Any]) -> str:
     if not summary["rows"]:
         return "\n".join([*(imported or ["No trial to replay."]), *skipped])
     lines = imported + _count_lines(summary["counts"])
-    executions = summary.get("executions", [])
-    if executions:
-        lines += ["", *_cross_lines(executions), "", *_divergence_lines(executions)]
-    lines += _engine_lines(summary["rows"])
+    for task, sides in sorted(summary.get("against_recorded", {}).items()):
+        told = ", ".join(f"{side} {said['k']} of {said['n']}" for side, said in sides.items())
+        lines += ["", f"{task}, as the operator's labels say: {told}"]
+    lines += _divergence_lines(summary["rows"])
+    if any(SAME_ENGINE in row.get("warnings", ()) for row in summary["rows"]):
+        lines += ["", f"{SAME_ENGINE}: these verdicts are shown and never counted by evaluate"]
     lines += _sample_lines(summary["rows"])
     lines += _reason_lines(summary["rows"])
     lines += skipped
@@ -158,22 +96,6 @@ def describe_run(summary: Mapping[str, Any]) -> str:
     if kept:
         lines.append(f"{kept} of {len(summary['rows'])} were there already; --force redoes them.")
     return "\n".join(lines)
-
-
-def _engine_lines(rows: Rows) -> list[str]:
-    """Where several engines were asked: how often they agree, and what each says where not."""
-    asked = [row for row in rows if len(row.get("engines") or ()) > 1 and not row["error"]]
-    differing = [row for row in asked if row["engines_disagree"]]
-    lines = []
-    if asked:
-        lines += ["", f"engines agree on {len(asked) - len(differing)} of {len(asked)} replays"]
-    lines += [
-        f"  {row['episode']} {row['plan']} {row['trajectory']}: {row['engines_disagree']}"
-        for row in differing
-    ]
-    if any(SAME_ENGINE in row.get("warnings", ()) for row in rows):
-        lines += ["", f"{SAME_ENGINE}: these verdicts are shown and never counted by evaluate"]
-    return lines
 
 
 def _reason_lines(rows: Rows) -> list[str]:
@@ -242,44 +164,19 @@ def _count_lines(counts: Counts) -> list[str]:
     return lines
 
 
-def _cross_lines(executions: Rows) -> list[str]:
-    """One table per task, because what they ask is not the same."""
-    lines: list[str] = []
-    tables = against_recorded(executions)
-    for task, table in tables.items():
-        lines += ["", f"{task}:"] if len(tables) > 1 else []
-        lines += _cross_of(table["counts"], table["agreement"])
-    return lines
-
-
-def _cross_of(counts: Mapping[str, Counts], agreement: Counts) -> list[str]:
-    lines = [
-        f"{'':28}  {'recorded:':>9} {'success':>8} {'failure':>8} {'unlabelled':>10} {'agree':>9}"
-    ]
-    for name, rows in counts.items():
-        agree = f"{agreement[name]['k']} of {agreement[name]['n']}"
-        for word, cells in rows.items():
-            lines.append(
-                f"{name:<17} {word:<10}  {'':>9} {cells['success']:>8} {cells['failure']:>8} "
-                f"{cells['unknown']:>10} {agree:>9}".rstrip()
-            )
-            agree = ""
-    return lines
-
-
-def _divergence_lines(executions: Rows) -> list[str]:
-    unplanned = all(entry["plan"] == NO_PLAN for entry in executions)
-    sides = "executed and recorded" if unplanned else "planned, executed and recorded"
-    lines = [f"where {sides} diverge first:"]
-    for entry in executions:
-        first = entry["divergence"]
-        if first is None:
-            text = "nowhere" if entry["executed"] is not None else "not compared"
-        else:
-            text = f"{first['first_t_ns'] * 1e-9:.2f} s: {first['detail']} ({first['attribution']})"
-        lag = "" if entry["lag_s"] is None else f", lag {entry['lag_s'] * 1e3:.0f} ms"
-        lines.append(f"  {entry['episode']} {entry['plan']}: {text}{lag}")
-    return lines
+def _divergence_lines(rows: Rows) -> list[str]:
+    """Where each execution that was compared parts from its plan and its recording."""
+    lines = []
+    for row in rows:
+        if row.get("divergence"):
+            first, lag_s = row["divergence"]["first"], row["divergence"]["lag_s"]
+            text = "nowhere"
+            if first is not None:
+                at = f"{first['first_t_ns'] * 1e-9:.2f} s"
+                text = f"{at}: {first['detail']} ({first['attribution']})"
+            lag = "" if lag_s is None else f", lag {lag_s * 1e3:.0f} ms"
+            lines.append(f"  {row['episode']} {row['plan']}: {text}{lag}")
+    return ["", "where the twin and the recording diverge first:", *lines] if lines else []
 
 
 def _motion_lines(rows: Rows) -> list[str]:

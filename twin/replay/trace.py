@@ -82,9 +82,9 @@ def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
         if record["source"] == "physics" and first == GRIPPER:
             span = (int(record["stamp_ns"]) - start_ns, int(record["end_ns"]) - start_ns)
             spans.setdefault(second, []).append(span)
-    tool_track = _since(streams.pose_track(episode, tool), start_ns)
+    tool_track = streams.pose_track(episode, tool).shifted(-start_ns)
     objects = {
-        name: _since(streams.pose_track(episode, topic), start_ns)
+        name: streams.pose_track(episode, topic).shifted(-start_ns)
         for name, topic in streams.object_pose_topics(episode).items()
     }
     return Trace(
@@ -109,10 +109,6 @@ def poses_over(
 def longest(spans: list[Touch]) -> Touch | None:
     """The longest of several stretches of time; the earlier of two that are as long."""
     return max(spans, key=lambda span: span[1] - span[0], default=None)
-
-
-def _since(track: PoseTrajectory, start_ns: int) -> PoseTrajectory:
-    return PoseTrajectory(track.stamps_ns - start_ns, track.p_m, track.q_wxyz)
 
 
 # What a recording itself says of an execution, without physics.
@@ -177,7 +173,7 @@ class Recording:
 
 def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) -> Trace:
     """The recorded trace; objects only at the instants at which they were localised."""
-    times = _times(recording.path, rate_hz)
+    times = recording.path.dense_times_ns(rate_hz)
     movable = recording.scene.movable()
     seen = np.array([0, max(recording.end_seen_ns, recording.path.end_ns() + 1)])
     return Trace(
@@ -240,7 +236,7 @@ def _watched(
     """Measure the recorded joints, and what the fingers carry, against the scene."""
     scene, path = recording.scene, recording.path
     monitor = ClearanceMonitor(scene, recording.plan, hulls, config)
-    times = _times(path, config.sample_rate_hz)
+    times = path.dense_times_ns(config.sample_rate_hz)
     joints, widths = path.joints_at(times), path.width_at(times)
     tools = robot.Ts_base_tcp(joints)
     poses = _inferred_poses(recording, times, tools, recording.touches(robot))
@@ -276,8 +272,3 @@ def _inferred_poses(
                 Ts[times_ns >= touch[0]] = unknown
         poses[name] = Ts
     return poses
-
-
-def _times(path: JointPath, rate_hz: int) -> Int[np.ndarray, " num_times"]:
-    count = int(np.ceil(path.end_ns() * 1e-9 * rate_hz)) + 1
-    return np.linspace(0, path.end_ns(), count).round().astype(np.int64)

@@ -32,14 +32,14 @@ from twin.replay.checks import (
 )
 from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.clearance.surroundings import posture_clearance
-from twin.replay.config import PATH_STEP_S, ReplayConfig
-from twin.replay.dynamics import Burst, States, free_start, simulate, soft_models
+from twin.replay.config import ReplayConfig
+from twin.replay.dynamics import free_start, simulate, soft_models
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import Failure, factor_from
 from twin.replay.grasps import grasps_seen
 from twin.replay.motion import held_of, motion_failures, payload_unknown
 from twin.replay.path import JointPath, check_path, path_of_plan
-from twin.replay.result import ReplayResult
+from twin.replay.result import ReplayResult, States
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
@@ -51,12 +51,11 @@ MANY = 8
 
 
 def terminal_factor(
-    result: ReplayResult,
+    states: States,
     scene: ReplayScene,
     config: ReplayConfig,  # only its mode counts
     *,
     unreachable_ns: int | None,  # from when on waypoints cannot be reached
-    burst: Burst | None,  # the first one
 ) -> Factor:
     """Judge the settled state at the end.
 
@@ -65,6 +64,7 @@ def terminal_factor(
     """
     if config.mode == "kinematic":
         return Factor(value=None, detail="a kinematic replay does not move objects")
+    burst = states.burst
     if burst is not None:
         detail = f"{burst.object_id}: {burst.found}"
         bodies = (burst.object_id,)
@@ -73,11 +73,11 @@ def terminal_factor(
     if unreachable_ns is not None:
         detail = f"the trajectory cannot be executed beyond {unreachable_ns * 1e-9:.2f} s"
         return Factor(value=None, detail=detail)
-    end_ns = int(result.stamps_ns[-1])
-    for name, found in result.broken.items():
+    end_ns = int(states.stamps_ns[-1])
+    for name, found in states.broken.items():
         failure = Failure(t_ns=end_ns, cause=Cause.SHAPE, bodies=(name,), detail=f"{name} {found}")
         return factor_from([failure])
-    findings = evaluate_success(scene.task, result.rollout())
+    findings = evaluate_success(scene.task, states)
     value = all_hold(findings)
     if value is True:
         many = len(findings) > MANY
@@ -132,14 +132,6 @@ def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float =
         }
         for finding in findings
     ]
-
-
-def warnings_of(scene: ReplayScene, result: ReplayResult) -> tuple[str, ...]:
-    """What does not change the verdict but should be known."""
-    warnings = []
-    if already_true_at_start(scene.task, result.rollout()):
-        warnings.append(HELD_BEFORE)
-    return tuple(warnings)
 
 
 def reason_of(verdict: Verdict) -> str | None:
@@ -265,23 +257,15 @@ def judge_states(
 def _result(
     commanded: Commanded, moved: Moved, plan: Plan, scene: ReplayScene, config: ReplayConfig
 ) -> ReplayResult:
-    robot, states = load_robot(scene.urdf), moved.states
-    result = ReplayResult(
-        verdict=_undecided(plan, commanded.trajectory, config, scene),
-        stamps_ns=states.stamps_ns,
-        joints_rad=states.joints_rad,
-        width_m=states.width_m,
-        Ts_base_tcp=robot.Ts_base_tcp(states.joints_rad),
-        Ts_base_object=states.Ts_base_object,
-        finger_contact=states.finger_contact,
+    states = replace(moved.states, contacts=moved.monitor.contacts())
+    Ts_base_tcp = load_robot(scene.urdf).Ts_base_tcp(states.joints_rad)
+    verdict = _judge(states, Ts_base_tcp, commanded, moved, plan, scene, config)
+    return ReplayResult(
+        **vars(states),
+        verdict=replace(verdict, reason=reason_of(verdict)),
+        Ts_base_tcp=Ts_base_tcp,
         clearance_m=moved.clearance_m,
-        contacts=moved.monitor.contacts(),
-        nodes_m=states.nodes_m,
-        extents_m=states.extents_m,
-        broken=states.broken,
     )
-    verdict = _judge(result, commanded, moved, plan, scene, config)
-    return replace(result, verdict=replace(verdict, reason=reason_of(verdict)))
 
 
 def _move(
@@ -297,21 +281,19 @@ def _move(
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     _pre_grasp(monitor, path)
     dynamic = config.mode == "dynamic"
-    states, by_physics, measured = None, dynamic, True
+    by_physics, measured = dynamic, True
+    stamps_ns = path.dense_times_ns(config.sample_rate_hz)
     if dynamic and refuse_early:
         found = commanded.failures or monitor.failures or any(commanded.checks.values())
         measured = not found
-        states = follow(path, scene, config)
         ahead = ClearanceMonitor(scene, plan, hulls, config)
         if measured:
-            _clearance_m(ahead, states, [])
+            _clearance_m(ahead, follow(path, scene, stamps_ns), [])
         by_physics = measured and not ahead.failures
     if by_physics:
         states = simulate(path, scene, hulls, config)
-    elif states is None:
-        states = follow(path, scene, config)
-    if not measured:
-        states = first_of(states)
+    else:
+        states = follow(path, scene, stamps_ns if measured else stamps_ns[:1])
     return Moved(
         states=states,
         clearance_m=_clearance_m(monitor, states, list(scene.movable())),
@@ -322,7 +304,8 @@ def _move(
 
 
 def _judge(
-    result: ReplayResult,
+    states: States,
+    Ts_base_tcp: Float[np.ndarray, "num_steps 4 4"],
     commanded: Commanded,
     moved: Moved,
     plan: Plan,
@@ -330,7 +313,7 @@ def _judge(
     config: ReplayConfig,
 ) -> Verdict:
     """Every factor and check, and what is worth knowing beside them."""
-    path, checks, states = commanded.path, commanded.checks, moved.states
+    path, checks = commanded.path, commanded.checks
     # What was executed is judged by where things end: it is known whether they were dropped.
     planned = moved.by_physics and commanded.trajectory == "planned"
     if planned:
@@ -340,27 +323,31 @@ def _judge(
         checks = {**checks, "limits": checks["limits"] + simulated}
     unreachable_ns = commanded.unreachable_ns
     if moved.by_physics or config.mode == "kinematic":
-        terminal = terminal_factor(
-            result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
-        )
+        terminal = terminal_factor(states, scene, config, unreachable_ns=unreachable_ns)
     else:
         terminal = Factor(value=None, detail=REFUSED_BEFORE)
     undecided = (
         _clearance_undecided(scene, unreachable_ns, states) if moved.measured else REFUSED_BEFORE
     )
-    findings = findings_of(scene.task, result.rollout(), "replayed") if moved.by_physics else ()
-    return replace(
-        result.verdict,
+    findings = findings_of(scene.task, states, "replayed") if moved.by_physics else ()
+    return Verdict(
+        plan_id=plan.id,
+        trajectory=commanded.trajectory,
+        mode=config.mode,
+        engine=engine_of(scene.task, config),
+        seed=config.seed,
+        scene_hash=scene.scene_hash,
+        calibration_id=scene.calibration_id,
         ik=factor_from(commanded.failures),
         clearance=factor_from(moved.monitor.failures, undecided=undecided),
         terminal=terminal,
-        warnings=warnings_of(scene, result),
+        warnings=(HELD_BEFORE,) if already_true_at_start(scene.task, states) else (),
         findings=tuple(findings),
         checks={
             name: factor_from(found, undecided=commanded.unknown if name == "limits" else None)
             for name, found in checks.items()
         },
-        grasps=grasps_seen(plan, path, result) if planned else (),
+        grasps=grasps_seen(plan, path, states, Ts_base_tcp) if planned else (),
         nearest=moved.monitor.nearest() if moved.measured else None,
     )
 
@@ -383,57 +370,26 @@ def _clearance_m(
     )
 
 
-def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
+def follow(path: JointPath, scene: ReplayScene, stamps_ns: Int[np.ndarray, " num_steps"]) -> States:
     """Follow the joints exactly; no physics, so nothing is known of objects that can move."""
-    count = int(np.ceil(path.end_ns() * 1e-9 * config.sample_rate_hz)) + 1
-    stamps: Int[np.ndarray, " num_steps"] = (
-        np.linspace(0, path.end_ns(), count).round().astype(np.int64)
-    )
-    fixed: dict[str, Float[np.ndarray, "num_steps 4 4"]] = {
-        name: np.repeat(T[None], count, axis=0) for name, T in scene.containers().items()
+    fixed = {
+        name: np.repeat(T[None], len(stamps_ns), axis=0) for name, T in scene.containers().items()
     }
     return States(
-        stamps_ns=stamps,
-        joints_rad=path.joints_at(stamps),
-        width_m=path.width_at(stamps),
+        stamps_ns=stamps_ns,
+        joints_rad=path.joints_at(stamps_ns),
+        width_m=path.width_at(stamps_ns),
         Ts_base_object=fixed,
         finger_contact={},
     )
 
 
-def first_of(states: States) -> States:
-    """The first of several states alone."""
-    return replace(
-        states,
-        stamps_ns=states.stamps_ns[:1],
-        joints_rad=states.joints_rad[:1],
-        width_m=states.width_m[:1],
-        Ts_base_object={name: Ts[:1] for name, Ts in states.Ts_base_object.items()},
-    )
-
-
 def _pre_grasp(monitor: ClearanceMonitor, path: JointPath) -> None:
-    times = path.dense_times_ns(PATH_STEP_S)
+    times = path.dense_times_ns()
     if path.first_close_ns is not None:
         times = times[times < path.first_close_ns]
     for t_ns, joints, width in zip(times, path.joints_at(times), path.width_at(times), strict=True):
         monitor.check_pre_grasp(int(t_ns), joints, float(width))
-
-
-def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayScene) -> Verdict:
-    open_factor = Factor(value=None)
-    return Verdict(
-        plan_id=plan.id,
-        trajectory=trajectory,
-        mode=config.mode,
-        ik=open_factor,
-        clearance=open_factor,
-        terminal=open_factor,
-        engine=engine_of(scene.task, config),
-        seed=config.seed,
-        scene_hash=scene.scene_hash,
-        calibration_id=scene.calibration_id,
-    )
 
 
 def engine_of(task: Task, config: ReplayConfig) -> str:
@@ -441,7 +397,7 @@ def engine_of(task: Task, config: ReplayConfig) -> str:
     if config.mode == "kinematic":
         return KINEMATIC_ENGINE
     soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""
-    return f"{engine_version(config.engines()[0])}{soft}"
+    return f"{engine_version(config.engine)}{soft}"
 
 
 def _clearance_undecided(

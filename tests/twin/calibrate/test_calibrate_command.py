@@ -19,8 +19,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.calibrate import cameras
-from twin.calibrate.cameras import placement
-from twin.calibrate.pairs import recorded_pairs
+from twin.calibrate.cameras import placement, recorded_pairs
 from twin.robot.model import load_robot
 from twin.scene.align.align import RobotNotAlignedError
 from twin.scene.store.calibration import (

@@ -9,7 +9,7 @@ import pytest
 
 from bridge.geometry import se3
 from twin.calibrate import hand_eye
-from twin.calibrate.pairs import PosePairs
+from twin.calibrate.hand_eye import PosePairs
 
 SHARED = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).parents[4] / "shared" / "data"))
 MOVEIT = SHARED / "handeye_moveit_samples" / "pose_samples.json"

@@ -199,9 +199,9 @@ def test_samples_take_turns_among_the_draws_as_their_weights_say() -> None:
     ]
     config = ReplayConfig(variation=VariationConfig(posterior=tuple(few)))
     frictions = [
-        monte_carlo.draw_variation(
-            monte_carlo.sample_rng(0, "s", k), scene(), config, index=k
-        ).physics.finger_friction
+        monte_carlo.draw_variation(monte_carlo.sample_rng(0, "s", k), scene(), config, index=k)[
+            1
+        ].physics.finger_friction
         for k in range(16)
     ]
     first = few[0].finger_pair_friction / config.physics.object_friction
@@ -216,8 +216,7 @@ def test_the_success_probability_counts_each_answer_as_far_as_it_is_trusted() ->
     def replay(there: ReplayScene, settings: ReplayConfig) -> Verdict:
         return replace(VERDICT, terminal=Factor(value=next(answers)))
 
-    samples = monte_carlo.replay_samples(replay, scene(), config, plan_id="p", identity="s")
-    p = monte_carlo.with_probability(VERDICT, samples).p_success
+    p = monte_carlo.with_samples(VERDICT, replay, scene(), config, identity="s").p_success
     assert p is not None
     assert p["value"] == pytest.approx((0.6 + 0.6 + 0.1 + 0.1) / 4)
     assert (p["k"], p["n"]) == (2, 4)

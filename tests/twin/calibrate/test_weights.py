@@ -157,7 +157,8 @@ def test_what_a_trial_weighed_turns_the_next_verdict(
     starts = {key: track.transforms()[0] for key, track in tracks.items()}
 
     def scene() -> Any:
-        return read_rebuilt_scene(run, task).scene(task, ROBOT.urdf_text(), starts)
+        known = read_rebuilt_scene(run, task)
+        return replace(known, urdf=ROBOT.urdf_text(), Ts_base_object=starts)
 
     assert judge_of(run.path, scene())(plan).accepted is True
     assert cli.calibrate(run.path, config=CalibrateConfig(physics=True)) == 0
@@ -170,8 +171,9 @@ def test_what_a_trial_weighed_turns_the_next_verdict(
     assert "more than the 5 kg of" in str(verdict.reason)
 
     config = for_task(ReplayConfig(), read_calibration(run), task)
-    drawn = draw_variation(np.random.default_rng(0), scene(), config).objects["cube"].mass_kg
-    assert 0 < abs(drawn - scene().task.objects["cube"].mass_kg) < 0.1
+    drawn, _ = draw_variation(np.random.default_rng(0), scene(), config)
+    mass_kg = drawn.task.objects["cube"].mass_kg
+    assert 0 < abs(mass_kg - scene().task.objects["cube"].mass_kg) < 0.1
     wide = replace(draw_beforehand(1)[0], mass_scale=2.0)
     for settings, times in ((config, 1.0), (ReplayConfig(), 2.0)):
         varied, _ = with_draw(wide, scene(), settings)

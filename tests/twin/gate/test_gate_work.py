@@ -115,30 +115,6 @@ def test_as_many_samples_are_run_as_fit_into_the_steps_on_any_machine(
     assert answer(question).to_json() == idle.to_json()
 
 
-def test_a_gate_asks_both_engines_within_the_same_steps(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[str] = []
-
-    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig, **_: Any) -> Any:
-        (engine,) = config.engines()
-        asked.append(engine)
-        terminal = Factor(value=engine == "pybullet", cause="inside")
-        return SimpleNamespace(verdict=replace(ACCEPTED, engine=engine, terminal=terminal))
-
-    monkeypatch.setattr(verdict_module, "replay_plan", replay_plan)
-    monkeypatch.setattr(auditor, "audit", lambda *_, **__: YES)
-    config = ReplayConfig(engine="both")
-    question = question_of(run, config=config, max_steps=2 * NOMINAL_STEPS)
-    question = replace(question, task=load_task("cube_into_box"))
-    said = answer(question)
-    assert asked == ["pybullet", "mujoco"]
-    assert said.accepted is True
-    assert "engines disagree: pybullet accepted; mujoco rejected" in str(said.reason)
-    with pytest.raises(UndecidedError, match="600 simulated steps, and a verdict at most 599"):
-        answer(replace(question, max_steps=2 * NOMINAL_STEPS - 1))
-
-
 def test_a_plan_that_alone_needs_too_many_steps_gets_no_verdict(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:

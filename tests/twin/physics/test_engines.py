@@ -212,5 +212,5 @@ def test_an_engine_that_is_not_installed_is_named_with_its_extra(
     with pytest.raises(MissingDependencyError, match=r"robot-gst\[mujoco\]"):
         open_world("mujoco", URDF, {}, PhysicsConfig())
     with pytest.raises(MissingDependencyError, match="--engine mujoco needs it"):
-        ReplayConfig(engine="both")
+        ReplayConfig(engine="mujoco")
     require_engine("pybullet")

@@ -5,19 +5,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from twin.plan.problem import Numbers, Points, Pose, Poses, Problem, Vector
+from twin.plan.problem import Numbers, Points, Pose, Poses, Vector
 from twin.replay._clearance import surface_to_boxes, surface_to_grid
-from twin.replay.clearance.bodies import placed_panels
-from twin.replay.clearance.distance_grid import GridLookup
-from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_obstacles
-from twin.robot.collision import RobotHulls
+from twin.scene.shape.sdf import SdfGrid
 
 
-def grid_clearance(lookup: GridLookup, points_m: Points, Ts_grid_body: Poses) -> Numbers:
+def grid_clearance(grid: SdfGrid, points_m: Points, Ts_grid_body: Poses) -> Numbers:
     """Smallest signed distance of a body's surface points to what a grid holds, for each pose."""
     nearest = np.empty(len(Ts_grid_body))
-    grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
-    surface_to_grid(*grid, *_poses(Ts_grid_body), np.ascontiguousarray(points_m), nearest)
+    values = grid.values_m, grid.origin_m, grid.voxel_m
+    surface_to_grid(*values, *_poses(Ts_grid_body), np.ascontiguousarray(points_m), nearest)
     return nearest
 
 
@@ -37,21 +34,6 @@ def boxes_clearance(boxes: Sequence[tuple[Pose, Vector]]) -> Away:
         return np.asarray(nearest.min(axis=1))
 
     return away
-
-
-def scene_grid(problem: Problem, hulls: RobotHulls) -> GridLookup | None:
-    """Distances to what has no name in a scene: all but table, containers and the robot's foot."""
-    scene = problem.scene
-    if scene.static_sdf is None:
-        return None
-    _, foot = stationary_links(hulls)
-    panels = [
-        panel
-        for name, T in scene.containers().items()
-        for panel in placed_panels(problem.model(name), T)
-    ]
-    grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
-    return None if grid is None else GridLookup(grid)
 
 
 def _poses(Ts: Poses) -> tuple[Float[np.ndarray, "num_poses 3 3"], Points]:

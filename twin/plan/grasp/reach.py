@@ -4,7 +4,7 @@ import numpy as np
 
 from twin.plan.grasp.open_hand import OpenHand
 from twin.plan.problem import Joints, Pose, Postures, Problem
-from twin.replay.clearance.bodies import own_links
+from twin.replay.clearance.bodies import own_links_touch
 from twin.replay.clearance.surroundings import Surroundings
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
@@ -30,14 +30,14 @@ class ArmReach:
         self.hulls = hulls_of(problem.robot)
         self._eps_m = ReplayConfig().eps_col_m
         self._around = Surroundings(problem.scene, self.hulls, self._eps_m)
-        self._links = own_links(self.hulls)
+        self._links_touch = own_links_touch(self.hulls)
         start = problem.scene.start_rad
         self.start_rad = self.robot.home_rad if start is None else start
 
     def is_clear(self, joints_rad: Joints, open_m: float) -> bool:
         """Whether arm and hand keep clear of the robot itself and of what stands still."""
         self.hulls.place(joints_rad, open_m)
-        if self._links.touch():
+        if self._links_touch():
             return False
         return self._around.least_m(frozenset(), self._eps_m) >= self._eps_m
 

@@ -12,7 +12,7 @@ from bridge.task.plan import Plan, Stage, Waypoint
 from twin.errors import TwinError
 from twin.plan.path.world import SPARE_M, Carried, World, build_world
 from twin.plan.problem import Joints, Pose, Poses, Postures, Problem, TimedPath
-from twin.replay.clearance.bodies import own_links
+from twin.replay.clearance.bodies import own_links_touch
 from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
@@ -167,7 +167,7 @@ class Mover:
     def refused(self, path: TimedPath) -> tuple[NoPathError, ...]:
         """Return what the monitor's exact clearance, the last word, refuses of a movement."""
         hulls = hulls_of(self.problem.robot)
-        links = own_links(hulls)
+        links_touch = own_links_touch(hulls)
         monitor = ClearanceMonitor(self.problem.scene, self._plan(), hulls, self.config.replay)
         poses = self._object_poses(path.joints_rad)
         stamps = np.round(path.times_s * 1e9).astype(np.int64)
@@ -175,7 +175,7 @@ class Mover:
         for index, joints in enumerate(path.joints_rad):
             Ts = {name: rows[index] for name, rows in poses.items()}
             monitor.measure(int(stamps[index]), joints, self.width_m, Ts)
-            if links.touch():
+            if links_touch():
                 closest = hulls.self_distance()
                 told = f"{closest.links[0]} touches {closest.links[1]}"
                 refusals.append(_refused(closest.links, told, -closest.distance_m))

@@ -10,7 +10,6 @@ import pinocchio as pin
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
-from twin.plan.constrain.distances import scene_grid
 from twin.plan.path._motion import Motion
 from twin.plan.problem import Points, Pose, Problem, Vector
 from twin.replay.clearance.bodies import SCENE, TABLE, names_of, placed_panels
@@ -20,11 +19,12 @@ from twin.replay.clearance.bounding_spheres import (
     BoundingSphereTree,
     bounding_spheres_of,
 )
-from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.monitor import Allowed
 from twin.replay.clearance.static_obstacles import stationary_links
+from twin.replay.clearance.surroundings import scene_grid
 from twin.robot.collision import RobotHulls, hulls_of
 from twin.robot.model import RobotModel
+from twin.scene.shape.sdf import SdfGrid
 
 SPARE_M = 0.0003
 """A path keeps this much more than was asked: what the search may overlook is less."""
@@ -144,15 +144,15 @@ def build_world(
     Pairs that may touch are left to the monitor; what a check refused before keeps more.
     """
     hulls = hulls_of(problem.robot)
-    lookup = scene_grid(problem, hulls)
-    motion, bodies, T_last_tcp = _arm(hulls, width_m, has_grid=lookup is not None)
+    grid = scene_grid(problem.scene, hulls)
+    motion, bodies, T_last_tcp = _arm(hulls, width_m, has_grid=grid is not None)
     if carried is not None:
         box = box_corners(np.array(problem.model(carried.object_id).size_m))
         T = T_last_tcp @ carried.T_tcp_object
-        tree = None if lookup is None else bounding_spheres_of(box)
+        tree = None if grid is None else bounding_spheres_of(box)
         joints = len(problem.robot.joints)
         bodies.append(_Body(joint=joints, T_joint_body=T, corners_m=box, tree=tree))
-    _add_bodies(motion, bodies, lookup)
+    _add_bodies(motion, bodies, grid)
     obstacles = _obstacles(problem, carried)
     motion.set_table(problem.scene.table_height_m)
     for _, T, size in obstacles:
@@ -160,7 +160,7 @@ def build_world(
     names: list[Names] = []
     limits_m: list[float] = []
     boxes = [name for name, *_ in obstacles]
-    for body, kind, other, named in _pairs(hulls, boxes, carried, has_grid=lookup is not None):
+    for body, kind, other, named in _pairs(hulls, boxes, carried, has_grid=grid is not None):
         more_m = (wider_m or {}).get(frozenset(named))
         known = names_of(named[0], problem.robot.record.gripper)
         if more_m is None and any(frozenset((name, named[1])) in allowed for name in known):
@@ -173,7 +173,7 @@ def build_world(
     return World(motion=motion, names=names, robot=problem.robot, limits_m=limits_m)
 
 
-def _add_bodies(motion: Motion, bodies: list[_Body], lookup: GridLookup | None) -> None:
+def _add_bodies(motion: Motion, bodies: list[_Body], grid: SdfGrid | None) -> None:
     """Add bodies; where there is a grid, with the points that it is asked about."""
     begin, points, radii, children = 0, [], [], []
     for body in bodies:
@@ -187,9 +187,9 @@ def _add_bodies(motion: Motion, bodies: list[_Body], lookup: GridLookup | None) 
         radii.append(tree.radius_m)
         children.append((tree.children + begin).astype(np.int32))
         begin += len(tree.points_m)
-    if lookup is not None:
-        grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
-        motion.set_grid(*grid, *map(np.concatenate, (points, radii, children)))
+    if grid is not None:
+        about = grid.values_m, grid.origin_m, grid.voxel_m
+        motion.set_grid(*about, *map(np.concatenate, (points, radii, children)))
 
 
 def _obstacles(problem: Problem, carried: Carried | None) -> list[tuple[str, Pose, Vector]]:

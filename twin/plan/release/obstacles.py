@@ -5,11 +5,12 @@ from collections.abc import Collection
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from twin.plan.constrain.distances import Away, boxes_clearance, grid_clearance, scene_grid
+from twin.plan.constrain.distances import Away, boxes_clearance, grid_clearance
 from twin.plan.grasp.open_hand import open_hand
 from twin.plan.grasp.search import PREGRASP_M
 from twin.plan.problem import Points, Problem
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
+from twin.replay.clearance.surroundings import scene_grid
 from twin.robot.collision import RobotHulls
 from twin.robot.model import RobotModel
 
@@ -24,7 +25,7 @@ def obstacles_of(problem: Problem, hulls: RobotHulls, carried: Collection[str]) 
     for name, T_base in scene.Ts_base_object.items():
         if name not in carried:
             found[name] = boxes_clearance([*placed_panels(problem.model(name), T_base)])
-    if (grid := scene_grid(problem, hulls)) is not None:
+    if (grid := scene_grid(problem.scene, hulls)) is not None:
         error_m = float(np.sqrt(3) / 2 * grid.voxel_m)
         found[SCENE] = lambda points_m, Ts: grid_clearance(grid, points_m, Ts) - error_m
     return found

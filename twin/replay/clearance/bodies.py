@@ -1,6 +1,6 @@
 """Convex pieces with what holds them, and the names bodies have in contacts and failures."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,10 +14,12 @@ from bridge.geometry.mesh import box_corners
 from bridge.robots.robot import Gripper
 from bridge.task.meshes.toys import basket_parts, basket_rim_parts
 from bridge.task.task_file import BASKET, ObjectModel
-from twin.replay._clearance import Bounds
+from twin.replay._clearance import Bounds, surface_to_boxes
 from twin.robot.collision import RobotHulls, convex_hull
 
 TABLE = "table"
+PanelBox = tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]
+"""Pose ``T_base_box`` of the middle, and extents of a box [m]."""
 GRIPPER = "gripper"
 """What task files call the links of any robot's gripper."""
 SCENE = "scene"
@@ -76,9 +78,7 @@ def placement_of(T: Float[np.ndarray, "4 4"]) -> coal.Transform3s:
     return coal.Transform3s(T[:3, :3], T[:3, 3])
 
 
-def placed_panels(
-    model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
-) -> list[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]]:
+def placed_panels(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> list[PanelBox]:
     """An object's boxes (walls, a basket's corners, rim, handles): pose of centre, extents [m]."""
     if model.mesh == BASKET:
         shape = model.inner_m, model.wall_m
@@ -139,28 +139,14 @@ class NearPairs:
         return zip(bounds.tolist(), self._order[:count].tolist(), strict=True)
 
 
-class OwnLinks:
-    """The robot's links against each other."""
-
-    def __init__(self, hulls: RobotHulls) -> None:
-        """Choose the pairs that must stay apart."""
-        self._hulls = hulls
-        solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
-        self._near = NearPairs(solids, hulls.pairs)
-        # The same memory: the pairs are where the hulls have been placed last.
-        self._near.R, self._near.t = hulls.rotations, hulls.translations
-
-    def touch(self) -> bool:
-        """Whether any touch where the hulls have been placed."""
-        return any(
-            self._hulls.pair_distance_m(index) <= 0 for _, index in self._near.nearest_first(0.0)
-        )
-
-
 @lru_cache(maxsize=4)
-def own_links(hulls: RobotHulls) -> OwnLinks:
-    """Return the pairs of a robot, made once."""
-    return OwnLinks(hulls)
+def own_links_touch(hulls: RobotHulls) -> Callable[[], bool]:
+    """Say whether links of the robot touch where its hulls have been placed; made once."""
+    solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
+    near = NearPairs(solids, hulls.pairs)
+    # The same memory: the pairs are where the hulls have been placed last.
+    near.R, near.t = hulls.rotations, hulls.translations
+    return lambda: any(hulls.pair_distance_m(index) <= 0 for _, index in near.nearest_first(0.0))
 
 
 # Distances of soft bodies, which are given by their nodes.
@@ -169,44 +155,37 @@ def own_links(hulls: RobotHulls) -> OwnLinks:
 # body is as large as its nodes say.
 
 
-@dataclass(frozen=True, kw_only=True)
-class Planes:
-    """The faces of a convex piece, in the frame of its link."""
+Planes = Float[np.ndarray, "num_planes 4"]
+"""The faces of a convex piece in the frame of its link: outward normals of unit length, offsets."""
 
-    normals: Float[np.ndarray, "num_planes 3"]
-    """Outward, unit length."""
-    offsets_m: Float[np.ndarray, " num_planes"]
 
-    def distance_m(
-        self,
-        points_m: Float[np.ndarray, "num_points 3"],  # base frame
-        R: Float[np.ndarray, "3 3"],  # of the piece's link in the base frame
-        t: Float[np.ndarray, "3"],  # that link's origin, base frame [m]
-    ) -> float:
-        """Smallest signed distance of points to the placed piece [m], never too large outside."""
-        local = (points_m - t) @ R
-        return float((local @ self.normals.T + self.offsets_m).max(axis=1).min())
+def distance_to_planes_m(
+    planes: Planes,
+    points_m: Float[np.ndarray, "num_points 3"],  # base frame
+    R: Float[np.ndarray, "3 3"],  # of the piece's link in the base frame
+    t: Float[np.ndarray, "3"],  # that link's origin, base frame [m]
+) -> float:
+    """Smallest signed distance of points to the placed piece [m], never too large outside."""
+    local = (points_m - t) @ R
+    return float((local @ planes[:, :3].T + planes[:, 3]).max(axis=1).min())
 
 
 @lru_cache(maxsize=4)
 def planes_of(hulls: RobotHulls) -> tuple[Planes, ...]:
     """Return the planes of each of a robot's hulls."""
-    found = []
-    for hull in hulls.hulls:
-        equations = np.unique(ConvexHull(hull.points_m).equations.round(9), axis=0)
-        found.append(Planes(normals=equations[:, :3], offsets_m=equations[:, 3]))
-    return tuple(found)
+    faces = (ConvexHull(hull.points_m).equations.round(9) for hull in hulls.hulls)
+    return tuple(np.unique(each, axis=0) for each in faces)
 
 
 def distances_to_boxes_m(
     points_m: Float[np.ndarray, "num_points 3"],  # base frame
-    R_box_base: Float[np.ndarray, "num_boxes 3 3"],
-    p_box_base: Float[np.ndarray, "num_boxes 3"],
-    half_m: Float[np.ndarray, "num_boxes 3"],  # half the edges
+    boxes: Sequence[PanelBox],
 ) -> Float[np.ndarray, " num_boxes"]:
-    """Smallest signed distance of points to each box around the origin of its frame [m]."""
-    local = R_box_base @ points_m.T + p_box_base[:, :, None]
-    q = np.abs(local) - half_m[:, :, None]
-    out = np.maximum(q, 0.0)
-    outside = np.sqrt(np.einsum("bcn,bcn->bn", out, out))
-    return np.asarray((outside + np.minimum(q.max(axis=1), 0.0)).min(axis=1))
+    """Smallest signed distance of points to each box [m]."""
+    Ts = np.array([T for T, _ in boxes]).reshape(-1, 4, 4)
+    halves_m = np.array([extents / 2 for _, extents in boxes]).reshape(-1, 3)
+    where = np.ascontiguousarray(Ts[:, :3, :3]), np.ascontiguousarray(Ts[:, :3, 3]), halves_m
+    here = np.eye(3)[None], np.zeros((1, 3)), np.ascontiguousarray(points_m)
+    answers = np.empty((1, len(boxes)))
+    surface_to_boxes(*where, *here, answers)
+    return np.asarray(answers[0])

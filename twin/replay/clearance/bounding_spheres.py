@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int, Int32
 from scipy.spatial import ConvexHull, cKDTree
 
-from twin.replay._clearance import least, nearest
-from twin.replay.clearance.distance_grid import GridLookup
+from twin.replay._clearance import least, nearest, surface_to_grid
 from twin.robot.collision import RobotHulls
+from twin.scene.shape.sdf import SdfGrid
 
 FINE_M, ARM_FINE_M = 0.002, 0.004
 """For the gripper and what it carries, and for the arm."""
@@ -47,13 +47,13 @@ class BoundingSpheres:
 
     def __init__(self, trees: list[BoundingSphereTree]) -> None:
         """Put their trees into one."""
-        self._points = np.concatenate([tree.points_m for tree in trees])
-        self._radius = np.concatenate([tree.radius_m for tree in trees])
+        points = np.concatenate([tree.points_m for tree in trees])
+        radius = np.concatenate([tree.radius_m for tree in trees])
         starts = np.concatenate([[0], np.cumsum([len(tree.points_m) for tree in trees])])
         children = [tree.children + start for tree, start in zip(trees, starts, strict=False)]
-        self._children = np.concatenate(children).astype(np.int32)
         ends = starts[:-1] + [tree.num_roots for tree in trees]
-        self._roots = np.stack([starts[:-1], ends], axis=1).astype(np.int32)
+        roots = np.stack([starts[:-1], ends], axis=1).astype(np.int32)
+        self._trees = points, radius, np.concatenate(children).astype(np.int32), roots
         self._cover = np.array([tree.cover_m for tree in trees])
         middles = [(tree.points_m.min(axis=0) + tree.points_m.max(axis=0)) / 2 for tree in trees]
         self._centres = np.stack(middles)
@@ -67,7 +67,7 @@ class BoundingSpheres:
 
     def distances_m(
         self,
-        lookup: GridLookup,
+        grid: SdfGrid,
         R: Float[np.ndarray, "num_pieces 3 3"],
         t: Float[np.ndarray, "num_pieces 3"],  # origin of each piece's link, grid's frame [m]
     ) -> Float[np.ndarray, " num_pieces"]:
@@ -76,44 +76,40 @@ class BoundingSpheres:
         Never too large; too small by what the finest points leave uncovered, and by 2 % of it.
         """
         answers = np.empty(len(R))
-        nearest(
-            lookup.values_m,
-            lookup.origin_m,
-            lookup.voxel_m,
-            R,
-            t,
-            self._points,
-            self._radius,
-            self._children,
-            self._roots,
-            answers,
-        )
+        nearest(*_values(grid), R, t, *self._trees, answers)
         return np.asarray(answers - self._cover)
 
     def least_m(
         self,
-        lookup: GridLookup,
+        grid: SdfGrid,
         R: Float[np.ndarray, "num_pieces 3 3"],
         t: Float[np.ndarray, "num_pieces 3"],  # origin of each piece's link, grid's frame [m]
         below_m: float,  # that number; the smaller, the less is looked at
     ) -> float:
         """Return the smallest of ``distances_m``, or a number where none is below it [m]."""
-        found: float = least(
-            lookup.values_m,
-            lookup.origin_m,
-            lookup.voxel_m,
-            R,
-            t,
-            self._points,
-            self._radius,
-            self._children,
-            self._roots,
-            self._cover,
-            self._centres,
-            self._reaches,
-            below_m,
-        )
+        bounds = self._cover, self._centres, self._reaches, below_m
+        found: float = least(*_values(grid), R, t, *self._trees, *bounds)
         return found
+
+
+def _values(grid: SdfGrid) -> tuple[np.ndarray, np.ndarray, float]:
+    return grid.values_m, grid.origin_m, grid.voxel_m
+
+
+def grid_distances_m(
+    grid: SdfGrid, points_m: Float[np.ndarray, "num_points 3"]
+) -> Float[np.ndarray, " num_points"]:
+    """Signed distances of points in a grid's frame [m].
+
+    All solid lies inside the grid or nobody knows of it: beyond the grid, the nearest grid point at
+    distance e with d bounds them by sqrt(d^2 + e^2); solid that reaches the edge is taken to end
+    behind it as deep as it was.
+    """
+    answers, unturned = np.empty(len(points_m)), np.tile(np.eye(3), (len(points_m), 1, 1))
+    surface_to_grid(
+        *_values(grid), unturned, np.ascontiguousarray(points_m), np.zeros((1, 3)), answers
+    )
+    return answers
 
 
 def bounding_spheres_of(

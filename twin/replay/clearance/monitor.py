@@ -7,7 +7,7 @@ the start belong to nobody's motion and are left out. Links and the carried boxe
 soft bodies their nodes, and distances are on the safe side.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from math import asin, hypot, sqrt
@@ -22,7 +22,13 @@ from bridge.task.causes import Cause
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
 from bridge.task.predicate import Contact
-from twin.replay.clearance.bodies import GRIPPER, names_of, placement_of, planes_of
+from twin.replay.clearance.bodies import (
+    GRIPPER,
+    distance_to_planes_m,
+    names_of,
+    placement_of,
+    planes_of,
+)
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.config import MOVED_M, ReplayConfig
 from twin.replay.failure import Failure
@@ -197,7 +203,7 @@ class ClearanceMonitor:
         """Prepare the static scene and the bounding spheres."""
         self.config = config
         self.hulls = hulls
-        self.stages = plan.stages
+        self._allowed_at = allowed_at(plan.stages)
         self._gripper = hulls.robot.record.gripper
         self.failures: list[Failure] = []
         self._scene = scene
@@ -216,7 +222,6 @@ class ClearanceMonitor:
         self._late_m = np.zeros(len(self._links))
         self._hand = [k for k, s in enumerate(self._links) if s.body in self._gripper.links]
         self._object_late_m: dict[str, float] = {}
-        self._allowed: dict[int, Allowed] = {}
         self._reach = Reach(hulls)
         self._contacts: dict[tuple[str, str, bool], list[Contact]] = {}
         self._last: _Look | None = None
@@ -376,8 +381,11 @@ class ClearanceMonitor:
             for index in np.flatnonzero(away <= self._radii + solid.radius_m).tolist():
                 link = self._links[index]
                 distance = (
-                    planes_of(self.hulls)[index].distance_m(
-                        se3.apply(T, object_mesh(model).vertices_m), R[index], t[index]
+                    distance_to_planes_m(
+                        planes_of(self.hulls)[index],
+                        se3.apply(T, object_mesh(model).vertices_m),
+                        R[index],
+                        t[index],
                     )
                     if model.mesh is not None
                     else signed_distance(
@@ -418,13 +426,6 @@ class ClearanceMonitor:
         centre = nodes.mean(axis=0)
         start = self._first_centre.setdefault(name, centre)
         return bool(np.linalg.norm(centre - start) > MOVED_M)
-
-    def _allowed_at(self, t_ns: int) -> Allowed:
-        """As ``allowed_pairs``, worked out once for each stage."""
-        stage = id(active_stage(self.stages, t_ns))
-        if stage not in self._allowed:
-            self._allowed[stage] = allowed_pairs(self.stages, t_ns)
-        return self._allowed[stage]
 
     def _judge(self, t_ns: int, pair: Pair, distance: float, allowed: Allowed) -> float:
         """Note a pair that is too close; returns its distance if the pair may not touch."""
@@ -482,6 +483,19 @@ def active_stage(stages: tuple[Stage, ...], t_ns: int) -> Stage | None:
     if begun:
         return begun[-1]
     return stages[0] if stages else None
+
+
+def allowed_at(stages: tuple[Stage, ...]) -> Callable[[int], Allowed]:
+    """As ``allowed_pairs`` by time, worked out once for each stage."""
+    known: dict[int, Allowed] = {}
+
+    def at(t_ns: int) -> Allowed:
+        stage = id(active_stage(stages, t_ns))
+        if stage not in known:
+            known[stage] = allowed_pairs(stages, t_ns)
+        return known[stage]
+
+    return at
 
 
 def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:

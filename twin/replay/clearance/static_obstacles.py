@@ -6,11 +6,11 @@ from functools import lru_cache
 
 import coal
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
-from twin.replay.clearance.bodies import TABLE, Solid, half_space_solid, solid_of
+from twin.replay.clearance.bodies import TABLE, PanelBox, Solid, half_space_solid, solid_of
 from twin.robot.collision import RobotHulls
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 from twin.scene.shape.static import OBJECT_MARGIN_VOXELS, StaticSdf
@@ -24,9 +24,6 @@ from twin.scene.shape.static import OBJECT_MARGIN_VOXELS, StaticSdf
 _AROUND_M = 0.15
 """How far around a container distances are made anew; further out the old ones stay, which are
 too small if anything."""
-
-PanelBox = tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]
-"""Pose ``T_base_panel`` and extents of a box [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,32 +41,13 @@ def unmodelled_obstacles(
 
     What nobody saw counts as free, as in the observed grid, and what lies beyond the grid too.
     """
-    grid = _without_table(static, table_height_m, foot)
+    grid = _cleared(static, table_height_m, foot)
     return None if grid is None else _without_panels(grid, panels)
 
 
-@dataclass
-class _Remembered:
-    """The last scene a process took the table out of: replays of a run share it."""
-
-    key: tuple[int, float, Foot | None] | None = None
-    static: StaticSdf | None = None
-    grid: SdfGrid | None = None
-
-
-_LAST = _Remembered()
-
-
-def _without_table(static: StaticSdf, table_height_m: float, foot: Foot | None) -> SdfGrid | None:
-    key = (id(static), table_height_m, foot)
-    if _LAST.key != key:
-        # The scene is kept with its grid, so that its id stays its own.
-        _LAST.key, _LAST.static = key, static
-        _LAST.grid = _cleared(static, table_height_m, foot)
-    return _LAST.grid
-
-
+@lru_cache(maxsize=1)
 def _cleared(static: StaticSdf, table_height_m: float, foot: Foot | None) -> SdfGrid | None:
+    """Without table and foot; replays of a run share it."""
     grid = static.observed
     solid = grid.values_m < 0
     margin = OBJECT_MARGIN_VOXELS * grid.voxel_m
@@ -110,8 +88,12 @@ def _without_panels(grid: SdfGrid, panels: Sequence[PanelBox]) -> SdfGrid | None
     low = np.maximum(cells.min(axis=0) - around, 0)
     high = np.minimum(cells.max(axis=0) + around + 1, solid.shape)
     part = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    # Solid may lie right outside of the part, where it does not end with the grid.
+    rim = [(int(a > 0), int(b < size)) for a, b, size in zip(low, high, solid.shape, strict=True)]
+    inner = tuple(slice(a, -b or None) for a, b in rim)
+    new = distances_of_solid(np.pad(solid[part], rim, constant_values=True), grid.voxel_m)[inner]
     values = grid.values_m.copy()
-    values[part] = _anew(values[part], solid[part], grid.voxel_m, _rim_m(grid, low, high))
+    values[part] = np.maximum(values[part], new)  # what became less is nowhere nearer than before
     return replace(grid, values_m=values)
 
 
@@ -129,59 +111,15 @@ def _window(
     return x, y, z
 
 
-def _rim_m(
-    grid: SdfGrid, low: Int[np.ndarray, "3"], high: Int[np.ndarray, "3"]
-) -> Float[np.ndarray, "num_x num_y num_z"]:
-    """How far each voxel of a part is at least from solid outside of the part [m]."""
-    rim = np.full(tuple(high - low), np.inf)
-    for axis in range(3):
-        index = np.arange(low[axis], high[axis], dtype=np.float64)
-        ways = np.full(len(index), np.inf)
-        if low[axis] > 0:
-            ways = np.minimum(ways, index - (low[axis] - 1))
-        if high[axis] < grid.values_m.shape[axis]:
-            ways = np.minimum(ways, high[axis] - index)
-        shape = [1, 1, 1]
-        shape[axis] = len(index)
-        rim = np.minimum(rim, ((ways - 0.5) * grid.voxel_m).reshape(shape))
-    return rim
-
-
-def _anew(
-    old_m: Float32[np.ndarray, "num_x num_y num_z"],
-    solid: Bool[np.ndarray, "num_x num_y num_z"],
-    voxel_m: float,
-    rim_m: Float[np.ndarray, "num_x num_y num_z"],
-) -> Float32[np.ndarray, "num_x num_y num_z"]:
-    """Distances in a part whose solid became less: bounded by what may lie outside of the part."""
-    certain = np.maximum(old_m, rim_m)
-    if not solid.any():
-        return np.asarray(np.minimum(certain, 1e3), dtype=np.float32)
-    if solid.all():
-        return old_m
-    new = distances_of_solid(solid, voxel_m)
-    return np.asarray(
-        np.where(solid, np.maximum(new, old_m), np.minimum(new, certain)), dtype=np.float32
-    )
-
-
-ContainerPanel = tuple[str, int, tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]]
-"""A container, which of its boxes it is, and that box: ``T_base_panel`` and extents [m]."""
+ContainerPanel = tuple[str, int, PanelBox]
+"""A container, which of its boxes it is, and that box."""
 
 _STILL_M = 1e-9
 _SAMPLES = 4
 
 
-@dataclass(frozen=True, kw_only=True)
-class StaticObstacle:
-    """A panel of a container, or the table."""
-
-    body: str
-    piece: int
-    """Which of the body's it is."""
-    solid: Solid
-    T: Float[np.ndarray, "4 4"]
-    """``T_base_solid``."""
+StaticObstacle = tuple[Solid, int, Float[np.ndarray, "4 4"]]
+"""The table or a panel of a container, which of the body's it is, and ``T_base_solid``."""
 
 
 def static_obstacles(
@@ -191,10 +129,9 @@ def static_obstacles(
     """The table and the panels, each in its own frame."""
     T_base_table = np.eye(4)
     T_base_table[2, 3] = table_height_m
-    found = [StaticObstacle(body=TABLE, piece=0, solid=half_space_solid(TABLE), T=T_base_table)]
+    found: list[StaticObstacle] = [(half_space_solid(TABLE), 0, T_base_table)]
     for name, piece, (T, extents) in panels:
-        solid = solid_of(name, coal.Box(*extents), box_corners(extents))
-        found.append(StaticObstacle(body=name, piece=piece, solid=solid, T=T))
+        found.append((solid_of(name, coal.Box(*extents), box_corners(extents)), piece, T))
     return found
 
 

@@ -17,8 +17,9 @@ from twin.replay.clearance.bodies import (
     NearPairs,
     Solid,
     box_solid,
+    distance_to_planes_m,
     distances_to_boxes_m,
-    own_links,
+    own_links_touch,
     placed_panels,
     placement_of,
     planes_of,
@@ -29,10 +30,10 @@ from twin.replay.clearance.bounding_spheres import (
     FINE_M,
     BoundingSpheres,
     bounding_spheres_of,
+    grid_distances_m,
     robot_bounding_spheres,
     surface_points,
 )
-from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.static_obstacles import (
     static_obstacles,
     stationary_links,
@@ -41,6 +42,7 @@ from twin.replay.clearance.static_obstacles import (
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, convex_hull, signed_distance
+from twin.scene.shape.sdf import SdfGrid
 
 Pair = tuple[str, int, str, int]
 """A body and which of the robot's hulls it is (-1: an object), the other body and its piece."""
@@ -61,6 +63,19 @@ class _Pairing:
     """Of what stands; None where something may move."""
 
 
+def scene_grid(scene: ReplayScene, hulls: RobotHulls) -> SdfGrid | None:
+    """Distances to what has no name in a scene: all but table, containers and the robot's foot."""
+    if scene.static_sdf is None:
+        return None
+    _, foot = stationary_links(hulls)
+    panels = [
+        panel
+        for name, T in scene.containers().items()
+        for panel in placed_panels(scene.task.objects[name], T)
+    ]
+    return unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
+
+
 class Surroundings:
     """Table, container panels and the unnamed rest of the scene."""
 
@@ -74,31 +89,20 @@ class Surroundings:
             for name, T in scene.containers().items()
             for piece, panel in enumerate(placed_panels(scene.task.objects[name], T))
         ]
-        if self._panels:
-            Ts_panel_base = np.stack([se3.invert(T) for _, _, (T, _) in self._panels])
-            self._R_panel_base, self._p_panel_base = (
-                Ts_panel_base[:, :3, :3],
-                Ts_panel_base[:, :3, 3],
-            )
-            self._half_m = np.stack([extents / 2 for _, _, (_, extents) in self._panels])
         self.static = static_obstacles(self._panels, scene.table_height_m)
         self._pairings: dict[tuple[tuple[str, ...], tuple[str, ...]], _Pairing] = {}
-        stationary, foot = stationary_links(hulls)
+        stationary, _ = stationary_links(hulls)
         self._mobile = [i for i, hull in enumerate(hulls.hulls) if hull.link not in stationary]
         self.links = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
         self.objects = {
             name: box_solid(name, np.array(scene.task.objects[name].size_m))
             for name in scene.movable()
         }
-        self.lookup: GridLookup | None = None
-        if scene.static_sdf is not None:
-            panels = [panel for _, _, panel in self._panels]
-            grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
-            self.lookup = None if grid is None else GridLookup(grid)
+        self.grid = scene_grid(scene, hulls)
         self._link_spheres: BoundingSpheres | None = None
         self._object_spheres: dict[str, BoundingSpheres] = {}
         self._spheres_without: dict[frozenset[str], tuple[BoundingSpheres, list[int]]] = {}
-        if self.lookup is not None:
+        if self.grid is not None:
             self._link_spheres = robot_bounding_spheres(hulls, stationary)
             self._object_spheres = {
                 name: _box_spheres(scene.task.objects[name].size_m)
@@ -172,10 +176,10 @@ class Surroundings:
                     pairing.placements[other],
                 ),
             )
-        if self.lookup is None:
+        if self.grid is None:
             return best
         spheres, asked = self._asked(left_out)
-        return spheres.least_m(self.lookup, links.rotations[asked], links.translations[asked], best)
+        return spheres.least_m(self.grid, links.rotations[asked], links.translations[asked], best)
 
     def _asked(self, left_out: frozenset[str]) -> tuple[BoundingSpheres, list[int]]:
         """The bounding spheres of the links that move, but for some; and which links these are."""
@@ -198,28 +202,28 @@ class Surroundings:
         solids = [
             *self.links,
             *(self.objects[name] for name in known),
-            *(item.solid for item in self.static),
+            *(solid for solid, _, _ in self.static),
         ]
         names: list[Pair] = []
         bodies: list[tuple[int, int]] = []
-        for other, item in enumerate(self.static, start=first):
-            links = self._mobile if item.body == TABLE else range(num_links)
+        for other, (solid, number, _) in enumerate(self.static, start=first):
+            links = self._mobile if solid.body == TABLE else range(num_links)
             for index in (*links, *movers):
                 piece = index if index < num_links else -1
-                names.append((solids[index].body, piece, item.body, item.piece))
+                names.append((solids[index].body, piece, solid.body, number))
                 bodies.append((index, other))
         for other, name in enumerate(known, start=num_links):
             names += [(link.body, index, name, 0) for index, link in enumerate(self.links)]
             bodies += [(index, other) for index in range(num_links)]
         near = NearPairs(solids, bodies)
-        for index, item in enumerate(self.static, start=first):
-            near.R[index], near.t[index] = item.T[:3, :3], item.T[:3, 3]
+        for index, (_, _, T) in enumerate(self.static, start=first):
+            near.R[index], near.t[index] = T[:3, :3], T[:3, 3]
         pairing = _Pairing(
             near=near,
             names=names,
             bodies=bodies,
             shapes=[solid.shape for solid in solids],
-            placements=[None] * first + [placement_of(item.T) for item in self.static],
+            placements=[None] * first + [placement_of(T) for _, _, T in self.static],
         )
         self._pairings[known, moved] = pairing
         return pairing
@@ -239,19 +243,15 @@ class Surroundings:
                 R, t = self._hulls.rotations[index], self._hulls.translations[index]
                 gap = float(np.linalg.norm(R @ link.centre + t - centre)) - radius - link.radius_m
                 if gap < self._eps_m:
-                    planes = planes_of(self._hulls)[index]
-                    found[link.body, index, name, 0] = planes.distance_m(nodes, R, t)
-                else:
-                    found[link.body, index, name, 0] = gap
+                    gap = distance_to_planes_m(planes_of(self._hulls)[index], nodes, R, t)
+                found[link.body, index, name, 0] = gap
         for name, nodes in moved_m.items():
             found[name, -1, TABLE, 0] = float(nodes[:, 2].min()) - self._table_height_m
-            if self._panels:
-                panels = self._R_panel_base, self._p_panel_base, self._half_m
-                distances = distances_to_boxes_m(nodes, *panels).tolist()
-                for (container, piece, _), distance in zip(self._panels, distances, strict=True):
-                    found[name, -1, container, piece] = distance
-            if self.lookup is not None:
-                found[name, -1, SCENE, 0] = float(self.lookup.distance(nodes).min())
+            distances = distances_to_boxes_m(nodes, [panel for _, _, panel in self._panels])
+            for (container, piece, _), distance in zip(self._panels, distances, strict=True):
+                found[name, -1, container, piece] = float(distance)
+            if self.grid is not None:
+                found[name, -1, SCENE, 0] = float(grid_distances_m(self.grid, nodes).min())
         return found
 
     def closest_points(
@@ -268,10 +268,10 @@ class Surroundings:
         if other == TABLE:
             p = own_m[own_m[:, 2].argmin()]
             return p, np.array([p[0], p[1], self._table_height_m])
-        if other == SCENE and self.lookup is not None:
+        if other == SCENE and self.grid is not None:
             fine_m = FINE_M if index < 0 else ARM_FINE_M
             spread_m = own_m if is_soft else surface_points(own_m, fine_m)
-            return _nearest_in_grid(self.lookup, spread_m)
+            return _nearest_in_grid(self.grid, spread_m)
         panel = next((box for name, at, box in self._panels if (name, at) == (other, piece)), None)
         if panel is None:
             other_m, other_is_soft = self._points_of(other, -1, Ts_base_object, nodes_m)
@@ -307,10 +307,10 @@ class Surroundings:
 
     def _to_scene(self, moved: Sequence[str], Ts_base_object: Poses) -> dict[Pair, float]:
         """Distances to the unmodelled scene: of every link that moves, and of moved objects."""
-        if self.lookup is None or self._link_spheres is None:
+        if self.grid is None or self._link_spheres is None:
             return {}
         R, t = self._hulls.rotations, self._hulls.translations
-        links = self._link_spheres.distances_m(self.lookup, R[self._mobile], t[self._mobile])
+        links = self._link_spheres.distances_m(self.grid, R[self._mobile], t[self._mobile])
         found: dict[Pair, float] = {
             (self.links[index].body, index, SCENE, 0): distance
             for index, distance in zip(self._mobile, links.tolist(), strict=True)
@@ -320,7 +320,7 @@ class Surroundings:
             if spheres is not None:
                 T = Ts_base_object[name][None]
                 R, t = np.ascontiguousarray(T[:, :3, :3]), np.ascontiguousarray(T[:, :3, 3])
-                found[name, -1, SCENE, 0] = float(spheres.distances_m(self.lookup, R, t)[0])
+                found[name, -1, SCENE, 0] = float(spheres.distances_m(self.grid, R, t)[0])
         return found
 
 
@@ -339,14 +339,14 @@ def _nearest_node(
 
 
 def _nearest_in_grid(
-    lookup: GridLookup, points_m: Float[np.ndarray, "num_points 3"]
+    grid: SdfGrid, points_m: Float[np.ndarray, "num_points 3"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """The point that is nearest to a grid's surface, and that surface along the slope there."""
-    distances = lookup.distance(points_m)
+    distances = grid_distances_m(grid, points_m)
     p = points_m[distances.argmin()]
-    steps = np.concatenate([np.eye(3), -np.eye(3)]) * lookup.voxel_m / 2
-    ahead = lookup.distance(p + steps)
-    slope = (ahead[:3] - ahead[3:]).astype(np.float64)
+    steps = np.concatenate([np.eye(3), -np.eye(3)]) * grid.voxel_m / 2
+    ahead = grid_distances_m(grid, p + steps)
+    slope = ahead[:3] - ahead[3:]
     length = float(np.linalg.norm(slope))
     toward = slope / length if length > 0 else slope
     return p, p - float(distances.min()) * toward
@@ -367,7 +367,7 @@ def posture_clearance(
     hulls, and says ``up_to_m`` of what is farther: 0 is enough for the sign, and much faster.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
-    links, gripper = own_links(hulls), hulls.robot.record.gripper
+    links_touch, gripper = own_links_touch(hulls), hulls.robot.record.gripper
     hand = frozenset(gripper.links)
 
     def margin_m(
@@ -377,7 +377,7 @@ def posture_clearance(
 
     def one(joints_rad: Float[np.ndarray, " num_joints"]) -> float:
         hulls.place(joints_rad, gripper.max_width_m)
-        if links.touch():
+        if links_touch():
             return hulls.self_distance().distance_m
         return around.least_m(hand, config.eps_col_m + up_to_m) - config.eps_col_m
 

@@ -41,7 +41,7 @@ public:
         }
     }
 
-    // Trilinear; beyond the grid as if all solid were inside of it (see GridLookup.at).
+    // Trilinear; beyond the grid, e from its nearest point with d: sqrt(d^2 + e^2), or inside d + e.
     double at(const double* point) const {
         constexpr double kUnturned[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1}, kHere[3] = {0, 0, 0};
         double distance = 0.0;

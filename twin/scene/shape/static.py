@@ -39,7 +39,7 @@ MAX_VIEWS = 40
 """More views than this are thinned out evenly."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class StaticSdf:
     """The static scene as distances."""
 

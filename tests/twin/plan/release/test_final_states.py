@@ -11,7 +11,6 @@ from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import ObjectModel, Task, load_task
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.constrain.distances import scene_grid
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.problem import Grasp, Miss, NoPlanError, Problem, Release, Shape, State
 from twin.plan.release.final_states import final_states
@@ -19,6 +18,7 @@ from twin.plan.release.obstacles import hand_points, obstacles_of
 from twin.plan.release.resting import lying_there, orientations, target_of
 from twin.plan.stage.solver import perturbed
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
+from twin.replay.clearance.surroundings import scene_grid
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of, signed_distance
 from twin.robot.model import load_robot
@@ -131,7 +131,7 @@ def test_the_static_grid_is_made_thicker_by_its_own_error() -> None:
     assert tuple(obstacles) == (TABLE, "box", SCENE)
     T = upright(0.5, 0.25, 0.2)[None]
     distance = obstacles[SCENE](np.zeros((1, 3)), T)[0]
-    grid = scene_grid(problem, hulls_of(problem.robot))
+    grid = scene_grid(problem.scene, hulls_of(problem.robot))
     assert grid is not None
     there = float(grid.distance(T[:, :3, 3])[0])
     assert distance == pytest.approx(there - np.sqrt(3) / 2 * voxel_m, abs=1e-6)

@@ -12,7 +12,7 @@ from scripted_plans import joints_over
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.task.plan import Stage
-from twin.replay.clearance.bodies import planes_of
+from twin.replay.clearance.bodies import distance_to_planes_m, planes_of
 from twin.replay.clearance.monitor import ClearanceMonitor, State, allowed_pairs, object_travel_m
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
@@ -88,14 +88,14 @@ def test_corners_of_a_placed_hull_lie_on_it_and_its_middle_inside() -> None:
         R = se3.rotation_from_quaternion(rng.normal(size=4))
         t = rng.normal(size=3)
         for corner in hull.points_m[::7]:
-            found = planes.distance_m((R @ corner + t)[None], R, t)
+            found = distance_to_planes_m(planes, (R @ corner + t)[None], R, t)
             assert found == pytest.approx(0.0, abs=1e-6)
         middle = hull.points_m.mean(axis=0)
-        assert planes.distance_m((R @ middle + t)[None], R, t) < 0
-        normal, offset = planes.normals[0], planes.offsets_m[0]
+        assert distance_to_planes_m(planes, (R @ middle + t)[None], R, t) < 0
+        normal, offset = planes[0, :3], planes[0, 3]
         face = middle - (normal @ middle + offset) * normal  # above the face, seen from the middle
         outside = R @ (face + 0.05 * normal) + t
-        assert planes.distance_m(outside[None], R, t) >= 0.05 - 1e-9
+        assert distance_to_planes_m(planes, outside[None], R, t) >= 0.05 - 1e-9
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,14 @@ from scripted_plans import joints_over
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, own_links, planes_of
-from twin.replay.clearance.bounding_spheres import bounding_spheres_of
-from twin.replay.clearance.distance_grid import GridLookup
+from twin.replay.clearance.bodies import (
+    SCENE,
+    distance_to_planes_m,
+    distances_to_boxes_m,
+    own_links_touch,
+    planes_of,
+)
+from twin.replay.clearance.bounding_spheres import bounding_spheres_of, grid_distances_m
 from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
 from twin.replay.clearance.static_obstacles import unmodelled_obstacles
 from twin.replay.clearance.surroundings import Surroundings, posture_clearance
@@ -269,20 +274,20 @@ def test_a_finger_in_a_soft_body_is_as_deep_as_its_nodes_say(
     index = next(i for i, hull in enumerate(hulls.hulls) if hull.link == "gripper_base")
     lone = np.array([[0.0, 0.0, 0.2]])  # above the box of the gripper's base, in its own frame
     R, t = hulls.rotations[index], hulls.translations[index]
-    assert planes_of(hulls)[index].distance_m(lone @ R.T + t, R, t) == pytest.approx(0.12)
+    planes = planes_of(hulls)[index]
+    assert distance_to_planes_m(planes, lone @ R.T + t, R, t) == pytest.approx(0.12)
 
 
 def test_distances_of_points_to_a_box_are_exact() -> None:
     T = se3.transform_from(np.array([0.9, 0.1, 0.2, 0.3]), np.array([0.1, 0.2, 0.3]))
-    T_box_base = np.stack([se3.invert(T), np.eye(4)])
-    half = np.array([[0.1, 0.05, 0.2], [1.0, 1.0, 1.0]])
+    boxes = [(T, np.array([0.2, 0.1, 0.4])), (np.eye(4), np.full(3, 2.0))]
     for local, expected in (
         ([0.2, 0.0, 0.0], 0.1),
         ([0.13, 0.09, 0.0], 0.05),
         ([0.0, 0.03, 0.0], -0.02),
     ):
         points = se3.apply(T, np.array([local, [5.0, 5.0, 5.0]]))
-        found = distances_to_boxes_m(points, T_box_base[:, :3, :3], T_box_base[:, :3, 3], half)
+        found = distances_to_boxes_m(points, boxes)
         assert found[0] == pytest.approx(expected)
         assert found[1] == pytest.approx(np.abs(points[0]).max() - 1.0), "the box at the base"
 
@@ -326,7 +331,7 @@ def test_a_posture_is_as_clear_as_the_nearest_of_all_its_distances(
     post: Box = ((0.45, -0.25, 0.3), (0.06, 0.06, 0.6))
     scene = replace(script.scene(), static_sdf=static_of(POST, post))
     gripper = hulls.robot.record.gripper.links
-    around, links = Surroundings(scene, hulls, config.eps_col_m), own_links(hulls)
+    around, links_touch = Surroundings(scene, hulls, config.eps_col_m), own_links_touch(hulls)
     margin_m = posture_clearance(scene, hulls, config)
     capped_m = posture_clearance(scene, hulls, config, up_to_m=0.03)
     sign = posture_clearance(scene, hulls, config, up_to_m=0.0)
@@ -336,7 +341,7 @@ def test_a_posture_is_as_clear_as_the_nearest_of_all_its_distances(
         assert (float(sign(joints[None])[0]) < 0) == (found < 0)
         assert float(capped_m(joints[None])[0]) == pytest.approx(min(found, 0.03), abs=1e-12)
         hulls.place(joints, hulls.robot.record.gripper.max_width_m)
-        if links.touch():
+        if links_touch():
             continue
         distances, _ = around.measure({}, [], near_m=9.0, counts=lambda body, other: True)
         arm = [d for (body, *_), d in distances.items() if body not in gripper]
@@ -366,7 +371,7 @@ def test_lookups_are_those_of_the_grid_and_beyond_it_never_too_large() -> None:
     rng = np.random.default_rng(4)
     grid = replace(static_of(POST).observed, closed=True)
     points = rng.uniform([-0.6, -0.8, -0.1], [1.0, 0.8, 0.7], (4000, 3))
-    found, known = GridLookup(grid).distance(points), grid.distance(points)
+    found, known = grid_distances_m(grid, points), grid.distance(points)
     end = grid.origin_m + VOXEL_M * (np.array(grid.values_m.shape) - 1)
     held = np.clip(points, grid.origin_m, end)
     alike = (grid.distance(held) > 0) | (held == points).all(axis=1)

@@ -40,12 +40,12 @@ def every_distance(
         *((link.body, link.shape, p) for link, p in zip(around.links, hulls.placements)),  # noqa: B905
         *((name, *cube) for name, cube in cubes.items()),
     ]
-    for item in around.static:
+    for solid, _, T in around.static:
         for body, shape, placed in movers:
-            if item.body == TABLE and body in ("base_link", "shoulder_link"):
+            if solid.body == TABLE and body in ("base_link", "shoulder_link"):
                 continue
-            distance = signed_distance(shape, placed, item.solid.shape, placement_of(item.T))
-            note(body, item.body, distance)
+            distance = signed_distance(shape, placed, solid.shape, placement_of(T))
+            note(body, solid.body, distance)
     return found
 
 

@@ -9,10 +9,10 @@ import pytest
 from bridge.robots.default import ROBOT
 from bridge.task.predicate import evaluate_success
 from bridge.task.task_file import SoftMaterial
-from twin.replay.comparison import recorded_findings
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import path_of_execution
 from twin.replay.result import ReplayResult
+from twin.replay.run_job import recorded_findings
 from twin.replay.scene import StartState
 from twin.replay.trace import Recording, states_of_recording, trace_of_recording
 from twin.replay.verdict import replay_plan

@@ -12,8 +12,8 @@ from twin.physics.soft_world import SoftWorld
 from twin.physics.world import World
 from twin.replay.clearance.monitor import allowed_pairs
 from twin.replay.config import ReplayConfig
-from twin.replay.dynamics import Burst, burst_of, outline_m, soft_models
-from twin.replay.result import ReplayResult
+from twin.replay.dynamics import burst_of, outline_m, soft_models
+from twin.replay.result import Burst, ReplayResult
 from twin.replay.verdict import replay_plan, terminal_factor
 
 CONFIG = ReplayConfig()
@@ -53,7 +53,7 @@ def placed(script: SimpleNamespace) -> tuple[ReplayResult, object]:
 
 
 def judged(result: ReplayResult, scene: object, burst: Burst | None = None) -> object:
-    return terminal_factor(result, scene, CONFIG, unreachable_ns=None, burst=burst)
+    return terminal_factor(replace(result, burst=burst), scene, CONFIG, unreachable_ns=None)
 
 
 def test_a_sound_toy_in_the_basket_passes(placed: tuple[ReplayResult, object]) -> None:

@@ -17,8 +17,7 @@ from bridge.task.task_file import load_task
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import NotEvaluatedError
-from twin.replay.job import ReplayJob
-from twin.replay.job_row import row_of_failure
+from twin.replay.job import ReplayJob, row_of_failure
 from twin.replay.path import UnusablePlanError
 from twin.replay.result import ReplayResult
 from twin.replay.scene import StartState

@@ -8,14 +8,15 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.replay.config import ReplayConfig, VariationConfig
-from twin.replay.monte_carlo import Variation, draw_variation, sample_rng
+from twin.replay.config import ReplayConfig
+from twin.replay.monte_carlo import draw_variation, sample_rng
 from twin.replay.scene import ReplayScene
 
 
-def draws(scene: ReplayScene, count: int) -> list[Variation]:
-    config = ReplayConfig(variation=VariationConfig())
-    return [draw_variation(sample_rng(0, "start", k), scene, config) for k in range(count)]
+def draws(scene: ReplayScene, count: int) -> list[ReplayScene]:
+    return [
+        draw_variation(sample_rng(0, "start", k), scene, ReplayConfig())[0] for k in range(count)
+    ]
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -71,7 +72,7 @@ def test_mass_and_stiffness_of_a_soft_body_are_independent() -> None:
     T = np.eye(4)
     T[2, 3] = task.objects["sloth"].rest_height_m
     scene = ReplayScene(task=task, Ts_base_object={"sloth": T}, urdf="")
-    found = [draw.objects["sloth"] for draw in draws(scene, 400)]
+    found = [draw.task.objects["sloth"] for draw in draws(scene, 400)]
     assert found[0].soft is not None
     masses = np.log([model.mass_kg for model in found])
     stiffnesses = np.log([model.soft.young_pa for model in found if model.soft is not None])

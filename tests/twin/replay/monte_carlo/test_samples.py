@@ -18,12 +18,10 @@ from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.replay.config import UNKNOWN_POSE_M, ReplayConfig, ReplayRunConfig, VariationConfig
 from twin.replay.monte_carlo import (
-    Sample,
     draw_variation,
     given_upright,
-    replay_samples,
     sample_rng,
-    with_probability,
+    with_samples,
 )
 from twin.replay.path import path_of_plan
 from twin.replay.rebuilt_scene import calibrated
@@ -37,12 +35,14 @@ CORRELATED[0, 1] = CORRELATED[1, 0] = 4e-6
 
 
 def scene_with(script: SimpleNamespace, covariance: np.ndarray | None = CORRELATED) -> ReplayScene:
-    scene = script.scene()
+    scene: ReplayScene = script.scene()
     spreads = {} if covariance is None else dict.fromkeys(scene.Ts_base_object, covariance)
     return replace(scene, covariances=spreads)
 
 
-def draws(scene: ReplayScene, count: int, **settings: Any) -> list[Any]:
+def draws(
+    scene: ReplayScene, count: int, **settings: Any
+) -> list[tuple[ReplayScene, ReplayConfig]]:
     config = ReplayConfig(variation=VariationConfig(**settings))
     return [draw_variation(sample_rng(0, "start", k), scene, config) for k in range(count)]
 
@@ -66,7 +66,7 @@ def test_what_stands_goes_on_standing_and_moves_as_far_as_localisation_is_unsure
 ) -> None:
     scene = scene_with(script)
     T = scene.Ts_base_object["cube"]
-    moved = np.array([draw.Ts_base_object["cube"] for draw in draws(scene, 800)])
+    moved = np.array([there.Ts_base_object["cube"] for there, _ in draws(scene, 800)])
     np.testing.assert_array_equal(moved[:, 2, 3], T[2, 3])
     np.testing.assert_allclose(moved[:, 2, 2], 1.0, atol=1e-12)
     shifts = moved[:, :2, 3] - T[:2, 3]
@@ -94,8 +94,8 @@ def test_a_cube_turned_by_a_quarter_is_the_same_cube(script: SimpleNamespace) ->
     scene = scene_with(script, anyhow)
     cube = scene.Ts_base_object["cube"]
     turns = [
-        se3.rotation_angle_rad(cube[:3, :3].T @ draw.Ts_base_object["cube"][:3, :3])
-        for draw in draws(scene, 200)
+        se3.rotation_angle_rad(cube[:3, :3].T @ there.Ts_base_object["cube"][:3, :3])
+        for there, _ in draws(scene, 200)
     ]
     assert np.max(turns) <= np.pi / 4 + 1e-9
     assert np.max(turns) > 0.6
@@ -111,34 +111,33 @@ def test_a_toy_looks_different_from_every_side() -> None:
         urdf="",
         covariances={"sloth": np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 100.0])},
     )
-    yaws = [np.arctan2(*d.Ts_base_object["sloth"][(1, 0), 0]) for d in draws(scene, 200)]
+    yaws = [np.arctan2(*d.Ts_base_object["sloth"][(1, 0), 0]) for d, _ in draws(scene, 200)]
     assert stats.kstest(yaws, "uniform", args=(-np.pi, 2 * np.pi)).pvalue > 1e-3
 
 
 def test_without_a_covariance_the_prior_says_how_unsure_a_pose_is(script: SimpleNamespace) -> None:
     scene = scene_with(script, None)
-    moved = np.array([d.Ts_base_object["cube"] for d in draws(scene, 300)])
+    moved = np.array([d.Ts_base_object["cube"] for d, _ in draws(scene, 300)])
     assert np.std(moved[:, 0, 3]) == pytest.approx(UNKNOWN_POSE_M, rel=0.2)
 
 
 def test_physics_is_log_normal_around_what_the_nominal_replay_uses(script: SimpleNamespace) -> None:
     scene = scene_with(script)
     found = draws(scene, 600)
-    frictions = np.log([draw.physics.object_friction / 0.8 for draw in found])
+    frictions = np.log([config.physics.object_friction / 0.8 for _, config in found])
     assert stats.kstest(frictions / 0.2, "norm").pvalue > 1e-3
-    masses = np.log([draw.objects["cube"].mass_kg for draw in found])
+    masses = np.log([there.task.objects["cube"].mass_kg for there, _ in found])
     assert np.exp(np.median(masses)) == pytest.approx(scene.task.objects["cube"].mass_kg, rel=0.05)
-    assert all(draw.objects["box"] == scene.task.objects["box"] for draw in found)
-    delays = [draw.grip_delay_s for draw in found]
+    assert all(d.task.objects["box"] == scene.task.objects["box"] for d, _ in found)
+    delays = [config.grip_delay_s for _, config in found]
     assert stats.kstest(delays, "uniform", args=(0.0, 0.1)).pvalue > 1e-3
 
 
 def test_a_calibration_replaces_the_priors_of_what_it_identified(script: SimpleNamespace) -> None:
     found = draws(scene_with(script), 200, calibrated=(("object_friction", 0.01),))
-    assert np.std(np.log([d.physics.object_friction for d in found])) == pytest.approx(
-        0.01, rel=0.2
-    )
-    assert np.std(np.log([d.physics.finger_friction for d in found])) == pytest.approx(0.2, rel=0.2)
+    for friction, spread in (("object_friction", 0.01), ("finger_friction", 0.2)):
+        drawn = np.log([getattr(config.physics, friction) for _, config in found])
+        assert np.std(drawn) == pytest.approx(spread, rel=0.2)
 
 
 def test_the_same_start_draws_the_same_whatever_else_is_asked(script: SimpleNamespace) -> None:
@@ -148,7 +147,10 @@ def test_the_same_start_draws_the_same_whatever_else_is_asked(script: SimpleName
     first = [draw_variation(sample_rng(1, "a", k), scene, config) for k in (0, 1, 2)]
     again = [draw_variation(sample_rng(1, "a", k), scene, config) for k in (2, 1, 0)]
     for one, other in zip(first, reversed(again), strict=True):
-        assert one.to_record(config) == other.to_record(config)
+        assert one[1] == other[1]
+        assert one[0].task == other[0].task
+        for name, T in one[0].Ts_base_object.items():
+            np.testing.assert_array_equal(T, other[0].Ts_base_object[name])
     others = [sample_rng(2, "a", 0), sample_rng(1, "b", 0), sample_rng(1, "a", 1)]
     values = {rng.random() for rng in [sample_rng(1, "a", 0), *others]}
     assert len(values) == 4
@@ -158,42 +160,35 @@ def test_a_lost_object_does_not_change_what_the_others_draw(script: SimpleNamesp
     scene = scene_with(script)
     only = replace(scene, Ts_base_object={"cube": scene.Ts_base_object["cube"]})
     config = ReplayConfig()
-    whole = draw_variation(sample_rng(0, "s", 0), scene, config)
-    part = draw_variation(sample_rng(0, "s", 0), only, config)
+    whole, _ = draw_variation(sample_rng(0, "s", 0), scene, config)
+    part, _ = draw_variation(sample_rng(0, "s", 0), only, config)
     np.testing.assert_array_equal(whole.Ts_base_object["cube"], part.Ts_base_object["cube"])
     assert set(part.Ts_base_object) == {"cube"}
 
 
-def asked(script: SimpleNamespace, replay: Any, count: int, **more: Any) -> tuple[Sample, ...]:
-    return replay_samples(
-        replay,
-        scene_with(script),
-        ReplayConfig(samples=count),
-        plan_id="p",
-        identity="start",
-        **more,
-    )
-
-
-def test_every_sample_is_a_record_and_the_share_has_wilsons_interval(
-    script: SimpleNamespace,
-) -> None:
+def asked(scene: ReplayScene, answers: list[Any]) -> tuple[Any, list[tuple[ReplayScene, Any]]]:
+    """The success probability when varied replays answer so, and what was replayed."""
     seen: list[tuple[ReplayScene, ReplayConfig]] = []
 
-    def replay(scene: ReplayScene, config: ReplayConfig) -> Verdict:
-        seen.append((scene, config))
-        return verdict(len(seen) % 4 != 0)
+    def replay(there: ReplayScene, config: ReplayConfig) -> Verdict:
+        seen.append((there, config))
+        answer = answers[len(seen) - 1]
+        if isinstance(answer, GstError):
+            raise answer
+        return verdict(answer)
 
-    samples = asked(script, replay, 8)
-    assert [sample.index for sample in samples] == list(range(8))
-    assert [sample.accepted for sample in samples] == [True, True, True, False] * 2
-    assert samples[3].first_failing == "terminal"
-    for sample, (scene, config) in zip(samples, seen, strict=True):
-        record = sample.to_record()
-        assert record["variation"]["physics"]["grip_force_N"] == config.physics.grip_force_N
-        assert record["variation"]["mass_kg"]["cube"] == scene.task.objects["cube"].mass_kg
-        assert config.samples == 0
-    p = with_probability(verdict(True), samples).p_success
+    config = ReplayConfig(samples=len(answers))
+    p = with_samples(verdict(True), replay, scene, config, identity="start").p_success
+    return p, seen
+
+
+def test_every_sample_is_another_draw_and_the_share_has_wilsons_interval(
+    script: SimpleNamespace,
+) -> None:
+    p, seen = asked(scene_with(script), [True, True, True, False] * 2)
+    assert len({there.task.objects["cube"].mass_kg for there, _ in seen}) == 8
+    assert len({config.physics.grip_force_N for _, config in seen}) == 8
+    assert all(config.samples == 0 for _, config in seen)
     # Wilson (1927), by hand: centre (k + z2/2) / (n + z2), n = 8, k = 6.
     z2 = stats.norm.ppf(0.975) ** 2
     centre, half = (6 + z2 / 2) / (8 + z2), np.sqrt(z2 * (6 * 2 / 8 + z2 / 4)) / (8 + z2)
@@ -208,32 +203,18 @@ def test_every_sample_is_a_record_and_the_share_has_wilsons_interval(
 
 @given(st.lists(st.sampled_from([True, False, None]), max_size=30))
 def test_the_interval_holds_the_share_and_undecided_is_no_success(said: list[bool | None]) -> None:
-    samples = [
-        Sample(plan_id="p", index=k, variation={}, accepted=a, first_failing=None, reason=None)
-        for k, a in enumerate(said)
-    ]
-    p = with_probability(verdict(True), samples).p_success
+    p, _ = asked(ReplayScene(task=load_task("cube_into_box"), Ts_base_object={}, urdf=""), said)
     if not said:
         assert p is None
         return
-    assert p is not None
     assert p["k"] == said.count(True)
     assert p["n"] == len(said)
     assert 0 <= p["low"] <= p["value"] <= p["high"] <= 1
 
 
 def test_a_variation_that_cannot_be_replayed_costs_only_itself(script: SimpleNamespace) -> None:
-    answers = iter([verdict(True), TwinError("the cube lies inside the box"), verdict(True)])
-
-    def replay(scene: ReplayScene, config: ReplayConfig) -> Verdict:
-        answer = next(answers)
-        if isinstance(answer, GstError):
-            raise answer
-        return answer
-
-    samples = asked(script, replay, 3)
-    assert [sample.accepted for sample in samples] == [True, None, True]
-    assert samples[1].reason == "the cube lies inside the box"
+    p, seen = asked(scene_with(script), [True, TwinError("the cube lies inside the box"), True])
+    assert (p["k"], p["n"], len(seen)) == (2, 3, 3)
 
 
 def test_a_late_gripper_lags_behind_the_arm(script: SimpleNamespace) -> None:

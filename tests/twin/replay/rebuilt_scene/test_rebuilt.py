@@ -13,7 +13,7 @@ from twin.npz import UnreadableArraysError
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.replay.config import ReplayConfig
-from twin.replay.rebuilt_scene import TASK_SHAPE, calibrated, read_rebuilt_scene, shape_hashes
+from twin.replay.rebuilt_scene import calibrated, read_rebuilt_scene, shape_hashes
 from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
@@ -56,13 +56,12 @@ def write_object(run: RunFolder, *, watertight: bool) -> None:
 def test_without_a_scene_the_task_file_says_everything(tmp_path: Path) -> None:
     place = read_rebuilt_scene(RunFolder.create(tmp_path / "run"), TASK)
     assert (place.scene_hash, place.static_sdf, dict(place.lattices)) == (None, None, {})
-    assert set(place.shape_sources.values()) == {TASK_SHAPE}
 
 
 def test_the_lattice_of_the_scene_is_taken_and_named(run: RunFolder) -> None:
     place = read_rebuilt_scene(run, TASK)
     assert place.scene_hash == "abc"
-    assert place.shape_sources["sloth"].startswith("lattice of the scene")
+    assert not any("sloth" in note for note in place.notes)
     body = SoftModel.from_lattice(place.lattices["sloth"], TASK.objects["sloth"])
     assert len(body.nodes_m) == len(SoftModel.from_task(TASK.objects["sloth"]).nodes_m)
     assert any("sdf.npz" in note for note in place.notes)
@@ -72,21 +71,21 @@ def test_a_mesh_that_is_not_watertight_is_not_believed(run: RunFolder) -> None:
     write_object(run, watertight=False)
     place = read_rebuilt_scene(run, TASK)
     assert not place.lattices
-    assert "not watertight" in place.shape_sources["sloth"]
+    assert "not watertight" in place.notes[0]
 
 
 def test_a_lattice_of_another_size_is_another_body(run: RunFolder) -> None:
     lattice_of_task(stretch=1.5).save(run.scene_dir / "objects" / "sloth" / "soft.npz")
     place = read_rebuilt_scene(run, TASK)
     assert not place.lattices
-    assert "% off)" in place.shape_sources["sloth"]
+    assert "% off)" in place.notes[0]
 
 
 def test_a_damaged_lattice_is_passed_over_with_the_reason(run: RunFolder) -> None:
     (run.scene_dir / "objects" / "sloth" / "soft.npz").write_bytes(b"no arrays")
     place = read_rebuilt_scene(run, TASK)
     assert not place.lattices
-    assert "soft.npz" in place.shape_sources["sloth"]
+    assert "soft.npz" in place.notes[0]
     assert any("sloth: shape of the task file" in note for note in place.notes)
 
 

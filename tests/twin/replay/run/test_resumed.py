@@ -5,15 +5,13 @@ from dataclasses import replace
 
 import pytest
 
-from bridge.episode import schema, streams
+from bridge.episode import streams
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
-from bridge.task.record import parse_record
 from twin.replay import runner
 from twin.replay.config import ReplayConfig
-from twin.replay.job import ReplayJob
-from twin.replay.job_row import row_of_existing
+from twin.replay.job import ReplayJob, row_of_existing
 from twin.replay.run_job import run_job
 from twin.replay.runner import there_already
 from twin.replay.summary import count_verdicts, describe_run
@@ -58,7 +56,6 @@ def test_settings_of_samples_name_another_file(jobs: list[ReplayJob]) -> None:
 
 @pytest.mark.slow
 def test_what_a_killed_replay_left_is_made_again_and_whole(jobs: list[ReplayJob]) -> None:
-    """With its varied replays as records beside the verdict, in the same file."""
     job = replace(jobs[0], config=replace(QUICK, samples=1))
     part = job.path().with_name(job.path().name + ".part")
     writer = EpisodeWriter(job.path())
@@ -74,15 +71,10 @@ def test_what_a_killed_replay_left_is_made_again_and_whole(jobs: list[ReplayJob]
     assert again["skipped"]
     assert again == {**row, "skipped": True}
     episode = Episode.open(job.path())
-    (sample,) = [
-        parse_record(message.data, name="sample")
-        for message in episode.messages(episode.topics_of_type(schema.SAMPLE))
-    ]
-    assert (sample["plan_id"], sample["index"]) == ("a", 0)
     ((_, verdict),) = streams.verdicts(episode)
     assert verdict.p_success == row["p_success"]
     assert verdict.p_success is not None
-    assert (verdict.p_success["k"], verdict.p_success["n"]) == (int(sample["accepted"]), 1)
+    assert verdict.p_success["n"] == 1
     assert "varied replays that succeed:" in describe_run(
         {"rows": [row], "counts": count_verdicts([row])}
     )

@@ -3,23 +3,15 @@
 from typing import Any
 
 from bridge.task.verdict import Factor, Verdict
-from twin.replay.job_row import predicates_hold
-from twin.replay.summary import (
-    EXECUTED,
-    PLANNED,
-    SEEN,
-    against_recorded,
-    count_verdicts,
-    cross_table,
-    describe_run,
-    executions_of,
-)
+from twin.replay.job import predicates_hold
+from twin.replay.summary import against_recorded, count_verdicts, describe_run
 
 
 def row(episode: str, trajectory: str, accepted: bool | None, **more: Any) -> dict[str, Any]:
     return {
         "episode": episode, "plan": "p", "trajectory": trajectory, "mode": "dynamic",
-        "executed": True, "accepted": accepted, "error": None, "reason": "r", "skipped": False,
+        "executed": True, "task": "t", "accepted": accepted, "predicates": None, "error": None,
+        "reason": "r", "skipped": False,
         **more,
     }  # fmt: skip
 
@@ -41,22 +33,8 @@ LABELS = {"a": "success", "b": "failure", "c": "unknown"}
 
 
 def summary() -> dict[str, Any]:
-    return {"rows": ROWS, "counts": count_verdicts(ROWS), "executions": executions_of(ROWS, LABELS)}
-
-
-def test_an_executed_plan_has_one_line_with_every_side() -> None:
-    first, second = executions_of(ROWS, LABELS)
-    assert (first["recorded"], first["recorded_predicates"]) == ("success", True)
-    assert (first["planned"], first["executed"], first["divergence"]) == (True, True, None)
-    assert (second["planned"], second["executed"]) == (True, False)
-    assert second["divergence"]["attribution"] == "perception"
-
-
-def test_a_plan_that_was_never_executed_is_in_no_cross_table() -> None:
-    table = cross_table(executions_of(ROWS, LABELS))
-    assert table[PLANNED]["accepted"] == {"success": 1, "failure": 1, "unknown": 0}
-    assert table[EXECUTED]["rejected"] == {"success": 0, "failure": 1, "unknown": 0}
-    assert sum(sum(cells.values()) for cells in table[PLANNED].values()) == 2
+    told = against_recorded(ROWS, LABELS)
+    return {"rows": ROWS, "counts": count_verdicts(ROWS), "against_recorded": told}
 
 
 def test_the_text_holds_the_tables_and_where_things_part() -> None:
@@ -64,17 +42,21 @@ def test_the_text_holds_the_tables_and_where_things_part() -> None:
     assert "planned dynamic, never executed" in text
     assert "b p: 2.34 s: only as planned in the twin (perception), lag 60 ms" in text
     assert "a p: nowhere, lag 50 ms" in text
+    told = "planned in twin 1 of 2, executed in twin 2 of 2, executed as seen 1 of 1"
+    assert f"t, as the operator's labels say: {told}" in text
 
 
-def test_what_was_seen_is_held_against_the_label_too() -> None:
-    tables = against_recorded(executions_of(ROWS, LABELS))
-    assert list(tables) == [""], "rows of one task"
-    assert tables[""]["counts"][SEEN]["accepted"] == {"success": 1, "failure": 0, "unknown": 0}
-    assert tables[""]["agreement"] == {
-        PLANNED: {"k": 1, "n": 2},
-        EXECUTED: {"k": 2, "n": 2},
-        SEEN: {"k": 1, "n": 1},
+def test_what_was_never_executed_labelled_or_decided_is_held_against_nothing() -> None:
+    unlabelled = {"a": "success", "b": "unknown"}
+    assert against_recorded(ROWS, unlabelled) == {
+        "t": {
+            "planned in twin": {"k": 1, "n": 1},
+            "executed in twin": {"k": 1, "n": 1},
+            "executed as seen": {"k": 1, "n": 1},
+        }
     }
+    open_rows = [{**each, "accepted": None, "predicates": None} for each in ROWS]
+    assert against_recorded(open_rows, LABELS) == {}
 
 
 def test_every_answer_that_is_no_yes_is_listed_with_its_reason_once() -> None:

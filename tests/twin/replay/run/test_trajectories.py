@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import string_to_cdr
-from bridge.episode.metadata import SAME_ENGINE_KEY, SECOND_ENGINE_KEY, EpisodeInfo
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
@@ -23,10 +23,9 @@ from bridge.terminal import Output
 from twin.replay import run_job as run_job_module
 from twin.replay import runner as runner_module
 from twin.replay.config import ReplayConfig, ReplayRunConfig
-from twin.replay.job import ReplayJob
-from twin.replay.job_row import divergence_of, row_of_failure
+from twin.replay.job import ReplayJob, divergence_of, row_of_failure
 from twin.replay.result import ReplayResult
-from twin.replay.runner import Execution, execution_of, replay_run
+from twin.replay.runner import execution_of, replay_run
 from twin.replay.scene import StartState, StartStates
 from twin.replay.summary import describe_run
 from twin.scene.localise.episode import Phase
@@ -110,10 +109,9 @@ def test_every_plan_and_every_execution_becomes_one_episode(
     assert summary["scene_hash"] is None
     assert len(run.derived("*.replay.*")) == 4
     _check_file(run, "trial_0001.replay.planned.dynamic.round-1.pybullet.*")
-    (execution,) = summary["executions"]
-    assert (execution["planned"], execution["executed"]) == (True, True)
-    assert execution["recorded"] == "unknown", "nobody labelled it"
-    assert execution["lag_s"] is not None, "compared with the plan, replayed before"
+    assert summary["against_recorded"] == {}, "nobody labelled it"
+    (told,) = [row["divergence"] for row in summary["rows"] if row["divergence"]]
+    assert told["lag_s"] is not None, "compared with the plan, replayed before"
     (path,) = run.derived("trial_0001.replay.executed.dynamic.*")
     record = divergence_of(Episode.open(path))
     assert record is not None
@@ -174,42 +172,20 @@ def _check_file(run: RunFolder, pattern: str) -> None:
 
 
 @pytest.mark.slow
-def test_both_engines_write_an_episode_each_and_the_first_decides(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = ReplayRunConfig(replay=replace(QUICK, engine="both"))
-    summary = replay_run(run, config, QUIET)
+def test_what_the_cells_own_engine_says_is_shown_and_marked(run: RunFolder) -> None:
+    summary = replay_run(run, ReplayRunConfig(replay=replace(QUICK, engine="mujoco")), QUIET)
     dynamic = [row for row in summary["rows"] if row["mode"] == "dynamic"]
     assert len(dynamic) == 3
     for row in dynamic:
         assert row["accepted"] is True
-        assert row["engines"] == ["pybullet", "mujoco"]
-        assert row["engines_disagree"] is None
-        assert ".pybullet." in row["file"]
-    assert "engines agree on 3 of 3 replays" in describe_run(summary)
-    for engine, marks in (
-        ("pybullet", {}),
-        ("mujoco", {SAME_ENGINE_KEY: True, SECOND_ENGINE_KEY: True}),
-    ):
-        paths = run.derived(f"trial_0001.replay.*.dynamic.*.{engine}.*")
-        assert len(paths) == 3
-        for path in paths:
-            episode = Episode.open(path)
-            ((_, verdict),) = streams.verdicts(episode)
-            assert episode.derived is not None
-            assert verdict.engine == episode.derived.engine
-            assert str(verdict.engine).startswith(f"{engine}-")
-            keys = (SAME_ENGINE_KEY, SECOND_ENGINE_KEY)
-            settings = episode.derived.settings
-            assert {key: settings[key] for key in keys if key in settings} == marks
-            assert (SAME_ENGINE in verdict.warnings) is bool(marks)
-    again = replay_run(run, config, QUIET)
-    assert all(row["skipped"] for row in again["rows"])
-    run.derived("*.mujoco.*")[0].unlink()
-    done: list[ReplayJob] = []
-    monkeypatch.setattr(runner_module, "run_job", lambda job: done.append(job) or dynamic[0])
-    replay_run(run, config, QUIET)
-    assert len(done) == 1, "an engine's episode that is missing is made again"
+        assert ".mujoco." in row["file"]
+        episode = Episode.open(run.derived_dir / row["file"])
+        ((_, verdict),) = streams.verdicts(episode)
+        assert episode.derived is not None
+        assert verdict.engine == episode.derived.engine
+        assert str(verdict.engine).startswith("mujoco-")
+        assert SAME_ENGINE in verdict.warnings
+    assert SAME_ENGINE in describe_run(summary)
 
 
 def test_an_unknown_episode_lists_those_that_exist(run: RunFolder) -> None:
@@ -268,11 +244,11 @@ def marks(*said: str) -> list[dict[str, Any]]:
 def test_an_execution_without_an_end_of_its_own_is_no_plan_that_was_never_executed(
     said: str, interval: tuple[int, int] | None, problem: str
 ) -> None:
-    found = execution_of(marks(said), "a")
-    assert found.interval_ns == interval
-    assert problem in found.problem
-    assert bool(found.problem) is bool(problem)
-    assert execution_of(marks(said), "b") == Execution(interval_ns=None)
+    interval_ns, told = execution_of(marks(said), "a")
+    assert interval_ns == interval
+    assert problem in told
+    assert bool(told) is bool(problem)
+    assert execution_of(marks(said), "b") == (None, "")
 
 
 def test_a_recording_that_ends_while_the_robot_moves_says_so(

@@ -11,10 +11,9 @@ from bridge.task.plan import Plan, Stage
 from bridge.task.verdict import Factor, Verdict
 from twin.replay.checks import limited_to_task, stops_of_arm, task_failures
 from twin.replay.config import ReplayConfig
-from twin.replay.dynamics import States
 from twin.replay.motion import motion_failures
 from twin.replay.path import JointPath
-from twin.replay.result import ReplayResult
+from twin.replay.result import ReplayResult, States
 from twin.replay.verdict import REFUSED_BEFORE, replay_plan
 from twin.robot.model import load_robot
 

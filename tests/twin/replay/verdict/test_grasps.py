@@ -55,15 +55,19 @@ def carried(script: SimpleNamespace, turn_rad: float = 0.0) -> tuple[Plan, Repla
     return plan, result
 
 
+def seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict[str, object], ...]:
+    return grasps_seen(plan, path, result, result.Ts_base_tcp)
+
+
 def held(plan: Plan, result: ReplayResult, path: JointPath | None = None) -> bool:
-    (grasp,) = grasps_seen(plan, path_of(plan) if path is None else path, result)
+    (grasp,) = seen(plan, path_of(plan) if path is None else path, result)
     assert grasp["object"] == "cube"
     return bool(grasp["held"])
 
 
 def test_what_goes_along_with_the_hand_is_held_however_it_turns(script: SimpleNamespace) -> None:
     plan, result = carried(script, turn_rad=1.0)
-    (grasp,) = grasps_seen(plan, path_of(plan), result)
+    (grasp,) = seen(plan, path_of(plan), result)
     assert (grasp["touched"], grasp["held"]) == (True, True)
     assert grasp["p_object_m"] == pytest.approx([-0.03, 0.0, 0.0], abs=1e-6)
 
@@ -74,7 +78,7 @@ def test_what_is_let_go_before_the_hand_leaves_is_touched_and_not_held(
     plan, result = carried(script)
     before = result.stamps_ns < (LEAVES_S - 0.1) * 1e9
     brief = {"cube": result.finger_contact["cube"] & before}
-    (grasp,) = grasps_seen(plan, path_of(plan), replace(result, finger_contact=brief))
+    (grasp,) = seen(plan, path_of(plan), replace(result, finger_contact=brief))
     assert (grasp["touched"], grasp["held"]) == (True, False)
 
 
@@ -91,13 +95,13 @@ def test_what_is_touched_beside_the_object_that_is_grasped_is_no_grasp(
 ) -> None:
     plan, result = carried(script)
     stages = tuple(replace(stage, grasp=stage.grasp and "duck") for stage in plan.stages)
-    assert grasps_seen(replace(plan, stages=stages), path_of(plan), result) == ()
+    assert seen(replace(plan, stages=stages), path_of(plan), result) == ()
 
 
 def test_a_grasp_that_misses_is_neither_touched_nor_held(script: SimpleNamespace) -> None:
     plan, result = carried(script)
     nothing = {"cube": np.zeros(len(result.stamps_ns), dtype=bool)}
-    (grasp,) = grasps_seen(plan, path_of(plan), replace(result, finger_contact=nothing))
+    (grasp,) = seen(plan, path_of(plan), replace(result, finger_contact=nothing))
     assert (grasp["touched"], grasp["held"], grasp["p_object_m"]) == (False, False, None)
 
 

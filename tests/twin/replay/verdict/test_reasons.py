@@ -38,7 +38,7 @@ def at_rest(script: SimpleNamespace, scene: ReplayScene, **settings: object) -> 
 
 
 def terminal(scene: ReplayScene, result: ReplayResult) -> Factor:
-    return terminal_factor(result, scene, CONFIG, unreachable_ns=None, burst=None)
+    return terminal_factor(result, scene, CONFIG, unreachable_ns=None)
 
 
 def test_a_rejection_names_what_failed_and_nothing_that_held(script: SimpleNamespace) -> None:
