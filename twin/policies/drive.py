@@ -129,7 +129,8 @@ class KeyPage:
         self._count = 0
         self._told, self._prompt = "", ""
         self.allowed = (
-            "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'unsafe-inline'; "
+            "default-src 'none'; img-src 'self' data:; connect-src 'self'; "
+            "style-src 'unsafe-inline'; "
             f"script-src 'nonce-{self._token}'; frame-ancestors 'none'; base-uri 'none'"
         )
         page = self

@@ -7,6 +7,7 @@ nearest in time. Action: the plan's command for the next row, or the next row's 
 import fnmatch
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -316,15 +317,15 @@ def select_episodes(source: Path, config: LeRobotConfig) -> tuple[list[Path], li
     files = {path.stem: path for path in RunFolder.open(source).episodes()}
     if config.episodes:
         files |= {path.stem: path for path in RunFolder(source).derived(f"*.{ROLLOUT}.*")}
-        chosen = [(name, fnmatch.filter(files, name)) for name in config.episodes]
-        absent = [name for name, found in chosen if not found]
+        wanted = {name: fnmatch.filter(files, name) for name in config.episodes}
+        absent = [name for name, found in wanted.items() if not found]
         if absent:
             message = (
                 f"{source} has no episode {', '.join(absent)}. "
                 f"There are: {', '.join(list(files)[:10]) or 'none'}."
             )
             raise UsageError(message)
-        return [files[name] for name in dict.fromkeys(n for _, ns in chosen for n in ns)], []
+        return [files[name] for name in dict.fromkeys(chain(*wanted.values()))], []
     kinds = {name: Episode.open(path).info.kind for name, path in files.items()}
     chosen = [files[name] for name, kind in kinds.items() if kind in KINDS]
     left_out = [name for name, kind in kinds.items() if kind not in KINDS]
