@@ -140,5 +140,5 @@ exact = LookAndPick
 glance = partial(LookAndPick, looks=1)
 low = partial(LookAndPick, carry_m=0.05)
 high = partial(LookAndPick, drop_m=0.08)
-miss_8, miss_12, miss_16 = (partial(LookAndPick, miss_m=m) for m in (0.008, 0.012, 0.016))
-miss_20, miss_26, miss_32 = (partial(LookAndPick, miss_m=m) for m in (0.020, 0.026, 0.032))
+miss_12, miss_20, miss_24 = (partial(LookAndPick, miss_m=m) for m in (0.012, 0.020, 0.024))
+miss_28, miss_32, miss_40 = (partial(LookAndPick, miss_m=m) for m in (0.028, 0.032, 0.040))
