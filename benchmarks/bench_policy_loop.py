@@ -16,9 +16,11 @@ from measure import Target, cpu_seconds, report_targets
 from bridge.episode.run_folder import RunFolder
 from twin.policies.environment import TwinEnv
 from twin.robot.posture import Posture
+from twin.scene.raster.backend import open_rasteriser
 
 STEP_S, SIZE, REPEATS, STEPS = 0.1, (224, 224), 20, 60
 REAL_TIME, PER_CORE = 4.0, 8.0
+RASTERISER = open_rasteriser()
 
 
 def anew(env: TwinEnv) -> dict[str, np.ndarray]:
@@ -31,7 +33,7 @@ def anew(env: TwinEnv) -> dict[str, np.ndarray]:
     found = {}
     for name, place in cameras.viewpoints.items():
         T = place.T(T_base_tcp)
-        view = cameras._rasteriser.view(cloud, place.camera, T)
+        view = RASTERISER.view(cloud, place.camera, T)
         view = view if backdrop is None else backdrop.behind(view, place.camera, T)
         found[name] = view.image_u8()
     return found

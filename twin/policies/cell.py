@@ -11,7 +11,7 @@ from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success
 from twin.physics.engines import PhysicsWorld, open_world
-from twin.policies.errors import StoppedError
+from twin.policies.errors import RefusedError, StoppedError
 from twin.policies.limits import refuse_target
 from twin.policies.starts import Start
 from twin.replay.checks import stops_of_arm
@@ -130,6 +130,17 @@ class TwinCell:
     def hold(self, duration_s: float) -> None:
         """Stay where the last target was."""
         self.go(self.target_rad, self.target_width_m, duration_s)
+
+    def slow_down(self, duration_s: float) -> None:
+        """Go on as slowly as the limits let an arm that moves, at best not at all."""
+        step = self.target_rad - self._knots[-2][1] if len(self._knots) > 1 else 0.0
+        for share in np.linspace(0.0, 1.0, 11):
+            try:
+                self.go(self.target_rad + share * step, self.target_width_m, duration_s)
+            except RefusedError:
+                continue
+            return
+        self._follow(self.steps_of(duration_s), self.target_rad, [0.0] * len(self.target_rad))
 
     def rest(self, duration_s: float) -> None:
         """Let everything settle, with the motors where they were sent; nothing stops that."""

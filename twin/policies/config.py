@@ -6,7 +6,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from bridge.errors import refuse_outside
+from bridge.errors import UsageError, refuse_outside
 from bridge.terminal import RARE
 from bridge.wire.config import LOOPBACK
 
@@ -17,7 +17,8 @@ class RolloutConfig:
     """What ``robot-gst rollout`` lets act, and where."""
 
     policy: str
-    """ws://HOST:PORT of a server that speaks openpi's protocol, or module:function."""
+    """ws://HOST:PORT of a server that speaks openpi's protocol, module:function, or keys: you drive
+    in the browser, or by a file of keys (keys:FILE)."""
     name: Annotated[str, RARE] = ""
     """What the policy is called in recordings and tables; none: how it is opened."""
     map: Path | None = None
@@ -25,7 +26,7 @@ class RolloutConfig:
     task: str = ""
     """Only starts of this task."""
     starts: str = "recorded"
-    """Those of recorded trials, or so many drawn from the task file."""
+    """Those of recorded trials, so many drawn from the task file, or one by its id."""
     times: Annotated[int, RARE] = 1
     """Rollouts from each start; three or more show how much a policy varies by itself."""
     cell: str = ""
@@ -60,3 +61,5 @@ class RolloutConfig:
                 "timeout_s": (0.1, 600),
             },
         )
+        if self.policy.partition(":")[0] == "keys" and (self.map or self.cell or self.check):
+            raise UsageError("--policy keys drives the twin: leave out --map, --cell and --check")

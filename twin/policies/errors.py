@@ -18,3 +18,7 @@ class StoppedError(TwinError):
         """
         self.name = name
         super().__init__(f"{name}: {detail}")
+
+
+class RefusedError(StoppedError):
+    """A target was refused before anything moved."""

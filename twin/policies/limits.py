@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from twin.policies.errors import StoppedError
+from twin.policies.errors import RefusedError
 from twin.replay.motion import motion_failures
 from twin.replay.path import JointPath, outside_limits
 from twin.robot.model import RobotModel
@@ -27,13 +27,13 @@ def refuse_target(
         knots: The targets before it, at least one.
 
     Raises:
-        StoppedError: Which limit refuses it, and by how much.
+        RefusedError: Which limit refuses it, and by how much.
     """
     now_ns, last_rad = knots[-1]
     if joints_rad.shape != last_rad.shape or not (
         np.isfinite(joints_rad).all() and np.isfinite(width_m)
     ):
-        raise StoppedError(
+        raise RefusedError(
             name="target",
             detail=f"{len(robot.joints)} joints and a width were expected, all of them finite; "
             f"got {np.array2string(joints_rad, precision=3)} and {width_m}",
@@ -52,7 +52,7 @@ def refuse_target(
     failures = outside_limits(robot, path.times_ns[-1:], joints_rad[None])
     hint = _degrees(robot, joints_rad) if failures else ""
     for failure in failures or motion_failures(path, robot):
-        raise StoppedError(name="limits", detail=f"{failure.detail}{hint}")
+        raise RefusedError(name="limits", detail=f"{failure.detail}{hint}")
 
 
 def _degrees(robot: RobotModel, joints_rad: Float[np.ndarray, " num_joints"]) -> str:

@@ -17,7 +17,7 @@ from PIL import Image
 from bridge.episode.provenance import hash_settings
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
-from twin.policies.errors import PolicyError, StoppedError
+from twin.policies.errors import PolicyError, RefusedError
 from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
 from twin.robot.model import RobotModel
@@ -194,7 +194,7 @@ class Interpreter:
         """Joints and width that one row asks for, from the target before it.
 
         Raises:
-            StoppedError: A pose that the arm does not reach.
+            RefusedError: A pose that the arm does not reach.
         """
         actions = self.mapping.actions
         arm = row if actions.gripper == "none" else row[:-1]
@@ -232,7 +232,7 @@ class Interpreter:
         found = solve_ik(self._robot, T, IkConfig(restarts=0), warm_start_rad=last_rad)
         if not found.reached:
             p = ", ".join(f"{x:.3f}" for x in T[:3, 3])
-            raise StoppedError(
+            raise RefusedError(
                 name="reach",
                 detail=f"the arm does not bring the tool to ({p}) m: "
                 f"{found.position_error_m * 1e3:.0f} mm and {found.rotation_error_rad:.2f} rad "

@@ -146,6 +146,11 @@ class ServedPolicy:
     def reset(self, seed: int) -> None:
         """Servers of this protocol keep no state between requests."""
 
+    def refused(self, text: str) -> bool:
+        """The protocol has no word for it; the rollout ends there."""
+        del text
+        return False
+
     def close(self) -> None:
         """Close the connection."""
         self._opened.close()

@@ -14,6 +14,8 @@ from twin.policies.mapping import PolicyMap
 from twin.policies.openpi import ServedPolicy
 
 WORDS = ("ws://", "wss://")
+END = object()
+"""The answer of a policy that wants nothing more: the rollout ends and is judged."""
 HASHES = ("server=", "code=", "map=")
 """How it begins who acted, where no checkpoint is named."""
 
@@ -31,6 +33,9 @@ class Policy(Protocol):
     def reset(self, seed: int) -> None:
         """A new rollout begins."""
 
+    def refused(self, text: str) -> bool:
+        """Told which limit refused its target; whether it goes on, with the arm slowing down."""
+
     def close(self) -> None:
         """Nothing more is asked."""
 
@@ -41,6 +46,8 @@ class ImportedPolicy:
 
     act: Callable[[dict[str, Any]], Any]
     again: Callable[..., Any] | None = None
+    told: Callable[[str], Any] | None = None
+    """Its ``refused``, where it has one."""
     metadata: dict[str, Any] = field(default_factory=dict)
 
     def infer(self, observation: dict[str, Any]) -> Any:
@@ -59,6 +66,12 @@ class ImportedPolicy:
         else:
             self.again()
 
+    def refused(self, text: str) -> bool:
+        """It goes on where it takes such words."""
+        if self.told is not None:
+            self.told(text)
+        return self.told is not None
+
     def close(self) -> None:
         """Nothing is open."""
 
@@ -68,8 +81,14 @@ def open_policy(address: str, timeout_s: float) -> Policy:
 
     Args:
         address: ``ws://HOST:PORT``, or ``module:name``: a factory without arguments, a function of
-            an observation, or an object with ``infer`` or ``select_action``.
+            an observation, or an object with ``infer`` or ``select_action``; or ``keys``, which
+            somebody holds in the browser, or ``keys:FILE``.
     """
+    if is_driven(address):
+        from twin.policies import drive  # noqa: PLC0415  # drive is made of policies
+
+        _, colon, path = address.partition(":")
+        return drive.KeyPolicy(drive.KeyFile(Path(path)) if colon else drive.KeyPage())
     if address.startswith(WORDS):
         return ServedPolicy(address, timeout_s)
     module, colon, name = address.partition(":")
@@ -91,11 +110,17 @@ def open_policy(address: str, timeout_s: float) -> Policy:
             return ImportedPolicy(
                 act=getattr(found, method),
                 again=getattr(found, "reset", None),
+                told=getattr(found, "refused", None),
                 metadata=dict(about) if isinstance(about, dict) else {},
             )
     if not callable(found):
         raise PolicyError(f"--policy {address}: {type(found).__name__} cannot be asked for actions")
     return ImportedPolicy(act=found)
+
+
+def is_driven(address: str) -> bool:
+    """Whether keys drive the arm."""
+    return address.partition(":")[0] == "keys"
 
 
 def _takes_one(found: Callable[..., Any]) -> bool:

@@ -18,9 +18,9 @@ from bridge.errors import GstError
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan
 from twin.policies.cell import TwinCell
-from twin.policies.errors import PolicyError, StoppedError
+from twin.policies.errors import PolicyError, RefusedError, StoppedError
 from twin.policies.mapping import Interpreter, PolicyMap
-from twin.policies.policy import Policy, open_policy, who_acts
+from twin.policies.policy import END, Policy, open_policy, who_acts
 from twin.policies.starts import Start, drawn_starts, open_start
 from twin.policies.views import Pictures, TwinCameras
 from twin.replay.output import ReplayOrigin, write_replay
@@ -136,6 +136,49 @@ def _roll_out(
         cell.close()
 
 
+@dataclass
+class _Follower:
+    """Brings the cell where rows of answers say."""
+
+    cell: TwinCell
+    policy: Policy
+    speak: Interpreter
+    max_s: float
+    steps: int = 0
+
+    @property
+    def period_s(self) -> float:
+        """Time that one row has."""
+        return 1.0 / self.speak.mapping.rate_hz
+
+    def follow(self, rows: np.ndarray) -> bool:
+        """Whether to go on: the task is not done, and there is time."""
+        look = max(1, round(LOOK_S / self.period_s))
+        for row in rows:
+            allowed = self._go(row)
+            self.steps += 1
+            if self.cell.burst or self.cell.t_ns >= self.max_s * 1e9:
+                return False
+            if self.steps % look == 0 and self.cell.succeeds():
+                return False
+            if not allowed:
+                break  # it is asked again
+        return True
+
+    def _go(self, row: np.ndarray) -> bool:
+        """Whether the limits let it; a policy that takes their words goes on all the same."""
+        cell = self.cell
+        try:
+            target = self.speak.target(row, cell.target_rad, cell.target_width_m)
+            cell.go(*target, self.period_s)
+        except RefusedError as error:
+            if not self.policy.refused(str(error)):
+                raise
+            cell.slow_down(self.period_s)
+            return False
+        return True
+
+
 def act(
     cell: TwinCell,
     cameras: TwinCameras,
@@ -153,37 +196,26 @@ def act(
     Args:
         latency_s: From a picture to the first action that answers it.
     """
-    period_s = 1.0 / speak.mapping.rate_hz
-    late, look = round(latency_s / period_s), max(1, round(LOOK_S / period_s))
-    acted, rest, steps = Acted(), np.zeros((0, speak.num_values())), 0
-
-    def follow(rows: np.ndarray) -> bool:
-        """Whether to go on."""
-        nonlocal steps
-        for row in rows:
-            cell.go(*speak.target(row, cell.target_rad, cell.target_width_m), period_s)
-            steps += 1
-            if cell.burst or cell.t_ns >= max_s * 1e9:
-                return False
-            if steps % look == 0 and cell.succeeds():
-                return False
-        return True
-
+    does = _Follower(cell=cell, policy=policy, speak=speak, max_s=max_s)
+    late, horizon = round(latency_s / does.period_s), speak.mapping.horizon
+    acted, rest = Acted(), np.zeros((0, speak.num_values()))
     try:
         going = True
         while going:
             pictures = cameras.draw(cell)
             acted.pictures.append((cell.t_ns, pictures))
             began = time.monotonic()
-            answer = speak.rows(policy.infer(speak.observation(pictures, *cell.posture())))
+            found = policy.infer(speak.observation(pictures, *cell.posture()))
             acted.answer_s += time.monotonic() - began
+            if found is END:
+                break
+            answer = speak.rows(found)
             acted.asked += 1
-            going = follow(rest[:late])
+            going = does.follow(rest[:late])
             for _ in range(late - len(rest) if going else 0):
-                cell.hold(period_s)
-            horizon = speak.mapping.horizon or len(answer)
-            rest = answer[horizon:]
-            going = going and follow(answer[:horizon])
+                cell.hold(does.period_s)
+            rest = answer[horizon or len(answer) :]
+            going = going and does.follow(answer[: horizon or len(answer)])
     except StoppedError as error:
         acted.stopped = str(error)
     except PolicyError as error:

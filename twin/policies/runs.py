@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from bridge.episode import streams
 from bridge.episode.catalogue import find_episodes
 from bridge.episode.catalogue_query import CatalogueQuery
 from bridge.episode.metadata import CHECKPOINT_TAG, ROLLOUT, WITH, tagged
@@ -16,8 +17,9 @@ from bridge.process_pool import Failed, runner_of
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
 from twin.policies.config import RolloutConfig
+from twin.policies.drive import drive_mapping
 from twin.policies.mapping import read_mapping
-from twin.policies.policy import HASHES
+from twin.policies.policy import HASHES, is_driven
 from twin.policies.rollout import RolloutJob, roll_out, row_of_file
 from twin.policies.starts import trial_episodes
 
@@ -40,7 +42,11 @@ checkpoint who acted: the recorded trial's in a row of its own where it was anot
 
 def jobs_of(run: RunFolder, config: RolloutConfig) -> Iterator[RolloutJob]:
     """List the rollouts that are asked for."""
-    episodes, mapping = trial_episodes(run, config.task), read_mapping(config.map)
+    episodes = trial_episodes(run, config.task)
+    if is_driven(config.policy):
+        mapping = drive_mapping(tuple(streams.camera_ids(episodes[0])))
+    else:
+        mapping = read_mapping(config.map)
     for episode, drawn in _starts(episodes, config.starts):
         for number in range(config.times):
             yield RolloutJob(
@@ -62,8 +68,16 @@ def _starts(episodes: Sequence[Episode], starts: str) -> Iterator[tuple[Episode,
     if starts == "recorded":
         yield from ((episode, None) for episode in episodes)
         return
+    named = [e for e in episodes if starts in (e.info.start_id, e.info.id)]
+    if named:
+        yield from ((episode, None) for episode in named)
+        return
     if not starts.isdigit() or not 1 <= int(starts) <= 10_000:
-        raise UsageError(f"--starts {starts!r} is neither 'recorded' nor a number from 1 to 10000")
+        there = ", ".join(e.info.start_id or e.info.id for e in episodes[:10])
+        raise UsageError(
+            f"--starts {starts!r} is neither 'recorded', nor a number from 1 to 10000, nor a start "
+            f"of these trials: {there}"
+        )
     first = {episode.info.task: episode for episode in reversed(episodes)}
     yield from ((episode, number) for episode in first.values() for number in range(int(starts)))
 
@@ -76,13 +90,14 @@ def roll_out_run(run: RunFolder, config: RolloutConfig, output: Output) -> dict[
     """
     run.refuse_empty()
     rows, todo = [], []
+    workers = 1 if is_driven(config.policy) else config.workers
     for job in jobs_of(run, config):
         row = None if config.force else row_of_file(job.path())
         if row is None or row["problem"]:
             todo.append(job)
         else:
             rows.append(row)
-    with output.progress("rollout", len(todo)) as advance, runner_of(config.workers) as runner:
+    with output.progress("rollout", len(todo)) as advance, runner_of(workers) as runner:
         for done, (job, answer) in enumerate(runner.run(roll_out, todo, RolloutJob.cost), start=1):
             if isinstance(answer, Failed):
                 output.detail(answer.trace)

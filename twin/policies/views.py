@@ -1,10 +1,10 @@
 """What the cell's cameras see of the twin while a policy acts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
@@ -17,14 +17,20 @@ from twin.policies.starts import Start
 from twin.replay.images import Drawable, mounting, set_up
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture
+from twin.scene.backdrop import Backdrop
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
 from twin.scene.gaussians import GaussianCloud, concatenate
+from twin.scene.objects.decompose import covered, without
 from twin.scene.raster.backend import open_rasteriser
-from twin.scene.raster.rasteriser import View
+from twin.scene.raster.rasteriser import Rasteriser, View
 from twin.scene.standpoint import sized_camera
 from twin.scene.store.calibration import read_calibration
 
 Pictures = Mapping[str, UInt8[np.ndarray, "height width 3"]]
+Places = Mapping[str, Float[np.ndarray, "4 4"]]
+"""Of objects, ``T_base_object``."""
+Nodes = Mapping[str, Float32[np.ndarray, "num_nodes 3"]]
+"""Of soft objects."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +47,57 @@ class Viewpoint:
         if self.T_tcp_camera is not None:
             return np.asarray(T_base_tcp @ self.T_tcp_camera)
         return self.T_base_camera
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resting:
+    """What stands still, composed once."""
+
+    cloud: GaussianCloud
+    objects: frozenset[str]
+    """Those in it."""
+    covered: Bool[np.ndarray, " num_splats"]
+    """Background that they cover."""
+
+
+class Canvas:
+    """What one camera sees; one that stands still draws what rests once."""
+
+    def __init__(self, place: Viewpoint, backdrop: Backdrop | None) -> None:
+        """Nothing is drawn yet."""
+        self._place, self._backdrop = place, backdrop
+        self._rasteriser = open_rasteriser()
+        self._under: tuple[GaussianCloud, Float32[np.ndarray, "5 height width"]] | None = None
+
+    def picture(
+        self,
+        rest: GaussianCloud,
+        over: Sequence[GaussianCloud],
+        hidden: Bool[np.ndarray, " num_splats"] | None,
+        T_base_tcp: Float[np.ndarray, "4 4"],
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Colours alone: depth costs as much again, and no policy is sent it.
+
+        Args:
+            over: What moves.
+            hidden: Which of what rests that covers.
+        """
+        camera, T = self._place.camera, self._place.T(T_base_tcp)
+        carried = self._place.T_tcp_camera is not None
+        if carried or not isinstance(self._rasteriser, Rasteriser):
+            cloud = rest if hidden is None else without(rest, hidden)
+            planes = self._rasteriser.draw_planes(concatenate([cloud, *over]), camera, T)
+        else:
+            if self._under is None or self._under[0] is not rest:
+                self._under = rest, self._rasteriser.draw_planes(rest, camera, T)
+            planes = self._under[1]
+            if over:
+                planes = self._rasteriser.draw_over(concatenate([*over]), planes, hidden)
+        image = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))
+        view = View(image=image, depth_m=np.zeros_like(planes[4]), alpha=planes[4])
+        if self._backdrop is not None:
+            view = self._backdrop.behind(view, camera, T)
+        return view.image_u8()
 
 
 class TwinCameras:
@@ -69,47 +126,61 @@ class TwinCameras:
                 f"{', '.join(known) or 'none'}"
             )
         self._drawable: Drawable = set_up(run, episode, start.scene)
-        self._rasteriser = open_rasteriser()
-        self._kept: tuple[bytes, GaussianCloud] | None = None
+        self._resting: Resting | None = None
+        self._last: dict[str, bytes] = {}
         self.viewpoints = {
             name: _viewpoint(run, episode, start, name, (sizes or {}).get(name))
             for name in cameras or known
         }
+        backdrop = self._drawable.parts.backdrop
+        self._canvases = {name: Canvas(at, backdrop) for name, at in self.viewpoints.items()}
 
     def draw(self, cell: TwinCell) -> Pictures:
         """One picture for each camera."""
         joints_rad, width_m = cell.posture()
-        posture = Posture(joints_rad=joints_rad, width_m=width_m)
-        cloud = self._cloud(cell, posture)
+        places, nodes = cell.places(), cell.nodes_m()
+        rest, parts = self._what_rests(places, nodes), self._drawable.parts
+        moving = [name for name in parts.objects if name not in rest.objects]
+        over = [self._object_at(name, places, nodes) for name in moving]
+        if parts.links:
+            posture = Posture(joints_rad=joints_rad, width_m=width_m)
+            over.append(parts.robot_at(posture, self._drawable.urdf))
+        hidden = self._covered(moving, places, nodes) & ~rest.covered
+        padded = np.zeros(len(rest.cloud), dtype=bool)
+        padded[: len(hidden)] = hidden
         T_base_tcp = cell.robot.T_base_tcp(joints_rad)
         return {
-            name: self._picture(cloud, place.camera, place.T(T_base_tcp))
-            for name, place in self.viewpoints.items()
+            name: canvas.picture(rest.cloud, over, padded if hidden.any() else None, T_base_tcp)
+            for name, canvas in self._canvases.items()
         }
 
-    def _cloud(self, cell: TwinCell, posture: Posture) -> GaussianCloud:
-        """Everything where it is now; what stood still is kept from the last picture."""
-        places, nodes = cell.places(), cell.nodes_m()
-        key = b"".join(T.round(6).tobytes() for T in places.values())
-        key += b"".join(rows.tobytes() for rows in nodes.values())
-        if self._kept is None or self._kept[0] != key:
-            self._kept = key, self._drawable.at(places, nodes, None)
-        rest, parts = self._kept[1], self._drawable.parts
-        if not parts.links:
-            return rest
-        return concatenate([rest, parts.robot_at(posture, self._drawable.urdf)])
+    def _what_rests(self, places: Places, nodes: Nodes) -> Resting:
+        """As it was, unless some of it moved, or something else came to rest."""
+        keys = {name: T.round(6).tobytes() for name, T in places.items()}
+        keys |= {name: rows.tobytes() for name, rows in nodes.items()}
+        last, self._last = self._last or keys, keys
+        parts = self._drawable.parts
+        still = frozenset(name for name in parts.objects if keys.get(name) == last.get(name))
+        if self._resting is None or self._resting.objects != still:
+            covered = self._covered(still, places, nodes)
+            clouds = [self._object_at(n, places, nodes) for n in parts.objects if n in still]
+            cloud = concatenate([without(parts.background, covered), *clouds])
+            self._resting = Resting(cloud=cloud, objects=still, covered=covered)
+        return self._resting
 
-    def _picture(
-        self, cloud: GaussianCloud, camera: Camera, T: Float[np.ndarray, "4 4"]
-    ) -> UInt8[np.ndarray, "height width 3"]:
-        """Colours alone: depth costs as much again, and no policy is sent it."""
-        planes = self._rasteriser.draw_planes(cloud, camera, T)
-        image = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))
-        view = View(image=image, depth_m=np.zeros_like(planes[4]), alpha=planes[4])
-        backdrop = self._drawable.parts.backdrop
-        if backdrop is not None:
-            view = backdrop.behind(view, camera, T)
-        return view.image_u8()
+    def _object_at(self, name: str, places: Places, nodes: Nodes) -> GaussianCloud:
+        if name in self._drawable.bindings and name in nodes:
+            return self._drawable.bent(name, nodes)
+        return self._drawable.parts.object_at(name, places)
+
+    def _covered(
+        self, names: Iterable[str], places: Places, nodes: Nodes
+    ) -> Bool[np.ndarray, " num_splats"]:
+        """Background that some of the objects cover; soft ones cover none."""
+        parts = self._drawable.parts
+        rigid = [n for n in names if n not in self._drawable.bindings or n not in nodes]
+        where = {name: places.get(name, parts.objects[name].T_base_object) for name in rigid}
+        return covered(parts.background, parts.objects, where)
 
 
 def _viewpoint(

@@ -57,12 +57,14 @@ class Drawable:
         posture: Posture | None,
     ) -> GaussianCloud:
         """The scene in one state."""
-        bent = {
-            name: pose_cloud(self.parts.objects[name].cloud, binding, nodes_m[name])
-            for name, binding in self.bindings.items()
-            if name in nodes_m
-        }
+        bent = {name: self.bent(name, nodes_m) for name in self.bindings if name in nodes_m}
         return self.parts.at(Ts_base_object, posture, self.urdf, bent)
+
+    def bent(
+        self, name: str, nodes_m: Mapping[str, Float32[np.ndarray, "num_nodes 3"]]
+    ) -> GaussianCloud:
+        """A soft object's Gaussians, where its nodes carry them."""
+        return pose_cloud(self.parts.objects[name].cloud, self.bindings[name], nodes_m[name])
 
 
 def render_replay(

@@ -148,10 +148,14 @@ def turned_quats(
     turn: Float[np.ndarray, "*splats 4"], quats: Float[np.ndarray, "num_splats 4"]
 ) -> Float[np.ndarray, "num_splats 4"]:
     """Orientations after a turn, one for all or one for each: the Hamilton product, wxyz."""
-    w, v = turn[..., :1], turn[..., 1:]
-    w2, v2 = np.split(quats.astype(np.float64), [1], axis=1)
-    scalar = w * w2 - (v * v2).sum(axis=1, keepdims=True)
-    return np.concatenate([scalar, w * v2 + w2 * v + np.cross(v, v2)], axis=1)
+    w, x, y, z = np.moveaxis(turn, -1, 0)
+    w2, x2, y2, z2 = np.ascontiguousarray(quats.T, dtype=np.float64)
+    turned = np.empty((len(quats), 4))
+    turned[:, 0] = w * w2 - (x * x2 + y * y2 + z * z2)
+    turned[:, 1] = w * x2 + w2 * x + (y * z2 - z * y2)
+    turned[:, 2] = w * y2 + w2 * y + (z * x2 - x * z2)
+    turned[:, 3] = w * z2 + w2 * z + (x * y2 - y * x2)
+    return turned
 
 
 COLUMNS = (

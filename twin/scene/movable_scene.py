@@ -164,12 +164,18 @@ class MovableScene:
             if name not in bent
         }
         parts = [uncovered(self.background, self.objects, placed)]
-        for name, item in self.objects.items():
-            own = bent[name] if name in bent else moved_cloud(item.cloud, placed[name])
-            parts.append(own)
+        for name in self.objects:
+            parts.append(bent[name] if name in bent else self.object_at(name, placed))
         if posture is not None and self.links:
             parts.append(self.robot_at(posture, urdf))
         return concatenate(parts)
+
+    def object_at(
+        self, name: str, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]
+    ) -> GaussianCloud:
+        """One object's part of that cloud; where it was scanned unless a place is given."""
+        item = self.objects[name]
+        return moved_cloud(item.cloud, Ts_base_object.get(name, item.T_base_object))
 
     def robot_at(self, posture: Posture, urdf: str) -> GaussianCloud:
         """The robot's part of that cloud; there must be links."""

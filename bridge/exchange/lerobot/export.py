@@ -4,8 +4,10 @@ Row k is at ``t_0 + k / fps``. State: joints and gripper, interpolated at that t
 nearest in time. Action: the plan's command for the next row, or the next row's state.
 """
 
+import fnmatch
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +19,7 @@ from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.cdr.messages import color_from_message
 from bridge.episode.clocks import open_episode
+from bridge.episode.metadata import ROLLOUT
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import (
@@ -28,7 +31,7 @@ from bridge.episode.streams import (
     joint_track,
     plans,
 )
-from bridge.episode.topics import COLOR_IMAGE, GRIPPER_STATE
+from bridge.episode.topics import COLOR_IMAGE, GRIPPER_STATE, RENDERED_IMAGE, RENDERED_TOPIC
 from bridge.errors import EpisodeError, UsageError
 from bridge.exchange.lerobot import layout
 from bridge.exchange.lerobot.layout import LeRobotConfig
@@ -67,7 +70,7 @@ class Samples:
 
 def choose_fps(episode: Episode) -> int:
     """Return the rate of the first camera, to the nearest whole number per second."""
-    for camera in camera_ids(episode):
+    for camera in _cameras(episode):
         stamps, _ = _image_stamps(episode, camera)
         if len(stamps) > 1:
             return max(1, round(NS_PER_S / float(np.median(np.diff(stamps)))))
@@ -79,7 +82,7 @@ def sample(episode: Episode, fps: int) -> Samples:
     tracks = [joint_track(episode)]
     if any(topic.endswith(GRIPPER_STATE) for topic in episode.topics_of_type(schema.JOINT_STATE)):
         tracks.append(joint_track(episode, GRIPPER_STATE))
-    cameras = {camera: _image_stamps(episode, camera) for camera in camera_ids(episode)}
+    cameras = {camera: _image_stamps(episode, camera) for camera in _cameras(episode)}
     spans = [track.stamps_ns for track in tracks] + [stamps for stamps, _ in cameras.values()]
     if any(not len(span) for span in spans):
         empty = [camera for camera, (stamps, _) in cameras.items() if not len(stamps)]
@@ -140,10 +143,16 @@ def row_images(
             row += 1
 
 
+def _cameras(episode: Episode) -> list[str]:
+    """Those that recorded; of what happened in the twin those through which it was seen."""
+    found = (RENDERED_TOPIC.search(topic) for topic in episode.topics())
+    return camera_ids(episode) or sorted({match[1] for match in found if match is not None})
+
+
 def _topic(episode: Episode, camera: str) -> str:
-    topic = find_camera_topic(episode, camera, COLOR_IMAGE[1:])
-    assert topic is not None  # noqa: S101  # camera_ids found it
-    return topic
+    tails = (COLOR_IMAGE[1:], RENDERED_IMAGE[1:])
+    topics = (find_camera_topic(episode, camera, tail) for tail in tails)
+    return next(topic for topic in topics if topic is not None)
 
 
 def _image_stamps(
@@ -174,6 +183,8 @@ def _commands(
     episode: Episode, tracks: list[JointTrack], times_ns: Int[np.ndarray, " num_rows"]
 ) -> Float[np.ndarray, "num_rows num_joints"] | None:
     """What the plan in force commands at each time; None where one of them does not say it all."""
+    if episode.derived is not None:
+        return None  # its plan tells what happened, not what was commanded
     records = events(episode)
     executed: list[tuple[int, Plan]] = []
     for _, plan in plans(episode):
@@ -246,13 +257,15 @@ def card_text(shape: DatasetShape, kind: ActionKind, table: list[dict[str, Any]]
         kind: What the column ``action`` holds: ``plan`` or ``next_state``.
     """
     cameras = ", ".join(shape.cameras) or "none"
-    stand_in = sum(bool(row["stand_in"]) for row in table)
-    origin = (
-        f"{stand_in} of {len(table)} episodes come from a stand-in cell (simulated), not from a "
-        "real robot."
-        if stand_in
-        else "Recorded from a real cell, as its episodes say."
-    )
+    stand_in, in_twin = (sum(bool(row[k]) for row in table) for k in ("stand_in", "rollout"))
+    origin = "Recorded from a real cell, as its episodes say."
+    if stand_in:
+        origin = (
+            f"{stand_in} of {len(table)} episodes come from a stand-in cell (simulated), not from "
+            "a real robot."
+        )
+    if in_twin:
+        origin = f"{in_twin} of {len(table)} episodes were acted in the twin (simulated, rendered)."
     success = (
         f"`{layout.SUCCESS}` is true in the last row of an episode whose operator said success."
         if shape.labelled
@@ -303,14 +316,16 @@ def select_episodes(source: Path, config: LeRobotConfig) -> tuple[list[Path], li
         return [source], []
     files = {path.stem: path for path in RunFolder.open(source).episodes()}
     if config.episodes:
-        absent = [name for name in config.episodes if name not in files]
+        files |= {path.stem: path for path in RunFolder(source).derived(f"*.{ROLLOUT}.*")}
+        wanted = {name: fnmatch.filter(files, name) for name in config.episodes}
+        absent = [name for name, found in wanted.items() if not found]
         if absent:
             message = (
                 f"{source} has no episode {', '.join(absent)}. "
                 f"There are: {', '.join(list(files)[:10]) or 'none'}."
             )
             raise UsageError(message)
-        return [files[name] for name in config.episodes], []
+        return [files[name] for name in dict.fromkeys(chain(*wanted.values()))], []
     kinds = {name: Episode.open(path).info.kind for name, path in files.items()}
     chosen = [files[name] for name, kind in kinds.items() if kind in KINDS]
     left_out = [name for name, kind in kinds.items() if kind not in KINDS]
@@ -460,6 +475,9 @@ def _images(
 
 
 def _success(run: RunFolder | None, episode: Episode) -> bool | None:
+    if episode.derived is not None:
+        done: bool | None = episode.derived.settings.get(ROLLOUT, {}).get("success")
+        return done
     outcome = episode.outcome if run is None else outcome_of(run, episode)
     return {"success": True, "failure": False}.get(outcome.result if outcome else "")
 
@@ -472,7 +490,8 @@ def _task(episode: Episode) -> str:
 def _row(number: int, episode: Episode, samples: Samples, success: bool | None) -> dict[str, Any]:
     return {
         "episode_index": number,
-        "id": episode.info.id,
+        "id": episode.info.id if episode.derived is None else episode.path.stem,
+        "rollout": episode.derived is not None,
         "start_ns": int(samples.stamps_ns[0]),
         "frames": len(samples.stamps_ns),
         "success": success,

@@ -24,7 +24,8 @@ class LeRobotConfig:
     action: Literal["auto", "plan", "next-state"] = "auto"
     """plan: what the executed plan commands for the next row; auto: that if all trials have it."""
     episodes: tuple[str, ...] = ()
-    """Only the episodes with these ids, of any kind."""
+    """Only those with these ids, of any kind; or a pattern, rollouts in the twin too:
+    '*.rollout.me.*'."""
     crf: int = 23
     """Quality of the H.264 video, lower is better."""
     clock: ClockChoice = "recorded"

@@ -1,13 +1,22 @@
 """The twin as Gymnasium has it."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
+from drawn_run import GREY, cloud
 from gymnasium.utils.env_checker import check_env
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
+from bridge.geometry import se3
 from twin.policies.environment import ID, TwinEnv
+from twin.replay.images import Drawable
+from twin.robot.posture import Posture
+from twin.scene.gaussians import as_float32
+from twin.scene.raster.backend import open_rasteriser
+from twin.scene.shape.sdf import SdfGrid
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*WARN.*")
 
@@ -110,3 +119,40 @@ def test_what_is_not_there_is_told(run: RunFolder) -> None:
         env.step(np.zeros(7))
     with pytest.raises(UsageError, match=r"no start 'x' in .*; there are: start 1, start 2"):
         env.reset(options={"start_id": "x"})
+
+
+def with_a_table(drawable: Drawable, T_base_cube: np.ndarray) -> Drawable:
+    """The same on a table, of which a solid cube covers what is in it."""
+    grid = np.mgrid[-0.1:0.1:40j, -0.1:0.1:40j].reshape(2, -1).T
+    points = np.column_stack([grid, np.zeros(len(grid))]) + T_base_cube[:3, 3]
+    x, y, z = (np.mgrid[:9, :9, :9] - 4) * 0.01
+    box = np.maximum(np.maximum(abs(x), abs(y)), abs(z)) - 0.02
+    sdf = SdfGrid(values_m=as_float32(box), origin_m=np.full(3, -0.04), voxel_m=0.01)
+    objects = dict(drawable.parts.objects)
+    objects["cube"] = replace(objects["cube"], sdf=sdf)
+    parts = replace(drawable.parts, background=cloud(points, GREY), objects=objects)
+    return replace(drawable, parts=parts)
+
+
+def test_pictures_are_those_of_drawing_everything_anew(run: RunFolder) -> None:
+    env = TwinEnv(run.path)
+    start = env.reset()[0]["agent_pos"].astype(float)
+    cell, cameras, rasteriser = env._opened(), env._cameras, open_rasteriser()
+    begun = cell.places()
+    drawable = with_a_table(cameras._drawable, begun["cube"])
+    cameras._drawable, cameras._resting = drawable, None
+    # The cube rests, moves, rests again; the arm moves all the time.
+    for step, shift_m in enumerate((0.0, 0.0, 0.01, 0.03, 0.03, 0.03)):
+        cell.go(start[:6] + np.array([0.01 * step, 0, 0, 0, 0, 0]), start[6], 0.1)
+        at = np.array([shift_m, shift_m, 0.0])
+        places = begun | {"cube": se3.transform_from(np.eye(4)[0], at) @ begun["cube"]}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(cell, "places", lambda found=places: found)
+            pictures = cameras.draw(cell)
+        joints_rad, width_m = cell.posture()
+        everything = drawable.at(places, {}, Posture(joints_rad=joints_rad, width_m=width_m))
+        for name, place in cameras.viewpoints.items():
+            T = place.T(cell.robot.T_base_tcp(joints_rad))
+            wanted = drawable.parts.draw(rasteriser, everything, place.camera, T).image_u8
+            np.testing.assert_array_equal(pictures[name], wanted)
+    env.close()

@@ -134,7 +134,7 @@ def test_starts_are_drawn_as_the_task_says(run: RunFolder) -> None:
     assert [row["start_id"] for row in found["rows"]] == ["drawn_5_0", "drawn_5_1", "drawn_5_2"]
     assert len({row["detail"] for row in found["rows"]}) == 3
     for wrong in ("none", "0", "-1", "99999"):
-        with pytest.raises(UsageError, match="neither 'recorded' nor a number"):
+        with pytest.raises(UsageError, match="neither 'recorded', nor a number"):
             roll_out_run(run, config("still", starts=wrong), QUIET)
 
 

@@ -43,7 +43,7 @@ class Lighting:
         if self == EVEN or len(cloud) == 0:
             return cloud
         unit = cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)
-        normals = se3.rotation_from_quaternion(unit.astype(np.float64))[:, :, 2]
+        normals = se3.third_axis(unit.astype(np.float64))
         lit = cloud.colors * self.brightness(normals)[:, None]
         return replace(cloud, colors=as_float32(lit))
 
@@ -106,6 +106,6 @@ def fit_lighting(seen: Sequence[Patches]) -> Lighting:
 
 
 def _basis(normals: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 9"]:
-    x, y, z = normals.T
+    x, y, z = np.ascontiguousarray(normals.T)
     second = (x * y, y * z, 3 * z**2 - 1, x * z, x**2 - y**2)
     return np.stack([np.ones_like(x), x, y, z, *second], axis=1)

@@ -27,9 +27,7 @@ class PyRasteriser {
                          const Intrinsics& intrinsics, float alpha_cut, float transmittance_stop,
                          const std::optional<Harmonics>& harmonics) {
         const std::size_t n = means.shape(0);
-        if (quats.shape(0) != n || scales_log.shape(0) != n || opacities.shape(0) != n ||
-            colors.shape(0) != n || (harmonics && harmonics->shape(0) != n))
-            throw nb::value_error("all tables need one row per Gaussian");
+        check_tables(n, quats, scales_log, opacities, colors, harmonics);
         num_harmonics_ = harmonics ? checked_harmonics(harmonics->shape(1)) : 0;
         const Camera camera = make_camera(T_camera_world, intrinsics);
         const Settings settings = make_settings(alpha_cut, transmittance_stop);
@@ -40,6 +38,27 @@ class PyRasteriser {
         {
             nb::gil_scoped_release unlocked;
             rasteriser_.draw(in, static_cast<int>(n), camera, settings, planes.data());
+        }
+        return planes;
+    }
+
+    NewArray<float> draw_over(const Table3& means, const Table4& quats, const Table3& scales_log,
+                              const Column& opacities, const Table3& colors, const Planes& under,
+                              const std::optional<Buffer<bool, nb::shape<-1>>>& hidden,
+                              const std::optional<Harmonics>& harmonics) {
+        const std::size_t n = means.shape(0);
+        check_tables(n, quats, scales_log, opacities, colors, harmonics);
+        check_size(under.shape(1), under.shape(2));
+        if (hidden) check_rows(hidden->shape(0));
+        const Splats in{means.data(),  quats.data(),
+                        scales_log.data(), opacities.data(),
+                        colors.data(), harmonics ? harmonics->data() : nullptr,
+                        harmonics ? checked_harmonics(harmonics->shape(1)) : 0};
+        auto planes = new_array<float>({kPlanes, under.shape(1), under.shape(2)});
+        {
+            nb::gil_scoped_release unlocked;
+            rasteriser_.draw_over(in, static_cast<int>(n), hidden ? hidden->data() : nullptr,
+                                  under.data(), planes.data());
         }
         return planes;
     }
@@ -123,6 +142,14 @@ class PyRasteriser {
   private:
     static std::size_t width(const Camera& camera) { return camera.width; }
     static std::size_t height(const Camera& camera) { return camera.height; }
+
+    static void check_tables(std::size_t n, const Table4& quats, const Table3& scales_log,
+                             const Column& opacities, const Table3& colors,
+                             const std::optional<Harmonics>& harmonics) {
+        if (quats.shape(0) != n || scales_log.shape(0) != n || opacities.shape(0) != n ||
+            colors.shape(0) != n || (harmonics && harmonics->shape(0) != n))
+            throw nb::value_error("all tables need one row per Gaussian");
+    }
 
     void check_size(std::size_t rows, std::size_t columns) const {
         if (rows != height(rasteriser_.camera()) || columns != width(rasteriser_.camera()))
@@ -216,6 +243,11 @@ NB_MODULE(_splat, module) {
              "scales_log"_a.noconvert(), "opacities_logit"_a.noconvert(),
              "colors"_a.noconvert(), "T_camera_world"_a.noconvert(), "intrinsics"_a,
              "alpha_cut"_a, "transmittance_stop"_a, "harmonics"_a.noconvert().none() = nb::none())
+        .def("draw_over", &PyRasteriser::draw_over, "means"_a.noconvert(),
+             "quats_wxyz"_a.noconvert(), "scales_log"_a.noconvert(),
+             "opacities_logit"_a.noconvert(), "colors"_a.noconvert(), "under"_a.noconvert(),
+             "hidden"_a.noconvert().none() = nb::none(),
+             "harmonics"_a.noconvert().none() = nb::none())
         .def("pull", &PyRasteriser::pull, "planes"_a.noconvert(), "plane_gradients"_a.noconvert())
         .def("draw_features", &PyRasteriser::draw_features, "features"_a.noconvert())
         .def("lift", &PyRasteriser::lift, "planes"_a.noconvert())

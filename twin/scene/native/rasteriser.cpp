@@ -6,6 +6,7 @@
 #include "rasteriser.hpp"
 
 #include <algorithm>
+#include <iterator>
 
 #include "threads.hpp"
 
@@ -156,6 +157,67 @@ void Rasteriser::draw(const Splats& splats, int count, const Camera& camera,
     for (int tile = 0; tile < num_tiles(); ++tile)
         drawn_[tile] =
             kernels_.draw_tile(projected_.data(), job(tile), camera_, settings_, planes);
+}
+
+// Projects what comes over the last ``draw``, and lists for each tile what touches it by depth.
+void Rasteriser::sort_over(const Splats& splats, int count) {
+    projected_.resize(count_ + count);
+    Projected* const added = projected_.data() + count_;
+#pragma omp parallel for schedule(static) num_threads(threads_)
+    for (int begin = 0; begin < count; begin += kProjectBlock)
+        kernels_.project(splats, camera_, settings_, added, begin,
+                         std::min(begin + kProjectBlock, count));
+    depth_order_over_.begin(1);
+    for (int i = 0; i < count; ++i)
+        if (visible(count_ + i)) depth_order_over_.add(0, added[i].depth, i);
+    depth_order_over_.sort(0);
+    depth_order_over_.cut();
+    std::vector<std::uint32_t> order(depth_order_over_.count());
+    depth_order_over_.merge(0, order.data());
+    over_.resize(num_tiles());
+    for (auto& ids : over_) ids.clear();
+    for (const std::uint32_t i : order) {
+        const TileRange range = tiles_of(added[i]);
+        for (int y = range.y0; y < range.y1; ++y)
+            for (int x = range.x0; x < range.x1; ++x)
+                over_[y * tiles_x_ + x].push_back(count_ + i);
+    }
+}
+
+std::vector<int> Rasteriser::changed_tiles(const bool* hidden) const {
+    std::vector<char> touched(num_tiles(), 0);
+    for (int i = 0; hidden != nullptr && i < count_; ++i)
+        if (hidden[i])
+            for (int y = ranges_[i].y0; y < ranges_[i].y1; ++y)
+                for (int x = ranges_[i].x0; x < ranges_[i].x1; ++x) touched[y * tiles_x_ + x] = 1;
+    std::vector<int> tiles;
+    for (int tile = 0; tile < num_tiles(); ++tile)
+        if (touched[tile] || !over_[tile].empty()) tiles.push_back(tile);
+    return tiles;
+}
+
+void Rasteriser::draw_over(const Splats& splats, int count, const bool* hidden, const float* under,
+                           float* planes) {
+    sort_over(splats, count);
+    std::copy_n(under, static_cast<std::int64_t>(kPlanes) * camera_.width * camera_.height, planes);
+    const std::vector<int> tiles = changed_tiles(hidden);
+#pragma omp parallel for schedule(dynamic, 4) num_threads(threads_)
+    for (int i = 0; i < static_cast<int>(tiles.size()); ++i) {
+        TileJob merged = job(tiles[i]);
+        const std::vector<std::uint32_t>& over = over_[tiles[i]];
+        std::vector<std::uint32_t> rest, ids(merged.count + over.size());
+        std::copy_if(merged.ids, merged.ids + merged.count, std::back_inserter(rest),
+                     [&](std::uint32_t id) { return hidden == nullptr || !hidden[id]; });
+        // Of equal depths those below come first, as their indices would.
+        const auto end = std::merge(
+            rest.begin(), rest.end(), over.begin(), over.end(), ids.begin(),
+            [&](std::uint32_t a, std::uint32_t b) {
+                return projected_[a].depth < projected_[b].depth;
+            });
+        merged.ids = ids.data();
+        merged.count = static_cast<int>(end - ids.begin());
+        kernels_.draw_tile(projected_.data(), merged, camera_, settings_, planes);
+    }
 }
 
 // The rows of a tile's pairs; those that were not drawn are zero.

@@ -22,6 +22,12 @@ class Rasteriser {
     // Fills ``planes`` (5 x height x width): red, green, blue, sum w depth, sum w.
     void draw(const Splats&, int count, const Camera&, const Settings&, float* planes);
 
+    // Draws more Gaussians into the last ``draw``, of which some may be hidden (one flag each, or
+    // null): the bits of drawing all at once. Tiles that none of them touches are copied from the
+    // planes of that call, ``under``.
+    void draw_over(const Splats&, int count, const bool* hidden, const float* under,
+                   float* planes);
+
     // Gradients of the last ``draw``; inputs and planes must be those of that call. ``d_pose`` is
     // with respect to the 3 x 4 matrix [R | t].
     void pull(const Splats&, const float* planes, const float* plane_gradients,
@@ -51,6 +57,8 @@ class Rasteriser {
     TileRange tiles_of(const Projected&) const;
     void project(const Splats&);
     void project_block(const Splats&, int begin, int end);
+    void sort_over(const Splats&, int count);
+    std::vector<int> changed_tiles(const bool* hidden) const;
     void sort_and_count();
     void begin_tiles();
     void fill_tiles();
@@ -74,6 +82,8 @@ class Rasteriser {
     std::vector<std::int64_t> tile_begin_;
     std::vector<std::uint32_t> tile_ids_;
     std::vector<std::int64_t> next_;        // where each slice of order_ writes in each tile
+    DepthOrder depth_order_over_;
+    std::vector<std::vector<std::uint32_t>> over_;  // per tile: what ``draw_over`` adds
     std::vector<int> drawn_;                // per tile: Gaussians drawn before it was opaque
     std::vector<std::int64_t> slot_begin_;  // per Gaussian: its pairs in slots_
     std::vector<std::int64_t> slots_;       // where those pairs stand in tile_ids_

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from bridge.episode import provenance
@@ -112,20 +112,37 @@ def uncovered(
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
 ) -> GaussianCloud:
     """The background, transparent where closed objects stand in it or on it."""
-    means = background.means_m
-    opacities = background.opacities_logit.copy()
+    return without(background, covered(background, objects, Ts_base_object))
+
+
+def without(cloud: GaussianCloud, hidden: Bool[np.ndarray, " num_splats"]) -> GaussianCloud:
+    """The same Gaussians, some of them transparent."""
+    logits = np.where(hidden, np.float32(TRANSPARENT_LOGIT), cloud.opacities_logit)
+    return replace(cloud, opacities_logit=logits)
+
+
+def covered(
+    background: GaussianCloud,
+    objects: Mapping[str, ObjectSplats],
+    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
+) -> Bool[np.ndarray, " num_splats"]:
+    """Which Gaussians of the background lie in a closed object, or just under it."""
+    means, found = background.means_m, np.zeros(len(background), dtype=bool)
     for name, T in Ts_base_object.items():
         sdf = objects[name].sdf
         if sdf is None:
             continue
         reach_m = sdf.voxel_m * float(np.linalg.norm(sdf.values_m.shape)) + UNDER_M
-        near = np.abs(means - T[:3, 3].astype(np.float32)).max(axis=1) < reach_m
+        near = np.ones(len(means), dtype=bool)
+        for axis in range(3):
+            near &= np.abs(means[:, axis] - np.float32(T[axis, 3])) < reach_m
         ids = np.flatnonzero(near)
         p = means[ids].astype(np.float64)
         for up_m in (0.0, UNDER_M / 2, UNDER_M):
             lifted = se3.apply(se3.invert(T), p + up_m * UP)
-            opacities[ids[sdf.distance(lifted) < 0]] = TRANSPARENT_LOGIT
-    return replace(background, opacities_logit=opacities)
+            there = sdf.may_hold(lifted)
+            found[ids[there][sdf.distance(lifted[there]) < 0]] = True
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -282,6 +282,32 @@ class Rasteriser:
         )
         return planes
 
+    def draw_over(
+        self,
+        cloud: GaussianCloud,
+        under: Float32[np.ndarray, "5 height width"],
+        hidden: Bool[np.ndarray, " num_splats"] | None = None,
+    ) -> Float32[np.ndarray, "5 height width"]:
+        """Draw a cloud into the last ``draw_planes``, which stays as it is.
+
+        The same bits as drawing both at once, in the time that the tiles take where the cloud is.
+
+        Args:
+            under: What that call returned.
+            hidden: Gaussians of that call to be left out.
+        """
+        planes: np.ndarray = self._native.draw_over(
+            cloud.means_m,
+            cloud.quats_wxyz,
+            cloud.scales_log,
+            cloud.opacities_logit,
+            cloud.colors,
+            under,
+            hidden,
+            cloud.harmonics if cloud.num_harmonics else None,
+        )
+        return planes
+
     def draw_features(
         self, features: Float32[np.ndarray, "num_splats num_channels"]
     ) -> Float32[np.ndarray, "num_channels height width"]:

@@ -11,6 +11,8 @@ from twin.npz import UnreadableArraysError, read_npz, write_npz
 
 MAX_VOXELS = 16_000_000
 """Larger files are refused."""
+NEXT_TO_M = 1e-6
+"""Points this near a grid are looked up in it, on account of rounding."""
 LEVEL_STEPS = 24
 """Halvings on the way to the level that keeps a volume."""
 _NAMES = ("values_m", "origin_m", "voxel_m", "closed")
@@ -40,6 +42,17 @@ class SdfGrid:
         e = np.linalg.norm(place - held, axis=1) * self.voxel_m
         far = np.hypot(np.maximum(value, 0.0), e) if self.closed else value - e
         return np.asarray(np.where(e > 0, far, value).reshape(points_m.shape[:-1]))
+
+    def may_hold(self, points_m: Float[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num"]:
+        """Whether points may be in the solid: those beyond a closed grid are not."""
+        if not self.closed:
+            return np.ones(len(points_m), dtype=bool)
+        end = self.origin_m + (np.array(self.values_m.shape) - 1.0) * self.voxel_m
+        found = np.ones(len(points_m), dtype=bool)
+        for axis in range(3):
+            along = points_m[:, axis]
+            found &= (along > self.origin_m[axis] - NEXT_TO_M) & (along < end[axis] + NEXT_TO_M)
+        return found
 
     def gradient(self, points_m: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Derivative of ``distance`` by the point; about a unit vector away from the surface.

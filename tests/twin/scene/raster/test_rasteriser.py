@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from splat_pull import pull_back
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32, concatenate
 from twin.scene.raster import rasteriser as raster
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, SplatExtensionMissingError
 
@@ -89,6 +91,34 @@ def test_a_broken_gaussian_does_not_spoil_the_others(broken: str, value: float) 
     others = np.arange(50) != 10
     if not (broken == "colors" and np.isfinite(value)):
         assert all(np.isfinite(getattr(gradient, n)[others]).all() for n, _ in arrays(cloud))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("num_over", [0, 40, 2000])
+def test_drawing_over_has_the_bits_of_drawing_at_once(num_over: int, threads: int) -> None:
+    under, over = many_gaussians(), many_gaussians(num_over, seed=8)
+    over = replace(over, means_m=as_float32(over.means_m * 0.4 + [0.0, 0.0, 1.2]))
+    over.means_m[:20] = under.means_m[: len(over.means_m[:20])]  # equal depths keep their order
+    hidden = np.zeros(len(under), dtype=bool)
+    hidden[100:160] = True
+    pale = replace(under, opacities_logit=np.where(hidden, np.float32(-30), under.opacities_logit))
+    rasteriser = Rasteriser(RasterConfig(threads=threads))
+    planes = rasteriser.draw_planes(under, CAMERA, IDENTITY)
+    drawn = rasteriser.draw_over(over, planes, hidden)
+    np.testing.assert_array_equal(drawn, draw(concatenate([pale, over])))
+    assert (drawn != planes).any()
+    np.testing.assert_array_equal(
+        rasteriser.draw_over(over, planes), draw(concatenate([under, over]))
+    )
+
+
+def test_drawing_over_needs_what_was_drawn() -> None:
+    rasteriser, cloud = Rasteriser(), many_gaussians(10)
+    planes = rasteriser.draw_planes(cloud, CAMERA, IDENTITY)
+    with pytest.raises(ValueError, match="row per Gaussian of the last draw"):
+        rasteriser.draw_over(cloud, planes, np.zeros(9, dtype=bool))
+    with pytest.raises(ValueError, match="not those of the last draw"):
+        rasteriser.draw_over(cloud, planes[:, 1:].copy())
 
 
 def test_an_empty_cloud_draws_black() -> None:
