@@ -68,7 +68,7 @@ _TOLD = {
     "render --rate-hz": "One frame is drawn for each recorded image.",
     "replay --grasp|gate --grasp": "A grasp holds by friction, as in life.",
     "replay --engines-must-agree|gate --engines-must-agree": (
-        "--engine both replays in both and says where they differ."
+        "--engine mujoco replays in MuJoCo, after or before pybullet."
     ),
     "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",

@@ -66,11 +66,11 @@ def against_recorded(rows: Rows, labels: Mapping[str, str]) -> dict[str, dict[st
     found: dict[str, dict[str, Any]] = {}
     for row in rows:
         label = labels.get(row["episode"])
-        said = row["predicates" if row["mode"] == "kinematic" else "accepted"]
-        if row["executed"] and said is not None and label in ("success", "failure"):
+        answer = row["predicates" if row["mode"] == "kinematic" else "accepted"]
+        if row["executed"] and answer is not None and label in ("success", "failure"):
             sides = found.setdefault(row["task"], {})
             side = sides.setdefault(SIDES[row["trajectory"], row["mode"]], {"k": 0, "n": 0})
-            side["k"] += said is (label == "success")
+            side["k"] += answer is (label == "success")
             side["n"] += 1
     return found
 
@@ -84,7 +84,7 @@ def describe_run(summary: Mapping[str, Any]) -> str:
         return "\n".join([*(imported or ["No trial to replay."]), *skipped])
     lines = imported + _count_lines(summary["counts"])
     for task, sides in sorted(summary.get("against_recorded", {}).items()):
-        told = ", ".join(f"{side} {said['k']} of {said['n']}" for side, said in sides.items())
+        told = ", ".join(f"{side} {each['k']} of {each['n']}" for side, each in sides.items())
         lines += ["", f"{task}, as the operator's labels say: {told}"]
     lines += _divergence_lines(summary["rows"])
     if any(SAME_ENGINE in row.get("warnings", ()) for row in summary["rows"]):
@@ -165,7 +165,7 @@ def _count_lines(counts: Counts) -> list[str]:
 
 
 def _divergence_lines(rows: Rows) -> list[str]:
-    """Where each execution that was compared parts from its plan and its recording."""
+    """Where each execution that was compared diverges from plan and recording."""
     lines = []
     for row in rows:
         if row.get("divergence"):

@@ -10,7 +10,7 @@ namespace lookups::GRID_ISA {
 
 namespace {
 
-// Beyond the grid as if all solid were inside of it (see GridLookup.at).
+// Beyond the grid as if all solid were inside of it (see Grid::at).
 void look(const GridView& grid, const double* R, const double* t, const double* points, int count,
           double* distances) {
     const std::int32_t step_y = grid.count[2], step_x = grid.count[1] * grid.count[2];
