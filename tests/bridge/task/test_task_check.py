@@ -60,6 +60,8 @@ def test_what_is_shipped_is_right_and_named_like_its_file(path: Path) -> None:
         ('grasp = "cube"', 'grasp = "cube"\nclearance_m = 0.1', "stages[0].clearance_m", "carry"),
         ('["gripper", "cube"]]\n\n', '["griper", "cube"]]\n\n', "stages[0].allowed_contacts[1]",
          "Did you mean 'gripper'?"),
+        ('grasp = "cube"', 'grasp = "cube"\npath = [{kind = "upright", obj = "cube", max_deg = 5}]',
+         "stages[0].path[0]", "'max_deg'. Did you mean 'tolerance_rad'?"),
         ('id = "place"', 'id = "grasp"', "stages[1].id", "already"),
         ('manipulated = ["cube"]', 'manipulated = ["box"]', "manipulated[0]", "fixed"),
         ('containers = ["box"]', 'containers = ["cube"]', "containers[0]", "no container"),
