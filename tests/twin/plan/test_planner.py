@@ -17,7 +17,9 @@ from bridge.task.verdict import Factor
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.loop.nominal import PlanProposer
 from twin.plan.loop.propose import NoPlanError, choose
+from twin.plan.loop.push import ASIDE_M, push, push_choices
 from twin.plan.loop.steer import tried_in
+from twin.plan.loop.tau import Trajectory
 from twin.plan.problem import Problem, State
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
@@ -105,6 +107,17 @@ def test_every_kind_of_task_has_a_plan(task: str) -> None:
     assert [stage.id for stage in found.plan.stages] == [
         stage["id"] for stage in problem.scene.task.stages
     ]
+
+
+def test_the_least_shifted_push_comes_first_and_leads_to_the_mark() -> None:
+    first, *others = push_choices()
+    assert first == (0.0, 0.0, (0.0, 0.0))
+    assert {aside for _, aside, _ in others} == set(ASIDE_M)
+    problem = drawn("push_cube_to_mark", 5)
+    (key,) = problem.scene.task.manipulated
+    after = push(problem, key, first, Trajectory(robot=problem.robot))
+    mark = problem.scene.task.mark_of(key)
+    assert after.scene.Ts_base_object[key][:2, 3] == pytest.approx(mark)
 
 
 def test_what_was_not_localised_is_not_planned(problem: Problem) -> None:
