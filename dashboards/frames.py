@@ -13,8 +13,11 @@ from jaxtyping import UInt8
 from bridge.episode import schema
 from bridge.episode.cdr.messages import color_file_from_message
 from bridge.episode.reader import Episode, RawMessage
+from bridge.episode.streams import lens_of
 from bridge.episode.topics import RECORDED_TOPIC, RENDERED_TOPIC
+from bridge.errors import BridgeError
 from bridge.media.color import decode_color
+from bridge.media.straighten import Straightening
 from dashboards.errors import NotHereError
 
 RENDERED = "rendered:"
@@ -30,6 +33,8 @@ class CameraTrack:
     topic: str
     stamps_ns: tuple[int, ...]
     log_times_ns: tuple[int, ...]
+    lens: Straightening | None
+    """What the twin sees them through."""
 
     def nearest(self, stamp_ns: int) -> int:
         """Return the index of the frame taken closest to an instant."""
@@ -71,8 +76,17 @@ def _tracks(path: Path, _mtime_ns: int, _size: int) -> dict[str, CameraTrack]:
             topic=topic,
             stamps_ns=tuple(pair[0] for pair in ordered),
             log_times_ns=tuple(pair[1] for pair in ordered),
+            lens=_lens(episode, names[topic]),
         )
     return tracks
+
+
+def _lens(episode: Episode, camera_id: str) -> Straightening | None:
+    """Of a camera that no command can use, pictures are shown as they are."""
+    try:
+        return lens_of(episode, camera_id)
+    except BridgeError:
+        return None
 
 
 def _camera_of(topic: str) -> str | None:
@@ -86,7 +100,8 @@ def _camera_of(topic: str) -> str | None:
 def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
     """Return the image nearest to an instant and its media type.
 
-    A compressed image is given byte for byte as recorded; a raw one becomes JPEG.
+    A compressed image is given byte for byte as recorded; a raw one becomes JPEG, and so does one
+    through a lens, which is straightened.
 
     Args:
         stamp_ns: Source time of the wanted instant [ns].
@@ -97,7 +112,7 @@ def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
     if message is None:
         text = f"{path.name} changed while it was read; reload the page."
         raise NotHereError(text)
-    data = color_file_from_message(message.type_name, message.data).data
+    data = color_file_from_message(message.type_name, message.data, track.lens).data
     return data, media_type(data, path)
 
 
@@ -119,7 +134,7 @@ def pack_frames(path: Path, camera_id: str) -> bytes:
     for index, message in _in_one_pass(path, track, 0, count - 1):
         if index in files or index % step:
             continue
-        files[index] = color_file_from_message(message.type_name, message.data).data
+        files[index] = color_file_from_message(message.type_name, message.data, track.lens).data
         if len(files) == 1:
             step = max(step, -(-count * len(files[index]) // MAX_PACKED_BYTES))
     head = {
@@ -154,7 +169,7 @@ def read_span(
     if not places:
         return
     for index, message in _in_one_pass(path, track, places[0], places[-1]):
-        color = color_file_from_message(message.type_name, message.data)
+        color = color_file_from_message(message.type_name, message.data, track.lens)
         yield track.stamps_ns[index], decode_color(color.data)
 
 

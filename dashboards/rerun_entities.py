@@ -16,6 +16,7 @@ from bridge.episode.reader import Episode
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.media.straighten import Straightening
 from bridge.robots.robot import RECORD_TAG, mimics_of, resolve_mesh, robot_of
 from dashboards.frames import media_type
 from dashboards.recording import Recording
@@ -146,7 +147,8 @@ def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -
             entity = f"{prefix}/cameras/{camera_id}/{kind}"
             entities.append(entity)
             try:
-                stamps_ns = send(file, episode, topic, entity)
+                lens = streams.lens_of(episode, camera_id, kind)
+                stamps_ns = send(file, episode, topic, entity, lens)
             except GstError as error:
                 file.note(f"{entity} is not shown further: {error}")
                 continue
@@ -158,10 +160,12 @@ def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -
     return entities
 
 
-def _send_color(file: RerunFile, episode: Episode, topic: str, entity: str) -> list[int]:
+def _send_color(
+    file: RerunFile, episode: Episode, topic: str, entity: str, lens: Straightening | None
+) -> list[int]:
     stamps = []
     for message in episode.messages([topic]):
-        image = color_file_from_message(message.type_name, message.data)
+        image = color_file_from_message(message.type_name, message.data, lens)
         try:
             kind = media_type(image.data, episode.path)
         except GstError as error:
@@ -173,10 +177,12 @@ def _send_color(file: RerunFile, episode: Episode, topic: str, entity: str) -> l
     return stamps
 
 
-def _send_depth(file: RerunFile, episode: Episode, topic: str, entity: str) -> list[int]:
+def _send_depth(
+    file: RerunFile, episode: Episode, topic: str, entity: str, lens: Straightening | None
+) -> list[int]:
     stamps = []
     for message in episode.messages([topic]):
-        image = DepthImage.from_message(message.type_name, message.data)
+        image = DepthImage.from_message(message.type_name, message.data, lens)
         file.at(entity, image.stamp_ns, rr.DepthImage(image.depth_mm.astype("<u2")))
         stamps.append(image.stamp_ns)
     file.always(entity, rr.DepthImage.from_fields(meter=MILLIMETRES_PER_METRE))

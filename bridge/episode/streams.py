@@ -38,6 +38,7 @@ from bridge.errors import EpisodeError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.media.straighten import Straightening
 from bridge.robots.robot import Robot, robot_of
 from bridge.task.find import ATTACHMENT, Attached, find_task_file
 from bridge.task.plan import Plan
@@ -149,19 +150,43 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
     raise EpisodeError(path=episode.path, found=f"{topic} is empty", hint="Record it again.")
 
 
+def lens_of(episode: Episode, camera_id: str, stream: str = "color") -> Straightening | None:
+    """What straightens the images of ``color`` or ``depth``; None without a lens, or any word."""
+    topic = find_camera_topic(episode, camera_id, f"{stream}/info")
+    first = next(iter(episode.messages([topic] if topic else [])), None)
+    return None if first is None else CameraInfo.from_cdr(first.data).lens
+
+
+def color_images(episode: Episode, camera_id: str) -> Iterator[CompressedColor | RawColor]:
+    """Colour images of a camera in log order, straightened when they are decoded."""
+    topic = find_camera_topic(episode, camera_id, "color/image")
+    lens = lens_of(episode, camera_id)
+    for message in episode.messages([topic] if topic else []):
+        yield color_from_message(message.type_name, message.data, lens)
+
+
+def depth_images(episode: Episode, camera_id: str) -> Iterator[DepthImage]:
+    """Depth images of a camera in log order, straightened."""
+    topic = find_camera_topic(episode, camera_id, "depth/image")
+    lens = lens_of(episode, camera_id, "depth")
+    for message in episode.messages([topic] if topic else []):
+        yield DepthImage.from_message(message.type_name, message.data, lens)
+
+
 def rgbd_pairs(episode: Episode, camera_id: str) -> Iterator[RgbdPair]:
     """Yield colour and depth that belong together; colour without depth nearby is passed over."""
     tails = ("color/image", "depth/image")
     color_topic, depth_topic = (find_camera_topic(episode, camera_id, tail) for tail in tails)
     if color_topic is None or depth_topic is None:
         return
+    color_lens, depth_lens = (lens_of(episode, camera_id, stream) for stream in ("color", "depth"))
     colors: list[CompressedColor | RawColor] = []
     depths: list[DepthImage] = []
     for message in episode.messages([color_topic, depth_topic]):
         if message.topic == color_topic:
-            colors.append(color_from_message(message.type_name, message.data))
+            colors.append(color_from_message(message.type_name, message.data, color_lens))
         else:
-            depths.append(DepthImage.from_message(message.type_name, message.data))
+            depths.append(DepthImage.from_message(message.type_name, message.data, depth_lens))
         while colors and depths:
             if abs(gap_ns := colors[0].stamp_ns - depths[0].stamp_ns) <= PAIRING_TOLERANCE_NS:
                 yield colors.pop(0), depths.pop(0)

@@ -25,7 +25,13 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.schema import StampedMessage
-from bridge.episode.streams import camera_ids, camera_info, find_camera_topic, transform_tree
+from bridge.episode.streams import (
+    camera_ids,
+    camera_info,
+    find_camera_topic,
+    lens_of,
+    transform_tree,
+)
 from bridge.episode.transforms import TransformTree
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
@@ -58,6 +64,8 @@ class CameraReport:
     depths: list[Stamped] = field(default_factory=list)
     depth_too_far: int = 0
     """Pixels beyond 13.107 m, written as "no measurement"."""
+    straightened: str = ""
+    """What was done to its images, where a lens bent them."""
 
 
 def export_tum(
@@ -89,7 +97,11 @@ def export_tum(
             "depth": "16-bit PNG, 5000 per metre",
             "poses": "groundtruth.txt is T_base_color at every colour and depth stamp",
             "cameras": {
-                name: {"folder": report.folder, "depth_pixels_too_far": report.depth_too_far}
+                name: {
+                    "folder": report.folder,
+                    "depth_pixels_too_far": report.depth_too_far,
+                    **({"lens": report.straightened} if report.straightened else {}),
+                }
                 for name, report in zip(wanted, reports, strict=True)
             },
         }
@@ -110,15 +122,17 @@ def _write_camera(
     for part in ("rgb", "depth"):
         (place / part).mkdir(parents=True, exist_ok=True)
     topics = [find_camera_topic(episode, name, f"{kind}/image") for kind in ("color", "depth")]
+    lenses = [lens_of(episode, name, stream) for stream in ("color", "depth")]
+    report.straightened = "" if info.lens is None else info.lens.said
     counts = dict.fromkeys(topics, 0)
     for message in episode.messages([topic for topic in topics if topic is not None]):
         counts[message.topic] += 1
         with message_named(episode, message.topic, counts[message.topic]):
             if message.topic == topics[0]:
-                image = color_from_message(message.type_name, message.data)
+                image = color_from_message(message.type_name, message.data, lenses[0])
                 report.colors.append(_write_color(place, image, color))
             else:
-                depth = DepthImage.from_message(message.type_name, message.data)
+                depth = DepthImage.from_message(message.type_name, message.data, lenses[1])
                 item, too_far = _write_depth(place, depth)
                 report.depths.append(item)
                 report.depth_too_far += too_far
@@ -133,7 +147,8 @@ def _write_camera(
 
 def _write_color(place: Path, image: CompressedColor | RawColor, color: ColorFormat) -> Stamped:
     stem = f"rgb/{seconds_text(image.stamp_ns)}"
-    data = image.data if isinstance(image, CompressedColor) and color == "recorded" else b""
+    is_whole = image.lens is None and color == "recorded"
+    data = image.data if isinstance(image, CompressedColor) and is_whole else b""
     if data[:2] == JPEG_MAGIC:
         name = f"{stem}.jpg"
         (place / name).write_bytes(data)

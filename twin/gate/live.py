@@ -40,6 +40,7 @@ from bridge.episode.topics import (
 )
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
+from bridge.media.straighten import Straightening
 from bridge.robots.robot import robot_of
 from bridge.task.record import parse_record
 from twin.errors import TwinError
@@ -63,6 +64,18 @@ class LiveCamera:
         default_factory=lambda: deque(maxlen=KEPT_IMAGES)
     )
     depths: deque[DepthImage] = field(default_factory=lambda: deque(maxlen=KEPT_IMAGES))
+
+    def take_info(self, stream: str, info: CameraInfo) -> None:
+        """Images that came before, or with another lens, were not straightened as these will be."""
+        before = self.infos.get(stream)
+        if (None if before is None else before.lens) != info.lens:
+            self.colors.clear()
+            self.depths.clear()
+        self.infos[stream] = info
+
+    def lens(self, stream: str) -> Straightening | None:
+        """What straightens the images of a stream, as far as is known."""
+        return self.infos[stream].lens if stream in self.infos else None
 
 
 class CameraNotReadyError(TwinError):
@@ -302,12 +315,12 @@ class LiveView:
             return
         camera = self._cameras.setdefault(camera_id, LiveCamera())
         if kind == "info":
-            camera.infos[stream] = CameraInfo.from_cdr(data)
+            camera.take_info(stream, CameraInfo.from_cdr(data))
         elif kind == "image" and stream == "color":
-            camera.colors.append(color_from_message(type_name, data))
+            camera.colors.append(color_from_message(type_name, data, camera.lens(stream)))
             self._newest_ns = max(self._newest_ns, camera.colors[-1].stamp_ns)
         elif kind == "image" and stream == "depth":
-            camera.depths.append(DepthImage.from_message(type_name, data))
+            camera.depths.append(DepthImage.from_message(type_name, data, camera.lens(stream)))
 
     def cameras_from(self) -> str:
         """By what the cameras are posed, in words."""

@@ -9,7 +9,7 @@ few threads, as NumPy and the image decoders let go of the interpreter.
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -19,8 +19,11 @@ import numpy as np
 from bridge.episode import schema, topics
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
+from bridge.episode.streams import lens_of
+from bridge.episode.topics import COLOR_IMAGE
 from bridge.errors import GstError, MissingDependencyError
-from bridge.media.color import JPEG_MAGIC, decode_color
+from bridge.media.color import JPEG_MAGIC, decode_color, encode_png
+from bridge.media.straighten import Straightening
 from evaluator.compare.measure import mean_of, measured
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Quantity
@@ -132,7 +135,8 @@ def read_images(episode: Episode) -> Images:
     for topic in episode.topics_of_type(schema.COMPRESSED_IMAGE):
         for name, pattern in _COLOR_TOPICS:
             if match := pattern.search(topic):
-                put[topic] = partial(_put_color, images.color[name], match.group(1))
+                lens = lens_of(episode, match.group(1)) if topic.endswith(COLOR_IMAGE) else None
+                put[topic] = partial(_put_color, images.color[name], match.group(1), lens=lens)
                 break
         else:
             if match := topics.MASK_TOPIC.search(topic):
@@ -147,9 +151,14 @@ def read_images(episode: Episode) -> Images:
     return images
 
 
-def _put_color(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:
+def _put_color(
+    into: dict[Key, bytes], camera_id: str, data: bytes, *, lens: Straightening | None = None
+) -> None:
     image = CompressedColor.from_cdr(data)
-    into[camera_id, image.stamp_ns] = image.data
+    is_straight = lens is None
+    into[camera_id, image.stamp_ns] = (
+        image.data if is_straight else encode_png(replace(image, lens=lens).image_u8(), level=1)
+    )
 
 
 def _put_depth(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:

@@ -13,7 +13,6 @@ from jaxtyping import Float, Int, UInt8
 from scipy import ndimage
 
 from bridge.episode import streams
-from bridge.episode.cdr.messages import color_from_message
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
@@ -132,14 +131,12 @@ def robot_smear_px(
 
 def sharpness_at(episode: Episode, camera_id: str, stamps_ns: Collection[int]) -> dict[int, float]:
     """Decode the colour images with these stamps and rate each."""
-    topic = streams.find_camera_topic(episode, camera_id, "color/image")
     wanted = set(stamps_ns)
-    found: dict[int, float] = {}
-    for message in episode.messages([topic] if topic else []):
-        image = color_from_message(message.type_name, message.data)
-        if image.stamp_ns in wanted:
-            found[image.stamp_ns] = sharpness(image.image_u8())
-    return found
+    return {
+        image.stamp_ns: sharpness(image.image_u8())
+        for image in streams.color_images(episode, camera_id)
+        if image.stamp_ns in wanted
+    }
 
 
 def sharpness(image_u8: UInt8[np.ndarray, "height width 3"]) -> float:

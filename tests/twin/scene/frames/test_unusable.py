@@ -117,19 +117,19 @@ def test_intrinsics_that_are_not_the_images_are_refused(
         choose_frames(find_sources(run), FrameConfig(), QUIET)
 
 
-def test_a_lens_that_distorts_is_refused_by_the_name_of_its_camera(
+def test_a_lens_that_turns_back_is_refused_by_the_name_of_its_camera(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     encode = CameraInfo.to_cdr
 
     def distorted(self: CameraInfo) -> bytes:
         message = codec.decode(schema.CAMERA_INFO, encode(self))
-        return codec.encode(schema.CAMERA_INFO, {**message, "d": np.array([0.1, 0, 0, 0, 0])})
+        return codec.encode(schema.CAMERA_INFO, {**message, "d": np.array([-2.0, 0, 0, 0, 0])})
 
     with monkeypatch.context() as spoilt:
         spoilt.setattr(CameraInfo, "to_cdr", distorted)
         textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=6)
-    with pytest.raises(GstError, match=r"camera wrist of episode scan .*lens distortion"):
+    with pytest.raises(GstError, match=r"camera wrist of episode scan .*a lens that turns back.*calibrate"):
         choose_frames(find_sources(run), FrameConfig(), QUIET)
 
 
