@@ -19,7 +19,6 @@ from mcap.summary import Summary
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.file import (
     Seen,
-    attachment_entry,
     chunk_entry,
     read_footer,
     read_header,
@@ -33,6 +32,7 @@ from bridge.episode.mcap.walk import (
     ByteStream,
     MessageHead,
     RecordSpan,
+    attachment_entry,
     attachment_of,
     message_head,
     parse,

@@ -8,7 +8,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, Header, Metadata, Schema
 
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
@@ -22,6 +22,7 @@ from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChun
 from bridge.episode.mcap.format import Buffer, crc32
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
+from bridge.episode.mcap.walk import RecordSpan, attachment_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
 
@@ -90,7 +91,7 @@ class CopyTarget:
         """Copy one thing; index spans, damage and the old end are left behind."""
         if self.section.file.offset == 0:
             is_header = isinstance(found, Plain) and found.opcode == mcap.HEADER
-            header = found.raw if is_header else mcap.header("", UNKNOWN_LIBRARY)  # type: ignore[union-attr]
+            header = found.raw if is_header else mcap.encoded(Header("", UNKNOWN_LIBRARY))  # type: ignore[union-attr]
             self.section.file.append([mcap.MAGIC + header])
         match found:
             case Plain():
@@ -153,7 +154,7 @@ class CopyTarget:
                 if schema_id and schema_id not in summary.schemas:
                     if self._look_up(mcap.SCHEMA, schema_id):
                         return
-                    self._make(mcap.schema(schema_id, "unknown", "", b""))
+                    self._make(mcap.encoded(Schema(schema_id, b"", "", "unknown")))
                     self._made_schemas.add(schema_id)
 
     def _look_up(self, opcode: int, number: int) -> bool:
@@ -182,7 +183,7 @@ class CopyTarget:
         if channel_id in self.section.summary.channels:
             return
         if not self._look_up(mcap.CHANNEL, channel_id):
-            self._make(mcap.channel(channel_id, 0, unknown_topic(channel_id), ""))
+            self._make(mcap.encoded(Channel(channel_id, unknown_topic(channel_id), "", {}, 0)))
             self._made_channels.add(channel_id)
 
     def _take_message(self, found: TopMessage) -> None:
@@ -202,15 +203,9 @@ class CopyTarget:
         offset = self.section.file.offset
         for block in self._source.blocks(found.offset, found.length):
             self.section.file.append([block])
-        self.section.summary.add_attachment(
-            found.record.name,
-            media_type=found.record.media_type,
-            log_time_ns=found.record.log_time,
-            create_time_ns=found.record.create_time,
-            data_size=found.data_size,
-            offset=offset,
-            length=found.length,
-        )
+        span = RecordSpan.between(mcap.ATTACHMENT, offset, self.section.file.offset)
+        entry = attachment_entry(span, found.record, found.data_size)
+        self.section.summary.add_index(entry)
 
 
 def _definitions(source: RecordFile) -> dict[tuple[int, int], bytes]:

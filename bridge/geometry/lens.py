@@ -14,6 +14,8 @@ Plane = Float[np.ndarray, "rows columns"]
 WIDEST, NARROWEST = 0.5, 4.0
 """Focal length of the pinhole camera in those of the lens. Below, the middle would lose more than
 half of its resolution to a rim drawn out long."""
+NEAR_RIM = 0.1
+"""Of the smaller side: where a lens turns back so near the rim, its corners are cut off."""
 GRID = (49, 65)
 """Rows and columns at which a view is tried."""
 
@@ -115,7 +117,8 @@ def pinhole_within(lens: Lens, recorded: Camera) -> tuple[Camera, float]:
             wide, factor = (
                 (wide, middle) if _room(lens, recorded, middle) >= 0 else (middle, factor)
             )
-        if not 0 <= _room(lens, recorded, factor) < 1:
+        least = min(recorded.width, recorded.height)
+        if not 0 <= _room(lens, recorded, factor) < max(1, NEAR_RIM * least):
             raise LensError("a lens that turns back inside the image, or leaves none of it")
     camera = replace(recorded, fx=recorded.fx * factor, fy=recorded.fy * factor)
     u, v = landing(lens, recorded, camera, *_grid(camera))

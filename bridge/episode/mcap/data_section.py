@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import zstandard
+from mcap import records
 
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.format import (
@@ -11,16 +12,17 @@ from bridge.episode.mcap.format import (
     MESSAGE_FIELDS,
     MESSAGE_HEAD,
     Buffer,
-    ChunkPlace,
     Payload,
     crc32,
+    encoded,
     joined_crc,
 )
 from bridge.episode.mcap.part_file import PartFile
+from bridge.episode.mcap.walk import RecordSpan, attachment_entry, metadata_entry
 
 
 class Summary:
-    """Schemas, channels, statistics and indexes of one file."""
+    """Schemas, channels, statistics and indexes of one file, each as it will stand in it."""
 
     def __init__(self) -> None:
         """Begin with an empty file."""
@@ -29,73 +31,42 @@ class Summary:
         self.message_counts: dict[int, int] = {}
         self.start_ns: int | None = None
         self.end_ns = 0
-        self._chunks: list[bytes] = []
-        self._attachments: list[bytes] = []
-        self._metadata: list[bytes] = []
+        self._indexes: dict[int, list[bytes]] = {
+            mcap_format.CHUNK_INDEX: [],
+            mcap_format.ATTACHMENT_INDEX: [],
+            mcap_format.METADATA_INDEX: [],
+        }
 
-    def add_chunk(self, place: ChunkPlace, counts: dict[int, int]) -> None:
-        """Book a chunk that is in the file, with its number of messages by channel."""
-        self._chunks.append(mcap_format.chunk_index(place))
-        if counts:
-            self.add_messages(counts, start_ns=place.start_ns, end_ns=place.end_ns)
+    def add_index(self, entry: records.McapRecord) -> None:
+        """Book where a chunk, attachment or metadata record lies."""
+        record = encoded(entry)
+        self._indexes[record[0]].append(record)
 
-    def add_messages(self, counts: dict[int, int], *, start_ns: int, end_ns: int) -> None:
-        """Book messages by channel, the first and the last log time among them."""
+    def add_messages(self, counts: Mapping[int, int], *, start_ns: int, end_ns: int) -> None:
+        """Book the messages of a chunk by channel, the first and the last log time among them."""
         for channel_id, count in counts.items():
             self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
-        self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
-        self.end_ns = max(self.end_ns, end_ns)
-
-    def add_attachment(
-        self,
-        name: str,
-        *,
-        media_type: str,
-        log_time_ns: int,
-        create_time_ns: int,
-        data_size: int,
-        offset: int,
-        length: int,
-    ) -> None:
-        """Book an attachment record that is in the file."""
-        self._attachments.append(
-            mcap_format.attachment_index(
-                name,
-                media_type=media_type,
-                log_time_ns=log_time_ns,
-                create_time_ns=create_time_ns,
-                data_size=data_size,
-                offset=offset,
-                length=length,
-            )
-        )
-
-    def add_metadata(self, name: str, *, offset: int, length: int) -> None:
-        """Book a metadata record that is in the file."""
-        self._metadata.append(mcap_format.metadata_index(name, offset=offset, length=length))
+        if counts:
+            self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
+            self.end_ns = max(self.end_ns, end_ns)
 
     def encode(self, start: int) -> bytes:
         """Return everything from the summary to the end of the file."""
-        counts = dict(sorted(self.message_counts.items()))
-        statistics = mcap_format.statistics(
-            schemas=len(self.schemas),
-            channels=len(self.channels),
-            attachments=len(self._attachments),
-            metadata_records=len(self._metadata),
-            chunks=len(self._chunks),
-            start_ns=self.start_ns or 0,
-            end_ns=self.end_ns,
-            message_counts=counts,
+        chunks, attachments, metadata = self._indexes.values()
+        statistics = records.Statistics(
+            attachment_count=len(attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=dict(sorted(self.message_counts.items())),
+            chunk_count=len(chunks),
+            message_count=sum(self.message_counts.values()),
+            message_start_time=self.start_ns or 0,
+            message_end_time=self.end_ns,
+            metadata_count=len(metadata),
+            schema_count=len(self.schemas),
         )
-        groups = (
-            (mcap_format.SCHEMA, b"".join(self.schemas.values())),
-            (mcap_format.CHANNEL, b"".join(self.channels.values())),
-            (mcap_format.STATISTICS, statistics),
-            (mcap_format.CHUNK_INDEX, b"".join(self._chunks)),
-            (mcap_format.ATTACHMENT_INDEX, b"".join(self._attachments)),
-            (mcap_format.METADATA_INDEX, b"".join(self._metadata)),
-        )
-        return mcap_format.summary_section(groups, start)
+        definitions = (self.schemas.values(), self.channels.values())
+        groups = (*definitions, [encoded(statistics)], chunks, attachments, metadata)
+        return mcap_format.summary_section(map(b"".join, groups), start)
 
 
 ZSTD_LEVEL = 1
@@ -233,7 +204,7 @@ class OpenChunk:
             compression=compression,
             data_size=data_size,
         )
-        encoded = EncodedChunk(
+        made = EncodedChunk(
             buffers=[head, *data],
             length=len(head) + data_size,
             crc=joined_crc(crc32(head, 0), data_crc, data_size),
@@ -246,7 +217,7 @@ class OpenChunk:
         )
         self._clear()
         self.number += 1
-        return encoded
+        return made
 
 
 def _compressor(*, gather: bool) -> zstandard.ZstdCompressor:
@@ -265,7 +236,7 @@ class DataSection:
 
     def begin(self, profile: str, library: str) -> None:
         """Write magic and header."""
-        self.file.append([mcap_format.MAGIC + mcap_format.header(profile, library)])
+        self.file.append([mcap_format.MAGIC + encoded(records.Header(profile, library))])
 
     def add_chunk(self, chunk: EncodedChunk) -> None:
         """Write a chunk and its message indexes."""
@@ -290,60 +261,47 @@ class DataSection:
         self, chunk: EncodedChunk, start: int, offsets: dict[int, int], index_length: int
     ) -> None:
         """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``."""
-        place = ChunkPlace(
-            start_ns=chunk.start_ns,
-            end_ns=chunk.end_ns,
-            offset=start,
-            length=chunk.length,
-            index_offsets=offsets,
-            index_length=index_length,
-            compression=chunk.compression,
-            compressed_size=chunk.compressed_size,
-            uncompressed_size=chunk.uncompressed_size,
+        self.summary.add_index(
+            records.ChunkIndex(
+                chunk_length=chunk.length,
+                chunk_start_offset=start,
+                compression=chunk.compression,
+                compressed_size=chunk.compressed_size,
+                message_end_time=chunk.end_ns,
+                message_index_length=index_length,
+                message_index_offsets=offsets,
+                message_start_time=chunk.start_ns,
+                uncompressed_size=chunk.uncompressed_size,
+            )
         )
         counts = {channel_id: len(entries) // 2 for channel_id, entries in chunk.index.items()}
-        self.summary.add_chunk(place, counts)
+        self.summary.add_messages(counts, start_ns=chunk.start_ns, end_ns=chunk.end_ns)
 
-    def add_attachment(
-        self, name: str, data: bytes, *, media_type: str, log_time_ns: int, create_time_ns: int
-    ) -> None:
+    def add_attachment(self, entry: records.Attachment) -> None:
         """Write an attachment."""
-        buffers = mcap_format.attachment(
-            name,
-            data,
-            media_type=media_type,
-            log_time_ns=log_time_ns,
-            create_time_ns=create_time_ns,
-        )
         offset = self.file.offset
-        self.file.append(buffers)
-        self.summary.add_attachment(
-            name,
-            media_type=media_type,
-            log_time_ns=log_time_ns,
-            create_time_ns=create_time_ns,
-            data_size=len(data),
-            offset=offset,
-            length=self.file.offset - offset,
-        )
+        self.file.append(mcap_format.attachment(entry))
+        span = RecordSpan.between(mcap_format.ATTACHMENT, offset, self.file.offset)
+        self.summary.add_index(attachment_entry(span, entry, len(entry.data)))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        offset = self.file.offset
-        self.file.append([mcap_format.metadata(name, values)])
-        self.summary.add_metadata(name, offset=offset, length=self.file.offset - offset)
+        offset, entry = self.file.offset, records.Metadata(name, dict(values))
+        self.file.append([encoded(entry)])
+        span = RecordSpan.between(mcap_format.METADATA, offset, self.file.offset)
+        self.summary.add_index(metadata_entry(span, entry))
 
     def seal(self) -> None:
         """Write the end of the data, the summary and the footer."""
-        data_end = mcap_format.data_end(self.file.crc)
+        data_end = encoded(records.DataEnd(self.file.crc))
         self.file.append([data_end, self.summary.encode(self.file.offset + len(data_end))])
 
 
 def index_records(index: dict[int, list[int]], start: int) -> tuple[bytes, dict[int, int]]:
     """Return a chunk's message index records and where each lies, the first at ``start``."""
-    records = [mcap_format.message_index(*item) for item in index.items()]
+    found = [mcap_format.message_index(*item) for item in index.items()]
     offsets = {}
-    for channel_id, encoded in zip(index, records, strict=True):
+    for channel_id, record in zip(index, found, strict=True):
         offsets[channel_id] = start
-        start += len(encoded)
-    return b"".join(records), offsets
+        start += len(record)
+    return b"".join(found), offsets

@@ -26,8 +26,10 @@ from bridge.episode.mcap.walk import (
     ChunkHead,
     MessageHead,
     RecordSpan,
+    attachment_entry,
     attachment_of,
     message_head,
+    metadata_entry,
     parse,
     parse_chunk,
     read_body,
@@ -59,28 +61,6 @@ def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
         message_index_length=0,
         message_index_offsets={},
         uncompressed_size=chunk.size,
-    )
-
-
-def metadata_entry(place: RecordSpan, record: records.Metadata) -> records.MetadataIndex:
-    """Make the index entry of a metadata record."""
-    return records.MetadataIndex(
-        offset=place.offset, length=place.end - place.offset, name=record.name
-    )
-
-
-def attachment_entry(
-    place: RecordSpan, record: records.Attachment, data_size: int
-) -> records.AttachmentIndex:
-    """Make the index entry of an attachment."""
-    return records.AttachmentIndex(
-        offset=place.offset,
-        length=place.end - place.offset,
-        log_time=record.log_time,
-        create_time=record.create_time,
-        data_size=data_size,
-        name=record.name,
-        media_type=record.media_type,
     )
 
 

@@ -75,6 +75,33 @@ class RecordSpan(NamedTuple):
         """Where the next record begins."""
         return self.offset + RECORD_HEAD.size + self.length
 
+    @staticmethod
+    def between(opcode: int, start: int, end: int) -> "RecordSpan":
+        """Say the same of a record by its first and its last byte."""
+        return RecordSpan(opcode, start, end - start - RECORD_HEAD.size)
+
+
+def metadata_entry(place: RecordSpan, record: records.Metadata) -> records.MetadataIndex:
+    """Make the index entry of a metadata record."""
+    return records.MetadataIndex(
+        offset=place.offset, length=place.end - place.offset, name=record.name
+    )
+
+
+def attachment_entry(
+    place: RecordSpan, record: records.Attachment, data_size: int
+) -> records.AttachmentIndex:
+    """Make the index entry of an attachment."""
+    return records.AttachmentIndex(
+        offset=place.offset,
+        length=place.end - place.offset,
+        log_time=record.log_time,
+        create_time=record.create_time,
+        data_size=data_size,
+        name=record.name,
+        media_type=record.media_type,
+    )
+
 
 def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     """Yield the places of all records between two offsets; the stream may be used in between."""

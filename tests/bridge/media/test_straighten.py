@@ -36,7 +36,10 @@ def seen_by_opencv(
     """Pixels of the recorded image, centres at +0.5."""
     cv2 = pytest.importorskip("cv2")
     fx, fy, cx, cy = RECORDED.to_ros()
-    K, d = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(numbers or LENSES[model], float)
+    K, d = (
+        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+        np.array(numbers or LENSES[model], float),
+    )
     project = cv2.fisheye.projectPoints if model == "equidistant" else None
     still = np.zeros(3)
     if project is not None:
@@ -115,7 +118,7 @@ def test_a_message_keeps_its_lens_and_images_are_read_through_it() -> None:
     depth = DepthImage(stamp_ns=5, frame_id="eye", depth_mm=image[..., 0].astype(np.uint16))
     read = DepthImage.from_message(IMAGE, depth.to_cdr(), lens).depth_mm
     assert np.array_equal(read, lens.depth(depth.depth_mm))
-    with pytest.raises(UnreadableImageError, match="100 x 120 pixels.*160 x 120 as its camera"):
+    with pytest.raises(UnreadableImageError, match=r"100 x 120 pixels.*160 x 120 as its camera"):
         lens.color(image[:, :100])
 
 

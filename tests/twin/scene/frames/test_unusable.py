@@ -129,7 +129,9 @@ def test_a_lens_that_turns_back_is_refused_by_the_name_of_its_camera(
     with monkeypatch.context() as spoilt:
         spoilt.setattr(CameraInfo, "to_cdr", distorted)
         textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=6)
-    with pytest.raises(GstError, match=r"camera wrist of episode scan .*a lens that turns back.*calibrate"):
+    with pytest.raises(
+        GstError, match=r"camera wrist of episode scan .*a lens that turns back.*calibrate"
+    ):
         choose_frames(find_sources(run), FrameConfig(), QUIET)
 
 

@@ -32,10 +32,10 @@ from twin.scene.store.folder import read_record
 cv2 = pytest.importorskip("cv2")
 pytestmark = [pytest.mark.slow, pytest.mark.parity]
 FISHEYE = Camera(width=128, height=96, fx=70.0, fy=70.0, cx=65.0, cy=47.0)
-RATIONAL = Camera(width=128, height=96, fx=83.0, fy=83.0, cx=63.0, cy=49.0)
+RATIONAL = Camera(width=128, height=96, fx=105.0, fy=105.0, cx=63.0, cy=49.0)
 LENSES = {
     "equidistant": (FISHEYE, (-0.01, 0.02, -0.015, 0.003)),
-    "rational_polynomial": (RATIONAL, (0.31, -2.6, 0.0008, -0.0003, 1.4, 0.6, -2.3, 1.0)),
+    "rational_polynomial": (RATIONAL, (0.55, -2.7, 0.0008, -0.0003, 1.5, 0.43, -2.5, 1.5)),
 }
 NUM_FRAMES, HALF_SIZE_M, CENTRE_M = 24, np.array([1.2, 0.9, 0.7]), np.array([0.0, -0.3, 0.7])
 
@@ -75,7 +75,7 @@ def rays_through(model: str, at: tuple[float, float]) -> np.ndarray:
         here = landing(rays)
         slopes = [(landing(rays + step * axis) - here) / step for axis in np.eye(2)]
         rays = rays + np.linalg.solve(np.stack(slopes, axis=-1), (wanted - here)[..., None])[..., 0]
-    assert np.abs(landing(rays) - wanted).max() < 1e-6
+    assert np.abs(landing(rays) - wanted).max() < 1e-3
     return np.column_stack([rays, np.ones(len(rays))]).reshape(camera.height, camera.width, 3)
 
 
