@@ -11,13 +11,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import color_file_from_message
+from bridge.episode.cdr.messages import color_from_message
+from bridge.episode.cdr.straighten import Straightening
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.streams import lens_of
 from bridge.episode.topics import RECORDED_TOPIC, RENDERED_TOPIC
 from bridge.errors import BridgeError
-from bridge.media.color import decode_color
-from bridge.media.straighten import Straightening
 from dashboards.errors import NotHereError
 
 RENDERED = "rendered:"
@@ -112,7 +111,7 @@ def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
     if message is None:
         text = f"{path.name} changed while it was read; reload the page."
         raise NotHereError(text)
-    data = color_file_from_message(message.type_name, message.data, track.lens).data
+    data = color_from_message(message.type_name, message.data, track.lens).as_file()
     return data, media_type(data, path)
 
 
@@ -134,7 +133,8 @@ def pack_frames(path: Path, camera_id: str) -> bytes:
     for index, message in _in_one_pass(path, track, 0, count - 1):
         if index in files or index % step:
             continue
-        files[index] = color_file_from_message(message.type_name, message.data, track.lens).data
+        color = color_from_message(message.type_name, message.data, track.lens)
+        files[index] = color.as_file()
         if len(files) == 1:
             step = max(step, -(-count * len(files[index]) // MAX_PACKED_BYTES))
     head = {
@@ -169,8 +169,8 @@ def read_span(
     if not places:
         return
     for index, message in _in_one_pass(path, track, places[0], places[-1]):
-        color = color_file_from_message(message.type_name, message.data, track.lens)
-        yield track.stamps_ns[index], decode_color(color.data)
+        color = color_from_message(message.type_name, message.data, track.lens)
+        yield track.stamps_ns[index], color.image_u8()
 
 
 def _in_one_pass(

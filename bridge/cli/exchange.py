@@ -191,7 +191,7 @@ def import_rgbd(
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
     source = describe_folder(index, config)
     total = num_frames(index, config)
-    path = _import_scan(run, info, folder_messages(index, config, None), total, source, output)
+    path = _import_scan(run, info, folder_messages(index, config), total, source, output)
     unused = [Unused(*item) for item in index.unused]
     data = {
         "file": str(path),

@@ -18,11 +18,11 @@ from bridge.episode.mcap.damaged import (
     summary_definitions,
     walk_records,
 )
-from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
+from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk, chunk_of
 from bridge.episode.mcap.format import Buffer, crc32
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
-from bridge.episode.mcap.walk import RecordSpan, attachment_entry
+from bridge.episode.mcap.walk import RecordSpan, attachment_entry, chunk_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
 
@@ -33,7 +33,7 @@ UNKNOWN_LIBRARY = "unknown; recovered by robot-gst"
 
 def key_of(found: Chunk | CutChunk) -> tuple[int, int]:
     """What tells a chunk from every other: CRC and size of its records."""
-    return found.head.crc, found.head.uncompressed_size
+    return found.head.crc, found.head.size
 
 
 def scan_with_journal(source: RecordFile, journal: RecordFile | None) -> Iterator[Found]:
@@ -254,38 +254,20 @@ def verbatim(found: Chunk) -> EncodedChunk:
     crc = 0
     for buffer in buffers:
         crc = crc32(buffer, crc)
-    return EncodedChunk(
-        buffers=buffers,
-        length=found.length,
-        crc=crc,
-        start_ns=start_ns,
-        end_ns=end_ns,
-        compression=found.head.compression,
-        compressed_size=found.head.data_bytes,
-        uncompressed_size=found.head.uncompressed_size,
-        index=found.contents.index,
-    )
+    entry = chunk_entry(RecordSpan.between(mcap.CHUNK, 0, found.length), found.head)
+    entry.message_start_time, entry.message_end_time = start_ns, end_ns
+    return EncodedChunk(buffers=buffers, crc=crc, entry=entry, index=found.contents.index)
 
 
 def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
     """Return the records saved from a cut chunk as a whole one."""
-    start_ns, end_ns = contents.time_range()
-    head = mcap.chunk_head(
-        start_ns=start_ns,
-        end_ns=end_ns,
+    crc = crc32(records, 0)
+    return chunk_of(
+        [records],
+        contents.index,
+        times_ns=contents.time_range(),
         size=len(records),
-        crc=crc32(records, 0),
+        crc=crc,
         compression="",
-        data_size=len(records),
-    )
-    return EncodedChunk(
-        buffers=[head, records],
-        length=len(head) + len(records),
-        crc=crc32(records, crc32(head, 0)),
-        start_ns=start_ns,
-        end_ns=end_ns,
-        compression="",
-        compressed_size=len(records),
-        uncompressed_size=len(records),
-        index=contents.index,
+        data_crc=crc,
     )

@@ -22,6 +22,7 @@ from bridge.episode.cdr.messages import (
     string_from_cdr,
     transforms_from_cdr,
 )
+from bridge.episode.cdr.straighten import Straightening
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import (
@@ -38,7 +39,6 @@ from bridge.errors import EpisodeError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.media.straighten import Straightening
 from bridge.robots.robot import Robot, robot_of
 from bridge.task.find import ATTACHMENT, Attached, find_task_file
 from bridge.task.plan import Plan

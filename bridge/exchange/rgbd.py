@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from bridge.episode import streams
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -25,13 +26,6 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.schema import StampedMessage
-from bridge.episode.streams import (
-    camera_ids,
-    camera_info,
-    find_camera_topic,
-    lens_of,
-    transform_tree,
-)
 from bridge.episode.transforms import TransformTree
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
@@ -78,7 +72,7 @@ def export_tum(
     advance: Advance,
 ) -> list[CameraReport]:
     """Write one camera into ``out`` itself, several into one folder each."""
-    known = camera_ids(episode)
+    known = streams.camera_ids(episode)
     wanted = known if camera is None else [camera]
     if not wanted or not set(wanted) <= set(known):
         raise EpisodeError(
@@ -86,7 +80,7 @@ def export_tum(
             found="no colour images" if not known else f"no camera {camera!r}",
             hint=f"Cameras here: {', '.join(known) or 'none'}.",
         )
-    tree = transform_tree(episode)
+    tree = streams.transform_tree(episode)
     reports: list[CameraReport] = []
     with new_folder(out, force=force) as folder:
         for name, place_name in safe_names(wanted).items():
@@ -100,7 +94,7 @@ def export_tum(
                 name: {
                     "folder": report.folder,
                     "depth_pixels_too_far": report.depth_too_far,
-                    **({"lens": report.straightened} if report.straightened else {}),
+                    "lens": report.straightened,
                 }
                 for name, report in zip(wanted, reports, strict=True)
             },
@@ -118,11 +112,12 @@ def _write_camera(
     advance: Advance,
 ) -> CameraReport:
     report = CameraReport(folder=place.name)
-    info = camera_info(episode, name, "color")
+    info = streams.camera_info(episode, name, "color")
     for part in ("rgb", "depth"):
         (place / part).mkdir(parents=True, exist_ok=True)
-    topics = [find_camera_topic(episode, name, f"{kind}/image") for kind in ("color", "depth")]
-    lenses = [lens_of(episode, name, stream) for stream in ("color", "depth")]
+    kinds = ("color", "depth")
+    topics = [streams.find_camera_topic(episode, name, f"{kind}/image") for kind in kinds]
+    lenses = [streams.lens_of(episode, name, kind) for kind in kinds]
     report.straightened = "" if info.lens is None else info.lens.said
     counts = dict.fromkeys(topics, 0)
     for message in episode.messages([topic for topic in topics if topic is not None]):
@@ -185,8 +180,8 @@ def _write_poses(path: Path, tree: TransformTree, frame: str, stamps: list[int])
 def _write_cameras(
     path: Path, episode: Episode, name: str, tree: TransformTree, color: CameraInfo
 ) -> None:
-    has_depth = find_camera_topic(episode, name, "depth/info") is not None
-    depth = camera_info(episode, name, "depth") if has_depth else color
+    has_depth = streams.find_camera_topic(episode, name, "depth/info") is not None
+    depth = streams.camera_info(episode, name, "depth") if has_depth else color
     T_color_depth = np.eye(4)
     if depth.frame_id != color.frame_id:
         # The two sit on one rig, so any instant gives the same transform.

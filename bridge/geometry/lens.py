@@ -1,23 +1,14 @@
-"""How a lens bends rays, and the pinhole camera that sees the same without.
+"""How a lens bends rays.
 
 Rays have z = 1. Coefficients stand in OpenCV's order, as ROS sends them.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from bridge.geometry.camera import Camera
-
 Plane = Float[np.ndarray, "rows columns"]
-WIDEST, NARROWEST = 0.5, 4.0
-"""Focal length of the pinhole camera in those of the lens. Below, the middle would lose more than
-half of its resolution to a rim drawn out long."""
-NEAR_RIM = 0.1
-"""Of the smaller side: where a lens turns back so near the rim, its corners are cut off."""
-GRID = (49, 65)
-"""Rows and columns at which a view is tried."""
 
 
 class LensError(ValueError):
@@ -90,60 +81,3 @@ def lens_of(model: str, coefficients: tuple[float, ...]) -> Lens | None:
         return None
     room = 12 if kind is Brown else count
     return kind((*map(float, used), *([0.0] * (room - len(used)))))
-
-
-def landing(
-    lens: Lens, recorded: Camera, camera: Camera, u: Plane, v: Plane
-) -> tuple[Plane, Plane]:
-    """Where in the recorded image lies what a pinhole camera sees at u, v [px, centres at +0.5]."""
-    x, y = lens.bend((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
-    return x * recorded.fx + recorded.cx, y * recorded.fy + recorded.cy
-
-
-def pinhole_within(lens: Lens, recorded: Camera) -> tuple[Camera, float]:
-    """The widest pinhole camera of that size, axis and pixel shape that sees recorded pixels only.
-
-    And the share of the recorded view that it does not see.
-
-    Raises:
-        LensError: Where the lens turns back inside the image, so that two rays meet in a pixel.
-    """
-    if _room(lens, recorded, WIDEST) >= 0:
-        factor = WIDEST
-    else:
-        wide, factor = WIDEST, NARROWEST
-        for _ in range(40):
-            middle = (wide + factor) / 2
-            wide, factor = (
-                (wide, middle) if _room(lens, recorded, middle) >= 0 else (middle, factor)
-            )
-        least = min(recorded.width, recorded.height)
-        if not 0 <= _room(lens, recorded, factor) < max(1, NEAR_RIM * least):
-            raise LensError("a lens that turns back inside the image, or leaves none of it")
-    camera = replace(recorded, fx=recorded.fx * factor, fy=recorded.fy * factor)
-    u, v = landing(lens, recorded, camera, *_grid(camera))
-    rim_u, rim_v = (np.concatenate([p[0], p[1:, -1], p[-1, -2::-1], p[-2:0:-1, 0]]) for p in (u, v))
-    area = 0.5 * abs(np.sum(rim_u * np.roll(rim_v, 1) - rim_v * np.roll(rim_u, 1)))
-    return camera, max(0.0, 1 - float(area) / ((recorded.width - 1) * (recorded.height - 1)))
-
-
-def _grid(camera: Camera) -> tuple[Plane, Plane]:
-    """Some pixels of a view, its rim among them."""
-    rows, columns = GRID
-    sides = (camera.width, columns), (camera.height, rows)
-    u, v = np.meshgrid(*(np.linspace(0.5, side - 0.5, count) for side, count in sides))
-    return u, v
-
-
-@np.errstate(all="ignore")  # what is no number is outside of every image
-def _room(lens: Lens, recorded: Camera, factor: float) -> float:
-    """Pixels left between a view and the rim of the recorded image; -1: it folds or sticks out."""
-    camera = replace(recorded, fx=recorded.fx * factor, fy=recorded.fy * factor)
-    u, v = landing(lens, recorded, camera, *_grid(camera))
-    (down_u, right_u), (down_v, right_v) = np.gradient(u), np.gradient(v)
-    room = min(
-        (u - 0.5).min(), (v - 0.5).min(),
-        (recorded.width - 0.5 - u).min(), (recorded.height - 0.5 - v).min(),
-    )  # fmt: skip
-    folds = not (right_u * down_v - down_u * right_v > 0).all()
-    return -1.0 if folds or not room >= 0 else float(room)

@@ -7,7 +7,7 @@ says why there are none. Knows nothing of the network: whoever is connected hand
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -40,7 +40,6 @@ from bridge.episode.topics import (
 )
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
-from bridge.media.straighten import Straightening
 from bridge.robots.robot import robot_of
 from bridge.task.record import parse_record
 from twin.errors import TwinError
@@ -64,18 +63,6 @@ class LiveCamera:
         default_factory=lambda: deque(maxlen=KEPT_IMAGES)
     )
     depths: deque[DepthImage] = field(default_factory=lambda: deque(maxlen=KEPT_IMAGES))
-
-    def take_info(self, stream: str, info: CameraInfo) -> None:
-        """Images that came before, or with another lens, were not straightened as these will be."""
-        before = self.infos.get(stream)
-        if (None if before is None else before.lens) != info.lens:
-            self.colors.clear()
-            self.depths.clear()
-        self.infos[stream] = info
-
-    def lens(self, stream: str) -> Straightening | None:
-        """What straightens the images of a stream, as far as is known."""
-        return self.infos[stream].lens if stream in self.infos else None
 
 
 class CameraNotReadyError(TwinError):
@@ -156,15 +143,15 @@ def frames_of(
     if not pairs:
         raise CameraNotReadyError("no colour and depth pair taken at rest since the last motion")
     oldest_ns = pairs[-1][0].stamp_ns - MAX_SPAN_NS
-    tree, lenses = poses.tree, {name: info.camera for name, info in camera.infos.items()}
+    tree, infos = poses.tree, camera.infos
     frames = [
         RgbdFrame(
             camera_id=camera_id,
             stamp_ns=color.stamp_ns,
-            image_u8=color.image_u8(),
-            depth_m=depth.depth_m(),
-            color_camera=lenses["color"],
-            depth_camera=lenses["depth"],
+            image_u8=replace(color, lens=infos["color"].lens).image_u8(),
+            depth_m=depth.through(infos["depth"].lens).depth_m(),
+            color_camera=infos["color"].camera,
+            depth_camera=infos["depth"].camera,
             T_base_color=tree.T_root_frame(frame_id, color.stamp_ns),
             T_base_depth=tree.T_root_frame(camera.infos["depth"].frame_id, depth.stamp_ns),
         )
@@ -315,12 +302,12 @@ class LiveView:
             return
         camera = self._cameras.setdefault(camera_id, LiveCamera())
         if kind == "info":
-            camera.take_info(stream, CameraInfo.from_cdr(data))
+            camera.infos[stream] = CameraInfo.from_cdr(data)
         elif kind == "image" and stream == "color":
-            camera.colors.append(color_from_message(type_name, data, camera.lens(stream)))
+            camera.colors.append(color_from_message(type_name, data))
             self._newest_ns = max(self._newest_ns, camera.colors[-1].stamp_ns)
         elif kind == "image" and stream == "depth":
-            camera.depths.append(DepthImage.from_message(type_name, data, camera.lens(stream)))
+            camera.depths.append(DepthImage.from_message(type_name, data))
 
     def cameras_from(self) -> str:
         """By what the cameras are posed, in words."""

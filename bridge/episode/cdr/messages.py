@@ -17,17 +17,16 @@ from bridge.episode.cdr.images import (
     DEPTH_ENCODINGS,
     FLOAT_DEPTH,
     image_header,
-    image_to_jpeg,
     no_encoding,
     pixel_rows,
 )
+from bridge.episode.cdr.straighten import Straightening, straightening
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.lens import KannalaBrandt, LensError
 from bridge.media import depth
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.media.pixels import COLORS, rgb_from
-from bridge.media.straighten import Straightening, straightening
 
 
 def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
@@ -119,6 +118,10 @@ class CompressedColor:
         image_u8 = decode_color(self.data)
         return image_u8 if self.lens is None else self.lens.color(image_u8)
 
+    def as_file(self) -> bytes:
+        """JPEG or PNG to be shown: as it was recorded, or a JPEG without its lens."""
+        return self.data if self.lens is None else encode_jpeg(self.image_u8())
+
 
 @dataclass(frozen=True, kw_only=True)
 class RawColor:
@@ -154,29 +157,17 @@ class RawColor:
             raise codec.MalformedMessageError(type_name=schema.IMAGE, found=found) from error
         return image_u8 if self.lens is None else self.lens.color(image_u8)
 
+    def as_file(self) -> bytes:
+        """JPEG to be shown."""
+        return encode_jpeg(self.image_u8())
+
 
 def color_from_message(
     type_name: str, data: bytes, lens: Straightening | None = None
 ) -> CompressedColor | RawColor:
-    """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``."""
-    color = (RawColor if type_name == schema.IMAGE else CompressedColor).from_cdr(data)
-    return color if lens is None else replace(color, lens=lens)
-
-
-def color_file_from_message(
-    type_name: str, data: bytes, lens: Straightening | None = None
-) -> CompressedColor:
-    """Read a colour image as a file to show: as it was recorded, or a JPEG of what it shows."""
-    color = color_from_message(type_name, data, lens)
-    if isinstance(color, CompressedColor) and lens is None:
-        return color
-    jpeg = image_to_jpeg(data) if lens is None else None
-    if jpeg is not None:
-        return CompressedColor.from_cdr(jpeg)
-    shown = encode_jpeg(color.image_u8())
-    return CompressedColor(
-        stamp_ns=color.stamp_ns, frame_id=color.frame_id, format="jpeg", data=shown
-    )
+    """Read a colour image; both kinds have ``stamp_ns``, ``image_u8()`` and ``as_file()``."""
+    kind = RawColor if type_name == schema.IMAGE else CompressedColor
+    return replace(kind.from_cdr(data), lens=lens)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,15 +214,17 @@ class DepthImage:
     ) -> "DepthImage":
         """Read depth in any form an episode may hold: raw, or compressed as RVL or PNG."""
         if type_name == schema.IMAGE:
-            found = DepthImage.from_cdr(data)
-        else:
-            image = CompressedColor.from_cdr(data)
-            found = DepthImage(
-                stamp_ns=image.stamp_ns,
-                frame_id=image.frame_id,
-                depth_mm=depth.unpack(image.format, image.data),
-            )
-        return found if lens is None else replace(found, depth_mm=lens.depth(found.depth_mm))
+            return DepthImage.from_cdr(data).through(lens)
+        image = CompressedColor.from_cdr(data)
+        return DepthImage(
+            stamp_ns=image.stamp_ns,
+            frame_id=image.frame_id,
+            depth_mm=depth.unpack(image.format, image.data),
+        ).through(lens)
+
+    def through(self, lens: Straightening | None) -> "DepthImage":
+        """As a pinhole camera sees it."""
+        return self if lens is None else replace(self, depth_mm=lens.depth(self.depth_mm))
 
     def depth_m(self) -> Float[np.ndarray, "height width"]:
         """Depth in metres, 0 where there is no measurement."""

@@ -16,6 +16,7 @@ from bridge.episode.mcap.format import (
     crc32,
     encoded,
     joined_crc,
+    num_bytes,
 )
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.mcap.walk import RecordSpan, attachment_entry, metadata_entry
@@ -42,7 +43,7 @@ class Summary:
         record = encoded(entry)
         self._indexes[record[0]].append(record)
 
-    def add_messages(self, counts: Mapping[int, int], *, start_ns: int, end_ns: int) -> None:
+    def add_messages(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
         """Book the messages of a chunk by channel, the first and the last log time among them."""
         for channel_id, count in counts.items():
             self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
@@ -85,20 +86,53 @@ LARGE_PACKING = zstandard.ZstdCompressionParameters(
 less CPU time for 5 % more bytes (``docs/decisions/0003-mcap-files.md``)."""
 
 
+Index = dict[int, list[int]]
+"""By channel: log time and offset of each message, one after the other."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class EncodedChunk:
     """A chunk record ready to be written."""
 
     buffers: list[Buffer]
-    length: int
     crc: int
-    start_ns: int
-    end_ns: int
-    compression: str
-    compressed_size: int
-    uncompressed_size: int
-    index: dict[int, list[int]]
-    """By channel: log time and offset of each message, one after the other."""
+    entry: records.ChunkIndex
+    """What the summary will say of it; where it lies is known when it is written."""
+    index: Index
+
+    @property
+    def length(self) -> int:
+        """Bytes of the record."""
+        return self.entry.chunk_length
+
+
+def chunk_of(
+    data: list[Buffer],
+    index: Index,
+    *,
+    times_ns: tuple[int, int],
+    size: int,
+    crc: int,
+    compression: str,
+    data_crc: int,
+) -> EncodedChunk:
+    """Make a chunk of records, packed or not; ``size`` and ``crc`` are of the records."""
+    data_size = sum(map(num_bytes, data))
+    entry = records.ChunkIndex(
+        chunk_length=0,
+        chunk_start_offset=0,
+        compression=compression,
+        compressed_size=data_size,
+        message_end_time=times_ns[1],
+        message_index_length=0,
+        message_index_offsets={},
+        message_start_time=times_ns[0],
+        uncompressed_size=size,
+    )
+    head = mcap_format.chunk_head(entry, crc)
+    entry.chunk_length = len(head) + data_size
+    joined = joined_crc(crc32(head, 0), data_crc, data_size)
+    return EncodedChunk(buffers=[head, *data], crc=joined, entry=entry, index=index)
 
 
 class OpenChunk:
@@ -190,30 +224,19 @@ class OpenChunk:
         crc = 0
         for piece in pieces:
             crc = crc32(piece, crc)
-        data, data_crc, compression = pieces, crc, ""
+        data, packed_crc, compression = pieces, crc, ""
         if self._compressor is not None:
             packed = self._compressor.compress(pieces[0] if self._gather else b"".join(pieces))
             if len(packed) < self.size:
-                data, data_crc, compression = [packed], crc32(packed, 0), "zstd"
-        data_size = len(data[0]) if compression else self.size
-        head = mcap_format.chunk_head(
-            start_ns=self._start_ns,
-            end_ns=self._end_ns,
+                data, packed_crc, compression = [packed], crc32(packed, 0), "zstd"
+        made = chunk_of(
+            data,
+            self._index,
+            times_ns=(self._start_ns, self._end_ns),
             size=self.size,
             crc=crc,
             compression=compression,
-            data_size=data_size,
-        )
-        made = EncodedChunk(
-            buffers=[head, *data],
-            length=len(head) + data_size,
-            crc=joined_crc(crc32(head, 0), data_crc, data_size),
-            start_ns=self._start_ns,
-            end_ns=self._end_ns,
-            compression=compression,
-            compressed_size=data_size,
-            uncompressed_size=self.size,
-            index=self._index,
+            data_crc=packed_crc,
         )
         self._clear()
         self.number += 1
@@ -261,21 +284,12 @@ class DataSection:
         self, chunk: EncodedChunk, start: int, offsets: dict[int, int], index_length: int
     ) -> None:
         """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``."""
-        self.summary.add_index(
-            records.ChunkIndex(
-                chunk_length=chunk.length,
-                chunk_start_offset=start,
-                compression=chunk.compression,
-                compressed_size=chunk.compressed_size,
-                message_end_time=chunk.end_ns,
-                message_index_length=index_length,
-                message_index_offsets=offsets,
-                message_start_time=chunk.start_ns,
-                uncompressed_size=chunk.uncompressed_size,
-            )
-        )
+        entry = chunk.entry
+        entry.chunk_start_offset, entry.message_index_length = start, index_length
+        entry.message_index_offsets = offsets
+        self.summary.add_index(entry)
         counts = {channel_id: len(entries) // 2 for channel_id, entries in chunk.index.items()}
-        self.summary.add_messages(counts, start_ns=chunk.start_ns, end_ns=chunk.end_ns)
+        self.summary.add_messages(counts, entry.message_start_time, entry.message_end_time)
 
     def add_attachment(self, entry: records.Attachment) -> None:
         """Write an attachment."""

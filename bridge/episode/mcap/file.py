@@ -23,11 +23,11 @@ from bridge.episode.mcap.format import (
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
-    ChunkHead,
     MessageHead,
     RecordSpan,
     attachment_entry,
     attachment_of,
+    chunk_entry,
     message_head,
     metadata_entry,
     parse,
@@ -47,21 +47,6 @@ def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     for place in walk(stream, len(MAGIC), data_end):
         builder.add(stream, place)
     return builder.seen.to_summary()
-
-
-def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
-    """Make the index entry of a chunk; its message indexes are yet to be added."""
-    return records.ChunkIndex(
-        chunk_length=place.end - place.offset,
-        chunk_start_offset=place.offset,
-        compression=chunk.compression,
-        compressed_size=len(chunk.data),
-        message_start_time=chunk.start_ns,
-        message_end_time=chunk.end_ns,
-        message_index_length=0,
-        message_index_offsets={},
-        uncompressed_size=chunk.size,
-    )
 
 
 @dataclass(kw_only=True)
@@ -166,7 +151,7 @@ class _Builder:
                 body = at + RECORD_HEAD.size
                 inside = RecordSpan(opcode, at, length)
                 self._define(inside, parse(opcode, data[body : body + length]))
-        self._chunk = chunk_entry(place, chunk)
+        self._chunk = chunk_entry(place, chunk.head)
         self.seen.chunks.append(self._chunk)
 
 

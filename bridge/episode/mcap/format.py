@@ -60,13 +60,13 @@ def encoded(entry: records.McapRecord) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def chunk_head(
-    *, start_ns: int, end_ns: int, size: int, crc: int, compression: str, data_size: int
-) -> bytes:
-    """Encode everything of a chunk that stands before its data."""
-    fields = CHUNK_FIELDS.pack(start_ns, end_ns, size, crc) + text(compression)
-    fields += struct.pack("<Q", data_size)
-    return RECORD_HEAD.pack(CHUNK, len(fields) + data_size) + fields
+def chunk_head(entry: records.ChunkIndex, crc: int) -> bytes:
+    """Encode everything of a chunk that stands before its data; ``crc`` is that of its records."""
+    fields = CHUNK_FIELDS.pack(
+        entry.message_start_time, entry.message_end_time, entry.uncompressed_size, crc
+    )
+    fields += text(entry.compression) + struct.pack("<Q", entry.compressed_size)
+    return RECORD_HEAD.pack(CHUNK, len(fields) + entry.compressed_size) + fields
 
 
 def message_index(channel_id: int, entries: list[int]) -> bytes:

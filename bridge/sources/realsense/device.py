@@ -15,7 +15,7 @@ from bridge.errors import MissingDependencyError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.depth import to_millimetres
-from bridge.media.straighten import Resampling
+from bridge.media.resample import Resampling
 from bridge.sources.device_samples import HostClock
 from bridge.sources.realsense.config import CameraStreamError, RealSenseConfig
 from bridge.sources.realsense.messages import Calibration, ColorFrame, DepthFrame, Frame

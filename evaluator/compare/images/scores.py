@@ -18,12 +18,12 @@ import numpy as np
 
 from bridge.episode import schema, topics
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
+from bridge.episode.cdr.straighten import Straightening
 from bridge.episode.reader import Episode
 from bridge.episode.streams import lens_of
 from bridge.episode.topics import COLOR_IMAGE
 from bridge.errors import GstError, MissingDependencyError
 from bridge.media.color import JPEG_MAGIC, decode_color, encode_png
-from bridge.media.straighten import Straightening
 from evaluator.compare.measure import mean_of, measured
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Quantity
@@ -154,11 +154,9 @@ def read_images(episode: Episode) -> Images:
 def _put_color(
     into: dict[Key, bytes], camera_id: str, data: bytes, *, lens: Straightening | None = None
 ) -> None:
-    image = CompressedColor.from_cdr(data)
-    is_straight = lens is None
-    into[camera_id, image.stamp_ns] = (
-        image.data if is_straight else encode_png(replace(image, lens=lens).image_u8(), level=1)
-    )
+    image = replace(CompressedColor.from_cdr(data), lens=lens)
+    shown = image.data if lens is None else encode_png(image.image_u8(), level=1)
+    into[camera_id, image.stamp_ns] = shown
 
 
 def _put_depth(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:

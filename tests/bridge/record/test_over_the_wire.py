@@ -97,17 +97,6 @@ def write_folder(folder: Path, *, frames: int) -> None:
     (folder / "scene.json").write_text(json.dumps(record))
 
 
-def test_a_folder_with_an_unreadable_image_leaves_no_episode(
-    joined: Joined, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_folder(tmp_path, frames=3)
-    (tmp_path / "c2.jpg").write_bytes(b"not an image")
-    arguments = ["--fast", "--episode", "scan", "--connect", joined.endpoint, "--quiet"]
-    assert robot_gst.run(["publish", "folder", str(tmp_path), *arguments]) == 2
-    assert "c2.jpg: unreadable image" in capsys.readouterr().err
-    assert list(joined.run.episodes_dir.iterdir()) == []
-
-
 def test_ctl_sends_the_task_file_that_a_person_names(
     joined: Joined, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

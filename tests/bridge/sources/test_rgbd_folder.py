@@ -82,7 +82,7 @@ def rewrite(folder: Path, record: dict[str, Any]) -> None:
 
 def messages_of(folder: Path, **changes: Any) -> list[list[StampedMessage]]:
     config = FolderConfig(**{"cell": "lab", "camera": "eye", **changes})
-    return list(folder_messages(read_index(folder), config, 1_000))
+    return list(folder_messages(read_index(folder), config))
 
 
 def test_topics_types_and_stamps_are_those_of_a_camera(folder: Path) -> None:
@@ -312,9 +312,7 @@ def test_names_that_cannot_be_topics_are_refused() -> None:
 def test_a_failed_import_leaves_no_episode(folder: Path, tmp_path: Path) -> None:
     (folder / "c.png").write_bytes(b"no image")
     run = RunFolder.create(tmp_path / "run")
-    messages = (
-        m for frame in folder_messages(read_index(folder), FolderConfig(), 0) for m in frame
-    )
+    messages = (m for frame in folder_messages(read_index(folder), FolderConfig()) for m in frame)
     with pytest.raises(GstError, match="unreadable image"):
         write_scan(run, EpisodeInfo(id="scan", kind="scan"), messages, source={})
     assert list(run.episodes_dir.iterdir()) == []

@@ -16,13 +16,13 @@ from bridge.episode.cdr.messages import (
     FrameTransform,
     transforms_to_cdr,
 )
+from bridge.episode.cdr.straighten import Straightening, straightening
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry.camera import Camera
 from bridge.media.color import decode_color, encode_png
-from bridge.media.straighten import Straightening, straightening
 from bridge.terminal import Output
 from twin.scene import settings
 from twin.scene.rebuild.record import describe_scene
@@ -31,8 +31,8 @@ from twin.scene.store.folder import read_record
 
 cv2 = pytest.importorskip("cv2")
 pytestmark = [pytest.mark.slow, pytest.mark.parity]
-FISHEYE = Camera(width=128, height=96, fx=70.0, fy=70.0, cx=65.0, cy=47.0)
-RATIONAL = Camera(width=128, height=96, fx=105.0, fy=105.0, cx=63.0, cy=49.0)
+FISHEYE = Camera(width=320, height=240, fx=175.0, fy=175.0, cx=162.0, cy=118.0)
+RATIONAL = Camera(width=320, height=240, fx=262.0, fy=262.0, cx=158.0, cy=122.0)
 LENSES = {
     "equidistant": (FISHEYE, (-0.01, 0.02, -0.015, 0.003)),
     "rational_polynomial": (RATIONAL, (0.55, -2.7, 0.0008, -0.0003, 1.5, 0.43, -2.5, 1.5)),
@@ -150,8 +150,8 @@ def test_a_scene_is_rebuilt_through_a_lens_as_well_as_through_a_pinhole(
     lens = straightening(model, numbers, camera)
     assert isinstance(lens, Straightening)
     config = settings.RebuildConfig(
-        fit=settings.FitConfig(iterations=300, threads=1),
-        initialise=settings.InitialiseConfig(max_splats=10_000),
+        fit=settings.FitConfig(iterations=150, threads=1),
+        initialise=settings.InitialiseConfig(max_splats=2_500),
     )
     reached = {}
     for name in (model, ""):

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage, color_from_message
+from bridge.episode.cdr.straighten import Straightening, straightening
 from bridge.episode.schema import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
 from bridge.geometry.camera import Camera
 from bridge.geometry.lens import LensError
 from bridge.media.color import UnreadableImageError, encode_png
-from bridge.media.straighten import Straightening, straightening
 
 RECORDED = Camera(width=160, height=120, fx=95.0, fy=96.5, cx=78.2, cy=61.3)
 LENSES = {
