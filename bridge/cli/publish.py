@@ -24,28 +24,23 @@ def _recorded(
 ) -> Iterator[dict[str, Any]]:
     """Have the recorder record while the context lasts; an error throws the episode away.
 
-    Args:
-        client: The recorder.
-        episode: Id of the new episode; None records nothing.
-        info: What it is, as ``RecorderClient.start`` takes it.
-
     Yields:
         What the recorder says at the end; empty until then, and where nothing is recorded.
     """
     from bridge.errors import GstError
 
     answer: dict[str, Any] = {}
-    if episode is not None:
-        client.start(episode, info)
+    if episode is None:
+        yield answer
+        return
+    client.start(episode, info)
     try:
         yield answer
     except GstError:
-        if episode is not None:
-            with contextlib.suppress(GstError):  # the first error is the one to show
-                client.stop(discard=True)
+        with contextlib.suppress(GstError):  # the first error is the one to show
+            client.stop(discard=True)
         raise
-    if episode is not None:
-        answer.update(client.stop())
+    answer.update(client.stop())
 
 
 PLAYBACK = PlaybackConfig()

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,7 +39,6 @@ from bridge.terminal import Advance
 STORED_PER_MM = 5
 MAX_MM = 65535 // STORED_PER_MM
 """Beyond 13.107 m a depth does not fit in 16 bits at 5000 per metre."""
-ColorFormat = Literal["recorded", "png"]
 
 
 class Stamped(NamedTuple):
@@ -67,7 +66,6 @@ def export_tum(
     out: Path,
     *,
     camera: str | None,
-    color: ColorFormat,
     force: bool,
     advance: Advance,
 ) -> list[CameraReport]:
@@ -85,9 +83,9 @@ def export_tum(
     with new_folder(out, force=force) as folder:
         for name, place_name in safe_names(wanted).items():
             place = folder if len(wanted) == 1 else folder / place_name
-            reports.append(_write_camera(episode, name, tree, place, color, advance))
+            reports.append(_write_camera(episode, name, tree, place, advance))
         choices = {
-            "color": "JPEG as recorded" if color == "recorded" else "PNG",
+            "color": "JPEG as recorded, PNG of others and of those through a lens",
             "depth": "16-bit PNG, 5000 per metre",
             "poses": "groundtruth.txt is T_base_color at every colour and depth stamp",
             "cameras": {
@@ -108,7 +106,6 @@ def _write_camera(
     name: str,
     tree: TransformTree,
     place: Path,
-    color: ColorFormat,
     advance: Advance,
 ) -> CameraReport:
     report = CameraReport(folder=place.name)
@@ -125,7 +122,7 @@ def _write_camera(
         with message_named(episode, message.topic, counts[message.topic]):
             if message.topic == topics[0]:
                 image = color_from_message(message.type_name, message.data, lenses[0])
-                report.colors.append(_write_color(place, image, color))
+                report.colors.append(_write_color(place, image))
             else:
                 depth = DepthImage.from_message(message.type_name, message.data, lenses[1])
                 item, too_far = _write_depth(place, depth)
@@ -140,16 +137,13 @@ def _write_camera(
     return report
 
 
-def _write_color(place: Path, image: CompressedColor | RawColor, color: ColorFormat) -> Stamped:
-    stem = f"rgb/{seconds_text(image.stamp_ns)}"
-    is_whole = image.lens is None and color == "recorded"
-    data = image.data if isinstance(image, CompressedColor) and is_whole else b""
-    if data[:2] == JPEG_MAGIC:
-        name = f"{stem}.jpg"
-        (place / name).write_bytes(data)
-    else:
-        name = f"{stem}.png"
-        (place / name).write_bytes(encode_png(image.image_u8(), level=1))
+def _write_color(place: Path, image: CompressedColor | RawColor) -> Stamped:
+    data = image.data if isinstance(image, CompressedColor) and image.lens is None else b""
+    ending = "jpg" if data[:2] == JPEG_MAGIC else "png"
+    if ending == "png":
+        data = encode_png(image.image_u8(), level=1)
+    name = f"rgb/{seconds_text(image.stamp_ns)}.{ending}"
+    (place / name).write_bytes(data)
     return Stamped(image.stamp_ns, name)
 
 

@@ -4,6 +4,7 @@
 centres at +0.5) in memory and ROS (centres at whole numbers) on disk.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from bridge.episode.cdr.images import (
 from bridge.episode.cdr.straighten import Straightening, straightening
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.geometry.lens import KannalaBrandt, LensError
+from bridge.geometry.lens import LensError
 from bridge.media import depth
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.media.pixels import COLORS, rgb_from
@@ -118,9 +119,9 @@ class CompressedColor:
         image_u8 = decode_color(self.data)
         return image_u8 if self.lens is None else self.lens.color(image_u8)
 
-    def as_file(self) -> bytes:
-        """JPEG or PNG to be shown: as it was recorded, or a JPEG without its lens."""
-        return self.data if self.lens is None else encode_jpeg(self.image_u8())
+    def as_file(self, encode: Callable[[np.ndarray], bytes] = encode_jpeg) -> bytes:
+        """JPEG or PNG to be shown: as it was recorded, or encoded anew without its lens."""
+        return self.data if self.lens is None else encode(self.image_u8())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,9 +158,9 @@ class RawColor:
             raise codec.MalformedMessageError(type_name=schema.IMAGE, found=found) from error
         return image_u8 if self.lens is None else self.lens.color(image_u8)
 
-    def as_file(self) -> bytes:
-        """JPEG to be shown."""
-        return encode_jpeg(self.image_u8())
+    def as_file(self, encode: Callable[[np.ndarray], bytes] = encode_jpeg) -> bytes:
+        """A file to be shown."""
+        return encode(self.image_u8())
 
 
 def color_from_message(
@@ -242,19 +243,14 @@ class CameraInfo:
     lens: Straightening | None = None
 
     def to_cdr(self) -> bytes:
-        """Serialise as sensor_msgs/CameraInfo, of the images as they are recorded."""
-        fx, fy, cx, cy = (self.camera if self.lens is None else self.lens.recorded).to_ros()
-        model, numbers = "plumb_bob", [0.0] * 5
-        if self.lens is not None:
-            is_fisheye = isinstance(self.lens.lens, KannalaBrandt)
-            model = "equidistant" if is_fisheye else "thin_prism_model"
-            numbers = list(self.lens.lens.coefficients)
+        """Serialise as sensor_msgs/CameraInfo, of images without distortion."""
+        fx, fy, cx, cy = self.camera.to_ros()
         message = {
             "header": _header(self.stamp_ns, self.frame_id),
             "height": self.camera.height,
             "width": self.camera.width,
-            "distortion_model": model,
-            "d": numbers,
+            "distortion_model": "plumb_bob",
+            "d": [0.0] * 5,
             "k": [fx, 0, cx, 0, fy, cy, 0, 0, 1],
             "r": [1, 0, 0, 0, 1, 0, 0, 0, 1],
             "p": [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],

@@ -36,7 +36,6 @@ from bridge.episode.mcap.walk import (
     records_in,
     unpack_chunk,
     walk,
-    walk_section,
 )
 from bridge.errors import EpisodeError
 
@@ -298,11 +297,10 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
     if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
         raise BrokenRecordError("its summary has another CRC than it declares")
     summary = Summary()
-    start = footer.summary_start
-    for place in walk_section(section[: footer_at - start], start):
-        body = section[place.offset + RECORD_HEAD.size - start : place.end - start]
-        is_shared = place.opcode in (SCHEMA, CHANNEL) and place.length <= _SHARED_BYTES
-        _add(summary, (_parse_once if is_shared else parse)(place.opcode, body))
+    for opcode, at, length in records_in(section[: footer_at - footer.summary_start]):
+        body = section[at + RECORD_HEAD.size : at + RECORD_HEAD.size + length]
+        is_shared = opcode in (SCHEMA, CHANNEL) and length <= _SHARED_BYTES
+        _add(summary, (_parse_once if is_shared else parse)(opcode, body))
     return summary
 
 

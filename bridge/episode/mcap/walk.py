@@ -108,31 +108,18 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     at = start
     while at < end:
         stream.seek(at)
-        place = _place(stream.read(RECORD_HEAD.size), at, end)
+        head = stream.read(RECORD_HEAD.size)
+        if len(head) < RECORD_HEAD.size:
+            raise BrokenRecordError(f"the record at byte {at} is cut off")
+        opcode, length = RECORD_HEAD.unpack(head)
+        if opcode == 0:
+            raise BrokenRecordError(f"the record at byte {at} is of kind 0, which there is not")
+        if length > end - at - RECORD_HEAD.size:
+            message = f"the record at byte {at} claims {length} bytes, {end - at} are left"
+            raise BrokenRecordError(message)
+        place = RecordSpan(opcode, at, length)
         yield place
         at = place.end
-
-
-def walk_section(section: bytes, start: int) -> Iterator[RecordSpan]:
-    """Yield the places of all records of a section of a file that is in memory."""
-    at, end = start, start + len(section)
-    while at < end:
-        front = at - start
-        place = _place(section[front : front + RECORD_HEAD.size], at, end)
-        yield place
-        at = place.end
-
-
-def _place(head: bytes, at: int, end: int) -> RecordSpan:
-    if len(head) < RECORD_HEAD.size:
-        raise BrokenRecordError(f"the record at byte {at} is cut off")
-    opcode, length = RECORD_HEAD.unpack(head)
-    if opcode == 0:
-        raise BrokenRecordError(f"the record at byte {at} is of kind 0, which there is not")
-    if length > end - at - RECORD_HEAD.size:
-        message = f"the record at byte {at} claims {length} bytes, {end - at} are left"
-        raise BrokenRecordError(message)
-    return RecordSpan(opcode, at, length)
 
 
 def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
@@ -390,16 +377,16 @@ def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
 
 
 def records_in(data: Buffer, at: int = 0) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, offset and body length of each record in a chunk's unpacked data."""
+    """Yield opcode, offset and body length of each record in a chunk's data, or a summary."""
     end = len(data)
     head_bytes, unpack = RECORD_HEAD.size, RECORD_HEAD.unpack_from
     while at < end:
         if end - at < head_bytes:
-            raise BrokenRecordError(f"{end - at} bytes too many at the end of a chunk")
+            raise BrokenRecordError(f"{end - at} bytes too many behind the last record")
         opcode, length = unpack(data, at)
         after = at + head_bytes + length
         if after > end or opcode == 0 or (opcode == MESSAGE and length < MESSAGE_FIELDS):
-            message = f"a record of kind {opcode} in a chunk claims {length} of {end - at} bytes"
+            message = f"a record of kind {opcode} claims {length} of {end - at} bytes"
             raise BrokenRecordError(message)
         yield opcode, at, length
         at = after

@@ -9,19 +9,16 @@ few threads, as NumPy and the image decoders let go of the interpreter.
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from bridge.episode import schema, topics
+from bridge.episode import schema, streams, topics
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
-from bridge.episode.cdr.straighten import Straightening
 from bridge.episode.reader import Episode
-from bridge.episode.streams import lens_of
-from bridge.episode.topics import COLOR_IMAGE
 from bridge.errors import GstError, MissingDependencyError
 from bridge.media.color import JPEG_MAGIC, decode_color, encode_png
 from evaluator.compare.measure import mean_of, measured
@@ -122,9 +119,10 @@ def images_of(views: Episode, source: Episode | None) -> Images:
     """Collect the images of a views episode; recorded ones of its source where it has none."""
     images = read_images(views)
     if source is not None and not images.color[RECORDED]:
-        wanted = {stamp for _, stamp in images.color[RENDERED]}
-        theirs = read_images(source).color[RECORDED]
-        images.color[RECORDED] = {key: theirs[key] for key in theirs if key[1] in wanted}
+        for name in {camera_id for camera_id, _ in images.color[RENDERED]}:
+            for image in streams.color_images(source, name):
+                if (key := (name, image.stamp_ns)) in images.color[RENDERED]:
+                    images.color[RECORDED][key] = image.as_file(encode_png)
     return images
 
 
@@ -135,8 +133,7 @@ def read_images(episode: Episode) -> Images:
     for topic in episode.topics_of_type(schema.COMPRESSED_IMAGE):
         for name, pattern in _COLOR_TOPICS:
             if match := pattern.search(topic):
-                lens = lens_of(episode, match.group(1)) if topic.endswith(COLOR_IMAGE) else None
-                put[topic] = partial(_put_color, images.color[name], match.group(1), lens=lens)
+                put[topic] = partial(_put_color, images.color[name], match.group(1))
                 break
         else:
             if match := topics.MASK_TOPIC.search(topic):
@@ -151,12 +148,9 @@ def read_images(episode: Episode) -> Images:
     return images
 
 
-def _put_color(
-    into: dict[Key, bytes], camera_id: str, data: bytes, *, lens: Straightening | None = None
-) -> None:
-    image = replace(CompressedColor.from_cdr(data), lens=lens)
-    shown = image.data if lens is None else encode_png(image.image_u8(), level=1)
-    into[camera_id, image.stamp_ns] = shown
+def _put_color(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:
+    image = CompressedColor.from_cdr(data)
+    into[camera_id, image.stamp_ns] = image.data
 
 
 def _put_depth(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:
@@ -197,9 +191,7 @@ def _score_depth(images: Images, key: Key) -> DepthScore | None:
         return None
 
 
-NOT_A_SAMPLE = (
-    "views of one scene are no random sample of views; the per-image list is in the table"
-)
+NOT_A_SAMPLE = "views of one scene are no random sample of views; each image is in the table"
 
 
 def size_words(sizes: Iterable[tuple[int, int]]) -> str:
