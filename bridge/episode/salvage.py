@@ -98,12 +98,12 @@ class CopyTarget:
                 self._take_plain(found)
             case Chunk():
                 self._define(found.contents)
-                self.section.add_chunk(verbatim(found))
+                self.section.add_chunks([verbatim(found)])
             case CutChunk():
                 records, contents = self._without_contradictions(found)
                 self._define(contents)
                 if contents.num_messages:
-                    self.section.add_chunk(salvaged(records, contents))
+                    self.section.add_chunks([salvaged(records, contents)])
             case TopMessage():
                 self._take_message(found)
             case AttachmentSpan():
@@ -197,7 +197,7 @@ class CopyTarget:
 
     def _flush_loose(self) -> None:
         if self._loose.has_messages:
-            self.section.add_chunk(self._loose.encode())
+            self.section.add_chunks([self._loose.encode()])
 
     def _take_attachment(self, found: AttachmentSpan) -> None:
         offset = self.section.file.offset

@@ -131,23 +131,16 @@ def _readable(episode: Episode) -> Iterator[str]:
             yield topic
 
 
-def _camera_topic(episode: Episode, camera_id: str, tail: str) -> str:
-    topic = find_camera_topic(episode, camera_id, tail)
-    if topic is not None:
-        return topic
-    raise EpisodeError(
-        path=episode.path,
-        found=f"no topic ends with {CAMERAS}{camera_id}/{tail}",
-        hint=f"Cameras here: {', '.join(camera_ids(episode)) or 'none'}.",
-    )
-
-
 def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> CameraInfo:
     """Return the first intrinsics of ``color`` or ``depth``."""
-    topic = _camera_topic(episode, camera_id, f"{stream}/info")
-    for message in episode.messages([topic]):
+    topic = find_camera_topic(episode, camera_id, f"{stream}/info")
+    for message in episode.messages([topic] if topic else []):
         return CameraInfo.from_cdr(message.data)
-    raise EpisodeError(path=episode.path, found=f"{topic} is empty", hint="Record it again.")
+    raise EpisodeError(
+        path=episode.path,
+        found=f"no message on a topic that ends with {CAMERAS}{camera_id}/{stream}/info",
+        hint=f"Cameras here: {', '.join(camera_ids(episode)) or 'none'}.",
+    )
 
 
 def lens_of(episode: Episode, camera_id: str, stream: str = "color") -> Straightening | None:

@@ -212,8 +212,9 @@ class EpisodeWriter:
         self._monotonic = monotonic
         self._file = open_part(path, replace_dead=config.flush_s is None)
         self._section = DataSection(self._file)
+        header = mcap_format.encoded(records.Header(PROFILE, LIBRARY))
         try:
-            self._section.begin(PROFILE, LIBRARY)
+            self._file.append([mcap_format.MAGIC + header])
         except OSError as error:
             self.part_path.unlink(missing_ok=True)
             self._file.close()
@@ -224,7 +225,6 @@ class EpisodeWriter:
         self._pending: deque[EncodedChunk] = deque()
         self._queue: ChunkQueue | None = None
         if config.flush_s is not None:
-            header = mcap_format.encoded(records.Header(PROFILE, LIBRARY))
             self._queue = ChunkQueue(
                 self._section, self.part_path, header=header, monotonic=monotonic
             )
@@ -360,7 +360,7 @@ class EpisodeWriter:
         if self._queue is not None:
             self._queue.drain()
         while self._pending:
-            self._section.add_chunk(self._pending[0])
+            self._section.add_chunks([self._pending[0]])
             self._pending.popleft()
 
     def write_json(

@@ -62,12 +62,7 @@ class CameraReport:
 
 
 def export_tum(
-    episode: Episode,
-    out: Path,
-    *,
-    camera: str | None,
-    force: bool,
-    advance: Advance,
+    episode: Episode, out: Path, *, camera: str | None, force: bool, advance: Advance
 ) -> list[CameraReport]:
     """Write one camera into ``out`` itself, several into one folder each."""
     known = streams.camera_ids(episode)
@@ -102,11 +97,7 @@ def export_tum(
 
 
 def _write_camera(
-    episode: Episode,
-    name: str,
-    tree: TransformTree,
-    place: Path,
-    advance: Advance,
+    episode: Episode, name: str, tree: TransformTree, place: Path, advance: Advance
 ) -> CameraReport:
     report = CameraReport(folder=place.name)
     info = streams.camera_info(episode, name, "color")

@@ -257,14 +257,6 @@ class DataSection:
         self.file = file
         self.summary = Summary()
 
-    def begin(self, profile: str, library: str) -> None:
-        """Write magic and header."""
-        self.file.append([mcap_format.MAGIC + encoded(records.Header(profile, library))])
-
-    def add_chunk(self, chunk: EncodedChunk) -> None:
-        """Write a chunk and its message indexes."""
-        self.add_chunks([chunk])
-
     def add_chunks(self, chunks: Sequence[EncodedChunk]) -> None:
         """Write chunks, each with its message indexes, all or none."""
         start, crc = self.file.offset, self.file.crc

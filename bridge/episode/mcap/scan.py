@@ -121,7 +121,6 @@ Found: TypeAlias = (
 
 MAX_PLAIN_BYTES = 64 << 20
 """Headers, schemas, channels and metadata beyond this are refused."""
-COMPRESSIONS = ("", "lz4", "zstd")
 _FRONT_BYTES = 64
 """Enough for every fixed part of a record."""
 _SUMMARY_ONLY = frozenset(
@@ -208,7 +207,7 @@ def _chunk_head(front: bytes) -> ChunkHead:
         raise BrokenRecordError("no chunk head")
     length = mcap.RECORD_HEAD.unpack_from(front)[1]
     head = parse_chunk_head(front[mcap.RECORD_HEAD.size :], length)
-    if head.compression not in COMPRESSIONS:
+    if head.compression not in ("", "lz4", "zstd"):
         raise BrokenRecordError(f"its compression {head.compression!r} is not known")
     return head
 
