@@ -10,7 +10,6 @@ from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage,
 from bridge.episode.cdr.straighten import Straightening, straightening
 from bridge.episode.schema import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
 from bridge.geometry.camera import Camera
-from bridge.geometry.lens import LensError
 from bridge.media.color import UnreadableImageError, encode_png
 
 RECORDED = Camera(width=160, height=120, fx=95.0, fy=96.5, cx=78.2, cy=61.3)
@@ -128,7 +127,6 @@ def test_a_lens_that_bends_nothing_leaves_images_alone(
 def test_what_cannot_be_straightened_is_refused_with_what_to_do(
     model: str, numbers: tuple[float, ...], found: str
 ) -> None:
-    assert isinstance(straightening(model, tuple(map(float, numbers)), RECORDED), LensError)
     info = CameraInfo(stamp_ns=5, frame_id="eye", camera=RECORDED)
     message = codec.decode(CAMERA_INFO, info.to_cdr())
     data = codec.encode(
