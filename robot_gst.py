@@ -51,7 +51,6 @@ CORE: tuple[leaves.Command, ...] = (
         leaves.RECORD,
         "bridge.cli.publish",
         """
-        publish folder | Play an RGB-D folder as a live camera. | DIR --episode scan
         publish episode | Play an episode back with its own timing. | FILE --rate 2
         """,
     ),

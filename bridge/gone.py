@@ -24,6 +24,8 @@ _TOLD = {
     "prune": "robot-gst ls RUN --json lists age, size and outcome for a script of yours.",
     "export lerobot --depth": "Depth stays in the episodes; robot-gst export tum writes it.",
     "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
+    "export tum --color": "Files stay as recorded; ImageMagick decodes: mogrify -format png *.jpg.",
+    "publish folder": "robot-gst import rgbd DIR RUN; publish episode plays what that made.",
     "publish episode --remap": "Messages keep their names; namespace in --config comes before.",
     "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",

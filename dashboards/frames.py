@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import color_file_from_message
-from bridge.episode.reader import Episode, RawMessage
+from bridge.episode.cdr.messages import CompressedColor, RawColor, color_from_message
+from bridge.episode.reader import Episode
+from bridge.episode.streams import lens_of
 from bridge.episode.topics import RECORDED_TOPIC, RENDERED_TOPIC
-from bridge.media.color import decode_color
 from dashboards.errors import NotHereError
 
 RENDERED = "rendered:"
@@ -86,18 +86,18 @@ def _camera_of(topic: str) -> str | None:
 def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
     """Return the image nearest to an instant and its media type.
 
-    A compressed image is given byte for byte as recorded; a raw one becomes JPEG.
+    A compressed image without a lens is given as recorded, byte for byte; others become JPEG.
 
     Args:
         stamp_ns: Source time of the wanted instant [ns].
     """
     track = _track_of(path, camera_id)
     index = track.nearest(stamp_ns)
-    _, message = next(_in_one_pass(path, track, index, index), (index, None))
-    if message is None:
+    _, color = next(_in_one_pass(path, track, index, index), (index, None))
+    if color is None:
         text = f"{path.name} changed while it was read; reload the page."
         raise NotHereError(text)
-    data = color_file_from_message(message.type_name, message.data).data
+    data = color.as_file()
     return data, media_type(data, path)
 
 
@@ -116,10 +116,10 @@ def pack_frames(path: Path, camera_id: str) -> bytes:
     count = len(track.stamps_ns)
     step = -(-count // MAX_PACKED)
     files: dict[int, bytes] = {}
-    for index, message in _in_one_pass(path, track, 0, count - 1):
+    for index, color in _in_one_pass(path, track, 0, count - 1):
         if index in files or index % step:
             continue
-        files[index] = color_file_from_message(message.type_name, message.data).data
+        files[index] = color.as_file()
         if len(files) == 1:
             step = max(step, -(-count * len(files[index]) // MAX_PACKED_BYTES))
     head = {
@@ -153,22 +153,23 @@ def read_span(
     places = [i for i, stamp in enumerate(track.stamps_ns) if start_ns <= stamp <= end_ns]
     if not places:
         return
-    for index, message in _in_one_pass(path, track, places[0], places[-1]):
-        color = color_file_from_message(message.type_name, message.data)
-        yield track.stamps_ns[index], decode_color(color.data)
+    for index, color in _in_one_pass(path, track, places[0], places[-1]):
+        yield track.stamps_ns[index], color.image_u8()
 
 
 def _in_one_pass(
     path: Path, track: CameraTrack, first: int, last: int
-) -> Iterator[tuple[int, RawMessage]]:
+) -> Iterator[tuple[int, CompressedColor | RawColor]]:
     """Yield the frames from one place in a track to another, with their places."""
+    episode = Episode.open(path)
+    lens = lens_of(episode, track.camera_id)
     log_ns = track.log_times_ns[first : last + 1]
     places = {track.stamps_ns[place]: place for place in range(first, last + 1)}
     span = {"start_ns": min(log_ns), "end_ns": max(log_ns) + 1}
-    for message in Episode.open(path).messages([track.topic], **span):
+    for message in episode.messages([track.topic], **span):
         place = places.get(message.publish_time_ns)
         if place is not None:
-            yield place, message
+            yield place, color_from_message(message.type_name, message.data, lens)
 
 
 def media_type(data: bytes, path: Path) -> str:

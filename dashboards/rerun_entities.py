@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from rerun.urdf import UrdfTree
 
 from bridge.episode import streams
-from bridge.episode.cdr.messages import CameraInfo, DepthImage, color_file_from_message
+from bridge.episode.cdr.messages import CameraInfo
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
 from bridge.geometry import se3
@@ -146,7 +146,7 @@ def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -
             entity = f"{prefix}/cameras/{camera_id}/{kind}"
             entities.append(entity)
             try:
-                stamps_ns = send(file, episode, topic, entity)
+                stamps_ns = send(file, episode, camera_id, entity)
             except GstError as error:
                 file.note(f"{entity} is not shown further: {error}")
                 continue
@@ -158,25 +158,24 @@ def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -
     return entities
 
 
-def _send_color(file: RerunFile, episode: Episode, topic: str, entity: str) -> list[int]:
+def _send_color(file: RerunFile, episode: Episode, camera_id: str, entity: str) -> list[int]:
     stamps = []
-    for message in episode.messages([topic]):
-        image = color_file_from_message(message.type_name, message.data)
+    for image in streams.color_images(episode, camera_id):
+        data = image.as_file()
         try:
-            kind = media_type(image.data, episode.path)
+            kind = media_type(data, episode.path)
         except GstError as error:
             file.note(f"{entity}: {error}")
             continue
-        picture = rr.EncodedImage(contents=image.data, media_type=kind)
+        picture = rr.EncodedImage(contents=data, media_type=kind)
         file.at(entity, image.stamp_ns, picture)
         stamps.append(image.stamp_ns)
     return stamps
 
 
-def _send_depth(file: RerunFile, episode: Episode, topic: str, entity: str) -> list[int]:
+def _send_depth(file: RerunFile, episode: Episode, camera_id: str, entity: str) -> list[int]:
     stamps = []
-    for message in episode.messages([topic]):
-        image = DepthImage.from_message(message.type_name, message.data)
+    for image in streams.depth_images(episode, camera_id):
         file.at(entity, image.stamp_ns, rr.DepthImage(image.depth_mm.astype("<u2")))
         stamps.append(image.stamp_ns)
     file.always(entity, rr.DepthImage.from_fields(meter=MILLIMETRES_PER_METRE))

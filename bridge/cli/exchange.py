@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -23,7 +23,6 @@ def export_tum(
     /,
     *,
     camera: str | None = None,
-    color: Literal["recorded", "png"] = "recorded",
     clock: ClockChoice = "recorded",
     force: bool = False,
     output: Output = OUTPUT,
@@ -37,7 +36,6 @@ def export_tum(
         episode: An episode file with colour, depth and transforms.
         out: The folder to make.
         camera: Only this camera.
-        color: recorded keeps JPEG bytes as they are; png decodes them.
         clock: corrected takes offset and drift of the sources' clocks out of all stamps.
         force: Replace an earlier export.
     """
@@ -47,7 +45,7 @@ def export_tum(
     opened = open_episode(episode, clock=clock)
     images = sum(item.count for topic, item in opened.topics().items() if topic.endswith("/image"))
     with output.progress("export", images) as advance:
-        reports = write_tum(opened, out, camera=camera, color=color, force=force, advance=advance)
+        reports = write_tum(opened, out, camera=camera, force=force, advance=advance)
     data = [
         {
             "folder": report.folder,
@@ -60,6 +58,7 @@ def export_tum(
     lines = []
     for report in reports:
         line = f"{len(report.colors)} colour and {len(report.depths)} depth images"
+        line += f"; {report.straightened}" if report.straightened else ""
         if report.depth_too_far:
             line += f"; {report.depth_too_far} depths beyond 13.107 m do not fit and are left out"
         lines.append(line if len(reports) == 1 else f"{report.folder}: {line}")
@@ -191,7 +190,7 @@ def import_rgbd(
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
     source = describe_folder(index, config)
     total = num_frames(index, config)
-    path = _import_scan(run, info, folder_messages(index, config, None), total, source, output)
+    path = _import_scan(run, info, folder_messages(index, config), total, source, output)
     unused = [Unused(*item) for item in index.unused]
     data = {
         "file": str(path),

@@ -1,4 +1,4 @@
-"""Commands that publish a folder or an episode; leaves bring others."""
+"""The command that publishes an episode; leaves bring others."""
 
 import contextlib
 from collections.abc import Iterator
@@ -7,63 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from bridge.sources.folder.config import FolderConfig
 from bridge.sources.playback.config import PlaybackConfig
 from bridge.sources.source import Duration
-from bridge.terminal import Output, stop_signals
+from bridge.terminal import Output
 from bridge.wire.config import LOOPBACK
 
 if TYPE_CHECKING:
     from bridge.record.control import RecorderClient
 
 OUTPUT = Output()
-FOLDER = FolderConfig()
-
-
-def publish_folder(
-    folder: Path,
-    /,
-    *,
-    config: Annotated[FolderConfig, Parameter(name="*")] = FOLDER,
-    fast: bool = False,
-    episode: str | None = None,
-    recorder: str = "main",
-    connect: tuple[str, ...] = LOOPBACK,
-    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
-    output: Output = OUTPUT,
-) -> int:
-    """Publish an RGB-D folder (scene.json, TUM or 7-Scenes layout) as if it were a live camera.
-
-    Example: robot-gst publish folder data/kitchen --cell kitchen --camera kinect --episode scan
-
-    Args:
-        folder: Folder of one of the three layouts (docs/rgbd_folder.md).
-        fast: Send as fast as the recorder takes it; stamps keep their distance.
-        episode: Ask the recorder to record this episode from the first to the last frame.
-        recorder: Name of the recorder.
-        connect: Where it listens.
-        zenoh_config: zenoh configuration (JSON5).
-    """
-    from bridge.record.control import RecorderClient
-    from bridge.record.status import describe_answer
-    from bridge.sources.folder.messages import read_index
-    from bridge.sources.folder.publish import FolderSource
-    from bridge.wire.config import WireConfig
-    from bridge.wire.session import open_session
-
-    index = read_index(folder, config)
-    output.say(f"{index.path}: {index.summary}")
-    wire = WireConfig(connect=connect, config=zenoh_config)
-    info = {"kind": "scan", "cell": config.cell, "tags": [f"folder:{index.name}"]}
-    with stop_signals() as stop, open_session(wire) as session:
-        client = RecorderClient(session, recorder)
-        with _recorded(client, episode, info) as answer:  # a part of a folder is no scan
-            sent = FolderSource(index, config, fast).run(session, stop, output)
-    text = f"{sent['frames']} of {sent['of']} frames, {sent['messages']} messages sent"
-    if answer:
-        text += f"\n{describe_answer(answer)}"
-    output.result({"sent": sent, "recorded": answer or None}, text)
-    return 0
 
 
 @contextlib.contextmanager
@@ -72,28 +24,23 @@ def _recorded(
 ) -> Iterator[dict[str, Any]]:
     """Have the recorder record while the context lasts; an error throws the episode away.
 
-    Args:
-        client: The recorder.
-        episode: Id of the new episode; None records nothing.
-        info: What it is, as ``RecorderClient.start`` takes it.
-
     Yields:
         What the recorder says at the end; empty until then, and where nothing is recorded.
     """
     from bridge.errors import GstError
 
     answer: dict[str, Any] = {}
-    if episode is not None:
-        client.start(episode, info)
+    if episode is None:
+        yield answer
+        return
+    client.start(episode, info)
     try:
         yield answer
     except GstError:
-        if episode is not None:
-            with contextlib.suppress(GstError):  # the first error is the one to show
-                client.stop(discard=True)
+        with contextlib.suppress(GstError):  # the first error is the one to show
+            client.stop(discard=True)
         raise
-    if episode is not None:
-        answer.update(client.stop())
+    answer.update(client.stop())
 
 
 PLAYBACK = PlaybackConfig()

@@ -19,8 +19,6 @@ from mcap.summary import Summary
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.file import (
     Seen,
-    attachment_entry,
-    chunk_entry,
     read_footer,
     read_header,
     read_summary,
@@ -33,7 +31,9 @@ from bridge.episode.mcap.walk import (
     ByteStream,
     MessageHead,
     RecordSpan,
+    attachment_entry,
     attachment_of,
+    chunk_entry,
     message_head,
     parse,
     parse_chunk,
@@ -257,7 +257,7 @@ class FileCheck:
         whose = f"the chunk at byte {place.offset}"
         self.seen.num_chunks += 1
         chunk = parse_chunk(body)
-        self._chunk = chunk_entry(place, chunk)
+        self._chunk = chunk_entry(place, chunk.head)
         data = unpack_chunk(chunk, whose=whose)
         first_ns, last_ns = NEVER, 0
         for opcode, at, length in records_in(data):
@@ -274,8 +274,8 @@ class FileCheck:
                     RecordSpan(opcode, at, length), parse(opcode, data[start : start + length])
                 )
         found = (first_ns, last_ns) if self._entries else (0, 0)
-        if found != (chunk.start_ns, chunk.end_ns):
-            said = (chunk.start_ns, chunk.end_ns)
+        if found != (chunk.head.start_ns, chunk.head.end_ns):
+            said = (chunk.head.start_ns, chunk.head.end_ns)
             self._fault(f"{whose} says its messages are from {said}, they are from {found}")
 
     def _note(self, head: MessageHead) -> None:

@@ -33,7 +33,7 @@ class Decoder:
     """Reads messages and forgets them, but for the drop log and the sizes of depth images.
 
     A topic of the contract must hold what ``docs/episode_format.md`` says. Any other topic of a
-    known type need only be valid, and its images readable: a lens may be distorted.
+    known type need only be valid, and its images readable.
     """
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, Header, Metadata, Schema
 
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
@@ -18,10 +18,11 @@ from bridge.episode.mcap.damaged import (
     summary_definitions,
     walk_records,
 )
-from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
+from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk, chunk_of
 from bridge.episode.mcap.format import Buffer, crc32
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
+from bridge.episode.mcap.walk import RecordSpan, attachment_entry, chunk_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
 
@@ -32,7 +33,7 @@ UNKNOWN_LIBRARY = "unknown; recovered by robot-gst"
 
 def key_of(found: Chunk | CutChunk) -> tuple[int, int]:
     """What tells a chunk from every other: CRC and size of its records."""
-    return found.head.crc, found.head.uncompressed_size
+    return found.head.crc, found.head.size
 
 
 def scan_with_journal(source: RecordFile, journal: RecordFile | None) -> Iterator[Found]:
@@ -90,19 +91,19 @@ class CopyTarget:
         """Copy one thing; index spans, damage and the old end are left behind."""
         if self.section.file.offset == 0:
             is_header = isinstance(found, Plain) and found.opcode == mcap.HEADER
-            header = found.raw if is_header else mcap.header("", UNKNOWN_LIBRARY)  # type: ignore[union-attr]
+            header = found.raw if is_header else mcap.encoded(Header("", UNKNOWN_LIBRARY))  # type: ignore[union-attr]
             self.section.file.append([mcap.MAGIC + header])
         match found:
             case Plain():
                 self._take_plain(found)
             case Chunk():
                 self._define(found.contents)
-                self.section.add_chunk(verbatim(found))
+                self.section.add_chunks([verbatim(found)])
             case CutChunk():
                 records, contents = self._without_contradictions(found)
                 self._define(contents)
                 if contents.num_messages:
-                    self.section.add_chunk(salvaged(records, contents))
+                    self.section.add_chunks([salvaged(records, contents)])
             case TopMessage():
                 self._take_message(found)
             case AttachmentSpan():
@@ -153,7 +154,7 @@ class CopyTarget:
                 if schema_id and schema_id not in summary.schemas:
                     if self._look_up(mcap.SCHEMA, schema_id):
                         return
-                    self._make(mcap.schema(schema_id, "unknown", "", b""))
+                    self._make(mcap.encoded(Schema(schema_id, b"", "", "unknown")))
                     self._made_schemas.add(schema_id)
 
     def _look_up(self, opcode: int, number: int) -> bool:
@@ -182,7 +183,7 @@ class CopyTarget:
         if channel_id in self.section.summary.channels:
             return
         if not self._look_up(mcap.CHANNEL, channel_id):
-            self._make(mcap.channel(channel_id, 0, unknown_topic(channel_id), ""))
+            self._make(mcap.encoded(Channel(channel_id, unknown_topic(channel_id), "", {}, 0)))
             self._made_channels.add(channel_id)
 
     def _take_message(self, found: TopMessage) -> None:
@@ -196,21 +197,15 @@ class CopyTarget:
 
     def _flush_loose(self) -> None:
         if self._loose.has_messages:
-            self.section.add_chunk(self._loose.encode())
+            self.section.add_chunks([self._loose.encode()])
 
     def _take_attachment(self, found: AttachmentSpan) -> None:
         offset = self.section.file.offset
         for block in self._source.blocks(found.offset, found.length):
             self.section.file.append([block])
-        self.section.summary.add_attachment(
-            found.record.name,
-            media_type=found.record.media_type,
-            log_time_ns=found.record.log_time,
-            create_time_ns=found.record.create_time,
-            data_size=found.data_size,
-            offset=offset,
-            length=found.length,
-        )
+        span = RecordSpan.between(mcap.ATTACHMENT, offset, self.section.file.offset)
+        entry = attachment_entry(span, found.record, found.data_size)
+        self.section.summary.add_index(entry)
 
 
 def _definitions(source: RecordFile) -> dict[tuple[int, int], bytes]:
@@ -259,38 +254,20 @@ def verbatim(found: Chunk) -> EncodedChunk:
     crc = 0
     for buffer in buffers:
         crc = crc32(buffer, crc)
-    return EncodedChunk(
-        buffers=buffers,
-        length=found.length,
-        crc=crc,
-        start_ns=start_ns,
-        end_ns=end_ns,
-        compression=found.head.compression,
-        compressed_size=found.head.data_bytes,
-        uncompressed_size=found.head.uncompressed_size,
-        index=found.contents.index,
-    )
+    entry = chunk_entry(RecordSpan.between(mcap.CHUNK, 0, found.length), found.head)
+    entry.message_start_time, entry.message_end_time = start_ns, end_ns
+    return EncodedChunk(buffers=buffers, crc=crc, entry=entry, index=found.contents.index)
 
 
 def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
     """Return the records saved from a cut chunk as a whole one."""
-    start_ns, end_ns = contents.time_range()
-    head = mcap.chunk_head(
-        start_ns=start_ns,
-        end_ns=end_ns,
+    crc = crc32(records, 0)
+    return chunk_of(
+        [records],
+        contents.index,
+        times_ns=contents.time_range(),
         size=len(records),
-        crc=crc32(records, 0),
+        crc=crc,
         compression="",
-        data_size=len(records),
-    )
-    return EncodedChunk(
-        buffers=[head, records],
-        length=len(head) + len(records),
-        crc=crc32(records, crc32(head, 0)),
-        start_ns=start_ns,
-        end_ns=end_ns,
-        compression="",
-        compressed_size=len(records),
-        uncompressed_size=len(records),
-        index=contents.index,
+        data_crc=crc,
     )

@@ -22,6 +22,7 @@ from bridge.episode.cdr.messages import (
     string_from_cdr,
     transforms_from_cdr,
 )
+from bridge.episode.cdr.straighten import Straightening
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import (
@@ -130,23 +131,39 @@ def _readable(episode: Episode) -> Iterator[str]:
             yield topic
 
 
-def _camera_topic(episode: Episode, camera_id: str, tail: str) -> str:
-    topic = find_camera_topic(episode, camera_id, tail)
-    if topic is not None:
-        return topic
+def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> CameraInfo:
+    """Return the first intrinsics of ``color`` or ``depth``."""
+    topic = find_camera_topic(episode, camera_id, f"{stream}/info")
+    for message in episode.messages([topic] if topic else []):
+        return CameraInfo.from_cdr(message.data)
     raise EpisodeError(
         path=episode.path,
-        found=f"no topic ends with {CAMERAS}{camera_id}/{tail}",
+        found=f"no message on a topic that ends with {CAMERAS}{camera_id}/{stream}/info",
         hint=f"Cameras here: {', '.join(camera_ids(episode)) or 'none'}.",
     )
 
 
-def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> CameraInfo:
-    """Return the first intrinsics of ``color`` or ``depth``."""
-    topic = _camera_topic(episode, camera_id, f"{stream}/info")
-    for message in episode.messages([topic]):
-        return CameraInfo.from_cdr(message.data)
-    raise EpisodeError(path=episode.path, found=f"{topic} is empty", hint="Record it again.")
+def lens_of(episode: Episode, camera_id: str, stream: str = "color") -> Straightening | None:
+    """What straightens the images of ``color`` or ``depth``; None without a lens, or any word."""
+    topic = find_camera_topic(episode, camera_id, f"{stream}/info")
+    first = next(iter(episode.messages([topic] if topic else [])), None)
+    return None if first is None else CameraInfo.from_cdr(first.data).lens
+
+
+def color_images(episode: Episode, camera_id: str) -> Iterator[CompressedColor | RawColor]:
+    """Colour images of a camera in log order, straightened when they are decoded."""
+    topic = find_camera_topic(episode, camera_id, "color/image")
+    lens = lens_of(episode, camera_id)
+    for message in episode.messages([topic] if topic else []):
+        yield color_from_message(message.type_name, message.data, lens)
+
+
+def depth_images(episode: Episode, camera_id: str) -> Iterator[DepthImage]:
+    """Depth images of a camera in log order, straightened."""
+    topic = find_camera_topic(episode, camera_id, "depth/image")
+    lens = lens_of(episode, camera_id, "depth")
+    for message in episode.messages([topic] if topic else []):
+        yield DepthImage.from_message(message.type_name, message.data, lens)
 
 
 def rgbd_pairs(episode: Episode, camera_id: str) -> Iterator[RgbdPair]:
@@ -155,13 +172,14 @@ def rgbd_pairs(episode: Episode, camera_id: str) -> Iterator[RgbdPair]:
     color_topic, depth_topic = (find_camera_topic(episode, camera_id, tail) for tail in tails)
     if color_topic is None or depth_topic is None:
         return
+    color_lens, depth_lens = (lens_of(episode, camera_id, stream) for stream in ("color", "depth"))
     colors: list[CompressedColor | RawColor] = []
     depths: list[DepthImage] = []
     for message in episode.messages([color_topic, depth_topic]):
         if message.topic == color_topic:
-            colors.append(color_from_message(message.type_name, message.data))
+            colors.append(color_from_message(message.type_name, message.data, color_lens))
         else:
-            depths.append(DepthImage.from_message(message.type_name, message.data))
+            depths.append(DepthImage.from_message(message.type_name, message.data, depth_lens))
         while colors and depths:
             if abs(gap_ns := colors[0].stamp_ns - depths[0].stamp_ns) <= PAIRING_TOLERANCE_NS:
                 yield colors.pop(0), depths.pop(0)

@@ -14,6 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from mcap import records
+
 from bridge.episode import metadata, provenance, schema
 from bridge.episode.chunk_queue import ChunkQueue
 from bridge.episode.mcap import format as mcap_format
@@ -86,7 +88,8 @@ class Channels:
         channel = self._channels.get(key)
         if channel is None:
             channel_id = len(self._channels) + 1
-            encoded = mcap_format.channel(channel_id, schema_id, topic, encoding, dict(about))
+            entry = records.Channel(channel_id, topic, encoding, dict(about), schema_id)
+            encoded = mcap_format.encoded(entry)
             type_name = "" if record is None else record.name
             channel = Channel(channel_id, type_name, definition + encoded)
             self._channels[key] = channel
@@ -98,7 +101,8 @@ class Channels:
         key = (record.name, record.schema_encoding, record.data)
         if key not in self._schemas:
             schema_id = len(self._schemas) + 1
-            encoded = mcap_format.schema(schema_id, *key)
+            entry = records.Schema(schema_id, record.data, record.schema_encoding, record.name)
+            encoded = mcap_format.encoded(entry)
             self._schemas[key] = (schema_id, encoded)
             self._summary.schemas[schema_id] = encoded
         return self._schemas[key]
@@ -208,8 +212,9 @@ class EpisodeWriter:
         self._monotonic = monotonic
         self._file = open_part(path, replace_dead=config.flush_s is None)
         self._section = DataSection(self._file)
+        header = mcap_format.encoded(records.Header(PROFILE, LIBRARY))
         try:
-            self._section.begin(PROFILE, LIBRARY)
+            self._file.append([mcap_format.MAGIC + header])
         except OSError as error:
             self.part_path.unlink(missing_ok=True)
             self._file.close()
@@ -220,7 +225,6 @@ class EpisodeWriter:
         self._pending: deque[EncodedChunk] = deque()
         self._queue: ChunkQueue | None = None
         if config.flush_s is not None:
-            header = mcap_format.header(PROFILE, LIBRARY)
             self._queue = ChunkQueue(
                 self._section, self.part_path, header=header, monotonic=monotonic
             )
@@ -356,7 +360,7 @@ class EpisodeWriter:
         if self._queue is not None:
             self._queue.drain()
         while self._pending:
-            self._section.add_chunk(self._pending[0])
+            self._section.add_chunks([self._pending[0]])
             self._pending.popleft()
 
     def write_json(
@@ -382,7 +386,7 @@ class EpisodeWriter:
         """Add an attachment, for example ``robot.urdf``; it is in the file at once."""
         self.wait_for_disk()
         self._section.add_attachment(
-            name, data, media_type=media_type, log_time_ns=log_time_ns, create_time_ns=log_time_ns
+            records.Attachment(log_time_ns, log_time_ns, name, media_type, data)
         )
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:

@@ -10,10 +10,11 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from bridge.episode import streams
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -25,7 +26,6 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.schema import StampedMessage
-from bridge.episode.streams import camera_ids, camera_info, find_camera_topic, transform_tree
 from bridge.episode.transforms import TransformTree
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
@@ -39,7 +39,6 @@ from bridge.terminal import Advance
 STORED_PER_MM = 5
 MAX_MM = 65535 // STORED_PER_MM
 """Beyond 13.107 m a depth does not fit in 16 bits at 5000 per metre."""
-ColorFormat = Literal["recorded", "png"]
 
 
 class Stamped(NamedTuple):
@@ -58,19 +57,15 @@ class CameraReport:
     depths: list[Stamped] = field(default_factory=list)
     depth_too_far: int = 0
     """Pixels beyond 13.107 m, written as "no measurement"."""
+    straightened: str = ""
+    """What was done to its images, where a lens bent them."""
 
 
 def export_tum(
-    episode: Episode,
-    out: Path,
-    *,
-    camera: str | None,
-    color: ColorFormat,
-    force: bool,
-    advance: Advance,
+    episode: Episode, out: Path, *, camera: str | None, force: bool, advance: Advance
 ) -> list[CameraReport]:
     """Write one camera into ``out`` itself, several into one folder each."""
-    known = camera_ids(episode)
+    known = streams.camera_ids(episode)
     wanted = known if camera is None else [camera]
     if not wanted or not set(wanted) <= set(known):
         raise EpisodeError(
@@ -78,18 +73,22 @@ def export_tum(
             found="no colour images" if not known else f"no camera {camera!r}",
             hint=f"Cameras here: {', '.join(known) or 'none'}.",
         )
-    tree = transform_tree(episode)
+    tree = streams.transform_tree(episode)
     reports: list[CameraReport] = []
     with new_folder(out, force=force) as folder:
         for name, place_name in safe_names(wanted).items():
             place = folder if len(wanted) == 1 else folder / place_name
-            reports.append(_write_camera(episode, name, tree, place, color, advance))
+            reports.append(_write_camera(episode, name, tree, place, advance))
         choices = {
-            "color": "JPEG as recorded" if color == "recorded" else "PNG",
+            "color": "JPEG as recorded, PNG of others and of those through a lens",
             "depth": "16-bit PNG, 5000 per metre",
             "poses": "groundtruth.txt is T_base_color at every colour and depth stamp",
             "cameras": {
-                name: {"folder": report.folder, "depth_pixels_too_far": report.depth_too_far}
+                name: {
+                    "folder": report.folder,
+                    "depth_pixels_too_far": report.depth_too_far,
+                    "lens": report.straightened,
+                }
                 for name, report in zip(wanted, reports, strict=True)
             },
         }
@@ -98,27 +97,25 @@ def export_tum(
 
 
 def _write_camera(
-    episode: Episode,
-    name: str,
-    tree: TransformTree,
-    place: Path,
-    color: ColorFormat,
-    advance: Advance,
+    episode: Episode, name: str, tree: TransformTree, place: Path, advance: Advance
 ) -> CameraReport:
     report = CameraReport(folder=place.name)
-    info = camera_info(episode, name, "color")
+    info = streams.camera_info(episode, name, "color")
     for part in ("rgb", "depth"):
         (place / part).mkdir(parents=True, exist_ok=True)
-    topics = [find_camera_topic(episode, name, f"{kind}/image") for kind in ("color", "depth")]
+    kinds = ("color", "depth")
+    topics = [streams.find_camera_topic(episode, name, f"{kind}/image") for kind in kinds]
+    lenses = [streams.lens_of(episode, name, kind) for kind in kinds]
+    report.straightened = "" if info.lens is None else info.lens.said
     counts = dict.fromkeys(topics, 0)
     for message in episode.messages([topic for topic in topics if topic is not None]):
         counts[message.topic] += 1
         with message_named(episode, message.topic, counts[message.topic]):
             if message.topic == topics[0]:
-                image = color_from_message(message.type_name, message.data)
-                report.colors.append(_write_color(place, image, color))
+                image = color_from_message(message.type_name, message.data, lenses[0])
+                report.colors.append(_write_color(place, image))
             else:
-                depth = DepthImage.from_message(message.type_name, message.data)
+                depth = DepthImage.from_message(message.type_name, message.data, lenses[1])
                 item, too_far = _write_depth(place, depth)
                 report.depths.append(item)
                 report.depth_too_far += too_far
@@ -131,15 +128,13 @@ def _write_camera(
     return report
 
 
-def _write_color(place: Path, image: CompressedColor | RawColor, color: ColorFormat) -> Stamped:
-    stem = f"rgb/{seconds_text(image.stamp_ns)}"
-    data = image.data if isinstance(image, CompressedColor) and color == "recorded" else b""
-    if data[:2] == JPEG_MAGIC:
-        name = f"{stem}.jpg"
-        (place / name).write_bytes(data)
-    else:
-        name = f"{stem}.png"
-        (place / name).write_bytes(encode_png(image.image_u8(), level=1))
+def _write_color(place: Path, image: CompressedColor | RawColor) -> Stamped:
+    data = image.data if isinstance(image, CompressedColor) and image.lens is None else b""
+    ending = "jpg" if data[:2] == JPEG_MAGIC else "png"
+    if ending == "png":
+        data = encode_png(image.image_u8(), level=1)
+    name = f"rgb/{seconds_text(image.stamp_ns)}.{ending}"
+    (place / name).write_bytes(data)
     return Stamped(image.stamp_ns, name)
 
 
@@ -170,8 +165,8 @@ def _write_poses(path: Path, tree: TransformTree, frame: str, stamps: list[int])
 def _write_cameras(
     path: Path, episode: Episode, name: str, tree: TransformTree, color: CameraInfo
 ) -> None:
-    has_depth = find_camera_topic(episode, name, "depth/info") is not None
-    depth = camera_info(episode, name, "depth") if has_depth else color
+    has_depth = streams.find_camera_topic(episode, name, "depth/info") is not None
+    depth = streams.camera_info(episode, name, "depth") if has_depth else color
     T_color_depth = np.eye(4)
     if depth.frame_id != color.frame_id:
         # The two sit on one rig, so any instant gives the same transform.

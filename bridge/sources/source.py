@@ -1,4 +1,4 @@
-"""What a source of live data is: a folder, cameras, an arm, the stand-in cell; and how one is run.
+"""What a source of live data is: an episode, a camera, an arm, a cell; and how one is run.
 
 Another device becomes a source by fulfilling ``Source``: ``run_source`` connects it, stops it and
 counts what it sent.
@@ -23,7 +23,7 @@ Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s")
 
 @runtime_checkable
 class Source(Protocol):
-    """Publishes what one device, folder or simulation has to say."""
+    """Publishes what one device or simulation has to say."""
 
     @property
     def name(self) -> str:

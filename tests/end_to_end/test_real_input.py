@@ -33,15 +33,16 @@ def every_third_run(folder: Path, thinned: Path) -> None:
             (thinned / path.relative_to(folder)).symlink_to(path)
 
 
-def test_a_real_kitchen_is_published_recorded_and_rebuilt(
+def test_a_real_kitchen_is_imported_played_recorded_and_rebuilt(
     tmp_path: Path, gst: Gst, recorder: Recorder, endpoint: str, shared_data: Shared
 ) -> None:
-    kitchen, run = tmp_path / "images", tmp_path / "kitchen"
+    kitchen, run, source = tmp_path / "images", tmp_path / "kitchen", tmp_path / "imported"
     every_fourth_frame(shared_data("rgbd_7scenes_redkitchen_a"), kitchen)
+    assert gst("import", "rgbd", str(kitchen), str(source)).returncode == 0
     with recorder(run, endpoint):
         sent = gst(
-            *("publish", "folder", str(kitchen), "--cell", "kitchen", "--camera", "kinect"),
-            *("--episode", "scan", "--fast", "--connect", endpoint, "--json"),
+            *("publish", "episode", str(source / "episodes" / "scan.mcap"), "--rate", "4"),
+            *("--episode", "scan", "--connect", endpoint, "--json"),
         )
     assert sent.returncode == 0, sent.stderr
     assert json.loads(sent.stdout)["recorded"]["lost"] == 0

@@ -7,7 +7,7 @@ import pytest
 
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.messages import DepthImage, color_file_from_message, color_from_message
+from bridge.episode.cdr.messages import DepthImage, color_from_message
 from bridge.media.pixels import COLORS
 
 cv2 = pytest.importorskip("cv2")
@@ -70,8 +70,8 @@ def test_colour_is_that_of_opencv_to_the_last_bit(encoding: str, size: tuple[int
 @pytest.mark.parametrize("encoding", ["bayer_rggb8", "yuv422", "nv12", "rgb16", "8UC3"])
 def test_every_encoding_can_be_shown(encoding: str) -> None:
     stored, rgb = stored_and_rgb(encoding, 32, 48)
-    shown = color_file_from_message(schema.IMAGE, message(stored, encoding, 32, 48))
-    decoded = cv2.cvtColor(cv2.imdecode(np.frombuffer(shown.data, np.uint8), 1), cv2.COLOR_BGR2RGB)
+    shown = color_from_message(schema.IMAGE, message(stored, encoding, 32, 48)).as_file()
+    decoded = cv2.cvtColor(cv2.imdecode(np.frombuffer(shown, np.uint8), 1), cv2.COLOR_BGR2RGB)
     assert decoded.shape == rgb.shape
     assert abs(float(decoded.mean()) - float(rgb.mean())) < 4
 

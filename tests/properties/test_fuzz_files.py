@@ -12,6 +12,7 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap import records
 from mcap.writer import CompressionType, Writer
 
 from bridge.episode.check import check_episode
@@ -88,8 +89,9 @@ def test_a_changed_file_is_read_or_refused(
     examine(path)
 
 
-def with_footer(*records: bytes, summary: bytes = b"") -> bytes:
-    body = MAGIC + mcap_format.header("", "") + b"".join(records) + mcap_format.data_end(0)
+def with_footer(*data: bytes, summary: bytes = b"") -> bytes:
+    first, last = map(mcap_format.encoded, (records.Header("", ""), records.DataEnd(0)))
+    body = MAGIC + first + b"".join(data) + last
     fields = struct.pack("<QQI", len(body) if summary else 0, 0, 0)
     return body + summary + mcap_format.record(mcap_format.FOOTER, fields) + MAGIC
 
@@ -106,27 +108,8 @@ def liars() -> dict[str, bytes]:
     endless = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(64 << 20))
     huge = RECORD_HEAD.pack(mcap_format.CHUNK, 1 << 62)
     index = struct.pack("<QQQQIQ", 0, 0, 8, 1 << 60, 0, 0) + mcap_format.text("")
-    place = mcap_format.ChunkPlace(
-        start_ns=0,
-        end_ns=0,
-        offset=1 << 60,
-        length=9,
-        index_offsets={},
-        index_length=0,
-        compression="",
-        compressed_size=1,
-        uncompressed_size=1 << 62,
-    )
-    statistics = mcap_format.statistics(
-        schemas=0,
-        attachments=0,
-        metadata_records=0,
-        chunks=1,
-        channels=0,
-        start_ns=0,
-        end_ns=0,
-        message_counts={},
-    )
+    place = records.ChunkIndex(9, 1 << 60, "", 1, 0, 0, {}, 0, 1 << 62)
+    statistics = records.Statistics(0, 0, {}, 1, 0, 0, 0, 0, 0)
     name = struct.pack("<I", 0xFFFF_FFF0)
     return {
         "a chunk of 4 EiB": with_footer(chunk(1 << 62, "zstd", zstandard.compress(b"x"))),
@@ -147,7 +130,7 @@ def liars() -> dict[str, bytes]:
             )
         ),
         "an index that points nowhere": with_footer(
-            summary=statistics + mcap_format.chunk_index(place)
+            summary=mcap_format.encoded(statistics) + mcap_format.encoded(place)
         ),
         "an index that is cut": with_footer(
             summary=mcap_format.record(mcap_format.CHUNK_INDEX, index[:30])

@@ -154,12 +154,10 @@ def _stationary(episode: Episode, camera_id: str, track: PostureTrack) -> Iterat
 
 def _load(episode: Episode, camera_id: str, chosen: Sequence[_Seen]) -> Iterator[RobotView]:
     wanted = {i.stamp_ns: i.posture for i in chosen if i.episode.path == episode.path}
-    topic = streams.find_camera_topic(episode, camera_id, "depth/image")
-    if topic is None or not wanted:
+    if not wanted:
         return
     camera = streams.camera_info(episode, camera_id, "depth").camera
-    for message in episode.messages([topic]):
-        image = DepthImage.from_message(message.type_name, message.data)
+    for image in streams.depth_images(episode, camera_id):
         if image.stamp_ns in wanted:
             yield RobotView(
                 camera=camera,

@@ -7,7 +7,7 @@ says why there are none. Knows nothing of the network: whoever is connected hand
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -143,15 +143,15 @@ def frames_of(
     if not pairs:
         raise CameraNotReadyError("no colour and depth pair taken at rest since the last motion")
     oldest_ns = pairs[-1][0].stamp_ns - MAX_SPAN_NS
-    tree, lenses = poses.tree, {name: info.camera for name, info in camera.infos.items()}
+    tree, infos = poses.tree, camera.infos
     frames = [
         RgbdFrame(
             camera_id=camera_id,
             stamp_ns=color.stamp_ns,
-            image_u8=color.image_u8(),
-            depth_m=depth.depth_m(),
-            color_camera=lenses["color"],
-            depth_camera=lenses["depth"],
+            image_u8=replace(color, lens=infos["color"].lens).image_u8(),
+            depth_m=depth.through(infos["depth"].lens).depth_m(),
+            color_camera=infos["color"].camera,
+            depth_camera=infos["depth"].camera,
             T_base_color=tree.T_root_frame(frame_id, color.stamp_ns),
             T_base_depth=tree.T_root_frame(camera.infos["depth"].frame_id, depth.stamp_ns),
         )

@@ -22,7 +22,6 @@ from twin.policies.views import Pictures
 from twin.robot.posture import Posture
 from twin.scene.movable_scene import Frame
 from twin.scene.raster.backend import open_rasteriser
-from twin.scene.render import recorded_images
 from twin.scene.standpoint import poses_in_scene
 from twin.scene.store.folder import read_scene
 from twin.scene.trial import open_trial
@@ -86,7 +85,7 @@ def visual_gap(
 def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[_State]:
     scene = read_scene(run)
     trial = open_trial(run, scene, episode)
-    pictures = {name: list(recorded_images(episode, name)) for name in names}
+    pictures = {name: list(streams.color_images(episode, name)) for name in names}
     if trial.postures is None or not all(len(items) > 1 for items in pictures.values()):
         return
     clock = [item.stamp_ns for item in pictures[names[0]][:-1]]

@@ -12,8 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from bridge.episode import streams
-from bridge.episode.cdr.messages import CompressedColor, RawColor, color_from_message
-from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry.camera import Camera
@@ -66,7 +64,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     frames = _frames(run, scene, trial, camera_id, stamps, config)
     agreement = ImageAgreement() if config.compare and config.is_sequence else None
     meshes = {} if agreement is None else trial.meshes(run)
-    recorded = recorded_images(episode, camera_id)
+    recorded = streams.color_images(episode, camera_id)
     coverage: list[float] = []
     files: list[str] = []
     with _writer(run, config, f"{episode.path.stem}.{camera_id}", stamps) as write:
@@ -123,7 +121,7 @@ def _stamps(
         first_ns = streams.first_stamp_ns(episode)
         began_ns = episode.start_ns if first_ns is None else first_ns
         return np.array([began_ns + round((config.at_s or 0.0) * 1e9)])
-    images = recorded_images(episode, camera_id)
+    images = streams.color_images(episode, camera_id)
     recorded = np.array([message.stamp_ns for message in images], dtype=np.int64)
     first_ns, last_ns = episode.start_ns, episode.end_ns
     if trial.postures is not None:
@@ -166,13 +164,6 @@ def _frames(
         )
         raise UsageError(message)
     return frames
-
-
-def recorded_images(episode: Episode, camera_id: str) -> Iterator[CompressedColor | RawColor]:
-    """Colour images of a camera, in log order."""
-    topic = streams.find_camera_topic(episode, camera_id, "color/image")
-    for message in episode.messages([] if topic is None else [topic]):
-        yield color_from_message(message.type_name, message.data)
 
 
 class ImageAgreement:

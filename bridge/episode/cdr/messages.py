@@ -4,7 +4,8 @@
 centres at +0.5) in memory and ROS (centres at whole numbers) on disk.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -17,18 +18,16 @@ from bridge.episode.cdr.images import (
     DEPTH_ENCODINGS,
     FLOAT_DEPTH,
     image_header,
-    image_to_jpeg,
     no_encoding,
     pixel_rows,
 )
+from bridge.episode.cdr.straighten import Straightening, straightening
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.geometry.lens import LensError
 from bridge.media import depth
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.media.pixels import COLORS, rgb_from
-
-STRAIGHT = ("", "none", "pinhole", "plumb_bob", "rational_polynomial", "thin_prism_model")
-"""Distortion models that bend no line where their numbers are 0, and what ends in brown_conrady."""
 
 
 def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
@@ -87,6 +86,7 @@ class CompressedColor:
     frame_id: str
     format: str
     data: bytes
+    lens: Straightening | None = None
 
     def to_cdr(self) -> bytes:
         """Serialise as sensor_msgs/CompressedImage."""
@@ -115,8 +115,13 @@ class CompressedColor:
         return self.image_u8()
 
     def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Decode to sRGB; raises ``UnreadableImageError``."""
-        return decode_color(self.data)
+        """Decode to sRGB, as a pinhole camera sees it; raises ``UnreadableImageError``."""
+        image_u8 = decode_color(self.data)
+        return image_u8 if self.lens is None else self.lens.color(image_u8)
+
+    def as_file(self, encode: Callable[[np.ndarray], bytes] = encode_jpeg) -> bytes:
+        """JPEG or PNG to be shown: as it was recorded, or encoded anew without its lens."""
+        return self.data if self.lens is None else encode(self.image_u8())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +133,7 @@ class RawColor:
     encoding: str
     rows: UInt8[np.ndarray, "rows row"]
     swap_bytes: bool = False
+    lens: Straightening | None = None
 
     @staticmethod
     def from_cdr(data: bytes) -> "RawColor":
@@ -144,31 +150,25 @@ class RawColor:
         )
 
     def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Convert to sRGB of 8 bits; alpha is dropped."""
+        """Convert to sRGB of 8 bits, as a pinhole camera sees it; alpha is dropped."""
         try:
-            return rgb_from(self.rows, self.encoding, swap_bytes=self.swap_bytes)
+            image_u8 = rgb_from(self.rows, self.encoding, swap_bytes=self.swap_bytes)
         except ValueError as error:
             found = str(error)
             raise codec.MalformedMessageError(type_name=schema.IMAGE, found=found) from error
+        return image_u8 if self.lens is None else self.lens.color(image_u8)
+
+    def as_file(self, encode: Callable[[np.ndarray], bytes] = encode_jpeg) -> bytes:
+        """A file to be shown."""
+        return encode(self.image_u8())
 
 
-def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:
-    """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``."""
-    return (RawColor if type_name == schema.IMAGE else CompressedColor).from_cdr(data)
-
-
-def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
-    """Read a colour image as a file to show: as it was recorded, or as JPEG when it is raw."""
-    if type_name != schema.IMAGE:
-        return CompressedColor.from_cdr(data)
-    jpeg = image_to_jpeg(data)
-    if jpeg is not None:
-        return CompressedColor.from_cdr(jpeg)
-    color = RawColor.from_cdr(data)
-    shown = encode_jpeg(color.image_u8())
-    return CompressedColor(
-        stamp_ns=color.stamp_ns, frame_id=color.frame_id, format="jpeg", data=shown
-    )
+def color_from_message(
+    type_name: str, data: bytes, lens: Straightening | None = None
+) -> CompressedColor | RawColor:
+    """Read a colour image; both kinds have ``stamp_ns``, ``image_u8()`` and ``as_file()``."""
+    kind = RawColor if type_name == schema.IMAGE else CompressedColor
+    return replace(kind.from_cdr(data), lens=lens)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,16 +210,22 @@ class DepthImage:
         return DepthImage(stamp_ns=header.stamp_ns, frame_id=header.frame_id, depth_mm=depth_mm)
 
     @staticmethod
-    def from_message(type_name: str, data: bytes) -> "DepthImage":
+    def from_message(
+        type_name: str, data: bytes, lens: Straightening | None = None
+    ) -> "DepthImage":
         """Read depth in any form an episode may hold: raw, or compressed as RVL or PNG."""
         if type_name == schema.IMAGE:
-            return DepthImage.from_cdr(data)
+            return DepthImage.from_cdr(data).through(lens)
         image = CompressedColor.from_cdr(data)
         return DepthImage(
             stamp_ns=image.stamp_ns,
             frame_id=image.frame_id,
             depth_mm=depth.unpack(image.format, image.data),
-        )
+        ).through(lens)
+
+    def through(self, lens: Straightening | None) -> "DepthImage":
+        """As a pinhole camera sees it."""
+        return self if lens is None else replace(self, depth_mm=lens.depth(self.depth_mm))
 
     def depth_m(self) -> Float[np.ndarray, "height width"]:
         """Depth in metres, 0 where there is no measurement."""
@@ -233,9 +239,11 @@ class CameraInfo:
     stamp_ns: int
     frame_id: str
     camera: Camera
+    """The pinhole camera of the images as they are read: those of a lens are straightened."""
+    lens: Straightening | None = None
 
     def to_cdr(self) -> bytes:
-        """Serialise as sensor_msgs/CameraInfo without distortion."""
+        """Serialise as sensor_msgs/CameraInfo, of images without distortion."""
         fx, fy, cx, cy = self.camera.to_ros()
         message = {
             "header": _header(self.stamp_ns, self.frame_id),
@@ -253,20 +261,7 @@ class CameraInfo:
     def from_cdr(data: bytes) -> "CameraInfo":
         """Read a sensor_msgs/CameraInfo; refuses what it cannot use instead of ignoring it."""
         message, found = codec.decode(schema.CAMERA_INFO, data), ""
-        k, model = message["k"], str(message["distortion_model"])
-        is_straight = model.lower() in STRAIGHT or model.lower().endswith("brown_conrady")
-        if np.any(np.asarray(message["d"]) != 0) or not is_straight:
-            found = f"lens distortion ({model or 'no model'}) is not zero; publish rectified images"
-        elif not (
-            np.isfinite(k).all() and min(k[0], k[4], message["width"], message["height"]) > 0
-        ):
-            size = f"images of {message['width']} x {message['height']}"
-            found = f"focal lengths of {k[0]:g} and {k[4]:g} pixels, {size}; calibrate the camera"
-        elif k[1] or max(message["binning_x"], message["binning_y"]) > 1:
-            found = f"skew of {k[1]:g}, or binned images; publish what K says of the images as sent"
-        if found:
-            hint = "Mend what publishes it."
-            raise codec.MalformedMessageError(type_name=schema.CAMERA_INFO, found=found, hint=hint)
+        k = message["k"]
         camera = Camera.from_ros(
             width=message["width"],
             height=message["height"],
@@ -275,8 +270,23 @@ class CameraInfo:
             cx=float(k[2]),
             cy=float(k[5]),
         )
+        if not (np.isfinite(k).all() and min(k[0], k[4], camera.width, camera.height) > 0):
+            size = f"images of {message['width']} x {message['height']}"
+            found = f"focal lengths of {k[0]:g} and {k[4]:g} pixels, {size}; calibrate the camera"
+        elif k[1] or max(message["binning_x"], message["binning_y"]) > 1:
+            found = f"skew of {k[1]:g}, or binned images; publish what K says of the images as sent"
+        numbers = tuple(map(float, message["d"]))
+        lens = None if found else straightening(message["distortion_model"], numbers, camera)
+        if isinstance(lens, LensError):
+            found = f"{lens}; calibrate the camera, or publish rectified images with zeros in D"
+        if found or isinstance(lens, LensError):
+            hint = "Mend what publishes it."
+            raise codec.MalformedMessageError(type_name=schema.CAMERA_INFO, found=found, hint=hint)
         return CameraInfo(
-            stamp_ns=stamp_of(message), frame_id=message["header"]["frame_id"], camera=camera
+            stamp_ns=stamp_of(message),
+            frame_id=message["header"]["frame_id"],
+            camera=camera if lens is None else lens.camera,
+            lens=lens,
         )
 
 

@@ -13,15 +13,19 @@ from mcap.records import McapRecord, Schema
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.format import (
     CHANNEL,
-    CHUNK,
-    CHUNK_FIELDS,
     MESSAGE,
     RECORD_HEAD,
     SCHEMA,
     Buffer,
     crc32,
 )
-from bridge.episode.mcap.walk import MAX_CHUNK_BYTES, BrokenRecordError, parse, records_in
+from bridge.episode.mcap.walk import (
+    MAX_CHUNK_BYTES,
+    BrokenRecordError,
+    ChunkHead,
+    parse,
+    records_in,
+)
 
 BLOCK_BYTES = 1 << 20
 
@@ -112,8 +116,6 @@ def finished_data(file: RecordFile) -> FinishedData | None:
 
 _INDEX_FIELDS = struct.Struct("<HxxxxQ")
 """Channel and log time of a message, after its record head."""
-_CHUNK_HEAD_BYTES = RECORD_HEAD.size + CHUNK_FIELDS.size + 4
-_COMPRESSIONS = (b"", b"lz4", b"zstd")
 
 
 def read_plain(record: bytes) -> McapRecord | None:
@@ -122,50 +124,6 @@ def read_plain(record: bytes) -> McapRecord | None:
     if isinstance(found, Schema) and found.id == 0:
         raise BrokenRecordError("a schema has id 0")
     return found
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChunkHead:
-    """What stands before a chunk's data."""
-
-    head_bytes: int
-    record_bytes: int
-    """Of the whole record, as claimed; a cut chunk has fewer, foxglove's tail claims 2^64."""
-    data_bytes: int
-    uncompressed_size: int
-    crc: int
-    compression: str
-
-    @property
-    def is_consistent(self) -> bool:
-        """Do the two lengths agree and the sizes stay within the limit?"""
-        return (
-            self.record_bytes == self.head_bytes + self.data_bytes
-            and self.data_bytes <= MAX_CHUNK_BYTES
-            and self.uncompressed_size <= MAX_CHUNK_BYTES
-        )
-
-
-def parse_chunk_head(front: bytes) -> ChunkHead:
-    """Read a chunk's head from the first bytes of its record."""
-    if len(front) < _CHUNK_HEAD_BYTES or front[0] != CHUNK:
-        raise BrokenRecordError("no chunk head")
-    _, length = RECORD_HEAD.unpack_from(front)
-    _, _, size, crc = CHUNK_FIELDS.unpack_from(front, RECORD_HEAD.size)
-    at = _CHUNK_HEAD_BYTES
-    name_bytes = int.from_bytes(front[at - 4 : at], "little")
-    name = front[at : at + name_bytes] if name_bytes <= len("zstd") else b"?"
-    at += name_bytes
-    if name not in _COMPRESSIONS or len(front) < at + 8:
-        raise BrokenRecordError(f"its compression {name!r} is not known")
-    return ChunkHead(
-        head_bytes=at + 8,
-        record_bytes=RECORD_HEAD.size + length,
-        data_bytes=int.from_bytes(front[at : at + 8], "little"),
-        uncompressed_size=size,
-        crc=crc,
-        compression=name.decode(),
-    )
 
 
 @dataclass(kw_only=True)
@@ -215,7 +173,7 @@ def unpack_front(head: ChunkHead, data: bytes) -> bytes:
     """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified."""
     if head.compression == "":
         return data
-    limit = min(head.uncompressed_size or MAX_CHUNK_BYTES, MAX_CHUNK_BYTES)
+    limit = min(head.size or MAX_CHUNK_BYTES, MAX_CHUNK_BYTES)
     return (_unpack_zstd if head.compression == "zstd" else _unpack_lz4)(data, limit)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import zstandard
+from mcap import records
 
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.format import (
@@ -11,16 +12,18 @@ from bridge.episode.mcap.format import (
     MESSAGE_FIELDS,
     MESSAGE_HEAD,
     Buffer,
-    ChunkPlace,
     Payload,
     crc32,
+    encoded,
     joined_crc,
+    num_bytes,
 )
 from bridge.episode.mcap.part_file import PartFile
+from bridge.episode.mcap.walk import RecordSpan, attachment_entry, metadata_entry
 
 
 class Summary:
-    """Schemas, channels, statistics and indexes of one file."""
+    """Schemas, channels, statistics and indexes of one file, each as it will stand in it."""
 
     def __init__(self) -> None:
         """Begin with an empty file."""
@@ -29,73 +32,42 @@ class Summary:
         self.message_counts: dict[int, int] = {}
         self.start_ns: int | None = None
         self.end_ns = 0
-        self._chunks: list[bytes] = []
-        self._attachments: list[bytes] = []
-        self._metadata: list[bytes] = []
+        self._indexes: dict[int, list[bytes]] = {
+            mcap_format.CHUNK_INDEX: [],
+            mcap_format.ATTACHMENT_INDEX: [],
+            mcap_format.METADATA_INDEX: [],
+        }
 
-    def add_chunk(self, place: ChunkPlace, counts: dict[int, int]) -> None:
-        """Book a chunk that is in the file, with its number of messages by channel."""
-        self._chunks.append(mcap_format.chunk_index(place))
-        if counts:
-            self.add_messages(counts, start_ns=place.start_ns, end_ns=place.end_ns)
+    def add_index(self, entry: records.McapRecord) -> None:
+        """Book where a chunk, attachment or metadata record lies."""
+        record = encoded(entry)
+        self._indexes[record[0]].append(record)
 
-    def add_messages(self, counts: dict[int, int], *, start_ns: int, end_ns: int) -> None:
-        """Book messages by channel, the first and the last log time among them."""
+    def add_messages(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
+        """Book the messages of a chunk by channel, the first and the last log time among them."""
         for channel_id, count in counts.items():
             self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
-        self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
-        self.end_ns = max(self.end_ns, end_ns)
-
-    def add_attachment(
-        self,
-        name: str,
-        *,
-        media_type: str,
-        log_time_ns: int,
-        create_time_ns: int,
-        data_size: int,
-        offset: int,
-        length: int,
-    ) -> None:
-        """Book an attachment record that is in the file."""
-        self._attachments.append(
-            mcap_format.attachment_index(
-                name,
-                media_type=media_type,
-                log_time_ns=log_time_ns,
-                create_time_ns=create_time_ns,
-                data_size=data_size,
-                offset=offset,
-                length=length,
-            )
-        )
-
-    def add_metadata(self, name: str, *, offset: int, length: int) -> None:
-        """Book a metadata record that is in the file."""
-        self._metadata.append(mcap_format.metadata_index(name, offset=offset, length=length))
+        if counts:
+            self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
+            self.end_ns = max(self.end_ns, end_ns)
 
     def encode(self, start: int) -> bytes:
         """Return everything from the summary to the end of the file."""
-        counts = dict(sorted(self.message_counts.items()))
-        statistics = mcap_format.statistics(
-            schemas=len(self.schemas),
-            channels=len(self.channels),
-            attachments=len(self._attachments),
-            metadata_records=len(self._metadata),
-            chunks=len(self._chunks),
-            start_ns=self.start_ns or 0,
-            end_ns=self.end_ns,
-            message_counts=counts,
+        chunks, attachments, metadata = self._indexes.values()
+        statistics = records.Statistics(
+            attachment_count=len(attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=dict(sorted(self.message_counts.items())),
+            chunk_count=len(chunks),
+            message_count=sum(self.message_counts.values()),
+            message_start_time=self.start_ns or 0,
+            message_end_time=self.end_ns,
+            metadata_count=len(metadata),
+            schema_count=len(self.schemas),
         )
-        groups = (
-            (mcap_format.SCHEMA, b"".join(self.schemas.values())),
-            (mcap_format.CHANNEL, b"".join(self.channels.values())),
-            (mcap_format.STATISTICS, statistics),
-            (mcap_format.CHUNK_INDEX, b"".join(self._chunks)),
-            (mcap_format.ATTACHMENT_INDEX, b"".join(self._attachments)),
-            (mcap_format.METADATA_INDEX, b"".join(self._metadata)),
-        )
-        return mcap_format.summary_section(groups, start)
+        definitions = (self.schemas.values(), self.channels.values())
+        groups = (*definitions, [encoded(statistics)], chunks, attachments, metadata)
+        return mcap_format.summary_section(map(b"".join, groups), start)
 
 
 ZSTD_LEVEL = 1
@@ -114,20 +86,53 @@ LARGE_PACKING = zstandard.ZstdCompressionParameters(
 less CPU time for 5 % more bytes (``docs/decisions/0003-mcap-files.md``)."""
 
 
+Index = dict[int, list[int]]
+"""By channel: log time and offset of each message, one after the other."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class EncodedChunk:
     """A chunk record ready to be written."""
 
     buffers: list[Buffer]
-    length: int
     crc: int
-    start_ns: int
-    end_ns: int
-    compression: str
-    compressed_size: int
-    uncompressed_size: int
-    index: dict[int, list[int]]
-    """By channel: log time and offset of each message, one after the other."""
+    entry: records.ChunkIndex
+    """What the summary will say of it; where it lies is known when it is written."""
+    index: Index
+
+    @property
+    def length(self) -> int:
+        """Bytes of the record."""
+        return self.entry.chunk_length
+
+
+def chunk_of(
+    data: list[Buffer],
+    index: Index,
+    *,
+    times_ns: tuple[int, int],
+    size: int,
+    crc: int,
+    compression: str,
+    data_crc: int,
+) -> EncodedChunk:
+    """Make a chunk of records, packed or not; ``size`` and ``crc`` are of the records."""
+    data_size = sum(map(num_bytes, data))
+    entry = records.ChunkIndex(
+        chunk_length=0,
+        chunk_start_offset=0,
+        compression=compression,
+        compressed_size=data_size,
+        message_end_time=times_ns[1],
+        message_index_length=0,
+        message_index_offsets={},
+        message_start_time=times_ns[0],
+        uncompressed_size=size,
+    )
+    head = mcap_format.chunk_head(entry, crc)
+    entry.chunk_length = len(head) + data_size
+    joined = joined_crc(crc32(head, 0), data_crc, data_size)
+    return EncodedChunk(buffers=[head, *data], crc=joined, entry=entry, index=index)
 
 
 class OpenChunk:
@@ -219,34 +224,23 @@ class OpenChunk:
         crc = 0
         for piece in pieces:
             crc = crc32(piece, crc)
-        data, data_crc, compression = pieces, crc, ""
+        data, packed_crc, compression = pieces, crc, ""
         if self._compressor is not None:
             packed = self._compressor.compress(pieces[0] if self._gather else b"".join(pieces))
             if len(packed) < self.size:
-                data, data_crc, compression = [packed], crc32(packed, 0), "zstd"
-        data_size = len(data[0]) if compression else self.size
-        head = mcap_format.chunk_head(
-            start_ns=self._start_ns,
-            end_ns=self._end_ns,
+                data, packed_crc, compression = [packed], crc32(packed, 0), "zstd"
+        made = chunk_of(
+            data,
+            self._index,
+            times_ns=(self._start_ns, self._end_ns),
             size=self.size,
             crc=crc,
             compression=compression,
-            data_size=data_size,
-        )
-        encoded = EncodedChunk(
-            buffers=[head, *data],
-            length=len(head) + data_size,
-            crc=joined_crc(crc32(head, 0), data_crc, data_size),
-            start_ns=self._start_ns,
-            end_ns=self._end_ns,
-            compression=compression,
-            compressed_size=data_size,
-            uncompressed_size=self.size,
-            index=self._index,
+            data_crc=packed_crc,
         )
         self._clear()
         self.number += 1
-        return encoded
+        return made
 
 
 def _compressor(*, gather: bool) -> zstandard.ZstdCompressor:
@@ -262,14 +256,6 @@ class DataSection:
         """Take over an open file."""
         self.file = file
         self.summary = Summary()
-
-    def begin(self, profile: str, library: str) -> None:
-        """Write magic and header."""
-        self.file.append([mcap_format.MAGIC + mcap_format.header(profile, library)])
-
-    def add_chunk(self, chunk: EncodedChunk) -> None:
-        """Write a chunk and its message indexes."""
-        self.add_chunks([chunk])
 
     def add_chunks(self, chunks: Sequence[EncodedChunk]) -> None:
         """Write chunks, each with its message indexes, all or none."""
@@ -290,60 +276,38 @@ class DataSection:
         self, chunk: EncodedChunk, start: int, offsets: dict[int, int], index_length: int
     ) -> None:
         """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``."""
-        place = ChunkPlace(
-            start_ns=chunk.start_ns,
-            end_ns=chunk.end_ns,
-            offset=start,
-            length=chunk.length,
-            index_offsets=offsets,
-            index_length=index_length,
-            compression=chunk.compression,
-            compressed_size=chunk.compressed_size,
-            uncompressed_size=chunk.uncompressed_size,
-        )
+        entry = chunk.entry
+        entry.chunk_start_offset, entry.message_index_length = start, index_length
+        entry.message_index_offsets = offsets
+        self.summary.add_index(entry)
         counts = {channel_id: len(entries) // 2 for channel_id, entries in chunk.index.items()}
-        self.summary.add_chunk(place, counts)
+        self.summary.add_messages(counts, entry.message_start_time, entry.message_end_time)
 
-    def add_attachment(
-        self, name: str, data: bytes, *, media_type: str, log_time_ns: int, create_time_ns: int
-    ) -> None:
+    def add_attachment(self, entry: records.Attachment) -> None:
         """Write an attachment."""
-        buffers = mcap_format.attachment(
-            name,
-            data,
-            media_type=media_type,
-            log_time_ns=log_time_ns,
-            create_time_ns=create_time_ns,
-        )
         offset = self.file.offset
-        self.file.append(buffers)
-        self.summary.add_attachment(
-            name,
-            media_type=media_type,
-            log_time_ns=log_time_ns,
-            create_time_ns=create_time_ns,
-            data_size=len(data),
-            offset=offset,
-            length=self.file.offset - offset,
-        )
+        self.file.append(mcap_format.attachment(entry))
+        span = RecordSpan.between(mcap_format.ATTACHMENT, offset, self.file.offset)
+        self.summary.add_index(attachment_entry(span, entry, len(entry.data)))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        offset = self.file.offset
-        self.file.append([mcap_format.metadata(name, values)])
-        self.summary.add_metadata(name, offset=offset, length=self.file.offset - offset)
+        offset, entry = self.file.offset, records.Metadata(name, dict(values))
+        self.file.append([encoded(entry)])
+        span = RecordSpan.between(mcap_format.METADATA, offset, self.file.offset)
+        self.summary.add_index(metadata_entry(span, entry))
 
     def seal(self) -> None:
         """Write the end of the data, the summary and the footer."""
-        data_end = mcap_format.data_end(self.file.crc)
+        data_end = encoded(records.DataEnd(self.file.crc))
         self.file.append([data_end, self.summary.encode(self.file.offset + len(data_end))])
 
 
 def index_records(index: dict[int, list[int]], start: int) -> tuple[bytes, dict[int, int]]:
     """Return a chunk's message index records and where each lies, the first at ``start``."""
-    records = [mcap_format.message_index(*item) for item in index.items()]
+    found = [mcap_format.message_index(*item) for item in index.items()]
     offsets = {}
-    for channel_id, encoded in zip(index, records, strict=True):
+    for channel_id, record in zip(index, found, strict=True):
         offsets[channel_id] = start
-        start += len(encoded)
-    return b"".join(records), offsets
+        start += len(record)
+    return b"".join(found), offsets

@@ -23,18 +23,19 @@ from bridge.episode.mcap.format import (
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
-    ChunkHead,
     MessageHead,
     RecordSpan,
+    attachment_entry,
     attachment_of,
+    chunk_entry,
     message_head,
+    metadata_entry,
     parse,
     parse_chunk,
     read_body,
     records_in,
     unpack_chunk,
     walk,
-    walk_section,
 )
 from bridge.errors import EpisodeError
 
@@ -45,43 +46,6 @@ def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     for place in walk(stream, len(MAGIC), data_end):
         builder.add(stream, place)
     return builder.seen.to_summary()
-
-
-def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
-    """Make the index entry of a chunk; its message indexes are yet to be added."""
-    return records.ChunkIndex(
-        chunk_length=place.end - place.offset,
-        chunk_start_offset=place.offset,
-        compression=chunk.compression,
-        compressed_size=len(chunk.data),
-        message_start_time=chunk.start_ns,
-        message_end_time=chunk.end_ns,
-        message_index_length=0,
-        message_index_offsets={},
-        uncompressed_size=chunk.size,
-    )
-
-
-def metadata_entry(place: RecordSpan, record: records.Metadata) -> records.MetadataIndex:
-    """Make the index entry of a metadata record."""
-    return records.MetadataIndex(
-        offset=place.offset, length=place.end - place.offset, name=record.name
-    )
-
-
-def attachment_entry(
-    place: RecordSpan, record: records.Attachment, data_size: int
-) -> records.AttachmentIndex:
-    """Make the index entry of an attachment."""
-    return records.AttachmentIndex(
-        offset=place.offset,
-        length=place.end - place.offset,
-        log_time=record.log_time,
-        create_time=record.create_time,
-        data_size=data_size,
-        name=record.name,
-        media_type=record.media_type,
-    )
 
 
 @dataclass(kw_only=True)
@@ -186,7 +150,7 @@ class _Builder:
                 body = at + RECORD_HEAD.size
                 inside = RecordSpan(opcode, at, length)
                 self._define(inside, parse(opcode, data[body : body + length]))
-        self._chunk = chunk_entry(place, chunk)
+        self._chunk = chunk_entry(place, chunk.head)
         self.seen.chunks.append(self._chunk)
 
 
@@ -333,11 +297,10 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
     if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
         raise BrokenRecordError("its summary has another CRC than it declares")
     summary = Summary()
-    start = footer.summary_start
-    for place in walk_section(section[: footer_at - start], start):
-        body = section[place.offset + RECORD_HEAD.size - start : place.end - start]
-        is_shared = place.opcode in (SCHEMA, CHANNEL) and place.length <= _SHARED_BYTES
-        _add(summary, (_parse_once if is_shared else parse)(place.opcode, body))
+    for opcode, at, length in records_in(section[: footer_at - footer.summary_start]):
+        body = section[at + RECORD_HEAD.size : at + RECORD_HEAD.size + length]
+        is_shared = opcode in (SCHEMA, CHANNEL) and length <= _SHARED_BYTES
+        _add(summary, (_parse_once if is_shared else parse)(opcode, body))
     return summary
 
 

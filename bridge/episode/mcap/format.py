@@ -1,4 +1,4 @@
-"""How MCAP records look in bytes: one small function per record, used by writer and recovery.
+"""How MCAP records look in bytes: those that must be quick, and the `mcap` package's for others.
 
 Layouts follow the MCAP specification, version 0. Numbers are little-endian, times are nanoseconds,
 a text is its UTF-8 bytes after their number. Offsets count from the start of the file.
@@ -6,12 +6,13 @@ a text is its UTF-8 bytes after their number. Offsets count from the start of th
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from importlib import import_module
-from types import MappingProxyType
 from typing import TypeAlias
+
+from mcap import records
+from mcap.data_stream import RecordBuilder
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -35,22 +36,6 @@ Payload: TypeAlias = Buffer | Sequence[Buffer]
 """Bytes, whole or in pieces that follow each other."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChunkPlace:
-    """What a chunk index record says of one chunk."""
-
-    start_ns: int
-    end_ns: int
-    offset: int
-    length: int
-    index_offsets: Mapping[int, int]
-    """Where the message index of each channel lies."""
-    index_length: int
-    compression: str
-    compressed_size: int
-    uncompressed_size: int
-
-
 def num_bytes(data: Buffer) -> int:
     """Return the size of a buffer, whatever its items are."""
     return data.nbytes if isinstance(data, memoryview) else len(data)
@@ -68,42 +53,20 @@ def text(value: str) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
-def text_map(values: Mapping[str, str]) -> bytes:
-    """Encode a map of texts with its length in bytes."""
-    data = b"".join(text(name) + text(value) for name, value in values.items())
-    return struct.pack("<I", len(data)) + data
+def encoded(entry: records.McapRecord) -> bytes:
+    """Encode a record that is small or rare: any but messages, chunks and their indexes."""
+    builder = RecordBuilder()
+    entry.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def header(profile: str, library: str) -> bytes:
-    """Encode the first record of a file."""
-    return record(HEADER, text(profile), text(library))
-
-
-def schema(schema_id: int, name: str, encoding: str, data: bytes) -> bytes:
-    """Encode a schema; ids start at 1."""
-    size = struct.pack("<I", len(data))
-    return record(SCHEMA, struct.pack("<H", schema_id), text(name), text(encoding), size, data)
-
-
-def channel(
-    channel_id: int,
-    schema_id: int,
-    topic: str,
-    message_encoding: str,
-    about: Mapping[str, str] = MappingProxyType({}),
-) -> bytes:
-    """Encode a channel with its metadata; schema id 0 is none."""
-    ids = struct.pack("<HH", channel_id, schema_id)
-    return record(CHANNEL, ids, text(topic), text(message_encoding), text_map(about))
-
-
-def chunk_head(
-    *, start_ns: int, end_ns: int, size: int, crc: int, compression: str, data_size: int
-) -> bytes:
-    """Encode everything of a chunk that stands before its data."""
-    fields = CHUNK_FIELDS.pack(start_ns, end_ns, size, crc) + text(compression)
-    fields += struct.pack("<Q", data_size)
-    return RECORD_HEAD.pack(CHUNK, len(fields) + data_size) + fields
+def chunk_head(entry: records.ChunkIndex, crc: int) -> bytes:
+    """Encode everything of a chunk that stands before its data; ``crc`` is that of its records."""
+    fields = CHUNK_FIELDS.pack(
+        entry.message_start_time, entry.message_end_time, entry.uncompressed_size, crc
+    )
+    fields += text(entry.compression) + struct.pack("<Q", entry.compressed_size)
+    return RECORD_HEAD.pack(CHUNK, len(fields) + entry.compressed_size) + fields
 
 
 def message_index(channel_id: int, entries: list[int]) -> bytes:
@@ -112,92 +75,21 @@ def message_index(channel_id: int, entries: list[int]) -> bytes:
     return record(MESSAGE_INDEX, head, struct.pack(f"<{len(entries)}Q", *entries))
 
 
-def chunk_index(place: ChunkPlace) -> bytes:
-    """Encode a chunk index."""
-    offsets = b"".join(struct.pack("<HQ", *item) for item in place.index_offsets.items())
-    return record(
-        CHUNK_INDEX,
-        struct.pack(
-            "<QQQQI", place.start_ns, place.end_ns, place.offset, place.length, len(offsets)
-        ),
-        offsets,
-        struct.pack("<Q", place.index_length),
-        text(place.compression),
-        struct.pack("<QQ", place.compressed_size, place.uncompressed_size),
-    )
+def attachment(entry: records.Attachment) -> list[Buffer]:
+    """Encode an attachment as buffers to be written one after the other; its data is not copied."""
+    fields = ATTACHMENT_FIELDS.pack(entry.log_time, entry.create_time)
+    fields += text(entry.name) + text(entry.media_type) + struct.pack("<Q", len(entry.data))
+    crc = zlib.crc32(entry.data, zlib.crc32(fields))
+    head = RECORD_HEAD.pack(ATTACHMENT, len(fields) + len(entry.data) + 4) + fields
+    return [head, entry.data, struct.pack("<I", crc)]
 
 
-def attachment(
-    name: str, data: bytes, *, media_type: str, log_time_ns: int, create_time_ns: int
-) -> list[Buffer]:
-    """Encode an attachment as buffers to be written one after the other."""
-    fields = ATTACHMENT_FIELDS.pack(log_time_ns, create_time_ns) + text(name) + text(media_type)
-    fields += struct.pack("<Q", len(data))
-    crc = zlib.crc32(data, zlib.crc32(fields))
-    head = RECORD_HEAD.pack(ATTACHMENT, len(fields) + len(data) + 4) + fields
-    return [head, data, struct.pack("<I", crc)]
-
-
-def attachment_index(
-    name: str,
-    *,
-    media_type: str,
-    log_time_ns: int,
-    create_time_ns: int,
-    data_size: int,
-    offset: int,
-    length: int,
-) -> bytes:
-    """Encode where an attachment record of ``length`` bytes lies."""
-    numbers = struct.pack("<QQQQQ", offset, length, log_time_ns, create_time_ns, data_size)
-    return record(ATTACHMENT_INDEX, numbers, text(name), text(media_type))
-
-
-def metadata(name: str, values: Mapping[str, str]) -> bytes:
-    """Encode a metadata record."""
-    return record(METADATA, text(name), text_map(values))
-
-
-def metadata_index(name: str, *, offset: int, length: int) -> bytes:
-    """Encode where a metadata record of ``length`` bytes lies."""
-    return record(METADATA_INDEX, struct.pack("<QQ", offset, length), text(name))
-
-
-def statistics(
-    *,
-    schemas: int,
-    attachments: int,
-    metadata_records: int,
-    chunks: int,
-    channels: int,
-    start_ns: int,
-    end_ns: int,
-    message_counts: Mapping[int, int],
-) -> bytes:
-    """Encode the counts of a file; ``message_counts`` is by channel."""
-    counts = b"".join(struct.pack("<HQ", *item) for item in message_counts.items())
-    numbers = (sum(message_counts.values()), schemas, channels, attachments, metadata_records)
-    times = (chunks, start_ns, end_ns, len(counts))
-    return record(STATISTICS, struct.pack("<QHIII", *numbers), struct.pack("<IQQI", *times), counts)
-
-
-def summary_offset(opcode: int, *, start: int, length: int) -> bytes:
-    """Encode where the summary's records of one kind lie."""
-    return record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, length))
-
-
-def data_end(crc: int) -> bytes:
-    """Encode the end of the data; ``crc`` is that of the whole file up to here, 0 for unknown."""
-    return record(DATA_END, struct.pack("<I", crc))
-
-
-def summary_section(groups: Iterable[tuple[int, bytes]], start: int) -> bytes:
-    """Encode summary, offsets, footer and magic."""
+def summary_section(groups: Iterable[bytes], start: int) -> bytes:
+    """Encode summary, offsets, footer and magic; each group holds the records of one kind."""
     body, offsets = b"", b""
-    for opcode, records in groups:
-        if records:
-            offsets += summary_offset(opcode, start=start + len(body), length=len(records))
-            body += records
+    for group in filter(None, groups):
+        offsets += encoded(records.SummaryOffset(group[0], start + len(body), len(group)))
+        body += group
     if not body:
         start = 0
     offsets_start = start + len(body) if offsets else 0

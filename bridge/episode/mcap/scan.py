@@ -15,10 +15,8 @@ from mcap.records import Attachment, McapRecord
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
     BLOCK_BYTES,
-    ChunkHead,
     Contents,
     RecordFile,
-    parse_chunk_head,
     read_plain,
     unpack_front,
     walk_records,
@@ -26,9 +24,11 @@ from bridge.episode.mcap.damaged import (
 from bridge.episode.mcap.walk import (
     MAX_CHUNK_BYTES,
     BrokenRecordError,
+    ChunkHead,
     RecordSpan,
     attachment_of,
     parse_chunk,
+    parse_chunk_head,
     unpack_chunk,
 )
 
@@ -201,8 +201,19 @@ def _read_record(file: RecordFile, offset: int) -> Found | None:
     return Plain(offset=offset, length=length, opcode=opcode, raw=raw, record=read_plain(raw))
 
 
+def _chunk_head(front: bytes) -> ChunkHead:
+    """Read what the first bytes of a record say, where they are those of a chunk."""
+    if len(front) < mcap.RECORD_HEAD.size or front[0] != mcap.CHUNK:
+        raise BrokenRecordError("no chunk head")
+    length = mcap.RECORD_HEAD.unpack_from(front)[1]
+    head = parse_chunk_head(front[mcap.RECORD_HEAD.size :], length)
+    if head.compression not in ("", "lz4", "zstd"):
+        raise BrokenRecordError(f"its compression {head.compression!r} is not known")
+    return head
+
+
 def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
-    head = parse_chunk_head(front)
+    head = _chunk_head(front)
     if not head.is_consistent:
         message = "the lengths of a chunk contradict each other or are beyond all limits"
         raise BrokenRecordError(message)
@@ -289,10 +300,10 @@ def _trusted_length(file: RecordFile, offset: int) -> int:
 
 def _read_cut_chunk(file: RecordFile, offset: int, front: bytes) -> CutChunk | None:
     try:
-        head = parse_chunk_head(front)
+        head = _chunk_head(front)
     except BrokenRecordError:
         return None
-    if offset + head.record_bytes <= file.size or head.uncompressed_size > MAX_CHUNK_BYTES:
+    if offset + head.record_bytes <= file.size or head.size > MAX_CHUNK_BYTES:
         return None
     records = unpack_front(head, file.read(offset + head.head_bytes, MAX_CHUNK_BYTES))
     contents = walk_records(records)
@@ -335,7 +346,7 @@ def _next_chunk(file: RecordFile, offset: int) -> int | None:
 
 def _is_chunk(file: RecordFile, offset: int, window: bytes, at: int) -> bool:
     try:
-        head = parse_chunk_head(window[at : at + _FRONT_BYTES])
+        head = _chunk_head(window[at : at + _FRONT_BYTES])
     except BrokenRecordError:
         return False
     return head.is_consistent and offset + head.record_bytes <= file.size

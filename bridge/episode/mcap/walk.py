@@ -75,37 +75,51 @@ class RecordSpan(NamedTuple):
         """Where the next record begins."""
         return self.offset + RECORD_HEAD.size + self.length
 
+    @staticmethod
+    def between(opcode: int, start: int, end: int) -> "RecordSpan":
+        """Say the same of a record by its first and its last byte."""
+        return RecordSpan(opcode, start, end - start - RECORD_HEAD.size)
+
+
+def metadata_entry(place: RecordSpan, record: records.Metadata) -> records.MetadataIndex:
+    """Make the index entry of a metadata record."""
+    return records.MetadataIndex(
+        offset=place.offset, length=place.end - place.offset, name=record.name
+    )
+
+
+def attachment_entry(
+    place: RecordSpan, record: records.Attachment, data_size: int
+) -> records.AttachmentIndex:
+    """Make the index entry of an attachment."""
+    return records.AttachmentIndex(
+        offset=place.offset,
+        length=place.end - place.offset,
+        log_time=record.log_time,
+        create_time=record.create_time,
+        data_size=data_size,
+        name=record.name,
+        media_type=record.media_type,
+    )
+
 
 def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     """Yield the places of all records between two offsets; the stream may be used in between."""
     at = start
     while at < end:
         stream.seek(at)
-        place = _place(stream.read(RECORD_HEAD.size), at, end)
+        head = stream.read(RECORD_HEAD.size)
+        if len(head) < RECORD_HEAD.size:
+            raise BrokenRecordError(f"the record at byte {at} is cut off")
+        opcode, length = RECORD_HEAD.unpack(head)
+        if opcode == 0:
+            raise BrokenRecordError(f"the record at byte {at} is of kind 0, which there is not")
+        if length > end - at - RECORD_HEAD.size:
+            message = f"the record at byte {at} claims {length} bytes, {end - at} are left"
+            raise BrokenRecordError(message)
+        place = RecordSpan(opcode, at, length)
         yield place
         at = place.end
-
-
-def walk_section(section: bytes, start: int) -> Iterator[RecordSpan]:
-    """Yield the places of all records of a section of a file that is in memory."""
-    at, end = start, start + len(section)
-    while at < end:
-        front = at - start
-        place = _place(section[front : front + RECORD_HEAD.size], at, end)
-        yield place
-        at = place.end
-
-
-def _place(head: bytes, at: int, end: int) -> RecordSpan:
-    if len(head) < RECORD_HEAD.size:
-        raise BrokenRecordError(f"the record at byte {at} is cut off")
-    opcode, length = RECORD_HEAD.unpack(head)
-    if opcode == 0:
-        raise BrokenRecordError(f"the record at byte {at} is of kind 0, which there is not")
-    if length > end - at - RECORD_HEAD.size:
-        message = f"the record at byte {at} claims {length} bytes, {end - at} are left"
-        raise BrokenRecordError(message)
-    return RecordSpan(opcode, at, length)
 
 
 def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
@@ -236,7 +250,7 @@ MAX_CHUNK_BYTES = 1 << 30
 
 
 class ChunkHead(NamedTuple):
-    """A chunk record, its data still packed."""
+    """What stands before a chunk's data."""
 
     start_ns: int
     end_ns: int
@@ -245,58 +259,101 @@ class ChunkHead(NamedTuple):
     crc: int
     """CRC-32 of those bytes, 0 for unknown."""
     compression: str
+    data_bytes: int
+    head_bytes: int
+    """Where the data begins, from the record's opcode."""
+    record_bytes: int
+    """Of the whole record, as claimed; a cut chunk has fewer, foxglove's tail claims 2^64."""
+
+    @property
+    def is_consistent(self) -> bool:
+        """Do the two lengths agree and the sizes stay within the limit?"""
+        return (
+            self.record_bytes == self.head_bytes + self.data_bytes
+            and self.data_bytes <= MAX_CHUNK_BYTES
+            and self.size <= MAX_CHUNK_BYTES
+        )
+
+
+class PackedChunk(NamedTuple):
+    """A chunk record, its data still packed."""
+
+    head: ChunkHead
     data: memoryview
 
 
-def parse_chunk(body: bytes) -> ChunkHead:
-    """Read a chunk record."""
+def parse_chunk_head(front: bytes, length: int) -> ChunkHead:
+    """Read a chunk's head from the first bytes of its body, whose length is claimed."""
     try:
-        start_ns, end_ns, size, crc = CHUNK_FIELDS.unpack_from(body, 0)
+        start_ns, end_ns, size, crc = CHUNK_FIELDS.unpack_from(front, 0)
         at = CHUNK_FIELDS.size
-        (length,) = struct.unpack_from("<I", body, at)
-        at += 4
-        compression = str(body[at : at + length], "utf-8")
-        at += length
-        (length,) = struct.unpack_from("<Q", body, at)
+        (name_bytes,) = _U32.unpack_from(front, at)
+        at += _U32.size
+        compression = str(front[at : at + name_bytes], "utf-8")
+        at += name_bytes
+        (data_bytes,) = _U64.unpack_from(front, at)
     except (struct.error, ValueError) as error:
-        raise BrokenRecordError(f"a chunk record of {len(body)} bytes cannot be read") from error
-    at += 8
-    if length > len(body) - at:
-        message = f"a chunk claims {length} bytes of data, {len(body) - at} are there"
+        raise BrokenRecordError(f"a chunk record of {length} bytes cannot be read") from error
+    head_bytes, record_bytes = RECORD_HEAD.size + at + _U64.size, RECORD_HEAD.size + length
+    return ChunkHead(start_ns, end_ns, size, crc, compression, data_bytes, head_bytes, record_bytes)
+
+
+def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
+    """Make the index entry of a chunk; its message indexes are yet to be added."""
+    return records.ChunkIndex(
+        chunk_length=place.end - place.offset,
+        chunk_start_offset=place.offset,
+        compression=chunk.compression,
+        compressed_size=chunk.data_bytes,
+        message_start_time=chunk.start_ns,
+        message_end_time=chunk.end_ns,
+        message_index_length=0,
+        message_index_offsets={},
+        uncompressed_size=chunk.size,
+    )
+
+
+def parse_chunk(body: bytes) -> PackedChunk:
+    """Read a chunk record."""
+    head = parse_chunk_head(body, len(body))
+    data = memoryview(body)[head.head_bytes - RECORD_HEAD.size :]
+    if head.data_bytes > len(data):
+        message = f"a chunk claims {head.data_bytes} bytes of data, {len(data)} are there"
         raise BrokenRecordError(message)
-    return ChunkHead(start_ns, end_ns, size, crc, compression, memoryview(body)[at : at + length])
+    return PackedChunk(head, data[: head.data_bytes])
 
 
-def unpack_chunk(chunk: ChunkHead, *, whose: str = "a chunk") -> bytes:
+def unpack_chunk(chunk: PackedChunk, *, whose: str = "a chunk") -> bytes:
     """Decompress a chunk and compare its size and CRC."""
-    if chunk.size > MAX_CHUNK_BYTES:
-        raise BrokenRecordError(f"{whose} claims {chunk.size} bytes, more than {MAX_CHUNK_BYTES}")
+    size, crc = chunk.head.size, chunk.head.crc
+    if size > MAX_CHUNK_BYTES:
+        raise BrokenRecordError(f"{whose} claims {size} bytes, more than {MAX_CHUNK_BYTES}")
     try:
         data = _decompress(chunk)
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise BrokenRecordError(f"{whose} cannot be unpacked ({error})") from error
-    if len(data) != chunk.size:
-        raise BrokenRecordError(f"{whose} has {len(data)} bytes, {chunk.size} are declared")
-    if chunk.crc and crc32(data, 0) != chunk.crc:
+    if len(data) != size:
+        raise BrokenRecordError(f"{whose} has {len(data)} bytes, {size} are declared")
+    if crc and crc32(data, 0) != crc:
         raise BrokenRecordError(f"{whose} has another CRC than it declares")
     return data
 
 
-def _decompress(chunk: ChunkHead) -> bytes:
-    if chunk.compression == "":
+def _decompress(chunk: PackedChunk) -> bytes:
+    if chunk.head.compression == "":
         return bytes(chunk.data)
-    if not chunk.size:
+    if not chunk.head.size:
         return b""
-    if chunk.compression == "zstd":
+    if chunk.head.compression == "zstd":
         declared = zstandard.get_frame_parameters(chunk.data).content_size
-        if declared not in (chunk.size, zstandard.CONTENTSIZE_UNKNOWN):
-            message = f"a zstd frame of {declared} bytes where {chunk.size} are declared"
+        if declared not in (chunk.head.size, zstandard.CONTENTSIZE_UNKNOWN):
+            message = f"a zstd frame of {declared} bytes where {chunk.head.size} are declared"
             raise BrokenRecordError(message)
-        return zstandard.decompress(chunk.data, max_output_size=chunk.size)
-    if chunk.compression == "lz4":
+        return zstandard.decompress(chunk.data, max_output_size=chunk.head.size)
+    if chunk.head.compression == "lz4":
         unpacker = lz4.frame.LZ4FrameDecompressor()
-        return bytes(unpacker.decompress(chunk.data, max_length=chunk.size))
-    raise BrokenRecordError(f"compression {chunk.compression!r} is not known")
+        return bytes(unpacker.decompress(chunk.data, max_length=chunk.head.size))
+    raise BrokenRecordError(f"compression {chunk.head.compression!r} is not known")
 
 
 class MessageHead(NamedTuple):
@@ -320,16 +377,16 @@ def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
 
 
 def records_in(data: Buffer, at: int = 0) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, offset and body length of each record in a chunk's unpacked data."""
+    """Yield opcode, offset and body length of each record in a chunk's data, or a summary."""
     end = len(data)
     head_bytes, unpack = RECORD_HEAD.size, RECORD_HEAD.unpack_from
     while at < end:
         if end - at < head_bytes:
-            raise BrokenRecordError(f"{end - at} bytes too many at the end of a chunk")
+            raise BrokenRecordError(f"{end - at} bytes too many behind the last record")
         opcode, length = unpack(data, at)
         after = at + head_bytes + length
         if after > end or opcode == 0 or (opcode == MESSAGE and length < MESSAGE_FIELDS):
-            message = f"a record of kind {opcode} in a chunk claims {length} of {end - at} bytes"
+            message = f"a record of kind {opcode} claims {length} of {end - at} bytes"
             raise BrokenRecordError(message)
         yield opcode, at, length
         at = after

@@ -29,6 +29,7 @@ from bridge.episode.streams import (
     execution_ns,
     find_camera_topic,
     joint_track,
+    lens_of,
     plans,
 )
 from bridge.episode.topics import COLOR_IMAGE, GRIPPER_STATE, RENDERED_IMAGE, RENDERED_TOPIC
@@ -130,14 +131,14 @@ def row_images(
     episode: Episode, camera: str, wanted: Int[np.ndarray, " num_rows"]
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Yield the decoded image of each row; ``wanted`` never decreases."""
-    row = 0
+    row, lens = 0, lens_of(episode, camera)
     for number, message in enumerate(episode.messages([_topic(episode, camera)])):
         if row == len(wanted):
             return
         if number != wanted[row]:
             continue
         with message_named(episode, message.topic, number + 1):
-            image_u8 = color_from_message(message.type_name, message.data).image_u8()
+            image_u8 = color_from_message(message.type_name, message.data, lens).image_u8()
         while row < len(wanted) and number == wanted[row]:
             yield image_u8
             row += 1

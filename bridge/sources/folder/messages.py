@@ -97,13 +97,8 @@ def num_frames(index: FolderIndex, config: FolderConfig) -> int:
     return min(len(index.frames), config.max_frames or len(index.frames))
 
 
-def frame_times_ns(
-    index: FolderIndex, config: FolderConfig, start_ns: int | None = None
-) -> list[tuple[int, int]]:
-    """Stamps of colour and depth of every frame that will be sent [ns].
-
-    Real times are kept; moved so that the first is ``start_ns`` where that is given. A folder
-    without times gets the configured rate, from ``start_ns`` or 0.
+def frame_times_ns(index: FolderIndex, config: FolderConfig) -> list[tuple[int, int]]:
+    """Stamps of colour and depth of every frame [ns]: real times, or the rate asked for, from 0.
 
     Raises:
         UsageError: When a rate is asked of a folder that has real times.
@@ -111,18 +106,15 @@ def frame_times_ns(
     count = num_frames(index, config)
     if not index.has_times:
         period_ns = ns_from_s(1.0 / (config.rate_hz or DEFAULT_RATE_HZ))
-        stamps = [(start_ns or 0) + number * period_ns for number in range(count)]
-        return [(stamp_ns, stamp_ns) for stamp_ns in stamps]
+        return [(number * period_ns, number * period_ns) for number in range(count)]
     if config.rate_hz is not None:
         raise UsageError(
             f"--rate-hz {config.rate_hz:g} was given, but {index.path} says when each frame was "
             "taken. Leave the option out."
         )
-    times = [
+    return [
         (frame.color_stamp_ns or 0, frame.depth_stamp_ns or 0) for frame in index.frames[:count]
     ]
-    shift_ns = 0 if start_ns is None else start_ns - min(times[0])
-    return [(color_ns + shift_ns, depth_ns + shift_ns) for color_ns, depth_ns in times]
 
 
 def describe_folder(index: FolderIndex, config: FolderConfig) -> dict[str, Any]:
@@ -142,13 +134,10 @@ def describe_folder(index: FolderIndex, config: FolderConfig) -> dict[str, Any]:
     }
 
 
-def folder_messages(
-    index: FolderIndex, config: FolderConfig, start_ns: int | None
-) -> Iterator[list[StampedMessage]]:
+def folder_messages(index: FolderIndex, config: FolderConfig) -> Iterator[list[StampedMessage]]:
     """Yield the messages of one frame after another."""
-    times = frame_times_ns(index, config, start_ns)
-    shift_ns = times[0][0] - (index.frames[0].color_stamp_ns or 0)
-    poses = _pose_messages(index, config, times, shift_ns)
+    times = frame_times_ns(index, config)
+    poses = _pose_messages(index, config, times)
     pose = next(poses, None)
     color_camera: Camera | None = None
     next_info_ns = min(times[0])
@@ -170,14 +159,14 @@ def folder_messages(
 
 
 def _pose_messages(
-    index: FolderIndex, config: FolderConfig, times: list[tuple[int, int]], shift_ns: int
+    index: FolderIndex, config: FolderConfig, times: list[tuple[int, int]]
 ) -> Iterator[StampedMessage]:
     """One pose per frame, or all that the folder has from before the first to after the last."""
     if index.poses is None:
         stamps = [color_ns for color_ns, _ in times]
         transforms = [frame.T_world_depth for frame in index.frames[: len(times)]]
     else:
-        inside = index.poses.stamps_ns + shift_ns
+        inside = index.poses.stamps_ns
         ends = [at for pair in times for at in pair]
         first = max(int(np.searchsorted(inside, min(ends), side="right")) - 1, 0)
         last = int(np.searchsorted(inside, max(ends))) + 1

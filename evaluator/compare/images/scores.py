@@ -16,11 +16,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from bridge.episode import schema, topics
+from bridge.episode import schema, streams, topics
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
 from bridge.errors import GstError, MissingDependencyError
-from bridge.media.color import JPEG_MAGIC, decode_color
+from bridge.media.color import JPEG_MAGIC, decode_color, encode_png
 from evaluator.compare.measure import mean_of, measured
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Quantity
@@ -119,9 +119,10 @@ def images_of(views: Episode, source: Episode | None) -> Images:
     """Collect the images of a views episode; recorded ones of its source where it has none."""
     images = read_images(views)
     if source is not None and not images.color[RECORDED]:
-        wanted = {stamp for _, stamp in images.color[RENDERED]}
-        theirs = read_images(source).color[RECORDED]
-        images.color[RECORDED] = {key: theirs[key] for key in theirs if key[1] in wanted}
+        for name in {camera_id for camera_id, _ in images.color[RENDERED]}:
+            for image in streams.color_images(source, name):
+                if (key := (name, image.stamp_ns)) in images.color[RENDERED]:
+                    images.color[RECORDED][key] = image.as_file(encode_png)
     return images
 
 
@@ -190,9 +191,7 @@ def _score_depth(images: Images, key: Key) -> DepthScore | None:
         return None
 
 
-NOT_A_SAMPLE = (
-    "views of one scene are no random sample of views; the per-image list is in the table"
-)
+NOT_A_SAMPLE = "views of one scene are no random sample of views; each image is in the table"
 
 
 def size_words(sizes: Iterable[tuple[int, int]]) -> str:

@@ -1,4 +1,4 @@
-"""Many messages read at once are what each one read by itself says, whatever their bytes."""
+"""Many messages read or written at once are what each one by itself is, whatever their bytes."""
 
 import struct
 
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from joint_samples import at_positions
 
-from bridge.episode.cdr.batch import joints_of, pose_messages, poses_of
+from bridge.episode.cdr.batch import joint_messages, joints_of, pose_messages, poses_of
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import JointSample, PoseSample
 from bridge.episode.streams import joint_track_of, pose_track_of
@@ -113,3 +113,31 @@ def test_big_endian_messages_are_read_one_by_one() -> None:
     track = pose_track_of([bytes(big)])
     assert track is not None
     assert track.p_m[0, 0] == 0.25
+
+
+@pytest.mark.parametrize(
+    "names", [("a",), ("shoulder", "elbow_joint", "wrist"), ("gripper_width",)]
+)
+def test_joint_states_are_the_same_bytes(names: tuple[str, ...]) -> None:
+    position = np.random.default_rng(0).normal(size=(len(STAMPS), len(names)))
+    position[0] = 0.0
+    position[1] = np.inf
+    for stamp, row, data in zip(
+        STAMPS, position, joint_messages(STAMPS, names, position), strict=True
+    ):
+        sample = at_positions(int(stamp), names, row)
+        assert data == sample.to_cdr()
+
+
+@pytest.mark.parametrize("frame", ["base_link", "b", "world_frame"])
+def test_poses_are_the_same_bytes(frame: str) -> None:
+    Ts = transforms(len(STAMPS), seed=1)
+    for stamp, T, data in zip(STAMPS, Ts, pose_messages(STAMPS, frame, Ts), strict=True):
+        sample = PoseSample(stamp_ns=int(stamp), frame_id=frame, T_frame_body=T)
+        assert data == sample.to_cdr()
+
+
+def test_no_messages_are_none() -> None:
+    none = np.zeros(0, dtype=np.int64)
+    assert list(joint_messages(none, ("a",), np.zeros((0, 1)))) == []
+    assert list(pose_messages(none, "base", np.zeros((0, 4, 4)))) == []

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.episode import run_folder
+from bridge.errors import PathNotFoundError, UsageError
 
 
 def run_with(folder: Path, *names: str) -> run_folder.RunFolder:
@@ -66,3 +67,16 @@ def test_every_file_belongs_to_exactly_one_episode(indices: set[int]) -> None:
     assert list(run_folder.grouped_parts(names[::-1]).items()) == [
         (name, names) for name in names[:1]
     ]
+
+
+def test_a_file_is_not_called_missing(tmp_path: Path) -> None:
+    path = tmp_path / "trial_0001.mcap"
+    path.write_bytes(b"")
+    with pytest.raises(UsageError, match="is a file, not a run") as caught:
+        run_folder.RunFolder.open(path)
+    assert not isinstance(caught.value, PathNotFoundError)
+
+
+def test_a_folder_that_is_not_there_is_called_missing(tmp_path: Path) -> None:
+    with pytest.raises(PathNotFoundError, match="run folder not found"):
+        run_folder.RunFolder.open(tmp_path / "nowhere")

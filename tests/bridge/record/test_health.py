@@ -55,7 +55,7 @@ def jpeg(number: int, data: bytes, form: str = "jpeg") -> bytes:
 
 
 SKEW = {"k": [50.0, 1, 32, 0, 50, 24, 0, 0, 1]}
-ODD = (SKEW, {"binning_x": 2}, {"width": 0}, *({"distortion_model": m} for m in ("mei", "fisheye")))
+ODD = (SKEW, {"binning_x": 2}, {"width": 0}, *({"distortion_model": m} for m in ("mei", "ocam")))
 
 
 def lens(number: int) -> bytes:

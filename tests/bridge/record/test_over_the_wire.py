@@ -5,10 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 from loopback import recording
-from PIL import Image
 
 import robot_gst
 from bridge.data_files import datasets_folder
@@ -82,30 +80,6 @@ def test_requests_that_are_no_objects_are_refused(joined: Joined, payload: bytes
     with pytest.raises(RemoteError, match="JSON"):
         joined.client.query("rec/main/ctl/mark", payload, timeout_s=10.0)
     assert RecorderClient(joined.client).status()["ok"]
-
-
-def write_folder(folder: Path, *, frames: int) -> None:
-    """Write a tiny RGB-D folder, each frame with files of its own."""
-    listed = []
-    for number in range(frames):
-        names = {"color": f"c{number}.jpg", "depth": f"d{number}.png"}
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(folder / names["color"])
-        Image.fromarray(np.full((6, 8), 700, np.uint16)).save(folder / names["depth"])
-        listed.append({**names, "T_world_cam": np.eye(4).tolist()})
-    camera = {"fx": 9.0, "fy": 9.0, "cx": 4.0, "cy": 3.0, "width": 8, "height": 6}
-    record = {"depth_unit_m": 0.001, "depth_intrinsics": camera, "frames": listed}
-    (folder / "scene.json").write_text(json.dumps(record))
-
-
-def test_a_folder_with_an_unreadable_image_leaves_no_episode(
-    joined: Joined, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_folder(tmp_path, frames=3)
-    (tmp_path / "c2.jpg").write_bytes(b"not an image")
-    arguments = ["--fast", "--episode", "scan", "--connect", joined.endpoint, "--quiet"]
-    assert robot_gst.run(["publish", "folder", str(tmp_path), *arguments]) == 2
-    assert "c2.jpg: unreadable image" in capsys.readouterr().err
-    assert list(joined.run.episodes_dir.iterdir()) == []
 
 
 def test_ctl_sends_the_task_file_that_a_person_names(

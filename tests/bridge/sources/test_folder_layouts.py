@@ -1,8 +1,6 @@
 """TUM and 7-Scenes folders: found by their files, read as their makers describe them."""
 
 import io
-import threading
-import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,7 +16,6 @@ from bridge.errors import PathNotFoundError, UsageError
 from bridge.sources.folder.config import FolderConfig, FolderError
 from bridge.sources.folder.messages import folder_messages, frame_times_ns, read_index
 from bridge.sources.folder.tum import StampedFile, associate
-from bridge.terminal import Output
 
 SMALL = FolderConfig(depth_intrinsics=(9.0, 9.5, 4.0, 3.0), color_intrinsics=(8.0, 8.5, 4.1, 3.1))
 TUM = FolderConfig(depth_intrinsics=(9.0, 9.5, 4.0, 3.0))
@@ -84,14 +81,11 @@ def test_a_tum_folder_keeps_its_times_to_the_nanosecond(tum: Path) -> None:
     assert index.summary == "TUM layout with its own times: 3 frames"
     assert "depth_intrinsics" not in index.assumed
     assert frame_times_ns(index, TUM)[0] == (STAMPS_NS[0], STAMPS_NS[0] + 5_000_000)
-    moved = frame_times_ns(index, TUM, 7)
-    assert moved[0] == (7, 5_000_007)
-    assert moved[2][0] - moved[0][0] == STAMPS_NS[2] - STAMPS_NS[0]
 
 
 def test_tum_depth_is_a_fifth_of_a_millimetre_and_quaternions_end_with_w(tum: Path) -> None:
     index = read_index(tum, TUM)
-    frames = list(folder_messages(index, TUM, None))
+    frames = list(folder_messages(index, TUM))
     messages = [message for frame in frames for message in frame]
     depth = [DepthImage.from_cdr(m.data) for m in messages if m.topic.endswith("depth/image")]
     assert depth[0].depth_mm[3, 3] == 1000
@@ -181,7 +175,7 @@ def test_missing_parts_of_a_tum_folder_are_named(tum: Path) -> None:
 def test_a_rate_is_refused_where_times_are_known(tum: Path) -> None:
     config = FolderConfig(depth_intrinsics=(9.0, 9.5, 4.0, 3.0), rate_hz=10.0)
     with pytest.raises(UsageError, match=r"--rate-hz 10 was given, but .*rgb.txt says when"):
-        list(folder_messages(read_index(tum, config), config, None))
+        list(folder_messages(read_index(tum, config), config))
 
 
 def test_intrinsics_are_asked_for_where_none_are_documented(tum: Path, scenes: Path) -> None:
@@ -196,7 +190,7 @@ def test_a_sevenscenes_folder_is_read_in_the_order_of_its_numbers(scenes: Path) 
     assert [frame.T_world_depth[0, 3] for frame in index.frames] == [0, 1, 12]
     assert not index.has_times
     assert "nominal" in index.assumed["color_from_depth"]
-    first = next(iter(folder_messages(index, SMALL, None)))
+    first = next(iter(folder_messages(index, SMALL)))
     by_topic = {message.topic: message.data for message in first}
     depth = DepthImage.from_cdr(by_topic["/kitchen/cam/kinect/depth/image"]).depth_mm
     assert depth[3, 3] == 1234
@@ -232,43 +226,3 @@ def test_options_that_a_scene_json_answers_itself_are_refused(tmp_path: Path) ->
         read_index(tmp_path, FolderConfig(depth_unit_m=0.001))
     with pytest.raises(UsageError, match="--depth-intrinsics"):
         FolderConfig(depth_intrinsics=(0.0, 1.0, 1.0, 1.0))
-
-
-def test_a_published_tum_folder_keeps_the_distances_between_its_times(
-    tum: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Session:
-        def __init__(self) -> None:
-            self.sent: dict[str, list[int]] = {}
-
-        def now_ns(self) -> int:
-            return 50_000_000_000
-
-        def publisher(self, topic: str, type_name: str) -> "Publisher":
-            return Publisher(self.sent.setdefault(topic, []))
-
-    class Publisher:
-        def __init__(self, sent: list[int]) -> None:
-            self._sent = sent
-
-        def put(self, data: bytes, *, source_ns: int) -> None:
-            self._sent.append(source_ns)
-
-    from bridge.sources.folder import publish
-    from bridge.sources.folder.publish import FolderSource
-
-    monkeypatch.setattr(publish, "announce", lambda *_: None)
-    session = Session()
-    slept_s = [0.0]
-    now_s = time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: now_s + slept_s[0])
-    monkeypatch.setattr(time, "sleep", lambda seconds: slept_s.append(slept_s.pop() + seconds))
-    source = FolderSource(read_index(tum, TUM), TUM)
-    unchecked = getattr(FolderSource.run, "__wrapped__", FolderSource.run)
-    # Our session only looks like one.
-    sent = unchecked(source, session, threading.Event(), Output(quiet=True))
-    assert set(sent["topics"]) <= set(source.topics)
-    assert slept_s[0] == pytest.approx((STAMPS_NS[2] - STAMPS_NS[0]) * 1e-9)
-    assert sent["frames"] == 3
-    color = session.sent["/kitchen/cam/kinect/color/image"]
-    assert color == [50_000_000_000 + stamp - STAMPS_NS[0] for stamp in STAMPS_NS]

@@ -18,8 +18,8 @@ from bridge.sources.realsense.config import (  # noqa: E402
 )
 from bridge.sources.realsense.device import (  # noqa: E402
     FrameStamps,
-    Rectifier,
     is_distorted,
+    rectifier,
 )
 from bridge.sources.realsense.messages import read_mounts  # noqa: E402
 
@@ -36,7 +36,7 @@ def test_rectified_images_are_those_of_opencv() -> None:
     cv2 = pytest.importorskip("cv2")
     found = intrinsics(320, 240, fx=305.0, coeffs=D405)
     image = smooth_image(320, 240)
-    ours = Rectifier(found).apply(image)
+    ours = rectifier(found).apply(image)
     x = (np.arange(320) - found.ppx) / found.fx
     y = (np.arange(240) - found.ppy) / found.fy
     pixels = np.array(

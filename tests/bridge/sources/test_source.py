@@ -9,9 +9,6 @@ import pytest
 from loopback import free_endpoint
 
 from bridge.episode.topics import type_of_topic
-from bridge.sources.folder.config import FolderConfig
-from bridge.sources.folder.frames import FolderIndex
-from bridge.sources.folder.publish import FolderSource
 from bridge.sources.source import Source, run_source
 from bridge.sources.standin.session import StandinSource
 from bridge.sources.standin.settings import SessionConfig
@@ -21,10 +18,7 @@ from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.session import open_session
 
-INDEX = FolderIndex.__new__(FolderIndex)
-vars(INDEX)["name"] = "kitchen"
 SOURCES = [
-    FolderSource(INDEX, FolderConfig(cell="lab", camera="eye")),
     UrSource("10.0.0.1", UrConfig(cell="lab")),
     StandinSource(SessionConfig(cell="lab", task="sloth_into_basket")),
 ]

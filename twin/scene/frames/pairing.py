@@ -33,8 +33,8 @@ def check_camera(episode: Episode, camera_id: str) -> None:
     """Look at the first intrinsics and the first image of colour and depth.
 
     Raises:
-        UnusableCameraError: The lens distorts, intrinsics are missing or of another image size, or
-            an image cannot be read.
+        UnusableCameraError: The lens turns back, intrinsics are missing or of another image size,
+            or an image cannot be read.
     """
     for stream in ("color", "depth"):
         try:

@@ -124,7 +124,7 @@ def protocol_of(
 
 def camera_record(choice: FrameChoice) -> dict[str, Any]:
     """What ``scene.json`` says about one camera of one episode."""
-    camera = streams.camera_info(choice.episode, choice.camera_id).camera
+    info = streams.camera_info(choice.episode, choice.camera_id)
     return {
         "episode": choice.episode.info.id,
         "id": choice.camera_id,
@@ -132,7 +132,8 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
         "poses_from": choice.poses.source,
         "train_frames": len(choice.train_ns),
         "holdout_frames": len(choice.holdout_ns),
-        "color": asdict(camera),
+        "color": asdict(info.camera),
+        **({} if info.lens is None else {"lens": info.lens.said}),
     }
 
 
@@ -156,6 +157,7 @@ def describe_scene(record: Mapping[str, Any]) -> str:
     lines += [
         f"camera {item['id']} of {item['episode']}: {item['train_frames']} training frames, "
         f"{item['holdout_frames']} held out; poses from {SAYS[item['poses_from']]}"
+        + (f"; {item['lens']}" if "lens" in item else "")
         for item in record["cameras"]
     ]
     lines += [
