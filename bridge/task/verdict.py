@@ -56,9 +56,8 @@ class Verdict:
     checks: Mapping[str, Factor] = field(default_factory=dict)
     """Further factors, see docs/gate.md: start, task, limits, audit; absent: not asked for."""
     grasps: tuple[dict[str, Any], ...] = ()
-    """What became of each grasp in the simulation: object, touched and held (yes or no),
-    p_object_m, where the tool was in the object's frame when a finger first touched it, and
-    T_base_object, where it was at the end; a planner steers by them."""
+    """What became of each grasp in the simulation: object, held (yes or no), and T_base_object,
+    where it was at the end; a planner steers by them."""
     nearest: Mapping[str, Any] | None = None
     """Where the smallest clearance was, of the pairs that may not touch: t_ns, distance_m, bodies,
     and p_m, the nearest point of each in the base frame. None where nothing was measured."""

@@ -64,7 +64,7 @@ def _refusal(run: RunFolder, episode: Episode, task: Task) -> tuple[Refusal, ...
     worst, yes = max(far_m, key=lambda key: far_m[key]), Factor(value=True)
     terminal = Factor(value=False, cause=str(goals_of(task, worst)[0]["kind"]), bodies=(worst,))
     grasps = tuple(
-        {"object": key, "touched": True, "held": True, "T_base_object": se3.pose_record(T)}
+        {"object": key, "held": True, "T_base_object": se3.pose_record(T)}
         for key, T in ends.items()
     )
     verdict = Verdict(

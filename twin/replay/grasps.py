@@ -1,4 +1,4 @@
-"""What became of each grasp of a plan: touched, and carried along when the hand left."""
+"""What became of each grasp of a plan: whether the object was carried along."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -27,26 +27,14 @@ def grasps_seen(
         for name, first, end in stretches
         if _carries(Ts_base_tcp[first:end, :3, 3], states.finger_contact[name][first:end])
     }
-    seen = []
-    for name, first, end in stretches:
-        contact = states.finger_contact[name][first:end]
-        p_object_m = None
-        if contact.any():
-            T_object_base = se3.invert(
-                states.Ts_base_object[name][when := first + contact.argmax()]
-            )
-            tool_m = se3.apply(T_object_base, Ts_base_tcp[when][None, :3, 3])[0]
-            p_object_m = tool_m.round(6).tolist()
-        seen.append(
-            {
-                "object": name,
-                "touched": bool(contact.any()),
-                "held": name in held,
-                "p_object_m": p_object_m,
-                "T_base_object": se3.pose_record(states.Ts_base_object[name][-1]),
-            }
-        )
-    return tuple(seen)
+    return tuple(
+        {
+            "object": name,
+            "held": name in held,
+            "T_base_object": se3.pose_record(states.Ts_base_object[name][-1]),
+        }
+        for name, _, _ in stretches
+    )
 
 
 def _carries(

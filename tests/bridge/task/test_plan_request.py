@@ -39,7 +39,7 @@ PLAN = Plan(
 NO = verdict_of(
     "plan_0",
     terminal=Factor(value=False, cause="inside", bodies=("cube", "box")),
-    grasps=({"object": "cube", "touched": True, "held": False, "p_object_m": [0.0, 0.01, 0.0]},),
+    grasps=({"object": "cube", "held": False},),
 )
 REQUEST = PlanRequest(
     task="cube_into_box",

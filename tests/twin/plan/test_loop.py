@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from planned_start import problem_of_test
 from scripted_plans import pick_and_place
@@ -17,6 +16,7 @@ from twin.plan.loop.nominal import PlanProposer
 from twin.plan.loop.propose import Candidate, choose, plan_and_verify
 from twin.plan.loop.steer import Steer, tried_in
 from twin.plan.problem import Problem
+from twin.plan.stage.solver import alike
 from twin.replay.scene import ReplayScene
 
 YES = Factor(value=True)
@@ -89,22 +89,13 @@ def test_what_was_refused_is_not_offered_again(problem: Problem, listed: Listed)
         refused.append(Refusal(plan=plan, verdict=said(plan, False)))
 
 
-def test_a_grasp_moves_towards_where_a_finger_touched(problem: Problem) -> None:
-    """Along the pads and the approach; between the pads it stays in the middle."""
+def test_a_grasp_that_slipped_is_followed_by_another(problem: Problem) -> None:
     planner = PlanProposer()
     first = chosen(planner, problem)
-    (before,) = tried_in(first)
-    toward = before.T_object_tcp[:3, 3] + before.T_object_tcp[:3, :3] @ [0.006, 0.004, 0.0]
-    seen = {"object": "cube", "touched": True, "held": False, "p_object_m": toward.tolist()}
-    no = said(first, False, "inside", grasps=(seen,))
+    no = said(first, False, "inside", grasps=({"object": "cube", "held": False},))
     second = chosen(planner, problem, 1, (Refusal(plan=first, verdict=no),))
-    assert second.steered_by is not None
-    assert second.steered_by.clause == "terminal.inside"
-    (after,) = tried_in(second)
-    left = after.T_object_tcp[:3, :3].T @ (toward - after.T_object_tcp[:3, 3])
-    np.testing.assert_allclose(left[[0, 2]], 0.0, atol=1e-3)
-    far_m = np.linalg.norm(toward - before.T_object_tcp[:3, 3])
-    assert abs(left[1]) < far_m
+    (before,), (after,) = tried_in(first), tried_in(second)
+    assert not alike(before.T_object_tcp[None], after.T_object_tcp)[0]
 
 
 def test_the_loop_ends_at_the_first_yes_or_unknown_or_when_rounds_are_used_up(

@@ -14,7 +14,6 @@ from bridge.task.plan import Plan, Ranking, SteeredBy
 from bridge.task.relations import SHOWN
 from twin.plan.constrain.constraint import Constraint, violated
 from twin.plan.constrain.kinds import compile_constraint
-from twin.plan.grasp.reach import nearest_solutions
 from twin.plan.grasp.search import GraspSearcher, turned
 from twin.plan.loop.propose import Candidate, refuse_lost
 from twin.plan.loop.push import push, push_choices
@@ -31,7 +30,7 @@ from twin.plan.loop.tau import (
 )
 from twin.plan.path.planner import BUDGET_SPENT, START_TOUCHES, Mover, NoPathError, PathConfig
 from twin.plan.path.transfer import LEGS, LIFT_M, Leg, PickAndPlace, left_with
-from twin.plan.problem import Grasp, Miss, NoPlanError, Problem, Release, State, Vector
+from twin.plan.problem import Grasp, Miss, NoPlanError, Problem, Release, State
 from twin.plan.release.final_states import MAX_RELEASES, final_states, places_on_table
 from twin.plan.release.resting import lying_there
 from twin.replay.clearance.bodies import SCENE
@@ -271,26 +270,7 @@ class _Moves:
 
         if steer.change == "grasp":
             return [grasp for grasp in grasps if not refused(grasp)]
-        if steer.change == "grasp_shift" and steer.toward_m is not None:
-            toward = np.array(steer.toward_m)
-            near = sorted(
-                grasps, key=lambda each: float(np.linalg.norm(each.T_object_tcp[:3, 3] - toward))
-            )
-            fresh = [grasp for grasp in near if not refused(grasp)]
-            shifted = self._shifted(next((g for g in grasps if refused(g)), grasps[0]), toward)
-            return [*shifted, *fresh]
         return sorted(grasps, key=lambda each: not refused(each))
-
-    def _shifted(self, grasp: Grasp, toward_m: Vector) -> list[Grasp]:
-        """The refused grasp moved along its pads to where a finger met the object."""
-        T = grasp.T_object_tcp.copy()
-        way = toward_m - T[:3, 3]
-        T[:3, 3] += way - T[:3, 1] * (way @ T[:3, 1])  # between the pads it stays in the middle
-        if self._steer is not None and self._steer.has_grasp_like(self._key, T):
-            return []
-        goal = self._problem.scene.Ts_base_object[self._key] @ T
-        joints = nearest_solutions(self._problem.robot, goal, grasp.joints_rad)
-        return [replace(grasp, T_object_tcp=T, joints_rad=joints[0])] if joints else []
 
     def _pairs(self) -> Iterator[tuple[Grasp, Release]]:
         """Every grasp with its cheapest final state, then every grasp with the next, and so on."""

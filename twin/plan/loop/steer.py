@@ -17,7 +17,7 @@ from twin.plan.problem import Grasp, Miss, Pose, Problem, Release
 from twin.plan.stage.solver import alike
 from twin.replay.config import ReplayConfig
 
-Change = Literal["grasp", "grasp_shift", "release", "path", "slower", "any"]
+Change = Literal["grasp", "release", "path", "slower", "any"]
 MOST_MISS_M, MOST_MISS_RAD = 0.04, np.radians(30.0)
 """An object that ends farther from where it was let go fell, or was knocked over."""
 _SQUEEZED = (Cause.EXPLODED, Cause.SHAPE, Cause.PROBABILITY)
@@ -46,16 +46,13 @@ class Steer:
     """The change a refusal asks for, and everything that was refused before."""
 
     change: Change
-    """``grasp``: another one, or another width; ``grasp_shift``: nearer to where a finger touched;
-    ``release``: another final state; ``path``: another way or approach; ``slower``: the same at
-    less speed; ``any``: nothing in particular."""
+    """``grasp``: another one; ``release``: another final state; ``path``: another way or approach;
+    ``slower``: the same at less speed; ``any``: nothing in particular."""
     clause: str
     """Factor and cause: ``terminal.inside``."""
     bodies: tuple[str, ...] = ()
     object_id: str | None = None
     """Whose grasp or release is meant; None: none in particular."""
-    toward_m: tuple[float, float, float] | None = None
-    """Where the tool was in the object's frame when a finger first touched it in the twin."""
     miss: Miss | None = None
     """How far beside the newest refused release the object came to lie, held in that grasp."""
     lacking_m: float = 0.0
@@ -99,7 +96,6 @@ def steer_by(refusals: Sequence[Refusal], problem: Problem) -> Steer:
         clause=f"{name}.{factor.cause}" if factor.cause else name or "undecided",
         bodies=factor.bodies,
         object_id=object_id,
-        toward_m=_touched_at(verdict, object_id) if change == "grasp_shift" else None,
         miss=_miss_of(refusals, object_id) if change == "release" else None,
         lacking_m=lacking_m,
         refused=tuple(tried for refusal in refusals for tried in tried_in(refusal.plan)),
@@ -168,18 +164,8 @@ def _change_of_outcome(cause: str, bodies: Sequence[str], verdict: Verdict, task
     if cause == "allowed_contacts":
         return "path"
     named = set(bodies) & set(task.manipulated)
-    missed = [item for item in verdict.grasps if item["object"] in named and not item["held"]]
-    if not missed:
-        return "release"
-    return "grasp_shift" if missed[0]["touched"] else "grasp"
-
-
-def _touched_at(verdict: Verdict, object_id: str | None) -> tuple[float, float, float] | None:
-    for item in verdict.grasps:
-        if item["object"] == object_id and item.get("p_object_m") is not None:
-            x, y, z = item["p_object_m"]
-            return float(x), float(y), float(z)
-    return None
+    slipped = any(item["object"] in named and not item["held"] for item in verdict.grasps)
+    return "grasp" if slipped else "release"
 
 
 def tried_in(plan: Plan) -> tuple[Tried, ...]:
