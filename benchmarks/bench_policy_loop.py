@@ -34,8 +34,7 @@ def anew(env: TwinEnv) -> dict[str, np.ndarray]:
     for name, place in cameras.viewpoints.items():
         T = place.T(T_base_tcp)
         view = RASTERISER.view(cloud, place.camera, T)
-        view = view if backdrop is None else backdrop.behind(view, place.camera, T)
-        found[name] = view.image_u8()
+        found[name] = backdrop.behind(view, place.camera, T).image_u8()
     return found
 
 
@@ -51,14 +50,13 @@ def main() -> int:
             env.step(start + np.append(rng.normal(0.0, 0.02, len(start) - 1), 0.0))
 
         step()
-        own = env._cameras.draw(env._opened())
+        cameras, cell = env._cameras, env._opened()
+        own = cameras.draw(cell)
         reference = anew(env)
         off = max(int(np.abs(own[n].astype(int) - reference[n].astype(int)).max()) for n in own)
         cpu = statistics.median(cpu_seconds(step, repeats=REPEATS))
         drawn_anew = statistics.median(cpu_seconds(lambda: anew(env), repeats=REPEATS))
-        drawn = statistics.median(
-            cpu_seconds(lambda: env._cameras.draw(env._opened()), repeats=REPEATS)
-        )
+        drawn = statistics.median(cpu_seconds(lambda: cameras.draw(cell), repeats=REPEATS))
         began = time.perf_counter()
         for _ in range(STEPS):
             step()

@@ -41,13 +41,6 @@ def rotation_from_quaternion(
     return R
 
 
-def third_axis(q_wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3"]:
-    """The third column of the rotation matrix of quaternions (not necessarily unit)."""
-    w, x, y, z = np.moveaxis(q_wxyz / np.linalg.norm(q_wxyz, axis=-1, keepdims=True), -1, 0)
-    column = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    return np.stack(column, axis=-1)
-
-
 def quaternion_from_rotation(
     R: Float[np.ndarray, "*batch 3 3"],
 ) -> Float[np.ndarray, "*batch 4"]:

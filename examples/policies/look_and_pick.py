@@ -1,8 +1,15 @@
-"""Ten graded policies that look through the wrist camera, pick the red cube, and put it somewhere.
+r"""Ten graded policies that look through the wrist camera, pick the red cube, and put it somewhere.
 
-In this folder: ``--policies exact=look_and_pick:exact --map look_and_pick.toml``. It looks from
-above, looks again from near, grasps, looks for where to put the cube, and releases it there. Camera
-and colours are those of the stand-in cell.
+They look from above, look again from near, grasp, look for where to put the cube, and release it
+there. Camera and colours are those of the stand-in cell. The study of docs/policies.md, in this
+folder, with all ten where two are named:
+
+    robot-gst trials runs/study --task cube_into_box cube_on_block cube_beside_cube --trials 20 \
+        --seed 41207 --map look_and_pick.toml --policies exact=look_and_pick:exact \
+        miss_20=look_and_pick:miss_20
+    robot-gst rebuild runs/study
+    robot-gst rollout runs/study --map look_and_pick.toml --policy look_and_pick:exact --name exact
+    robot-gst evaluate runs/study/rollouts.csv
 """
 
 from collections.abc import Iterator
