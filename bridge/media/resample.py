@@ -34,7 +34,7 @@ class Resampling:
         weights = [np.where(inside, np.floor(share * ONE), 0.0) for share in shares]
         weights.insert(0, np.where(inside, ONE - sum(weights), 0.0))
         self._shape = (height, width)
-        self._taps = [
+        self.taps = [  # for each pixel four that are read, and their weights
             (corner + step, weight.astype(np.uint32).ravel())
             for step, weight in zip((0, 1, width, width + 1), weights, strict=True)
         ]
@@ -46,7 +46,7 @@ class Resampling:
         packed = pixels.view(np.uint32).ravel()
         read, work = np.empty((2, packed.size), np.uint32)
         outer, inner = np.full((2, packed.size), HALF, np.uint32)
-        for places, weight in self._taps:
+        for places, weight in self.taps:
             np.take(packed, places, out=read, mode="clip")
             for total, shift in ((outer, 0), (inner, 8)):
                 np.right_shift(read, shift, out=work)

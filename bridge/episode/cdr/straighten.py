@@ -2,15 +2,15 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TypeVar, cast
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from bridge.geometry.camera import Camera
 from bridge.geometry.lens import Lens, LensError, Plane, lens_of
 from bridge.media.color import UnreadableImageError
-from bridge.media.resample import Resampling
+from bridge.media.resample import ONE, Resampling
 
 Pixels = TypeVar("Pixels", bound=np.ndarray)
 WIDEST, NARROWEST = 0.5, 4.0
@@ -18,6 +18,8 @@ WIDEST, NARROWEST = 0.5, 4.0
 half of its resolution to a rim drawn out long."""
 NEAR_RIM = 0.1
 """Of the smaller side: where a lens turns back so near the rim, its corners are cut off."""
+SAME = 0.03
+"""Neighbours whose depths differ by no more than this share lie on one surface."""
 GRID = (49, 65)
 """Rows and columns at which a view is tried."""
 
@@ -100,9 +102,18 @@ class Straightening:
         """Straighten a colour image, bilinearly."""
         return self._bilinear.apply(self._of_this_size(image_u8))
 
-    def depth(self, values: Pixels) -> Pixels:
-        """Straighten depth or a mask by nearest neighbour: values are never mixed."""
-        return cast(Pixels, self._of_this_size(values)[self._nearest])
+    def depth(self, depth_mm: UInt16[np.ndarray, "height width"]) -> UInt16[np.ndarray, "h w"]:
+        """Straighten depth: between pixels of one surface its inverse is linear; else the nearest.
+
+        Surfaces are never mixed.
+        """
+        places, weights = map(np.stack, zip(*self._bilinear.taps, strict=True))
+        around = self._of_this_size(depth_mm).ravel()[places]
+        nearest = np.take_along_axis(around, weights.argmax(axis=0)[None], axis=0)[0]
+        one_surface = (around.min(axis=0) > 0) & (np.ptp(around, axis=0) <= SAME * nearest)
+        between = ONE / (weights / np.maximum(around, 1)).sum(axis=0)
+        found = np.where(one_surface, np.rint(between), nearest)
+        return np.asarray(found.reshape(depth_mm.shape), dtype=np.uint16)
 
     def _of_this_size(self, image: Pixels) -> Pixels:
         if image.shape[:2] != (self.recorded.height, self.recorded.width):
@@ -121,11 +132,6 @@ class Straightening:
     @cached_property
     def _bilinear(self) -> Resampling:
         return Resampling(*self._places)
-
-    @cached_property
-    def _nearest(self) -> tuple[np.ndarray, np.ndarray]:
-        u, v = (np.rint(place).astype(np.int32) for place in self._places)
-        return v, u
 
 
 @lru_cache(maxsize=32)

@@ -80,6 +80,24 @@ def test_depth_is_moved_and_never_mixed() -> None:
     assert np.array_equal(straight.ravel()[sure], np.where(u < 80, 500, 2000)[sure])
 
 
+@pytest.mark.parametrize("model", ["equidistant", "plumb_bob"])
+def test_depth_of_a_slanted_plane_is_that_of_the_pinhole_camera(model: str) -> None:
+    cv2 = pytest.importorskip("cv2")
+    normal, away_mm = np.array([0.75, -0.35, 0.56]), 700.0
+    v, u = np.mgrid[0 : RECORDED.height, 0 : RECORDED.width].astype(float)
+    fx, fy, cx, cy = RECORDED.to_ros()
+    undo = (cv2.fisheye if model == "equidistant" else cv2).undistortPoints
+    K, d = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(LENSES[model])
+    rays = undo(np.stack([u, v], axis=-1).reshape(-1, 1, 2), K, d).reshape(*u.shape, 2)
+    recorded = away_mm / np.maximum(rays @ normal[:2] + normal[2], 0.02)
+    expected = away_mm / np.maximum(made(model).camera.rays() @ normal, 0.02)
+    found = made(model).depth(np.rint(np.minimum(recorded, 60_000)).astype(np.uint16))
+    near = expected < 1200  # farther off it is so steep that each pixel stands alone
+    off = np.abs(found - expected)[near]
+    assert near.mean() > 0.3
+    assert off.max() < 2.0  # a millimetre rounds twice
+
+
 def test_a_message_keeps_its_lens_and_images_are_read_through_it() -> None:
     lens = made("equidistant")
     straight = CameraInfo(stamp_ns=5, frame_id="eye", camera=RECORDED)
