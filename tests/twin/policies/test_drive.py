@@ -126,11 +126,6 @@ def test_a_limit_slows_the_arm_down_and_does_not_end_the_rollout(
     assert "the arm does not bring the tool to" in capsys.readouterr().err
 
 
-def test_an_unknown_start_is_named_with_those_there_are(run: RunFolder) -> None:
-    with pytest.raises(UsageError, match="nor a start of these trials: start 1, start 2"):
-        roll_out_run(run, driven(Path("none"), "start 3"), QUIET)
-
-
 @pytest.fixture
 def page() -> Any:
     served = KeyPage()
