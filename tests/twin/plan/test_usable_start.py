@@ -1,7 +1,7 @@
 """Starts from which nothing can be planned: one sentence each, with what, where and what to do."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,6 @@ def problem() -> Problem:
         (placed("cube", 0.5, 0, 0.02, scale=2.0), "pose of cube has a rotation", "Localise"),
         (placed("cube", 2.0, 0, 0.02), "the arm reaches no grasp", "nearer"),
         (placed("box", 0.5, 2.5, 0.0), "no joints reach the release pose", "nearer"),
-        (scene_with(start_rad=HOME * np.nan), "joints at the start are not", "Record"),
         (scene_with(start_rad=HOME[:4]), "gives 4 joints, and ur5", "--robot"),
         (scene_with(start_rad=HOME + 20), "rad, beyond its limits", "Move it back"),
         (scene_with(covariances={"box": SURE * np.nan}), "covariance of box", "Localise"),
@@ -106,55 +105,48 @@ def test_a_good_start_is_not_refused(problem: Problem) -> None:
     refuse_unusable(scene_with(covariances={"cube": SURE, "box": SURE})(problem))
 
 
-def begun(
-    run: RunFolder,
-    monkeypatch: pytest.MonkeyPatch,
-    names: Sequence[str],
-    values_rad: Sequence[float],
-) -> Start:
-    """Where plans begin of an episode with one joint state at 5 s, whose objects all are found."""
-    seen = scene_of_test().Ts_base_object
-
-    def localised(*_: Any, **__: Any) -> dict[str, LocalisedObject]:
-        said = {"confidence": 1.0, "method": "given", "reason": None, "stamp_ns": 5 * S}
-        return {
-            key: LocalisedObject(object_id=key, T_base_object=T, **said) for key, T in seen.items()
-        }
-
-    monkeypatch.setattr(once, "localise_episode", localised)
-    with EpisodeWriter(run.episodes_dir / "odd.mcap") as writer:
-        writer.describe(EpisodeInfo(id="odd", kind="trial"))
-        sample = at_positions(5 * S, names, np.array(values_rad))
-        writer.write("/lab/joint_states", sample.to_cdr(), type_name=JOINT_STATE, log_time_ns=5 * S)
-    return start_of(run, scene_of_test().task, PlanConfig(), ROBOT.name)
+Begin = Callable[[np.ndarray], Start]
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
+def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Begin:
+    """Where plans begin of an episode with one joint state at 5 s, whose objects all are found."""
+    said: dict[str, Any] = {"confidence": 1.0, "method": "", "reason": None, "stamp_ns": 5 * S}
+    found = {
+        key: LocalisedObject(object_id=key, T_base_object=T, **said)
+        for key, T in scene_of_test().Ts_base_object.items()
+    }
+    monkeypatch.setattr(once, "localise_episode", lambda *_, **__: found)
+    run = RunFolder.create(tmp_path / "run")
+
+    def start(joints_rad: np.ndarray) -> Start:
+        with EpisodeWriter(run.episodes_dir / "trial.mcap") as writer:
+            writer.describe(EpisodeInfo(id="trial", kind="trial"))
+            cdr = at_positions(5 * S, ROBOT.joints[: len(joints_rad)], joints_rad).to_cdr()
+            writer.write("/lab/joint_states", cdr, type_name=JOINT_STATE, log_time_ns=5 * S)
+        return start_of(run, scene_of_test().task, PlanConfig(), ROBOT.name)
+
+    return start
 
 
-def test_plans_begin_where_the_arm_was_recorded_to_stand(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    start = begun(run, monkeypatch, ROBOT.joints, HOME.tolist())
+def test_plans_begin_where_the_arm_was_recorded_to_stand(begin: Begin) -> None:
+    start = begin(HOME)
     np.testing.assert_array_equal(start.problem.scene.start_rad, HOME)
     assert start.arm == "as recorded"
 
 
-def test_where_joints_are_lacking_plans_begin_at_the_home_posture_and_say_so(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    start = begun(run, monkeypatch, ROBOT.joints[1:], HOME[1:].tolist())
+def test_where_joints_are_lacking_plans_begin_at_the_home_posture_and_say_so(begin: Begin) -> None:
+    start = begin(HOME[:5])
     assert start.problem.scene.start_rad is None
-    assert start.arm == "its home posture, for nobody recorded all its joints within 1 s"
+    said = "its home posture, for nobody recorded all its joints within 1 s"
+    assert f"  arm: {said}" in start.lines()
 
 
 def test_joints_that_were_recorded_and_are_no_numbers_are_not_taken_for_the_home_posture(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+    begin: Begin,
 ) -> None:
     with pytest.raises(NoPlanError, match=r"joints at the start are not made of numbers\. Record"):
-        begun(run, monkeypatch, ROBOT.joints, [*HOME[:5], np.nan])
+        begin(np.append(HOME[:5], np.nan))
 
 
 def test_a_scene_of_another_robot_is_refused(tmp_path: Path) -> None:
