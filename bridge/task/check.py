@@ -29,8 +29,10 @@ REFERENCES = ("object", "container", "support", "reference", "first", "second", 
 """Keys of a predicate or a constraint that name an object; the first is the one that moves."""
 _TOOK_PLACE = {"object": "obj", "tolerance_rad": "max_deg", "tolerance_m": "tol", "over": "region"}
 _TOOK_PLACE |= {"aside_m": "xy_tol", "direction": "way vector", "gap_m": "min_gap max_gap"}
+_TOOK_PLACE |= {"the kind aligned": "undirected", "world, or object and axis, or ee": "from"}
 RENAMED = {old: new for new, names in _TOOK_PLACE.items() for old in names.split()}
-"""Keys of constraints of earlier editions, and what they are called now."""
+"""Keys of constraints of earlier editions, and what to say now."""
+_GONE = {"part": " Leave it out: grasps are sought on the whole object."}
 
 
 class TaskFileError(UsageError):
@@ -100,10 +102,9 @@ def _sentence(error: "ValidationError") -> str:
     match error.kind.name:
         case "additionalProperties":
             known = reduce(getitem, error.schema_path[:-1], schema_of("task"))["properties"]
-            wrong = about["unexpected"]
-            meant = [nearest(RENAMED.get(key, key), known) for key in wrong]
             said = "; ".join(
-                f"unknown key {key!r}.{m}" for key, m in zip(wrong, meant, strict=True)
+                f"unknown key {key!r}.{_GONE.get(key) or nearest(RENAMED.get(key, key), known)}"
+                for key in about["unexpected"]
             )
             return f"{place}: {said} Allowed: {_names(known)}."
         case "enum":
@@ -184,7 +185,7 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
 
 def _on_the_way(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
     """What belongs to one verb, what holds meanwhile, and where a push goes."""
-    for key, verb in (("part", "grasp"), ("clearance_m", "carry"), ("speed_m_s", "push")):
+    for key, verb in (("clearance_m", "carry"), ("speed_m_s", "push")):
         if key in stage and verb not in stage:
             yield f"{place}.{key}: belongs to {verb}"
     for number, way in enumerate(stage.get("path", [])):

@@ -75,8 +75,6 @@ def _mm(length_m: float) -> str:
 def _handled(stage: Mapping[str, Any]) -> str:
     done = [f"{verb}s {stage[verb]}" for verb in VERBS if verb in stage]
     said = " and ".join(done).replace("carrys", "carries").replace("pushs", "pushes")
-    if "part" in stage:
-        said += f" by its {stage['part']}"
     if "speed_m_s" in stage:
         said += f" at {stage['speed_m_s']:g} m/s"
     if "clearance_m" in stage:

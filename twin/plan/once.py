@@ -38,11 +38,11 @@ from twin.plan.missed import missed_before
 from twin.plan.model_goals import Asked, ask_for_goals
 from twin.plan.problem import NoPlanError, Pose, Problem, State
 from twin.plan.shapes import problem_of
-from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
+from twin.plan.usable_start import refuse_other_robot, refuse_unusable
 from twin.replay.config import ReplayConfig
 from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import for_task
-from twin.replay.run_job import cell_of
+from twin.replay.run_job import cell_of, recorded_joints
 from twin.replay.verdict import replay_plan
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces
@@ -60,14 +60,13 @@ class Start:
     """When the last of its objects was seen [ns]."""
     localised: Mapping[str, LocalisedObject]
     problem: Problem
-    from_home: str = ""
-    """Why nobody knows where the arm stood, so that plans begin at its home posture; empty: it was
-    recorded."""
 
     @property
     def arm(self) -> str:
         """Where plans begin, in words."""
-        return f"its home posture, for {self.from_home}" if self.from_home else "as recorded"
+        if self.problem.scene.start_rad is not None:
+            return "as recorded"
+        return "its home posture, for nobody recorded all its joints within 1 s"
 
     def lines(self) -> list[str]:
         """Where each object is, how sure, and by what."""
@@ -139,16 +138,14 @@ def _start(
             hint=f"Record {ROBOT_DESCRIPTION}, or name the robot file: --robot.",
         )
     seen_ns = max(item.stamp_ns for item in found.values())
-    start_rad, unknown = start_posture(episode, seen_ns, robot_of(urdf).joints)
+    start_rad = recorded_joints(episode, seen_ns, robot_of(urdf).joints)
     poses = {key: T for key, item in found.items() if (T := item.T_base_object) is not None}
     sure = {key: item.covariance for key, item in found.items() if item.covariance is not None}
     problem = problem_of(run, task, urdf, poses, sure, start_rad)
     if not robot:
         refuse_other_robot(run, problem.robot.record)
     refuse_unusable(problem)
-    return Start(
-        episode=episode, seen_ns=seen_ns, localised=found, problem=problem, from_home=unknown
-    )
+    return Start(episode=episode, seen_ns=seen_ns, localised=found, problem=problem)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,18 +1,11 @@
 """What of a start makes planning pointless, said before anything is searched."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from bridge.episode import streams
-from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.topics import JOINT_STATES
-from bridge.errors import BridgeError
 from bridge.robots.robot import Robot
-from twin.plan.problem import Joints, NoPlanError, Problem
+from twin.plan.problem import NoPlanError, Problem
 from twin.replay.rebuilt_scene import scene_of_other_robot
-from twin.replay.run_job import START_KNOWN_NS, recorded_start
 
 _AGAIN = "Record the start again: robot-gst record RUN; a live cell asks again."
 _RIGID = 1e-3
@@ -41,27 +34,6 @@ def refuse_unusable(problem: Problem) -> None:
                 f"{MOST_UNCERTAIN_M * 1e3:.0f} mm are good enough",
                 "Localise it again, nearer or with more frames.",
             )
-
-
-def start_posture(
-    episode: Episode, stamp_ns: int, joints: Sequence[str]
-) -> tuple[Joints | None, str]:
-    """Where the arm was recorded to stand at the start [rad], or why nobody knows."""
-    found = recorded_start(episode, stamp_ns, joints)
-    if found is not None:
-        return found, ""
-    try:
-        track = streams.joint_track(episode, JOINT_STATES)
-    except BridgeError:
-        return None, "no joint states were recorded"
-    if lacking := [name for name in joints if name not in track.names]:
-        return None, f"the recorded joint states lack {', '.join(lacking)}"
-    away_ns = int(np.abs(track.stamps_ns - stamp_ns).min())
-    if away_ns > START_KNOWN_NS:
-        return None, f"the nearest joint states are {away_ns * 1e-9:.1f} s away from it"
-    raise NoPlanError(
-        f"the arm's joints at the start of {episode.path.stem} are not made of numbers. {_AGAIN}"
-    )
 
 
 def refuse_other_robot(run: RunFolder, robot: Robot) -> None:

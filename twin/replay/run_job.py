@@ -159,7 +159,15 @@ def _open(job: ReplayJob) -> _Source:
 def recorded_start(
     episode: Episode, stamp_ns: int, joints: Sequence[str]
 ) -> Float[np.ndarray, " num_joints"] | None:
-    """Where the arm was recorded to be when a plan began [rad]; None where nobody recorded it."""
+    """Where the arm was recorded to be when a plan began [rad]; None where no numbers say it."""
+    found = recorded_joints(episode, stamp_ns, joints)
+    return found if found is not None and np.isfinite(found).all() else None
+
+
+def recorded_joints(
+    episode: Episode, stamp_ns: int, joints: Sequence[str]
+) -> Float[np.ndarray, " num_joints"] | None:
+    """Joints as recorded near an instant [rad], numbers or not; None where there are none."""
     try:
         track = streams.joint_track(episode, JOINT_STATES)
     except GstError:
@@ -169,7 +177,7 @@ def recorded_start(
         return None
     order = [track.names.index(name) for name in joints]
     found: Float[np.ndarray, " num_joints"] = track.at(np.array([stamp_ns]))[0, order]
-    return found if np.isfinite(found).all() else None
+    return found
 
 
 def _run(source: _Source, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:

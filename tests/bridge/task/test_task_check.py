@@ -62,6 +62,8 @@ def test_what_is_shipped_is_right_and_named_like_its_file(path: Path) -> None:
          "Did you mean 'gripper'?"),
         ('grasp = "cube"', 'grasp = "cube"\npath = [{kind = "upright", obj = "cube", max_deg = 5}]',
          "stages[0].path[0]", "'max_deg'. Did you mean 'tolerance_rad'?"),
+        ('grasp = "cube"', 'grasp = "cube"\npart = "handle"', "stages[0]",
+         "'part'. Leave it out: grasps are sought on the whole object. Allowed: "),
         ('id = "place"', 'id = "grasp"', "stages[1].id", "already"),
         ('manipulated = ["cube"]', 'manipulated = ["box"]', "manipulated[0]", "fixed"),
         ('containers = ["box"]', 'containers = ["cube"]', "containers[0]", "no container"),

@@ -1,7 +1,6 @@
 """What ``plan RUN`` leaves in a run: the accepted plan, those refused before, a replay of each."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,9 +103,6 @@ def test_where_plans_begin_is_said(steered: tuple[RunFolder, Planned]) -> None:
     assert "  arm: as recorded" in done.lines()
     assert any(line.startswith("    at rest: inside holds") for line in done.explained())
     assert done.to_json()["start"]["arm"] == "as recorded"
-    start = replace(done.begun.start, from_home="no joint states were recorded")
-    home = replace(done, begun=replace(done.begun, start=start))
-    assert "  arm: its home posture, for no joint states were recorded" in home.lines()
 
 
 def test_an_episode_of_an_empty_run_is_not_looked_up_in_an_empty_list(

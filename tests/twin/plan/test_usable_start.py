@@ -9,22 +9,26 @@ from typing import Any
 import numpy as np
 import pytest
 from foreign_scene import write_scan
+from joint_samples import at_positions
 from planned_start import HOME, problem_of_test
+from scripted_plans import scene_of_test
 
-from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.schema import JOINT_STATE
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.robots.robot import read_robot
+from twin.plan import once
+from twin.plan.config import PlanConfig
 from twin.plan.loop.nominal import PlanProposer
 from twin.plan.loop.propose import NoPlanError
+from twin.plan.once import Start, start_of
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
-from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
+from twin.plan.usable_start import refuse_other_robot, refuse_unusable
+from twin.scene.localise.result import LocalisedObject
 from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION
 
 SURE = np.eye(6) * 1e-6
@@ -69,7 +73,6 @@ def problem() -> Problem:
         (placed("cube", 0.5, 0, 0.02, scale=2.0), "pose of cube has a rotation", "Localise"),
         (placed("cube", 2.0, 0, 0.02), "the arm reaches no grasp", "nearer"),
         (placed("box", 0.5, 2.5, 0.0), "no joints reach the release pose", "nearer"),
-        (scene_with(start_rad=HOME * np.nan), "joints at the start are not", "Record"),
         (scene_with(start_rad=HOME[:4]), "gives 4 joints, and ur5", "--robot"),
         (scene_with(start_rad=HOME + 20), "rad, beyond its limits", "Move it back"),
         (scene_with(covariances={"box": SURE * np.nan}), "covariance of box", "Localise"),
@@ -102,52 +105,48 @@ def test_a_good_start_is_not_refused(problem: Problem) -> None:
     refuse_unusable(scene_with(covariances={"cube": SURE, "box": SURE})(problem))
 
 
-def recorded(path: Path, names: tuple[str, ...], *values_rad: float) -> Episode:
-    """One joint state, at 5 s; none without values."""
-    with EpisodeWriter(path) as writer:
-        writer.describe(EpisodeInfo(id=path.stem, kind="trial"))
-        if values_rad:
-            none = np.zeros(0)
-            position = np.array(values_rad)
-            sample = JointSample(
-                stamp_ns=5 * S, names=names, position=position, velocity=none, effort=none
-            )
-            writer.write(
-                "/lab/joint_states", sample.to_cdr(), type_name=JOINT_STATE, log_time_ns=5 * S
-            )
-    return Episode.open(path)
+Begin = Callable[[np.ndarray], Start]
 
 
-def test_where_the_arm_stood_is_what_was_recorded(tmp_path: Path) -> None:
-    episode = recorded(tmp_path / "a.mcap", ROBOT.joints, *HOME)
-    found, why = start_posture(episode, 5 * S, ROBOT.joints)
-    np.testing.assert_array_equal(found, HOME)
-    assert why == ""
+@pytest.fixture
+def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Begin:
+    """Where plans begin of an episode with one joint state at 5 s, whose objects all are found."""
+    said: dict[str, Any] = {"confidence": 1.0, "method": "", "reason": None, "stamp_ns": 5 * S}
+    found = {
+        key: LocalisedObject(object_id=key, T_base_object=T, **said)
+        for key, T in scene_of_test().Ts_base_object.items()
+    }
+    monkeypatch.setattr(once, "localise_episode", lambda *_, **__: found)
+    run = RunFolder.create(tmp_path / "run")
+
+    def start(joints_rad: np.ndarray) -> Start:
+        with EpisodeWriter(run.episodes_dir / "trial.mcap") as writer:
+            writer.describe(EpisodeInfo(id="trial", kind="trial"))
+            cdr = at_positions(5 * S, ROBOT.joints[: len(joints_rad)], joints_rad).to_cdr()
+            writer.write("/lab/joint_states", cdr, type_name=JOINT_STATE, log_time_ns=5 * S)
+        return start_of(run, scene_of_test().task, PlanConfig(), ROBOT.name)
+
+    return start
 
 
-@pytest.mark.parametrize(
-    ("names", "values_rad", "stamp_ns", "said"),
-    [
-        (ROBOT.joints, (), 5 * S, "no joint states were recorded"),
-        (("panda_joint1",), (0.1,), 5 * S, "the recorded joint states lack shoulder_pan_joint, "),
-        (ROBOT.joints, tuple(HOME), 8 * S, "the nearest joint states are 3.0 s away from it"),
-    ],
-)
-def test_where_nobody_knows_where_the_arm_stood_the_reason_is_said(
-    tmp_path: Path, names: tuple[str, ...], values_rad: tuple[float, ...], stamp_ns: int, said: str
-) -> None:
-    episode = recorded(tmp_path / "a.mcap", names, *values_rad)
-    found, why = start_posture(episode, stamp_ns, ROBOT.joints)
-    assert found is None
-    assert said in why
+def test_plans_begin_where_the_arm_was_recorded_to_stand(begin: Begin) -> None:
+    start = begin(HOME)
+    np.testing.assert_array_equal(start.problem.scene.start_rad, HOME)
+    assert start.arm == "as recorded"
+
+
+def test_where_joints_are_lacking_plans_begin_at_the_home_posture_and_say_so(begin: Begin) -> None:
+    start = begin(HOME[:5])
+    assert start.problem.scene.start_rad is None
+    said = "its home posture, for nobody recorded all its joints within 1 s"
+    assert f"  arm: {said}" in start.lines()
 
 
 def test_joints_that_were_recorded_and_are_no_numbers_are_not_taken_for_the_home_posture(
-    tmp_path: Path,
+    begin: Begin,
 ) -> None:
-    episode = recorded(tmp_path / "odd.mcap", ROBOT.joints, *(HOME * np.nan))
-    with pytest.raises(NoPlanError, match=r"start of odd are not made of numbers\. Record"):
-        start_posture(episode, 5 * S, ROBOT.joints)
+    with pytest.raises(NoPlanError, match=r"joints at the start are not made of numbers\. Record"):
+        begin(np.append(HOME[:5], np.nan))
 
 
 def test_a_scene_of_another_robot_is_refused(tmp_path: Path) -> None:

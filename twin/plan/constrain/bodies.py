@@ -77,37 +77,19 @@ def millimetres(p_m: Numbers) -> str:
     return "(" + ", ".join(f"{value * 1e3:.0f}" for value in p_m) + ") mm"
 
 
-def directions_of(spec: Record, problem: Problem) -> tuple[Point, str]:
-    """A direction of each state in the base frame, and its name in words.
-
-    ``(num_states, num_axes, 3)``: three axes where any of them will do, else one.
-    """
-    if "from" in spec:
-        (start, start_name), (end, end_name) = (point_of(spec[k], problem) for k in ("from", "to"))
-        return (
-            lambda state: (end(state) - start(state))[:, None],
-            f"the way from {start_name} to {end_name}",
-        )
+def direction_of(spec: Record) -> tuple[Point, str]:
+    """A direction of each state in the base frame, and its name in words."""
     if "ee" in spec:
         column = {"approach": 2, "closing": 1}[spec["ee"]]
-        return (
-            lambda state: state.T_base_tcp[:, None, :3, column],
-            f"the tool's {spec['ee']} direction",
-        )
+        return lambda state: state.T_base_tcp[:, :3, column], f"the tool's {spec['ee']} direction"
     name = spec["axis"] if "object" in spec else spec["world"]
-    if name == "any":
-        return (
-            lambda state: pose_of(state, spec["object"])[:, :3, :3].swapaxes(1, 2),
-            f"the nearest axis of {spec['object']}",
-        )
-    sign, column = (-1.0 if name[0] == "-" else 1.0), AXES.index(name[-1])
+    axis = (-1.0 if name[0] == "-" else 1.0) * np.eye(3)[AXES.index(name[-1])]
     if "object" in spec:
         return (
-            lambda state: sign * pose_of(state, spec["object"])[:, None, :3, column],
+            lambda state: pose_of(state, spec["object"])[:, :3, :3] @ axis,
             f"{spec['object']}'s {name} axis",
         )
-    axis = sign * np.eye(3)[column]
-    return lambda state: axis[None, None], f"the base frame's {name} axis"
+    return lambda state: axis[None], f"the base frame's {name} axis"
 
 
 def surface_points(problem: Problem, object_id: str, count: int = NUM_POINTS) -> Points:

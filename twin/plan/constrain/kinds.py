@@ -18,7 +18,7 @@ from twin.plan.constrain.bodies import (
     Record,
     box_of,
     carried,
-    directions_of,
+    direction_of,
     point_of,
     pose_of,
     surface_points,
@@ -87,18 +87,14 @@ def _above(record: Record, problem: Problem) -> Constraint:
     return Constraint(record=record, measured=measured)
 
 
-def _align(record: Record, problem: Problem) -> Constraint:
-    (a, a_name), (b, b_name) = (directions_of(record[key], problem) for key in "ab")
-    either = any(record[key].get("axis") == "any" for key in "ab")
-    undirected = either or record.get("undirected", False)
-    most_rad = float(record["tolerance_rad"])
+def _align(record: Record, _: Problem) -> Constraint:
+    (a, a_name), (b, b_name) = (direction_of(record[key]) for key in "ab")
+    what, most_rad = f"the angle between {a_name} and {b_name}", float(record["tolerance_rad"])
 
     def measured(state: State) -> list[Measured]:
-        one, other = a(state)[:, :, None], b(state)[:, None]
+        one, other = a(state), b(state)
         across, along = np.linalg.norm(np.cross(one, other), axis=-1), (one * other).sum(-1)
-        off = np.arctan2(across, abs(along) if undirected else along).min(axis=(1, 2))
-        what = f"the angle between {a_name} and {b_name}"
-        return [Measured(what, off, high=most_rad, unit="rad")]
+        return [Measured(what, np.arctan2(across, along), high=most_rad, unit="rad")]
 
     return Constraint(record=record, measured=measured, unit="rad")
 

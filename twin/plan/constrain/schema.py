@@ -124,7 +124,7 @@ def _what(error: Any) -> str:
         return f"{shown(value)} is unknown. Known: {', '.join(known) or 'none'}.{near}"
     if error.kind.name == "additionalProperties":
         keys = about["unexpected"][:3]
-        now = [f"{key} is called {RENAMED[key]} now" for key in keys if key in RENAMED]
+        now = [f"For {key} say {RENAMED[key]}" for key in keys if key in RENAMED]
         return ". ".join([f"unknown key {', '.join(map(shown, keys))}", *now])
     return str(error.message)
 
@@ -154,7 +154,3 @@ def meaning_problems(record: Mapping[str, Any], place: str) -> Iterator[str]:
     yield from contradictions(place or "top level", record)
     if record["kind"] in ("distance", "above", "align") and record["a"] == record["b"]:
         yield f"{place}.b: is the same as a"
-    for key in ("a", "b"):
-        direction = record.get(key, {})
-        if "from" in direction and direction["from"] == direction["to"]:
-            yield f"{place}.{key}: runs from a point to the same point"

@@ -136,11 +136,7 @@ def _is_symmetric(pieces: Sequence[SweptPiece]) -> bool:
 
     def boxes(sign: float) -> Float[np.ndarray, "num_pieces 6"]:
         turn = np.array([sign, sign, 1.0])
-        rows = [
-            np.concatenate([np.sort([p.low_m * turn, p.high_m * turn], axis=0).ravel()])
-            for p in pieces
-        ]
-        table = np.array(rows)
+        table = np.array([np.sort([p.low_m * turn, p.high_m * turn], 0).ravel() for p in pieces])
         return table[np.lexsort(np.rint(table / _SAME_M).T)]
 
     return bool(np.abs(boxes(1.0) - boxes(-1.0)).max() < _SAME_M)

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float
@@ -246,31 +247,26 @@ class GraspSearcher:
     def _hands_on(self, pairs: Pairs, T_base_object: Pose, rejected: Counter[str]) -> _Candidates:
         """Put hands onto closing lines, from several directions and at several depths."""
         down = -T_base_object[2, :3]
+        signs = (1.0,) if self._hand.symmetric else (1.0, -1.0)
+        ways = np.array(list(product(signs, APPROACHES_RAD, DEPTHS_M)))
+        sign, turn, depth = np.repeat(ways, len(pairs.axes), axis=0).T[..., None]
+        pairs = pairs.chosen(np.tile(np.arange(len(pairs.axes)), len(ways)))
         y = pairs.axes
         steep = down - y * (y @ down)[:, None]
         length = np.linalg.norm(steep, axis=1)
         z0 = steep / np.maximum(length, 1e-9)[:, None]
-        rows: list[tuple[Poses, Ids]] = []
-        for turn in APPROACHES_RAD:
-            z = np.cos(turn) * z0 + np.sin(turn) * np.cross(y, z0)
-            R = np.stack([np.cross(y, z), y, z], axis=-1)
-            for depth in DEPTHS_M:
-                Ts = np.tile(np.eye(4), (len(y), 1, 1))
-                Ts[:, :3, :3] = R
-                Ts[:, :3, 3] = pairs.middles_m + depth * z
-                rows.append((Ts, np.arange(len(y))))
-        Ts_all = np.concatenate([Ts for Ts, _ in rows])
-        ids = np.concatenate([numbers for _, numbers in rows])
-        if not self._hand.symmetric:
-            Ts_all, ids = np.concatenate([Ts_all, turned(Ts_all)]), np.concatenate([ids, ids])
+        z = np.cos(turn) * z0 + np.sin(turn) * np.cross(y, z0)
+        Ts = np.tile(np.eye(4), (len(y), 1, 1))
+        Ts[:, :3, :3] = np.stack([sign * np.cross(y, z), sign * y, z], axis=-1)
+        Ts[:, :3, 3] = pairs.middles_m + depth * z
         lines = Lines(
-            Ts_object_tcp=Ts_all,
-            middles_m=pairs.middles_m[ids],
-            widths_m=pairs.widths_m[ids],
-            cosines=pairs.cosines[ids],
+            Ts_object_tcp=Ts,
+            middles_m=pairs.middles_m,
+            widths_m=pairs.widths_m,
+            cosines=pairs.cosines,
         )
+        level = (Ts[:, :3, 2] @ down >= np.cos(MOST_TILT_RAD)) & (length > 1e-6)
         found = _Candidates(lines=lines, rejected=rejected)
-        level = (Ts_all[:, :3, 2] @ down >= np.cos(MOST_TILT_RAD)) & (length[ids] > 1e-6)
         found.keep(level, "tilt")
         return found
 

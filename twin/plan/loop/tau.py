@@ -118,12 +118,6 @@ def refuse_without_stages(task: Task) -> None:
             f"task {task.name} wants something between others, and the planner knows no such goal. "
             "Ask for it beside one of them."
         )
-    for table in task.stages:
-        if "part" in table:
-            raise NoPlanError(
-                f"task {task.name} takes {table.get('grasp')} by its {table['part']}, and grasps "
-                "are no longer sought on one part. Leave the part out."
-            )
     for key in task.manipulated:
         verbs = stages_of(task, key).keys()
         lacking = [verb for verb in ("grasp", "release") if verb not in verbs]

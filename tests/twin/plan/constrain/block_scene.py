@@ -151,7 +151,6 @@ IN_BOX = state(cube=pose(0.5, 0.2, 0.03, 0.3))
 ON_BRICK = state(cube=pose(0.46, 0.01, 0.07, 0.5))
 OVER_BOX = state(cube=pose(0.51, 0.2, 0.096, 0.5))
 BESIDE = state(cube=pose(0.45, 0.07, 0.02, 0.2))
-BETWEEN = state(cube=pose(0.59, 0.0, 0.02, 0.1))
 OUT = state(cube=pose(0.5, 0.05, 0.02, 0.3))
 START = state()
 TILTED = state(
@@ -159,8 +158,7 @@ TILTED = state(
 )
 
 TOOL, MIDDLE = {"ee": True}, {"object": "cube"}
-FROM_BRICK = {"from": {"object": "brick"}, "to": {"object": "post"}}
-DOWN, ASKEW = {"a": {"ee": "approach"}, "b": {"world": "-z"}}, pose(0.5, -0.2, 0.02, 0.7)
+DOWN = {"a": {"ee": "approach"}, "b": {"world": "-z"}}
 OVER = {"a": CUBE, "b": OPENING, "height": 0.02, "tolerance_m": 0.01, "aside_m": 0.03}
 POINT = pose(0.5, 0.1, 0.1)
 RIGHT = state(cube=pose(0.45, -0.07, 0.02, 0.2))
@@ -180,8 +178,8 @@ _EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
     "beside left": ({"object": "cube", "reference": "brick", "direction": "left"}, BESIDE, RIGHT),
     "align": ({**DOWN, "tolerance_rad": TEN}, START, state(tcp=np.eye(4))),
     "align bodies": (
-        {"a": {"object": "cube", "axis": "any"}, "b": FROM_BRICK, "tolerance_rad": 2 * TEN},
-        BETWEEN, state(cube=ASKEW),
+        {"a": MIDDLE | {"axis": "-y"}, "b": {"object": "post", "axis": "x"}, "tolerance_rad": 0.3},
+        state(cube=pose(0.5, -0.2, 0.02, 2.1)), START,
     ),
     "upright": ({"object": "brick", "tolerance_rad": TEN}, START, TILTED),
     "upright cube": (

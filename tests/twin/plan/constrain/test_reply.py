@@ -140,7 +140,18 @@ def test_an_earlier_form_is_named_with_what_took_its_place() -> None:
     (said,) = judged(json.dumps(valid_reply() | {"version": 2}))
     assert said.startswith("top level: version 2 is an earlier form. Say version 3: object for obj")
     (said,) = judged(json.dumps(put(("goals", 0), {**INSIDE, "max_deg": 5})))
-    assert said == 'goals[0]: unknown key "max_deg". max_deg is called tolerance_rad now'
+    assert said == 'goals[0]: unknown key "max_deg". For max_deg say tolerance_rad'
+
+
+def test_directions_of_earlier_editions_are_refused_with_what_to_say() -> None:
+    align = {"kind": "align", "a": {"ee": "approach"}, "b": {"world": "z"}, "tolerance_rad": 0.1}
+    assert judged(json.dumps(put(KEEP, align))) == ()
+    for changed, said in (
+        ({"undirected": True}, "For undirected say the kind aligned"),
+        ({"a": {"object": "cube", "axis": "any"}}, '"any" is unknown. Known: x, y, z, -x, -y, -z.'),
+        ({"a": {"from": {"ee": True}, "to": {"xyz": [0, 0, 0]}}}, '"to". For from say world, or'),
+    ):
+        assert any(said in text for text in judged(json.dumps(put(KEEP, align | changed)))), said
 
 
 def test_the_largest_reply_is_read_in_time() -> None:

@@ -66,10 +66,9 @@ def two_cubes(lower: np.ndarray, other: np.ndarray) -> Problem:
     return problem(task, dict(zip(names, (lower, other), strict=False)))
 
 
-def refusal(given: Problem, object_id: str, config: GraspConfig = FEW) -> NoPlanError:
-    config = replace(FEW, samples=400)
+def refusal(given: Problem, object_id: str) -> NoPlanError:
     with pytest.raises(NoPlanError) as caught:
-        GraspSearcher(given, config).search(object_id)
+        GraspSearcher(given, replace(FEW, samples=400)).search(object_id)
     return caught.value
 
 

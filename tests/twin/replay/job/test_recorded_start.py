@@ -12,7 +12,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from bridge.robots.default import ARM_JOINTS
-from twin.replay.run_job import recorded_start
+from twin.replay.run_job import recorded_joints, recorded_start
 
 S = 1_000_000_000
 
@@ -52,6 +52,7 @@ def test_a_start_that_nobody_recorded_is_not_known(tmp_path: Path) -> None:
     assert recorded_start(other, 10 * S, ARM_JOINTS) is None
     broken = recorded(tmp_path / "c", ARM_JOINTS, [[np.nan] * 6])
     assert recorded_start(broken, 10 * S, ARM_JOINTS) is None
+    assert np.isnan(recorded_joints(broken, 10 * S, ARM_JOINTS)).all(), "recorded, but no numbers"
     with EpisodeWriter(tmp_path / "none.mcap") as writer:
         writer.describe(EpisodeInfo(id="none", kind="trial"))
     assert recorded_start(Episode.open(tmp_path / "none.mcap"), 10 * S, ARM_JOINTS) is None
