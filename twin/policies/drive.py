@@ -22,8 +22,7 @@ from bridge.errors import PathNotFoundError
 from bridge.media.color import encode_jpeg
 from bridge.terminal import Output
 from twin.policies.errors import PolicyError
-from twin.policies.mapping import Actions, Picture, PolicyMap
-from twin.policies.policy import END
+from twin.policies.mapping import END, Actions, Picture, PolicyMap
 
 RATE_HZ, SIZE = 15.0, (320, 240)
 SPEED = np.array([0.12, 0.12, 0.12, 0.6, 0.6, 0.6])

@@ -74,6 +74,8 @@ class PolicyMap(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
 
 
 DEFAULT = PolicyMap()
+END = object()
+"""The answer of a policy that wants nothing more: the rollout ends and is judged."""
 
 
 def read_mapping(path: Path | None) -> PolicyMap:

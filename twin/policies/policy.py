@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from bridge.episode.provenance import hash_settings
+from twin.policies.drive import KeyFile, KeyPage, KeyPolicy
 from twin.policies.errors import PolicyError
 from twin.policies.mapping import PolicyMap
 from twin.policies.openpi import ServedPolicy
 
 WORDS = ("ws://", "wss://")
-END = object()
-"""The answer of a policy that wants nothing more: the rollout ends and is judged."""
 HASHES = ("server=", "code=", "map=")
 """How it begins who acted, where no checkpoint is named."""
 
@@ -85,10 +84,8 @@ def open_policy(address: str, timeout_s: float) -> Policy:
             somebody holds in the browser, or ``keys:FILE``.
     """
     if is_driven(address):
-        from twin.policies import drive  # noqa: PLC0415  # drive is made of policies
-
         _, colon, path = address.partition(":")
-        return drive.KeyPolicy(drive.KeyFile(Path(path)) if colon else drive.KeyPage())
+        return KeyPolicy(KeyFile(Path(path)) if colon else KeyPage())
     if address.startswith(WORDS):
         return ServedPolicy(address, timeout_s)
     module, colon, name = address.partition(":")

@@ -19,8 +19,8 @@ from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan
 from twin.policies.cell import TwinCell
 from twin.policies.errors import PolicyError, RefusedError, StoppedError
-from twin.policies.mapping import Interpreter, PolicyMap
-from twin.policies.policy import END, Policy, open_policy, who_acts
+from twin.policies.mapping import END, Interpreter, PolicyMap
+from twin.policies.policy import Policy, open_policy, who_acts
 from twin.policies.starts import Start, drawn_starts, open_start
 from twin.policies.views import Pictures, TwinCameras
 from twin.replay.output import ReplayOrigin, write_replay

@@ -160,12 +160,12 @@ class TwinCameras:
         keys |= {name: rows.tobytes() for name, rows in nodes.items()}
         last, self._last = self._last or keys, keys
         parts = self._drawable.parts
-        still = frozenset(name for name in parts.objects if keys.get(name) == last.get(name))
-        if self._resting is None or self._resting.objects != still:
-            covered = self._covered(still, places, nodes)
-            clouds = [self._object_at(n, places, nodes) for n in parts.objects if n in still]
+        resting = frozenset(name for name in parts.objects if keys.get(name) == last.get(name))
+        if self._resting is None or self._resting.objects != resting:
+            covered = self._covered(resting, places, nodes)
+            clouds = [self._object_at(n, places, nodes) for n in parts.objects if n in resting]
             cloud = concatenate([without(parts.background, covered), *clouds])
-            self._resting = Resting(cloud=cloud, objects=still, covered=covered)
+            self._resting = Resting(cloud=cloud, objects=resting, covered=covered)
         return self._resting
 
     def _object_at(self, name: str, places: Places, nodes: Nodes) -> GaussianCloud:

@@ -21,7 +21,8 @@ from bridge.exchange.lerobot.layout import LeRobotConfig
 from twin.policies.config import RolloutConfig
 from twin.policies.drive import RATE_HZ, SPEED, KeyFile, KeyPage, KeyPolicy
 from twin.policies.errors import PolicyError
-from twin.policies.policy import END, open_policy
+from twin.policies.mapping import END
+from twin.policies.policy import open_policy
 from twin.policies.runs import roll_out_run
 
 PICTURE = np.zeros((24, 32, 3), dtype=np.uint8)
