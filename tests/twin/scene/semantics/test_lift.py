@@ -3,7 +3,6 @@ import pytest
 from table_scene import World, iou
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_from_masks
 from twin.scene.semantics.lift import Viewpoint, render_labels
@@ -11,17 +10,6 @@ from twin.scene.semantics.lift import Viewpoint, render_labels
 SMALL = Viewpoint(
     camera=Camera(width=24, height=16, fx=20.0, fy=20.0, cx=12.0, cy=8.0), T_base_camera=np.eye(4)
 )
-
-
-def few_gaussians(count: int = 30) -> GaussianCloud:
-    rng = np.random.default_rng(0)
-    return GaussianCloud(
-        means_m=as_float32(rng.uniform([-0.5, -0.35, 0.8], [0.5, 0.35, 1.6], (count, 3))),
-        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
-        scales_log=as_float32(np.log(rng.uniform(0.02, 0.1, (count, 3)))),
-        opacities_logit=as_float32(rng.normal(0.5, 1.0, count)),
-        colors=as_float32(rng.uniform(size=(count, 3))),
-    )
 
 
 @pytest.fixture
