@@ -34,10 +34,9 @@ class Resampling:
         weights = [np.where(inside, np.floor(share * ONE), 0.0) for share in shares]
         weights.insert(0, np.where(inside, ONE - sum(weights), 0.0))
         self._shape = (height, width)
-        self.taps = [  # for each pixel four that are read, and their weights
-            (corner + step, weight.astype(np.uint32).ravel())
-            for step, weight in zip((0, 1, width, width + 1), weights, strict=True)
-        ]
+        self.weights = np.array(weights, dtype=np.uint32).reshape(4, -1)
+        self.places = corner + np.array([[0], [1], [width], [width + 1]])  # what they weigh
+        self.nearest = self.places[self.weights.argmax(axis=0), np.arange(corner.size)]
 
     def apply(self, image_u8: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """Return the image with each pixel taken from its place."""
@@ -46,7 +45,7 @@ class Resampling:
         packed = pixels.view(np.uint32).ravel()
         read, work = np.empty((2, packed.size), np.uint32)
         outer, inner = np.full((2, packed.size), HALF, np.uint32)
-        for places, weight in self.taps:
+        for places, weight in zip(self.places, self.weights, strict=True):
             np.take(packed, places, out=read, mode="clip")
             for total, shift in ((outer, 0), (inner, 8)):
                 np.right_shift(read, shift, out=work)

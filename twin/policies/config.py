@@ -11,6 +11,11 @@ from bridge.terminal import RARE
 from bridge.wire.config import LOOPBACK
 
 
+def is_driven(policy: str) -> bool:
+    """Whether keys drive the arm."""
+    return policy.partition(":")[0] == "keys"
+
+
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class RolloutConfig:
@@ -61,5 +66,5 @@ class RolloutConfig:
                 "timeout_s": (0.1, 600),
             },
         )
-        if self.policy.partition(":")[0] == "keys" and (self.map or self.cell or self.check):
+        if is_driven(self.policy) and (self.map or self.cell or self.check):
             raise UsageError("--policy keys drives the twin: leave out --map, --cell and --check")

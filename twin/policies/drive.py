@@ -132,12 +132,8 @@ class KeyPage:
             "style-src 'unsafe-inline'; "
             f"script-src 'nonce-{self._token}'; frame-ancestors 'none'; base-uri 'none'"
         )
-        page = self
-
-        class Handler(_Handler):
-            served = page
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        handler = type("Handler", (_Handler,), {"served": self})
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
         self._server.daemon_threads = True
         self.address = f"http://127.0.0.1:{self._server.server_port}/{self._token}/"
         threading.Thread(target=self._server.serve_forever, daemon=True).start()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from bridge.episode.provenance import hash_settings
+from twin.policies.config import is_driven
 from twin.policies.drive import KeyFile, KeyPage, KeyPolicy
 from twin.policies.errors import PolicyError
 from twin.policies.mapping import PolicyMap
@@ -113,11 +114,6 @@ def open_policy(address: str, timeout_s: float) -> Policy:
     if not callable(found):
         raise PolicyError(f"--policy {address}: {type(found).__name__} cannot be asked for actions")
     return ImportedPolicy(act=found)
-
-
-def is_driven(address: str) -> bool:
-    """Whether keys drive the arm."""
-    return address.partition(":")[0] == "keys"
 
 
 def _takes_one(found: Callable[..., Any]) -> bool:

@@ -197,7 +197,7 @@ def act(
         latency_s: From a picture to the first action that answers it.
     """
     does = _Follower(cell=cell, policy=policy, speak=speak, max_s=max_s)
-    late, horizon = round(latency_s / does.period_s), speak.mapping.horizon
+    late = round(latency_s / does.period_s)
     acted, rest = Acted(), np.zeros((0, speak.num_values()))
     try:
         going = True
@@ -214,8 +214,9 @@ def act(
             going = does.follow(rest[:late])
             for _ in range(late - len(rest) if going else 0):
                 cell.hold(does.period_s)
-            rest = answer[horizon or len(answer) :]
-            going = going and does.follow(answer[: horizon or len(answer)])
+            horizon = speak.mapping.horizon or len(answer)
+            rest = answer[horizon:]
+            going = going and does.follow(answer[:horizon])
     except StoppedError as error:
         acted.stopped = str(error)
     except PolicyError as error:

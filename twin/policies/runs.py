@@ -16,10 +16,10 @@ from bridge.errors import UsageError
 from bridge.process_pool import Failed, runner_of
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
-from twin.policies.config import RolloutConfig
+from twin.policies.config import RolloutConfig, is_driven
 from twin.policies.drive import drive_mapping
 from twin.policies.mapping import read_mapping
-from twin.policies.policy import HASHES, is_driven
+from twin.policies.policy import HASHES
 from twin.policies.rollout import RolloutJob, roll_out, row_of_file
 from twin.policies.starts import trial_episodes
 

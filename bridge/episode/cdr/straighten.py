@@ -107,11 +107,10 @@ class Straightening:
 
         Surfaces are never mixed.
         """
-        places, weights = map(np.stack, zip(*self._bilinear.taps, strict=True))
-        around = self._of_this_size(depth_mm).ravel()[places]
-        nearest = np.take_along_axis(around, weights.argmax(axis=0)[None], axis=0)[0]
+        taps, recorded = self._bilinear, self._of_this_size(depth_mm).ravel()
+        around, nearest = recorded[taps.places], recorded[taps.nearest]
         one_surface = (around.min(axis=0) > 0) & (np.ptp(around, axis=0) <= SAME * nearest)
-        between = ONE / (weights / np.maximum(around, 1)).sum(axis=0)
+        between = ONE / (taps.weights / np.maximum(around, 1)).sum(axis=0)
         found = np.where(one_surface, np.rint(between), nearest)
         return np.asarray(found.reshape(depth_mm.shape), dtype=np.uint16)
 
