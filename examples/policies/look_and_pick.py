@@ -54,12 +54,12 @@ class LookAndPick:
         """Begin anew."""
         self._does = self._act()
 
-    def infer(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """The next movement."""
+    def infer(self, observation: dict[str, np.ndarray]) -> np.ndarray | dict[str, bool]:
+        """The next movement, or that it is done."""
         self._seen = observation
         return next(self._does)
 
-    def _act(self) -> Iterator[np.ndarray]:
+    def _act(self) -> Iterator[np.ndarray | dict[str, bool]]:
         self._p, self._yaw, self._width = np.array(self._seen["tool"][:3], float), 0.0, OPEN_M
         word = next(word for word in PLACES if f" {word}" in str(self._seen["prompt"]))
         color, top_m, release_m = PLACES[word]
@@ -79,7 +79,7 @@ class LookAndPick:
         yield self._grip(OPEN_M)
         yield self._move([*place, release_m + 0.12], yaw)
         while True:
-            yield self._grip(OPEN_M)
+            yield {"done": True}
 
     def _look(self, color: str, top_m: float, at: np.ndarray) -> Iterator[np.ndarray]:
         """Hold the camera over a place until something of a colour was found there."""

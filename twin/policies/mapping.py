@@ -74,8 +74,13 @@ class PolicyMap(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
 
 
 DEFAULT = PolicyMap()
-END = object()
+END = {"done": True}
 """The answer of a policy that wants nothing more: the rollout ends and is judged."""
+
+
+def is_end(answer: object) -> bool:
+    """Whether an answer says that the policy is done."""
+    return isinstance(answer, Mapping) and answer.get("done") is True
 
 
 def read_mapping(path: Path | None) -> PolicyMap:

@@ -19,7 +19,7 @@ from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan
 from twin.policies.cell import TwinCell
 from twin.policies.errors import PolicyError, RefusedError, StoppedError
-from twin.policies.mapping import END, Interpreter, PolicyMap
+from twin.policies.mapping import Interpreter, PolicyMap, is_end
 from twin.policies.policy import Policy, open_policy, who_acts
 from twin.policies.starts import Start, drawn_starts, open_start
 from twin.policies.views import Pictures, TwinCameras
@@ -207,7 +207,7 @@ def act(
             began = time.monotonic()
             found = policy.infer(speak.observation(pictures, *cell.posture()))
             acted.answer_s += time.monotonic() - began
-            if found is END:
+            if is_end(found):
                 break
             answer = speak.rows(found)
             acted.asked += 1

@@ -43,7 +43,7 @@ from bridge.wire.session import WireSample, WireSession, open_session
 from twin.policies.config import RolloutConfig
 from twin.policies.errors import PolicyError, StoppedError
 from twin.policies.limits import Knot, refuse_target
-from twin.policies.mapping import Interpreter, read_mapping
+from twin.policies.mapping import Interpreter, is_end, read_mapping
 from twin.policies.policy import open_policy, who_acts
 from twin.robot.model import RobotModel, load_robot
 
@@ -88,6 +88,8 @@ class Ended:
     """The limit or the person who stopped it; empty: it goes on, or the cell ended it."""
     problem: str = ""
     """Why the trial says nothing of the policy; empty: it does."""
+    done: bool = False
+    """The policy wants nothing more."""
     asked: int = 0
 
 
@@ -265,7 +267,7 @@ class Trial:
         pool: ThreadPoolExecutor,
     ) -> None:
         rows = rest = np.zeros((0, speak.num_values()))
-        thinking: Future[np.ndarray] | None = None
+        thinking: Future[np.ndarray | None] | None = None
         due_ns, period_s = knots[0][0], 1.0 / speak.mapping.rate_hz
         period_ns = round(period_s * 1e9)
         while self._wait_until(due_ns):
@@ -276,6 +278,9 @@ class Trial:
                 wait((thinking,), timeout=period_s / 2)  # a quick one answers in time
             if thinking is not None and thinking.done():
                 answer, thinking = thinking.result(), None
+                if answer is None:
+                    self._ended.done = True
+                    return
                 self._ended.asked += 1
                 horizon = speak.mapping.horizon or len(answer)
                 rows, rest = answer[:horizon], answer[horizon:]
@@ -291,8 +296,9 @@ class Trial:
             self._send(robot, joints_rad, width_m)
             due_ns = max(due_ns, self._now_ns() - period_ns // 2) + period_ns
 
-    def _asked(self, speak: Interpreter, told: dict[str, Any]) -> np.ndarray:
-        return speak.rows(self._policy.infer(told))
+    def _asked(self, speak: Interpreter, told: dict[str, Any]) -> np.ndarray | None:
+        answer = self._policy.infer(told)
+        return None if is_end(answer) else speak.rows(answer)
 
     def _send(
         self, robot: RobotModel, joints_rad: Float[np.ndarray, " num_joints"], width_m: float

@@ -62,6 +62,8 @@ class Controller:
             return "", f"what answers on {self._key} is no policy's runner ({error!r})"
         if stopped.startswith(("limits", "tracking")):
             return stopped, ""
+        if told.get("done"):
+            return "", ""
         unasked = "" if told["asked"] else "the policy gave no answer in time"
         return told["stopped"], told["problem"] or ("" if told["stopped"] else stopped or unasked)
 

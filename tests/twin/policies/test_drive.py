@@ -21,7 +21,7 @@ from bridge.exchange.lerobot.layout import LeRobotConfig
 from twin.policies.config import RolloutConfig
 from twin.policies.drive import RATE_HZ, SPEED, KeyFile, KeyPage, KeyPolicy
 from twin.policies.errors import PolicyError
-from twin.policies.mapping import END
+from twin.policies.mapping import is_end
 from twin.policies.policy import open_policy
 from twin.policies.runs import roll_out_run
 
@@ -44,7 +44,7 @@ def driven(path: Path, start: str) -> RolloutConfig:
 def rows(path: Path) -> np.ndarray:
     """All that a file of keys asks for."""
     policy, found = open_policy(f"keys:{path}", 1.0), []
-    while (answer := policy.infer(observation())) is not END:
+    while not is_end(answer := policy.infer(observation())):
         found.append(answer[0])
     return np.array(found)
 
@@ -174,7 +174,7 @@ def test_keys_in_chromium_reach_the_arm_and_pictures_come_back(
     def drive() -> None:
         for _ in range(600):
             found = policy.infer(observation())
-            if found is END:
+            if is_end(found):
                 return
             moved.append(found[0])
 

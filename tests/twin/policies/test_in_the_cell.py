@@ -100,6 +100,15 @@ def test_what_a_policy_sends_moves_the_arm_and_says_who_acted(laboratory: Labora
     assert pan.max() == pytest.approx(went.max(), abs=0.06)  # the last one may not be reached
 
 
+def test_a_policy_that_is_done_ends_its_trial_and_is_judged(laboratory: Laboratory) -> None:
+    with laboratory.acting("scripted_policies:nodding_until_it_turned") as runner:
+        _, episode, label, moved = laboratory.trial(max_s=60.0)
+    assert label.startswith("failure: the middle of cube is ")
+    assert runner.ended.done
+    assert moved > 0.1
+    assert np.ptp(streams.joint_track(episode).stamps_ns) < 30e9  # the cell's clock
+
+
 def lasting(data: bytes) -> bytes:
     time.sleep(3.0)
     return data

@@ -55,7 +55,7 @@ def test_it_goes_down_on_the_cube_and_beside_the_other(turn_rad: float) -> None:
     policy, T = LookAndPick(), tool_at(np.array([0.42, 0, 0.42, 0, 0, 1, 0]))
     policy.reset()
     ends = []
-    for _ in range(11):
+    for _ in range(12):
         rows = policy.infer(seen_from(T, squares, "Put it to the left of the blue cube."))
         assert np.abs(np.diff(rows[:, :3], axis=0)).max(initial=0.0) <= 0.1 * 0.22 * 1.05
         T = tool_at(rows[-1])
@@ -72,6 +72,7 @@ def test_it_goes_down_on_the_cube_and_beside_the_other(turn_rad: float) -> None:
     np.testing.assert_allclose(release[:3, 3], [other[0], far_y + 0.04, 0.022], atol=0.003)
     assert abs(release[0, 1]) > 0.999  # fingers open away from the other cube
     assert ends[10][1] == 0.085
+    assert policy.infer(seen_from(T, squares, "")) == {"done": True}
 
 
 def test_a_worse_policy_misses_by_as_much_as_it_says_and_a_hidden_cube_is_told() -> None:
