@@ -209,6 +209,8 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Entry point of the ``robot-gst`` command."""
+    # Matrices here are small: threads that wait for the next one take a core, and bring nothing.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _prepare_streams()
     end_with_starter()
     sys.exit(run(sys.argv[1:]))
