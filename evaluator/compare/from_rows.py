@@ -7,6 +7,7 @@ from bridge.episode.executions import NO_PLAN
 from bridge.task.protocol import VOID_CAUSES, Protocol
 from evaluator.cache import SummaryCache
 from evaluator.compare.agreement import group_agreement, usable_groups
+from evaluator.compare.attribution import attribution_table
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.conclusions import conclusions_table
 from evaluator.compare.gate import agreement
@@ -74,6 +75,7 @@ def compare_rows(
             success_table(groups, word, "Outcomes as the table gives them." if given else ""),
             *notes_table([*notes_of_trials(rows, void_causes), *notes(groups, measurements)]),
             *((confusion_table(rows, word),) if has_twin else ()),
+            *attribution_table(rows),
             *stage_tables,
             *failures_table(rows, word),
             trials_table(rows, word),

@@ -63,10 +63,11 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
     rolled = index.rollout(facts.info) if facts.plan_id in (None, NO_PLAN) else None
     if facts.plan_id is None and rolled is None:
         lacking.append("no execution_started event: no plan was sent")
-    elif facts.plan_id is not None and rolled is None:
+    elif facts.plan_id is not None:
         asked = TRAJECTORIES if facts.plan_id != NO_PLAN else ("executed",)
         sent = {**made_from, "plan_id": facts.plan_id}
         found |= {name: index.replay(**sent, trajectory=name) for name in asked}
+    if facts.plan_id is not None and rolled is None:
         lacking += [replay.reason for replay in found.values() if replay.reason is not None]
         cells_engine = index.answer_of_cells_engine(**sent)
     localised = index.localised(**made_from)
@@ -75,7 +76,7 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
     replays = {name: replay.file for name, replay in found.items() if replay.file is not None}
     row = _row(file, facts, found, localised, replays)
     if rolled is not None:
-        row = _with_rollout(row, rolled)
+        row = _with_rollout(row, rolled, found["executed"])
     if cells_engine is not None:
         row = replace(row, baselines=((CELLS_ENGINE, cells_engine),))
     return Trial(
@@ -88,8 +89,11 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
     )
 
 
-def _with_rollout(row: TrialRow, rolled: DerivedFile) -> TrialRow:
-    """Lay a trial of a policy beside its rollout in the twin, which stands where a plan's would."""
+def _with_rollout(row: TrialRow, rolled: DerivedFile, executed: Replay) -> TrialRow:
+    """Lay a trial of a policy beside its rollout in the twin, which stands where a plan's would.
+
+    Its own motion in the twin is judged as the rollout is, by the task alone.
+    """
     told = rollout_of(rolled)
     success = bool(told["success"])
     return replace(
@@ -97,9 +101,13 @@ def _with_rollout(row: TrialRow, rolled: DerivedFile) -> TrialRow:
         plan_id=ROLLOUT,
         nothing_executed=False,
         sim_planned=success,
+        sim_executed=None if executed.verdict is None else executed.verdict.done,
         planned_replay=rolled.file_name,
         first_failing=None if success else "terminal",
         failing_detail=None if success else str(told.get("detail") or "") or None,
+        failing_cause=None,
+        failing_bodies=(),
+        failing_stage="",
     )
 
 

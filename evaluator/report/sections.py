@@ -83,7 +83,7 @@ agreement | Agreement over groups | agreement.[!sv]* agreement.spearman_rho deci
     does not show that the right decision follows, nor that there is no bias.
 comparisons | Which is better |  | comparisons standing
     Policies, and each without and with replanning, as recorded.
-gate | Trial by trial: twin and outcome | agreement.sim_planned.* agreement.verdict* baseline.* | confusion
+gate | Trial by trial: twin and outcome | agreement.sim_planned.* agreement.verdict* baseline.* | confusion attribution
     What the twin said of each plan against how it ended, and what obeying it costs and avoids.
 raters | Other raters |  | raters
     How far raters of the same trials agree.
@@ -126,6 +126,7 @@ TABLES: dict[str, str] = {
     "trials": "which trial to look at",
     "image_methods": "which reconstruction to use",
     "confusion": "whether the twin's yes may start the robot, and its no may stop it",
+    "attribution": "whether to work on what a policy sees, or on the physics",
     "funnel": "on which stage to work",
     "failures": "which cause to remove first",
     "end_points_*": "whether the engine's friction and timing are right",

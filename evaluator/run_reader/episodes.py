@@ -78,6 +78,8 @@ class VerdictSummary:
     """What touched, came too close or was lost, in the verdict's order."""
     failing_t_ns: int | None = None
     """First instant at which it is false, since the start of the plan."""
+    done: bool | None = None
+    """Whether the task was done in the end, whatever else was wrong."""
 
 
 def summarise_verdict(verdict: Verdict) -> VerdictSummary:
@@ -96,6 +98,7 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
         engine=verdict.engine,
         failing_bodies=() if factor is None else factor.bodies,
         failing_t_ns=None if factor is None else factor.first_t_ns,
+        done=verdict.terminal.value,
     )
 
 

@@ -1,5 +1,6 @@
 """Trials that nobody planned: labels count, and agreement is that of the executed side."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,17 @@ from joint_samples import at_positions
 from bridge.episode import schema
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from evaluator.compare import compare_run
+from evaluator.compare.attribution import (
+    ACTIONS,
+    AGREE,
+    UNKNOWN,
+    WORLD,
+    attributed,
+    attribution_table,
+)
 from evaluator.report.wording import headlines
 
 STEP_NS = 8_000_000
@@ -78,3 +88,40 @@ def test_when_it_was_executed_follows_from_the_joints(maker: Any, field: str) ->
     facts = read_recorded(maker.run, maker.run.episodes_dir / "t1.mcap")
     expected = 10**18 + {"started_ns": 200, "ended_ns": 400}[field] * STEP_NS
     assert abs(getattr(facts, field) - expected) <= 50_000_000
+
+
+def rolled(maker: Any, name: str, success: bool) -> None:
+    """A rollout of a trial's policy from its start."""
+    told = {"policy": "act", "task": "cube_into_box", "start_id": name, "success": success}
+    path = maker.replay(name, plan_id="rollout", trajectory="rollout", tag="r")
+    derived = Episode.open(path).derived
+    assert derived is not None
+    derived = replace(derived, kind="rollout", settings={"rollout": told | {"number": 0}})
+    with EpisodeWriter(path.with_name(f"{name}.rollout.act.mcap")) as writer:
+        writer.describe(EpisodeInfo(id=f"{name}-rollout", kind="trial"), derived=derived)
+    path.unlink()
+
+
+def test_a_rollout_that_ends_otherwise_is_put_down_to_the_world_or_to_what_was_done(
+    maker: Any,
+) -> None:
+    """The trial's motion in the twin decides, by its end alone: these replays touch the box."""
+    cases = {
+        # recorded, rolled out, whether the trial's motion does the task in the twin
+        "t1": ("success", True, True, AGREE),
+        "t2": ("failure", True, True, WORLD),
+        "t3": ("success", False, True, ACTIONS),
+        "t4": ("success", False, None, UNKNOWN),
+    }
+    for name, (result, success, does, _) in cases.items():
+        moved(maker, name, result)
+        rolled(maker, name, success)
+        if does is not None:
+            maker.replay(name, plan_id=NO_PLAN, trajectory="executed", accepted=False)
+    comparison = compare_run(maker.run)
+    assert {row.episode: attributed(row) for row in comparison.rows} == {
+        name: case[-1] for name, case in cases.items()
+    }
+    (table,) = (table for table in comparison.tables if table.id == "attribution")
+    assert table.rows[-1] == ("", "all", 4, 1, 1, 1, 1)
+    assert attribution_table([replace(comparison.rows[0], plan_id="p")]) == ()
