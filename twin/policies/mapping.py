@@ -23,7 +23,9 @@ from twin.robot.inverse import solve_ik
 from twin.robot.model import RobotModel
 
 Kind = Literal["joint_position", "joint_delta", "joint_velocity", "ee_delta", "ee_pose"]
-Value = Literal["joints_rad", "joints_deg", "width_m", "closed", "open", "tool_m", "tool_wxyz"]
+Value = Literal[
+    "joints_rad", "joints_deg", "width_m", "closed", "open", "open_percent", "tool_m", "tool_wxyz"
+]
 JOINTS_OF_POSE = {"ee_delta": 6, "ee_pose": 7}
 
 
@@ -47,9 +49,9 @@ class Actions(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     degrees: bool = False
     scale: float = 1.0
     """Times all but the gripper's number."""
-    gripper: Literal["width_m", "closed", "open", "none"] = "width_m"
+    gripper: Literal["width_m", "closed", "open", "open_percent", "none"] = "width_m"
     """What the last number of a row says: a distance between the pads, or how closed or open the
-    gripper is, 0 to 1."""
+    gripper is, 0 to 1 or to 100."""
     binary_at: float | None = None
     """The gripper opens or closes all the way: above this share it is the one that is named."""
 
@@ -152,9 +154,10 @@ class Interpreter:
             return np.asarray(np.degrees(joints_rad))
         if value == "width_m":
             return np.array([width_m])
-        if value in ("closed", "open"):
+        if value in ("closed", "open", "open_percent"):
             share = width_m / self._max_width_m if self._max_width_m else 0.0
-            return np.array([1.0 - share if value == "closed" else share])
+            shares = {"closed": 1.0 - share, "open": share, "open_percent": 100.0 * share}
+            return np.array([shares[value]])
         q_wxyz, p_m = se3.split(self._robot.T_base_tcp(joints_rad))
         found: Float[np.ndarray, " num_values"] = p_m if value == "tool_m" else q_wxyz
         return found
@@ -219,10 +222,12 @@ class Interpreter:
         actions = self.mapping.actions
         if actions.gripper == "width_m":
             return number
+        if actions.gripper == "open_percent":
+            number /= 100.0
         if actions.binary_at is not None:
             number = float(number > actions.binary_at)
         share = min(max(number, 0.0), 1.0)
-        return self._max_width_m * (share if actions.gripper == "open" else 1.0 - share)
+        return self._max_width_m * (1.0 - share if actions.gripper == "closed" else share)
 
     def _reach(
         self, pose: Float[np.ndarray, " num_values"], last_rad: Float[np.ndarray, " num_joints"]

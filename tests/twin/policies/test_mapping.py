@@ -154,6 +154,24 @@ def test_a_mapping_that_is_none_is_told(tmp_path: Path, text: str, words: str) -
         read_mapping(tmp_path / "none.toml")
 
 
+@pytest.mark.parametrize("name", ["droid_joint_position", "lerobot_so101", "ur_joint_position"])
+def test_with_a_ready_mapping_a_policy_that_answers_what_it_sees_stays(
+    robot: RobotModel, name: str
+) -> None:
+    folder = Path(__file__).parents[3] / "examples" / "policies"
+    speak = Interpreter(read_mapping(folder / f"{name}.toml"), robot, "Put it away.")
+    assert set(speak.cameras()) == {"side", "wrist"}
+    pictures = dict.fromkeys(speak.cameras(), np.zeros((48, 64, 3), dtype=np.uint8))
+    joints_rad, width_m = np.linspace(-1.0, 1.0, 6), robot.record.gripper.max_width_m
+    found = speak.observation(pictures, joints_rad, width_m)
+    assert found[speak.mapping.prompt_key] == "Put it away."
+    seen = np.concatenate([found[key] for key in speak.mapping.state])
+    (row,) = speak.rows({speak.mapping.actions.key: seen})
+    wanted_rad, wanted_m = speak.target(row, np.zeros(6), 0.0)
+    np.testing.assert_allclose(wanted_rad, joints_rad, atol=1e-6)
+    assert wanted_m == pytest.approx(width_m)
+
+
 def test_a_picture_is_fitted_in_black() -> None:
     tall = np.full((64, 32, 3), 200, dtype=np.uint8)
     found = fitted(tall, (64, 64))
