@@ -1,7 +1,6 @@
 """Labels by raters who see neither the twin nor each other, and none of which is ever lost."""
 
 import json
-import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,12 +9,12 @@ from typing import Any
 from urllib.parse import quote
 
 import pytest
+from serving import judged
 from visible import words
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.exchange import reviews
-from dashboards.comparison import judge
 from dashboards.guard import Admission
 from dashboards.label_page import OPERATOR, next_trial, rater_name, trials_to_label
 from dashboards.label_routes import MAX_BODY
@@ -28,11 +27,9 @@ def label(trial: str = "trial_0001", result: str = "success", **more: object) ->
 
 
 @pytest.fixture
-def run(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
+def run(copy: RunFolder) -> RunFolder:
     """Return the synthetic run, for a test that writes labels into it."""
-    copy = tmp_path / "monday"
-    shutil.copytree(shared_run.path, copy)
-    return RunFolder(copy)
+    return copy
 
 
 @pytest.fixture
@@ -94,7 +91,7 @@ def test_nothing_that_anybody_else_said_changes_what_a_rater_sees(
 
 
 def test_each_rater_has_an_order_of_their_own_over_the_same_trials(shared_run: RunFolder) -> None:
-    judgement = judge(shared_run)
+    judgement = judged(shared_run)
     orders = {name: trials_to_label(judgement, name) for name in ("Ann", "Bob", "Cleo", "Di")}
     assert len({tuple(order) for order in orders.values()}) > 1
     assert len({frozenset(order) for order in orders.values()}) == 1

@@ -8,30 +8,21 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from serving import judged
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import decode_color
 from dashboards import clips
-from dashboards.comparison import judge
 from dashboards.moments import moment_of
 
 CARRIED_NS = 2_800_000_000
 """Into the plan: when the twin drops the cube in the synthetic refusals."""
 
 
-@pytest.fixture
-def disagreement(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
-    """Return one trial that succeeded, of which the twin says that it fails."""
-    run = RunFolder.create(tmp_path / "run")
-    synthetic.write_trial(run, synthetic.TRIALS[1])
-    synthetic.write_replay(run, synthetic.TRIALS[1], "planned", False)
-    return run
-
-
 def test_a_picture_shows_the_instant_at_which_the_twin_fails(disagreement: RunFolder) -> None:
-    (row,) = judge(disagreement).rows
+    (row,) = judged(disagreement).rows
     moment = moment_of(disagreement, row)
     assert moment is not None
     assert (moment.t_ns, moment.text) == (CARRIED_NS, "the cube left the gripper during carry")
@@ -51,7 +42,7 @@ def test_the_divergence_that_a_replay_tells_comes_before_its_verdict(
     plan_id = synthetic.make_plan(trial).id
     with EpisodeWriter(path.with_name("other.mcap")) as writer:
         synthetic.write_divergence(writer, plan_id, ("planned", "executed"), 1_500_000_000)
-    (row,) = judge(disagreement).rows
+    (row,) = judged(disagreement).rows
     moment = moment_of(disagreement, replace(row, executed_replay="other.mcap"))
     assert moment is not None
     assert (moment.t_s, moment.text) == (1.5, "cube lies 69 mm apart")
@@ -60,7 +51,7 @@ def test_the_divergence_that_a_replay_tells_comes_before_its_verdict(
 def test_a_picture_is_drawn_once_and_again_when_the_recording_changes(
     disagreement: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (row,) = judge(disagreement).rows
+    (row,) = judged(disagreement).rows
     first = clips.picture(disagreement, row)
     folder = disagreement.results_dir / clips.PICTURES
     (kept,) = folder.iterdir()

@@ -7,12 +7,12 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from serving import judged
 from visible import words
 
 from bridge.episode.run_folder import RunFolder
 from dashboards import overview_page
 from dashboards.app import create_app
-from dashboards.comparison import judge
 from dashboards.errors import NotHereError
 from dashboards.guard import COOKIE, Admission
 from dashboards.library import Library, derived_path, episode_path
@@ -58,7 +58,7 @@ def test_the_first_page_begins_with_the_answer_and_the_worst(
     assert "First divergence : the cube left the gripper during carry" in seen
     (picture,) = re.findall(r'src="(/failures/picture/[^"]*)"', page)
     assert picture == "/failures/picture/trial_0002"
-    found = build_twin(run, judge(run)).views[0]  # the worst first
+    found = build_twin(run, judged(run)).views[0]  # the worst first
     assert f"PSNR {found.psnr_db:.2f} dB · SSIM {found.ssim:.3f}" in seen
     for side in ("recorded", "rendered"):
         address = f"/twin/{found.file}/{side}/{found.camera}?stamp={found.stamp_ns}"
@@ -75,7 +75,7 @@ def test_a_cause_has_few_words_and_a_trial_without_a_camera_no_picture(
     synthetic.write_replay(run, synthetic.TRIALS[1], "planned", False)
     long = Moment(plan_id="p", t_ns=0, text="a " * 21)
     monkeypatch.setattr(overview_page, "moment_of", lambda *_: long)
-    worst = overview_page.worst_disagreement(run, judge(run))
+    worst = overview_page.worst_disagreement(run, judged(run))
     assert worst is not None
     assert worst.cause == "a " * 20 + "…"
     browser = synthetic.browser_of(run)
@@ -172,14 +172,13 @@ def test_a_frame_is_the_recorded_bytes_nearest_to_the_time(
     ],
 )
 def test_a_missing_part_names_the_next_command(
-    synthetic: ModuleType, shared_run: RunFolder, tmp_path: Path, part: str, command: str
+    synthetic: ModuleType, copy: RunFolder, part: str, command: str
 ) -> None:
-    run = RunFolder(shutil.copytree(shared_run.path, tmp_path / "run"))
     for folder in ("results", "derived", "episodes"):
-        shutil.rmtree(run.path / folder)
+        shutil.rmtree(copy.path / folder)
         if folder == part:
             break
-    answer = synthetic.browser_of(run).get("/")
+    answer = synthetic.browser_of(copy).get("/")
     assert answer.status_code == 200
     assert command in words(answer.text)
 

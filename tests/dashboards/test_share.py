@@ -20,6 +20,7 @@ from dashboards import share_file
 from dashboards.config import ShareConfig
 from dashboards.share_file import LEVELS, MB, build_share, share
 from evaluator.report.page import name_shared
+from evaluator.report.review import refresh
 
 
 @pytest.fixture
@@ -123,6 +124,7 @@ def test_hostile_names_stay_text(synthetic: ModuleType, tmp_path: Path) -> None:
                 result="failure", stages=({"id": HOSTILE, "result": "failure"},)
             ),
         )
+    refresh(run)
     made = build_share(run, ShareConfig(trials=("x",)))
     assert "<script" not in made.text
     assert "No clip: no camera images in x.mcap" in made.text
