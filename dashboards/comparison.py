@@ -33,7 +33,9 @@ IMPORTED = "imported"
 RENDERS = "image."
 """Begins the ids of numbers about folders of renders."""
 LISTS = ("exclusions", "missing", "answers", "notes", "tasks", "tables", "views")
-NOTHING: dict[str, Any] = {**dict.fromkeys(LISTS, ()), "num_exclusions": 0, "close_pp": 0.0}
+REASONS = ("comparison_reason", "results_reason", "outdated", "stand_in")
+NOTHING: dict[str, Any] = {**dict.fromkeys(LISTS, ()), **dict.fromkeys(REASONS)}
+NOTHING |= {"num_exclusions": 0, "close_pp": 0.0}
 """What an index says at least."""
 LOOKED_AT_S = 5.0
 """A larger run's files are looked at again after this; its folders at each page."""
@@ -88,23 +90,6 @@ class Judgement:
     def measurements(self) -> tuple[Measurement, ...]:
         """The numbers of ``results.json``, or newer ones where the run changed since."""
         return () if self.index is None else self.index.measurements
-
-    @property
-    def comparison_reason(self) -> str | None:
-        """Why the trials cannot be compared."""
-        found = self.about.get("comparison_reason")
-        return found if isinstance(found, str) else None
-
-    @property
-    def stand_in(self) -> bool | None:
-        """Whether the recorded side is a simulated laboratory; None when nothing says so."""
-        found = self.about.get("stand_in")
-        return found if isinstance(found, bool) else None
-
-    def outdated(self) -> str | None:
-        """Say what is not as it was when the stored results were computed."""
-        found = self.about.get("outdated")
-        return found if isinstance(found, str) else None
 
     def row(self, episode_id: str) -> TrialRow | None:
         """Return the trial of one episode."""

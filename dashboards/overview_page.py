@@ -13,7 +13,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards.comparison import Judgement
-from dashboards.moments import moment_of
+from dashboards.moments import Cause, cause_of
 from evaluator.report.wording import SIM_SIDE, agreeing_side
 from evaluator.result import Measurement
 from evaluator.review_index import (
@@ -43,8 +43,6 @@ COLUMNS = (
     ("distance", "Tool path, lag"),
     ("cause", "Cause in the twin"),
 )
-MOST_WORDS = 20
-"""Of the cause of the worst disagreement."""
 NUMBERS = {
     f"agreement.{SIM_SIDE}.rate": "Twin predicts the outcome",
     "agreement.bias_pp": "Success rates, twin minus recorded",
@@ -61,16 +59,14 @@ class Disagreement:
     """The worst trial in which twin and recorded outcome differ."""
 
     row: TrialRow
-    cause: str
-    """What differs first, in few words."""
+    cause: Cause | None
     has_picture: bool
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialList:
-    """One screen of the trials of a selection."""
+class Screen:
+    """One screen of a selection of trials."""
 
-    trials: tuple[TrialRow, ...] = ()
     selected: int = 0
     """How many the selection holds."""
     of: int = 0
@@ -78,6 +74,13 @@ class TrialList:
     page: int = 1
     pages: int = 1
     facets: Facets = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialList(Screen):
+    """The trials themselves."""
+
+    trials: tuple[TrialRow, ...] = ()
 
     @property
     def columns(self) -> tuple[tuple[str, str], ...]:
@@ -129,7 +132,7 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
     others, num_others = index.files(broken=False, limit=MOST_FILES) if index else nothing
     broken, num_broken = index.files(broken=True, limit=MOST_FILES) if index else nothing
     tasks = judgement.about["tasks"]
-    older, views = judgement.outdated(), judgement.about["views"]
+    older, views = judgement.about["outdated"], judgement.about["views"]
     return Overview(
         selection=selection,
         tasks=tuple(tasks[:MOST_TASKS]),
@@ -166,11 +169,7 @@ def worst_disagreement(run: RunFolder, judgement: Judgement) -> Disagreement | N
     row = next((trial for trial in trials if trial.file), None)
     if row is None:
         return None
-    moment = moment_of(run, row)
-    text = row.failing_detail or "no replay tells what differs first"
-    words = (moment.text if moment else text).split()
-    cause = " ".join(words[:MOST_WORDS]) + (" …" if len(words) > MOST_WORDS else "")
-    return Disagreement(row=row, cause=cause, has_picture=has_picture(run, row))
+    return Disagreement(row=row, cause=cause_of(run, row), has_picture=has_picture(run, row))
 
 
 def has_picture(run: RunFolder, row: TrialRow) -> bool:
@@ -220,11 +219,11 @@ def group_facets(index: ReviewIndex) -> Facets:
 
 
 def _notices(run: RunFolder, judgement: Judgement) -> Iterator[str]:
-    reason = judgement.about.get("results_reason")
+    reason = judgement.about["results_reason"]
     if reason is not None and stamp_of(run.path / RESULTS):
         yield f"The results cannot be shown: {reason}"
-    if judgement.comparison_reason is not None:
-        yield f"The trials cannot be compared: {judgement.comparison_reason}"
+    if reason := judgement.about["comparison_reason"]:
+        yield f"The trials cannot be compared: {reason}"
 
 
 def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
@@ -237,5 +236,5 @@ def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
     if recorded and not replayed:
         has_scene = (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap"))
         return f"robot-gst {'replay' if has_scene else 'rebuild'} {path}"
-    is_due = judgement.about.get("results_reason") or judgement.outdated()
+    is_due = judgement.about["results_reason"] or judgement.about["outdated"]
     return f"robot-gst evaluate {path}" if is_due else None

@@ -27,6 +27,8 @@ class HeldOutView:
     file: str
     camera: str
     stamp_ns: int
+    after_s: float
+    """Since the first of its file."""
     psnr_db: float | None
     ssim: float | None
 
@@ -76,9 +78,9 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
 def _views(path: Path, rated: Mapping[tuple[Any, ...], Mapping[str, Any]]) -> list[HeldOutView]:
     tracks = camera_tracks(path)
     views = []
-    for name, track in tracks.items():
-        if not name.startswith(RENDERED):
-            continue
+    drawn = {name: track for name, track in tracks.items() if name.startswith(RENDERED)}
+    first_ns = min((track.stamps_ns[0] for track in drawn.values()), default=0)
+    for name, track in drawn.items():
         camera_id = name.removeprefix(RENDERED)
         for stamp_ns in track.stamps_ns:
             rating = rated.get((path.name, camera_id, stamp_ns), {})
@@ -87,6 +89,7 @@ def _views(path: Path, rated: Mapping[tuple[Any, ...], Mapping[str, Any]]) -> li
                     file=path.name,
                     camera=camera_id,
                     stamp_ns=stamp_ns,
+                    after_s=1e-9 * (stamp_ns - first_ns),
                     psnr_db=rating.get("psnr_db"),
                     ssim=rating.get("ssim"),
                 )
