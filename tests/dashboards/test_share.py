@@ -3,7 +3,6 @@
 import base64
 import io
 import re
-import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from types import ModuleType
@@ -24,12 +23,10 @@ from evaluator.report.review import refresh
 
 
 @pytest.fixture
-def run(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
+def run(copy: RunFolder) -> RunFolder:
     """Return a copy of the run, with a report whose place for shared files is empty."""
-    shutil.copytree(shared_run.path, tmp_path / "monday")
-    found = RunFolder.open(tmp_path / "monday")
-    (found.results_dir / "report.html").write_text("<p>x</p><!--shared--><!--/shared--><p>y</p>")
-    return found
+    (copy.results_dir / "report.html").write_text("<p>x</p><!--shared--><!--/shared--><p>y</p>")
+    return copy
 
 
 class _Addresses(HTMLParser):
