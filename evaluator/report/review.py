@@ -166,8 +166,9 @@ def _views(results: Results) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     for table in (each for each in results.tables if each.title.startswith(VIEWS_TITLE)):
         file = f"{table.title.removeprefix(VIEWS_TITLE)}.mcap"
-        first_ns = min((row[1] for row in table.rows), default=0)
-        for camera, stamp_ns, psnr_db, ssim, *_ in table.rows:
+        rows: tuple[Any, ...] = table.rows
+        first_ns = min((row[1] for row in rows), default=0)
+        for camera, stamp_ns, psnr_db, ssim, *_ in rows:
             rated = {"camera": camera, "stamp_ns": stamp_ns, "psnr_db": psnr_db, "ssim": ssim}
             rated |= {"file": file, "after_s": 1e-9 * (stamp_ns - first_ns)}
             found += [rated] if psnr_db is not None else []
