@@ -210,26 +210,27 @@ class Pages:
 
     def numbers(self, request: Request) -> Response:
         """``/numbers``: every measurement of the evaluation, by what it is about."""
-        run = self._run(request)
+        known = judge(self._run(request))
         parts: dict[str, list[Measurement]] = {}
-        for each in judge(run).measurements:
+        for each in known.measurements:
             parts.setdefault(each.id.partition(".")[0], []).append(each)
-        return self._page("numbers.html", request, parts=parts, run=run)
+        return self._page("numbers.html", request, parts=parts, known=known)
 
     def episode(self, request: Request) -> Response:
         """``/episode/<id>``: one trial and its replays."""
         run = self._run(request)
         episode_id = request.path_params["id"]
-        judgement = judge(run)
-        page = build_page(run, episode_id, judgement.row(episode_id), _seconds(request))
+        known = judge(run)
+        page = build_page(run, episode_id, known.row(episode_id), _seconds(request))
         selection = Selection.of(request.query_params)
-        index = judgement.index
+        index = known.index
         around = None if index is None else index.neighbours(selection, episode_id)
         before, after = around or (None, None)
         return self._page(
             "episode.html",
             request,
             page=page,
+            known=known,
             selection=selection,
             before=before,
             after=after,

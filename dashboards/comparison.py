@@ -1,17 +1,17 @@
-"""What the evaluator measured in a run, from its index; the index is made anew where it is old."""
+"""What the evaluator measured in a run, from its index; no page waits for what is not there yet."""
 
+import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
+from tempfile import TemporaryFile
 from threading import Lock
-from typing import Any
+from typing import IO, Any
 
 from bridge.episode.run_folder import RunFolder
-from evaluator.report.review import refresh
-from evaluator.result import Measurement, Results, load_results
+from evaluator.result import Measurement
 from evaluator.review_index import (
     RESULTS,
     ReviewIndex,
@@ -24,19 +24,18 @@ from evaluator.review_index import (
 )
 from evaluator.trial_row import TrialRow
 
-WAITED_FOR = 3_000
-"""Files of a run that a page waits for; a larger run is brought up to date behind the page."""
+LARGE = 3_000
+"""Files of a run that are not looked at for every page."""
+NICENESS = 15
+"""Of the process that reads a run: whoever records or replays meanwhile comes first."""
 IMPORTED = "imported"
 """Kind of an episode that is a motion from elsewhere."""
 RENDERS = "image."
 """Begins the ids of numbers about folders of renders."""
-LISTS = ("exclusions", "missing", "answers", "notes", "tasks", "tables")
-NOTHING: dict[str, Any] = {
-    **dict.fromkeys(LISTS, ()),
-    "num_exclusions": 0,
-    "close_pp": 0.0,
-    "worst_view": None,
-}
+LISTS = ("exclusions", "missing", "answers", "notes", "tasks", "tables", "views")
+REASONS = ("comparison_reason", "results_reason", "outdated", "stand_in")
+NOTHING: dict[str, Any] = {**dict.fromkeys(LISTS, ()), **dict.fromkeys(REASONS)}
+NOTHING |= {"num_exclusions": 0, "close_pp": 0.0}
 """What an index says at least."""
 LOOKED_AT_S = 5.0
 """A larger run's files are looked at again after this; its folders at each page."""
@@ -48,11 +47,11 @@ class Judgement:
 
     run: RunFolder
     index: ReviewIndex | None
-    """None while a large run that nobody evaluated is read for the first time."""
+    """None while a run that nobody evaluated is read for the first time."""
     is_old: bool = False
-    """Whether files of a large run changed since."""
+    """Whether files of the run changed since."""
     is_being_updated: bool = False
-    """Whether another process reads them now."""
+    """Whether another process reads them now, or will next."""
 
     @property
     def about(self) -> dict[str, Any]:
@@ -61,8 +60,8 @@ class Judgement:
 
     @property
     def has_results(self) -> bool:
-        """Whether the run was evaluated and its results can be read."""
-        return self.index is not None and self.about["results_reason"] is None
+        """Whether there are numbers."""
+        return bool(self.measurements)
 
     @property
     def has_methods(self) -> bool:
@@ -89,39 +88,12 @@ class Judgement:
 
     @property
     def measurements(self) -> tuple[Measurement, ...]:
-        """The numbers of ``results.json``; none before ``robot-gst evaluate``."""
+        """The numbers of ``results.json``, or newer ones where the run changed since."""
         return () if self.index is None else self.index.measurements
-
-    @property
-    def results(self) -> Results | None:
-        """The whole of ``results.json``, with every table."""
-        return _results(self.run, stamp_of(self.run.path / RESULTS)) if self.has_results else None
-
-    @property
-    def comparison_reason(self) -> str | None:
-        """Why the trials cannot be compared."""
-        found = self.about.get("comparison_reason")
-        return found if isinstance(found, str) else None
-
-    @property
-    def stand_in(self) -> bool | None:
-        """Whether the recorded side is a simulated laboratory; None when nothing says so."""
-        found = self.about.get("stand_in")
-        return found if isinstance(found, bool) else None
-
-    def outdated(self) -> str | None:
-        """Say what of a trial is not as it was when the stored numbers were computed."""
-        found = self.about.get("outdated")
-        return found if isinstance(found, str) else None
 
     def row(self, episode_id: str) -> TrialRow | None:
         """Return the trial of one episode."""
         return None if self.index is None else self.index.trial(episode_id)
-
-
-@lru_cache(maxsize=2)
-def _results(run: RunFolder, _stamp: str) -> Results:
-    return load_results(run.path)
 
 
 @dataclass
@@ -131,49 +103,57 @@ class _Known:
     state: RunState | None = None
     folders: tuple[str, ...] = ()
     looked_s: float = 0.0
-    unwritten: bytes | None = None
-    """The index of a run that cannot be written."""
-    tried: str = ""
+    told: bytes | None = None
+    """The index that the last reader told: it may lie nowhere, if the run cannot be written."""
+    tried: RunState | None = None
     """The state that was last brought up to date."""
     update: "subprocess.Popen[bytes] | None" = None
-    asking: Lock = field(default_factory=Lock)
+    output: IO[bytes] | None = None
+    """What the reader tells."""
+
+    @property
+    def is_read(self) -> bool:
+        """Whether another process reads the run now; what one told that has ended is kept."""
+        if self.update is None or self.update.poll() is None:
+            return self.update is not None
+        if self.output is not None:
+            with self.output as output:
+                output.seek(0)
+                self.told = output.read() or self.told
+            self.output = None
+        return False
 
 
 _KNOWN: dict[RunFolder, _Known] = {}
-_ADDING = Lock()
+_ASKING = Lock()
+"""Two pages opened at once do not start two readers."""
 
 
-def judge(run: RunFolder) -> Judgement:
-    """Return what is known of a run; a small one that changed is read again first."""
-    with _ADDING:
+def judge(run: RunFolder, *, reads: bool = True) -> Judgement:
+    """Return what is known of a run; what changed since is read behind the page, if asked for."""
+    with _ASKING:
         known = _KNOWN.setdefault(run, _Known())
-    with known.asking:  # two pages opened at once wait for one answer instead of asking twice
-        state = _state(run, known)
+        is_read, state = known.is_read, _state(run, known)
         index = _open(run, known)
-        if index is not None and _holds(index, state, known):
+        if index is not None and index.is_of(state):
             return Judgement(run=run, index=index)
-        if state.num_files > WAITED_FOR:
-            is_read = _update_behind(run, known, state)
-            return Judgement(run=run, index=index, is_old=True, is_being_updated=is_read)
-        known.unwritten, known.tried = refresh(run), state.digest
-        return Judgement(run=run, index=_open(run, known))
-
-
-def _holds(index: ReviewIndex, state: RunState, known: _Known) -> bool:
-    if index.about["state"] != state.digest:
-        return False
-    return known.tried == state.digest or not index.about["changed_meanwhile"]
+        if reads and not is_read and known.tried != state:
+            is_read = any(other.is_read for other in _KNOWN.values()) or _read(run, known, state)
+        return Judgement(run=run, index=index, is_old=True, is_being_updated=is_read)
 
 
 def _open(run: RunFolder, known: _Known) -> ReviewIndex | None:
-    path = index_path(run)
-    sources: Sequence[Any] = (path, known.unwritten) if path.is_file() else (known.unwritten,)
-    for source in sources:
+    """Return the index of the present state, else one from before."""
+    last = None
+    for source in (index_path(run), known.told):
         try:
-            return None if source is None else _opened(source, stamp_of(path))
+            index = None if source is None else _opened(source, stamp_of(index_path(run)))
         except UnusableIndexError:
             continue
-    return None
+        if index is not None and known.state is not None and index.is_of(known.state):
+            return index
+        last = index or last
+    return last
 
 
 @lru_cache(maxsize=8)
@@ -189,7 +169,7 @@ def _state(run: RunFolder, known: _Known) -> RunState:
     places = (run.episodes_dir, run.derived_dir, run.notes_dir)
     folders = tuple(stamp_of(path) for path in (*places, run.path / RESULTS))
     is_recent = time.monotonic() - known.looked_s < LOOKED_AT_S
-    is_large = known.state is not None and known.state.num_files > WAITED_FOR
+    is_large = known.state is not None and known.state.num_files > LARGE
     if known.state is not None and is_large and is_recent and folders == known.folders:
         return known.state
     known.state, known.folders = state_of(run), folders
@@ -197,28 +177,23 @@ def _state(run: RunFolder, known: _Known) -> RunState:
     return known.state
 
 
-def _update_behind(run: RunFolder, known: _Known, state: RunState) -> bool:
-    """Let another process read a large run, once for each state: it takes minutes and memory.
-
-    Returns:
-        Whether one reads it now.
-    """
-    is_reading = known.update is not None and known.update.poll() is None
-    if is_reading or known.tried == state.digest:
-        return is_reading
-    known.tried = state.digest
+def _read(run: RunFolder, known: _Known, state: RunState) -> bool:
+    """Let another process read a run, once for each state: it takes seconds to minutes."""
+    known.tried = state
+    known.output = TemporaryFile()  # noqa: SIM115  # read once the process has ended
     known.update = subprocess.Popen(
         [sys.executable, "-m", "evaluator.report.review", str(run.path)],
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
+        stdout=known.output,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
+    os.setpriority(os.PRIO_PROCESS, known.update.pid, NICENESS)
     return True
 
 
 def stop_updates() -> None:
-    """End what still reads large runs; what was read so far is kept for the next time."""
+    """End what still reads a run; what was read so far is kept for the next time."""
     for known in _KNOWN.values():
         if known.update is not None and known.update.poll() is None:
             known.update.terminate()

@@ -13,7 +13,7 @@ from bridge.task.verdict import Factor, Verdict
 from dashboards.figures import StageChart, TimePlot
 from dashboards.frames import RENDERED, CameraTrack
 from dashboards.library import derived_paths, episode_path
-from dashboards.moments import Moment, moment_of
+from dashboards.moments import Cause, Moment, cause_of, moment_of
 from dashboards.recording import PageClock, Problems, Recording, read_recording
 from dashboards.trial_plots import (
     PLANNED,
@@ -96,6 +96,8 @@ class EpisodePage:
     divergence: Moment | None
     """The first divergence of recording and twin, where the replays tell one."""
     divergence_t_s: float | None
+    cause: Cause | None
+    """Why recorded and twin disagree."""
     sent_plan: Plan | None
     not_scanned: tuple[str, ...]
     """Objects that the twin draws from the task's shape, because no scan saw them."""
@@ -162,6 +164,7 @@ def build_page(
         failure_t_s=failure_t_s,
         divergence=moment,
         divergence_t_s=divergence_t_s,
+        cause=None if row is None else cause_of(run, row),
         sent_plan=sent_plan,
         not_scanned=tuple(not_scanned),
         problems=tuple(problems.texts),

@@ -6,7 +6,7 @@ from bridge.episode.run_folder import RunFolder
 from dashboards.clips import can_film
 from dashboards.comparison import Judgement
 from dashboards.moments import Moment, moment_of
-from dashboards.overview_page import Facets, group_facets, has_picture
+from dashboards.overview_page import Screen, group_facets, has_picture
 from evaluator.review_index import (
     FAILED,
     NOT_KNOWN,
@@ -49,23 +49,16 @@ class Kind:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FailuresPage:
+class FailuresPage(Screen):
     """Everything the template needs."""
 
     selection: FailureSelection
     can_film: bool
     kinds: tuple[Kind, ...] = ()
     num_kinds: int = 0
-    count: int = 0
-    """Failures selected."""
-    of: int = 0
-    """Failures in the run."""
     num_trials: int = 0
-    facets: Facets = ()
     failed: tuple[tuple[str, str, int], ...] = ()
     """Value, words and number of each choice of who failed."""
-    page: int = 1
-    pages: int = 1
 
 
 def build_failures(
@@ -86,7 +79,7 @@ def build_failures(
         selection=selection,
         kinds=tuple(_kind(run, index, selection, group, limit, offset) for group in shown),
         num_kinds=len(groups),
-        count=count,
+        selected=count,
         of=_count(index, FailureSelection()),
         num_trials=index.count(Selection()),
         facets=group_facets(index),

@@ -1,5 +1,6 @@
-"""The moment at which recording and twin of a trial first differ."""
+"""The moment at which recording and twin of a trial first differ, and why."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,7 +12,11 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.task.record import parse_record
+from bridge.task.verdict import Verdict
 from evaluator.trial_row import TrialRow
+
+MOST_WORDS = 20
+"""Of a cause."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +68,42 @@ def _moment(path: Path, _mtime_ns: int, _size: int) -> Moment | None:
     except GstError:
         return None  # the trial's own page says what is wrong with the file
     return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cause:
+    """Why recorded and twin disagree, as the replay that is compared tells it."""
+
+    text: str
+    """What differs first, in few words."""
+    margin: str
+    """How far what decides is from the other answer; empty where the verdict does not say."""
+    varied: Mapping[str, float] | None
+    """How many varied replays succeed; None where nothing was varied."""
+
+
+def cause_of(run: RunFolder, row: TrialRow) -> Cause | None:
+    """Put together what the replays tell of a disagreement; None where the two sides agree."""
+    if row.agrees is not False:
+        return None
+    moment, verdict = moment_of(run, row), _verdict_of(run, row)
+    text = moment.text if moment else row.failing_detail or "no replay tells what differs first"
+    words, decides = text.split(), None
+    if verdict is not None:  # what fails decides, else the goal
+        decides = verdict.factors().get(verdict.first_failing or "", verdict.terminal)
+    return Cause(
+        text=" ".join(words[:MOST_WORDS]) + (" …" if len(words) > MOST_WORDS else ""),
+        margin=(decides.detail or "").partition(";")[0] if decides else "",
+        varied=None if verdict is None else verdict.p_success,
+    )
+
+
+def _verdict_of(run: RunFolder, row: TrialRow) -> Verdict | None:
+    try:
+        path = run.derived_dir / (row.twin_replay or "")
+        return streams.verdicts(Episode.open(path))[-1][1] if path.is_file() else None
+    except (GstError, IndexError):  # the trial's own page says what is wrong with the file
+        return None
 
 
 def recorded_ns(path: Path, moment: Moment) -> int | None:

@@ -13,12 +13,12 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards.comparison import Judgement
-from dashboards.moments import moment_of
+from dashboards.moments import Cause, cause_of
 from evaluator.report.wording import SIM_SIDE, agreeing_side
 from evaluator.result import Measurement
 from evaluator.review_index import (
     FACETS,
-    NO_RESULTS,
+    RESULTS,
     IndexedFile,
     ReviewIndex,
     Selection,
@@ -43,8 +43,6 @@ COLUMNS = (
     ("distance", "Tool path, lag"),
     ("cause", "Cause in the twin"),
 )
-MOST_WORDS = 20
-"""Of the cause of the worst disagreement."""
 NUMBERS = {
     f"agreement.{SIM_SIDE}.rate": "Twin predicts the outcome",
     "agreement.bias_pp": "Success rates, twin minus recorded",
@@ -61,16 +59,14 @@ class Disagreement:
     """The worst trial in which twin and recorded outcome differ."""
 
     row: TrialRow
-    cause: str
-    """What differs first, in few words."""
+    cause: Cause | None
     has_picture: bool
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialList:
-    """One screen of the trials of a selection."""
+class Screen:
+    """One screen of a selection of trials."""
 
-    trials: tuple[TrialRow, ...] = ()
     selected: int = 0
     """How many the selection holds."""
     of: int = 0
@@ -78,6 +74,13 @@ class TrialList:
     page: int = 1
     pages: int = 1
     facets: Facets = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialList(Screen):
+    """The trials themselves."""
+
+    trials: tuple[TrialRow, ...] = ()
 
     @property
     def columns(self) -> tuple[tuple[str, str], ...]:
@@ -114,7 +117,7 @@ class Overview:
     num_broken: int
     notices: tuple[str, ...]
     outdated: str | None
-    """A message that the numbers are older than the run, naming the first that differs."""
+    """A message that the stored results are older than the run, naming the first that differs."""
     next_command: str | None
 
 
@@ -129,22 +132,22 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
     others, num_others = index.files(broken=False, limit=MOST_FILES) if index else nothing
     broken, num_broken = index.files(broken=True, limit=MOST_FILES) if index else nothing
     tasks = judgement.about["tasks"]
-    older, view = judgement.outdated(), judgement.about["worst_view"]
+    older, views = judgement.about["outdated"], judgement.about["views"]
     return Overview(
         selection=selection,
         tasks=tuple(tasks[:MOST_TASKS]),
         more_tasks=max(0, len(tasks) - MOST_TASKS),
         numbers=tuple(first_numbers(judgement)),
         disagreement=worst_disagreement(run, judgement),
-        worst_view=view if view and stamp_of(run.derived_dir / view["file"]) else None,
+        worst_view=next((v for v in views if stamp_of(run.derived_dir / v["file"])), None),
         not_scanned=tuple(not_scanned(run, judgement)),
         list=trial_list(judgement, selection),
         others=others,
         num_others=num_others,
         broken=broken,
         num_broken=num_broken,
-        notices=tuple(_notices(judgement)),
-        outdated=older and f"The numbers on this page are older than the run: {older}.",
+        notices=tuple(_notices(run, judgement)),
+        outdated=older and f"The stored results and the report are older than the run: {older}.",
         next_command=_next_command(run, judgement),
     )
 
@@ -166,11 +169,7 @@ def worst_disagreement(run: RunFolder, judgement: Judgement) -> Disagreement | N
     row = next((trial for trial in trials if trial.file), None)
     if row is None:
         return None
-    moment = moment_of(run, row)
-    text = row.failing_detail or "no replay tells what differs first"
-    words = (moment.text if moment else text).split()
-    cause = " ".join(words[:MOST_WORDS]) + (" …" if len(words) > MOST_WORDS else "")
-    return Disagreement(row=row, cause=cause, has_picture=has_picture(run, row))
+    return Disagreement(row=row, cause=cause_of(run, row), has_picture=has_picture(run, row))
 
 
 def has_picture(run: RunFolder, row: TrialRow) -> bool:
@@ -219,23 +218,23 @@ def group_facets(index: ReviewIndex) -> Facets:
     return tuple((name, found[:MOST_VALUES]) for name, found in values if len(found) > 1)
 
 
-def _notices(judgement: Judgement) -> Iterator[str]:
-    reason = judgement.about.get("results_reason")
-    if reason not in (None, NO_RESULTS):
+def _notices(run: RunFolder, judgement: Judgement) -> Iterator[str]:
+    reason = judgement.about["results_reason"]
+    if reason is not None and stamp_of(run.path / RESULTS):
         yield f"The results cannot be shown: {reason}"
-    if judgement.comparison_reason is not None:
-        yield f"The trials cannot be compared: {judgement.comparison_reason}"
+    if reason := judgement.about["comparison_reason"]:
+        yield f"The trials cannot be compared: {reason}"
 
 
 def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
     path = shlex.quote(str(run.path))
     if judgement.index is None:
-        return f"robot-gst evaluate {path}"
+        return None if judgement.is_being_updated else f"robot-gst evaluate {path}"
     trials, recorded, replayed = judgement.index.totals()
     if not trials and next(run.episodes_dir.glob("*.mcap"), None) is None:
         return None if judgement.has_results else f"robot-gst record {path}"
     if recorded and not replayed:
         has_scene = (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap"))
         return f"robot-gst {'replay' if has_scene else 'rebuild'} {path}"
-    is_due = not judgement.has_results or judgement.outdated() is not None
+    is_due = judgement.about["results_reason"] or judgement.about["outdated"]
     return f"robot-gst evaluate {path}" if is_due else None

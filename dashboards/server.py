@@ -100,8 +100,7 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
     text = f"Dashboard: {address.url}\nFrom another computer: {address.ssh_line}\nStop with Ctrl-C."
     record = {"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}
     others = set(threading.enumerate())
-    # The evaluator reads the first run while the reader is still opening the page.
-    threading.Thread(target=judge, args=(library.pick(None),), daemon=True).start()
+    judge(library.pick(None))  # what changed is read while the reader is still opening the page
     app.state.pages.is_ending = lambda: server.should_exit
     with listener, _ending_on_signals(server):
         output.result(record, text)

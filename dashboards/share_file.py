@@ -20,7 +20,7 @@ from dashboards.config import SHARE_LIMITS, ShareConfig
 from dashboards.episode_page import EpisodePage, build_page
 from evaluator.report.figures import DARK, LIGHT
 from evaluator.report.page import SHARED, environment, name_shared
-from evaluator.report.wording import stand_in_sentence
+from evaluator.report.wording import STAND_IN
 from evaluator.review_index import Selection
 from evaluator.trial_row import TrialRow
 
@@ -114,10 +114,10 @@ def build_share(run: RunFolder, config: ShareConfig, *, report: str = "") -> Sha
     Raises:
         UsageError: When a trial is not there, none can be chosen, or they do not fit.
     """
-    judgement = judge(run)
+    judgement = judge(run, reads=False)
     trials = [_trial(run, row) for row in chosen_trials(judgement, config.trials)]
     template = _environment().get_template("pages/share.html")
-    results, size = judgement.results, 0
+    size = 0
     for level in LEVELS if can_film() else (PICTURES,):
         shown = [_with_clip(run, trial, level) for trial in trials]
         text = template.render(
@@ -125,7 +125,7 @@ def build_share(run: RunFolder, config: ShareConfig, *, report: str = "") -> Sha
             policy=POLICY,
             light=LIGHT,
             dark=DARK,
-            banner=None if results is None else stand_in_sentence(results),
+            banner=STAND_IN if judgement.about["stand_in"] else None,
             report=report,
             trials=shown,
             plots=PLOTS,
@@ -153,8 +153,8 @@ def chosen_trials(judgement: Judgement, names: Sequence[str]) -> list[TrialRow]:
         UsageError: For one that is not there, with the nearest name, or where none can be chosen.
     """
     index = judgement.index
-    if index is None:
-        raise UsageError("this run was not evaluated yet: run robot-gst evaluate first.")
+    if index is None or judgement.is_old:
+        raise UsageError("this run is not evaluated as it is now: run robot-gst evaluate first.")
     if len(names) > MOST_TRIALS:
         message = f"{len(names)} trials are too many for one file; name at most {MOST_TRIALS}."
         raise UsageError(message)

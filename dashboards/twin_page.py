@@ -1,8 +1,10 @@
 """What the twin page shows: held-out views, recorded beside rendered."""
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -11,8 +13,7 @@ from dashboards.comparison import Judgement
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, camera_tracks, read_frame
 from dashboards.library import episode_path
-from evaluator.compare.images.views import VIEWS_TITLE
-from evaluator.result import Cell, Measurement, Table
+from evaluator.result import Measurement
 
 FIRST = tuple(
     f"views.all.{name}" for name in ("psnr_db", "psnr_gain_db", "ssim", "depth_median_abs_m")
@@ -26,6 +27,8 @@ class HeldOutView:
     file: str
     camera: str
     stamp_ns: int
+    after_s: float
+    """Since the first of its file."""
     psnr_db: float | None
     ssim: float | None
 
@@ -52,10 +55,11 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
     """
     views: list[HeldOutView] = []
     problems = []
+    rated = {(v["file"], v["camera"], v["stamp_ns"]): v for v in judgement.about["views"]}
     paths = run.derived("*.views.*")
     for path in paths:
         try:
-            views += _views(path, _scores(judgement, path.stem))
+            views += _views(path, rated)
         except GstError as error:
             problems.append(str(error))
     views.sort(key=lambda v: (v.psnr_db is None, v.psnr_db or 0.0, v.stamp_ns))
@@ -71,22 +75,23 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
     )
 
 
-def _views(path: Path, scores: dict[tuple[Cell, Cell], dict[str, Cell]]) -> list[HeldOutView]:
+def _views(path: Path, rated: Mapping[tuple[Any, ...], Mapping[str, Any]]) -> list[HeldOutView]:
     tracks = camera_tracks(path)
     views = []
-    for name, track in tracks.items():
-        if not name.startswith(RENDERED):
-            continue
+    drawn = {name: track for name, track in tracks.items() if name.startswith(RENDERED)}
+    first_ns = min((track.stamps_ns[0] for track in drawn.values()), default=0)
+    for name, track in drawn.items():
         camera_id = name.removeprefix(RENDERED)
         for stamp_ns in track.stamps_ns:
-            score = scores.get((camera_id, stamp_ns), {})
+            rating = rated.get((path.name, camera_id, stamp_ns), {})
             views.append(
                 HeldOutView(
                     file=path.name,
                     camera=camera_id,
                     stamp_ns=stamp_ns,
-                    psnr_db=_number(score.get("PSNR (dB)")),
-                    ssim=_number(score.get("SSIM")),
+                    after_s=1e-9 * (stamp_ns - first_ns),
+                    psnr_db=rating.get("psnr_db"),
+                    ssim=rating.get("ssim"),
                 )
             )
     return views
@@ -99,22 +104,6 @@ def _source_of(run: RunFolder, path: Path) -> Path | None:
         return None if derived is None else episode_path(run, derived.source_episode)
     except NotHereError:
         return None
-
-
-def _scores(judgement: Judgement, stem: str) -> dict[tuple[Cell, Cell], dict[str, Cell]]:
-    """Map camera and stamp to the evaluator's row for that image."""
-    tables: tuple[Table, ...] = judgement.results.tables if judgement.results else ()
-    scores = {}
-    for table in tables:
-        if table.title == VIEWS_TITLE + stem:
-            for row in table.rows:
-                record = dict(zip(table.columns, row, strict=True))
-                scores[(record["camera"], record["stamp_ns"])] = record
-    return scores
-
-
-def _number(value: Cell) -> float | None:
-    return float(value) if isinstance(value, int | float) else None
 
 
 def view_image(

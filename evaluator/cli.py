@@ -1,6 +1,5 @@
 """Commands of ``evaluator``; imports stay late so that --help is quick."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -57,6 +56,7 @@ def evaluate(
     """
     from bridge.episode.run_folder import RunFolder
     from evaluator.report.write import summary_text, write_report
+    from evaluator.review_index import state_of
     from evaluator.thresholds import missed, parse_thresholds
 
     thresholds = [] if fail_under is None else parse_thresholds(fail_under)
@@ -66,7 +66,8 @@ def evaluate(
             from evaluator.compare.published import check_published as recompute
 
             published = recompute(check_published, tables)
-        began_ns = time.time_ns()
+        run = RunFolder(sources[0]) if len(sources) == 1 else None
+        state = None if run is None else state_of(run)
         if sources:
             comparison, folder = _compare(sources, tables, images, output)
             comparison = _with_reviews(comparison, sources, reviews, tables)
@@ -80,10 +81,10 @@ def evaluate(
             comparison, folder = _images_alone(images)
         written = write_report(comparison, out or folder, everything=everything, latex=latex)
         results = written.content
-        if len(sources) == 1 and written.report.parent == RunFolder(*sources).results_dir:
+        if run and state and written.report.parent == run.results_dir:
             from evaluator.report.review import index_run
 
-            index_run(RunFolder(*sources), comparison, results, began_ns)
+            index_run(run, comparison, results, state)
         # Of a large run the record takes a second.
         output.result(results.to_record() if output.json else {}, summary_text(results, written))
         failed = missed(thresholds, results)

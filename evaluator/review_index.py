@@ -24,10 +24,8 @@ from evaluator.result import Measurement
 from evaluator.trial_row import TrialRow
 
 FILE_NAME = "review_index.msgpack"
-VERSION = 10
+VERSION = 11
 """Raise it whenever what a field holds changes."""
-NO_RESULTS = "no results yet"
-"""Why there are no numbers of a run that was never evaluated."""
 
 
 def severity(trial: TrialRow) -> tuple[int, float, str]:
@@ -74,7 +72,6 @@ SORT: dict[str, tuple[Callable[[TrialRow], Any], ...]] = {
     "planned": (lambda trial: -1 if trial.twin is None else trial.twin,),
     "cause": (lambda trial: trial.failing_cause or "~",),
     "distance": (lambda trial: 1.0 if trial.distance_m is None else -trial.distance_m,),
-    "date": (lambda trial: trial.began_ns,),
 }
 """Orders of the list: what comes first, and what then; the first is that of ``severity``. Only what
 comes first is turned round."""
@@ -219,23 +216,23 @@ class RunState:
     """What the disk says of a run without opening a file."""
 
     digest: str
-    newest_ns: int
-    """When the last of its recordings, replays and labels was written [ns since 1970]."""
+    """Of its recordings, replays and labels."""
+    results: str
+    """Stamp of its results."""
     num_files: int
 
 
 def state_of(run: RunFolder) -> RunState:
     """Look at every file that numbers follow from: name, size and time of writing."""
-    marks, newest_ns = list[str](), 0
+    marks = list[str]()
     for folder in (run.episodes_dir, run.derived_dir, run.notes_dir):
         for name, size, written_ns in _files_of(folder):
             is_part = name.endswith(PART)  # still being written: its size says nothing yet
             marks.append(f"{folder.name}/{name} {'' if is_part else f'{size} {written_ns}'}")
-            newest_ns = max(newest_ns, 0 if is_part else written_ns)
-    marks.sort()
-    marks += [f"{name} {stamp_of(run.path / name)}" for name in ("protocol.json", RESULTS)]
+    marks = [*sorted(marks), stamp_of(run.path / "protocol.json")]
     digest = hashlib.sha256("\n".join(marks).encode("utf-8", "surrogateescape"))
-    return RunState(digest=digest.hexdigest(), newest_ns=newest_ns, num_files=len(marks) - 2)
+    results = stamp_of(run.path / RESULTS)
+    return RunState(digest=digest.hexdigest(), results=results, num_files=len(marks) - 1)
 
 
 RESULTS = "results/results.json"
@@ -336,6 +333,10 @@ class ReviewIndex:
         """Whatever is not a list of trials or files."""
         self.measurements = content.measurements
         """The numbers of ``results.json``, without the episodes behind them."""
+
+    def is_of(self, state: RunState) -> bool:
+        """Say whether the run is as it was read."""
+        return bool(self.about["state"] == [state.digest, state.results])
 
     def trials(
         self, selection: _Selected, *, limit: int | None = None, offset: int = 0

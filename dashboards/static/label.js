@@ -5,6 +5,7 @@ const form = document.getElementById("label");
 const note = document.getElementById("note");
 const told = document.getElementById("said");
 const WORDS = { success: "✓ success", failure: "✗ failure", unknown: "? cannot tell", unrated: "no answer yet" };
+const NO_LABEL = { result: "", cause: "", flag: false, note: "" };
 const undoKey = "undo " + form.dataset.action;
 const pendingKey = "pending " + form.dataset.action;
 let busy = false;
@@ -30,27 +31,24 @@ function describe() {
 
 function draw() {
   const now = saved();
-  for (const button of form.querySelectorAll("[data-answer]")) {
-    button.setAttribute("aria-pressed", String(Boolean(now) && now.result === button.dataset.answer));
-  }
-  for (const button of form.querySelectorAll("[data-because]")) {
-    button.setAttribute("aria-pressed", String(Boolean(now) && now.cause === button.dataset.because));
+  for (const button of form.querySelectorAll("[data-answer], [data-because]")) {
+    const { answer, because } = button.dataset;
+    const isOn = now && (answer ? now.result === answer : now.cause === because);
+    button.setAttribute("aria-pressed", String(Boolean(isOn)));
   }
   form.querySelector("[data-do=flag]").setAttribute("aria-pressed", String(Boolean(now) && now.flag));
 }
 
 function take(reply) {
-  const now = reply.saved;
-  form.dataset.seen = reply.version;
-  form.dataset.result = now ? now.result : "";
-  form.dataset.cause = now ? now.cause : "";
-  form.dataset.flag = now && now.flag ? "yes" : "";
-  note.defaultValue = now ? now.note : "";
+  const { result, cause, flag, note: text } = reply.saved || NO_LABEL;
+  Object.assign(form.dataset, { seen: reply.version, result, cause, flag: flag ? "yes" : "" });
+  note.defaultValue = text;
   draw();
 }
 
 // Ask until the server answers: a label is never dropped because the server was away.
 async function post(label) {
+  busy = true;
   keep(pendingKey, label);
   for (;;) {
     try {
@@ -60,6 +58,7 @@ async function post(label) {
         body: JSON.stringify(label),
       });
       const text = await answer.text();
+      busy = false;
       sessionStorage.removeItem(pendingKey);
       try {
         return { status: answer.status, ...JSON.parse(text) };
@@ -76,7 +75,6 @@ async function post(label) {
 // Save what is said of this trial. Returns whether it is on disk.
 async function save(change, { onward = false, words = "" } = {}) {
   if (busy) return false;
-  busy = true;
   const before = saved();
   const label = {
     trial_id: form.dataset.trial,
@@ -87,7 +85,6 @@ async function save(change, { onward = false, words = "" } = {}) {
   };
   tell("saving …");
   const reply = await post(label);
-  busy = false;
   if (reply.status === 409) {
     const typed = note.value === note.defaultValue ? null : note.value;
     take(reply);
@@ -120,10 +117,8 @@ async function undo() {
   const last = stack.pop();
   if (busy) return;
   if (!last) { tell("nothing to undo in this tab; " + describe()); return; }
-  busy = true;
   const label = { trial_id: last.trial, seen: last.seen, ...(last.before || { result: null }) };
   const reply = await post(label);
-  busy = false;
   if (reply.status !== 200) {
     tell("NOT UNDONE: " + reply.message, true);
     if (reply.status === 409) keep(undoKey, stack);
@@ -179,9 +174,7 @@ tell(describe());
 // A label that was on its way when the page was left is sent again.
 const pending = read(pendingKey, "null");
 if (pending) {
-  busy = true;
   post(pending).then((reply) => {
-    busy = false;
     if (pending.trial_id === form.dataset.trial && reply.version !== undefined) take(reply);
     tell(reply.status === 200 ? describe() : "NOT SAVED: " + pending.trial_id + ": " + reply.message, reply.status !== 200);
   });

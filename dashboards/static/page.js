@@ -158,6 +158,13 @@ for (const button of document.querySelectorAll("[data-copy]")) {
   });
 }
 
+// Numbers that are being recomputed behind the page appear once they are there.
+async function awaitNumbers() {
+  const page = await fetch(location.href).then((answer) => answer.text()).catch(() => 'id="recomputed"');
+  if (page.includes('id="recomputed"')) setTimeout(awaitNumbers, 2000); else location.reload();
+}
+if (document.getElementById("recomputed")) setTimeout(awaitNumbers, 2000);
+
 // A choice in the filters is taken at once; without a script the button does it.
 for (const choice of document.querySelectorAll(".filters select")) {
   choice.addEventListener("change", () => choice.form.requestSubmit());

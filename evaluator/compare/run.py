@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
 
+from bridge.episode.catalogue_query import LABEL_SUFFIX
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -184,7 +185,7 @@ def compare_read(
         ),
         missing=(*missing, *base.missing),
         motions=summaries.motions,
-        provenance=_provenance(reads),
+        provenance=provenance_of(reads),
     )
     of_protocol = (
         protocol_results(
@@ -260,17 +261,20 @@ def _marks(read: ReadRun) -> Iterator[bool | None]:
     yield from (row.stand_in for row in read.rows if not row.file and row.episode not in recorded)
 
 
-def _provenance(reads: Sequence[ReadRun]) -> dict[str, Any]:
+def provenance_of(reads: Sequence[ReadRun]) -> dict[str, Any]:
+    """Say of which bytes numbers are made."""
     parts: dict[str, dict[str, Any]] = {}
     for read in reads:
+        labels = sorted(read.run.notes_dir.glob(f"*{LABEL_SUFFIX}"))
+        tables = [trials_path(read.run)] if read.imported else []
         parts[str(read.run.path)] = {
-            "imported_trials": hash_file(trials_path(read.run)) if read.imported else None,
             "episodes": {each.file.name: each.file.sha256 for each in read.contents.recorded},
             "derived": {
                 file.name: {"sha256": file.sha256}
                 | {name: getattr(file.derived, name) for name in MADE_FROM}
                 for file in read.contents.derived
             },
+            "labels": {path.name: hash_file(path) for path in (*labels, *tables)},
         }
     common: dict[str, Any] = {"software": software(), "start_limit_m": START_LIMIT_M}
     return common | (next(iter(parts.values())) if len(parts) == 1 else {"runs": parts})

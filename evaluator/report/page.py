@@ -106,7 +106,7 @@ def page(results: Results, figures: Sequence[Drawing] = (), *, everything: bool 
             has_twin=has_twin,
             shared_mark=Markup(NO_SHARED),
             source=SOURCES.get(results.source, results.source),
-            banner=wording.stand_in_sentence(results),
+            banner=wording.STAND_IN if results.stand_in else None,
             had_plans=wording.agreeing_side({m.id: m for m in results.measurements})
             == wording.SIM_SIDE,
             contents=names,

@@ -1,28 +1,23 @@
 """Write the index that the review pages read: trials, files, numbers, and what they mean."""
 
-import csv
 import sys
-import time
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, file_names
-from bridge.errors import GstError, PathNotFoundError
-from bridge.exchange.trials_csv import trials_text
+from bridge.errors import GstError
 from bridge.whole_file import write_whole
 from evaluator import review_index
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare.conclusions import CLOSE_PP
 from evaluator.compare.failures import failure_kind, start_regions
 from evaluator.compare.images.views import VIEWS_TITLE
-from evaluator.compare.measure import refuse_alike
 from evaluator.compare.motion import MotionSummary
-from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
-from evaluator.compare.run import read_run
-from evaluator.compare.spreadsheet import record_from_row
+from evaluator.compare.rows import Comparison, TrialRow
+from evaluator.compare.run import compare_run, provenance_of, read_run
 from evaluator.compare.stages import first_failed_stage
 from evaluator.memory import without_collecting
 from evaluator.quantity import slug
@@ -33,63 +28,70 @@ from evaluator.result import Results, Table, load_results
 
 SHOWN_EXCLUSIONS = 200
 """Of those left out; ``results.json`` has all."""
+MADE_OF = ("episodes", "derived", "labels")
+"""What numbers follow from, in their provenance."""
 SHOWN_ROWS = 24
 """Of a table of a run without trials; the report has all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Read:
-    """What the trials of a run say now, without the statistics of it, or why nothing."""
+    """What the trials of a run say now, and the numbers."""
 
-    began_ns: int
-    """When it began to be read."""
+    state: review_index.RunState
+    """When it began to be read: what changes meanwhile makes the index old."""
+    results: Results | None = None
     rows: Sequence[TrialRow] = ()
     motions: Sequence[MotionSummary] = ()
     derived: Container[str] = ()
     """Names of the derived files that were read."""
+    no_results: str | None = None
+    """Why the stored results cannot be read."""
+    outdated: str | None = None
+    """What is not as it was when the stored results were computed."""
     reason: str | None = None
+    """Why the trials say nothing."""
 
 
 def refresh(run: RunFolder) -> bytes:
-    """Read the run as it is now, beside its stored results; write and return its index.
+    """Read the run as it is now; write and return its index.
 
-    Where the run cannot be written, the index is only returned.
+    Stored results that say what the trials say are kept; otherwise the statistics are computed
+    anew, for the index alone. Where the run cannot be written, the index is only returned.
     """
-    read = _Read(began_ns=time.time_ns())
+    read = _Read(state=review_index.state_of(run))
+    try:
+        read = replace(read, results=load_results(run.path))
+    except GstError as error:
+        read = replace(read, no_results=str(error))
     try:
         with without_collecting(), SummaryCache(run.results_dir / FOLDER) as kept:
             found = read_run(RunFolder.open(run.path), kept)
-        for kind in review_index.FACETS:
-            refuse_alike(kind, ((getattr(row, kind), row.episode) for row in found.rows))
-        derived = {file.name for file in found.contents.derived}
-        read = replace(read, rows=found.rows, motions=found.summaries.motions, derived=derived)
+            now, motions = provenance_of([found]), found.summaries.motions
+            read = replace(read, rows=found.rows, motions=motions, derived=now["derived"])
+            read = replace(read, outdated=_outdated(read.results, now))
+            if (read.no_results or read.outdated) and (read.rows or run.episodes()):
+                read = replace(read, results=compare_run(run, cache=kept).results())
     except GstError as error:
         read = replace(read, reason=str(error))
-    try:
-        return _write(run, read, load_results(run.path), None)
-    except PathNotFoundError:
-        return _write(run, read, None, review_index.NO_RESULTS)
-    except GstError as error:
-        return _write(run, read, None, str(error))
+    return _write(run, read)
 
 
-def index_run(run: RunFolder, comparison: Comparison, results: Results, began_ns: int) -> None:
-    """Write the index of an evaluation that has just been written.
-
-    Args:
-        began_ns: When it began to read; what changed since is looked at again [ns since 1970].
-    """
-    derived = comparison.provenance.get("derived", {})
+def index_run(
+    run: RunFolder, comparison: Comparison, results: Results, state: review_index.RunState
+) -> None:
+    """Write the index of an evaluation that has just been written, in the state before it read."""
     read = _Read(
-        began_ns=began_ns, rows=comparison.rows, motions=comparison.motions, derived=derived
+        state=replace(state, results=review_index.stamp_of(run.path / review_index.RESULTS)),
+        results=results,
+        rows=comparison.rows,
+        motions=comparison.motions,
+        derived=comparison.provenance.get("derived", {}),
     )
-    _write(run, read, results, None, is_new=True)
+    _write(run, read)
 
 
-def _write(
-    run: RunFolder, read: _Read, results: Results | None, none: str | None, *, is_new: bool = False
-) -> bytes:
-    state = review_index.state_of(run)
+def _write(run: RunFolder, read: _Read) -> bytes:
     planned = [motion for motion in read.motions if motion.against == "planned"]
     off = {motion.episode: (motion.path_max_m, motion.lag_s) for motion in planned}
     regions = start_regions(read.rows)
@@ -101,18 +103,14 @@ def _write(
         key=review_index.severity,
     )
     about = {
-        "state": state.digest,
-        "as_of_ns": read.began_ns,
-        "changed_meanwhile": state.newest_ns >= read.began_ns,
+        "state": [read.state.digest, read.state.results],
         "comparison_reason": read.reason,
-        "outdated": None if is_new or not results or read.reason else _outdated(run, read.rows),
-        "results_reason": none,
-        "stand_in": stand_in_of(row.stand_in for row in read.rows)
-        if results is None or results.stand_in is None
-        else results.stand_in,
-        **_about(results, has_trials=bool(read.rows)),
+        "outdated": read.outdated,
+        "results_reason": read.no_results,
+        "stand_in": None if read.results is None else read.results.stand_in,
+        **_about(read.results, has_trials=bool(read.rows)),
     }
-    numbers = () if results is None else results.measurements
+    numbers = () if read.results is None else read.results.measurements
     files = _files(run, read, {trial.file for trial in trials})
     content = review_index.written_index(trials, files, about, numbers)
     path = review_index.index_path(run)
@@ -158,20 +156,23 @@ def _about(results: Results | None, *, has_trials: bool) -> dict[str, Any]:
             }
             for line in rows_of(results, "conclusions")
         ],
-        "worst_view": _worst_view(results),
+        "views": _views(results),
         "tables": [] if has_trials else [_shown(t) for t in results.tables if t.rows],
     }
 
 
-def _worst_view(results: Results) -> dict[str, Any] | None:
-    """Find the held-out view that is drawn worst, as the tables of views rate it."""
+def _views(results: Results) -> list[dict[str, Any]]:
+    """List the held-out views that the tables of views rate, the one drawn worst first."""
     found: list[dict[str, Any]] = []
     for table in (each for each in results.tables if each.title.startswith(VIEWS_TITLE)):
         file = f"{table.title.removeprefix(VIEWS_TITLE)}.mcap"
-        for camera, stamp_ns, psnr_db, ssim, *_ in table.rows:
+        rows: tuple[Any, ...] = table.rows
+        first_ns = min((row[1] for row in rows), default=0)
+        for camera, stamp_ns, psnr_db, ssim, *_ in rows:
             rated = {"camera": camera, "stamp_ns": stamp_ns, "psnr_db": psnr_db, "ssim": ssim}
-            found += [{"file": file, **rated}] if psnr_db is not None else []
-    return min(found, key=lambda view: view["psnr_db"], default=None)
+            rated |= {"file": file, "after_s": 1e-9 * (stamp_ns - first_ns)}
+            found += [rated] if psnr_db is not None else []
+    return sorted(found, key=lambda view: view["psnr_db"])
 
 
 def _shown(table: Table) -> dict[str, Any]:
@@ -185,22 +186,16 @@ def _shown(table: Table) -> dict[str, Any]:
     }
 
 
-def _outdated(run: RunFolder, rows: Sequence[TrialRow]) -> str | None:
-    """Say what of a trial is not as it was when the stored results were computed; None of none."""
-    try:
-        stored = (run.results_dir / "trials.csv").read_text(encoding="utf-8")
-    except (OSError, ValueError):
-        return None  # nothing to compare with
-    was, now = (
-        {line["trial_id"]: line for line in csv.DictReader(text.splitlines())}
-        for text in (stored, trials_text(map(record_from_row, rows)))
-    )
-    for name in dict.fromkeys((*was, *now)):
-        if name not in was or name not in now:
-            return f"trial {name} {'is new' if name in now else 'has gone'}"
-        for part, value in now[name].items():
-            if (before := was[name].get(part)) != value:
-                return f"{part} of {name} was {before or 'unknown'} and is now {value or 'unknown'}"
+def _outdated(stored: Results | None, now: Mapping[str, Any]) -> str | None:
+    """Say which file is not as it was when the stored results were computed; None of none."""
+    was = {} if stored is None else stored.provenance
+    for part in MADE_OF if "episodes" in was else ():
+        before, after = was.get(part, {}), now[part]
+        for name in {**before, **after}:
+            if name not in before or name not in after:
+                return f"{name} {'is new' if name in after else 'has gone'}"
+            if before[name] != after[name]:
+                return f"{name} changed"
     return None
 
 
@@ -233,5 +228,5 @@ def _file(run: RunFolder, path: Path) -> review_index.IndexedFile:
         return review_index.IndexedFile(name=str(path.relative_to(run.path)), error=str(error))
 
 
-if __name__ == "__main__":  # the dashboard reads a large run in another process
-    refresh(RunFolder.open(Path(sys.argv[1])))
+if __name__ == "__main__":  # the dashboard reads a run in another process
+    sys.stdout.buffer.write(refresh(RunFolder.open(Path(sys.argv[1]))))

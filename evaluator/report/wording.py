@@ -131,12 +131,11 @@ def agreeing_side(by_id: Mapping[str, Measurement]) -> str:
     return next((side for side, rate in rates.items() if rate is not None and rate.n), sides[0])
 
 
-def stand_in_sentence(results: Results) -> str | None:
-    """Return the warning every page made from a simulated laboratory carries."""
-    if not results.stand_in:
-        return None
-    where = "from a simulated laboratory, not from a real robot"
-    return f"Stand-in: every recorded outcome here comes {where}."
+STAND_IN = (
+    "Stand-in: every recorded outcome here comes from a simulated laboratory, not from a real "
+    "robot."
+)
+"""The warning every page made from a simulated laboratory carries."""
 
 
 def cell_text(cell: Shown) -> str:

@@ -13,7 +13,7 @@ from evaluator.report.figures import drawings_of
 from evaluator.report.page import name_shared, page
 from evaluator.report.sections import FIGURES, shown_tables
 from evaluator.report.tables import as_csv, as_latex, as_text
-from evaluator.report.wording import headlines, stand_in_sentence
+from evaluator.report.wording import STAND_IN, headlines
 from evaluator.result import Results, write_results
 
 SHOWN = ("published", "success", "comparisons", "standing", "image_methods", "notes")
@@ -131,7 +131,7 @@ def _write_parquet(
 
 def summary_text(results: Results, written: Written) -> str:
     """Write what the terminal shows: the success table, the headlines, what was left out."""
-    parts = [banner] if (banner := stand_in_sentence(results)) else []
+    parts = [STAND_IN] if results.stand_in else []
     understood = results.provenance.get("read_as")
     if isinstance(understood, list) and understood:
         parts.append("Read:\n" + "\n".join(f"  {line}" for line in understood))

@@ -1,7 +1,9 @@
 """A small synthetic run: four trials, replays, held-out views. Its numbers mean nothing."""
 
 import asyncio
+import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -20,19 +22,21 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
-from bridge.exchange.trials_csv import write_trials
 from bridge.media.color import encode_jpeg
 from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.verdict import Factor, Verdict
 from dashboards.app import create_app
+from dashboards.comparison import stop_updates
 from dashboards.guard import Admission
 from dashboards.library import Library
 from evaluator.compare import compare_run
-from evaluator.compare.spreadsheet import record_from_row
+from evaluator.report.review import refresh
 from evaluator.result import write_results
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+from serving import judged
 
 START_NS = 1_760_000_000_000_000_000
 EXECUTION_NS = START_NS + 1_000_000_000
@@ -394,9 +398,8 @@ def make_run(folder: Path) -> RunFolder:
         writer.describe(EpisodeInfo(id="scan", kind="scan", cell="standin", stand_in=True))
         _Log(writer).image("/standin/cam/side/color/image", picture(0.0, 0), START_NS)
     write_views(run)
-    comparison = compare_run(run)
-    write_results(comparison.results(), run.results_dir / "results.json")
-    write_trials(run.results_dir / "trials.csv", map(record_from_row, comparison.rows))
+    write_results(compare_run(run).results(), run.results_dir / "results.json")
+    refresh(run)
     return run
 
 
@@ -409,6 +412,21 @@ def synthetic() -> ModuleType:
 @pytest.fixture(scope="session")
 def shared_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return make_run(tmp_path_factory.mktemp("runs") / "monday")
+
+
+@pytest.fixture
+def disagreement(tmp_path: Path) -> RunFolder:
+    """Return one trial that succeeded, of which the twin says that it fails."""
+    run = RunFolder.create(tmp_path / "run")
+    write_trial(run, TRIALS[1])
+    write_replay(run, TRIALS[1], "planned", False)
+    return run
+
+
+@pytest.fixture
+def copy(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
+    """Return a copy of the evaluated run, in a folder whose name a shell would take apart."""
+    return RunFolder(shutil.copytree(shared_run.path, tmp_path / "Zelle 3 (früh)"))
 
 
 class Browser:
@@ -436,8 +454,17 @@ class Browser:
         return asyncio.run(ask())
 
 
+@pytest.fixture(autouse=True)
+def no_reader_left() -> Iterator[None]:
+    """End what pages let read behind them."""
+    yield
+    stop_updates()
+
+
 def browser_of(*runs: RunFolder, admission: Admission | None = None) -> Browser:
-    """Return a browser on the pages of some runs."""
+    """Return a browser on the pages of some runs, which are read as they are now."""
+    for run in runs:
+        judged(run)
     return Browser(create_app(Library.open([run.path for run in runs]), admission))
 
 

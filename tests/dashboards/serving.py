@@ -8,8 +8,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bridge.episode.run_folder import RunFolder
+from dashboards.comparison import Judgement, judge
+from evaluator.report.review import refresh
 
 ROOT = Path(__file__).parents[2]
+
+
+def judged(run: RunFolder) -> Judgement:
+    """Return what is known of a run, read as it is now."""
+    if judge(run, reads=False).is_old:
+        refresh(run)
+    return judge(run, reads=False)
 
 
 @contextmanager

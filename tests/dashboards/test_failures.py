@@ -5,19 +5,18 @@ import re
 from collections import Counter
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from serving import judged
 from test_review_index import HOSTILE, made, many
 from visible import words
 
 from bridge.episode.run_folder import RunFolder
 from bridge.media.color import decode_color
 from dashboards import clips
-from dashboards.comparison import judge
 from dashboards.failures_page import PART_WORDS
 from evaluator.compare.failures import (
     NO_ANSWER,
@@ -173,14 +172,10 @@ def test_the_page_groups_the_run_and_leads_to_each_trial(browser: Any) -> None:
 
 
 @pytest.fixture
-def drawn(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
+def drawn(synthetic: ModuleType, disagreement: RunFolder) -> RunFolder:
     """Return a disagreement whose planned replay was drawn; the twin's cube lags a second."""
-    run = RunFolder.create(tmp_path / "run")
-    trial = synthetic.TRIALS[1]
-    synthetic.write_trial(run, trial)
-    synthetic.write_replay(run, trial, "planned", False)
-    synthetic.write_drawn(run, trial, "planned", range(20, 110, 5))
-    return run
+    synthetic.write_drawn(disagreement, synthetic.TRIALS[1], "planned", range(20, 110, 5))
+    return disagreement
 
 
 def _cube_px(image: np.ndarray) -> float:
@@ -191,7 +186,7 @@ def _cube_px(image: np.ndarray) -> float:
 
 
 def test_picture_and_clip_show_recorded_beside_twin_at_the_moment(drawn: RunFolder) -> None:
-    (row,) = judge(drawn).rows
+    (row,) = judged(drawn).rows
     found = clips.footage(drawn, row)
     assert found.has_twin
     width = (found.frames[0].shape[1] - clips.GAP_PX) // 2

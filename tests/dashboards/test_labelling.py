@@ -1,7 +1,6 @@
 """Labels by raters who see neither the twin nor each other, and none of which is ever lost."""
 
 import json
-import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,12 +9,12 @@ from typing import Any
 from urllib.parse import quote
 
 import pytest
+from serving import judged
 from visible import words
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.exchange import reviews
-from dashboards.comparison import judge
 from dashboards.guard import Admission
 from dashboards.label_page import OPERATOR, next_trial, rater_name, trials_to_label
 from dashboards.label_routes import MAX_BODY
@@ -28,22 +27,14 @@ def label(trial: str = "trial_0001", result: str = "success", **more: object) ->
 
 
 @pytest.fixture
-def run(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
-    """Return the synthetic run, for a test that writes labels into it."""
-    copy = tmp_path / "monday"
-    shutil.copytree(shared_run.path, copy)
-    return RunFolder(copy)
+def pages(copy: RunFolder, synthetic: ModuleType) -> Any:
+    return synthetic.browser_of(copy)
 
 
-@pytest.fixture
-def pages(run: RunFolder, synthetic: ModuleType) -> Any:
-    return synthetic.browser_of(run)
-
-
-def test_a_label_is_on_disk_as_the_evaluator_reads_it(pages: Any, run: RunFolder) -> None:
+def test_a_label_is_on_disk_as_the_evaluator_reads_it(pages: Any, copy: RunFolder) -> None:
     answer = pages.post(ANN, json=label(result="failure", cause="dropped it", note="é", flag=True))
     assert answer.status_code == 200
-    (kept,) = reviews.read_reviews(run.path / "reviews")
+    (kept,) = reviews.read_reviews(copy.path / "reviews")
     assert (kept.trial_id, kept.rater, kept.success) == ("trial_0001", "Ann", False)
     assert kept.says == ("failure", "dropped it", "é", True)
     assert kept.time.endswith("Z")
@@ -94,7 +85,7 @@ def test_nothing_that_anybody_else_said_changes_what_a_rater_sees(
 
 
 def test_each_rater_has_an_order_of_their_own_over_the_same_trials(shared_run: RunFolder) -> None:
-    judgement = judge(shared_run)
+    judgement = judged(shared_run)
     orders = {name: trials_to_label(judgement, name) for name in ("Ann", "Bob", "Cleo", "Di")}
     assert len({tuple(order) for order in orders.values()}) > 1
     assert len({frozenset(order) for order in orders.values()}) == 1
@@ -115,20 +106,20 @@ def test_what_nobody_labelled_comes_next_and_then_what_only_others_did() -> None
     assert next_trial(["a"], said("Ann", "a"), "Ann") is None
 
 
-def test_the_second_of_two_tabs_is_told_and_may_replace(pages: Any, run: RunFolder) -> None:
+def test_the_second_of_two_tabs_is_told_and_may_replace(pages: Any, copy: RunFolder) -> None:
     first = pages.post(ANN, json=label(result="failure", cause="collision"))
     late = pages.post(ANN, json=label(result="success"))
     assert late.status_code == 409
     assert "changed elsewhere" in late.json()["message"]
     assert late.json()["saved"]["cause"] == "collision"
     assert late.json()["version"] == first.json()["version"]
-    assert reviews.read_reviews(run.path / "reviews")[0].result == "failure"
+    assert reviews.read_reviews(copy.path / "reviews")[0].result == "failure"
     # The same answer once more is no conflict: a page asks again when it heard nothing.
     again = pages.post(ANN, json=label(result="failure", cause="collision"))
     assert (again.status_code, again.json()["version"]) == (200, first.json()["version"])
     replaced = pages.post(ANN, json=label(result="success", seen=late.json()["version"]))
     assert replaced.status_code == 200
-    assert reviews.read_reviews(run.path / "reviews")[0].result == "success"
+    assert reviews.read_reviews(copy.path / "reviews")[0].result == "success"
 
 
 def test_of_many_who_save_at_once_one_wins_and_the_others_are_told(tmp_path: Path) -> None:
@@ -151,7 +142,7 @@ def test_of_many_who_save_at_once_one_wins_and_the_others_are_told(tmp_path: Pat
     assert len(list((tmp_path / "reviews").iterdir())) == 1
 
 
-def test_undo_brings_back_what_was_there_even_nothing(pages: Any, run: RunFolder) -> None:
+def test_undo_brings_back_what_was_there_even_nothing(pages: Any, copy: RunFolder) -> None:
     first = pages.post(ANN, json=label(result="failure", note="hm")).json()
     second = pages.post(ANN, json=label(result="success", seen=first["version"])).json()
     back = pages.post(
@@ -161,10 +152,10 @@ def test_undo_brings_back_what_was_there_even_nothing(pages: Any, run: RunFolder
     gone = pages.post(ANN, json=label(result=None, seen=back["version"]))  # type: ignore[arg-type]
     assert gone.json()["saved"] is None
     assert gone.json()["next"] is not None
-    assert reviews.read_reviews(run.path / "reviews") == []
+    assert reviews.read_reviews(copy.path / "reviews") == []
 
 
-def test_a_flag_without_an_answer_is_no_label(pages: Any, run: RunFolder) -> None:
+def test_a_flag_without_an_answer_is_no_label(pages: Any, copy: RunFolder) -> None:
     pages.post(ANN, json=label(result="unrated", flag=True, note="look again"))
     shown = words(pages.get("/label").text)
     assert "Ann 0 4" in shown
@@ -189,23 +180,23 @@ def test_notes_are_held_back_until_everybody_is_done(pages: Any) -> None:
 
 
 def test_a_label_from_a_table_is_shown_to_its_rater_and_can_be_replaced(
-    pages: Any, run: RunFolder
+    pages: Any, copy: RunFolder
 ) -> None:
-    (run.path / "reviews").mkdir()
+    (copy.path / "reviews").mkdir()
     table = "trial_id,rater,time,result,note\ntrial_0001,Ann,2026-01-01,fail,from a table\n"
-    (run.path / "reviews" / "ann.csv").write_text(table)
+    (copy.path / "reviews" / "ann.csv").write_text(table)
     page = pages.get(f"{ANN}&at=trial_0001").text
     assert 'data-result="failure"' in page
     assert "from a table" in page
     assert pages.post(ANN, json=label(result="success")).status_code == 200
-    assert [r.result for r in reviews.read_reviews(run.path / "reviews")] == ["success"]
+    assert [r.result for r in reviews.read_reviews(copy.path / "reviews")] == ["success"]
 
 
-def test_a_broken_label_file_is_named_and_hides_no_other(pages: Any, run: RunFolder) -> None:
+def test_a_broken_label_file_is_named_and_hides_no_other(pages: Any, copy: RunFolder) -> None:
     pages.post(ANN, json=label())
-    (run.path / "reviews" / "broken.json").write_text("{")
+    (copy.path / "reviews" / "broken.json").write_text("{")
     assert "broken.json" in words(pages.get("/label").text)
-    found, problems = reviews.readable_reviews(run.path)
+    found, problems = reviews.readable_reviews(copy.path)
     assert ([r.rater for r in found], len(problems)) == (["Ann"], 1)
 
 
@@ -237,16 +228,16 @@ def test_a_broken_label_file_is_named_and_hides_no_other(pages: Any, run: RunFol
     ],
 )
 def test_what_is_no_label_of_this_page_changes_nothing(
-    pages: Any, run: RunFolder, options: dict[str, Any], status: int
+    pages: Any, copy: RunFolder, options: dict[str, Any], status: int
 ) -> None:
     body = {} if {"json", "content"} & options.keys() else {"json": label()}
     assert pages.post(ANN, **body, **options).status_code == status
-    assert reviews.readable_reviews(run.path) == ([], [])
+    assert reviews.readable_reviews(copy.path) == ([], [])
 
 
-def test_without_the_token_nothing_is_written(run: RunFolder, synthetic: ModuleType) -> None:
+def test_without_the_token_nothing_is_written(copy: RunFolder, synthetic: ModuleType) -> None:
     admission = Admission(host="0.0.0.0", token="secret")
-    browser = synthetic.browser_of(run, admission=admission)
+    browser = synthetic.browser_of(copy, admission=admission)
     assert browser.post(ANN, json=label()).status_code == 403
     cookie = {"Cookie": "robot_gst_token=secret"}
     assert browser.post(ANN, json=label(), headers=cookie).status_code == 200

@@ -8,30 +8,22 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from serving import judged
+from visible import words
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import decode_color
-from dashboards import clips
-from dashboards.comparison import judge
-from dashboards.moments import moment_of
+from dashboards import clips, moments
+from dashboards.moments import Cause, cause_of, moment_of
 
 CARRIED_NS = 2_800_000_000
 """Into the plan: when the twin drops the cube in the synthetic refusals."""
 
 
-@pytest.fixture
-def disagreement(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
-    """Return one trial that succeeded, of which the twin says that it fails."""
-    run = RunFolder.create(tmp_path / "run")
-    synthetic.write_trial(run, synthetic.TRIALS[1])
-    synthetic.write_replay(run, synthetic.TRIALS[1], "planned", False)
-    return run
-
-
 def test_a_picture_shows_the_instant_at_which_the_twin_fails(disagreement: RunFolder) -> None:
-    (row,) = judge(disagreement).rows
+    (row,) = judged(disagreement).rows
     moment = moment_of(disagreement, row)
     assert moment is not None
     assert (moment.t_ns, moment.text) == (CARRIED_NS, "the cube left the gripper during carry")
@@ -51,16 +43,38 @@ def test_the_divergence_that_a_replay_tells_comes_before_its_verdict(
     plan_id = synthetic.make_plan(trial).id
     with EpisodeWriter(path.with_name("other.mcap")) as writer:
         synthetic.write_divergence(writer, plan_id, ("planned", "executed"), 1_500_000_000)
-    (row,) = judge(disagreement).rows
+    (row,) = judged(disagreement).rows
     moment = moment_of(disagreement, replace(row, executed_replay="other.mcap"))
     assert moment is not None
     assert (moment.t_s, moment.text) == (1.5, "cube lies 69 mm apart")
 
 
+def test_a_disagreement_has_a_cause_a_margin_and_says_how_often_it_happens(
+    disagreement: RunFolder, synthetic: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (row,) = judged(disagreement).rows
+    dropped = "the cube left the gripper during carry"
+    assert cause_of(disagreement, row) == Cause(text=dropped, margin=dropped, varied=None)
+    assert cause_of(disagreement, replace(row, recorded=False)) is None
+    said = synthetic.make_verdict("p", True, "planned", "bullet")
+    said = replace(
+        said,
+        terminal=replace(said.terminal, detail="2 mm within the box; it is still"),
+        p_success={"k": 4, "n": 8, "value": 0.5, "low": 0.2, "high": 0.8},
+    )
+    browser = synthetic.browser_of(disagreement)
+    for address in ("/", "/episode/trial_0002"):
+        assert "varied nothing was varied" in words(browser.get(address).text)
+        with monkeypatch.context() as patch:
+            patch.setattr(moments, "_verdict_of", lambda *_: said)
+            text = words(browser.get(address).text)
+            assert "margin 2 mm within the box varied 4 of 8 varied replays succeed" in text
+
+
 def test_a_picture_is_drawn_once_and_again_when_the_recording_changes(
     disagreement: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (row,) = judge(disagreement).rows
+    (row,) = judged(disagreement).rows
     first = clips.picture(disagreement, row)
     folder = disagreement.results_dir / clips.PICTURES
     (kept,) = folder.iterdir()

@@ -7,12 +7,12 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from serving import judged
 from visible import words
 
 from bridge.episode.run_folder import RunFolder
-from dashboards import overview_page
+from dashboards import moments, overview_page
 from dashboards.app import create_app
-from dashboards.comparison import judge
 from dashboards.errors import NotHereError
 from dashboards.guard import COOKIE, Admission
 from dashboards.library import Library, derived_path, episode_path
@@ -37,13 +37,12 @@ def test_the_overview_shows_the_numbers_of_results_json(
 
 
 def test_the_first_page_begins_with_the_answer_and_the_worst(
-    synthetic: ModuleType, shared_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    synthetic: ModuleType, copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = RunFolder(shutil.copytree(shared_run.path, tmp_path / "run"))
     monkeypatch.setattr(overview_page, "not_scanned_in", lambda *_: ["cube", "lid"])
-    page = synthetic.browser_of(run).get("/").text
+    page = synthetic.browser_of(copy).get("/").text
     seen = words(page)
-    answer = dict(front(load_results(run.path)).answers)["Trust the twin"]
+    answer = dict(front(load_results(copy.path)).answers)["Trust the twin"]
     at = [
         seen.index(part)
         for part in (
@@ -58,13 +57,13 @@ def test_the_first_page_begins_with_the_answer_and_the_worst(
     assert "First divergence : the cube left the gripper during carry" in seen
     (picture,) = re.findall(r'src="(/failures/picture/[^"]*)"', page)
     assert picture == "/failures/picture/trial_0002"
-    found = build_twin(run, judge(run)).views[0]  # the worst first
+    found = build_twin(copy, judged(copy)).views[0]  # the worst first
     assert f"PSNR {found.psnr_db:.2f} dB · SSIM {found.ssim:.3f}" in seen
     for side in ("recorded", "rendered"):
         address = f"/twin/{found.file}/{side}/{found.camera}?stamp={found.stamp_ns}"
         assert page.count(address) == 2  # by itself, and in the difference
-    (run.derived_dir / found.file).unlink()
-    assert "held-out" not in synthetic.browser_of(run).get("/").text
+    (copy.derived_dir / found.file).unlink()
+    assert "held-out" not in synthetic.browser_of(copy).get("/").text
 
 
 def test_a_cause_has_few_words_and_a_trial_without_a_camera_no_picture(
@@ -74,10 +73,11 @@ def test_a_cause_has_few_words_and_a_trial_without_a_camera_no_picture(
     synthetic.write_trial(run, synthetic.TRIALS[1], images=False)
     synthetic.write_replay(run, synthetic.TRIALS[1], "planned", False)
     long = Moment(plan_id="p", t_ns=0, text="a " * 21)
-    monkeypatch.setattr(overview_page, "moment_of", lambda *_: long)
-    worst = overview_page.worst_disagreement(run, judge(run))
+    monkeypatch.setattr(moments, "moment_of", lambda *_: long)
+    worst = overview_page.worst_disagreement(run, judged(run))
     assert worst is not None
-    assert worst.cause == "a " * 20 + "…"
+    assert worst.cause is not None
+    assert worst.cause.text == "a " * 20 + "…"
     browser = synthetic.browser_of(run)
     for address in ("/", "/failures"):
         assert "trial_0002" in browser.get(address).text
@@ -164,24 +164,18 @@ def test_a_frame_is_the_recorded_bytes_nearest_to_the_time(
 
 
 @pytest.mark.parametrize(
-    ("part", "command"),
-    [
-        ("results", "robot-gst evaluate"),
-        ("derived", "robot-gst rebuild"),
-        ("episodes", "robot-gst record"),
-    ],
+    ("part", "command"), [("results", "evaluate"), ("derived", "rebuild"), ("episodes", "record")]
 )
 def test_a_missing_part_names_the_next_command(
-    synthetic: ModuleType, shared_run: RunFolder, tmp_path: Path, part: str, command: str
+    synthetic: ModuleType, copy: RunFolder, part: str, command: str
 ) -> None:
-    run = RunFolder(shutil.copytree(shared_run.path, tmp_path / "run"))
     for folder in ("results", "derived", "episodes"):
-        shutil.rmtree(run.path / folder)
+        shutil.rmtree(copy.path / folder)
         if folder == part:
             break
-    answer = synthetic.browser_of(run).get("/")
+    answer = synthetic.browser_of(copy).get("/")
     assert answer.status_code == 200
-    assert command in words(answer.text)
+    assert f"robot-gst {command}" in words(answer.text)
 
 
 def test_broken_files_are_named_and_the_rest_is_shown(
@@ -282,21 +276,11 @@ def test_pages_hold_nothing_the_policy_forbids_and_nothing_from_outside(browser:
         assert not re.search(r"(src|href|action)=\"(https?:)?//", page)
 
 
-@pytest.mark.parametrize(
-    ("host", "status"),
-    [
-        ("127.0.0.1:8600", 200),
-        ("localhost:1234", 200),
-        ("[::1]:8600", 200),
-        ("evil.example", 400),
-        ("127.0.0.1.evil.example:8600", 400),
-        ("192.168.1.5:8600", 400),
-        ("", 400),
-        ("[::1", 400),
-    ],
-)
-def test_a_foreign_host_name_is_refused(browser: Any, host: str, status: int) -> None:
-    assert browser.get("/", headers={"host": host}).status_code == status
+def test_a_foreign_host_name_is_refused(browser: Any) -> None:
+    for host in ("127.0.0.1:8600", "localhost:1234", "[::1]:8600"):
+        assert browser.get("/", headers={"host": host}).status_code == 200
+    for host in ("evil.example", "127.0.0.1.evil.example:8600", "192.168.1.5:8600", "", "[::1"):
+        assert browser.get("/", headers={"host": host}).status_code == 400
 
 
 def test_an_open_address_asks_for_its_token(synthetic: ModuleType, shared_run: RunFolder) -> None:

@@ -8,14 +8,13 @@ from types import ModuleType
 import numpy as np
 import pytest
 from headless import CHROMIUM, NO_CHROMIUM, chromium
-from serving import dashboard
+from serving import dashboard, judged
 
 from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from dashboards import frames
-from dashboards.comparison import judge
 from dashboards.episode_page import EpisodePage, build_page
 
 ID = "trial_0002"
@@ -24,19 +23,15 @@ DROPPED_S = 1 + 2.8
 
 
 @pytest.fixture
-def run(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
+def run(synthetic: ModuleType, disagreement: RunFolder) -> RunFolder:
     """Return one trial whose planned replay was drawn too, from 1 s to 4 s."""
-    run = RunFolder.create(tmp_path / "run")
-    trial = synthetic.TRIALS[1]
-    synthetic.write_trial(run, trial)
-    synthetic.write_replay(run, trial, "planned", False)
     for trajectory in ("planned", "executed"):
-        synthetic.write_drawn(run, trial, trajectory, range(20, 80, 5))
-    return run
+        synthetic.write_drawn(disagreement, synthetic.TRIALS[1], trajectory, range(20, 80, 5))
+    return disagreement
 
 
 def page(run: RunFolder, t_s: float | None = None) -> EpisodePage:
-    return build_page(run, ID, judge(run).row(ID), t_s)
+    return build_page(run, ID, judged(run).row(ID), t_s)
 
 
 def test_a_trial_opens_where_recording_and_twin_part(run: RunFolder) -> None:
@@ -92,7 +87,7 @@ def test_lanes_say_what_is_apart_from_when_on_and_why_plans_were_sent_back(
 ) -> None:
     planned = next(p for p in run.derived(f"{ID}.replay.planned.*") if "drawn" not in p.name)
     write_touches(planned, synthetic)
-    row = judge(run).row(ID)
+    row = judged(run).row(ID)
     assert row is not None
     failed = replace(row, stages=(("carry", False), ("release", None)))
     chart = build_page(run, ID, failed, None).stages

@@ -1,16 +1,15 @@
 """The index says what the evaluation says, in any order, page and filter, and is never old."""
 
-import os
 import random
 import shutil
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import msgspec
 import pytest
+from serving import judged
 from visible import words
 
 from bridge.episode.catalogue import label_episode
@@ -22,6 +21,7 @@ from dashboards.comparison import judge
 from evaluator.compare import compare_run
 from evaluator.quantity import slug
 from evaluator.report.review import index_run, refresh
+from evaluator.result import load_results, write_results
 from evaluator.review_index import (
     SORT,
     ReviewIndex,
@@ -143,7 +143,7 @@ def test_the_index_holds_what_the_comparison_holds(shared_run: RunFolder) -> Non
     expected = {row.episode: row for row in compare_run(shared_run).rows}
     found = ReviewIndex(refresh(shared_run)).trials(Selection())
     assert {t.episode for t in found} == set(expected)
-    assert [t.episode for t in found] == [t.episode for t in judge(shared_run).rows]
+    assert [t.episode for t in found] == [t.episode for t in judged(shared_run).rows]
     assert any(t.distance_m for t in found)
     for trial in found:
         row = expected[trial.episode]
@@ -152,36 +152,48 @@ def test_the_index_holds_what_the_comparison_holds(shared_run: RunFolder) -> Non
         assert trial.file == f"{trial.episode}.mcap"
 
 
-@pytest.fixture
-def copy(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
-    return RunFolder(shutil.copytree(shared_run.path, tmp_path / "run"))
+def told_behind(run: RunFolder) -> ReviewIndex:
+    """What a page shows once whoever reads the run behind it is done."""
+    if judge(run).is_being_updated:
+        update = comparison._KNOWN[run].update
+        assert update is not None
+        assert update.wait(600) == 0
+    known = judge(run)
+    assert known.index is not None
+    assert (known.is_old, known.is_being_updated) == (False, False)
+    return known.index
 
 
-def test_an_unchanged_run_is_not_compared_again(
-    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    judge(copy)
-    comparison._KNOWN.clear()  # as another process would see it
-    (index_path(copy)).touch()
-    old_ns = 10**18
-    for path in (*copy.episodes(), *copy.derived()):
-        os.utime(path, ns=(old_ns, old_ns))
-    refresh(copy)
-    monkeypatch.setattr("evaluator.report.review.refresh", lambda _: pytest.fail("read again"))
-    assert len(judge(copy).rows) == 4
+def test_an_unchanged_run_is_not_read_again(copy: RunFolder) -> None:
+    assert not judge(copy).is_old
+    assert comparison._KNOWN[copy].update is None
 
 
-def test_a_changed_label_is_seen_at_the_next_page(copy: RunFolder) -> None:
-    assert judge(copy).rows[0].episode == "trial_0002"
+def test_numbers_of_a_changed_run_are_computed_anew_and_stored_ones_stay(copy: RunFolder) -> None:
+    stored = (copy.results_dir / "results.json").read_bytes()
     label_episode(copy, "trial_0003", Outcome(result="failure", by="reviewer"))
-    row = judge(copy).row("trial_0003")
-    assert row is not None
-    assert row.agrees is False
+    index = ReviewIndex(refresh(copy))
+    found = {each.id: each.value for each in index.measurements}
+    assert found == {each.id: each.value for each in compare_run(copy).results().measurements}
+    assert (
+        found["agreement.sim_planned.rate"]
+        != load_results(copy.path).get("agreement.sim_planned.rate").value
+    )
+    assert (copy.results_dir / "results.json").read_bytes() == stored
+    assert index.about["outdated"] == "trial_0003.outcome.json is new"
+
+
+def test_copied_files_leave_stored_numbers_as_they_are(copy: RunFolder) -> None:
+    results = load_results(copy.path)
+    kept = replace(results.measurements[0], value=0.125)
+    write_results(replace(results, measurements=(kept,)), copy.results_dir / "results.json")
+    index = ReviewIndex(refresh(copy))
+    assert [each.value for each in index.measurements] == [0.125]
+    assert index.about["outdated"] is None
 
 
 @pytest.mark.parametrize("damage", [b"", b"nonsense", None])
 def test_a_damaged_or_foreign_index_is_made_anew(copy: RunFolder, damage: bytes | None) -> None:
-    judge(copy)
     path = index_path(copy)
     if damage is None:
         other = msgspec.msgpack.decode(path.read_bytes()) | {"version": 999}
@@ -190,35 +202,58 @@ def test_a_damaged_or_foreign_index_is_made_anew(copy: RunFolder, damage: bytes 
         path.write_bytes(damage)
     with pytest.raises(UnusableIndexError):
         ReviewIndex(path)
-    comparison._KNOWN.clear()
-    assert len(judge(copy).rows) == 4
-    assert ReviewIndex(path).count(Selection()) == 4
+    assert judge(copy).index is None
+    assert told_behind(copy).count(Selection()) == ReviewIndex(path).count(Selection()) == 4
 
 
-def test_what_changes_while_an_evaluation_reads_is_read_again(copy: RunFolder) -> None:
-    compared = compare_run(copy)
-    index_run(copy, compared, compared.results(), began_ns=1)  # every file is younger
-    comparison._KNOWN.clear()
+def test_what_changes_while_an_evaluation_reads_makes_its_index_old(copy: RunFolder) -> None:
+    state, compared = state_of(copy), compare_run(copy)
+    index_run(copy, compared, compared.results(), state)
+    assert not judge(copy, reads=False).is_old
     (copy.episodes_dir / "trial_0001.mcap").unlink()
-    assert judge(copy).row("trial_0001") is None
+    index_run(copy, compared, compared.results(), state)
+    assert judge(copy, reads=False).is_old
 
 
-def test_a_large_run_is_shown_as_it_was_while_another_process_reads_it(
-    copy: RunFolder, synthetic: ModuleType, monkeypatch: pytest.MonkeyPatch
+def test_of_two_changed_runs_one_is_read_at_a_time(copy: RunFolder, own_run: RunFolder) -> None:
+    shutil.rmtree(copy.results_dir)
+    assert judge(copy).is_being_updated
+    assert judge(own_run).is_being_updated
+    assert comparison._KNOWN[own_run].update is None
+
+
+def test_a_page_says_that_its_numbers_are_being_recomputed(
+    copy: RunFolder, synthetic: ModuleType
 ) -> None:
-    judge(copy)
+    browser = synthetic.browser_of(copy)
     label_episode(copy, "trial_0003", Outcome(result="failure", by="reviewer"))
-    monkeypatch.setattr(comparison, "WAITED_FOR", 0)
-    comparison._KNOWN.clear()
-    text = words(synthetic.browser_of(copy).get("/").text)
-    assert "It is being read now" in text
-    assert "trial_0003" in text
-    update = comparison._KNOWN[copy].update
-    assert update is not None
-    assert update.wait(120) == 0
-    text = words(synthetic.browser_of(copy).get("/").text)
-    assert "It is being read now" not in text
-    assert "robot-gst evaluate" in text  # the numbers are older than the label
+    for address in ("/", "/failures", "/numbers", "/twin", "/label", "/episode/trial_0003"):
+        text = words(browser.get(address).text)
+        assert "its numbers are being recomputed" in text, address
+    before, after = judge(copy).row("trial_0003"), told_behind(copy).trial("trial_0003")
+    assert (before and before.agrees, after and after.agrees) == (True, False)
+    text = words(browser.get("/").text)
+    assert "being recomputed" not in text
+    assert "robot-gst evaluate" in text  # the report is older than the label
+
+
+def test_a_run_read_for_the_first_time_says_nothing_false(
+    own_run: RunFolder, synthetic: ModuleType
+) -> None:
+    app = synthetic.Browser(synthetic.create_app(synthetic.Library.open([own_run.path])))
+    for address in ("/", "/failures", "/numbers", "/label"):
+        text = words(app.get(address).text)
+        assert "being read for the first time" in text, address
+        assert "robot-gst record" not in text, address
+        assert "evaluate" not in text, address
+
+
+def test_a_run_that_cannot_be_written_is_shown_all_the_same(
+    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.rmtree(copy.results_dir)
+    copy.results_dir.write_bytes(b"")  # no folder can be made here
+    assert told_behind(copy).count(Selection()) == 4
 
 
 def test_a_name_that_is_not_unicode_is_spelled_out() -> None:
@@ -240,18 +275,15 @@ def test_a_file_being_written_does_not_make_the_index_old(copy: RunFolder) -> No
 def test_a_page_of_hostile_names_holds_no_markup_of_theirs(
     copy: RunFolder, synthetic: ModuleType
 ) -> None:
-    judge(copy)
-    comparison._KNOWN.clear()
-    state = state_of(copy).digest
+    state = state_of(copy)
     about = {
-        "state": state, "changed_meanwhile": False, "results_reason": None, "outdated": None,
-        "comparison_reason": None, "measurements": [], "missing": [HOSTILE],
+        "state": [state.digest, state.results], "missing": [HOSTILE],
         "tasks": [
             {"task": HOSTILE, "slug": slug(HOSTILE), "answer": "not yet", "sentence": HOSTILE}
         ],
-        "worst_view": {
-            "file": HOSTILE, "camera": HOSTILE, "stamp_ns": 1, "psnr_db": 9.0, "ssim": None
-        },
+        "views": [
+            {"file": HOSTILE, "camera": HOSTILE, "stamp_ns": 1, "psnr_db": 9.0, "ssim": None}
+        ],
     }  # fmt: skip
     trials = [replace(trial, start_id=HOSTILE, policy=HOSTILE) for trial in many()]
     index_path(copy).write_bytes(written_index(trials, (), about))

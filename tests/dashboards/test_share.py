@@ -3,7 +3,6 @@
 import base64
 import io
 import re
-import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from types import ModuleType
@@ -20,15 +19,14 @@ from dashboards import share_file
 from dashboards.config import ShareConfig
 from dashboards.share_file import LEVELS, MB, build_share, share
 from evaluator.report.page import name_shared
+from evaluator.report.review import refresh
 
 
 @pytest.fixture
-def run(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
+def run(copy: RunFolder) -> RunFolder:
     """Return a copy of the run, with a report whose place for shared files is empty."""
-    shutil.copytree(shared_run.path, tmp_path / "monday")
-    found = RunFolder.open(tmp_path / "monday")
-    (found.results_dir / "report.html").write_text("<p>x</p><!--shared--><!--/shared--><p>y</p>")
-    return found
+    (copy.results_dir / "report.html").write_text("<p>x</p><!--shared--><!--/shared--><p>y</p>")
+    return copy
 
 
 class _Addresses(HTMLParser):
@@ -123,6 +121,7 @@ def test_hostile_names_stay_text(synthetic: ModuleType, tmp_path: Path) -> None:
                 result="failure", stages=({"id": HOSTILE, "result": "failure"},)
             ),
         )
+    refresh(run)
     made = build_share(run, ShareConfig(trials=("x",)))
     assert "<script" not in made.text
     assert "No clip: no camera images in x.mcap" in made.text

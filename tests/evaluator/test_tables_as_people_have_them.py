@@ -59,28 +59,14 @@ READ: dict[str, tuple[str, Rates | Trials]] = {
         "| Gear | A | 74/80 (92.50%) | 13/20 (65.0%) | -27.50 |\n"
         "| Gear | B | 80/80 (100.00%) | 25%（5/20） | -75.00 |\n"
         "| Peg | A | 4/8 (50%) | — | — |\n",
-        {
-            ("Gear", "A", "sim"): (74, 80),
-            ("Gear", "A", "real"): (13, 20),
-            ("Gear", "B", "sim"): (80, 80),
-            ("Gear", "B", "real"): (5, 20),
-            ("Peg", "A", "sim"): (4, 8),
-        },
+        counts("Gear", "13/20 5/20", "74/80 80/80", "A B") | {("Peg", "A", "sim"): (4, 8)},
     ),
     "tables of one header below each other": (
         "**Open the Box**\n\n| 方法 | Sim (%) | Real (%) |\n|---|---|---|\n| A | 95.8 | 21.5 |\n"
         "| **B** | 84.4 | **82.5** |\n\n**Lift the Lid**\n\n| 方法 | Sim (%) | Real (%) |\n"
         "|---|---|---|\n| A | 80.1 | 29.9 |\n| **B** | 70.0 | **70.6** |\n",
-        {
-            ("Open the Box", "A", "sim"): Fraction("0.958"),
-            ("Open the Box", "A", "real"): Fraction("0.215"),
-            ("Open the Box", "B", "sim"): Fraction("0.844"),
-            ("Open the Box", "B", "real"): Fraction("0.825"),
-            ("Lift the Lid", "A", "sim"): Fraction("0.801"),
-            ("Lift the Lid", "A", "real"): Fraction("0.299"),
-            ("Lift the Lid", "B", "sim"): Fraction("0.7"),
-            ("Lift the Lid", "B", "real"): Fraction("0.706"),
-        },
+        fractions("Open the Box", "0.215 0.825", "0.958 0.844", "A B")
+        | fractions("Lift the Lid", "0.299 0.706", "0.801 0.7", "A B"),
     ),
     "words without blanks between them": (
         "| 方法 | 推理时间 (ms) | 仿真成功率 | 真实世界成功率 |\n|---|---|---|---|\n"
@@ -203,11 +189,7 @@ READ: dict[str, tuple[str, Rates | Trials]] = {
     ),
     "a missing cell": (
         "policy,real,sim\nACT,7/10,8/10\nDP,-,6/10\n",
-        {
-            ("table", "ACT", "real"): (7, 10),
-            ("table", "ACT", "sim"): (8, 10),
-            ("table", "DP", "sim"): (6, 10),
-        },
+        counts("table", "7/10", "8/10", "ACT") | {("table", "DP", "sim"): (6, 10)},
     ),
     "pairs of outcomes trial by trial": (
         "policy,task,real,sim\nACT,cup,1,1\nACT,cup,0,1\nACT,cup,1,0\n",

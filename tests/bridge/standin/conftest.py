@@ -142,6 +142,11 @@ def make_cell(cell_file: CellFile, task: Task, reserved_seed: int) -> Callable[.
 
 
 @pytest.fixture(scope="session")
+def lab() -> CellFile:
+    return load_cell("lab")
+
+
+@pytest.fixture(scope="session")
 def toys_cell() -> CellFile:
     return load_cell("standin_toys")
 

@@ -10,7 +10,7 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.sources.standin.cell import CellConfig, StandinCell
-from bridge.sources.standin.cell_file import CellFile, draw_hidden, load_cell
+from bridge.sources.standin.cell_file import CellFile, draw_hidden
 from bridge.sources.standin.gate_sight import GateSight
 from bridge.sources.standin.operator import Operator
 from bridge.sources.standin.settings import SessionConfig
@@ -20,11 +20,6 @@ from bridge.task.task_file import Task, load_task
 from bridge.wire.errors import NoReplyError
 
 SEED = 9_000_000
-
-
-@pytest.fixture(scope="module")
-def lab() -> CellFile:
-    return load_cell("lab")
 
 
 @pytest.fixture(scope="module")

@@ -76,11 +76,6 @@ def test_frozen_cells_are_what_they_were(row: tuple[str, str, int]) -> None:
 
 
 @pytest.fixture(scope="module")
-def lab() -> CellFile:
-    return load_cell("lab")
-
-
-@pytest.fixture(scope="module")
 def stack() -> Task:
     return load_task("stack_two_cubes")
 
