@@ -103,7 +103,7 @@ class FitConfig:
     """Wall time for initialisation and fit: 60s, 2min or plain seconds; 60s without --iterations.
     With --iterations it is only a limit, none by default: where it strikes first, the scene is
     reported as underfitted. Reading the frames before and all that is made of the scene afterwards
-    come on top; scene.json says how long each took."""
+    come on top."""
     iterations: int = 0
     """Fit exactly this many images: the result is then reproducible, on slow machines too."""
     seed: int = 0
