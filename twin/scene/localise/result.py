@@ -24,7 +24,7 @@ MESH_METHOD = "colour_mesh_icp"
 BOX_METHOD = "colour_box"
 BOXED_M = 0.01
 """A point of a thing that is only boxed in lies this near to the box."""
-REST_TOLERANCE_M = 0.006
+REST_TOLERANCE_M = 0.005
 """Nearer than this to standing on the table counts as standing on it."""
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""

@@ -24,10 +24,10 @@ NOTHING = {
 }
 
 
-def view_from(p_m: list[float]) -> CameraView:
+def view_from(p_m: np.ndarray) -> CameraView:
     """A camera that stands there and looks anywhere."""
     camera = Camera(width=4, height=4, fx=4.0, fy=4.0, cx=2.0, cy=2.0)
-    T = se3.from_rotation(np.eye(3), np.array(p_m))
+    T = se3.from_rotation(np.eye(3), p_m)
     return CameraView(
         camera_id="side",
         stamp_ns=1,
@@ -45,7 +45,7 @@ def view_from(p_m: list[float]) -> CameraView:
 def test_exact_points_give_the_exact_pose_from_a_pose_nearby(seed: int, turn_rad: float) -> None:
     model = replace(load_task("cube_into_box").objects["cube"], size_m=SIZE_M)
     T = pose_of(np.array([0.5, -0.1, SIZE_M[2] / 2, 0.3 * seed]))
-    view = view_from([0.9, -0.5, 0.6])
+    view = view_from(se3.apply(T, np.array([[0.4, -0.4, 0.6]]))[0])  # sees two sides and the top
     surface = mesh_surface(*shape_mesh(model), 20_000)
     seen = surface.p_m[facing(se3.invert(T), view, surface)][3::20]
     cluster = Cluster(p_base=se3.apply(T, seen), view_ids=np.zeros(len(seen), dtype=np.int64))
