@@ -76,8 +76,8 @@ def protocol_of(
     if frames.train_every:
         training = f"frame 0 and every {frames.train_every}th after it, but no held-out one"
     return {
-        "holdout": f"frame {frames.first_holdout} and every {frames.holdout_every}th after it of "
-        f"each camera, at most {frames.max_holdout_frames} in all",
+        "holdout": f"frame {frames.holdout_every // 2} and every {frames.holdout_every}th after it "
+        f"of each camera, at most {frames.max_holdout_frames} in all",
         "training": training,
         "train_frames": sum(len(choice.train_ns) for choice in choices),
         "cameras_from": sorted({SAYS[choice.poses.source] for choice in choices}),
