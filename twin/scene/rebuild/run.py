@@ -6,7 +6,7 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,10 @@ from twin.scene.dataset.training_set import (
     TrainingSet,
     read_training_set,
 )
-from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FitResult, fit
 from twin.scene.frames.selection import Sources, choose_frames, find_sources
-from twin.scene.gaussians import concatenate, write_ply
+from twin.scene.gaussians import write_ply
 from twin.scene.objects.decompose import Decomposition, decompose
 from twin.scene.objects.placement import find_placements, scanned_tasks
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
@@ -42,10 +41,8 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 28
+METHOD_VERSION = 29
 """Counts changes of method that make older scenes out of date."""
-COMPLETION = 0.1
-"""Gaussians for what was seen in colour and never measured, at most, in those of the fit."""
 SEARCHED_SPLATS = 80_000
 """Points of the fused surface in which things are looked for, at most."""
 
@@ -75,11 +72,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     fitted = _fit(training, config, output)
     raster = RasterConfig(threads=config.fit.threads)
-    most = round(COMPLETION * config.initialise.max_splats)
-    completed = complete_holes(fitted.cloud, training.bare_views, most, raster)
-    output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    fitted = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
     links = training.robot.links(config.initialise.max_splats)
     decomposed = decompose(placements, fitted.cloud, training.views_of, output, links.lighting)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
