@@ -306,9 +306,10 @@ def fit_mesh(
     compared.sort(key=lambda item: item[0])
     least, T, shifts = compared[0]
     rivals = [R for score, R, _ in compared[1:] if score < AMBIGUOUS * least]
-    for window_m in () if box is None else (2 * OUTLINE_WINDOW_M, OUTLINE_WINDOW_M):
-        problem = replace(problem, outlines=find_outlines(views, box, T, window_m))
-        T, shifts = _icp(T, shifts, problem, iterations=ITERATIONS, wide=2.0)
+    if box is not None:
+        for window_m in (2 * OUTLINE_WINDOW_M, OUTLINE_WINDOW_M):
+            problem = replace(problem, outlines=find_outlines(views, box, T, window_m))
+            T, shifts = _icp(T, shifts, problem, iterations=ITERATIONS, wide=2.0)
     return _summary(T, shifts, rivals, problem, yaw_period_rad)
 
 
