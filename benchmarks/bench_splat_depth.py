@@ -32,9 +32,7 @@ from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, psnr_db
 from twin.scene.settings import FitConfig, FrameConfig, InitialiseConfig, RebuildConfig
 
 IMAGES = 150
-KITCHEN = FrameConfig(
-    train_every=5, holdout_every=5, holdout_offset=2, max_holdout_frames=30, max_train_frames=100
-)
+KITCHEN = FrameConfig(train_every=5, holdout_every=5, max_holdout_frames=30, max_train_frames=100)
 CLEAN_SPLATS = 140_000
 QUIET = Output(quiet=True)
 CLEAN_MEDIAN_M = 0.5e-3

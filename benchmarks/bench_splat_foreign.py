@@ -53,9 +53,7 @@ FOLDERS = {
     "study": "rgbd_sun3d_studyroom_a",
 }
 NO_IMAGE = np.zeros((1, 1, 3), dtype=np.uint8)
-FRAMES = {
-    "kitchen": FrameConfig(train_every=5, holdout_every=5, holdout_offset=2, max_holdout_frames=4)
-}
+FRAMES = {"kitchen": FrameConfig(train_every=5, holdout_every=5, max_holdout_frames=4)}
 LIST = ROOT / "benchmarks" / "semantics" / "kitchen_objects.json"
 QUESTIONS = LIST.with_name("questions.json")
 

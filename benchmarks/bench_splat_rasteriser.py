@@ -151,7 +151,6 @@ def of_a_sequence(repeats: int) -> Target:
         background=concatenate([seen, guessed]),
         objects={"first": thing, "second": thing},
         links=links,
-        T_root_base=np.eye(4),
     )
     rasteriser = Rasteriser(RasterConfig(threads=1))
     posture = Posture(joints_rad=np.full(len(ROBOT.joints), 0.4), width_m=0.04)

@@ -83,7 +83,7 @@ _TOLD = {
     f"replay {_FIXED}|gate {_FIXED} --max-audit-distances --frames --max-frame-age-s "
     "--max-silence-s --max-joint-age-s --other-scene-m --moved-m --moved-rad|plan --candidates "
     "--policy|publish standin --real-time --execute-unverified --scan-id --first-probe --gate-cell"
-    "|rebuild --slab --harmonics --exposure --densify --loss --flatness --opacity "
+    "|rebuild --slab --harmonics --exposure --densify --loss --flatness --opacity --holdout-offset "
     "--footprint-factor --depth-weight --coarse-fraction --no-densify --appearance-steps": (
         "Nobody set it, so it is a constant of the code now."
     ),

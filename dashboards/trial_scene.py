@@ -16,7 +16,6 @@ from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
-from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.leaves import has_leaf, load_leaf
@@ -124,11 +123,6 @@ class _Gathering:
         """The samples as source stamps."""
         return np.array([self.clock.stamp_ns(t) for t in self.times_s.tolist()], dtype=np.int64)
 
-    @property
-    def T_root_base(self) -> Float[np.ndarray, "4 4"]:
-        """The robot's base in the scene's frame."""
-        return np.eye(4) if self.parts is None else self.parts.T_root_base
-
 
 def gather_scene(
     run: RunFolder,
@@ -200,7 +194,7 @@ def _recorded_side(
         for name, T in tracks.at(stamp_ns, T_base_tcp).items():
             rows.setdefault(name, []).append(T)
     objects = {name: np.stack(Ts) for name, Ts in rows.items()}
-    skeleton = se3.apply(gathering.T_root_base, np.stack(skeletons)) if skeletons else None
+    skeleton = np.stack(skeletons) if skeletons else None
     span_s = (0.0, gathering.clock.end_s)
     return Side(name=RECORDED, span_s=span_s, Ts_base_object=objects, skeleton_m=skeleton)
 
@@ -234,7 +228,7 @@ def _replayed_side(
     if joints is not None and robot is not None and set(robot.joints) <= set(joints.names):
         order = [joints.names.index(name) for name in robot.joints]
         points = [robot.skeleton_m(row) for row in joints.at(own_ns)[:, order]]
-        skeleton = se3.apply(gathering.T_root_base, np.stack(points))
+        skeleton = np.stack(points)
     return Side(
         name=trajectory,
         span_s=(float(ends[0]), float(ends[1])),
@@ -281,8 +275,7 @@ def _links(
     for stamp_ns in gathering.stamps_ns.tolist():
         posture: Posture = postures.at(stamp_ns)
         for link, Ts in rows.items():
-            T_base_link = robot.T_base_link(link, posture.joints_rad, posture.width_m)
-            Ts.append(parts.T_root_base @ T_base_link)
+            Ts.append(robot.T_base_link(link, posture.joints_rad, posture.width_m))
     return {link: np.stack(Ts) for link, Ts in rows.items()}
 
 
@@ -295,8 +288,7 @@ def _paths(
 
     def add(name: str, style: str, t_s: np.ndarray | None, p_m: np.ndarray) -> None:
         if t_s is not None and len(t_s) > 1:
-            p_root_m = se3.apply(gathering.T_root_base, p_m)
-            paths.append(ToolPath(name=name, style=style, t_s=t_s, p_m=p_root_m))
+            paths.append(ToolPath(name=name, style=style, t_s=t_s, p_m=p_m))
 
     for trajectory, replay in replays.items():
         if replay.tcp is not None:

@@ -44,8 +44,8 @@ class GaussianCloud:
     completed: Bool[np.ndarray, " num_splats"] = field(
         default_factory=lambda: np.zeros(0, dtype=bool)
     )
-    """Those that stand for what nobody measured: closed holes, undersides, hidden sides. They are
-    drawn like all others."""
+    """Those that stand for what nobody measured: undersides, hidden sides. They are drawn like all
+    others."""
 
     def __post_init__(self) -> None:
         """A cloud made without harmonics has rows of none, and one without marks was measured."""

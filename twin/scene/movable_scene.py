@@ -8,18 +8,17 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.ndimage import binary_dilation
 
 from bridge.episode.run_folder import RunFolder
-from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.palette import rgb
 from twin.robot.posture import Posture
 from twin.scene.backdrop import Backdrop, read_backdrop
 from twin.scene.fit.lighting import EVEN, Lighting, read_lighting
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
-from twin.scene.objects.decompose import ObjectSplats, read_objects, read_pose, uncovered
+from twin.scene.objects.decompose import ObjectSplats, read_objects, uncovered
 from twin.scene.raster.backend import CudaRasteriser
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.robot.splats import posed, read_links
-from twin.scene.store.folder import SCENE_FILE, Scene
+from twin.scene.store.folder import Scene
 from twin.scene.store.library import NOT_SCANNED
 
 SEEN = 0.5
@@ -93,8 +92,6 @@ class MovableScene:
     objects: Mapping[str, ObjectSplats]
     """Those that are drawn."""
     links: Mapping[str, GaussianCloud]
-    T_root_base: Float[np.ndarray, "4 4"]
-    """The robot's base in the scene's frame."""
     lighting: Lighting = EVEN
     """On the links."""
     backdrop: Backdrop | None = None
@@ -179,20 +176,17 @@ class MovableScene:
 
     def robot_at(self, posture: Posture, urdf: str) -> GaussianCloud:
         """The robot's part of that cloud; there must be links."""
-        return moved_cloud(posed(self.links, posture, urdf, self.lighting), self.T_root_base)
+        return posed(self.links, posture, urdf, self.lighting)
 
 
 def read_movable_scene(
     run: RunFolder, scene: Scene, wanted: Iterable[str] | None = None
 ) -> MovableScene:
     """Load the parts that ``scene.json`` lists, of its objects those that are wanted."""
-    root = scene.record.get("robot", {}).get("T_base_root")
-    T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
     return MovableScene(
         background=scene.background,
         objects=read_objects(run, scene.record, wanted),
         links=read_links(run, scene.record),
-        T_root_base=se3.invert(T_base_root),
         lighting=read_lighting(scene.record),
         backdrop=read_backdrop(run, scene.record),
     )

@@ -40,10 +40,8 @@ class FrameConfig:
     """Learn from every this many frames, whatever they show: a fixed protocol. 0: from the
     stillest frame of each stretch of the camera's path."""
     holdout_every: int = 8
-    """Every this many frames of a camera, one is kept out of everything: initialisation, poses,
-    exposure, fit, objects."""
-    holdout_offset: Annotated[int | None, RARE] = None
-    """Which of them, counted from 0; the one in the middle if not given."""
+    """Every this many frames of a camera, the middle one is kept out of everything: initialisation,
+    poses, exposure, fit, objects."""
     max_holdout_frames: Annotated[int, RARE] = 24
     """Held-out frames to render, spread evenly."""
     max_depth_m: float = 5.0
@@ -57,21 +55,10 @@ class FrameConfig:
 
     def __post_init__(self) -> None:
         """Refuse to hold out every frame, or to learn from none."""
-        least = {"holdout_every": 2, "train_every": 0, "holdout_offset": 0}
+        least = {"holdout_every": 2, "train_every": 0}
         least |= {"max_train_frames": 1, "max_holdout_frames": 1}
         refuse_outside(self, {name: (value, math.inf) for name, value in least.items()})
         refuse_outside(self, {"max_depth_m": (0.1, 1000.0)})
-        if self.first_holdout >= self.holdout_every:
-            message = (
-                f"--holdout-offset {self.first_holdout} lies beyond the first "
-                f"--holdout-every {self.holdout_every} frames; give less."
-            )
-            raise UsageError(message)
-
-    @property
-    def first_holdout(self) -> int:
-        """Index of the first held-out frame of each camera."""
-        return self.holdout_every // 2 if self.holdout_offset is None else self.holdout_offset
 
 
 @Parameter(name="*", group="Initialisation")
@@ -103,7 +90,7 @@ class FitConfig:
     """Wall time for initialisation and fit: 60s, 2min or plain seconds; 60s without --iterations.
     With --iterations it is only a limit, none by default: where it strikes first, the scene is
     reported as underfitted. Reading the frames before and all that is made of the scene afterwards
-    come on top; scene.json says how long each took."""
+    come on top."""
     iterations: int = 0
     """Fit exactly this many images: the result is then reproducible, on slow machines too."""
     seed: int = 0

@@ -267,7 +267,7 @@ def align_robot(
             sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(views)
         ]
         nowhere = np.zeros(2)
-        plane = LevelPlane(T_level_source=start, low_m=nowhere, high_m=nowhere, share=0.0)
+        plane = LevelPlane(T_level_source=start, low_m=nowhere, high_m=nowhere)
         _, around = _polished(views, samples, plane, 0.0, np.zeros(3))
         starts = [ScenePose(T_base_source=T) for T in (start, around)]
     coarse = [_refined(views, surfaces, pose, fine=False, seed=seed) for pose in starts]

@@ -67,8 +67,6 @@ class LevelPlane:
     low_m: Float[np.ndarray, "2"]
     high_m: Float[np.ndarray, "2"]
     """Where its points lie, in x and y of ``level``."""
-    share: float
-    """Part of all points that lie on it."""
 
 
 def find_planes(views: Sequence[RobotView]) -> list[LevelPlane]:
@@ -97,7 +95,7 @@ def find_planes(views: Sequence[RobotView]) -> list[LevelPlane]:
             break
         left &= ~on
         if normal @ up > UPRIGHT or normal @ back > LOOKING_DOWN:
-            planes.append(_level(p[on], normal, offset, eye, float(on.mean())))
+            planes.append(_level(p[on], normal, offset, eye))
     return planes
 
 
@@ -125,9 +123,7 @@ def _largest(
     return normal, offset, on
 
 
-def _level(
-    p: np.ndarray, normal: np.ndarray, offset: float, eye: np.ndarray, share: float
-) -> LevelPlane:
+def _level(p: np.ndarray, normal: np.ndarray, offset: float, eye: np.ndarray) -> LevelPlane:
     aside = np.eye(3)[int(np.argmin(np.abs(normal)))]
     x = np.cross(aside, normal)
     x /= np.linalg.norm(x)
@@ -135,4 +131,4 @@ def _level(
     T = se3.from_rotation(R, -R @ (eye - normal * (normal @ eye - offset)))
     xy = se3.apply(T, p)[:, :2]
     low, high = np.quantile(xy, [0.02, 0.98], axis=0)
-    return LevelPlane(T_level_source=T, low_m=low, high_m=high, share=share)
+    return LevelPlane(T_level_source=T, low_m=low, high_m=high)

@@ -22,7 +22,7 @@ from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, NoFramesError, load
 from twin.scene.objects.placement import NO_OBJECTS, Placements
-from twin.scene.robot.extraction import MAX_POSTURES, FoundRobot, find_robot
+from twin.scene.robot.extraction import MAX_POSTURES, RobotFrames, find_robot
 from twin.scene.settings import RebuildConfig
 
 MAX_POINTS = 3_000_000
@@ -47,7 +47,7 @@ class TrainingSet:
     """By index of the choice: what moves with a camera whose robot is not known by joints."""
     reference_views: list[ReferenceView]
     report: ScanReport
-    robot: FoundRobot
+    robot: RobotFrames
 
     def views_of(self, episode: Episode) -> list[TrainingView]:
         """Those of one episode."""
@@ -83,7 +83,7 @@ def read_training_set(
 
     Objects that stand elsewhere in another episode did not move while they were looked at.
     """
-    robot = find_robot(choices, output)
+    robot = find_robot(choices)
     read = _read(choices, config, robot, output)
     if not read.views:
         message = "no frame of this run has colour, depth and a pose together. Record it again."
@@ -93,7 +93,7 @@ def read_training_set(
     report = replace(report, found=(*report.found, *_colour_remarks(read)))
     stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
     for choice in choices:
-        robot.frames.look_closer(choice, limits_of(config), stride)
+        robot.look_closer(choice, limits_of(config), stride)
     ego_masks = _set_ego_pixels_aside(choices, read, robot)
     shares = {read.cameras[index].name: float(mask.mean()) for index, mask in ego_masks.items()}
     points, views, choice_of_view = read.points, read.views, read.choice_of_view
@@ -135,7 +135,7 @@ def read_training_set(
 
 
 def _read(
-    choices: Sequence[FrameChoice], config: RebuildConfig, robot: FoundRobot, output: Output
+    choices: Sequence[FrameChoice], config: RebuildConfig, robot: RobotFrames, output: Output
 ) -> _Read:
     """Read every training frame once, the robot set aside where its joints are known."""
     total = sum(len(choice.train_ns) for choice in choices)
@@ -148,7 +148,7 @@ def _read(
                 surface = FrameSurface(frame, limits_of(config))
                 seen = surface.points(_stride(total, frame.depth_m.size))
                 view = training_view(surface)
-                seen, view = robot.frames.take_out(choice.episode, frame, seen, view)
+                seen, view = robot.take_out(choice.episode, frame, seen, view)
                 read.points.append(seen)
                 read.views.append(view)
                 read.choice_of_view.append(index)
@@ -172,12 +172,12 @@ def _colour_remarks(read: _Read) -> list[str]:
 
 
 def _set_ego_pixels_aside(
-    choices: Sequence[FrameChoice], read: _Read, robot: FoundRobot
+    choices: Sequence[FrameChoice], read: _Read, robot: RobotFrames
 ) -> dict[int, Bool[np.ndarray, "height width"]]:
     """Take out of points and views what moves with a camera, where no joints tell the robot."""
     found: dict[int, np.ndarray] = {}
     for index, choice in enumerate(choices):
-        if choice.stationary or robot.frames.knows(choice.episode):
+        if choice.stationary or robot.knows(choice.episode):
             continue
         mine = [place for place, owner in enumerate(read.choice_of_view) if owner == index]
         mask = find_ego_mask([read.views[place] for place in mine])

@@ -3,11 +3,10 @@
 Measurements of one surface by many views scatter by more than a voxel: noise, and poses that are
 off. Voxels then lie in several layers one behind the other, each view meets the front one first,
 and depth comes out too near. So each voxel is moved along its normal to where the views measured
-the surface on average, and layers that coincide then become one.
+the surface on average.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int8
@@ -57,8 +56,7 @@ def fuse(points: list[PointSet], most: int, views: Sequence[TrainingView] = ()) 
     p = np.concatenate([item.p_m for item in points])
     if len(p) < MIN_POINTS:
         raise NoSurfaceError(_no_surface(len(p)))
-    origin = p.min(axis=0)
-    p -= origin
+    p -= p.min(axis=0)
     wanted = np.float32(FOOTPRINTS) * np.concatenate([item.footprint_m for item in points])
     base = float(np.quantile(wanted, 0.05))
     level = np.clip(np.rint(np.log2(wanted / np.float32(base))), 0, MAX_LEVEL).astype(np.int8)
@@ -74,67 +72,38 @@ def fuse(points: list[PointSet], most: int, views: Sequence[TrainingView] = ()) 
         _average([getattr(item, name) for item in points], inverse, kept, count)
         for name in ("p_m", "normals", "colors")
     )
-    voxels = _Voxels(means=means, normals=normals, colors=colors, count=count, sizes=sizes[kept])
     if len(views) > 0:
-        voxels = voxels.settled(views).merged(origin)
-    cloud = flat_gaussians(voxels.means, voxels.normals, voxels.colors, voxels.sizes)
+        means = _settled(means, normals, views)
+    cloud = flat_gaussians(means, normals, colors, sizes[kept])
     return cloud.take(morton_order(cloud.means_m))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Voxels:
-    """What was averaged in each voxel."""
+def _settled(
+    means: Float[np.ndarray, "num_voxels 3"],
+    normals: Float[np.ndarray, "num_voxels 3"],
+    views: Sequence[TrainingView],
+) -> Float[np.ndarray, "num_voxels 3"]:
+    """Voxels moved along their normals to the mean of what the views measured there.
 
-    means: Float[np.ndarray, "num_voxels 3"]
-    normals: Float[np.ndarray, "num_voxels 3"]
-    """Of any length."""
-    colors: Float[np.ndarray, "num_voxels 3"]
-    count: np.ndarray
-    sizes: Float[np.ndarray, " num_voxels"]
-
-    def settled(self, views: Sequence[TrainingView]) -> "_Voxels":
-        """Moved along their normals to the mean of what the views measured there.
-
-        Near measurements and those seen straight on count more, as the noise of depth cameras
-        grows with the square of the distance.
-        """
-        unit = self.normals / np.maximum(np.linalg.norm(self.normals, axis=1, keepdims=True), 1e-9)
-        means, normals = as_float32(self.means), as_float32(unit)
-        for _ in range(SETTLE_ROUNDS):
-            seen = list(_measured_offsets(means, normals, views))
-            scatter = np.concatenate([np.abs(off_m) / depth_m for _, off_m, depth_m, _ in seen])
-            if len(scatter) == 0:
-                break
-            limit = SETTLE_SIGMA * 1.4826 * np.median(scatter)
-            total, weights = (np.zeros(len(means), np.float32) for _ in range(2))
-            for voxel, off_m, depth_m, cosine in seen:
-                weight = cosine / np.square(depth_m)
-                weight *= np.abs(off_m) <= limit * depth_m
-                total[voxel] += weight * off_m
-                weights[voxel] += weight
-            means += (total / np.where(weights > 0, weights, 1.0))[:, None] * normals
-        return replace(self, means=means.astype(np.float64))
-
-    def merged(self, origin: Float[np.ndarray, "3"]) -> "_Voxels":
-        """One for all that now lie in the same voxel of their size."""
-        level = np.rint(np.log2(self.sizes / self.sizes.min())).astype(np.int64)
-        cell = np.floor((self.means - origin) / self.sizes[:, None]).astype(np.int64)
-        _, first, inverse = np.unique(
-            _pack(np.maximum(cell, 0), level), return_index=True, return_inverse=True
-        )
-        weight = np.bincount(inverse, weights=self.count)
-
-        def mean(rows: np.ndarray) -> np.ndarray:
-            columns = [np.bincount(inverse, weights=self.count * rows[:, k]) for k in range(3)]
-            return np.stack(columns, axis=1) / weight[:, None]
-
-        return _Voxels(
-            means=mean(self.means),
-            normals=mean(self.normals),
-            colors=mean(self.colors),
-            count=weight,
-            sizes=self.sizes[first],
-        )
+    Near measurements and those seen straight on count more, as the noise of depth cameras grows
+    with the square of the distance.
+    """
+    unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    means, unit = as_float32(means), as_float32(unit)
+    for _ in range(SETTLE_ROUNDS):
+        seen = list(_measured_offsets(means, unit, views))
+        scatter = np.concatenate([np.abs(off_m) / depth_m for _, off_m, depth_m, _ in seen])
+        if len(scatter) == 0:
+            break
+        limit = SETTLE_SIGMA * 1.4826 * np.median(scatter)
+        total, weights = (np.zeros(len(means), np.float32) for _ in range(2))
+        for voxel, off_m, depth_m, cosine in seen:
+            weight = cosine / np.square(depth_m)
+            weight *= np.abs(off_m) <= limit * depth_m
+            total[voxel] += weight * off_m
+            weights[voxel] += weight
+        means += (total / np.where(weights > 0, weights, 1.0))[:, None] * unit
+    return means.astype(np.float64)
 
 
 def _measured_offsets(

@@ -299,7 +299,7 @@ def _choose(
             "was not recorded. Record them synchronised."
         )
         raise UnusableCameraError(message)
-    held = stamps[config.first_holdout :: config.holdout_every]
+    held = stamps[config.holdout_every // 2 :: config.holdout_every]
     poses = find_poses(
         episode, camera_id, stamps, frozenset(held.tolist()), config, output, calibration
     )

@@ -1,9 +1,9 @@
-"""Lay a known mesh onto points: multi-start ICP with one camera error per view.
+"""Lay a known surface onto points: multi-start ICP with one camera error per view.
 
-Point to plane (Chen and Medioni 1992) with Tukey weights against those parts of the mesh that face
-the camera of each point. Of several starts the one wins that explains the points and does not
-claim surface where a camera saw through. Meshes come from the task, or from the scene where an
-object's shape is only known from a scan.
+Point to plane (Chen and Medioni 1992) with Tukey weights against those parts of the surface that
+face the camera of each point. Of several starts the one wins that explains the points and does not
+claim surface where a camera saw through; boxes are then laid onto their outlines as well. Surfaces
+come from the task, or from the scene where an object's shape is only known from a scan.
 """
 
 import json
@@ -20,29 +20,21 @@ from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.geometry.mesh import sample_triangles
-from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.scene.frames.downscaled import pixels_of
 from twin.scene.least_squares import normal_equations, tukey_weights
+from twin.scene.localise.outline import Outline, find_outlines, outline_distances
 from twin.scene.localise.points import CameraView, Cluster
-from twin.scene.localise.shape_fit import (
-    CAMERA_SIGMA_M,
-    CAMERA_SIGMA_RAD,
-    ITERATIONS,
-    MAX_POINTS,
-    POINT_SIGMA_M,
-    SHARED_ERROR,
-    TUKEY_M,
-    ShapeFit,
-)
 from twin.scene.shape.files import MESH, TASK_SHAPE
-from twin.scene.shape.known import pose_of
+from twin.scene.shape.known import pose_of, shape_mesh, starts, yaw_period_rad
 from twin.scene.shape.mesh import face_normals, read_mesh
 from twin.scene.store.folder import UnreadableSceneError, read_record
 from twin.scene.store.library import Library
 
 NUM_SAMPLES = 2500
 """Points on the surface of a mesh."""
+BOX_SAMPLES = 7500
+"""The same of a box: its walls are thin."""
 FACING = 0.15
 """Cosine below which a camera hardly sees a surface."""
 
@@ -74,9 +66,8 @@ def mesh_surface(
 
 @cache
 def known_surface(model: ObjectModel, num_samples: int = NUM_SAMPLES) -> MeshSurface:
-    """Surface of the mesh that the task file names."""
-    mesh = object_mesh(model)
-    return mesh_surface(mesh.vertices_m, mesh.triangles, num_samples)
+    """Surface of the shape that the task file states."""
+    return mesh_surface(*shape_mesh(model), num_samples)
 
 
 def facing(
@@ -179,8 +170,32 @@ def scanned_surfaces(run: RunFolder, task: Task) -> ScannedSurfaces:
     return found
 
 
+POINT_SIGMA_M = 0.002
+"""Standard error of one voxel-averaged point."""
+TUKEY_M = 0.008
+"""Residuals beyond this have no say."""
+ITERATIONS = 12
+MIN_EXPLAINED = 0.6
+"""Share of an object's points that its shape must explain."""
+SHARED_ERROR = 9.0
+"""Neighbouring pixels share their error: this many count as one."""
+CAMERA_SIGMA_M = 0.002
+"""Prior of a camera's position error, per axis."""
+CAMERA_SIGMA_RAD = 0.004
+"""Prior of a camera's rotation error, per axis; it acts through the distance."""
+UPRIGHT_SIGMA_RAD = 0.02
+"""Prior of roll and pitch of what stands."""
+MAX_POINTS = 1500
+"""Enough for the fit; more are thinned out evenly."""
+OUTLINE_WINDOW_M = 0.012
+"""Edges farther than this from the nominal outline belong to something else."""
+LEVEL_RAD = 1e-5
+"""Prior of roll and pitch of a box: they are not estimated."""
+
 _POSE = 6
 _PER_VIEW = 2
+_STEPS = (1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3)
+"""For the derivatives of outlines: metres, then radians."""
 _SIDES = [
     Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     for angles in ((0, 0, 0), (90, 0, 0), (-90, 0, 0), (180, 0, 0), (0, 90, 0), (0, -90, 0))
@@ -201,11 +216,18 @@ the covariance then covers both."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeshFit(ShapeFit):
-    """A mesh laid onto points."""
+class MeshFit:
+    """A surface laid onto what was seen."""
 
+    T_base_object: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]
+    """Of (x, y, z, rotation about x, y, z), base frame [m^2, m rad, rad^2]."""
+    residual_m: float
+    """Root mean square distance of the explained points to the surface."""
+    explained: float
+    """Share of points within the Tukey bound."""
     seen_through: float
-    """Share of the mesh's facing surface that cameras saw through."""
+    """Share of the facing surface that cameras saw through."""
     score: float
     """Lower is better."""
 
@@ -220,6 +242,7 @@ class _Problem:
     tilt_sigma_rad: float
     prior: Float[np.ndarray, " num_shifts"]
     """Information of each view's shift in x and y."""
+    outlines: Sequence[Outline] = ()
 
 
 def fit_mesh(
@@ -230,8 +253,9 @@ def fit_mesh(
     tilt_sigma_rad: float,
     yaw_period_rad: float = 2 * np.pi,
     lying: bool = False,
+    box: ObjectModel | None = None,
 ) -> MeshFit:
-    """Find the pose at which a mesh best agrees with what was seen.
+    """Find the pose at which a surface best agrees with what was seen.
 
     It starts upright in turns about the vertical, the middle over that of the points, the tops at
     one height.
@@ -240,6 +264,8 @@ def fit_mesh(
         views: What the cameras saw, in the order of the cluster's ``view_ids``.
         tilt_sigma_rad: Prior of roll and pitch: small for what stands, large for what may lie.
         lying: Try all six sides, each in half as many turns.
+        box: It starts along the smallest rectangle around the points instead, and is laid onto
+            its outlines in a shrinking window.
     """
     cluster = cluster.thinned(MAX_POINTS)
     centre = cluster.p_base.mean(axis=0)
@@ -264,13 +290,43 @@ def fit_mesh(
         points=few.by_view(len(views)),
     )
     sides, count = (_SIDES, NUM_STARTS // 2) if lying else (_SIDES[:1], NUM_STARTS)
-    first = [T for side in sides for T in _starts(problem, count, side, yaw_period_rad)]
-    tried = [_icp(T, coarse, iterations=6, wide=4.0)[0] for T in first]
-    unshifted = np.zeros((len(coarse.views), _PER_VIEW))
+    if box is None:
+        first = [T for side in sides for T in _starts(problem, count, side, yaw_period_rad)]
+    else:
+        first = [pose_of(state) for state in starts(cluster.p_base, box)]
+    unshifted = np.zeros((len(views), _PER_VIEW))
+    tried = [_icp(T, unshifted, coarse, iterations=6, wide=4.0)[0] for T in first]
     scores = [_score(T, unshifted, coarse)[0] for T in tried]
     best = [tried[index] for index in np.argsort(scores)[:NUM_REFINED]]
-    ends = [_icp(T, problem, iterations=ITERATIONS, wide=2.0) for T in best]
-    return _choose(ends, problem, yaw_period_rad)
+    ends = [_icp(T, unshifted, problem, iterations=ITERATIONS, wide=2.0) for T in best]
+    # With each camera where the fit found it: what cameras are off by makes every pose look bad,
+    # the right one too. With it, one that is turned by 50 degrees scores within a tenth of the
+    # right one; without, four times as high.
+    compared = [(_score(T, shifts, problem)[0], T, shifts) for T, shifts in ends]
+    compared.sort(key=lambda item: item[0])
+    least, T, shifts = compared[0]
+    rivals = [R for score, R, _ in compared[1:] if score < AMBIGUOUS * least]
+    if box is not None:
+        for window_m in (2 * OUTLINE_WINDOW_M, OUTLINE_WINDOW_M):
+            problem = replace(problem, outlines=find_outlines(views, box, T, window_m))
+            T, shifts = _icp(T, shifts, problem, iterations=ITERATIONS, wide=2.0)
+    return _summary(T, shifts, rivals, problem, yaw_period_rad)
+
+
+def fit_box(cluster: Cluster, views: Sequence[CameraView], model: ObjectModel) -> MeshFit:
+    """Find the pose of a box that stands, open or not, by its points and outlines."""
+    fit = fit_mesh(
+        cluster,
+        views,
+        known_surface(model, BOX_SAMPLES),
+        tilt_sigma_rad=LEVEL_RAD,
+        yaw_period_rad=yaw_period_rad(model),
+        box=model,
+    )
+    T, covariance = fit.T_base_object, fit.covariance
+    covariance[[3, 4], [3, 4]] = UPRIGHT_SIGMA_RAD**2
+    level = pose_of(np.array([*T[:3, 3], np.arctan2(T[1, 0], T[0, 0])]))
+    return replace(fit, T_base_object=level, covariance=covariance)
 
 
 def _starts(
@@ -320,6 +376,22 @@ def _residuals(
     return np.concatenate(rows), np.concatenate(jacobians), np.concatenate(ids)
 
 
+def _outline_residuals(
+    T: Float[np.ndarray, "4 4"], shifts: Float[np.ndarray, "num_views 2"], outline: Outline
+) -> tuple[Float[np.ndarray, " num_edges"], Float[np.ndarray, "num_edges 8"], np.ndarray]:
+    """The same for the edges of one outline; derivatives by small steps."""
+    moved = T.copy()
+    moved[:2, 3] += shifts[outline.view_id]
+    r, columns = outline_distances(outline, moved), []
+    for axis, step in enumerate(np.diag(_STEPS)):
+        beside = moved.copy()
+        beside[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ moved[:3, :3]
+        beside[:3, 3] += step[:3]
+        columns.append((outline_distances(outline, beside) - r) / _STEPS[axis])
+    J = np.column_stack([*columns, *columns[:_PER_VIEW]])
+    return r, J, np.full(len(r), outline.view_id)
+
+
 def _pose_equations(
     T: Float[np.ndarray, "4 4"],
     shifts: Float[np.ndarray, "num_views 2"],
@@ -327,13 +399,17 @@ def _pose_equations(
     bound_m: float,
     damping: Float[np.ndarray, "6"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return H, the gradient and the residuals."""
-    r, J8, ids = _residuals(T, shifts, problem)
+    """Return H, the gradient and the residuals of the points."""
+    rows = [_residuals(T, shifts, problem)]
+    rows += [_outline_residuals(T, shifts, outline) for outline in problem.outlines]
+    r, J8, ids = (np.concatenate([row[k] for row in rows]) for k in range(3))
+    sigmas_m = [POINT_SIGMA_M, *(outline.sigma_m for outline in problem.outlines)]
+    sigma_m = np.repeat(sigmas_m, [len(row[0]) for row in rows])
     J = np.zeros((len(r), _POSE + shifts.size))
     J[:, :_POSE] = J8[:, :_POSE]
     for axis in range(_PER_VIEW):
         J[np.arange(len(r)), _POSE + _PER_VIEW * ids + axis] = J8[:, _POSE + axis]
-    weight = tukey_weights(r, bound_m) / POINT_SIGMA_M**2 / SHARED_ERROR
+    weight = tukey_weights(r, bound_m) / sigma_m**2 / SHARED_ERROR
     H, gradient = normal_equations(J, r, weight)
     H += np.diag(np.concatenate([damping, problem.prior]))
     gradient[_POSE:] += problem.prior * shifts.ravel()
@@ -342,14 +418,18 @@ def _pose_equations(
     up = T[:3, 2]
     H[[3, 4], [3, 4]] += information
     gradient[3:5] += information * np.array([-up[1], up[0]])
-    return H, gradient, r
+    return H, gradient, rows[0][0]
 
 
 def _icp(
-    T: Float[np.ndarray, "4 4"], problem: _Problem, *, iterations: int, wide: float
+    T: Float[np.ndarray, "4 4"],
+    shifts: Float[np.ndarray, "num_views 2"],
+    problem: _Problem,
+    *,
+    iterations: int,
+    wide: float,
 ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "num_views 2"]]:
     """Gauss-Newton with correspondences anew in each step and a bound that shrinks."""
-    shifts = np.zeros((len(problem.views), _PER_VIEW))
     damping = 1 / np.array([0.03, 0.03, 0.03, 0.3, 0.3, 0.3]) ** 2
     for iteration in range(iterations):
         bound = TUKEY_M * max(1.0, wide * (1 - iteration / max(iterations - 2, 1)))
@@ -376,28 +456,21 @@ def _score(
     return misfit + through, through
 
 
-def _choose(
-    ends: Sequence[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "num_views 2"]]],
+def _summary(
+    T: Float[np.ndarray, "4 4"],
+    shifts: Float[np.ndarray, "num_views 2"],
+    rivals: Sequence[Float[np.ndarray, "4 4"]],
     problem: _Problem,
     period_rad: float,
 ) -> MeshFit:
-    # With each camera where the fit found it: what cameras are off by makes every pose look bad,
-    # the right one too. With it, one that is turned by 50 degrees scores within a tenth of the
-    # right one; without, four times as high.
-    compared = [(_score(T, shifts, problem)[0], T, shifts) for T, shifts in ends]
-    compared.sort(key=lambda item: item[0])
-    least, T, shifts = compared[0]
     # Limits on what is told were set with the cameras where they are said to be.
     score, through = _score(T, np.zeros_like(shifts), problem)
-    others = [(value, _turn(T[:3, :3].T @ R[:3, :3], period_rad)) for value, R, _ in compared[1:]]
-    rivals = [(value, angle) for value, angle in others if angle > np.radians(30)]
+    turns_rad = [_turn(T[:3, :3].T @ R[:3, :3], period_rad) for R in rivals]
     weak = 1 / np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0]) ** 2
     H, _, r = _pose_equations(T, shifts, problem, TUKEY_M, weak)
     covariance = np.linalg.inv(H)[:_POSE, :_POSE].copy()
     covariance[2, 2] += CAMERA_SIGMA_M**2
-    for value, angle in rivals:
-        if value < AMBIGUOUS * least:
-            covariance[5, 5] += (angle / 2) ** 2
+    covariance[5, 5] += sum((turn / 2) ** 2 for turn in turns_rad if turn > np.radians(30))
     near = np.abs(r) < TUKEY_M
     return MeshFit(
         T_base_object=T,

@@ -20,7 +20,14 @@ from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.scene.least_squares import normal_equations, tukey_weights
-from twin.scene.localise.mesh_fit import MeshSurface, fit_mesh, known_surface
+from twin.scene.localise.mesh_fit import (
+    MIN_EXPLAINED,
+    UPRIGHT_SIGMA_RAD,
+    MeshSurface,
+    fit_box,
+    fit_mesh,
+    known_surface,
+)
 from twin.scene.localise.points import (
     MIN_HEIGHT_M,
     MIN_LIKENESS,
@@ -37,7 +44,6 @@ from twin.scene.localise.result import (
     found_by_fit,
     missing,
 )
-from twin.scene.localise.shape_fit import MIN_EXPLAINED, UPRIGHT_SIGMA_RAD, ShapeFit, fit_shape
 from twin.scene.localise.soft import LEAST_HEIGHT_M, SoftFit, fit_toys
 from twin.scene.shape.known import yaw_period_rad
 
@@ -222,9 +228,8 @@ def _localise_one(
         boxed = found_by_box(model, groups[0].p_base, stamp_ns, detail)
         reason = _misfit(model, boxed.confidence, seen, "into the box")
         return missing(model, stamp_ns, reason, detail) if reason else boxed
-    fit: ShapeFit
     if scanned is None:
-        fit, onto = fit_shape(groups[0], views, model), "the shape"
+        fit, onto = fit_box(groups[0], views, model), "the shape"
     else:
         onto = "the mesh"
         fit = fit_mesh(

@@ -9,9 +9,8 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.task.record import check_record
-from bridge.task.task_file import ObjectModel
+from bridge.task.task_file import SCANNED, ObjectModel
 from twin.scene.localise.mesh_fit import MeshFit
-from twin.scene.localise.shape_fit import ShapeFit
 from twin.scene.shape.known import (
     pose_of,
     rectangle_yaw_rad,
@@ -25,7 +24,7 @@ MESH_METHOD = "colour_mesh_icp"
 BOX_METHOD = "colour_box"
 BOXED_M = 0.01
 """A point of a thing that is only boxed in lies this near to the box."""
-REST_TOLERANCE_M = 0.006
+REST_TOLERANCE_M = 0.005
 """Nearer than this to standing on the table counts as standing on it."""
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
@@ -91,16 +90,15 @@ def _of(
 
 
 def found_by_fit(
-    model: ObjectModel, fit: ShapeFit, stamp_ns: int, detail: dict[str, Any]
+    model: ObjectModel, fit: MeshFit, stamp_ns: int, detail: dict[str, Any]
 ) -> LocalisedObject:
     """Turn a fitted mesh or shape into a result; what nearly stands on the table stands on it."""
     T = fit.T_base_object.copy()
     lift_m = float(T[2, 3]) - model.rest_height_m
     detail |= {"residual_m": fit.residual_m, "lift_m": lift_m}
-    confidence, method = fit.explained, METHOD
-    if isinstance(fit, MeshFit):
-        detail["seen_through_fraction"] = fit.seen_through
-        confidence, method = fit.explained * (1 - fit.seen_through), MESH_METHOD
+    detail["seen_through_fraction"] = fit.seen_through
+    confidence = fit.explained * (1 - fit.seen_through)
+    method = METHOD if model.mesh is None and model.shape != SCANNED else MESH_METHOD
     is_upright = bool(T[2, 2] > UPRIGHT)
     if model.soft is None and is_upright:
         T = turned_alike(T, np.eye(4), model)

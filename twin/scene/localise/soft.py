@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from twin.scene.localise.mesh_fit import (
+    MIN_EXPLAINED,
     SEE_THROUGH_M,
     MeshFit,
     MeshSurface,
@@ -35,7 +36,6 @@ from twin.scene.localise.points import (
     object_points,
     voxel_mean,
 )
-from twin.scene.localise.shape_fit import MIN_EXPLAINED
 from twin.scene.shape.known import surface_distances
 
 LEAST_HEIGHT_M = 0.006

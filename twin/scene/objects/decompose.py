@@ -334,14 +334,6 @@ def read_objects(
 
 def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     try:
-        return read_pose(json.loads(path.read_text())["T_base_object"], path)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return se3.pose_from_record(json.loads(path.read_text())["T_base_object"])
+    except (OSError, ValueError, KeyError, TypeError, InvalidRecordError) as error:
         raise UnreadableSceneError(path=path, found=f"no pose ({error!r})") from error
-
-
-def read_pose(pose: Any, path: Path) -> Float[np.ndarray, "4 4"]:
-    """Turn ``p_m`` and ``q_wxyz`` of a scene's JSON file into a transform."""
-    try:
-        return se3.pose_from_record(pose)
-    except InvalidRecordError as error:
-        raise UnreadableSceneError(path=path, found=f"a pose that is none: {pose}") from error

@@ -183,7 +183,9 @@ class CudaRasteriser:
         R, p = T_camera_base[:3, :3], leaves["means_m"] @ T_camera_base[:3, :3].T
         x, y, z = (p + T_camera_base[:3, 3]).unbind(dim=1)
         z = z.clamp(min=NEAR_M)
-        shape = R @ self._rotations(leaves["quats_wxyz"]) * leaves["scales_log"].exp()[:, None]
+        turns = se3.rotation_from_quaternion(leaves["quats_wxyz"].cpu().numpy().astype(np.float64))
+        turned = torch.tensor(turns.astype(np.float32), device=self._device)
+        shape = R @ turned * leaves["scales_log"].exp()[:, None]
         across_x = camera.fx / z[:, None] * (shape[:, 0] - (x / z)[:, None] * shape[:, 2])
         across_y = camera.fy / z[:, None] * (shape[:, 1] - (y / z)[:, None] * shape[:, 2])
         A = torch.stack([across_x, across_y], dim=1)
@@ -192,15 +194,6 @@ class CudaRasteriser:
         u = camera.fx * x / z + camera.cx - camera.width / 2
         v = camera.fy * y / z + camera.cy - camera.height / 2
         return torch.stack([z - slope[:, 0] * u - slope[:, 1] * v, *slope.unbind(dim=1)], dim=1)
-
-    def _rotations(self, quats_wxyz: Any) -> Any:
-        w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=1, keepdim=True)).unbind(dim=1)
-        rows = [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ]
-        return self._torch.stack(rows, dim=1).reshape(-1, 3, 3)
 
     def _colors(self, leaves: dict[str, Any], centre: Any) -> Any:
         """Colours as seen from the camera."""

@@ -1,9 +1,6 @@
 """What ``scene.json`` says: where the scene came from, how it was made, how good it is."""
 
 import math
-import resource
-import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -18,37 +15,6 @@ from twin.scene.settings import RebuildConfig
 from twin.scene.store.folder import BACKGROUND, SCENE_VERSION
 
 
-class Clock:
-    """What a rebuild took so far, stage by stage."""
-
-    def __init__(self) -> None:
-        """Begin."""
-        self._wall = self._lap = time.monotonic()
-        self._cpu = time.process_time()
-        self._stages_s: dict[str, float] = {}
-
-    def end(self, stage: str) -> None:
-        """A stage is over; the next one begins."""
-        now = time.monotonic()
-        self._stages_s[stage] = round(now - self._lap, 2)
-        self._lap = now
-
-    def to_record(self) -> dict[str, Any]:
-        """What ``scene.json`` says: wall and CPU time, memory, wall time of each stage."""
-        return {
-            "seconds": round(time.monotonic() - self._wall, 2),
-            "cpu_seconds": round(time.process_time() - self._cpu, 2),
-            "peak_memory_mb": round(peak_memory_mb()),
-            "stages_s": dict(self._stages_s),
-        }
-
-
-def peak_memory_mb() -> float:
-    """Most memory this process ever held resident, in 10^6 bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
-
-
 def make_record(
     *,
     key: str,
@@ -61,7 +27,7 @@ def make_record(
     views: Mapping[str, Any],
     num_background: int,
     num_completed: int,
-    cost: Mapping[str, Any],
+    seconds: float,
 ) -> dict[str, Any]:
     """Put together the content of ``scene.json``."""
     settings = asdict(config)
@@ -96,8 +62,7 @@ def make_record(
             else round(min(fitted.train_psnr_db, MOST_DB), 3),
         },
         "views": dict(views),
-        "cost": dict(cost),
-        "seconds": cost["seconds"],
+        "seconds": round(seconds, 2),
         "software": provenance.software(),
     }
 
@@ -111,8 +76,8 @@ def protocol_of(
     if frames.train_every:
         training = f"frame 0 and every {frames.train_every}th after it, but no held-out one"
     return {
-        "holdout": f"frame {frames.first_holdout} and every {frames.holdout_every}th after it of "
-        f"each camera, at most {frames.max_holdout_frames} in all",
+        "holdout": f"frame {frames.holdout_every // 2} and every {frames.holdout_every}th after it "
+        f"of each camera, at most {frames.max_holdout_frames} in all",
         "training": training,
         "train_frames": sum(len(choice.train_ns) for choice in choices),
         "cameras_from": sorted({SAYS[choice.poses.source] for choice in choices}),
@@ -139,7 +104,7 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
 
 def describe_scene(record: Mapping[str, Any]) -> str:
     """Say in a few lines what was rebuilt and how well."""
-    fitted, cost = record["fit"], record["cost"]
+    fitted = record["fit"]
     asked = fitted["iterations_asked"]
     of_asked = "" if asked is None else f" of {asked}"
     lines = [
@@ -151,8 +116,7 @@ def describe_scene(record: Mapping[str, Any]) -> str:
             if fitted["train_psnr_db"] is None
             else f", training PSNR {fitted['train_psnr_db']:.2f} dB where nothing moved"
         ),
-        f"took {cost['seconds']:.0f} s, {cost['cpu_seconds']:.0f} CPU seconds, "
-        f"{cost['peak_memory_mb']} MB at most",
+        f"took {record['seconds']:.0f} s",
     ]
     lines += [
         f"camera {item['id']} of {item['episode']}: {item['train_frames']} training frames, "

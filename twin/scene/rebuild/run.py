@@ -6,7 +6,7 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +21,14 @@ from twin.scene.dataset.training_set import (
     TrainingSet,
     read_training_set,
 )
-from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FitResult, fit
 from twin.scene.frames.selection import Sources, choose_frames, find_sources
-from twin.scene.gaussians import concatenate, write_ply
+from twin.scene.gaussians import write_ply
 from twin.scene.objects.decompose import Decomposition, decompose
 from twin.scene.objects.placement import find_placements, scanned_tasks
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
-from twin.scene.rebuild.record import Clock, make_record, protocol_of
+from twin.scene.rebuild.record import make_record, protocol_of
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
 from twin.scene.robot.extraction import LitLinks, write_robot
 from twin.scene.settings import DEFAULT_BUDGET_S, RebuildConfig
@@ -42,10 +41,8 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 28
+METHOD_VERSION = 29
 """Counts changes of method that make older scenes out of date."""
-COMPLETION = 0.1
-"""Gaussians for what was seen in colour and never measured, at most, in those of the fit."""
 SEARCHED_SPLATS = 80_000
 """Points of the fused surface in which things are looked for, at most."""
 
@@ -68,31 +65,20 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     if done is not None:
         output.say("the scene is up to date (same episodes, same settings); --force redoes it")
         return done
-    clock = Clock()
+    began_s = time.monotonic()
     chosen = choose_frames(sources, config.frames, output, calibration)
     placements = find_placements(sources, chosen.choices, output)
-    clock.end("find_objects")
     training = read_training_set(chosen.choices, config, output, placements)
-    clock.end("read")
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     fitted = _fit(training, config, output)
-    clock.end("initialise_and_fit")
     raster = RasterConfig(threads=config.fit.threads)
-    most = round(COMPLETION * config.initialise.max_splats)
-    completed = complete_holes(fitted.cloud, training.bare_views, most, raster)
-    output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
-    clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    fitted = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
-    links = training.robot.frames.links(config.initialise.max_splats)
+    links = training.robot.links(config.initialise.max_splats)
     decomposed = decompose(placements, fitted.cloud, training.views_of, output, links.lighting)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
-    clock.end("decompose")
     backdrop = backdrop_of(fitted.cloud, training.bare_views, Rasteriser(raster))
     views = _hold_out(run, training, fitted, backdrop, decomposed, links, config, output)
-    clock.end("held_out_views")
     extras = _write_parts(run, sources, training, decomposed, links, config, output)
-    clock.end("objects_and_semantics")
     record = make_record(
         key=key,
         scene_hash=background_hash(run),
@@ -104,7 +90,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         views=views,
         num_background=len(decomposed.background),
         num_completed=int(decomposed.background.completed.sum()),
-        cost=clock.to_record(),
+        seconds=time.monotonic() - began_s,
     )
     record |= extras | {"backdrop": backdrop.write(run.scene_dir)}
     write_record(run, record)

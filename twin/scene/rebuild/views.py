@@ -130,7 +130,7 @@ def _rendered(
     scene, num_background = job.scenes.as_seen_in(choice.episode), len(job.scenes.background)
     for frame in load(choice, choice.holdout_ns):
         camera, T = frame.color_camera, frame.T_base_color
-        cloud = training.robot.frames.joined(job.links, scene, choice.episode, frame.stamp_ns)
+        cloud = training.robot.joined(job.links, scene, choice.episode, frame.stamp_ns)
         ego_mask = training.ego_masks.get(index)
         recorded = _recorded(frame, limits_of(job.config), references, ego_mask)
         view = job.backdrop.behind(rasteriser.view(cloud, camera, T), camera, T)

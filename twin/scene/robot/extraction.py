@@ -20,18 +20,15 @@ from bridge.episode.streams import RgbdFrame, recorded_robot
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.terminal import Output
 from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack, distinct_postures, posture_track
 from twin.robot.surface import PosedSurface, link_poses, link_surfaces
-from twin.scene.align.align import Alignment, align_robot
-from twin.scene.align.view import RobotView
 from twin.scene.fit.initialise import NoSurfaceError, flat_gaussians, fuse
 from twin.scene.fit.lighting import EVEN, Lighting, Patches, fit_lighting
 from twin.scene.fit.on_mesh import WIDER, colors_around, even_points, surface_area_m2, within_edges
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
-from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
-from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
+from twin.scene.frames.selection import FrameChoice, load, root_frame
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
 from twin.scene.robot.splats import posed, surface_links, write_links
 from twin.scene.shape.mesh import Mesh
 
@@ -176,19 +173,10 @@ def on_surface(
 class RobotFrames:
     """Tells robot from background in the frames of some episodes, and collects its surface."""
 
-    def __init__(
-        self,
-        episodes: Sequence[Episode],
-        T_base_root: Float[np.ndarray, "4 4"] | None = None,
-    ) -> None:
-        """Read joints and descriptions; an episode without them is passed over, with a remark.
-
-        Args:
-            T_base_root: Where the frames' root lies in the robot's base; None: it is the base.
-        """
-        self.T_base_root = np.eye(4) if T_base_root is None else T_base_root
+    def __init__(self, episodes: Sequence[Episode], remark: str = "") -> None:
+        """Read joints and descriptions; an episode without them is passed over, with a remark."""
         self._tracks: dict[str, PostureTrack] = {}
-        remarks = []
+        remarks = [remark] if remark else []
         for episode in episodes:
             try:
                 track = posture_track(episode)
@@ -216,8 +204,7 @@ class RobotFrames:
         if surface is None:
             return points, view
         owner = self._keep(episode, frame.stamp_ns, surface, points)
-        T_base_color = self.T_base_root @ view.T_base_color
-        shown = robot_mask(surface, view.half.camera, T_base_color, view.half.depth_m)
+        shown = robot_mask(surface, view.half.camera, view.T_base_color, view.half.depth_m)
         return points.take(owner < 0), view.without(shown)
 
     def look_closer(self, choice: FrameChoice, limits: DepthLimits, stride: int) -> None:
@@ -248,23 +235,23 @@ class RobotFrames:
         self, episode: Episode, stamp_ns: int, surface: PosedSurface, points: PointSet
     ) -> Int64[np.ndarray, " num_points"]:
         """Keep the robot's points if it stood still; return which shape owns each point, or -1."""
-        track, T = self._tracks[str(episode.path)], self.T_base_root
+        track = self._tracks[str(episode.path)]
         robot = load_robot(track.urdf)
         owner = surface_links(
             robot,
             surface,
-            se3.apply(T, points.p_m.astype(np.float64)),
-            points.normals.astype(np.float64) @ T[:3, :3].T,
+            points.p_m.astype(np.float64),
+            points.normals.astype(np.float64),
         )
         if track.is_stationary(stamp_ns):
             poses = link_poses(robot, track.at(stamp_ns))
             for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
                 mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
-                T_link_root, own = se3.invert(poses[link]) @ T, points.take(mine)
+                T_link_base, own = se3.invert(poses[link]), points.take(mine)
                 moved = replace(
                     own,
-                    p_m=as_float32(se3.apply(T_link_root, own.p_m.astype(np.float64))),
-                    normals=as_float32(own.normals @ T_link_root[:3, :3].T),
+                    p_m=as_float32(se3.apply(T_link_base, own.p_m.astype(np.float64))),
+                    normals=as_float32(own.normals @ T_link_base[:3, :3].T),
                 )
                 seen = SeenLink(points=moved, R_base_link=poses[link][:3, :3])
                 self._seen.setdefault(link, []).append(seen)
@@ -319,7 +306,7 @@ class RobotFrames:
         if track is None or not links.clouds or not track.covers(stamp_ns):
             return cloud
         robot = posed(links.clouds, track.at(stamp_ns), track.urdf, links.lighting)
-        return concatenate([cloud, moved_cloud(robot, se3.invert(self.T_base_root))])
+        return concatenate([cloud, robot])
 
 
 def robot_mask(
@@ -340,70 +327,29 @@ def robot_mask(
 
 
 MAX_POSTURES = 24
-ALIGN_FRAMES = 12
-"""Training frames of one camera that are looked at to find the robot in a foreign root frame."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FoundRobot:
-    """The robot of a rebuild; it may be known in no frame at all, which ``remark`` explains."""
-
-    frames: RobotFrames
-    remark: str
-    alignment: Alignment | None = None
-    """Where the scene's root is not the robot's base: how the two were laid onto each other."""
-
-
-def find_robot(choices: Sequence[FrameChoice], output: Output) -> FoundRobot:
+def find_robot(choices: Sequence[FrameChoice]) -> RobotFrames:
     """Say where the robot is in the frames of a rebuild, if that can be said.
 
-    Where the frames' root is the robot's base, the joints say it. In another root frame (poses
-    from odometry, another world) scene and robot are aligned by what the training frames show.
+    Joints say it where the frames' root is the robot's base.
     """
     root = root_frame(choices[0])
     episodes = list({choice.episode.path: choice.episode for choice in choices}.values())
     if root in {recorded_robot(episode).base_frame for episode in episodes}:
-        frames = RobotFrames(episodes)
-        return FoundRobot(frames=frames, remark=frames.remark)
-    try:
-        alignment = _aligned(choices)
-    except GstError as error:
-        remark = f"the scene's root is {root!r}, not the robot's base: {error}"
-        return FoundRobot(frames=RobotFrames([]), remark=remark)
-    output.say(
-        f"robot found in frame {root!r}: residual {alignment.residual_m * 1e3:.1f} mm, "
-        f"yaw margin {alignment.margin:.1f}"
+        return RobotFrames(episodes)
+    remark = (
+        f"the scene's root is {root!r}, not the robot's base: robot-gst calibrate RUN --cameras "
+        "finds where cameras are to it"
     )
-    frames = RobotFrames(episodes, alignment.T_base_source)
-    return FoundRobot(frames=frames, remark=frames.remark, alignment=alignment)
+    return RobotFrames([], remark)
 
 
-def _aligned(choices: Sequence[FrameChoice]) -> Alignment:
-    """Align by the camera that has joints; errors say what is missing."""
-    choice = choices[0]
-    track = posture_track(choice.episode)
-    stamps = spread(np.array(sorted(choice.train_ns), dtype=np.int64), ALIGN_FRAMES)
-    wanted = frozenset(stamp for stamp in stamps.tolist() if track.is_stationary(stamp))
-    views = [
-        RobotView(
-            camera=frame.depth_camera,
-            depth_m=np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0),
-            T_source_camera=frame.T_base_depth,
-            posture=track.at(frame.stamp_ns),
-        )
-        for frame in load(choice, wanted)
-    ]
-    return align_robot(views, load_robot(track.urdf))
-
-
-def write_robot(run: RunFolder, found: FoundRobot, links: LitLinks) -> dict[str, Any]:
+def write_robot(run: RunFolder, frames: RobotFrames, links: LitLinks) -> dict[str, Any]:
     """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot."""
-    record: dict[str, Any] = {
-        "remark": found.remark,
+    record = {
+        "remark": frames.remark,
         "links": write_links(run, links.clouds),
         "lighting": links.lighting.to_record(),
     }
-    if found.alignment is not None:
-        record["T_base_root"] = se3.pose_record(found.frames.T_base_root)
-        record["alignment"] = found.alignment.to_record()
     return {"robot": record}

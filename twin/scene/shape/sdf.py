@@ -54,15 +54,6 @@ class SdfGrid:
             found &= (along > self.origin_m[axis] - NEXT_TO_M) & (along < end[axis] + NEXT_TO_M)
         return found
 
-    def gradient(self, points_m: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Derivative of ``distance`` by the point; about a unit vector away from the surface.
-
-        Central differences over a thousandth of a voxel.
-        """
-        step = 1e-3 * self.voxel_m * np.eye(3)
-        ahead, behind = (self.distance(points_m[..., None, :] + s * step) for s in (1, -1))
-        return np.asarray((ahead - behind) / (2e-3 * self.voxel_m))
-
     def save(self, path: Path) -> None:
         """Write an npz file."""
         write_npz(path, self.arrays())

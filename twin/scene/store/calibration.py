@@ -30,7 +30,7 @@ CALIBRATION_FILE = "calibration.json"
 CALIBRATION_VERSION = 1
 _OLD_BASE = "base_link"
 """Link of fixed cameras in files that do not say how a camera is mounted."""
-UNNAMED = ("calibration_id", "software", "physics_history")
+UNNAMED = ("calibration_id", "software", "physics_history")  # the last in older files
 """What does not change what a calibration does, and so not its name."""
 
 
@@ -122,20 +122,10 @@ def write_calibration(
 
 
 def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
-    """Write what was found out about physics; earlier versions stay under ``physics_history``.
-
-    A result that was not promoted is kept there too and changes nothing that replays use.
-    """
+    """Write what was found out about physics; what was not promoted replaces nothing."""
     kept = _kept(run)
-    history = list(kept.get("physics_history", []))
-    current = kept.get("physics")
-    version = len(history) + (current is not None) + 1
-    new = {"version": version, **physics}
-    if current is not None:
-        history.append(current if new["promoted"] else new)
-    if current is None or new["promoted"]:
-        current = new
-    return _store(run, {**kept, "physics": current, "physics_history": history})
+    is_used = physics["promoted"] or kept.get("physics") is None
+    return _store(run, {**kept, "physics": dict(physics)} if is_used else kept)
 
 
 def write_part(run: RunFolder, name: str, part: Mapping[str, Any]) -> tuple[dict[str, Any], str]:

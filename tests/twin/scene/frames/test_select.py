@@ -69,7 +69,7 @@ def test_a_fixed_protocol_learns_from_every_fifth_and_holds_out_the_one_two_afte
     run = RunFolder.create(tmp_path)
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=20)
     (choice,) = selection.choose_frames(
-        selection.find_sources(run), FrameConfig(train_every=5, holdout_every=5, holdout_offset=2)
+        selection.find_sources(run), FrameConfig(train_every=5, holdout_every=5)
     ).choices
     index = {1_000_000_000 + 100_000_000 * k: k for k in range(20)}
     assert sorted(index[s] for s in choice.train_ns) == [0, 5, 10, 15]
@@ -79,8 +79,6 @@ def test_a_fixed_protocol_learns_from_every_fifth_and_holds_out_the_one_two_afte
 @pytest.mark.parametrize(
     ("settings", "found"),
     [
-        ({"holdout_offset": 8}, "beyond the first"),
-        ({"holdout_offset": -1}, "at least 0"),
         ({"train_every": -1}, "at least 0"),
     ],
 )

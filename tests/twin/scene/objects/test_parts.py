@@ -57,7 +57,7 @@ def test_putting_together_gives_every_gaussian_back(
 ) -> None:
     run, record, background, _ = written
     objects = read_objects(run, record)
-    scene = MovableScene(background=background, objects=objects, links={}, T_root_base=np.eye(4))
+    scene = MovableScene(background=background, objects=objects, links={})
     whole = scene.at({})
     assert len(whole) == len(background) + len(objects["cube"].cloud)
     moved_to = np.eye(4)
@@ -87,9 +87,7 @@ def test_a_table_just_under_a_closed_object_is_not_drawn_and_one_beside_it_is(
         voxel_m=0.001,
     )
     closed = replace(cube, T_base_object=T, sdf=sdf)
-    scene = MovableScene(
-        background=background, objects={"cube": closed}, links={}, T_root_base=np.eye(4)
-    )
+    scene = MovableScene(background=background, objects={"cube": closed}, links={})
     p = se3.apply(se3.invert(T), background.means_m.astype(np.float64))
     under = (np.abs(p[:, :2]) < 0.0195).all(axis=1)
     beside = (np.abs(p[:, :2]) > 0.0205).any(axis=1)

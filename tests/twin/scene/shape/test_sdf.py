@@ -31,24 +31,6 @@ def test_distances_have_the_right_sign_and_size() -> None:
         np.testing.assert_allclose(grid.distance(radius * ways), radius - RADIUS, atol=0.75 * VOXEL)
 
 
-def test_the_gradient_is_the_derivative_of_the_distance() -> None:
-    grid = ball()
-    rng = np.random.default_rng(2)
-    points = rng.uniform(-0.08, 0.08, (500, 3))
-    # Away from the faces between cells, where the derivative jumps.
-    cell = (points - grid.origin_m) / VOXEL
-    points = points[np.all(np.abs(cell - np.rint(cell)) > 0.01, axis=1)]
-    step = 1e-7
-    numeric = np.stack(
-        [
-            (grid.distance(points + e) - grid.distance(points - e)) / (2 * step)
-            for e in np.eye(3) * step
-        ],
-        axis=1,
-    )
-    np.testing.assert_allclose(grid.gradient(points), numeric, atol=1e-4)
-
-
 @pytest.mark.parametrize("closed", [True, False])
 def test_beyond_the_grid_the_distance_is_a_lower_bound(closed: bool) -> None:
     grid, ways = ball(closed), directions(300)
