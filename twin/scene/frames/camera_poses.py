@@ -188,8 +188,8 @@ def find_poses(
 ) -> CameraPoses:
     """Take what ``calibrate`` found, else the poses of ``/tf``, else follow the images.
 
-    Frames that are held out get a pose from the odometry too, but nothing is learnt from them, the
-    path of the camera neither.
+    Frames that are held out get a pose from the odometry too, but nothing is learnt from them:
+    neither the path of the camera nor its loop closures.
 
     Raises:
         FrameNotFoundError: When ``/tf`` is asked for and does not know the camera.
@@ -374,6 +374,7 @@ def _describe(path: CameraPath, num_lost: int) -> str:
     quality = path.quality
     text = (
         f"/tf has no poses; followed by RGB-D odometry: {quality['keyframes']} keyframes, "
-        f"{100 * quality['agreement']:.0f} % of the depth agrees between them"
+        f"{quality['loop_closures']} loop closures, {100 * quality['agreement']:.0f} % of the "
+        "depth agrees between them"
     )
     return text if num_lost == 0 else f"{text}; {num_lost} frames could not be placed"

@@ -1,12 +1,12 @@
 """Follow a hand-held RGB-D camera by its own images, where nobody recorded poses.
 
 Each frame is laid onto the last keyframe by Open3D's hybrid photometric and geometric odometry
-(Park, Zhou, Koltun 2017). The gauge is the first keyframe.
+(Park, Zhou, Koltun 2017); keyframes that see the same surface again are tied together, and the pose
+graph is solved (Choi, Zhou, Koltun 2015). The gauge is the first keyframe.
 """
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,10 @@ MIN_LIKENESS = 0.6
 correlates: depth alone lets a plane slide along itself."""
 PYRAMID = (20, 20, 10, 5)
 """Iterations per level, the coarsest first."""
+LOOP_SHIFT_M = 0.6
+LOOP_TURN_RAD = 0.6
+"""Keyframes nearer to each other than both are tied."""
+MAX_LOOPS = 30
 MIN_PLACED = 0.5
 """With a smaller share of frames placed, the camera counts as lost."""
 
@@ -42,6 +46,7 @@ class Step:
     """One image laid onto another."""
 
     T_target_source: Float[np.ndarray, "4 4"]
+    information: Float[np.ndarray, "6 6"]
     score: float
     """Agreement of depth times likeness of brightness."""
 
@@ -93,7 +98,7 @@ class Aligner:
     def lay(self, source: Look, target: Look, T_guess: Float[np.ndarray, "4 4"]) -> Step | None:
         """Lay one frame onto another, from a guess; None when they then disagree."""
         camera = source.small.camera
-        success, T, _ = self.open3d.pipelines.odometry.compute_rgbd_odometry(
+        success, T, information = self.open3d.pipelines.odometry.compute_rgbd_odometry(
             source.image,
             target.image,
             self.open3d.camera.PinholeCameraIntrinsic(
@@ -112,7 +117,7 @@ class Aligner:
         if met.likeness < MIN_LIKENESS:
             return None
         score = met.agreement * met.likeness
-        return Step(T_target_source=T, score=score)
+        return Step(T_target_source=T, information=np.array(information), score=score)
 
 
 SURE = 0.9
@@ -139,6 +144,8 @@ class Keyframe:
 
     look: Look
     T_first_key: Float[np.ndarray, "4 4"]
+    from_previous: Step | None
+    """How it lies to the keyframe before it."""
 
 
 class _Follower:
@@ -176,7 +183,7 @@ class _Follower:
                 self._promote()
 
     def _begin(self, look: Look) -> None:
-        self.keys.append(Keyframe(look=look, T_first_key=np.eye(4)))
+        self.keys.append(Keyframe(look=look, T_first_key=np.eye(4), from_previous=None))
         self.places[look.small.stamp_ns] = (0, np.eye(4))
         for early in self._early:
             self.take(early, held_out=True)
@@ -208,7 +215,7 @@ class _Follower:
             return
         look, step = self._last
         T_first_key = self.keys[-1].T_first_key @ step.T_target_source
-        self.keys.append(Keyframe(look=look, T_first_key=T_first_key))
+        self.keys.append(Keyframe(look=look, T_first_key=T_first_key, from_previous=step))
         self.places[look.small.stamp_ns] = (len(self.keys) - 1, np.eye(4))
         self._last = None
 
@@ -239,22 +246,85 @@ def follow_camera(
             "scan again slowly with textured surfaces near the camera."
         )
         raise LostError(message)
+    loops = _find_loops(follower.keys, aligner)
+    Ts_first_key = _solve(follower.keys, loops, aligner)
     return CameraPath(
         Ts_first_depth={
-            stamp_ns: follower.keys[index].T_first_key @ T_key_frame
+            stamp_ns: Ts_first_key[index] @ T_key_frame
             for stamp_ns, (index, T_key_frame) in sorted(follower.places.items())
         },
         quality={
             "keyframes": len(follower.keys),
-            "agreement": round(_agreement(follower.keys), 4),
+            "loop_closures": len(loops),
+            "agreement": round(_agreement(follower.keys, Ts_first_key), 4),
         },
     )
 
 
-def _agreement(keys: list[Keyframe]) -> float:
+def _find_loops(keys: list[Keyframe], aligner: Aligner) -> list[tuple[int, int, Step]]:
+    """Tie keyframes that see the same place, but do not follow each other; nearest first.
+
+    Each with its source, its target and how the source lies to the target.
+    """
+    near = []
+    for target in range(len(keys)):
+        for source in range(target + 2, len(keys)):
+            guess = se3.invert(keys[target].T_first_key) @ keys[source].T_first_key
+            shift = float(np.linalg.norm(guess[:3, 3]))
+            turn = float(se3.rotation_angle_rad(guess[:3, :3]))
+            if shift < LOOP_SHIFT_M and turn < LOOP_TURN_RAD:
+                near.append((shift + 0.5 * turn, source, target, guess))
+    near.sort(key=lambda item: item[:3])
+    loops = []
+    for _, source, target, guess in near[:MAX_LOOPS]:
+        step = aligner.lay(keys[source].look, keys[target].look, guess)
+        if step is not None:
+            loops.append((source, target, step))
+    return loops
+
+
+def _solve(
+    keys: list[Keyframe], loops: list[tuple[int, int, Step]], aligner: Aligner
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Spread what the loops say over the path; the first keyframe stays."""
+    if not loops:
+        return [key.T_first_key for key in keys]
+    tools = aligner.open3d.pipelines.registration
+    graph = tools.PoseGraph()
+    graph.nodes.extend([tools.PoseGraphNode(key.T_first_key) for key in keys])
+    for index, key in enumerate(keys):
+        if key.from_previous is not None:
+            graph.edges.append(_edge(tools, index, index - 1, key.from_previous, uncertain=False))
+    for source, target, step in loops:
+        graph.edges.append(_edge(tools, source, target, step, uncertain=True))
+    tools.global_optimization(
+        graph,
+        tools.GlobalOptimizationLevenbergMarquardt(),
+        tools.GlobalOptimizationConvergenceCriteria(),
+        tools.GlobalOptimizationOption(
+            max_correspondence_distance=DEPTH_DIFFERENCE_M,
+            edge_prune_threshold=0.25,
+            reference_node=0,
+        ),
+    )
+    T_key_first = se3.invert(np.array(graph.nodes[0].pose))
+    return [T_key_first @ np.array(node.pose) for node in graph.nodes]
+
+
+def _edge(tools: Any, source: int, target: int, step: Step, *, uncertain: bool) -> Any:
+    return tools.PoseGraphEdge(
+        source, target, step.T_target_source, step.information, uncertain=uncertain
+    )
+
+
+def _agreement(keys: list[Keyframe], Ts_first_key: list[np.ndarray]) -> float:
     """Mean share of the depth that agrees between neighbouring keyframes."""
     met = [
-        meet(b.look.small, a.look.small, se3.invert(a.T_first_key) @ b.T_first_key).agreement
-        for a, b in pairwise(keys)
+        meet(
+            keys[i + 1].look.small,
+            keys[i].look.small,
+            se3.invert(Ts_first_key[i]) @ Ts_first_key[i + 1],
+        ).agreement
+        for i in range(len(keys) - 1)
     ]
     return float(np.mean(met)) if met else 1.0
