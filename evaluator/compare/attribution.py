@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from bridge.episode.metadata import ROLLOUT
 from evaluator.compare.measure import grouped
 from evaluator.compare.rows import TrialRow
-from evaluator.result import Table
+from evaluator.result import Cell, Table
 
 AGREE, WORLD, ACTIONS, UNKNOWN = "end alike", "world", "actions", "not known"
 """``WORLD``: the trial's own motion, replayed in the twin, ends as the rollout did. ``ACTIONS``:
@@ -30,7 +30,7 @@ def attribution_table(rows: Sequence[TrialRow]) -> tuple[Table, ...]:
     by_group = grouped(known, lambda item: (item[0].task, item[0].policy))
     if not by_group:
         return ()
-    lines = []
+    lines: list[dict[str, Cell]] = []
     for (task, policy), members in [*by_group.items(), (("", "all"), known)]:
         counts = Counter(found for _, found in members)
         lines.append(

@@ -67,9 +67,9 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
         asked = TRAJECTORIES if facts.plan_id != NO_PLAN else ("executed",)
         sent = {**made_from, "plan_id": facts.plan_id}
         found |= {name: index.replay(**sent, trajectory=name) for name in asked}
-    if facts.plan_id is not None and rolled is None:
-        lacking += [replay.reason for replay in found.values() if replay.reason is not None]
-        cells_engine = index.answer_of_cells_engine(**sent)
+        if rolled is None:
+            lacking += [replay.reason for replay in found.values() if replay.reason is not None]
+            cells_engine = index.answer_of_cells_engine(**sent)
     localised = index.localised(**made_from)
     if localised is not None and localised.facts.broken:
         lacking.append(f"{localised.path.name}: {localised.facts.broken}")
