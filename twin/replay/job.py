@@ -136,7 +136,7 @@ class ReplayJob:
 
 # The row of one replay in the table of a run.
 
-MAY_STAY_OPEN = ("settled", "shape")
+MAY_STAY_OPEN = ("settled", "shape", "allowed_contacts")
 """Predicates that a recording without an answer to them may succeed without."""
 
 
@@ -213,8 +213,8 @@ def judged(
 def predicates_hold(verdict: Verdict) -> bool | None:
     """Whether the success predicates hold; None when what is known does not say.
 
-    One look afterwards seldom tells whether a thing lies still or kept its shape: those may stay
-    open. A thing that nobody found was not seen to be where it belongs.
+    One look afterwards seldom tells whether a thing lies still, kept its shape or was touched:
+    those may stay open. A thing that nobody found was not seen to be where it belongs.
     """
     values = [
         item["value"]

@@ -36,17 +36,14 @@ from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.replay.trace import (
-    CONTACT_M,
     Recording,
     Trace,
-    rollout_of_recording,
     states_of_recording,
     trace_of_file,
     trace_of_recording,
     trace_of_result,
 )
 from twin.replay.verdict import findings_of, replay_joints, replay_plan
-from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 from twin.robot.posture import check_clock, width_track
 
@@ -97,7 +94,7 @@ def _replay(job: ReplayJob) -> tuple[Verdict, dict[str, Any] | None]:
     job.config.refuse_soft(source.scene.task.soft_objects)
     result = _with_samples(source, _run(source, source.scene, job.config))
     if source.executed and job.config.mode == "kinematic":
-        found = recorded_findings(_recording(source), job.config)
+        found = recorded_findings(_recording(source))
         result = replace(result, verdict=replace(result.verdict, findings=found))
     elif source.executed:
         compared = compare(job, result, _recording(source), source.end_ns)
@@ -287,12 +284,10 @@ def _origin(
 Findings = dict[tuple[str, str], bool | None]
 
 
-def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[str, Any], ...]:
-    """What the success predicates, and the one on contacts, say of the recording itself."""
-    robot = load_robot(recording.scene.urdf)
-    rollout = rollout_of_recording(recording, robot, hulls_of(robot), config)
-    task = recording.scene.task
-    return tuple(findings_of(task, rollout, "recorded", tolerance_m=CONTACT_M))
+def recorded_findings(recording: Recording) -> tuple[dict[str, Any], ...]:
+    """What the success predicates say of the recording itself."""
+    states = states_of_recording(recording, load_robot(recording.scene.urdf))
+    return tuple(findings_of(recording.scene.task, states, "recorded"))
 
 
 def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: int) -> Divergence:
