@@ -152,17 +152,14 @@ class Recording:
         A grasp is of the object whose origin is nearest to the tool when the fingers stop.
         """
         places = {name: T[:3, 3] for name, T in self.scene.movable().items()}
-        spans: dict[str, Touch | None] = dict.fromkeys(places)
+        spans: dict[str, list[Touch]] = {name: [] for name in places}
         for first_ns, last_ns in self.grasps():
             p = robot.T_base_tcp(self.path.joints_at(np.array([first_ns]))[0])[:3, 3]
             near = {name: float(np.linalg.norm(p - place)) for name, place in places.items()}
             name = min(near, key=lambda key: near[key], default="")
-            if not name or near[name] > REACH_M:
-                continue
-            before = spans[name]
-            if before is None or last_ns - first_ns > before[1] - before[0]:
-                spans[name] = (first_ns, last_ns)
-        return spans
+            if name and near[name] <= REACH_M:
+                spans[name].append((first_ns, last_ns))
+        return {name: longest(found) for name, found in spans.items()}
 
 
 def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) -> Trace:

@@ -283,7 +283,7 @@ def _move(
     _pre_grasp(monitor, path)
     dynamic = config.mode == "dynamic"
     by_physics, measured = dynamic, True
-    stamps_ns = path.dense_times_ns(config.sample_rate_hz)
+    stamps_ns = path.dense_times_ns(config.states_hz)
     if dynamic and refuse_early:
         found = commanded.failures or monitor.failures or any(commanded.checks.values())
         measured = not found

@@ -16,7 +16,7 @@ from twin.replay.scene import StartState
 from twin.replay.trace import Recording, states_of_recording, trace_of_recording
 from twin.robot.model import load_robot
 
-CONFIG = ReplayConfig(mode="kinematic", sample_rate_hz=30)
+CONFIG = ReplayConfig(mode="kinematic")
 
 
 def recorded(
