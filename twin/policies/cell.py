@@ -116,8 +116,7 @@ class TwinCell:
             self._world.robot.command(target.tolist(), velocity, self.target_width_m)
             self._world.step()
             self._steps += 1
-            is_kept = self._steps % STATE_EVERY == 0
-            if is_kept and not self._samples.take(self._world, self.t_ns):
+            if self._steps % STATE_EVERY == 0 and not self._samples.take(self._world, self.t_ns):
                 self.burst = True
                 return
 

@@ -181,11 +181,9 @@ class ReplayRunConfig:
     episode: tuple[str, ...] = ()
     """Ids of the trial episodes to replay; all of them when none is given."""
     workers: int | None = None
-    """Processes that replay side by side, or processors of --ray local: one for each core, at most
-    8, when no number is given. A cluster that is there uses its own."""
+    """Processes that replay side by side: one for each core, at most 8, when no number is given."""
     ray: str = ""
-    """Replay on a Ray cluster instead: its HOST:PORT, or local to start one on this machine;
-    docs/scale.md says how it is kept closed."""
+    """Replay on a Ray cluster instead: its HOST:PORT; docs/scale.md says how it is kept closed."""
     samples: int = 0
     """Varied replays of each plan; they give the success probability of its verdict. A kinematic
     replay moves no objects and has none."""

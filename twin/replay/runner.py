@@ -226,7 +226,7 @@ def there_already(
 def runner_for(config: ReplayRunConfig) -> Runner:
     """What replays: this process, several, or a Ray cluster."""
     if config.ray:
-        runner: Runner = load_leaf("cluster", "runner")(config.ray, config.workers)
+        runner: Runner = load_leaf("cluster", "runner")(config.ray)
         return runner
     return runner_of(config.workers)
 
