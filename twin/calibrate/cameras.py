@@ -336,9 +336,9 @@ def describe_cameras(record: Mapping[str, Any]) -> str:
 def _describe(item: Mapping[str, Any]) -> str:
     text = f"{item['mount']}, residual {item['residual_m']['value'] * 1e3:.2f} mm"
     if "residual_rad" in item:
-        text += f" and {np.degrees(item['residual_rad']):.3f} degrees"
-        text += f", {item['num_pairs']} pairs, {item['num_outliers']} outliers"
-        return f"{text}; position known to {item['sigma_m'] * 1e3:.2f} mm"
+        text += f" and {np.degrees(item['residual_rad']):.3f} degrees, {item['num_pairs']} pairs"
+        known_mm, outliers = item["sigma_m"] * 1e3, item["num_outliers"]
+        return f"{text}, {outliers} outliers; position known to {known_mm:.2f} mm"
     text += f", robot seen in {item['num_postures']} postures, fitness {item['fitness']:.2f}"
     text += f", depth scale {item['depth_scale']:.4f}"
     if "correction_m" in item:

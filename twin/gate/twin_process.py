@@ -229,10 +229,10 @@ class TwinProcess(AbstractContextManager["TwinProcess"]):
             if not self._closed:
                 with suppress(OSError):  # the system gives no process: the next plan asks again
                     self._start()
-            late = f"the {what} was not done before the wall-clock limit (--deadline); it was "
-            late += "stopped"
+            late = f"the {what} was not done before the wall-clock limit (--deadline)"
             is_late = isinstance(error, TimeIsUpError)
-            raise UndecidedError(late if is_late else f"no {what}: {error}") from error
+            told = f"{late}; it was stopped" if is_late else f"no {what}: {error}"
+            raise UndecidedError(told) from error
         if isinstance(result, Failed):
             if not result.known:
                 self._output.say(result.trace or traceback.format_exc())

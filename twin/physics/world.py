@@ -10,7 +10,7 @@ same bits on every run.
 from collections.abc import Callable, Sequence
 from math import cos
 from operator import methodcaller
-from typing import Self
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -79,6 +79,7 @@ class FrictionAnchors:
 Box = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 """Centre and extents in the owner's frame [m]."""
 TABLE_M = (4.0, 4.0, 0.4)
+_World = TypeVar("_World")
 
 
 class Bodies:
@@ -124,7 +125,7 @@ class Bodies:
             give_client_back(self.client)
             self.client = Client(-1)
 
-    def __enter__(self) -> Self:
+    def __enter__(self: _World) -> _World:
         """Use as a context manager."""
         return self
 
