@@ -255,10 +255,10 @@ def describe_pushes(record: Mapping[str, Any], calibration_id: str) -> str:
         )
     held = record["held_out"]
     for name in ("nominal", "calibrated"):
-        item, errors = held[name], held[name]["by_episode_m"].values()
+        off_m, errors = held[name]["end_point_error_median_m"], held[name]["by_episode_m"].values()
         lines.append(
-            f"  held out, {name}: off by {item['end_point_error_median_m'] * 1e3:.1f} mm "
-            f"(median of {item['n']}; {min(errors) * 1e3:.1f} to {max(errors) * 1e3:.1f})"
+            f"  held out, {name}: end points off by {off_m * 1e3:.1f} mm "
+            f"(median of {len(errors)}; {min(errors) * 1e3:.1f} to {max(errors) * 1e3:.1f})"
         )
     lines += [f"  {name}: {why}" for name, why in record["skipped"].items()]
     return "\n".join(lines)
