@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import ENGINES, HOME, URDF, at, cell
+from cells import ENGINES, HOME, URDF, T_base_tcp, at, cell
 
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.robots.robot import read_robot
