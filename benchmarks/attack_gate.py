@@ -109,7 +109,7 @@ def prepare(folder: Path, task_name: str) -> Stage:
     from bridge.robots.robot import resolve_mesh
     from bridge.task.task_file import load_task
     from twin.gate.live import LiveView
-    from twin.gate.twin_process import Look, look
+    from twin.gate.twin_process import look
 
     path = folder / "run"
     run = RunFolder.open(path) if path.is_dir() else RunFolder.create(path)
@@ -121,7 +121,7 @@ def prepare(folder: Path, task_name: str) -> Stage:
         view.take(message.topic, message.data, message.log_time_ns, message.type_name)
     task = load_task(task_name)
     frames = view.frames(max_age_ns=5 * 10**9, max_per_camera=3).frames
-    found = look(Look(run_path=run.path, frames=frames, task=task))
+    found = look((run.path, frames, task))
     poses = {name: item.T_base_object for name, item in found.items()}
     track = streams.joint_track(episode, JOINT_STATES)
     order = [track.names.index(name) for name in ARM_JOINTS]

@@ -28,13 +28,10 @@ sys.path.insert(0, str(ROOT / "tests" / "twin" / "plan" / "path"))
 
 from path_scene import EPS_M, WIDTH_M, Pairs, pairs_of_test
 
-from bridge.robots.default import ROBOT
 from twin.plan.path.planner import Mover, PathConfig, limits_of, timed_path
 from twin.replay.clearance.bodies import own_links_touch
-from twin.replay.clearance.surroundings import Surroundings, posture_clearance
-from twin.replay.config import ReplayConfig
+from twin.replay.clearance.surroundings import Surroundings
 from twin.robot.collision import hulls_of
-from twin.robot.model import load_robot
 
 NOTE = "UR5 and parallel gripper, 40 pairs that need a detour; CPU time, one thread"
 EDGE_RAD = 0.05
@@ -249,41 +246,15 @@ def timing_rows(pairs: Pairs) -> list[Target]:
     ]  # fmt: skip
 
 
-def posture_rows(pairs: Pairs, count: int) -> list[Target]:
-    """The exact check of one posture, with a scene's grid and without."""
-    from dataclasses import replace
-
-    from bench_replay_robot import scene_mesh, static_of
-
-    robot = load_robot(ROBOT.urdf_text())
-    rng = np.random.default_rng(SEED)
-    postures = robot.home_rad + rng.uniform(-0.8, 0.8, (count, 6))
-    bare = pairs.problem.scene
-    grid = replace(bare, static_sdf=static_of(*scene_mesh(60)), table_height_m=-0.2)
-    found = []
-    for scene in (grid, bare):
-        for up_to_m in (0.0, np.inf):
-            margin_m = posture_clearance(scene, hulls_of(robot), ReplayConfig(), up_to_m=up_to_m)
-            spent = cpu_ms(lambda margin_m=margin_m: margin_m(postures), repeats=9)
-            found.append(spent / count * 1e3)
-    return [
-        Target(what="exact check of one posture, scene with a grid", measured=found[0], limit=80.0,
-               unit="us", reference=f"without a grid {found[2]:.0f} us; its distance too "
-               f"{found[1]:.0f} us, without a grid {found[3]:.0f} us"),
-    ]  # fmt: skip
-
-
 def main() -> None:
     """Measure everything once."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ways", type=int, default=1000)
-    parser.add_argument("--postures", type=int, default=400)
     sizes = parser.parse_args()
     pairs = pairs_of_test(each=10)
     rows = [
         *search_rows(pairs),
         *timing_rows(pairs),
-        *posture_rows(pairs, sizes.postures),
         *sweep_rows(pairs, sizes.ways),
     ]
     report_targets("plan_path", rows, note=NOTE)

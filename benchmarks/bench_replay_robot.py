@@ -210,7 +210,7 @@ def clearance_rows(num_states: int) -> list[Target]:
         for joints in postures[: max(num_states // 2, 5)]:
             hulls.place(joints, 0.08)
             mesh_m.append(min(
-                signed_distance(hulls.hulls[i].shape, hulls.placements[i], model,
+                signed_distance(hulls.hulls[i].shape, hulls.placement(i), model,
                                 coal.Transform3s()) for i in moving))  # fmt: skip
 
     reference_us = cpu_us(reference, repeats=1, each=max(num_states // 2, 5))

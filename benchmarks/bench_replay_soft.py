@@ -85,7 +85,7 @@ def digest() -> str:
             world.step()
             if step % 8 == 0:
                 found.update(world.soft.nodes_m("duck_1").astype(np.float32).tobytes())
-                found.update(world.robot.joints_rad().tobytes())
+                found.update(world.robot.posture()[0].tobytes())
     return found.hexdigest()
 
 

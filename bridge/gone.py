@@ -7,7 +7,7 @@ from bridge.errors import UsageError
 _FIXED = (
     "--replay.start-rad start-m start-overlap-m max-contact-depth-m pre-grasp-depth-m squeeze-m "
     "pre-grasp-soft-depth-m max-slip-m moved-m path-step-s max-joint-step-rad grip-delay-s "
-    "physics.finger-speed-m-s physics.soft-substeps physics.soft-stiffness-scale"
+    "sample-rate-hz physics.finger-speed-m-s physics.soft-substeps physics.soft-stiffness-scale"
 ).replace(" ", " --replay.")
 """Settings of a replay that are constants now."""
 

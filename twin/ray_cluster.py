@@ -6,13 +6,10 @@ even where a loopback address was asked for (measured), so a cluster without one
 
 import ipaddress
 import os
-import secrets
 import socket
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,24 +21,19 @@ from bridge.process_pool import (
     Failed,
     Function,
     Item,
-    default_size,
     do,
     lost,
 )
 from twin.errors import TwinError
 from twin.physics.config import ENGINES
 
-LOCAL = "local"
 LOOPBACK = "127.0.0.1"
 WINDOW = 2
 """Tasks per processor that are handed over before the first are back: one waits while one runs."""
 MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
-NICENESS = "RAY_worker_niceness"
-"""Ray gives way to everything else on a machine (15) unless told otherwise."""
 HIDDEN_LINES = "RAY_DEDUP_LOGS_SKIP_REGEX"
 """Ray tells of each lost process on standard output, in the middle of what a program reads there;
 what was lost is in the answers."""
-ENVIRONMENT = (MODE, TOKEN, TOKEN_PATH, NICENESS, HIDDEN_LINES)
 ANSWER_S = 5.0
 """How long the head of a cluster may take to accept a connection."""
 LOOK_S, EMPTY_LOOKS = 60.0, 5
@@ -58,32 +50,14 @@ class RayClusterError(TwinError):
 class RayRunner:
     """Does pieces of work as Ray tasks; see ``bridge.process_pool.Runner``."""
 
-    def __init__(self, address: str, workers: int | None) -> None:
+    def __init__(self, address: str) -> None:
         """Connect later."""
-        self._address, self._workers = address, workers or default_size()
+        self._address = address
         self._ray: Any = None
-        self._first: list[Any] = []
-        self._before: dict[str, str | None] = {}
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     def __enter__(self) -> "RayRunner":
-        """Connect, or start a cluster on the loopback address; refuses one without a token."""
-        self._before = {name: os.environ.get(name) for name in ENVIRONMENT}
-        if self._address == LOCAL:
-            # Ray leaves its logs behind, a hundred files for each start.
-            self._folder = tempfile.TemporaryDirectory(
-                prefix="gst-ray-", ignore_cleanup_errors=True
-            )
-        try:
-            self._ray = _connect(
-                self._address, self._workers, None if self._folder is None else self._folder.name
-            )
-        except BaseException:
-            self._restore()
-            raise
-        # Ray starts processes with the first tasks: they import while this process does.
-        first = self._ray.remote(num_cpus=1)(code_version)
-        self._first = [first.remote() for _ in range(self._processors())]
+        """Connect; refuses a cluster without a token."""
+        self._ray = _connect(self._address)
         return self
 
     def run(
@@ -91,7 +65,7 @@ class RayRunner:
     ) -> Iterator[tuple[Item, Answer | Failed]]:
         """See ``Runner``; Ray itself begins what lost its node once more."""
         ray = self._ray
-        most = WINDOW * self._processors()
+        most = WINDOW * max(1, int(ray.cluster_resources().get("CPU", 1)))
         task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_task)
         todo = deque(sorted(items, key=cost, reverse=True))
         running: dict[Any, Item] = {}
@@ -121,39 +95,16 @@ class RayRunner:
         )
         raise RayClusterError(message)
 
-    def _processors(self) -> int:
-        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
-
     def __exit__(self, *_: object) -> None:
-        """Leave; a cluster started here ends, any other one goes on."""
-        if self._ray is not None:
-            self._first.clear()
-            self._ray.shutdown()
-            self._ray = None
-        self._restore()
-
-    def _restore(self) -> None:
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
-        for name, value in self._before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        """Leave; the cluster goes on."""
+        self._ray.shutdown()
 
 
-def _connect(address: str, workers: int, folder: str | None) -> Any:
+def _connect(address: str) -> Any:
     settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    if address == LOCAL:
-        os.environ[TOKEN] = _own_token()
-        os.environ.pop(TOKEN_PATH, None)
-        os.environ.setdefault(NICENESS, "0")  # as processes without Ray have
-        settings |= {"num_cpus": workers, "include_dashboard": False, "_temp_dir": folder}
-    else:
-        _check_token()
-        _check_somebody_listens(address)
-    if address == LOCAL or is_loopback(address):
+    _check_token()
+    _check_somebody_listens(address)
+    if is_loopback(address):
         # Otherwise Ray replaces the loopback address by the machine's own, where nobody answers.
         settings["_node_ip_address"] = LOOPBACK
     os.environ[MODE] = "token"
@@ -173,12 +124,6 @@ def _connect(address: str, workers: int, folder: str | None) -> Any:
         )
         raise RayClusterError(message) from error
     return ray
-
-
-@cache
-def _own_token() -> str:
-    """The token of clusters started here: one for each process, which Ray reads only once."""
-    return secrets.token_hex(32)
 
 
 def _check_token() -> None:
@@ -201,7 +146,7 @@ def _check_somebody_listens(address: str) -> None:
     host, _, port = address.rpartition(":")
     host = host.strip("[]")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        message = f"--ray {address!r} is not an address: give HOST:PORT of the head, or {LOCAL}."
+        message = f"--ray {address!r} is not an address: give HOST:PORT of the head."
         raise UsageError(message)
     try:
         socket.create_connection((host, int(port)), timeout=ANSWER_S).close()

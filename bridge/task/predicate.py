@@ -49,8 +49,6 @@ class Rollout:
     """Soft objects that are no bodies any more (burst, turned inside out), and what was found."""
     contacts: Sequence[Contact] | None = None
     """Who was closer than the margin to whom over the whole execution; None: unknown."""
-    contacts_inferred: bool = False
-    """The contacts were worked out from joints and poses rather than measured or simulated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,14 +66,13 @@ def evaluate_success(task: Task, rollout: Rollout) -> list[PredicateResult]:
     return [_evaluate(spec, task, rollout) for spec in task.success]
 
 
-def evaluate_contacts(task: Task, rollout: Rollout, *, tolerance_m: float = 0.0) -> PredicateResult:
+def evaluate_contacts(task: Task, rollout: Rollout) -> PredicateResult:
     """Say whether nothing touched what it may not, from the start of the execution to its end.
 
     Asked of every rollout; the tolerance of a task that lists the predicate itself counts.
     """
     listed = (spec for spec in task.success if spec["kind"] == ALLOWED_CONTACTS)
-    spec = next(listed, {"kind": ALLOWED_CONTACTS, "tolerance_m": tolerance_m})
-    return _evaluate(spec, task, rollout)
+    return _evaluate(next(listed, {"kind": ALLOWED_CONTACTS}), task, rollout)
 
 
 def all_hold(findings: list[PredicateResult]) -> bool | None:
@@ -186,7 +183,6 @@ def _shape(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
 def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
     if rollout.contacts is None:
         return None, "contacts are not known"
-    said = "inferred: " if rollout.contacts_inferred else ""
     only, deepest = spec.get("object"), -float(spec.get("tolerance_m", 0.0))
     wrong = [
         contact
@@ -196,10 +192,10 @@ def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> 
         and (only is None or only in contact.bodies)
     ]
     if not wrong:
-        return True, f"{said}nothing touched what it may not touch"
+        return True, "nothing touched what it may not touch"
     first = min(wrong, key=lambda contact: contact.start_ns)
     detail = (
-        f"{said}{first.bodies[0]} touched {first.bodies[1]} at {first.start_ns * 1e-9:.2f} s, "
+        f"{first.bodies[0]} touched {first.bodies[1]} at {first.start_ns * 1e-9:.2f} s, "
         f"{-first.min_distance_m * 1e3:.1f} mm deep"
     )
     return False, detail

@@ -18,6 +18,7 @@ from bridge.task.task_file import load_task
 from twin.errors import TwinError
 from twin.gate.twin_process import Question, answer
 from twin.replay.config import ReplayConfig
+from twin.replay.scene import ReplayScene
 
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "benchmarks"))
@@ -69,13 +70,11 @@ def judged(payload: bytes, run: Path) -> bool | None:
         question = Question(
             run_path=run,
             plan=plan,
-            task=TASK,
-            Ts_base_object=POSES,
-            covariances={},
-            urdf=ROBOT.urdf_text(),
+            seen=ReplayScene(
+                task=TASK, Ts_base_object=POSES, urdf=ROBOT.urdf_text(), start_rad=HOME_RAD
+            ),
             config=ReplayConfig(),
             max_steps=100_000,
-            start_rad=HOME_RAD,
         )
         return answer(question).accepted
     except (BridgeError, TwinError):

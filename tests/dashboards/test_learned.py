@@ -46,7 +46,7 @@ def learning(
         }
         for name, some in sources.items()
     }
-    write_part(run, "posterior", {"tasks": tasks, "without_trials": [], "skipped": {}, **others})
+    write_part(run, "posterior", {"tasks": tasks, "skipped": {}, **others})
     return run
 
 

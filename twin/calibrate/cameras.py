@@ -309,7 +309,7 @@ def _camera(
 
 def target_record(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[str, Any]:
     """Say what pose pairs give."""
-    solution, mount = find_camera(pairs, config.mount, seed=config.seed)
+    solution, mount = find_camera(pairs, config.mount)
     found, names = asdict(solution), ("T_link_camera", "T_effector_target")
     X, Z = (se3.pose_record(found.pop(name)) for name in "XZ")
     names = ("T_link_camera", "T_base_target") if mount == "hand" else names[::-1]
@@ -320,6 +320,7 @@ def target_record(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[
         "stream": "color",
         **dict(zip(names, (X, Z), strict=True)),
         **found,
+        "residual_m": {"value": solution.residual_m},
         "sources": [pairs.source],
     }
 
@@ -333,14 +334,11 @@ def describe_cameras(record: Mapping[str, Any]) -> str:
 
 
 def _describe(item: Mapping[str, Any]) -> str:
-    residual = item["residual_m"]
-    text = f"{item['mount']}, residual {residual['value'] * 1e3:.2f} mm"
+    text = f"{item['mount']}, residual {item['residual_m']['value'] * 1e3:.2f} mm"
     if "residual_rad" in item:
-        text += f" [{residual['low'] * 1e3:.2f}, {residual['high'] * 1e3:.2f}]"
-        turn = {key: float(np.degrees(value)) for key, value in item["residual_rad"].items()}
-        text += f" and {turn['value']:.3f} [{turn['low']:.3f}, {turn['high']:.3f}] degrees"
-        text += f", {item['num_pairs']} pairs, {item['num_outliers']} outliers"
-        return f"{text}; position known to {item['sigma_m'] * 1e3:.2f} mm"
+        text += f" and {np.degrees(item['residual_rad']):.3f} degrees, {item['num_pairs']} pairs"
+        known_mm, outliers = item["sigma_m"] * 1e3, item["num_outliers"]
+        return f"{text}, {outliers} outliers; position known to {known_mm:.2f} mm"
     text += f", robot seen in {item['num_postures']} postures, fitness {item['fitness']:.2f}"
     text += f", depth scale {item['depth_scale']:.4f}"
     if "correction_m" in item:

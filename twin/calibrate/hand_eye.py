@@ -70,7 +70,6 @@ OUTLIER_SQUARE = 87.0
 """Pairs whose misfits in standard deviations have a larger sum of squares contradict the others."""
 ROUNDS = 5
 """Fits, each with the scales of the misfits that the one before left."""
-NUM_RESAMPLES = 200
 MEDIAN_OF_THREE = 1.538
 """Median length of three standard normal numbers."""
 FLOOR = 1e-7
@@ -79,15 +78,6 @@ FLOOR = 1e-7
 
 class UndeterminedCameraError(TwinError):
     """The recorded poses do not determine where the camera is."""
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A number with its 95 % bootstrap interval."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,28 +89,22 @@ class RobotWorld:
     num_pairs: int
     num_outliers: int
     """Pairs that had no say because they contradict the others."""
-    residual_m: Interval
+    residual_m: float
     """Median over pairs of the distance between the two ways to the camera or target."""
-    residual_rad: Interval
+    residual_rad: float
     """The same for the angle."""
     sigma_m: float
     """Standard deviation of the position of X, all axes together."""
-    sigma_rad: float
-    second_turn_rad: float
-    """Root mean square turn about the second axis; what determines the translation of X."""
 
 
 def solve(
-    Ts_a: Float[np.ndarray, "num_pairs 4 4"],
-    Ts_b: Float[np.ndarray, "num_pairs 4 4"],
-    *,
-    seed: int = 0,
+    Ts_a: Float[np.ndarray, "num_pairs 4 4"], Ts_b: Float[np.ndarray, "num_pairs 4 4"]
 ) -> RobotWorld:
     """Find X and Z with A X = Z B: from the closed form on, by Cauchy's loss of the misfits.
 
     UndeterminedCameraError for too few pairs, and for rotations about one axis only.
     """
-    turn = check_motions(Ts_a)
+    check_motions(Ts_a)
     X = solve_hand_eye(Ts_a, Ts_b)
     each, J = Ts_a @ X @ se3.invert(Ts_b), np.zeros((0, 12))
     gaps = np.linalg.norm(each[:, None, :3, 3] - each[None, :, :3, 3], axis=-1)
@@ -130,25 +114,20 @@ def solve(
     left = misfits(Ts_a, Ts_b, X, Z)
     distance, angle = _lengths(left)
     far = np.square(np.stack([distance, angle], axis=1) / _scales(left)).sum(axis=1)
-    drawn = np.random.default_rng(seed).integers(len(Ts_a), size=(NUM_RESAMPLES, len(Ts_a)))
-    medians = np.stack([np.median(values[drawn], axis=1) for values in (distance, angle)])
-    low, high = np.quantile(medians, [0.025, 0.975], axis=1)
     variance = np.diag(np.linalg.pinv(J.T @ J))
     return RobotWorld(
         X=X,
         Z=Z,
         num_pairs=len(Ts_a),
         num_outliers=int((far > OUTLIER_SQUARE).sum()),
-        residual_m=Interval(float(np.median(distance)), float(low[0]), float(high[0])),
-        residual_rad=Interval(float(np.median(angle)), float(low[1]), float(high[1])),
+        residual_m=float(np.median(distance)),
+        residual_rad=float(np.median(angle)),
         sigma_m=float(np.sqrt(variance[3:6].sum())),
-        sigma_rad=float(np.sqrt(variance[:3].sum())),
-        second_turn_rad=turn,
     )
 
 
-def check_motions(Ts_a: Float[np.ndarray, "num_pairs 4 4"]) -> float:
-    """Return the root mean square turn about the second axis of all motions [rad]."""
+def check_motions(Ts_a: Float[np.ndarray, "num_pairs 4 4"]) -> None:
+    """Refuse poses too few, or turned about one axis alone, to say where a camera is."""
     if len(Ts_a) < MIN_PAIRS:
         raise UndeterminedCameraError(
             f"{len(Ts_a)} pair(s) of poses do not determine a camera; at least {MIN_PAIRS} are "
@@ -164,7 +143,6 @@ def check_motions(Ts_a: Float[np.ndarray, "num_pairs 4 4"]) -> float:
             f"any second axis, {np.degrees(MIN_TURN_RAD):.0f} are needed): the camera's position "
             "is not determined. Tilt the tool about two different axes, 20 degrees or more."
         )
-    return float(sizes[1])
 
 
 def misfits(
@@ -222,12 +200,8 @@ class PosePairs:
     source: str
     """Episode ids."""
 
-    def __len__(self) -> int:
-        """Return the number of pairs."""
-        return len(self.Ts_base_effector)
 
-
-def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> tuple[RobotWorld, Mount]:
+def find_camera(pairs: PosePairs, mount: Mount) -> tuple[RobotWorld, Mount]:
     """Find a camera from pose pairs, and its mounting; ``auto`` takes what fits clearly better.
 
     With the camera in the hand X is ``T_effector_camera`` and Z is ``T_base_target``; with a fixed
@@ -236,12 +210,12 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> tuple[Robot
     """
     seen = pairs.Ts_camera_target
     each: dict[Mount, np.ndarray] = {"hand": se3.invert(seen), "fixed": seen}
-    found = {name: solve(pairs.Ts_base_effector, Ts, seed=seed) for name, Ts in each.items()}
-    size = {name: item.residual_m.value for name, item in found.items()}
+    found = {name: solve(pairs.Ts_base_effector, Ts) for name, Ts in each.items()}
+    size = {name: item.residual_m for name, item in found.items()}
     best, other = sorted(each, key=lambda name: size[name])
     if mount == "auto" and size[other] < CLEARLY * size[best]:
         raise UndeterminedCameraError(
-            f"the {len(pairs)} pose pairs of {pairs.source} fit a camera in the hand to "
+            f"the {len(seen)} pose pairs of {pairs.source} fit a camera in the hand to "
             f"{size['hand'] * 1e3:.1f} mm and a fixed one to {size['fixed'] * 1e3:.1f} mm, which "
             "does not tell them apart. Say which: --mount hand or --mount fixed."
         )
@@ -252,7 +226,7 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> tuple[Robot
             f"{size[chosen] * 1e3:.1f} mm and fit {best!r} to {size[best] * 1e3:.1f} mm. Say "
             f"--mount {best}, or invert the target poses: T_camera_target is wanted."
         )
-    metres, turn = size[chosen], found[chosen].residual_rad.value
+    metres, turn = size[chosen], found[chosen].residual_rad
     if metres > MAX_RESIDUAL_M or turn > MAX_RESIDUAL_RAD:
         raise UndeterminedCameraError(
             f"the pose pairs of {pairs.source} disagree by {metres * 1e3:.0f} mm and "

@@ -85,17 +85,6 @@ class Trial:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trials:
-    """What a run has to weigh draws by."""
-
-    usable: list[Trial]
-    skipped: dict[str, str]
-    """Why an episode is none, by its id."""
-    tasks: frozenset[str]
-    """Of all trials that were recorded, usable or not."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Ended:
     """How a trial ends with one draw."""
 
@@ -150,16 +139,15 @@ def _boxes(movers: Sequence[str], unit: Float[np.ndarray, "num_movers 4"]) -> tu
     )
 
 
-def read_trials(run: RunFolder, output: Output) -> Trials:
-    """Read every trial of a run that was executed and judged; missing localisations are made."""
-    trials, reasons, tasks = [], {}, set[str]()
+def read_trials(run: RunFolder, output: Output) -> tuple[list[Trial], dict[str, str]]:
+    """Executed and judged trials, localised where they were not; why others are none, by id."""
+    trials, reasons = [], {}
     paths = run.episodes()
     with output.progress("localise", len(paths)) as advance:
         for index, path in enumerate(paths):
             try:
                 episode = Episode.open(path)
                 if episode.info.kind == "trial":
-                    tasks.add(episode.info.task)
                     trials.append(_trial(run, episode))
             except GstError as error:
                 reasons[path.stem] = str(error)
@@ -168,7 +156,7 @@ def read_trials(run: RunFolder, output: Output) -> Trials:
         why = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
         message = f"{run.path} has no executed trial with an outcome. {why}".rstrip()
         raise UsageError(message)
-    return Trials(usable=trials, skipped=reasons, tasks=frozenset(tasks - {""}))
+    return trials, reasons
 
 
 def _trial(run: RunFolder, episode: Episode) -> Trial:
@@ -299,9 +287,9 @@ def calibrate_posterior(
     Returns:
         The record, and the id of the calibration that holds now.
     """
-    found, tasks = read_trials(run, output), dict[str, Any]()
-    for name in sorted({trial.scene.task.name for trial in found.usable}):
-        trials = [trial for trial in found.usable if trial.scene.task.name == name]
+    (usable, skipped), tasks = read_trials(run, output), dict[str, Any]()
+    for name in sorted({trial.scene.task.name for trial in usable}):
+        trials = [trial for trial in usable if trial.scene.task.name == name]
         beforehand = draw_beforehand(num_draws, rigid_movers(trials[0].scene.task))
         draws = weighed(beforehand, trials, workers=workers, output=output)
         tasks[name] = {
@@ -309,12 +297,7 @@ def calibrate_posterior(
             "effective_draws": effective(draws),
             "sources": {trial.info.id: trial.to_record() for trial in trials},
         }
-    record: dict[str, Any] = {
-        "tasks": tasks,
-        "without_trials": sorted(found.tasks - tasks.keys()),
-        "skipped": found.skipped,
-    }
-    return write_part(run, "posterior", record)
+    return write_part(run, "posterior", {"tasks": tasks, "skipped": skipped})
 
 
 def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:
@@ -327,9 +310,5 @@ def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:
             f"{name}: {len(draws)} draws weighed by {len(trials)} trials, {good} of which "
             f"succeeded; as much as {found['effective_draws']:.1f} equal ones"
         )
-    lines += [
-        f"{name}: no trial of it can be used, so its samples draw from the priors"
-        for name in record["without_trials"]
-    ]
     lines += [f"  {name} not used: {why}" for name, why in record["skipped"].items()]
     return "\n".join(lines)

@@ -1,10 +1,9 @@
 """The twin in a process of its own: one that hangs is ended, one that dies takes nobody with it."""
 
-import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.run_folder import RunFolder
-from bridge.process_pool import Failed, Function, TimeIsUpError, Worker, WorkerDiedError
+from bridge.process_pool import (
+    Failed,
+    Function,
+    TimeIsUpError,
+    Worker,
+    WorkerLostError,
+)
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
@@ -31,15 +36,11 @@ class Question:
     run_path: Path
     """Run folder with the rebuilt scene, or without one."""
     plan: Plan
-    task: Task
-    Ts_base_object: dict[str, Float[np.ndarray, "4 4"]]
-    covariances: dict[str, Float[np.ndarray, "6 6"]]
-    urdf: str
+    seen: ReplayScene
+    """Task, robot, where it stands and objects, as seen; the rest is read from the run."""
     config: ReplayConfig
     max_steps: int
     """Simulated steps, the samples' among them."""
-    start_rad: Float[np.ndarray, " num_joints"] | None = None
-    """Where the arm stands; None: not asked."""
     any_robot: bool = False
     """The scene may be another robot's, for somebody named the robot (``--robot``)."""
 
@@ -78,7 +79,7 @@ def answer(question: Question) -> Verdict:
 
     run, plan = RunFolder.open(question.run_path), question.plan
     scene = _scene_of(question, run)
-    config = for_task(question.config, read_calibration(run), question.task)
+    config = for_task(question.config, read_calibration(run), question.seen.task)
     most_samples = question.max_steps // _steps_of(question, config) - 1
 
     nominal = replay_plan(plan, scene, config, refuse_early=True)
@@ -115,7 +116,7 @@ def _scene_of(question: Question, run: RunFolder) -> ReplayScene:
             f"{other}, and plan {plan.id} is for {plan.robot}. Scan the cell with the robot that "
             "is to act and rebuild it: robot-gst rebuild RUN, or name the robot: --robot"
         )
-    scene = read_rebuilt_scene(run, question.task)
+    scene, seen = read_rebuilt_scene(run, question.seen.task), question.seen
     if plan.scene_hash not in (None, scene.scene_hash):
         raise UndecidedError(
             f"plan {plan.id} was made in scene {str(plan.scene_hash)[:12]}; the run now has "
@@ -123,10 +124,10 @@ def _scene_of(question: Question, run: RunFolder) -> ReplayScene:
         )
     return replace(
         scene,
-        urdf=question.urdf,
-        Ts_base_object=question.Ts_base_object,
-        covariances=question.covariances,
-        start_rad=question.start_rad,
+        urdf=seen.urdf,
+        Ts_base_object=seen.Ts_base_object,
+        covariances=seen.covariances,
+        start_rad=seen.start_rad,
     )
 
 
@@ -136,7 +137,9 @@ def _steps_of(question: Question, config: ReplayConfig) -> int:
     from twin.replay.path import check_usable  # noqa: PLC0415
     from twin.robot.model import load_robot  # noqa: PLC0415
 
-    check_usable(question.plan, load_robot(question.urdf))  # before its impossible times are steps
+    check_usable(
+        question.plan, load_robot(question.seen.urdf)
+    )  # before its impossible times are steps
     steps = max(1, num_steps(question.plan.tau[-1].t_ns, config))
     if steps > question.max_steps:
         raise UndecidedError(
@@ -146,48 +149,41 @@ def _steps_of(question: Question, config: ReplayConfig) -> int:
     return steps
 
 
-def _asked(gate: GateConfig, task: Task, **asked: Any) -> Question:
+def _asked(gate: GateConfig, run_path: Path, plan: Plan, seen: ReplayScene) -> Question:
     """A question as a gate with these settings has it."""
     config = replace(gate.replay, mode="dynamic", samples=gate.samples)
-    config.refuse_soft(task.soft_objects)
-    asked |= {"max_steps": gate.max_steps, "any_robot": bool(gate.robot)}
-    return Question(task=task, config=config, **asked)
+    config.refuse_soft(seen.task.soft_objects)
+    return Question(
+        run_path=run_path,
+        plan=plan,
+        seen=seen,
+        config=config,
+        max_steps=gate.max_steps,
+        any_robot=bool(gate.robot),
+    )
 
 
 def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
     """Judge here as a gate does in its own process; UndecidedError: a replay has too many steps."""
-    known: dict[str, Any] = {
-        "run_path": run_path,
-        "Ts_base_object": scene.Ts_base_object,
-        "covariances": dict(scene.covariances),
-        "urdf": scene.urdf,
-        "start_rad": scene.start_rad,
-    }
-    return lambda plan: answer(_asked(GateConfig(), scene.task, plan=plan, **known))
+    return lambda plan: answer(_asked(GateConfig(), run_path, plan, scene))
 
 
-class TwinProcess:
+class TwinProcess(AbstractContextManager["TwinProcess"]):
     """Localises and replays for a gate. A context manager; for one caller at a time."""
 
     def __init__(self, run_path: Path, config: GateConfig, output: Output) -> None:
         """Start it; it imports what it needs while the gate connects."""
         self._run_path, self._config, self._output = run_path, config, output
-        self._swapping = threading.Lock()
         self._closed = False
-        self._worker: Worker | None = None
-        self._start()
+        self._worker: Worker | None = self._start()
 
-    def _start(self) -> Worker | None:
-        """Begin anew, unless the gate is being stopped."""
-        worker = Worker()
-        with suppress(WorkerDiedError):  # at once: it is replaced when it should answer
+    def _start(self) -> Worker:
+        worker = self._worker = Worker()
+        with suppress(WorkerLostError):  # at once: it is replaced when it should answer
             worker.begin(get_ready, None)
-        with self._swapping:
-            if not self._closed:
-                self._worker = worker
-                return worker
-        worker.close()
-        return None
+        if self._closed:  # meanwhile
+            worker.close()
+        return worker
 
     def localise(self, frames: Any, task: Task, ends_s: float) -> Mapping[str, Any]:
         """Find a task's objects."""
@@ -203,72 +199,51 @@ class TwinProcess:
         ends_s: float,
     ) -> Verdict:
         """Replay a plan from where its objects were found and the arm stands."""
-        question = _asked(
-            self._config,
-            task,
-            run_path=self._run_path,
-            plan=plan,
+        known = [(name, item.covariance) for name, item in found.items()]
+        seen = ReplayScene(
+            task=task,
             Ts_base_object={name: item.T_base_object for name, item in found.items()},
-            covariances={
-                name: item.covariance for name, item in found.items() if item.covariance is not None
-            },
+            covariances={name: sure for name, sure in known if sure is not None},
             urdf=urdf,
             start_rad=start_rad,
         )
+        question = _asked(self._config, self._run_path, plan, seen)
         verdict: Verdict = self._do("replay", answer, question, ends_s)
         return verdict
 
     def _do(self, what: str, function: Function, item: Any, ends_s: float) -> Any:
-        worker = self._worker_now()
+        if self._closed:
+            raise UndecidedError("the gate is being stopped")
+        try:
+            worker = self._worker or self._start()  # the system gave no process the last time
+        except OSError as error:
+            raise UndecidedError(f"no process for the twin can be started: {error}") from error
         try:
             if worker.busy:  # with its imports
                 worker.finish(max(0.0, ends_s - time.monotonic()))
             worker.begin(function, item, max(0.0, ends_s - time.monotonic()))
             result = worker.finish(max(0.0, ends_s - time.monotonic()))
-        except TimeIsUpError as error:
-            self._replace(worker)
-            raise UndecidedError(
-                f"the {what} was not done before the wall-clock limit (--deadline); it was stopped"
-            ) from error
-        except WorkerDiedError as error:
-            self._replace(worker)
-            raise UndecidedError(f"no {what}: {error}") from error
+        except WorkerLostError as error:
+            worker.close()
+            self._worker = None
+            if not self._closed:
+                with suppress(OSError):  # the system gives no process: the next plan asks again
+                    self._start()
+            late = f"the {what} was not done before the wall-clock limit (--deadline)"
+            is_late = isinstance(error, TimeIsUpError)
+            told = f"{late}; it was stopped" if is_late else f"no {what}: {error}"
+            raise UndecidedError(told) from error
         if isinstance(result, Failed):
             if not result.known:
                 self._output.say(result.trace or traceback.format_exc())
             raise UndecidedError(result.message)
         return result
 
-    def _worker_now(self) -> Worker:
-        worker = self._worker
-        try:
-            if worker is None and not self._closed:  # the system gave no process the last time
-                worker = self._start()
-        except OSError as error:
-            raise UndecidedError(f"no process for the twin can be started: {error}") from error
-        if worker is None:
-            raise UndecidedError("the gate is being stopped")
-        return worker
-
-    def _replace(self, worker: Worker) -> None:
-        with self._swapping:
-            if self._worker is not worker:
-                return
-            self._worker = None
-        worker.close()
-        with suppress(OSError):  # the system gives no process: the next plan asks again
-            self._start()
-
     def close(self) -> None:
         """End it, also in the middle of something."""
-        with self._swapping:
-            worker, self._worker, self._closed = self._worker, None, True
-        if worker is not None:
-            worker.close()
-
-    def __enter__(self) -> "TwinProcess":
-        """Use as a context manager."""
-        return self
+        self._closed = True
+        if self._worker is not None:
+            self._worker.close()
 
     def __exit__(self, *_: object) -> None:
         """End it."""

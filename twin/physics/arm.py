@@ -30,11 +30,12 @@ Hulls = Mapping[str, Sequence[Float[np.ndarray, "num_points 3"]]]
 
 
 def write_description(urdf: str, mesh_hulls_m: Hulls, folder: Path) -> Path:
-    """Write ``robot.urdf`` (returned) with hulls [m, link's frame] for its collision meshes."""
+    """Write ``robot.urdf`` (returned) with hulls [m, link's frame] for its collision meshes.
+
+    Visuals are gone already (``with_absolute_meshes``).
+    """
     root = ET.fromstring(urdf)
     for number, link in enumerate(root.findall("link")):
-        for visual in link.findall("visual"):
-            link.remove(visual)
         if link.find("inertial") is None:
             link.append(ET.fromstring(_TINY_INERTIAL))
         hulls = mesh_hulls_m.get(link.get("name", ""), ())
@@ -308,10 +309,6 @@ class Arm:
             self._drive_fingers(self._target_m, max(speed, SLOWEST_M_S))
         else:
             self._drive_fingers(self._max_width_m, min(-speed, top))
-
-    def joints_rad(self) -> Float[np.ndarray, " num_joints"]:
-        """Where the arm is."""
-        return self.posture()[0]
 
     def width_m(self) -> float:
         """Distance between the finger pads, mean of what each finger says; 0 of a fixed tool."""

@@ -59,11 +59,8 @@ class SoftBodies(Protocol):
     def extents_m(self, object_id: str) -> Float[np.ndarray, "3"]:
         """Extents of a body's surface along the axes of its pose."""
 
-    def pose(self, object_id: str) -> tuple[float, ...]:
-        """Position [m] and quaternion wxyz of the rigid motion nearest to the nodes."""
-
     def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
-        """That motion; of a body that burst no numbers."""
+        """The rigid motion nearest to a body's nodes; of one that burst no numbers."""
 
     def health(self, object_id: str) -> SoftHealth:
         """Whether a body is sound."""

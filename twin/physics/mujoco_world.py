@@ -8,6 +8,7 @@ grasps neither slip as PyBullet's do nor fail where its iterations end.
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -25,7 +26,7 @@ from twin.physics.arm import Hulls, Joints, PhysicsError, require_parts, write_d
 from twin.physics.bending import SoftBodies
 from twin.physics.config import FINGER_SPEED_M_S, RIGID_ONLY, PhysicsConfig
 from twin.physics.unseen import EVEN, Unseen, box_inertia
-from twin.physics.world import Box
+from twin.physics.world import TABLE_M, Box
 
 STEP_HZ = 480
 """The engine takes whole steps in each period of control, at least so many a second: at fewer the
@@ -158,12 +159,6 @@ class MujocoArm:
         widths = [finger.width(value) for value, finger in zip(values, self._drives, strict=True)]
         return float(sum(widths) / len(widths)) if widths else 0.0
 
-    def T_base_link(self, link: str) -> Float[np.ndarray, "4 4"]:
-        """Pose of a link's frame."""
-        mujoco.mj_kinematics(self._model, self._data)
-        body = self._data.body(link)
-        return se3.transform_from(np.array(body.xquat), np.array(body.xpos))
-
 
 def _refuse_gripper(record: Robot, urdf: str) -> None:
     """Refuse (PhysicsError) fingers that turn, follow a lever or a table, or mimic another one."""
@@ -208,7 +203,7 @@ class _Shape:
         return not ((self.on_table and other.table) or (self.table and other.on_table))
 
 
-class MujocoWorld:
+class MujocoWorld(AbstractContextManager["MujocoWorld"]):
     """One simulated cell. A context manager, as every world; there is nothing to free."""
 
     def __init__(self, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
@@ -253,11 +248,11 @@ class MujocoWorld:
                     _Shape(name=geom.name, friction=mu, owner="robot", on_table=on_table)
                 )
 
-    def add_table(self, height_m: float, size_m: float = 4.0, thickness_m: float = 0.4) -> None:
+    def add_table(self, height_m: float) -> None:
         """Add the table: a slab whose top is at the height."""
         T = np.eye(4)
-        T[2, 3] = height_m - thickness_m / 2
-        self._add_static(np.array([size_m, size_m, thickness_m]), T, table=True)
+        T[2, 3] = height_m - TABLE_M[2] / 2
+        self._add_static(np.array(TABLE_M), T, table=True)
 
     def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> None:
         """Add solid boxes that never move."""
@@ -389,10 +384,6 @@ class MujocoWorld:
             known = ", ".join(self.free_objects) or "none"
             raise PhysicsError(f"no object {object_id!r} moves in this world. There are: {known}.")
         return self._addresses[object_id]
-
-    def __enter__(self) -> "MujocoWorld":
-        """Use as a context manager."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Nothing to free: model and data go with the world."""

@@ -12,10 +12,9 @@ from jaxtyping import Float
 
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
-from twin.physics.world import Bodies
+from twin.physics.world import TABLE_M, Bodies
 
 _HAND_MASS_KG = 1e4
-_TABLE_M = (4.0, 4.0, 0.4)
 
 
 class PushWorld(Bodies):
@@ -34,8 +33,8 @@ class PushWorld(Bodies):
         """Put table, box and hand into an empty world."""
         super().__init__(config)
         T_table, away = np.eye(4), np.eye(4)
-        T_table[2, 3], away[2, 3] = table_height_m - _TABLE_M[2] / 2, 10.0
-        table = self._box(np.array(_TABLE_M), 0.0, T_table)
+        T_table[2, 3], away[2, 3] = table_height_m - TABLE_M[2] / 2, 10.0
+        table = self._box(np.array(TABLE_M), 0.0, T_table)
         self._set_friction(table, config.surface_friction)
         self._object = self._box(size_m, mass_kg, T_world_box)
         self._set_friction(self._object, config.object_friction)

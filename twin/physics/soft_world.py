@@ -284,14 +284,6 @@ class SoftWorld:
             self._fits[object_id] = fit
         return self._fits[object_id]
 
-    def pose(self, object_id: str) -> tuple[float, ...]:
-        """Position [m] and quaternion wxyz of that motion, seven numbers."""
-        T = self.T_base_object(object_id)
-        if not np.isfinite(T).all():
-            return (float("nan"),) * 7
-        q, p = se3.split(T)
-        return (*p.tolist(), *q.tolist())
-
     def extents_m(self, object_id: str) -> Float[np.ndarray, "3"]:
         """Extents of a body's surface along the axes of its pose."""
         body, nodes = self.names[object_id], self.nodes_m(object_id)

@@ -78,8 +78,7 @@ class FrictionAnchors:
 
 Box = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 """Centre and extents in the owner's frame [m]."""
-
-
+TABLE_M = (4.0, 4.0, 0.4)
 _World = TypeVar("_World")
 
 
@@ -166,11 +165,10 @@ class World(Bodies):
             ids.append(body)
         return ids
 
-    def add_table(self, height_m: float, size_m: float = 4.0, thickness_m: float = 0.4) -> int:
+    def add_table(self, height_m: float) -> int:
         """Add the table: a slab around the robot's base, whose top is at the height over it."""
-        centre = np.array([0.0, 0.0, height_m - thickness_m / 2])
-        extents = np.array([size_m, size_m, thickness_m])
-        body = self.add_static([(centre, extents)], np.eye(4))[0]
+        centre = np.array([0.0, 0.0, height_m - TABLE_M[2] / 2])
+        body = self.add_static([(centre, np.array(TABLE_M))], np.eye(4))[0]
         # The robot stands on the table: its base touches it by construction.
         for link in (-1, *self.robot.base_links):
             self.client.setCollisionFilterPair(self.robot.id, body, link, -1, 0)
@@ -236,12 +234,7 @@ class World(Bodies):
             soft.step()
 
     def object_pose(self, object_id: str) -> tuple[float, ...]:
-        """Position [m] and quaternion wxyz of an object that moves, seven numbers.
-
-        The pose of a soft body is the rigid motion nearest to its nodes, weighted by mass.
-        """
-        if (soft := self._softly(object_id)) is not None:
-            return soft.pose(object_id)
+        """Position [m] and quaternion wxyz of a rigid object that moves, seven numbers."""
         p, (x, y, z, w) = self.client.getBasePositionAndOrientation(self._free(object_id))
         centre = self._centres_m.get(object_id)
         if centre is not None:
@@ -251,7 +244,7 @@ class World(Bodies):
         return (*p, w, x, y, z)
 
     def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
-        """Pose of an object that moves, as ``object_pose``."""
+        """Pose of an object that moves; of a soft one, the rigid motion nearest to its nodes."""
         if (soft := self._softly(object_id)) is not None:
             return soft.T_base_object(object_id).copy()
         pose = np.array(self.object_pose(object_id))

@@ -15,6 +15,7 @@ from twin.policies.errors import RefusedError, StoppedError
 from twin.policies.limits import refuse_target
 from twin.policies.starts import Start
 from twin.replay.checks import stops_of_arm
+from twin.replay.config import STATE_EVERY
 from twin.replay.dynamics import Samples, free_start, mesh_hulls, soft_models, spawn
 from twin.replay.observed import observed_plan
 from twin.replay.path import JointPath
@@ -39,7 +40,6 @@ class TwinCell:
         self._soft = soft_models(start.scene)
         self.scene = free_start(start.scene, self._soft)
         self._rate_hz = start.config.physics.rate_hz
-        self._stride = self._rate_hz // start.config.sample_rate_hz
         self._world: PhysicsWorld = open_world(
             start.config.engine,
             self._hulls.robot.urdf,
@@ -116,7 +116,7 @@ class TwinCell:
             self._world.robot.command(target.tolist(), velocity, self.target_width_m)
             self._world.step()
             self._steps += 1
-            if self._steps % self._stride == 0 and not self._samples.take(self._world, self.t_ns):
+            if self._steps % STATE_EVERY == 0 and not self._samples.take(self._world, self.t_ns):
                 self.burst = True
                 return
 

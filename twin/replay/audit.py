@@ -15,7 +15,6 @@ no inside: a body wholly inside a link's mesh is not found.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 from typing import Any
 
 import coal
@@ -24,6 +23,7 @@ import pinocchio as pin
 from jaxtyping import Bool, Float, Int
 
 from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan
 from bridge.task.task_file import BASKET
@@ -48,7 +48,6 @@ TOLERANCE_M = 0.0005
 _SLAB_M = (4.0, 4.0, 0.4)
 _BLOCK_M = 0.15
 """The scene's surface is cut into blocks, so that most of it need not be asked."""
-_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 Corners = Float[np.ndarray, "8 3"]
 _Excess = tuple[float, str, tuple[str, str]]
@@ -83,7 +82,7 @@ class _Placed:
 
     def corners(self) -> Float[np.ndarray, "num_states 8 3"]:
         """The corners of its box."""
-        local = self.body.centre_m + _CORNERS * self.body.half_m
+        local = self.body.centre_m + box_corners(2 * self.body.half_m)
         return np.asarray(np.einsum("sij,cj->sci", self.R, local) + self.t[:, None])
 
 

@@ -112,6 +112,8 @@ START_RAD, START_M = 0.05, 0.01
 """A plan starts no farther than this from where each joint of the robot is, nor its tool."""
 MOVED_M = 0.005
 """An object counts as carried or pushed once it is this far from its start [m]."""
+STATE_EVERY = 4
+"""Steps of physics between two states that are kept: 60 Hz at 240 steps a second."""
 PATH_RATE_HZ = 25
 PATH_STEP_S = 1 / PATH_RATE_HZ
 """Spacing at which the path between waypoints is checked [s]."""
@@ -128,8 +130,6 @@ class ReplayConfig:
     """What moves rigid bodies; soft ones are pybullet's alone."""
     eps_col_m: float = 0.002
     """Smallest distance between bodies that may not touch, the paper's epsilon_col [m]."""
-    sample_rate_hz: int = 60
-    """States per second that a replay keeps; divides the physics rate."""
     settle_before_s: float = 0.25
     """Objects come to rest for this long before the trajectory starts [s]."""
     settle_after_s: float = 1.0
@@ -149,7 +149,7 @@ class ReplayConfig:
     """Nominal physics."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers beyond which no comparison fails; rates and engines that do not fit."""
+        """Refuse numbers beyond which no comparison fails, and engines that are not there."""
         second = (0, 60)
         refuse_outside(
             self,
@@ -161,12 +161,11 @@ class ReplayConfig:
             },
         )
         require_engine(self.engine)
-        if self.sample_rate_hz < 1 or self.physics.rate_hz % self.sample_rate_hz:
-            message = (
-                f"sample_rate_hz {self.sample_rate_hz} does not divide the physics rate "
-                f"{self.physics.rate_hz} Hz. Choose a divisor, for example 60."
-            )
-            raise UsageError(message)
+
+    @property
+    def states_hz(self) -> int:
+        """States per second that a replay keeps."""
+        return self.physics.rate_hz // STATE_EVERY
 
     def refuse_soft(self, soft_objects: Sequence[str]) -> None:
         """Refuse soft objects in an engine that has none."""
@@ -182,11 +181,9 @@ class ReplayRunConfig:
     episode: tuple[str, ...] = ()
     """Ids of the trial episodes to replay; all of them when none is given."""
     workers: int | None = None
-    """Processes that replay side by side, or processors of --ray local: one for each core, at most
-    8, when no number is given. A cluster that is there uses its own."""
+    """Processes that replay side by side: one for each core, at most 8, when no number is given."""
     ray: str = ""
-    """Replay on a Ray cluster instead: its HOST:PORT, or local to start one on this machine;
-    docs/scale.md says how it is kept closed."""
+    """Replay on a Ray cluster instead: its HOST:PORT; docs/scale.md says how it is kept closed."""
     samples: int = 0
     """Varied replays of each plan; they give the success probability of its verdict. A kinematic
     replay moves no objects and has none."""

@@ -112,57 +112,40 @@ class DivergedQuantity:
     body: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Divergence:
-    """Everything in which the trajectories of one execution differ."""
-
-    plan_id: str
-    lag_s: float | None
-    """How far the recorded tool lags behind the planned one."""
-    quantities: tuple[DivergedQuantity, ...]
-
-    @property
-    def first(self) -> DivergedQuantity | None:
-        """The earliest; of several at one instant, the one nearest to the cause."""
-        return min(self.quantities, key=_rank, default=None)
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the gst divergence v1 record, checked against its schema."""
-        record = {
-            "schema_version": SCHEMA_VERSION,
-            "plan_id": self.plan_id,
-            "lag_s": self.lag_s,
-            "first": None if self.first is None else _plain(self.first),
-            "quantities": [_plain(one) for one in self.quantities],
-        }
-        check_record(record, name="divergence")
-        return record
-
-
 def diverge(
     plan_id: str,
     traces: Sequence[Trace],
     *,
     findings: Mapping[str, Mapping[tuple[str, str], bool | None]] | None = None,
-) -> Divergence:
-    """Compare every two trajectories, what each predicate (kind, object) said only if all agree."""
+) -> dict[str, Any]:
+    """Compare every two trajectories, what each predicate (kind, object) said only if all agree.
+
+    The gst divergence v1 record, checked against its schema: ``lag_s`` is how far the recorded tool
+    lags behind the planned one, ``first`` the earliest of ``quantities``; of several at one
+    instant, the one nearest to the cause.
+    """
     quantities: list[DivergedQuantity] = []
     lags: dict[tuple[str, str], float] = {}
     ordered = sorted(traces, key=lambda trace: SIDES.index(trace.side))
-    for first, second in combinations(ordered, 2):
-        pair = (first.side, second.side)
-        lags[pair] = lag_s(first, second)
-        found = sorted(_quantities(first, without_lag(second, lags[pair])), key=_rank)
+    for one, other in combinations(ordered, 2):
+        pair = (one.side, other.side)
+        lags[pair] = lag_s(one, other)
+        found = sorted(_quantities(one, without_lag(other, lags[pair])), key=_rank)
         if found:
-            found = [replace(one, attribution=found[0].attribution) for one in found]
+            found = [replace(each, attribution=found[0].attribution) for each in found]
         else:
-            found = list(_predicates(pair, findings or {}, max(first.end_ns, second.end_ns)))
+            found = list(_predicates(pair, findings or {}, max(one.end_ns, other.end_ns)))
         quantities += found
-    return Divergence(
-        plan_id=plan_id,
-        lag_s=lags.get(("planned", "recorded")),
-        quantities=tuple(quantities),
-    )
+    first = min(quantities, key=_rank, default=None)
+    record = {
+        "schema_version": SCHEMA_VERSION,
+        "plan_id": plan_id,
+        "lag_s": lags.get(("planned", "recorded")),
+        "first": None if first is None else _plain(first),
+        "quantities": [_plain(one) for one in quantities],
+    }
+    check_record(record, name="divergence")
+    return record
 
 
 def _quantities(first: Trace, second: Trace) -> Iterator[DivergedQuantity]:

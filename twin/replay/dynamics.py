@@ -17,11 +17,11 @@ from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from bridge.leaves import load_leaf
 from bridge.task.task_file import ObjectModel
-from twin.physics.bending import SoftHealth, SoftShape
+from twin.physics.bending import SoftShape
 from twin.physics.engines import PhysicsWorld, open_world
 from twin.physics.unseen import EVEN
 from twin.replay.clearance.bodies import placed_panels, placement_of
-from twin.replay.config import ReplayConfig
+from twin.replay.config import STATE_EVERY, ReplayConfig
 from twin.replay.failure import NotEvaluatedError
 from twin.replay.path import JointPath
 from twin.replay.result import Burst, States
@@ -90,9 +90,8 @@ def num_steps(end_ns: int, config: ReplayConfig) -> int:
 def _steps_kept(end_ns: int, config: ReplayConfig) -> int:
     """Those from the start on: whole samples, so that the last lies at the end of settling."""
     rate = config.physics.rate_hz
-    stride = rate // config.sample_rate_hz
     moving_steps = int(np.ceil(end_ns * 1e-9 * rate))
-    return -(-(moving_steps + round(config.settle_after_s * rate)) // stride) * stride
+    return -(-(moving_steps + round(config.settle_after_s * rate)) // STATE_EVERY) * STATE_EVERY
 
 
 def simulate(
@@ -105,7 +104,6 @@ def simulate(
     """
     check_dynamics(hulls.robot)
     rate = config.physics.rate_hz
-    stride = rate // config.sample_rate_hz
     total = _steps_kept(path.end_ns(), config)
     times_ns = (np.arange(total + 1) * (1e9 / rate)).round().astype(np.int64)
     postures = path.joints_at(times_ns)
@@ -125,7 +123,7 @@ def simulate(
         for step in range(total):
             world.robot.command(targets[step + 1], velocities[step], widths[step])
             world.step()
-            if (step + 1) % stride == 0 and not samples.take(world, stamps[step + 1]):
+            if (step + 1) % STATE_EVERY == 0 and not samples.take(world, stamps[step + 1]):
                 break
         return samples.states(world)
 
@@ -155,8 +153,9 @@ class Samples:
     def take(self, world: PhysicsWorld, t_ns: int) -> bool:
         """Keep the state; False, and nothing kept, when a soft body has burst."""
         for name in self._soft:
-            found = burst_of(world.soft_bodies().health(name))
-            if found is not None:
+            health = world.soft_bodies().health(name)
+            if health.burst:
+                found = health.describe()
                 self._burst = Burst(object_id=name, t_ns=t_ns, found=found)
                 if self._rows:
                     return False
@@ -210,11 +209,6 @@ class Samples:
             if not health.sound and name not in found:
                 found[name] = f"at the end: {health.describe()}"
         return found
-
-
-def burst_of(health: SoftHealth) -> str | None:
-    """Say in what way a soft body has burst; None when it has not."""
-    return health.describe() if health.burst else None
 
 
 START_OVERLAP_M = 0.006

@@ -13,7 +13,7 @@ from bridge.geometry.signals import runs_of_true
 from bridge.robots.robot import GRIPPER_WIDTH, Robot
 from bridge.task.plan import Plan, Stage
 from twin.replay.config import ReplayConfig
-from twin.replay.observed import PLATEAU_M, find_grips, in_order
+from twin.replay.observed import PLATEAU_M, find_grips
 from twin.replay.path import MAX_DURATION_S, WIDTH_SLACK_M, JointPath, UnusablePlanError
 
 SQUEEZE_M = 0.01
@@ -127,14 +127,7 @@ def path_of_execution(
             found="was executed without recorded joints or gripper",
             hint=f"Record {JOINT_STATES} and {GRIPPER_STATE} over the whole execution.",
         )
-    missing = [name for name in robot.joints if name not in track.names]
-    if missing:
-        raise UnusablePlanError(
-            plan_id=plan.id,
-            found=f"was recorded without the joints {', '.join(missing)}",
-            hint=f"The recording has {', '.join(track.names)}.",
-        )
-    arm = in_order(track, robot)
+    arm = in_order(track, robot, plan.id)
     check_track(arm, "joints", plan.id)
     widths = gripper_widths(widths, plan, robot)
     first_ns = int(track.stamps_ns[0])
@@ -150,6 +143,19 @@ def path_of_execution(
         width_m=np.where(closed, np.maximum(width - squeeze_m, 0.0), width),
         first_close_ns=next((closing for closing, _, _ in find_grips(width_times, width)), None),
     )
+
+
+def in_order(track: JointTrack, robot: Robot, plan_id: str) -> JointTrack:
+    """The robot's own joints alone, from base to hand."""
+    missing = [name for name in robot.joints if name not in track.names]
+    if missing:
+        raise UnusablePlanError(
+            plan_id=plan_id,
+            found=f"was recorded without the joints {', '.join(missing)}",
+            hint=f"The recording has {', '.join(track.names)}.",
+        )
+    order = [track.names.index(name) for name in robot.joints]
+    return replace(track, names=robot.joints, position=track.position[:, order])
 
 
 def cut_track(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:

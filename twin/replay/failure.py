@@ -7,18 +7,11 @@ from bridge.task.causes import Cause
 from bridge.task.verdict import Factor
 from twin.errors import TwinError
 
-NOT_EVALUATED = "not evaluated: "
-"""What tables and verdicts look for."""
 WORDS = {True: "accepted", False: "rejected", None: "undecided"}
 
 
 class NotEvaluatedError(TwinError):
     """A trajectory cannot be judged at all; the message says why."""
-
-    def __init__(self, why: str) -> None:
-        """Put the words that tables and verdicts look for in front."""
-        self.why = why.removeprefix(NOT_EVALUATED)
-        super().__init__(f"{NOT_EVALUATED}{self.why}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,11 +15,10 @@ from bridge.task.record import parse_record
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from twin.replay.config import ReplayConfig
-from twin.replay.failure import NOT_EVALUATED
 from twin.replay.scene import StartState
 from twin.replay.verdict import KINEMATIC_ENGINE, engine_of
 
-REPLAY_VERSION = 23
+REPLAY_VERSION = 24
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 
@@ -136,7 +135,7 @@ class ReplayJob:
 
 # The row of one replay in the table of a run.
 
-MAY_STAY_OPEN = ("settled", "shape")
+MAY_STAY_OPEN = ("settled", "shape", "allowed_contacts")
 """Predicates that a recording without an answer to them may succeed without."""
 
 
@@ -163,8 +162,7 @@ def divergence_of(episode: Episode) -> dict[str, Any] | None:
 
 def row_of_failure(job: ReplayJob, message: str) -> dict[str, Any]:
     """Return the row of a trajectory that was not evaluated, with the reason."""
-    why = message.removeprefix(NOT_EVALUATED)
-    return {**_row(job), "error": f"{NOT_EVALUATED}{why}", "reason": f"{NOT_EVALUATED}{why}"}
+    return {**_row(job), "error": message, "reason": message}
 
 
 def _row(job: ReplayJob) -> dict[str, Any]:
@@ -178,10 +176,8 @@ def _row(job: ReplayJob) -> dict[str, Any]:
         "file": job.path().name,
         "skipped": False,
         "accepted": None,
-        "first_failing": None,
         "reason": None,
         "error": None,
-        "engine": None,
         "warnings": [],
         "predicates": None,
         "divergence": None,
@@ -200,9 +196,7 @@ def judged(
         **_row(job),
         "skipped": skipped,
         "accepted": verdict.accepted,
-        "first_failing": verdict.first_failing,
         "reason": verdict.reason,
-        "engine": verdict.engine,
         "warnings": list(verdict.warnings),
         "predicates": predicates_hold(verdict),
         "p_success": verdict.p_success,
@@ -213,8 +207,8 @@ def judged(
 def predicates_hold(verdict: Verdict) -> bool | None:
     """Whether the success predicates hold; None when what is known does not say.
 
-    One look afterwards seldom tells whether a thing lies still or kept its shape: those may stay
-    open. A thing that nobody found was not seen to be where it belongs.
+    One look afterwards seldom tells whether a thing lies still, kept its shape or was touched:
+    those may stay open. A thing that nobody found was not seen to be where it belongs.
     """
     values = [
         item["value"]

@@ -15,7 +15,6 @@ from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.streams import JointTrack
 from bridge.geometry import se3
-from bridge.robots.robot import Robot
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import Task
 from twin.robot.model import RobotModel
@@ -158,14 +157,4 @@ def _stage(table: Mapping[str, Any], start_ns: int, end_ns: int) -> Stage:
         allowed_contacts=tuple((str(a), str(b)) for a, b in pairs),
         t_start_ns=start_ns,
         t_end_ns=end_ns,
-    )
-
-
-def in_order(track: JointTrack, robot: Robot) -> JointTrack:
-    """The robot's own joints alone, from base to hand; as it came where one is missing."""
-    if any(name not in track.names for name in robot.joints):
-        return track
-    order = [track.names.index(name) for name in robot.joints]
-    return JointTrack(
-        names=robot.joints, stamps_ns=track.stamps_ns, position=track.position[:, order]
     )

@@ -131,35 +131,25 @@ def _nodes(result: ReplayResult, cell: str, start_ns: int, frame_id: str) -> Ite
 
 def _contacts(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Message]:
     """Measured distances below the margin, and what physics says of the fingers."""
-    topic = f"{prefix}{CONTACT}"
-    for contact in result.contacts or ():
-        record = _contact_record(
-            start_ns, contact.start_ns, contact.end_ns, contact.bodies, source="distance"
-        ) | {"allowed": contact.allowed, "min_distance_m": contact.min_distance_m}
-        yield _json_message(topic, schema.CONTACT, record)
+    spans: list[tuple[Any, ...]] = [
+        (near.start_ns, near.end_ns, near.bodies, near.allowed, near.min_distance_m, "distance")
+        for near in result.contacts or ()
+    ]
     for name, touches in result.finger_contact.items():
         for first_ns, last_ns in stretches_ns(result.stamps_ns, touches):
-            record = _contact_record(start_ns, first_ns, last_ns, (GRIPPER, name), source="physics")
-            yield _json_message(topic, schema.CONTACT, record)
-
-
-def _contact_record(
-    origin_ns: int, first_ns: int, last_ns: int, bodies: tuple[str, str], *, source: str
-) -> dict[str, Any]:
-    return {
-        "schema_version": 1,
-        "stamp_ns": origin_ns + first_ns,
-        "end_ns": origin_ns + last_ns,
-        "bodies": list(bodies),
-        "allowed": None,
-        "min_distance_m": None,
-        "source": source,
-    }
-
-
-def _json_message(topic: str, type_name: str, record: Mapping[str, Any]) -> _Message:
-    data = json.dumps(record, separators=(",", ":")).encode()
-    return _Message(int(record["stamp_ns"]), topic, type_name, data)
+            spans.append((first_ns, last_ns, (GRIPPER, name), None, None, "physics"))
+    for first_ns, last_ns, bodies, allowed, min_distance_m, source in spans:
+        record = {
+            "schema_version": 1,
+            "stamp_ns": start_ns + first_ns,
+            "end_ns": start_ns + last_ns,
+            "bodies": list(bodies),
+            "allowed": allowed,
+            "min_distance_m": min_distance_m,
+            "source": source,
+        }
+        data = json.dumps(record, separators=(",", ":")).encode()
+        yield _Message(start_ns + first_ns, f"{prefix}{CONTACT}", schema.CONTACT, data)
 
 
 def _stamped(

@@ -94,12 +94,6 @@ def masses_of(calibration: Calibration | None, task: Task) -> dict[str, tuple[fl
     }
 
 
-def calibration_notes(calibration: Calibration | None, task: Task) -> tuple[str, ...]:
-    """What has to be said of a calibration: a posterior that is not the task's own."""
-    found = {} if calibration is None else _mapping(calibration.record, "posterior")
-    return (OTHER_TASKS,) if found and task.name not in _mapping(found, "tasks") else ()
-
-
 def for_task(config: ReplayConfig, calibration: Calibration | None, task: Task) -> ReplayConfig:
     """Settings of a task's replays: calibrated, and pressing as hard as its gripper is set.
 
@@ -139,7 +133,8 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> ReplayScene:
     the task file stands in for others. Robot and poses are left to whoever knows them.
     """
     calibration, record = read_calibration(run), read_record(run)
-    notes = list(calibration_notes(calibration, task))
+    drawn = {} if calibration is None else _mapping(calibration.record, "posterior")
+    notes = [OTHER_TASKS] if drawn and task.name not in _mapping(drawn, "tasks") else []
     weighed = {
         key: replace(task.objects[key], mass_kg=mass)
         for key, (mass, _) in masses_of(calibration, task).items()
@@ -155,8 +150,10 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> ReplayScene:
             notes.append(f"{key}: {found}")
         else:
             lattices[key] = found
-    static = _static(run.scene_dir / "sdf.npz")
-    if static is None:
+    path, static = run.scene_dir / "sdf.npz", None
+    if path.is_file():
+        static = _load_static(path, path.stat().st_mtime_ns)
+    else:
         notes.append(NO_DISTANCES)
     heights = _mapping(_mapping(record, "sdf"), "rim_height_m")
     return ReplayScene(
@@ -241,10 +238,6 @@ def _watertight(path: Path) -> bool:
         return False
     geometry = about.get("geometry") if isinstance(about, dict) else None
     return isinstance(geometry, dict) and geometry.get("watertight") is True
-
-
-def _static(path: Path) -> StaticSdf | None:
-    return _load_static(path, path.stat().st_mtime_ns) if path.is_file() else None
 
 
 @lru_cache(maxsize=2)

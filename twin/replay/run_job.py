@@ -15,41 +15,40 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, GstError
-from bridge.robots.robot import read_robot, robot_of
+from bridge.robots.robot import Robot, read_robot, robot_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import evaluate_success
 from bridge.task.verdict import SAME_ENGINE, Verdict, is_same_engine
 from twin.replay.config import ReplayConfig
-from twin.replay.divergence import Divergence, diverge
+from twin.replay.divergence import diverge
 from twin.replay.execution import (
     check_covers,
     check_length,
     cut_track,
+    in_order,
     path_of_execution,
     stages_as_executed,
 )
 from twin.replay.job import WITHOUT, ReplayJob, judged, row_of_failure
 from twin.replay.monte_carlo import with_samples
-from twin.replay.observed import in_order, observed_plan
+from twin.replay.observed import observed_plan
 from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.replay.trace import (
-    CONTACT_M,
     Recording,
     Trace,
-    rollout_of_recording,
     states_of_recording,
     trace_of_file,
     trace_of_recording,
     trace_of_result,
 )
 from twin.replay.verdict import findings_of, replay_joints, replay_plan
-from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 from twin.robot.posture import check_clock, width_track
 
+Tracks = tuple[streams.JointTrack, streams.JointTrack]
 START_KNOWN_NS = 1_000_000_000
 """Joint states this near to a plan's start say where the arm was."""
 
@@ -75,20 +74,13 @@ class _Source:
     plan_as_executed: Plan
     """With the stages at the times at which they were executed."""
     scene: ReplayScene
-
-    @property
-    def executed(self) -> bool:
-        return self.job.trajectory == "executed" and self.job.end_ns is not None
-
-    def is_same_engine(self, result: ReplayResult) -> bool:
-        """Whether the verdict is that of the engine that moved the cell itself."""
-        engine, stand_in = result.verdict.engine, self.episode.info.stand_in
-        return self.job.config.mode == "dynamic" and is_same_engine(engine, stand_in=stand_in)
+    tracks: Tracks | None
+    """Recorded joints and widths of what was executed; None: the plan is replayed."""
 
     @property
     def end_ns(self) -> int:
         """When the trajectory ended and settling began."""
-        return self.job.length_ns() if self.executed else self.plan.tau[-1].t_ns
+        return self.plan.tau[-1].t_ns if self.tracks is None else self.job.length_ns()
 
 
 def _replay(job: ReplayJob) -> tuple[Verdict, dict[str, Any] | None]:
@@ -96,13 +88,15 @@ def _replay(job: ReplayJob) -> tuple[Verdict, dict[str, Any] | None]:
     source, divergence = _open(job), None
     job.config.refuse_soft(source.scene.task.soft_objects)
     result = _with_samples(source, _run(source, source.scene, job.config))
-    if source.executed and job.config.mode == "kinematic":
-        found = recorded_findings(_recording(source), job.config)
-        result = replace(result, verdict=replace(result.verdict, findings=found))
-    elif source.executed:
-        compared = compare(job, result, _recording(source), source.end_ns)
-        divergence = compared.to_record()
-    if source.is_same_engine(result):
+    if source.tracks is not None:
+        recording = _recording(source, *source.tracks)
+        if job.config.mode == "kinematic":
+            found = recorded_findings(recording)
+            result = replace(result, verdict=replace(result.verdict, findings=found))
+        else:
+            divergence = compare(job, result, recording, source.end_ns)
+    engine, stand_in = result.verdict.engine, source.episode.info.stand_in
+    if job.config.mode == "dynamic" and is_same_engine(engine, stand_in=stand_in):
         told, why = (*result.verdict.warnings, SAME_ENGINE), result.verdict.reason or SAME_ENGINE
         result = replace(result, verdict=replace(result.verdict, warnings=told, reason=why))
     images = _images(source, result) if job.render else ()
@@ -123,11 +117,12 @@ def _open(job: ReplayJob) -> _Source:
             found="no robot description",
             hint=f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
         )
-    task = job.task
-    if job.plan_index == WITHOUT:
-        arm, widths = _tracks(job, episode, urdf)
-        robot = load_robot(urdf)
-        plan = observed_plan(in_order(arm, robot.record), widths, robot, task, episode.info)
+    task, robot = job.task, load_robot(urdf)
+    executed = job.trajectory == "executed" and job.end_ns is not None
+    tracks = _tracks(job, episode, robot.record) if executed else None
+    if job.plan_index == WITHOUT and tracks is not None:
+        arm, widths = in_order(tracks[0], robot.record, job.plan_id), tracks[1]
+        plan = observed_plan(arm, widths, robot, task, episode.info)
     else:
         plan = streams.plans(episode)[job.plan_index][1]
     known = ReplayScene(task=task)
@@ -141,18 +136,16 @@ def _open(job: ReplayJob) -> _Source:
         reasons=job.start.reasons,
         covariances=job.start.covariances,
     )
-    executed = job.trajectory == "executed" and job.end_ns is not None
     if job.trajectory == "planned":
-        joints = robot_of(urdf).joints
-        scene = replace(scene, start_rad=recorded_start(episode, job.start_ns, joints))
+        scene = replace(scene, start_rad=recorded_start(episode, job.start_ns, robot.joints))
     events = executed_events(episode) if executed else []
-    plan_as_executed = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
     return _Source(
         job=job,
         episode=episode,
         plan=plan,
-        plan_as_executed=plan_as_executed,
+        plan_as_executed=replace(plan, stages=stages_as_executed(plan, events, job.start_ns)),
         scene=scene,
+        tracks=tracks,
     )
 
 
@@ -181,31 +174,26 @@ def recorded_joints(
 
 
 def _run(source: _Source, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
-    if not source.executed:
+    if source.tracks is None:
         return replay_plan(source.plan_as_executed, scene, config)
-    arm, widths = _tracks(source.job, source.episode, source.scene.urdf)
-    return replay_joints(arm, widths, scene, config, plan=source.plan_as_executed)
+    return replay_joints(*source.tracks, scene, config, plan=source.plan_as_executed)
 
 
-def _tracks(
-    job: ReplayJob, episode: Episode, urdf: str
-) -> tuple[streams.JointTrack, streams.JointTrack]:
+def _tracks(job: ReplayJob, episode: Episode, robot: Robot) -> Tracks:
     """Recorded joints and widths, cut to the execution."""
     plan_id, end_ns = job.plan_id, job.start_ns + job.length_ns()
     check_clock(episode, (JOINT_STATES, GRIPPER_STATE), job.start_ns, end_ns, plan_id)
     check_length(job.length_ns(), plan_id)
     arm = cut_track(streams.joint_track(episode, JOINT_STATES), job.start_ns, end_ns)
     check_covers(arm, "joints", end_ns, plan_id)
-    widths = cut_track(width_track(episode, robot_of(urdf)), job.start_ns, end_ns)
+    widths = cut_track(width_track(episode, robot), job.start_ns, end_ns)
     check_covers(widths, "gripper widths", end_ns, plan_id)
     return arm, widths
 
 
-def _recording(source: _Source) -> Recording:
-    job = source.job
-    arm, widths = _tracks(source.job, source.episode, source.scene.urdf)
+def _recording(source: _Source, arm: streams.JointTrack, widths: streams.JointTrack) -> Recording:
+    job, seen_ns = source.job, source.job.end.seen_ns
     kinematic = replace(job.config, mode="kinematic")
-    seen_ns = job.end.seen_ns
     return Recording(
         plan=source.plan_as_executed,
         path=path_of_execution(
@@ -287,19 +275,19 @@ def _origin(
 Findings = dict[tuple[str, str], bool | None]
 
 
-def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[str, Any], ...]:
-    """What the success predicates, and the one on contacts, say of the recording itself."""
-    robot = load_robot(recording.scene.urdf)
-    rollout = rollout_of_recording(recording, robot, hulls_of(robot), config)
-    task = recording.scene.task
-    return tuple(findings_of(task, rollout, "recorded", tolerance_m=CONTACT_M))
+def recorded_findings(recording: Recording) -> tuple[dict[str, Any], ...]:
+    """What the success predicates say of the recording itself."""
+    states = states_of_recording(recording, load_robot(recording.scene.urdf))
+    return tuple(findings_of(recording.scene.task, states, "recorded"))
 
 
-def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: int) -> Divergence:
+def compare(
+    job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: int
+) -> dict[str, Any]:
     """Lay the executed replay over the planned one, if it is there, and over the recording."""
     robot = load_robot(recording.scene.urdf)
     executed = trace_of_result(result, "executed", end_ns)
-    recorded = trace_of_recording(recording, robot, job.config.sample_rate_hz)
+    recorded = trace_of_recording(recording, robot, job.config.states_hz)
     traces = [executed, recorded]
     task = job.task
     findings = {

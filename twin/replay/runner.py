@@ -1,7 +1,6 @@
 """Replay every trajectory of a run: each plan as planned, each execution as recorded."""
 
 import contextlib
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -212,53 +211,22 @@ def there_already(
     jobs: Sequence[ReplayJob], *, force: bool
 ) -> tuple[list[dict[str, Any]], list[ReplayJob]]:
     """Rows of the replays that were made before, and the jobs that are still to do."""
-    rows, todo, kept = [], [], []
+    rows, todo = [], []
     for job in jobs:
         row = None if force else row_of_existing(job)
         if row is None:
             todo.append(job)
-        else:
-            rows.append(row)
-            kept.append(job.path())
-    _count_again(kept)
-    return rows, todo
-
-
-def _count_again(kept: Iterable[Path]) -> None:
-    """Make kept files the newest of their trajectory, for the newest is the one that counts.
-
-    What was replayed with other settings meanwhile would count otherwise, although these were
-    asked for last.
-    """
-    newest: dict[Path, dict[str, int]] = {}
-    for path in kept:
-        stamps = newest.get(path.parent)
-        if stamps is None:
-            stamps = newest[path.parent] = _stamps(path.parent)
+            continue
+        rows.append(row)
         with contextlib.suppress(OSError):  # a folder that is only read keeps its order
-            if path.stat().st_mtime_ns < stamps[_trajectory_of(path.name)]:
-                os.utime(path)
-
-
-def _stamps(folder: Path) -> dict[str, int]:
-    """When the newest replay of each trajectory was made."""
-    stamps: dict[str, int] = {}
-    for entry in os.scandir(folder):
-        if entry.name.endswith(".mcap"):
-            key = _trajectory_of(entry.name)
-            stamps[key] = max(stamps.get(key, 0), entry.stat().st_mtime_ns)
-    return stamps
-
-
-def _trajectory_of(name: str) -> str:
-    """Leave out engine and settings: the end of ``ReplayJob.path``."""
-    return name.rsplit(".", 3)[0]
+            job.path().touch()  # the newest replay of a trajectory is the one that counts
+    return rows, todo
 
 
 def runner_for(config: ReplayRunConfig) -> Runner:
     """What replays: this process, several, or a Ray cluster."""
     if config.ray:
-        runner: Runner = load_leaf("cluster", "runner")(config.ray, config.workers)
+        runner: Runner = load_leaf("cluster", "runner")(config.ray)
         return runner
     return runner_of(config.workers)
 
@@ -310,7 +278,7 @@ def _replay_trajectories(
             what = (row["episode"], row["plan"], row["error"])
             if row["error"] and what not in told:
                 told.add(what)
-                output.say(f"{row['episode']} {row['plan']}: {row['error']}")
+                output.say(f"{row['episode']} {row['plan']}: not evaluated: {row['error']}")
     rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
     labels = recorded_labels(run, sorted({row["episode"] for row in rows}))
     return {

@@ -94,29 +94,26 @@ class StartStates:
     def __init__(self, task: Task, phases: list[Phase], states: list[StartState]) -> None:
         """Use ``localised_starts``, or state them directly in a test."""
         self._task = task
-        self._phases = phases
-        self._states = states
+        self._known = list(zip(phases, states, strict=True))
 
     def at(self, stamp_ns: int) -> StartState:
         """The state a plan found that began, or was made, at a source time [ns]."""
-        chosen = None
-        for phase, state in zip(self._phases, self._states, strict=True):
-            if phase.after_ns is None or phase.after_ns < stamp_ns:
-                chosen = (phase, state)
-        if chosen is None:
+        begun = [
+            item for item in self._known if item[0].after_ns is None or item[0].after_ns < stamp_ns
+        ]
+        if not begun:
             return self._nothing("no quiet frames before it")
-        phase, state = chosen
+        phase, state = begun[-1]
         if phase.before_ns is not None and stamp_ns > phase.before_ns:
             return self._nothing("the plan was made while another one was being executed")
         return state
 
     def after(self, plan_id: str) -> StartState:
         """The state that the last execution of a plan left behind."""
-        chosen = None
-        for phase, state in zip(self._phases, self._states, strict=True):
-            if phase.name == "end" and phase.plan_id == plan_id:
-                chosen = state
-        return self._nothing("no quiet frames after the execution") if chosen is None else chosen
+        ends = [
+            state for phase, state in self._known if (phase.name, phase.plan_id) == ("end", plan_id)
+        ]
+        return ends[-1] if ends else self._nothing("no quiet frames after the execution")
 
     def _nothing(self, reason: str) -> StartState:
         return StartState(reasons=dict.fromkeys(self._task.objects, reason))

@@ -13,7 +13,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.task.verdict import SAME_ENGINE
-from twin.replay.failure import NOT_EVALUATED, WORDS
+from twin.replay.failure import WORDS
 
 SIDES = {
     ("planned", "dynamic"): "planned in twin",
@@ -128,10 +128,7 @@ def _reason_lines(rows: Rows) -> list[str]:
 
 def _skipped_lines(skipped: Mapping[str, str], what: str) -> list[str]:
     """Episodes of which nothing, or less, could be replayed."""
-    lines = [
-        f"  {name}: {NOT_EVALUATED}{why.removeprefix(NOT_EVALUATED)}"
-        for name, why in sorted(skipped.items())
-    ]
+    lines = [f"  {name}: {why}" for name, why in sorted(skipped.items())]
     return ["", f"episodes {what}:", *lines] if lines else []
 
 

@@ -4,7 +4,7 @@ Times count from the start of the execution, so that the three can be laid over 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +19,10 @@ from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout
 from bridge.task.record import parse_record
 from twin.replay.clearance.bodies import GRIPPER
-from twin.replay.clearance.monitor import ClearanceMonitor
-from twin.replay.config import ReplayConfig
 from twin.replay.execution import closed_mask
 from twin.replay.path import JointPath
 from twin.replay.result import ReplayResult, stretches_ns
 from twin.replay.scene import ReplayScene, StartState
-from twin.robot.collision import RobotHulls
 from twin.robot.model import RobotModel
 
 Touch = tuple[int, int]
@@ -112,9 +109,8 @@ def longest(spans: list[Touch]) -> Touch | None:
 
 
 # What a recording itself says of an execution, without physics.
-# Joints and gripper are measured. Objects are localised before and after, and in between
-# inferred: what the fingers hold moves with the tool. Contacts follow from that, so they are
-# called inferred.
+# Joints and gripper are measured. Objects are localised before and after; what happened to them in
+# between, and what touched what, is not known.
 
 EMPTY_M = 0.003
 """Fingers that come within this of the width they were sent to hold nothing."""
@@ -122,8 +118,6 @@ REACH_M = 0.07
 """What the fingers hold has its origin within this of the tool."""
 AWAY_M = 0.12
 """Fingers that are farther than this from an object's origin do not touch it."""
-CONTACT_M = 0.005
-"""Poses and joints are known to a few millimetres: overlaps up to this are no inferred contact."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,17 +152,14 @@ class Recording:
         A grasp is of the object whose origin is nearest to the tool when the fingers stop.
         """
         places = {name: T[:3, 3] for name, T in self.scene.movable().items()}
-        spans: dict[str, Touch | None] = dict.fromkeys(places)
+        spans: dict[str, list[Touch]] = {name: [] for name in places}
         for first_ns, last_ns in self.grasps():
             p = robot.T_base_tcp(self.path.joints_at(np.array([first_ns]))[0])[:3, 3]
             near = {name: float(np.linalg.norm(p - place)) for name, place in places.items()}
             name = min(near, key=lambda key: near[key], default="")
-            if not name or near[name] > REACH_M:
-                continue
-            before = spans[name]
-            if before is None or last_ns - first_ns > before[1] - before[0]:
-                spans[name] = (first_ns, last_ns)
-        return spans
+            if name and near[name] <= REACH_M:
+                spans[name].append((first_ns, last_ns))
+        return {name: longest(found) for name, found in spans.items()}
 
 
 def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) -> Trace:
@@ -191,19 +182,11 @@ def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) ->
     )
 
 
-def rollout_of_recording(
-    recording: Recording, robot: RobotModel, hulls: RobotHulls, config: ReplayConfig
-) -> Rollout:
-    """The recorded states with the contacts that follow from joints and carried objects."""
-    monitor = _watched(recording, robot, hulls, config)
-    states = states_of_recording(recording, robot)
-    return replace(states, contacts=monitor.contacts(), contacts_inferred=True)
-
-
 def states_of_recording(recording: Recording, robot: RobotModel) -> Rollout:
     """The recorded states that success predicates read: localised before and after.
 
-    One look afterwards does not say whether anything still moves: ``settled`` stays undecided.
+    One look afterwards does not say whether anything still moves or what touched what before:
+    ``settled`` and ``allowed_contacts`` stay undecided.
     """
     scene, end = recording.scene, recording.end
     fixed = scene.containers()
@@ -228,47 +211,3 @@ def states_of_recording(recording: Recording, robot: RobotModel) -> Rollout:
             name: np.stack([rest[name], extents]) for name, extents in end.extents_m.items()
         },
     )
-
-
-def _watched(
-    recording: Recording, robot: RobotModel, hulls: RobotHulls, config: ReplayConfig
-) -> ClearanceMonitor:
-    """Measure the recorded joints, and what the fingers carry, against the scene."""
-    scene, path = recording.scene, recording.path
-    monitor = ClearanceMonitor(scene, recording.plan, hulls, config)
-    times = path.dense_times_ns(config.sample_rate_hz)
-    joints, widths = path.joints_at(times), path.width_at(times)
-    tools = robot.Ts_base_tcp(joints)
-    poses = _inferred_poses(recording, times, tools, recording.touches(robot))
-    for index, t_ns in enumerate(times.tolist()):
-        known = {name: Ts[index] for name, Ts in poses.items() if np.isfinite(Ts[index, 0, 3])}
-        monitor.measure(t_ns, joints[index], float(widths[index]), known)
-    return monitor
-
-
-def _inferred_poses(
-    recording: Recording,
-    times_ns: Int[np.ndarray, " num_times"],
-    Ts_base_tcp: Float[np.ndarray, "num_times 4 4"],
-    touches: dict[str, Touch | None],
-) -> dict[str, Float[np.ndarray, "num_times 4 4"]]:
-    """Start pose, then with the tool, then where it was found; NaN where nothing is known.
-
-    Nobody knows how a soft body bends in the hand and where it comes to lie: the box around it,
-    tilted, reaches through what it lies on. From when it is held on nothing is inferred of it.
-    """
-    poses = {}
-    for name, T_start in recording.scene.movable().items():
-        Ts = np.repeat(T_start[None], len(times_ns), axis=0)
-        touch = touches[name]
-        if touch is not None:
-            held = (times_ns >= touch[0]) & (times_ns <= touch[1])
-            if held.any():
-                first = int(np.argmax(held))
-                Ts[held] = Ts_base_tcp[held] @ se3.invert(Ts_base_tcp[first]) @ T_start
-            unknown = np.full((4, 4), np.nan)
-            Ts[times_ns > touch[1]] = recording.end.Ts_base_object.get(name, unknown)
-            if recording.scene.task.objects[name].soft is not None:
-                Ts[times_ns >= touch[0]] = unknown
-        poses[name] = Ts
-    return poses

@@ -114,14 +114,15 @@ def _once(sentences: Iterable[str]) -> str:
     return "; ".join(dict.fromkeys(sentences))
 
 
-def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float = 0.0) -> list[Any]:
+def findings_of(task: Task, rollout: Rollout, side: str) -> list[Any]:
     """What each predicate says of a recorded or replayed rollout, as the verdict keeps it.
 
-    Contacts are always asked for; up to ``tolerance_m`` deep none counts, if the task is silent.
+    Where contacts are known they are asked for, whether or not the task does.
     """
     findings = evaluate_success(task, rollout)
-    if not any(finding.kind == ALLOWED_CONTACTS for finding in findings):
-        findings.append(evaluate_contacts(task, rollout, tolerance_m=tolerance_m))
+    asked = any(finding.kind == ALLOWED_CONTACTS for finding in findings)
+    if rollout.contacts is not None and not asked:
+        findings.append(evaluate_contacts(task, rollout))
     return [
         {
             "side": side,
@@ -165,7 +166,7 @@ def replay_plan(
             path itself must then keep clear, too.
     """
     robot = load_robot(scene.urdf)
-    free = posture_clearance(scene, hulls_of(robot), config, up_to_m=0.0)
+    free = posture_clearance(scene, hulls_of(robot), config)
     path, failures, unreachable_ns = path_of_plan(
         plan, robot, clearance=free, start_rad=scene.start_rad
     )
@@ -282,7 +283,7 @@ def _move(
     _pre_grasp(monitor, path)
     dynamic = config.mode == "dynamic"
     by_physics, measured = dynamic, True
-    stamps_ns = path.dense_times_ns(config.sample_rate_hz)
+    stamps_ns = path.dense_times_ns(config.states_hz)
     if dynamic and refuse_early:
         found = commanded.failures or monitor.failures or any(commanded.checks.values())
         measured = not found

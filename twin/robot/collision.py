@@ -195,14 +195,6 @@ class RobotHulls:
         self._rotation_rows = self.rotations.reshape(-1, 3)
         self._translation_row = self.translations.reshape(-1)
         self._placements: dict[int, coal.Transform3s] = {}
-        points = [hull.points_m for hull in self.hulls]
-        self._centres = np.array([(p.min(axis=0) + p.max(axis=0)) / 2 for p in points])
-        self._radii = np.array(
-            [
-                np.linalg.norm(p - c, axis=1).max()
-                for p, c in zip(points, self._centres, strict=True)
-            ]
-        )
         self.left_out: dict[str, str] = {}
         """Pairs of links that are not watched, with the reason."""
         self.share_left_out = 0.0
@@ -226,35 +218,17 @@ class RobotHulls:
             self._placements[index] = placed
         return placed
 
-    @property
-    def placements(self) -> list[coal.Transform3s]:
-        """Where all hulls are."""
-        return [self.placement(index) for index in range(len(self.hulls))]
-
     def self_distance(self) -> SelfDistance:
         """Closest pair at the placed posture; infinite when there is no pair to check."""
         best, links = np.inf, ("", "")
-        if not self.pairs:
-            return SelfDistance(distance_m=best, links=links)
-        placed = np.einsum("nij,nj->ni", self.rotations, self._centres) + self.translations
-        one, other = np.array(self.pairs).T
-        gaps = np.linalg.norm(placed[one] - placed[other], axis=1)
-        gaps -= self._radii[one] + self._radii[other]
-        # Nearest spheres first: most pairs are then skipped, and the minimum stays exact.
-        for index in np.argsort(gaps, kind="stable").tolist():
-            if gaps[index] > best:
-                break
-            first, second = self.pairs[index]
-            distance = self.pair_distance_m(index)
+        for first, second in self.pairs:
+            distance = self.distance_m(first, second)
             if distance < best:
                 best, links = distance, (self.hulls[first].link, self.hulls[second].link)
-        return SelfDistance(distance_m=float(best), links=links)
+        return SelfDistance(distance_m=best, links=links)
 
-    def pair_distance_m(self, index: int) -> float:
-        """Signed distance of one of ``pairs`` [m]."""
-        return self._distance_m(*self.pairs[index])
-
-    def _distance_m(self, first: int, second: int) -> float:
+    def distance_m(self, first: int, second: int) -> float:
+        """Signed distance of two hulls, by their numbers [m]."""
         return signed_distance(
             self.hulls[first].shape,
             self.placement(first),
@@ -284,13 +258,13 @@ class RobotHulls:
         width_m = min(_WIDTH_M, robot.record.gripper.max_width_m)
         self.place(robot.home_rad, width_m)
         self._leave_out(candidates, self._listed, "the robot file lists them under may_overlap")
-        self._leave_out(candidates, lambda *p: self._distance_m(*p) <= 0, "they touch at home")
+        self._leave_out(candidates, lambda *p: self.distance_m(*p) <= 0, "they touch at home")
         rng = np.random.default_rng(0)
         overlaps = dict.fromkeys(candidates, 0)
         for _ in range(_SAMPLES):
             self.place(rng.uniform(low, high), width_m)
             for pair in candidates:
-                overlaps[pair] += self._distance_m(*pair) <= 0
+                overlaps[pair] += self.distance_m(*pair) <= 0
         most = _ALWAYS * _SAMPLES
         self._leave_out(candidates, lambda *p: overlaps[p] >= most, "they touch in every posture")
         return candidates

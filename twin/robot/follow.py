@@ -44,8 +44,6 @@ class Followed:
     reached: Bool[np.ndarray, " num_poses"]
     """False from the first pose on that cannot be reached; joints there are the nearest found,
     and are repeated behind it."""
-    branch: Int[np.ndarray, " num_poses"]
-    """Number of the closed form's branch, ``NO_BRANCH`` where the iteration answered."""
 
 
 def follow_poses(
@@ -125,9 +123,9 @@ def _completed(
         solution = solve_ik(robot, Ts_base_tcp[index], config, warm_start_rad=warm)
         joints[index] = solution.joints_rad
         if not solution.reached:
-            joints[index:], reached[index:], branch[index:] = joints[index], False, NO_BRANCH
+            joints[index:], reached[index:] = joints[index], False
             break
-    return Followed(joints_rad=joints, reached=reached, branch=branch)
+    return Followed(joints_rad=joints, reached=reached)
 
 
 class _Tree:

@@ -50,13 +50,12 @@ def mimicked(urdf: str) -> tuple[Mimic, ...]:
     return found
 
 
-def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:
-    """Replace ``package://`` URIs by paths; visuals are dropped unless they are wanted."""
+def with_absolute_meshes(urdf: str) -> str:
+    """Replace ``package://`` URIs by paths; visuals are dropped."""
     root = parse_description(urdf)
     for link in root.findall("link"):
-        if not keep_visuals:
-            for visual in link.findall("visual"):
-                link.remove(visual)
+        for visual in link.findall("visual"):
+            link.remove(visual)
         for mesh in link.iter("mesh"):
             mesh.set("filename", str(resolve_mesh(mesh.get("filename", ""))))
     return ET.tostring(root, encoding="unicode")

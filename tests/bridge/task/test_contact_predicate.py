@@ -56,18 +56,11 @@ def test_the_first_wrong_touch_is_told_with_its_time_and_depth() -> None:
     assert "forearm_link touched box at 2.00 s, 2.0 mm deep" in finding.detail
 
 
-def test_inferred_contacts_say_so_and_take_a_tolerance() -> None:
-    state = rollout(touch(0.004), contacts_inferred=True)
-    assert predicate.evaluate_contacts(CUBE, state, tolerance_m=0.005).value is True
-    finding = predicate.evaluate_contacts(CUBE, state, tolerance_m=0.003)
-    assert (finding.value, finding.detail.startswith("inferred: ")) == (False, True)
-
-
 def test_a_task_may_ask_for_it_like_for_any_other_predicate() -> None:
     task = replace(CUBE, success=({"kind": predicate.ALLOWED_CONTACTS, "tolerance_m": 0.003},))
     assert predicate.all_hold(predicate.evaluate_success(task, rollout(touch(0.002)))) is True
     assert predicate.all_hold(predicate.evaluate_success(task, rollout(touch(0.004)))) is False
-    listed = predicate.evaluate_contacts(task, rollout(touch(0.002)), tolerance_m=0.0)
+    listed = predicate.evaluate_contacts(task, rollout(touch(0.002)))
     assert listed.value is True, "the task's own tolerance counts"
 
 

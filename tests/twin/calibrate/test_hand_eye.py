@@ -68,7 +68,7 @@ def test_the_choice_of_base_frame_changes_only_what_lies_in_it() -> None:
     before, after = hand_eye.solve(Ts_a, Ts_b), hand_eye.solve(G @ Ts_a, Ts_b)
     np.testing.assert_allclose(after.X, before.X, atol=1e-8)
     np.testing.assert_allclose(after.Z, G @ before.Z, atol=1e-8)
-    assert after.residual_m.value == pytest.approx(before.residual_m.value, rel=1e-6)
+    assert after.residual_m == pytest.approx(before.residual_m, rel=1e-6)
 
 
 def test_wrong_pairs_are_counted_and_have_no_say() -> None:
@@ -90,7 +90,6 @@ def test_it_knows_how_wrong_the_position_is() -> None:
         solution = hand_eye.solve(Ts_a, Ts_b)
         found.append(solution.sigma_m)
         missed.append(distance(solution.X, X))
-        assert solution.residual_m.low <= solution.residual_m.value <= solution.residual_m.high
     ratio = float(np.sqrt(np.mean(np.square(missed)) / np.mean(np.square(found))))
     assert 0.5 < ratio < 2.0
 
@@ -108,7 +107,7 @@ def about_one_axis(count: int, wobble_rad: float) -> tuple[np.ndarray, np.ndarra
 def test_turning_about_one_axis_is_refused_and_about_two_is_not() -> None:
     with pytest.raises(hand_eye.UndeterminedCameraError, match=r"one axis only.*Tilt the tool"):
         hand_eye.solve(*about_one_axis(15, 0.002))
-    assert hand_eye.solve(*about_one_axis(15, 0.2)).residual_m.value < 1e-6
+    assert hand_eye.solve(*about_one_axis(15, 0.2)).residual_m < 1e-6
 
 
 @pytest.mark.parametrize(("count", "found"), [(8, "does not turn at all"), (3, r"3 pair\(s\)")])

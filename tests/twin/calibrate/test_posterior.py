@@ -24,7 +24,6 @@ from twin.calibrate.posterior import (
     WRONG,
     Ended,
     Trial,
-    Trials,
     calibrate_posterior,
     describe_posterior,
     draw_beforehand,
@@ -234,7 +233,6 @@ def of_one_task(draws: Sequence[PosteriorDraw]) -> dict[str, object]:
 def record_of(tasks: Mapping[str, Sequence[PosteriorDraw]]) -> dict[str, object]:
     return {
         "tasks": {name: of_one_task(draws) for name, draws in tasks.items()},
-        "without_trials": ["cube_into_box"],
         "skipped": {"trial_0002": "nobody said how it ended"},
     }
 
@@ -248,7 +246,6 @@ def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
     assert rebuilt_scene.calibrated(ReplayConfig(), known, TASK).variation.posterior == tuple(draws)
     told = describe_posterior(record, before)
     assert f"{TASK.name}: 4 draws weighed by 1 trials, 1 of which succeeded" in told
-    assert "cube_into_box: no trial of it can be used" in told
     assert "trial_0002 not used" in told
     write_part(run, "posterior", record_of({TASK.name: draws[:2]}))
     again = read_calibration(run)
@@ -285,11 +282,9 @@ def test_a_task_is_weighed_by_its_own_trials_alone(
         replace(each, info=replace(each.info, id="held"), scene=replace(each.scene, task=other))
         for each in [trial(success=True)] * 3
     ]
-    found = Trials(usable=[*held, *fell], skipped={}, tasks=frozenset({TASK.name, "unused"}))
-    monkeypatch.setattr(posterior, "read_trials", lambda run, output: found)
+    monkeypatch.setattr(posterior, "read_trials", lambda run, output: ([*held, *fell], {}))
     record, _ = calibrate_posterior(run, num_draws=16, workers=1, output=QUIET)
     assert sorted(record["tasks"]) == sorted([TASK.name, other.name])
-    assert record["without_trials"] == ["unused"]
     known = read_calibration(run)
     assert known is not None
     for task, mine in ((TASK, fell), (other, held)):

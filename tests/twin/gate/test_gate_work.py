@@ -65,10 +65,11 @@ def question_of(run: RunFolder, **changes: Any) -> Question:
     question = Question(
         run_path=run.path,
         plan=plan,
-        task=task,
-        Ts_base_object={"sloth": lying, "basket": np.eye(4)},
-        covariances={},
-        urdf=ROBOT.urdf_text(),
+        seen=ReplayScene(
+            task=task,
+            Ts_base_object={"sloth": lying, "basket": np.eye(4)},
+            urdf=ROBOT.urdf_text(),
+        ),
         config=ReplayConfig(),
         max_steps=100_000,
     )
@@ -192,7 +193,8 @@ def test_a_scene_that_another_robot_recorded_gives_no_verdict(
     assert not asked
     assert answer(replace(question, any_robot=True)).accepted is True
     plan = replace(question.plan, robot=other.name)
-    assert answer(replace(question, plan=plan, urdf=other.description())).accepted is True
+    there = replace(question.seen, urdf=other.description())
+    assert answer(replace(question, plan=plan, seen=there)).accepted is True
 
 
 def test_a_yes_that_the_audit_does_not_confirm_is_null_with_both_numbers(

@@ -8,7 +8,7 @@ from twin.physics.config import PhysicsConfig
 from twin.physics.engines import PhysicsWorld, open_world
 from twin.physics.mujoco_world import MujocoWorld
 from twin.physics.world import World
-from twin.robot.model import with_absolute_meshes
+from twin.robot.model import load_robot, with_absolute_meshes
 
 ENGINES = ("pybullet", "mujoco")
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
@@ -18,6 +18,11 @@ URDF = with_absolute_meshes(ROBOT.urdf_text())
 def cell(engine: str, urdf: str = URDF, **settings: float) -> PhysicsWorld:
     """An empty world; objects are put where the arm is not."""
     return open_world(engine, urdf, {}, PhysicsConfig(**settings))
+
+
+def T_base_tcp(world: PhysicsWorld) -> np.ndarray:
+    """Where the tool is."""
+    return load_robot(URDF).T_base_tcp(world.robot.posture()[0])
 
 
 def at(x: float, y: float, z: float, R: np.ndarray | None = None) -> np.ndarray:

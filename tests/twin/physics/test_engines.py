@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import ENGINES, HOME, URDF, at, cell
+from cells import ENGINES, HOME, URDF, T_base_tcp, at, cell
 
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.robots.robot import read_robot
@@ -77,7 +77,7 @@ def test_the_arm_follows_a_fast_motion(engine: str) -> None:
 def test_fingers_close_on_a_cube_hold_it_and_let_it_go(engine: str) -> None:
     with cell(engine) as world:
         world.reset_robot(HOME, 0.06)
-        T_tcp = world.robot.T_base_link("tcp")
+        T_tcp = T_base_tcp(world)
         world.add_free("cube", CUBE, 0.05, T_tcp)
         widths = []
         for _ in range(240):
@@ -91,13 +91,13 @@ def test_fingers_close_on_a_cube_hold_it_and_let_it_go(engine: str) -> None:
         assert closing_m_s <= 2 * 0.1 * 1.05, "each finger goes by 0.1 m/s at most"
     with cell(engine) as world:
         world.reset_robot(HOME, 0.041)
-        world.add_free("cube", CUBE, 0.05, world.robot.T_base_link("tcp"))
+        world.add_free("cube", CUBE, 0.05, T_base_tcp(world))
         for _ in range(240):
             world.robot.command(HOME, np.zeros(6), 0.0)
             world.step()
         assert world.robot.width_m() == pytest.approx(0.04, abs=1e-3)
         assert world.finger_touches("cube")
-        fallen = world.robot.T_base_link("tcp")[2, 3] - world.T_base_object("cube")[2, 3]
+        fallen = T_base_tcp(world)[2, 3] - world.T_base_object("cube")[2, 3]
         assert abs(fallen) < 4e-3
         for _ in range(120):
             world.robot.command(HOME, np.zeros(6), 0.08)
@@ -112,11 +112,11 @@ def test_a_grip_holds_what_coulomb_says(engine: str, mass_kg: float, holds: bool
     """Two pads with 20 N and friction 0.5 carry 20 N, which is 2.0 kg."""
     with cell(engine, object_friction=0.5) as world:
         world.reset_robot(HOME, 0.0401)
-        world.add_free("cube", CUBE, mass_kg, world.robot.T_base_link("tcp"))
+        world.add_free("cube", CUBE, mass_kg, T_base_tcp(world))
         for _ in range(240):
             world.robot.command(HOME, np.zeros(6), 0.0)
             world.step()
-        fallen = world.robot.T_base_link("tcp")[2, 3] - world.T_base_object("cube")[2, 3]
+        fallen = T_base_tcp(world)[2, 3] - world.T_base_object("cube")[2, 3]
     assert (fallen < 0.01) == holds
 
 
@@ -126,7 +126,7 @@ def test_the_arm_feels_the_weight_of_what_it_holds_and_not_its_own_grip(engine: 
     mass_kg, forces_N = 0.5, []
     with cell(engine) as world:
         world.reset_robot(HOME, 0.0401)
-        world.add_free("cube", CUBE, mass_kg, world.robot.T_base_link("tcp"))
+        world.add_free("cube", CUBE, mass_kg, T_base_tcp(world))
         for _ in range(240):
             world.robot.command(HOME, np.zeros(6), 0.0)
             world.step()
@@ -140,13 +140,13 @@ def test_a_tool_told_to_go_through_the_table_stops_on_it_within_its_torque(engin
     with cell(engine) as world:
         world.add_table(0.0)
         world.reset_robot(over, 0.02)
-        height_m = world.robot.T_base_link("tcp")[2, 3]
+        height_m = T_base_tcp(world)[2, 3]
         into = over + np.array([0, 0.3, 0, -0.3, 0, 0])
         for step in range(480):
             share = min(1.0, step / 240)
             world.robot.command(over + share * (into - over), np.zeros(6), 0.02)
             world.step()
-        low_m = world.robot.T_base_link("tcp")[2, 3]
+        low_m = T_base_tcp(world)[2, 3]
         joints, _ = world.robot.posture()
     assert height_m > 0.09
     # The tips are 10 mm below the tool's frame.

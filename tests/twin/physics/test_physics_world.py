@@ -34,7 +34,7 @@ def dropped(urdf: str, steps: int) -> str:
             world.step()
             digest.update(world.T_base_object("low").tobytes())
             digest.update(world.T_base_object("high").tobytes())
-            digest.update(world.robot.joints_rad().tobytes())
+            digest.update(world.robot.posture()[0].tobytes())
         return digest.hexdigest()
 
 

@@ -83,7 +83,7 @@ def test_every_run_gives_the_same_bits(urdf: str, box_of_cells: Boxes) -> None:
         with World(urdf, {}, PhysicsConfig()) as world:
             closed_on(world, box_of_cells((3, 3, 3)), 30)
             digest = hashlib.sha256(world.soft_bodies().nodes_m("toy").astype(np.float32).tobytes())
-            digest.update(world.robot.joints_rad().tobytes())
+            digest.update(world.robot.posture()[0].tobytes())
             found.add(digest.hexdigest())
     assert len(found) == 1
 
@@ -97,8 +97,6 @@ def test_poses_and_extents_at_rest_are_those_given(urdf: str) -> None:
         world.soft_bodies().add("duck", SoftModel.from_task(duck), T)
         np.testing.assert_allclose(world.T_base_object("duck"), T, atol=1e-6)
         np.testing.assert_allclose(world.soft_bodies().extents_m("duck"), duck.size_m, rtol=1e-5)
-        pose = np.array(world.object_pose("duck"))
-        np.testing.assert_allclose(se3.transform_from(pose[3:], pose[:3]), T, atol=1e-6)
         assert not world.finger_touches("duck")
 
 

@@ -50,10 +50,9 @@ def test_hulls_are_placed_where_the_kinematics_of_their_links_says(hulls: RobotH
     for _ in range(2):
         joints, width = rng.uniform(-3.0, 3.0, 6), float(rng.uniform(0.0, 0.08))
         hulls.place(joints, width)
-        placed = zip(
-            hulls.hulls, hulls.rotations, hulls.translations, hulls.placements, strict=True
-        )
-        for hull, R, t, placement in placed:
+        placed = zip(hulls.hulls, hulls.rotations, hulls.translations, strict=True)
+        for index, (hull, R, t) in enumerate(placed):
+            placement = hulls.placement(index)
             T = hulls.robot.T_base_link(hull.link, joints, width)
             np.testing.assert_array_equal(R, T[:3, :3])
             np.testing.assert_array_equal(t, T[:3, 3])

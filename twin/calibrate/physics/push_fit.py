@@ -137,7 +137,6 @@ def calibrate_pushes(
     record |= {
         "fitted_to": fitted,
         "held_out": {"episodes": held_out, **scores},
-        "fitted": _score(pushes, fitted, *_point(best)),
         "sources": {name: {"kind": "push", "sha256": pushes[name].sha256} for name in pushes},
         "skipped": skipped,
     }
@@ -197,8 +196,6 @@ def _score(
     return {
         "n": len(errors),
         "end_point_error_median_m": float(np.median(list(errors.values()))),
-        "least_m": min(errors.values()),
-        "most_m": max(errors.values()),
         "by_episode_m": errors,
     }
 
@@ -257,14 +254,11 @@ def describe_pushes(record: Mapping[str, Any], calibration_id: str) -> str:
             f"{item['unit']:<3} {word}: {item['why']}"
         )
     held = record["held_out"]
-    rows = [("identifying runs, calibrated", record["fitted"])]
-    rows += [
-        (f"held out, {name.replace('_', ' ')}", held[name]) for name in ("nominal", "calibrated")
-    ]
-    for label, item in rows:
+    for name in ("nominal", "calibrated"):
+        off_m, errors = held[name]["end_point_error_median_m"], held[name]["by_episode_m"].values()
         lines.append(
-            f"  {label}: end points off by {item['end_point_error_median_m'] * 1e3:.1f} mm "
-            f"(median of {item['n']}; {item['least_m'] * 1e3:.1f} to {item['most_m'] * 1e3:.1f})"
+            f"  held out, {name}: end points off by {off_m * 1e3:.1f} mm "
+            f"(median of {len(errors)}; {min(errors) * 1e3:.1f} to {max(errors) * 1e3:.1f})"
         )
     lines += [f"  {name}: {why}" for name, why in record["skipped"].items()]
     return "\n".join(lines)

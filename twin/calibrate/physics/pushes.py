@@ -25,6 +25,7 @@ from twin.calibrate.motion import Arm, Motion, Seen
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.physics.push import PushWorld
+from twin.replay.config import STATE_EVERY
 from twin.robot.hand import Hand
 
 Trajectory = Literal["planned", "executed"]
@@ -42,8 +43,6 @@ afterwards."""
 SETTLE_S = 1.0
 LOOK_EVERY = 12
 """Steps between two looks whether the hand is near; it moves by some 10 mm meanwhile."""
-STATE_EVERY = 4
-"""Steps between two states that are kept: 60 Hz at 240 steps a second."""
 
 
 class UnusablePushError(TwinError):

@@ -39,7 +39,7 @@ class ArmReach:
         self.hulls.place(joints_rad, open_m)
         if self._links_touch():
             return False
-        return self._around.least_m(frozenset(), self._eps_m) >= self._eps_m
+        return self._around.least_m(frozenset()) >= self._eps_m
 
     def first(self, T_base_tcp: Pose, hand: OpenHand, pregrasp_m: float) -> Reached | str:
         """How to reach a grasp, nearest to where the arm stands and clear, or why it cannot."""

@@ -146,7 +146,9 @@ def own_links_touch(hulls: RobotHulls) -> Callable[[], bool]:
     near = NearPairs(solids, hulls.pairs)
     # The same memory: the pairs are where the hulls have been placed last.
     near.R, near.t = hulls.rotations, hulls.translations
-    return lambda: any(hulls.pair_distance_m(index) <= 0 for _, index in near.nearest_first(0.0))
+    return lambda: any(
+        hulls.distance_m(*hulls.pairs[index]) <= 0 for _, index in near.nearest_first(0.0)
+    )
 
 
 # Distances of soft bodies, which are given by their nodes.

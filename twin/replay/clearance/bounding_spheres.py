@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int32
 from scipy.spatial import ConvexHull, cKDTree
 
-from twin.replay._clearance import least, nearest, surface_to_grid
+from twin.replay._clearance import nearest, surface_to_grid
 from twin.robot.collision import RobotHulls
 from twin.scene.shape.sdf import SdfGrid
 
@@ -55,15 +55,6 @@ class BoundingSpheres:
         roots = np.stack([starts[:-1], ends], axis=1).astype(np.int32)
         self._trees = points, radius, np.concatenate(children).astype(np.int32), roots
         self._cover = np.array([tree.cover_m for tree in trees])
-        middles = [(tree.points_m.min(axis=0) + tree.points_m.max(axis=0)) / 2 for tree in trees]
-        self._centres = np.stack(middles)
-        # How much less than at its middle a distance may be anywhere on a piece.
-        self._reaches = np.array(
-            [
-                SLOPE * np.linalg.norm(tree.points_m - middle, axis=1).max() + tree.cover_m
-                for tree, middle in zip(trees, middles, strict=True)
-            ]
-        )
 
     def distances_m(
         self,
@@ -78,18 +69,6 @@ class BoundingSpheres:
         answers = np.empty(len(R))
         nearest(*_values(grid), R, t, *self._trees, answers)
         return np.asarray(answers - self._cover)
-
-    def least_m(
-        self,
-        grid: SdfGrid,
-        R: Float[np.ndarray, "num_pieces 3 3"],
-        t: Float[np.ndarray, "num_pieces 3"],  # origin of each piece's link, grid's frame [m]
-        below_m: float,  # that number; the smaller, the less is looked at
-    ) -> float:
-        """Return the smallest of ``distances_m``, or a number where none is below it [m]."""
-        bounds = self._cover, self._centres, self._reaches, below_m
-        found: float = least(*_values(grid), R, t, *self._trees, *bounds)
-        return found
 
 
 def _values(grid: SdfGrid) -> tuple[np.ndarray, np.ndarray, float]:

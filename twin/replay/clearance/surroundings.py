@@ -101,7 +101,6 @@ class Surroundings:
         self.grid = scene_grid(scene, hulls)
         self._link_spheres: BoundingSpheres | None = None
         self._object_spheres: dict[str, BoundingSpheres] = {}
-        self._spheres_without: dict[frozenset[str], tuple[BoundingSpheres, list[int]]] = {}
         if self.grid is not None:
             self._link_spheres = robot_bounding_spheres(hulls, stationary)
             self._object_spheres = {
@@ -151,45 +150,12 @@ class Surroundings:
                 best = distance
         return found, np.inf
 
-    def least_m(self, left_out: frozenset[str], below_m: float = np.inf) -> float:
-        """Return the smallest distance of placed links to what stands still [m].
-
-        The same as the smallest of ``measure``, without the other distances.
-        """
-        pairing = self._pairing((), ())
-        links, near = self._hulls, pairing.near
-        num_links = len(self.links)
-        near.R[:num_links], near.t[:num_links] = links.rotations, links.translations
-        best = below_m
-        for bound, number in near.nearest_first(below_m):
-            if bound > best:
-                break
-            if pairing.names[number][0] in left_out:
-                continue
-            one, other = pairing.bodies[number]
-            best = min(
-                best,
-                signed_distance(
-                    pairing.shapes[one],
-                    links.placement(one),
-                    pairing.shapes[other],
-                    pairing.placements[other],
-                ),
-            )
-        if self.grid is None:
-            return best
-        spheres, asked = self._asked(left_out)
-        return spheres.least_m(self.grid, links.rotations[asked], links.translations[asked], best)
-
-    def _asked(self, left_out: frozenset[str]) -> tuple[BoundingSpheres, list[int]]:
-        """The bounding spheres of the links that move, but for some; and which links these are."""
-        found = self._spheres_without.get(left_out)
-        if found is None:
-            asked = [index for index in self._mobile if self.links[index].body not in left_out]
-            others = {link.body for link in self.links} - {self.links[i].body for i in asked}
-            found = robot_bounding_spheres(self._hulls, frozenset(others)), asked
-            self._spheres_without[left_out] = found
-        return found
+    def least_m(self, left_out: frozenset[str]) -> float:
+        """Smallest distance of placed links, but for some, to what stands still [m]."""
+        found, beyond_m = self.measure(
+            {}, (), near_m=0.0, counts=lambda body, _: body not in left_out
+        )
+        return min((d for (body, *_), d in found.items() if body not in left_out), default=beyond_m)
 
     def _pairing(self, known: tuple[str, ...], moved: tuple[str, ...]) -> _Pairing:
         """Links and moved objects against what stands, then links against objects."""
@@ -358,27 +324,22 @@ def _box_spheres(size_m: tuple[float, float, float]) -> BoundingSpheres:
 
 
 def posture_clearance(
-    scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig, *, up_to_m: float = np.inf
+    scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig
 ) -> Callable[[Float[np.ndarray, "num_postures num_joints"]], Float[np.ndarray, " num_postures"]]:
     """Return a function that says how far postures stay from contact: negative when links touch.
 
     The arm against itself and against what stands still, with ``eps_col_m`` taken off. The gripper
     is where the path says, whatever the arm does, so it is left out; so are objects. It moves the
-    hulls, and says ``up_to_m`` of what is farther: 0 is enough for the sign, and much faster.
+    hulls.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
     links_touch, gripper = own_links_touch(hulls), hulls.robot.record.gripper
     hand = frozenset(gripper.links)
 
-    def margin_m(
-        joints_rad: Float[np.ndarray, "num_postures num_joints"],
-    ) -> Float[np.ndarray, " num_postures"]:
-        return np.array([one(row) for row in joints_rad])
-
     def one(joints_rad: Float[np.ndarray, " num_joints"]) -> float:
         hulls.place(joints_rad, gripper.max_width_m)
         if links_touch():
             return hulls.self_distance().distance_m
-        return around.least_m(hand, config.eps_col_m + up_to_m) - config.eps_col_m
+        return around.least_m(hand) - config.eps_col_m
 
-    return margin_m
+    return lambda joints_rad: np.array([one(row) for row in joints_rad])

@@ -69,12 +69,9 @@ public:
            const std::int32_t* children, std::int32_t count)
         : grid_(grid), points_(points), radius_(radius), children_(children), count_(count) {}
 
-    // Smallest distance of the points below some roots, turned and shifted. What lies beyond `stop`
-    // is not looked into: an answer beyond it is only known to be there.
-    double nearest(const double* turn, const double* shift, std::int32_t begin, std::int32_t end,
-                   double stop = std::numeric_limits<double>::infinity()) {
+    // Smallest distance of the points below some roots, turned and shifted.
+    double nearest(const double* turn, const double* shift, std::int32_t begin, std::int32_t end) {
         best_ = std::numeric_limits<double>::infinity();
-        stop_ = stop;
         open_.clear();
         look(turn, shift, begin, end);
         while (!open_.empty()) {
@@ -98,7 +95,7 @@ private:
         for (const double distance : found_) best_ = std::min(best_, distance);
         // What cannot lead to less is left out at once: sorting it would cost more than finding it.
         const std::size_t first = open_.size();
-        const double most = std::min(certain(), stop_);
+        const double most = certain();
         for (std::int32_t index = begin; index < end; ++index) {
             const double distance = found_[static_cast<std::size_t>(index - begin)];
             if (children_[2 * index] < children_[2 * index + 1] && distance - radius_[index] < most)
@@ -117,7 +114,7 @@ private:
     const double* radius_;
     const std::int32_t* children_;
     std::int32_t count_;
-    double best_ = 0.0, stop_ = 0.0;
+    double best_ = 0.0;
     std::vector<Visit> open_;
     std::vector<double> found_;
 };

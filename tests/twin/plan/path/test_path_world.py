@@ -37,7 +37,7 @@ def exact_distances(surroundings: Surroundings, hulls: RobotHulls, Ts: dict) -> 
         found[body, other].append(distance)
     for index, (one, other) in enumerate(hulls.pairs):
         names = hulls.hulls[one].link, hulls.hulls[other].link
-        found[names].append(hulls.pair_distance_m(index))
+        found[names].append(hulls.distance_m(*hulls.pairs[index]))
     return found
 
 

@@ -326,20 +326,16 @@ def test_an_object_that_leaps_did_not_fly_through_what_lies_between(
 def test_a_posture_is_as_clear_as_the_nearest_of_all_its_distances(
     script: SimpleNamespace, hulls: RobotHulls
 ) -> None:
-    """To the last bit, though most links are hardly looked at."""
+    """To the last bit, though most pairs are hardly looked at."""
     config, rng = ReplayConfig(), np.random.default_rng(4)
     post: Box = ((0.45, -0.25, 0.3), (0.06, 0.06, 0.6))
     scene = replace(script.scene(), static_sdf=static_of(POST, post))
     gripper = hulls.robot.record.gripper.links
     around, links_touch = Surroundings(scene, hulls, config.eps_col_m), own_links_touch(hulls)
     margin_m = posture_clearance(scene, hulls, config)
-    capped_m = posture_clearance(scene, hulls, config, up_to_m=0.03)
-    sign = posture_clearance(scene, hulls, config, up_to_m=0.0)
     inside = outside = 0
     for joints in hulls.robot.home_rad + rng.uniform(-0.9, 0.9, (80, 6)):
         found = float(margin_m(joints[None])[0])
-        assert (float(sign(joints[None])[0]) < 0) == (found < 0)
-        assert float(capped_m(joints[None])[0]) == pytest.approx(min(found, 0.03), abs=1e-12)
         hulls.place(joints, hulls.robot.record.gripper.max_width_m)
         if links_touch():
             continue

@@ -33,11 +33,12 @@ def every_distance(
         found[body, other] = min(found.get((body, other), np.inf), distance)
 
     cubes = {name: (around.objects[name].shape, placement_of(T)) for name, T in poses.items()}
-    for link, placed in zip(around.links, hulls.placements, strict=True):
+    placements = [hulls.placement(index) for index in range(len(hulls.hulls))]
+    for link, placed in zip(around.links, placements, strict=True):
         for name, cube in cubes.items():
             note(link.body, name, signed_distance(link.shape, placed, *cube))
     movers = [
-        *((link.body, link.shape, p) for link, p in zip(around.links, hulls.placements)),  # noqa: B905
+        *((link.body, link.shape, p) for link, p in zip(around.links, placements)),  # noqa: B905
         *((name, *cube) for name, cube in cubes.items()),
     ]
     for solid, _, T in around.static:

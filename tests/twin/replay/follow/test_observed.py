@@ -11,8 +11,8 @@ from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo
 from bridge.robots.robot import robot_of
 from twin.replay.config import ReplayConfig
-from twin.replay.execution import closed_mask, path_of_execution
-from twin.replay.observed import find_grips, in_order, observed_plan, observed_stages
+from twin.replay.execution import closed_mask, in_order, path_of_execution
+from twin.replay.observed import find_grips, observed_plan, observed_stages
 from twin.replay.result import ReplayResult
 from twin.robot.model import load_robot
 
@@ -126,7 +126,7 @@ def test_the_fingers_command_and_the_path_are_those_of_the_plan(
     robot = load_robot(scene.urdf)
     record = robot_of(scene.urdf)
     info = EpisodeInfo(id="t", kind="trial", task=scene.task.name, policy="act")
-    seen = observed_plan(in_order(track, record), widths, robot, scene.task, info)
+    seen = observed_plan(in_order(track, record, "p"), widths, robot, scene.task, info)
     assert (seen.id, seen.robot, seen.frame, seen.policy) == (
         NO_PLAN,
         plan.robot,

@@ -12,7 +12,7 @@ from twin.physics.soft_world import SoftWorld
 from twin.physics.world import World
 from twin.replay.clearance.monitor import allowed_pairs
 from twin.replay.config import ReplayConfig
-from twin.replay.dynamics import burst_of, outline_m, soft_models
+from twin.replay.dynamics import outline_m, soft_models
 from twin.replay.result import Burst, ReplayResult
 from twin.replay.verdict import replay_plan, terminal_factor
 
@@ -102,7 +102,7 @@ def test_extents_that_are_far_from_rest_or_no_numbers_fail(
     ],
 )
 def test_what_counts_as_burst_while_it_moves(health: SoftHealth, bursts: bool) -> None:
-    assert (burst_of(health) is not None) is bursts
+    assert health.burst is bursts
 
 
 def test_every_localised_toy_becomes_a_body_and_no_other(script: SimpleNamespace) -> None:

@@ -306,10 +306,7 @@ def gate_verdict(run: RunFolder, plan: Plan, scene: ReplayScene) -> Verdict:
     question = Question(
         run_path=run.path,
         plan=plan,
-        task=scene.task,
-        Ts_base_object=dict(scene.Ts_base_object),
-        covariances={},
-        urdf=scene.urdf,
+        seen=scene,
         config=ReplayConfig(mode="dynamic"),
         max_steps=100_000,
     )

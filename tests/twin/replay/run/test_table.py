@@ -64,7 +64,7 @@ def test_every_answer_that_is_no_yes_is_listed_with_its_reason_once() -> None:
         row("a", "planned", None, reason="undecided: cube (hidden)"),
         row("a", "executed", None, mode="kinematic", reason="undecided: no physics"),
         row("b", "planned", False, reason="ik: unreachable"),
-        row("c", "planned", None, reason="not evaluated: NaN", error="not evaluated: NaN"),
+        row("c", "planned", None, reason="NaN", error="NaN"),
     ]
     text = describe_run({**summary(), "rows": rows, "counts": count_verdicts(rows)})
     assert "undecided:\n  a p planned dynamic: cube (hidden)\n" in text

@@ -264,7 +264,7 @@ def test_a_recording_that_ends_while_the_robot_moves_says_so(
     assert len(said) == 4
     for mode in ("dynamic", "kinematic"):
         row = said["round-1", "executed", mode]
-        assert row["error"].startswith("not evaluated: the execution of plan 'round-1' began, and")
+        assert row["error"].startswith("the execution of plan 'round-1' began, and")
         assert row["accepted"] is None
     assert summary["counts"]["planned dynamic"]["n"] == 1
     assert summary["counts"]["planned dynamic, never executed"]["n"] == 1
