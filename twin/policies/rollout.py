@@ -11,13 +11,14 @@ import numpy as np
 
 from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import ROLLOUT, Derived, EpisodeInfo
-from bridge.episode.provenance import hash_settings
+from bridge.episode.provenance import hash_file, hash_settings
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan
 from twin.policies.cell import TwinCell
+from twin.policies.config import is_driven
 from twin.policies.errors import PolicyError, RefusedError, StoppedError
 from twin.policies.mapping import Interpreter, PolicyMap, is_end
 from twin.policies.policy import Policy, open_policy, who_acts
@@ -55,10 +56,12 @@ class RolloutJob:
     timeout_s: float
 
     def settings(self) -> dict[str, Any]:
-        """What the name of the file covers."""
+        """What the name of the file covers; of a file of keys what it holds, not its place."""
+        keys = Path(self.policy.removeprefix("keys:"))
+        held = is_driven(self.policy) and keys.is_file()
         return {
             "rollout_version": ROLLOUT_VERSION,
-            "policy": self.policy,
+            "policy": f"keys:{hash_file(keys)}" if held else self.policy,
             "name": self.name,
             "mapping_sha256": self.mapping.sha256(),
             "drawn": self.drawn,

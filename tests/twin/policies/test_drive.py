@@ -102,6 +102,10 @@ def test_a_rollout_by_keys_is_an_episode_that_lerobot_takes(run: RunFolder, tmp_
     assert (row["start_id"], row["success"], row["problem"]) == ("start 2", False, "")
     assert row["asked"] == round(1.8 * RATE_HZ)
     made = Episode.open(run.derived_dir / row["file"])
+    path.write_text("r 0.4\n")  # other keys in the same place are another rollout
+    (other,) = roll_out_run(run, start, QUIET)["rows"]
+    assert (other["file"] != row["file"], other["asked"]) == (True, round(0.4 * RATE_HZ))
+    (run.derived_dir / other["file"]).unlink()
     poses = streams.joint_track(made).position
     assert np.abs(poses[-1] - poses[0]).max() > 0.02
     choice = LeRobotConfig(episodes=("*.rollout.me.*",))
