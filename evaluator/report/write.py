@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bridge.exchange.trials_csv import TrialRecord, write_trials
@@ -14,10 +14,12 @@ from evaluator.report.page import name_shared, page
 from evaluator.report.sections import FIGURES, shown_tables
 from evaluator.report.tables import as_csv, as_latex, as_text
 from evaluator.report.wording import STAND_IN, headlines
-from evaluator.result import Results, write_results
+from evaluator.result import Results, Table, write_results
 
 SHOWN = ("published", "success", "comparisons", "standing", "image_methods", "notes")
 """Tables a terminal shows; the others are in the report."""
+MOST_COMPARISONS = 12
+"""That it shows; ten policies in three tasks are compared 180 times."""
 
 GROUPS = "success"
 """The table of success rates; ``groups.parquet`` holds it too."""
@@ -129,6 +131,16 @@ def _write_parquet(
     return written, None
 
 
+def _beginning(table: Table) -> Table:
+    """The first of many comparisons, those that are decided before the others."""
+    more = len(table.rows) - MOST_COMPARISONS
+    if table.id != "comparisons" or more <= 0:
+        return table
+    at = table.columns.index("decided")
+    rows = sorted(table.rows, key=lambda row: row[at] == "no")[:MOST_COMPARISONS]
+    return replace(table, rows=tuple(rows), note=f"{more} more are in the report. {table.note}")
+
+
 def summary_text(results: Results, written: Written) -> str:
     """Write what the terminal shows: the success table, the headlines, what was left out."""
     parts = [STAND_IN] if results.stand_in else []
@@ -136,7 +148,7 @@ def summary_text(results: Results, written: Written) -> str:
     if isinstance(understood, list) and understood:
         parts.append("Read:\n" + "\n".join(f"  {line}" for line in understood))
     shown = [t for t in results.tables if t.id in SHOWN or t.id.startswith("end_points_")]
-    parts += [as_text(table) for table in shown]
+    parts += [as_text(_beginning(table)) for table in shown]
     lines = [f"{label}: {text}" for label, text, _ in headlines(results)]
     if lines or not any(m.value is not None for m in results.measurements):
         parts.append("\n".join(lines) if lines else "Nothing could be measured.")

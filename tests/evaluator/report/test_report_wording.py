@@ -188,6 +188,17 @@ def test_a_twin_is_trusted_only_where_the_numbers_say_so(tmp_path: Path) -> None
     assert "(t0, p0: 90 against 0 %; t0, p1: 90 against 0 %)" in blind
 
 
+def test_a_terminal_shows_twelve_of_many_comparisons_the_decided_ones_first(tmp_path: Path) -> None:
+    rows = [f"p{k},s{i},{int(k < 6)}" for k in range(7) for i in range(40)]  # the last one fails
+    terminal = shown(tmp_path, "\n".join(["policy,start_id,recorded", *rows]))[1]
+    found = re.findall(
+        r"p(\d) is (?:better|worse)|undecided: p\d", terminal.partition("Who may")[0]
+    )
+    assert (len(found), sum(map(bool, found))) == (12, 6)
+    assert all(found[:6])
+    assert "9 more are in the report." in " ".join(terminal.split())
+
+
 def test_rates_without_n_ask_for_it_and_claim_no_interval(tmp_path: Path) -> None:
     rates = "policy,real,sim\nA,50%,60%\nB,70%,65%\nC,30%,45%\nD,10%,20%\nE,80%,75%\n"
     page_text, terminal = shown(tmp_path, rates)
