@@ -13,6 +13,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
+from evaluator.compare.attribution import SAID, attributed
 from evaluator.trial_row import TrialRow
 
 MOST_WORDS = 20
@@ -88,7 +89,7 @@ def cause_of(run: RunFolder, row: TrialRow) -> Cause | None:
         return None
     moment, verdict = moment_of(run, row), _verdict_of(run, row)
     text = moment.text if moment else row.failing_detail or "no replay tells what differs first"
-    words, decides = text.split(), None
+    words, decides = (SAID.get(attributed(row) or "", "") + text).split(), None
     if verdict is not None:  # what fails decides, else the goal
         decides = verdict.factors().get(verdict.first_failing or "", verdict.terminal)
     return Cause(

@@ -11,6 +11,10 @@ from evaluator.result import Cell, Table
 AGREE, WORLD, ACTIONS, UNKNOWN = "end alike", "world", "actions", "not known"
 """``WORLD``: the trial's own motion, replayed in the twin, ends as the rollout did. ``ACTIONS``:
 it ends as the trial did, so that the policy did something else in the rollout."""
+SAID = {
+    WORLD: "The same motion ends otherwise in the twin: ",
+    ACTIONS: "The policy moved otherwise in the twin: ",
+}
 
 
 def attributed(row: TrialRow) -> str | None:

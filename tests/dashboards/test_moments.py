@@ -11,7 +11,7 @@ import pytest
 from serving import judged
 from visible import words
 
-from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.metadata import ROLLOUT, EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import decode_color
@@ -56,6 +56,13 @@ def test_a_disagreement_has_a_cause_a_margin_and_says_how_often_it_happens(
     dropped = "the cube left the gripper during carry"
     assert cause_of(disagreement, row) == Cause(text=dropped, margin=dropped, varied=None)
     assert cause_of(disagreement, replace(row, recorded=False)) is None
+    rolled = replace(row, plan_id=ROLLOUT, sim_executed=row.recorded)
+    moved = cause_of(disagreement, rolled)
+    assert moved is not None
+    assert moved.text == f"The policy moved otherwise in the twin: {dropped}"
+    same = cause_of(disagreement, replace(rolled, sim_executed=not row.recorded))
+    assert same is not None
+    assert same.text == f"The same motion ends otherwise in the twin: {dropped}"
     said = synthetic.make_verdict("p", True, "planned", "bullet")
     said = replace(
         said,
