@@ -1,6 +1,7 @@
 """Replay every trajectory of a run: each plan as planned, each execution as recorded."""
 
 import contextlib
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -107,7 +108,9 @@ def jobs_of(item: Preparation) -> Prepared:
     plans = streams.plans(episode)
     events = executed_events(episode)
     planned = {plan.id for _, plan in plans}
-    without = [i for i in _executed(events) if i not in planned]
+    started = [event for event in events if event["type"] == "execution_started"]
+    executed_ids = dict.fromkeys(str(event.get("plan_id") or NO_PLAN) for event in started)
+    without = [name for name in executed_ids if name not in planned]
     nothing = _nothing_to_replay(episode, config.robot, is_planned=bool(plans), moved=bool(without))
     if nothing is not None:
         return nothing
@@ -166,12 +169,6 @@ def jobs_of(item: Preparation) -> Prepared:
     return Prepared(jobs=tuple(jobs), why_not=why_not)
 
 
-def _executed(events: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Ids under which something was executed, each once."""
-    started = (event for event in events if event["type"] == "execution_started")
-    return list(dict.fromkeys(str(event.get("plan_id") or NO_PLAN) for event in started))
-
-
 def _nothing_to_replay(
     episode: Episode, robot: str, *, is_planned: bool, moved: bool
 ) -> Prepared | None:
@@ -211,16 +208,28 @@ def there_already(
     jobs: Sequence[ReplayJob], *, force: bool
 ) -> tuple[list[dict[str, Any]], list[ReplayJob]]:
     """Rows of the replays that were made before, and the jobs that are still to do."""
-    rows, todo = [], []
+    rows, todo, kept = [], [], list[Path]()
     for job in jobs:
         row = None if force else row_of_existing(job)
         if row is None:
             todo.append(job)
-            continue
-        rows.append(row)
-        with contextlib.suppress(OSError):  # a folder that is only read keeps its order
-            job.path().touch()  # the newest replay of a trajectory is the one that counts
+        else:
+            rows.append(row)
+            kept.append(job.path())
+    _count_again(kept)
     return rows, todo
+
+
+def _count_again(kept: Sequence[Path]) -> None:
+    """Make kept files the newest of their trajectory, for the newest is the one that counts."""
+    newest: dict[str, int] = {}
+    for entry in os.scandir(kept[0].parent) if kept else ():
+        trajectory = entry.name.rsplit(".", 3)[0]  # engine and settings are left out
+        newest[trajectory] = max(newest.get(trajectory, 0), entry.stat().st_mtime_ns)
+    for path in kept:
+        with contextlib.suppress(OSError):  # a folder that is only read keeps its order
+            if path.stat().st_mtime_ns < newest[path.name.rsplit(".", 3)[0]]:
+                os.utime(path)
 
 
 def runner_for(config: ReplayRunConfig) -> Runner:
