@@ -1,6 +1,8 @@
 """The real command as a process of its own."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -8,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bridge.episode.run_folder import RunFolder
+from dashboards import comparison
 from dashboards.comparison import Judgement, judge
 from evaluator.report.review import refresh
 
@@ -19,6 +22,19 @@ def judged(run: RunFolder) -> Judgement:
     if judge(run, reads=False).is_old:
         refresh(run)
     return judge(run, reads=False)
+
+
+@contextmanager
+def reader_held(run: RunFolder) -> Iterator[None]:
+    """Start what reads a run behind its pages, and let it wait."""
+    judge(run)
+    update = comparison._KNOWN[run].update
+    assert update is not None
+    os.kill(update.pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(update.pid, signal.SIGCONT)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from serving import judged
+from serving import judged, reader_held
 from visible import words
 
 from bridge.episode.catalogue import label_episode
@@ -217,9 +217,10 @@ def test_what_changes_while_an_evaluation_reads_makes_its_index_old(copy: RunFol
 
 def test_of_two_changed_runs_one_is_read_at_a_time(copy: RunFolder, own_run: RunFolder) -> None:
     shutil.rmtree(copy.results_dir)
-    assert judge(copy).is_being_updated
-    assert judge(own_run).is_being_updated
-    assert comparison._KNOWN[own_run].update is None
+    with reader_held(copy):
+        assert judge(copy).is_being_updated
+        assert judge(own_run).is_being_updated
+        assert comparison._KNOWN[own_run].update is None
 
 
 def test_a_page_says_that_its_numbers_are_being_recomputed(
@@ -227,9 +228,10 @@ def test_a_page_says_that_its_numbers_are_being_recomputed(
 ) -> None:
     browser = synthetic.browser_of(copy)
     label_episode(copy, "trial_0003", Outcome(result="failure", by="reviewer"))
-    for address in ("/", "/failures", "/numbers", "/twin", "/label", "/episode/trial_0003"):
-        text = words(browser.get(address).text)
-        assert "its numbers are being recomputed" in text, address
+    with reader_held(copy):
+        for address in ("/", "/failures", "/numbers", "/twin", "/label", "/episode/trial_0003"):
+            text = words(browser.get(address).text)
+            assert "its numbers are being recomputed" in text, address
     before, after = judge(copy).row("trial_0003"), told_behind(copy).trial("trial_0003")
     assert (before and before.agrees, after and after.agrees) == (True, False)
     text = words(browser.get("/").text)
@@ -241,11 +243,12 @@ def test_a_run_read_for_the_first_time_says_nothing_false(
     own_run: RunFolder, synthetic: ModuleType
 ) -> None:
     app = synthetic.Browser(synthetic.create_app(synthetic.Library.open([own_run.path])))
-    for address in ("/", "/failures", "/numbers", "/label"):
-        text = words(app.get(address).text)
-        assert "being read for the first time" in text, address
-        assert "robot-gst record" not in text, address
-        assert "evaluate" not in text, address
+    with reader_held(own_run):
+        for address in ("/", "/failures", "/numbers", "/label"):
+            text = words(app.get(address).text)
+            assert "being read for the first time" in text, address
+            assert "robot-gst record" not in text, address
+            assert "evaluate" not in text, address
 
 
 def test_a_run_that_cannot_be_written_is_shown_all_the_same(
