@@ -158,12 +158,12 @@ for (const button of document.querySelectorAll("[data-copy]")) {
   });
 }
 
-// Numbers that are being recomputed behind the page appear once they are there.
+// A page whose numbers are being recomputed is loaded again once they are there, unless somebody works in it.
 async function awaitNumbers() {
   const page = await fetch(location.href).then((answer) => answer.text()).catch(() => 'id="recomputed"');
   if (page.includes('id="recomputed"')) setTimeout(awaitNumbers, 2000); else location.reload();
 }
-if (document.getElementById("recomputed")) setTimeout(awaitNumbers, 2000);
+if (document.getElementById("recomputed") && !document.querySelector("form.scrub")) setTimeout(awaitNumbers, 2000);
 
 // A choice in the filters is taken at once; without a script the button does it.
 for (const choice of document.querySelectorAll(".filters select")) {
