@@ -158,6 +158,7 @@ def test_keys_move_all_pictures_and_they_never_differ_in_time(
 ) -> None:
     shown = "[...document.querySelectorAll('figure:not(.beside) .frame-time')].map(o => o.value)"
     hidden = "document.querySelector('.beside .apart').hidden"
+    judged(run)
     with dashboard(run) as (_, url), chromium(tmp_path) as tab:
         tab.show(f"{url}episode/{ID}", width=1280, dark=False)
         assert not tab.complaints

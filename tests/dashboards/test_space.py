@@ -13,7 +13,7 @@ import pytest
 from headless import CHROMIUM, NO_CHROMIUM, Browser, chromium
 from PIL import Image
 from rerun_cell import write_localised
-from serving import dashboard
+from serving import dashboard, judged
 
 from bridge.data_files import dataset_file
 from bridge.episode import schema, streams
@@ -320,6 +320,7 @@ def test_the_page_draws_what_the_rasteriser_draws_and_follows_clock_and_hand(
     run: RunFolder, tmp_path: Path, synthetic: ModuleType
 ) -> None:
     click = "[...document.querySelectorAll('.eyes button')].find(b => b.textContent.includes({}))"
+    judged(run)
     with dashboard(run) as (_, url), chromium(tmp_path, webgl=True) as tab:
         tab.show(f"{url}episode/{ID}?t=2.5&space=1", width=850, dark=False)
         canvas(tab)
