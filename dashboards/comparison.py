@@ -111,8 +111,7 @@ class _Known:
     output: IO[bytes] | None = None
     """What the reader tells."""
 
-    @property
-    def is_read(self) -> bool:
+    def look(self) -> bool:
         """Whether another process reads the run now; what one told that has ended is kept."""
         if self.update is None or self.update.poll() is None:
             return self.update is not None
@@ -133,12 +132,12 @@ def judge(run: RunFolder, *, reads: bool = True) -> Judgement:
     """Return what is known of a run; what changed since is read behind the page, if asked for."""
     with _ASKING:
         known = _KNOWN.setdefault(run, _Known())
-        is_read, state = known.is_read, _state(run, known)
+        is_read, state = known.look(), _state(run, known)
         index = _open(run, known)
         if index is not None and index.is_of(state):
             return Judgement(run=run, index=index)
         if reads and not is_read and known.tried != state:
-            is_read = any(other.is_read for other in _KNOWN.values()) or _read(run, known, state)
+            is_read = any(other.look() for other in _KNOWN.values()) or _read(run, known, state)
         return Judgement(run=run, index=index, is_old=True, is_being_updated=is_read)
 
 

@@ -100,9 +100,17 @@ def cause_of(run: RunFolder, row: TrialRow) -> Cause | None:
 
 
 def _verdict_of(run: RunFolder, row: TrialRow) -> Verdict | None:
+    path = run.derived_dir / (row.twin_replay or "")
+    if not path.is_file():
+        return None
+    status = path.stat()
+    return _verdict(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=64)
+def _verdict(path: Path, _mtime_ns: int, _size: int) -> Verdict | None:
     try:
-        path = run.derived_dir / (row.twin_replay or "")
-        return streams.verdicts(Episode.open(path))[-1][1] if path.is_file() else None
+        return streams.verdicts(Episode.open(path))[-1][1]
     except (GstError, IndexError):  # the trial's own page says what is wrong with the file
         return None
 

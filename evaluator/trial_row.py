@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from bridge.episode.executions import NO_PLAN
+from bridge.episode.metadata import ROLLOUT
 
 RECORDED_WORDS = {True: "stand-in", False: "real", None: "recorded"}
 """What the recorded side is called."""
@@ -96,6 +97,11 @@ class TrialRow:
     def had_plan(self) -> bool:
         """Whether what moved the robot had been announced; also where nothing moved it."""
         return self.plan_id != NO_PLAN
+
+    @property
+    def is_rolled_out(self) -> bool:
+        """Whether a policy's rollout stands where a plan's replay would."""
+        return self.plan_id == ROLLOUT
 
     @property
     def twin(self) -> bool | None:

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from bridge.episode.metadata import ROLLOUT
 from evaluator.compare.measure import grouped
 from evaluator.compare.rows import TrialRow
 from evaluator.result import Cell, Table
@@ -19,7 +18,7 @@ SAID = {
 
 def attributed(row: TrialRow) -> str | None:
     """To what a difference of trial and rollout is due; None where one of them is not known."""
-    if row.plan_id != ROLLOUT or row.recorded is None or row.sim_planned is None:
+    if not row.is_rolled_out or row.recorded is None or row.sim_planned is None:
         return None
     if row.recorded == row.sim_planned:
         return AGREE

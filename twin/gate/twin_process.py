@@ -12,13 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.run_folder import RunFolder
-from bridge.process_pool import (
-    Failed,
-    Function,
-    TimeIsUpError,
-    Worker,
-    WorkerLostError,
-)
+from bridge.process_pool import Failed, Function, TimeIsUpError, Worker, WorkerLostError
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
@@ -137,9 +131,8 @@ def _steps_of(question: Question, config: ReplayConfig) -> int:
     from twin.replay.path import check_usable  # noqa: PLC0415
     from twin.robot.model import load_robot  # noqa: PLC0415
 
-    check_usable(
-        question.plan, load_robot(question.seen.urdf)
-    )  # before its impossible times are steps
+    robot = load_robot(question.seen.urdf)
+    check_usable(question.plan, robot)  # before its impossible times are steps
     steps = max(1, num_steps(question.plan.tau[-1].t_ns, config))
     if steps > question.max_steps:
         raise UndecidedError(
@@ -241,9 +234,9 @@ class TwinProcess(AbstractContextManager["TwinProcess"]):
 
     def close(self) -> None:
         """End it, also in the middle of something."""
-        self._closed = True
-        if self._worker is not None:
-            self._worker.close()
+        self._closed, worker = True, self._worker  # which another thread may take away
+        if worker is not None:
+            worker.close()
 
     def __exit__(self, *_: object) -> None:
         """End it."""
