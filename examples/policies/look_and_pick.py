@@ -5,7 +5,7 @@ there. Camera and colours are those of the stand-in cell. The study of docs/poli
 folder, with all ten where two are named:
 
     robot-gst trials runs/study --task cube_into_box cube_on_block cube_beside_cube --trials 20 \
-        --seed 41207 --map look_and_pick.toml --policies exact=look_and_pick:exact \
+        --seed 71203 --map look_and_pick.toml --policies exact=look_and_pick:exact \
         miss_20=look_and_pick:miss_20
     robot-gst rebuild runs/study
     robot-gst rollout runs/study --map look_and_pick.toml --policy look_and_pick:exact --name exact
