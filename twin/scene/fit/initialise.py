@@ -196,6 +196,7 @@ def flat_gaussians(
     normals: np.ndarray,
     colors: np.ndarray,
     sizes: np.ndarray,
+    flatness: float = FLATNESS,
 ) -> GaussianCloud:
     """Gaussians as wide as what they stand for, flat along their normals.
 
@@ -203,9 +204,10 @@ def flat_gaussians(
         normals: Along which they are flat; any length.
         colors: sRGB, 0..1.
         sizes: Edge of the square or voxel each stands for [m].
+        flatness: Deviation along the normal, in that in the plane.
     """
     sigma = IN_PLANE_SIGMA * sizes
-    scales = np.stack([sigma, sigma, FLATNESS * sigma], axis=1)
+    scales = np.stack([sigma, sigma, flatness * sigma], axis=1)
     logit = np.log(OPACITY / (1 - OPACITY))
     return GaussianCloud(
         means_m=as_float32(means),

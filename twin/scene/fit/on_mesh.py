@@ -8,14 +8,20 @@ from scipy.spatial import cKDTree
 
 from bridge.geometry.mesh import sample_triangles
 from twin.robot.surface import ray_scene, tensor
+from twin.scene.fit.initialise import flat_gaussians
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.shape.mesh import Mesh, face_normals
 
 PER_CELL = 12
 """Samples for each that is kept: nearly every cell of the surface then has one."""
 WIDER = 1.15
 """Gaussians are wider than their spacing by this, so that nothing shows through."""
-FROM_EDGE = 0.95
-"""How far from an edge Gaussians end, in their spacing: half of the light passes at the edge."""
+THIN = 0.01
+"""Deviation along the normal, in that in the plane. Seen along a side, a stack of thicker ones
+makes the outline wider: each is a little blurred, and together they are opaque."""
+FROM_EDGE = 1.4
+"""How far from an edge Gaussians end, in their spacing: the area of a cube's outline comes out
+right at 0.3 m (measured: 1.5 % too large; 4.6 % with 0.95 and Gaussians ten times as thick)."""
 BLUR_M = 0.006
 """Surface so much farther away than the nearest has less to say about a colour."""
 DIRECTIONS, ROUNDS = 8, 3
@@ -82,6 +88,16 @@ def within_edges(
         farthest = beyond_m.argmax(axis=1)
         moved -= beyond_m[every, farthest, None] * around[every, farthest]
     return moved
+
+
+def thin_gaussians(
+    p: Float[np.ndarray, "num_points 3"],
+    normals: Float[np.ndarray, "num_points 3"],
+    colors: Float[np.ndarray, "num_points 3"],
+    spacing_m: float,
+) -> GaussianCloud:
+    """A surface's Gaussians, once they have a colour."""
+    return flat_gaussians(p, normals, colors, np.full(len(p), WIDER * spacing_m), THIN)
 
 
 def colors_around(

@@ -16,9 +16,14 @@ from scipy import ndimage
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.fit.lighting import EVEN, Lighting
-from twin.scene.fit.on_mesh import WIDER, colors_around, even_points, surface_area_m2, within_edges
+from twin.scene.fit.on_mesh import (
+    colors_around,
+    even_points,
+    surface_area_m2,
+    thin_gaussians,
+    within_edges,
+)
 from twin.scene.frames.downscaled import pixels_of
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud
@@ -73,7 +78,7 @@ def closed_object(
     seen = p[known], normals[known], (color / light)[known]
     paint, _ = colors_around(p[~known], normals[~known], seen, NEIGHBOURS, sideways=SIDEWAYS)
     color[~known] = paint * light[~known]
-    cloud = flat_gaussians(p, normals, color, np.full(len(p), WIDER * spacing_m))
+    cloud = thin_gaussians(p, normals, color, spacing_m)
     return replace(cloud, completed=~is_seen)
 
 

@@ -23,9 +23,15 @@ from bridge.geometry.camera import Camera
 from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack, distinct_postures, posture_track
 from twin.robot.surface import PosedSurface, link_poses, link_surfaces
-from twin.scene.fit.initialise import NoSurfaceError, flat_gaussians, fuse
+from twin.scene.fit.initialise import NoSurfaceError, fuse
 from twin.scene.fit.lighting import EVEN, Lighting, Patches, fit_lighting
-from twin.scene.fit.on_mesh import WIDER, colors_around, even_points, surface_area_m2, within_edges
+from twin.scene.fit.on_mesh import (
+    colors_around,
+    even_points,
+    surface_area_m2,
+    thin_gaussians,
+    within_edges,
+)
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice, load, root_frame
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
@@ -166,8 +172,7 @@ def on_surface(
     seen = seen_m, facing, seen_colors
     colors, told = colors_around(p, normals, seen, NEIGHBOURS, reach_m=REACH_M)
     colors[told <= LEAST_TOLD] = np.median(seen_colors, axis=0)
-    sizes = np.full(len(p), WIDER * spacing_m)
-    return flat_gaussians(p, normals, colors, sizes)
+    return thin_gaussians(p, normals, colors, spacing_m)
 
 
 class RobotFrames:

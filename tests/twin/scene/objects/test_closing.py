@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import open3d as o3d
 import pytest
+from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -124,6 +125,20 @@ def test_nothing_shows_through_it_however_it_is_turned(
     assert inside.sum() > 900
     assert (drawn.alpha[inside] < 0.5).mean() <= 0.01
     assert (drawn.alpha[~inside] > 0.5).mean() <= 0.01
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_its_outline_is_as_large_as_that_of_its_corners(
+    closed: GaussianCloud, turn: tuple[float, ...]
+) -> None:
+    q = np.array(turn) / np.linalg.norm(turn)
+    T_camera_cube = se3.transform_from(q, np.array([0.01, -0.02, 0.3]))
+    corners, _ = CAMERA.project(se3.apply(T_camera_cube, cube()[0]))
+    drawn = Rasteriser(RasterConfig(threads=1)).view(
+        moved_cloud(closed, T_camera_cube), CAMERA, np.eye(4)
+    )
+    area_px = ConvexHull(corners).volume  # in two dimensions this is the area
+    assert drawn.alpha.sum() == pytest.approx(area_px, rel=0.025)
 
 
 def test_each_side_has_its_colour_and_nothing_of_the_table(closed: GaussianCloud) -> None:
