@@ -34,6 +34,10 @@ class RolloutConfig:
     """Those of recorded trials, so many drawn from the task file, or one by its id."""
     times: Annotated[int, RARE] = 1
     """Rollouts from each start; three or more show how much a policy varies by itself."""
+    vary: Annotated[tuple[str, ...], RARE] = ()
+    """What differs from rollout to rollout, up to so much: light=20%, mass=30%, friction=30%,
+    objects.position=10mm, camera.side.position=30mm, camera.side.angle=3deg. Which of them goes
+    with failure is told; these rollouts are not compared with the cell."""
     cell: str = ""
     """Act in this cell instead, in every trial of the policy that is started at the recorder
     (robot-gst ctl start --policy NAME), until that trial is ended."""

@@ -133,6 +133,8 @@ def describe_gap(gap: Mapping[str, Any]) -> list[str]:
     if not gap:
         return ["visual gap: not measured, the trial has no pictures and joints of its motion"]
     rendered, step = gap["rendered"], max(gap["following"], gap["again"])
+    if not max(step, rendered["all"]):
+        return ["visual gap: not measured, the policy's first answer is the same whatever it sees"]
     times = f", {rendered['all'] / step:.1f} x as much" if step > 0 else ""
     alone = ", ".join(f"{name} {value:.3g}" for name, value in rendered.items() if name != "all")
     return [

@@ -23,6 +23,7 @@ from twin.policies.errors import PolicyError, RefusedError, StoppedError
 from twin.policies.mapping import Interpreter, PolicyMap, is_end
 from twin.policies.policy import Policy, open_policy, who_acts
 from twin.policies.starts import Start, drawn_starts, open_start
+from twin.policies.variation import Quantity, draw, varied_start
 from twin.policies.views import Pictures, TwinCameras
 from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.result import ReplayResult
@@ -51,6 +52,7 @@ class RolloutJob:
     name: str
     """What it is called in tables."""
     mapping: PolicyMap
+    vary: tuple[Quantity, ...]
     max_s: float
     latency_s: float
     timeout_s: float
@@ -59,7 +61,9 @@ class RolloutJob:
         """What the name of the file covers; of a file of keys what it holds, not its place."""
         keys = Path(self.policy.removeprefix("keys:"))
         held = is_driven(self.policy) and keys.is_file()
+        varied = {item.name: item.spread for item in self.vary}
         return {
+            **({"vary": varied} if varied else {}),
             "rollout_version": ROLLOUT_VERSION,
             "policy": f"keys:{hash_file(keys)}" if held else self.policy,
             "name": self.name,
@@ -122,16 +126,19 @@ def roll_out(job: RolloutJob) -> dict[str, Any]:
 def _roll_out(
     job: RolloutJob, run: RunFolder, episode: Episode, start: Start, policy: Policy
 ) -> dict[str, Any]:
+    drawn = draw(job.vary, job.seed, start.id, job.number)
+    start = varied_start(start, drawn) if drawn else start
     cell = TwinCell(start)
     try:
         speak = Interpreter(job.mapping, cell.robot, start.task.instruction)
-        cameras = TwinCameras(run, start, speak.cameras(), speak.sizes())
+        cameras = TwinCameras(run, start, speak.cameras(), speak.sizes(), drawn)
         policy.reset(job.seed + job.number)
         acted = act(cell, cameras, policy, speak, max_s=job.max_s, latency_s=job.latency_s)
         cell.rest(start.config.settle_after_s)
         info = replace(episode.info, policy=job.name, task=start.task.name)
         result, plan = cell.judged(info)
         row = _row(job, info, start.id, acted, result)
+        row["varied"] = {q.name: round(q.amount(drawn[q.name]), 6) for q in job.vary}
         row["checkpoint"] = who_acts(job.policy, job.mapping, policy.metadata)
         _write(job, episode, start, (result, plan), acted, row, policy.metadata)
         return row

@@ -22,6 +22,7 @@ from twin.policies.mapping import read_mapping
 from twin.policies.policy import HASHES
 from twin.policies.rollout import RolloutJob, roll_out, row_of_file
 from twin.policies.starts import trial_episodes
+from twin.policies.variation import Quantity, describe_effect, effects, read_quantities
 
 RESULTS = {"success": True, "failure": False}
 """Outcomes that count."""
@@ -47,7 +48,9 @@ def jobs_of(run: RunFolder, config: RolloutConfig) -> Iterator[RolloutJob]:
         mapping = drive_mapping(tuple(streams.camera_ids(episodes[0])))
     else:
         mapping = read_mapping(config.map)
+    vary = read_quantities(config.vary)
     for episode, drawn in _starts(episodes, config.starts):
+        _refuse_unknown(vary, episode)
         for number in range(config.times):
             yield RolloutJob(
                 run_path=run.path.resolve(),
@@ -58,6 +61,7 @@ def jobs_of(run: RunFolder, config: RolloutConfig) -> Iterator[RolloutJob]:
                 policy=config.policy,
                 name=config.name or config.policy,
                 mapping=mapping,
+                vary=vary,
                 max_s=config.max_s,
                 latency_s=config.latency_s,
                 timeout_s=config.timeout_s,
@@ -107,7 +111,20 @@ def roll_out_run(run: RunFolder, config: RolloutConfig, output: Output) -> dict[
     for reason in dict.fromkeys(row["problem"] for row in rows if row["problem"]):
         output.say(reason)
     rows.sort(key=lambda row: (row["task"], row["start_id"], row["number"]))
-    return {"run": str(run.path), "rows": rows, "table": str(write_table(run))}
+    found = {"run": str(run.path), "rows": rows, "table": str(write_table(run))}
+    quantities = read_quantities(config.vary)
+    return {**found, "effects": list(effects(rows, quantities))} if quantities else found
+
+
+def _refuse_unknown(vary: Sequence[Quantity], episode: Episode) -> None:
+    known = streams.camera_ids(episode)
+    for item in vary:
+        camera = item.name.removeprefix("camera.").rpartition(".")[0]
+        if item.name.startswith("camera.") and camera not in known:
+            raise UsageError(
+                f"--vary {item.name}: no camera {camera} in {episode.info.id}; it has: "
+                f"{', '.join(known) or 'none'}"
+            )
 
 
 def write_table(run: RunFolder) -> Path:
@@ -119,7 +136,7 @@ def write_table(run: RunFolder) -> Path:
     rows: dict[tuple[str, str], tuple[Any, ...]] = {}
     for path in sorted(run.derived(f"*.{ROLLOUT}.*"), key=lambda path: path.stat().st_mtime_ns):
         row = row_of_file(path)
-        if row is None or row["success"] is None:
+        if row is None or row["success"] is None or row.get("varied"):
             continue
         key = (row["policy"], row["task"], row["start_id"])
         outcomes, number = recorded.get(key, []), row["number"]
@@ -168,5 +185,8 @@ def describe_rollouts(summary: Mapping[str, Any]) -> str:
         line += f"; {len(mine) - len(judged)} say nothing" if len(judged) < len(mine) else ""
         lines.append(line)
         lines += [f"  {row['start_id']}: {row['detail']}" for row in mine if not row["success"]]
+    if "effects" in summary:
+        told = [describe_effect(effect) for effect in summary["effects"]]
+        return "\n".join([*lines, *(told or ["too few rollouts to tell what goes with failure"])])
     lines.append(f"next: robot-gst evaluate {summary['table']}")
     return "\n".join(lines)

@@ -1,7 +1,7 @@
 """What the cell's cameras see of the twin while a policy acts."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -9,11 +9,13 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.policies.cell import TwinCell
 from twin.policies.errors import PolicyError
 from twin.policies.mapping import fitting
 from twin.policies.starts import Start
+from twin.policies.variation import ANGLE, POSITION, Drawn
 from twin.replay.images import Drawable, mounting, set_up
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture
@@ -109,6 +111,7 @@ class TwinCameras:
         start: Start,
         cameras: Sequence[str] = (),
         sizes: Mapping[str, tuple[int, int]] | None = None,
+        drawn: Drawn | None = None,
     ) -> None:
         """Read the scene.
 
@@ -116,7 +119,9 @@ class TwinCameras:
             cameras: Ids; none: all that the episode has.
             sizes: Width and height in which the picture of a camera is to fit; others are drawn
                 as they were recorded.
+            drawn: Conditions that differ from the recorded ones.
         """
+        self._drawn = drawn or {}
         episode = Episode.open(start.episode_path)
         known = streams.camera_ids(episode)
         unknown = [name for name in cameras if name not in known]
@@ -129,7 +134,9 @@ class TwinCameras:
         self._resting: Resting | None = None
         self._last: dict[str, bytes] = {}
         self.viewpoints = {
-            name: _viewpoint(run, episode, start, name, (sizes or {}).get(name))
+            name: _moved(
+                _viewpoint(run, episode, start, name, (sizes or {}).get(name)), name, self._drawn
+            )
             for name in cameras or known
         }
         backdrop = self._drawable.parts.backdrop
@@ -149,10 +156,11 @@ class TwinCameras:
         padded = np.zeros(len(rest.cloud), dtype=bool)
         padded[: len(hidden)] = hidden
         T_base_tcp = cell.robot.T_base_tcp(joints_rad)
-        return {
+        drawn = {
             name: canvas.picture(rest.cloud, over, padded if hidden.any() else None, T_base_tcp)
             for name, canvas in self._canvases.items()
         }
+        return _lit(drawn, self._drawn)
 
     def _what_rests(self, places: Places, nodes: Nodes) -> Resting:
         """As it was, unless some of it moved, or something else came to rest."""
@@ -205,6 +213,30 @@ def _viewpoint(
         T_base_camera=tree.T_root_frame(info.frame_id, start.stamp_ns),
         T_tcp_camera=mounting(episode, tree, info.frame_id, start.joints_rad, robot),
     )
+
+
+def _moved(place: Viewpoint, camera_id: str, drawn: Drawn) -> Viewpoint:
+    """A camera that stands, or sits in the hand, elsewhere, seen along its own axes."""
+    shift = np.array(drawn.get(f"camera.{camera_id}{POSITION}", (0.0, 0.0, 0.0)))
+    turn = np.array(drawn.get(f"camera.{camera_id}{ANGLE}", (0.0, 0.0, 0.0)))
+    T: Float[np.ndarray, "4 4"] = se3.from_rotation(se3.rotation_from_vector(turn), shift)
+    mount = place.T_tcp_camera
+    return replace(
+        place,
+        T_base_camera=place.T_base_camera @ T,
+        T_tcp_camera=None if mount is None else mount @ T,
+    )
+
+
+def _lit(pictures: Pictures, drawn: Drawn) -> Pictures:
+    """Pictures as bright as another light makes them."""
+    gain = 1.0 + drawn.get("light", (0.0,))[0]
+    if gain == 1.0:
+        return pictures
+    return {
+        name: np.clip(np.rint(gain * image.astype(np.float32)), 0, 255).astype(np.uint8)
+        for name, image in pictures.items()
+    }
 
 
 def _fitted_in(camera: Camera, size: tuple[int, int]) -> Camera:
