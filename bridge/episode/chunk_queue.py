@@ -269,7 +269,7 @@ class _Journal:
                 self._file = PartFile.create(self.path)
             if not self._file.offset:
                 buffers = [mcap_format.MAGIC + header, *buffers]
-            self._file.append(buffers, crc=0)
+            self._file.append(buffers)
         except OSError:
             self.has_failed = True
             return False

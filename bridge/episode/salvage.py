@@ -251,23 +251,18 @@ def verbatim(found: Chunk) -> EncodedChunk:
     if has_wrong_times(found):
         front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
         buffers = [front, memoryview(found.raw)[len(front) :]]
-    crc = 0
-    for buffer in buffers:
-        crc = crc32(buffer, crc)
     entry = chunk_entry(RecordSpan.between(mcap.CHUNK, 0, found.length), found.head)
     entry.message_start_time, entry.message_end_time = start_ns, end_ns
-    return EncodedChunk(buffers=buffers, crc=crc, entry=entry, index=found.contents.index)
+    return EncodedChunk(buffers=buffers, entry=entry, index=found.contents.index)
 
 
 def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
     """Return the records saved from a cut chunk as a whole one."""
-    crc = crc32(records, 0)
     return chunk_of(
         [records],
         contents.index,
         times_ns=contents.time_range(),
         size=len(records),
-        crc=crc,
+        crc=crc32(records, 0),
         compression="",
-        data_crc=crc,
     )
