@@ -1,11 +1,10 @@
 """Verify an episode: every CRC, index and stream, and say what is wrong with what it holds.
 
 Broken is what contradicts itself: damage, indexes and counts that disagree with the data, messages
-that are not what they promise, parts that are missing. ``health`` names what is wrong with a whole
+that are not what they promise. ``health`` names what is wrong with a whole
 file (``exit_code`` 3). Files of other programs are held to the format only.
 """
 
-from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,8 +26,7 @@ from bridge.episode.contract import (
 )
 from bridge.episode.health import HealthFinding, drops_logged, in_order, in_words, unreadable
 from bridge.episode.metadata import BY_DISK
-from bridge.episode.reader import Episode, name_of_part, record_of
-from bridge.episode.run_folder import part_name
+from bridge.episode.reader import Episode
 from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import LIBRARY
 from bridge.errors import BridgeError, UsageError
@@ -39,8 +37,6 @@ class CheckReport:
     """What was found in one episode. ``exit_code``: 0 clean, 1 broken, 3 losses."""
 
     path: Path
-    parts: list[Path] = field(default_factory=list)
-    missing_parts: list[Path] = field(default_factory=list)
     messages: int = 0
     topics: dict[str, TopicCheck] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
@@ -77,8 +73,7 @@ class CheckReport:
         lost = f"{self.declared_losses} dropped (logged)"
         if self.undeclared_losses:
             lost += f", {self.undeclared_losses} more missing"
-        parts = f" in {len(self.parts)} parts" if len(self.parts) > 1 else ""
-        lines = [f"{self.path.name}: {self.summary}, {self.messages} messages{parts}, {lost}"]
+        lines = [f"{self.path.name}: {self.summary}, {self.messages} messages, {lost}"]
         lines += [f"  {fault}" for fault in self.faults]
         told = (each for each in self.findings if f"{each.about}: {each.text}" not in self.faults)
         lines += [f"  {found.line(self.start_ns)}" for found in told]
@@ -90,22 +85,19 @@ class CheckReport:
         """Everything, for ``--json``."""
         found = asdict(self)
         del found["path"], found["presences"], found["start_ns"]
-        paths = {name: list(map(str, found[name])) for name in ("parts", "missing_parts")}
-        return {"file": str(self.path), "state": self.summary, **found, **paths}
+        return {"file": str(self.path), "state": self.summary, **found}
 
 
 def check_episode(path: Path, *, contract: Contract | None = None) -> CheckReport:
-    """Read every byte of an episode and of its parts, and decode every type this project knows."""
+    """Read every byte of an episode, and decode every type this project knows."""
     report = CheckReport(path=path)
     faults = Faults()
     watch = _Watch()
     episode = _open(path, faults, watch)
-    report.parts = list(episode.parts) if episode else [path]
     if episode is not None:
         watch.pauses = Pauses(_paused_spans(episode))
-        for part in report.parts:
-            watch.read(FileCheck(part, faults))
-        _check_parts(report, episode, faults)
+        watch.read(FileCheck(path, faults))
+        _find_ends(report, episode)
         _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
     if episode is not None:
@@ -130,23 +122,6 @@ def learn_from(path: Path) -> Contract:
     return learn_contract(report.presences, cell=Episode.open(path).info.cell)
 
 
-def check_all(paths: Iterable[Path], *, contract: Contract | None = None) -> Iterator[CheckReport]:
-    """Check every episode among some files; a later part goes with the first of its episode."""
-    done: set[Path] = set()
-    for path in sorted(paths, key=_by_part):
-        if path not in done:
-            report = check_episode(path, contract=contract)
-            done.update(report.parts)
-            yield report
-
-
-def _by_part(path: Path) -> tuple[Path, int, str]:
-    name = name_of_part(path)
-    if name is None:
-        return path.parent, 1, path.name
-    return path.parent, name.number, name.episode_id
-
-
 def _open(path: Path, faults: Faults, watch: "_Watch") -> Episode | None:
     """Open an episode; one that cannot be opened is walked through for what else is wrong."""
     try:
@@ -163,7 +138,7 @@ def _open(path: Path, faults: Faults, watch: "_Watch") -> Episode | None:
 
 
 class _Watch:
-    """All topics over all parts."""
+    """All topics."""
 
     def __init__(self) -> None:
         self.decoder = Decoder()
@@ -181,29 +156,20 @@ class _Watch:
         self.is_ours = self.is_ours or file.library.startswith(LIBRARY)
 
 
-def _check_parts(report: CheckReport, episode: Episode, faults: Faults) -> None:
-    report.missing_parts = list(episode.missing_parts)
-    for path in episode.missing_parts:
-        if path.exists():
-            faults.add(f"part {path.name} cannot be read; the others are checked without it")
-        elif path.with_name(path.name + ".part").exists():
-            faults.add(f"part {path.name} is not finished: robot-gst recover {path}.part")
-        else:
-            faults.add(f"part {path.name} of this split episode is missing")
-    name = name_of_part(episode.path)
-    if name is not None and name.number > 1:
-        before = part_name(name.episode_id, name.number - 1)
-        if not episode.path.with_name(before).exists():
-            faults.add(f"part {before} of this split episode is missing")
-    for file in episode.files:
-        stopped_by = str((record_of(file, "recorder") or {}).get("stopped_by", ""))
-        if stopped_by.startswith(BY_DISK):
-            report.find("cut_short", file.path.name, f"ended by the {stopped_by}")
-        recovered = record_of(file, "recovered")
-        if recovered:
-            lost = recovered.get("bytes_lost", "an unknown number of")
-            text = f"{recovered.get('reason', 'its recorder died')}; {lost} bytes were lost"
-            report.find("recovered", file.path.name, text)
+def _find_ends(report: CheckReport, episode: Episode) -> None:
+    """Say what ended a file before its time."""
+    name = episode.path.name
+    stopped_by = str(episode.record("recorder").get("stopped_by", ""))
+    if stopped_by.startswith(BY_DISK):
+        report.find("cut_short", name, f"ended by the {stopped_by}")
+    split = episode.record("split")
+    if split and (split.get("index") != 1 or split.get("last") is not True):
+        text = "one part of several of an earlier edition; mcap merge makes one file of them"
+        report.find("cut_short", name, text)
+    if recovered := episode.record("recovered"):
+        lost = recovered.get("bytes_lost", "an unknown number of")
+        text = f"{recovered.get('reason', 'its recorder died')}; {lost} bytes were lost"
+        report.find("recovered", name, text)
 
 
 def _check_metadata(episode: Episode, faults: Faults) -> None:

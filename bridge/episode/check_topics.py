@@ -228,7 +228,7 @@ class TopicCheck:
 
 @dataclass(kw_only=True)
 class TopicWatch:
-    """Follows one topic through all parts of an episode."""
+    """Follows one topic through an episode."""
 
     topic: str
     pauses: Pauses

@@ -317,9 +317,6 @@ class Lifecycle:
                 f"{left} is being written, or left from a take that was cut off. "
                 "Recover it or move it away, or choose another episode id."
             )
-        later = next(self._run.episodes_dir.glob(f"{episode_id}.[0-9]*.mcap"), None)
-        if later is not None:
-            raise UsageError(f"{later} exists already. Choose another episode id.")
         lacks, free_mb, min_mb = self._space()
         if lacks:
             raise NoSpaceError(folder=self._run.path, free_mb=free_mb, wanted_mb=min_mb)
