@@ -31,30 +31,16 @@ UNKNOWN_LIBRARY = "unknown; recovered by robot-gst"
 """Of a file whose header was lost: its messages are held to no promise of ours."""
 
 
-def key_of(found: Chunk | CutChunk) -> tuple[int, int]:
-    """What tells a chunk from every other: CRC and size of its records."""
-    return found.head.crc, found.head.size
-
-
-def scan_with_journal(source: RecordFile, journal: RecordFile | None) -> Iterator[Found]:
-    """Return what a part holds, each chunk once, then the chunks that only its journal holds.
-
-    A chunk torn at the end of the part is left out where the journal has it whole.
-    """
-    written = list(scan(journal)) if journal is not None else []
-    kept = {key_of(found) for found in written if isinstance(found, Chunk)}
+def each_chunk_once(source: RecordFile) -> Iterator[Found]:
+    """Return what a file holds; a chunk that lies there twice is given once."""
     there: set[tuple[int, int]] = set()
     for found in scan(source):
-        if isinstance(found, Chunk):
-            if found.head.crc and key_of(found) in there:
+        if isinstance(found, Chunk) and found.head.crc:
+            key = found.head.crc, found.head.size
+            if key in there:
                 continue
-            there.add(key_of(found))
-        if not (isinstance(found, CutChunk) and key_of(found) in kept):
-            yield found
-    for found in written:
-        if isinstance(found, Chunk) and key_of(found) not in there:
-            there.add(key_of(found))
-            yield found
+            there.add(key)
+        yield found
 
 
 _RECORDS: dict[str, type] = {"episode": EpisodeInfo, "outcome": Outcome, "derived": Derived}
