@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bridge.episode import schema, streams
+from bridge.episode import schema
 from bridge.episode.check_file import Faults, FileCheck
-from bridge.episode.check_topics import Decoder, Pauses, TopicCheck, TopicWatch
+from bridge.episode.check_topics import Decoder, TopicCheck, TopicWatch
 from bridge.episode.contract import (
     RECORD_NAME,
     Contract,
@@ -95,14 +95,16 @@ def check_episode(path: Path, *, contract: Contract | None = None) -> CheckRepor
     watch = _Watch()
     episode = _open(path, faults, watch)
     if episode is not None:
-        watch.pauses = Pauses(_paused_spans(episode))
         watch.read(FileCheck(path, faults))
         _find_ends(report, episode)
         _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
     if episode is not None:
         report.start_ns, records = episode.start_ns, episode.metadata_records
-        if "recorder" in records or ("recovered" in records and RECORD_NAME in records):
+        is_judged = "recorder" in records or ("recovered" in records and RECORD_NAME in records)
+        if watch.decoder.was_paused:
+            report.notes.append("it was paused: what was missing or silent then is not judged")
+        elif is_judged:
             _judge_presence(report, episode, watch, faults, contract)
     report.faults, report.num_faults = faults.listed, faults.count
     report.findings = in_order(report.findings)
@@ -143,7 +145,6 @@ class _Watch:
     def __init__(self) -> None:
         self.decoder = Decoder()
         self.topics: dict[str, TopicWatch] = {}
-        self.pauses = Pauses([])
         self.is_ours = False
 
     def read(self, file: FileCheck) -> None:
@@ -151,7 +152,7 @@ class _Watch:
         for message in file.messages():
             topic = message.channel.topic
             if topic not in self.topics:
-                self.topics[topic] = TopicWatch(topic=topic, pauses=self.pauses)
+                self.topics[topic] = TopicWatch(topic=topic)
             self.topics[topic].see(message, self.decoder)
         self.is_ours = self.is_ours or file.library.startswith(LIBRARY)
 
@@ -216,7 +217,7 @@ def _judge_topics(
         if result.time_steps_back:
             text = f"{topic}: its log time steps back {result.time_steps_back} times"
             (say if is_recording else report.notes.append)(text)
-        if decoder.has_drop_log and topic not in shared:
+        if decoder.has_drop_log and topic not in shared and not decoder.was_paused:
             missing = max(0, result.sequence_gaps - result.declared_losses)
             report.undeclared_losses += missing
             if missing:
@@ -254,7 +255,6 @@ def _judge_presence(
     span = Span(
         start_ns if isinstance(start_ns, int) else episode.start_ns,
         end_ns if isinstance(end_ns, int) else episode.end_ns,
-        watch.pauses.spans,
     )
     report.presences = {topic: found.presence for topic, found in watch.topics.items()}
     is_stand_in = records.get("episode", {}).get("stand_in") is True
@@ -264,26 +264,3 @@ def _judge_presence(
     for topic, found in reports.items():
         report.topics.setdefault(topic, TopicCheck()).presence = found
     report.findings += findings_of(reports, report.presences, span.end_ns)
-
-
-def _paused_spans(episode: Episode) -> list[tuple[int, int]]:
-    """When the recorder left messages out on purpose [ns]; of a recovered one, by its events."""
-    record = episode.metadata_records.get("recorder")
-    if record is not None:
-        spans = record.get("paused")
-        return [
-            span for item in (spans if isinstance(spans, list) else []) if (span := _span(item))
-        ]
-    try:
-        said = [(event["stamp_ns"], event["type"]) for event in streams.events(episode)]
-    except BridgeError:  # the walk finds what is wrong
-        return []
-    said = [each for each in said if each[1] in ("paused", "resumed")]
-    pairs = zip(said, [*(stamp_ns for stamp_ns, _ in said[1:]), episode.end_ns], strict=False)
-    return [(start_ns, end_ns) for (start_ns, kind), end_ns in pairs if kind == "paused"]
-
-
-def _span(item: object) -> tuple[int, int] | None:
-    if isinstance(item, list) and len(item) == 2 and all(type(end) is int for end in item):
-        return item[0], item[1]
-    return None

@@ -231,7 +231,7 @@ class PresenceMonitor:
             self._is_recording = True
 
     def end(self) -> None:
-        """Nothing is recorded now, or it is paused: nobody need be told."""
+        """Nothing is recorded now: nobody need be told."""
         with self._lock:
             self._is_recording = False
 
