@@ -18,9 +18,9 @@ from bridge.episode.cdr.messages import (
     string_from_cdr,
     transforms_from_cdr,
 )
-from bridge.episode.check_file import ScannedMessage
 from bridge.episode.contract import Presence, TopicReport
 from bridge.episode.health import ContentWatch, HealthFinding, mixed_types, of_event
+from bridge.episode.mcap.data_walk import ScannedMessage
 from bridge.episode.schema import DEFINITIONS
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError

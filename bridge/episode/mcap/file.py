@@ -2,6 +2,7 @@
 
 import zlib
 from array import array
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -11,6 +12,7 @@ from mcap import records
 from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.data_walk import DataWalk
 from bridge.episode.mcap.format import (
     CHANNEL,
     FOOTER_FIELDS,
@@ -23,18 +25,12 @@ from bridge.episode.mcap.format import (
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
-    MessageHead,
     RecordSpan,
-    attachment_entry,
     attachment_of,
-    chunk_entry,
     message_head,
-    metadata_entry,
     parse,
-    parse_chunk,
     read_body,
     records_in,
-    unpack_chunk,
     walk,
 )
 from bridge.errors import EpisodeError
@@ -42,116 +38,13 @@ from bridge.errors import EpisodeError
 
 def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     """Read the whole data section once; every chunk is unpacked and its CRC checked."""
-    builder = _Builder()
-    for place in walk(stream, len(MAGIC), data_end):
-        builder.add(stream, place)
-    return builder.seen.to_summary()
+    found = DataWalk(stream, fault=_refuse, doubt=lambda text: None)
+    deque(found.messages(data_end), maxlen=0)
+    return found.seen.to_summary()
 
 
-@dataclass(kw_only=True)
-class Seen:
-    """What a walk through the data section found."""
-
-    schemas: dict[int, records.Schema] = field(default_factory=dict)
-    channels: dict[int, records.Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    start_ns: int | None = None
-    end_ns: int = 0
-    chunks: list[records.ChunkIndex] = field(default_factory=list)
-    """Of the chunks whose head can be read."""
-    num_chunks: int = 0
-    attachments: list[records.AttachmentIndex] = field(default_factory=list)
-    num_broken_attachments: int = 0
-    metadata: list[records.MetadataIndex] = field(default_factory=list)
-
-    def count(self, head: MessageHead) -> None:
-        """Take a message."""
-        self.counts[head.channel_id] = self.counts.get(head.channel_id, 0) + 1
-        if self.start_ns is None or head.log_time_ns < self.start_ns:
-            self.start_ns = head.log_time_ns
-        self.end_ns = max(self.end_ns, head.log_time_ns)
-
-    def define(self, place: RecordSpan, record: records.McapRecord | None) -> Iterator[str]:
-        """Take a schema, channel or metadata record; yields what is wrong with it."""
-        if isinstance(record, records.Metadata):
-            self.metadata.append(metadata_entry(place, record))
-        elif isinstance(record, records.Schema):
-            if record.id == 0:
-                yield "a schema has the id 0, which means none"
-            if self.schemas.setdefault(record.id, record) != record:
-                yield f"schema {record.id} is announced twice with different contents"
-        elif isinstance(record, records.Channel):
-            if record.schema_id and record.schema_id not in self.schemas:
-                yield f"channel {record.id} uses schema {record.schema_id}, not announced before"
-            if self.channels.setdefault(record.id, record) != record:
-                yield f"channel {record.id} is announced twice with different contents"
-
-    def to_summary(self) -> Summary:
-        """Make the summary that such a file should have."""
-        summary = Summary()
-        summary.schemas, summary.channels = self.schemas, self.channels
-        summary.chunk_indexes, summary.attachment_indexes = self.chunks, self.attachments
-        summary.metadata_indexes = self.metadata
-        summary.statistics = records.Statistics(
-            attachment_count=len(self.attachments),
-            channel_count=len(self.channels),
-            channel_message_counts=self.counts,
-            chunk_count=len(self.chunks),
-            message_count=sum(self.counts.values()),
-            message_start_time=self.start_ns or 0,
-            message_end_time=self.end_ns,
-            metadata_count=len(self.metadata),
-            schema_count=len(self.schemas),
-        )
-        return summary
-
-
-class _Builder:
-    def __init__(self) -> None:
-        self.seen = Seen()
-        self._chunk: records.ChunkIndex | None = None
-
-    def add(self, stream: ByteStream, place: RecordSpan) -> None:
-        """Take one record of the data section."""
-        if place.opcode == MESSAGE:
-            stream.seek(place.offset)
-            self._count(message_head(stream.read(MESSAGE_HEAD.size), 0, 0))
-        elif place.opcode == mcap_format.CHUNK:
-            self._add_chunk(stream, place)
-        elif place.opcode == mcap_format.ATTACHMENT:
-            found, data_size = attachment_of(stream, place, keep=False)
-            self.seen.attachments.append(attachment_entry(place, found, data_size))
-        else:
-            record = parse(place.opcode, read_body(stream, place))
-            if isinstance(record, records.MessageIndex) and self._chunk is not None:
-                self._chunk.message_index_offsets[record.channel_id] = place.offset
-                self._chunk.message_index_length += place.end - place.offset
-            self._define(place, record)
-        if place.opcode not in (mcap_format.CHUNK, mcap_format.MESSAGE_INDEX):
-            self._chunk = None
-
-    def _define(self, place: RecordSpan, record: records.McapRecord | None) -> None:
-        for fault in self.seen.define(place, record):
-            raise BrokenRecordError(fault)
-
-    def _count(self, head: MessageHead) -> None:
-        if head.channel_id not in self.seen.channels:
-            message = f"a message is of channel {head.channel_id}, which was never announced"
-            raise BrokenRecordError(message)
-        self.seen.count(head)
-
-    def _add_chunk(self, stream: ByteStream, place: RecordSpan) -> None:
-        chunk = parse_chunk(read_body(stream, place))
-        data = unpack_chunk(chunk, whose=f"the chunk at byte {place.offset}")
-        for opcode, at, length in records_in(data):
-            if opcode == MESSAGE:
-                self._count(message_head(data, at, at))
-            else:
-                body = at + RECORD_HEAD.size
-                inside = RecordSpan(opcode, at, length)
-                self._define(inside, parse(opcode, data[body : body + length]))
-        self._chunk = chunk_entry(place, chunk.head)
-        self.seen.chunks.append(self._chunk)
+def _refuse(text: str) -> None:
+    raise BrokenRecordError(text)
 
 
 _FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
