@@ -104,6 +104,8 @@ class Channels:
             self._warn(
                 f"{topic}: {type_name} was built from another definition ({sample.type_hash})"
             )
+        elif record is not None and not record.schema_encoding:
+            self._warn(f"{topic}: {type_name} is not known here; it is kept without a definition")
         look = inspector("" if is_strange else type_name, sample.message_encoding, sample.topic)
         last_ns = self._last_ns.setdefault(topic, [0])
         content = ContentWatch(topic, type_name)

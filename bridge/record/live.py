@@ -194,8 +194,7 @@ class LiveRecorder:
             for key in config.topics
         ]
         self._departures = PublisherLiveliness(session, core)
-        self._graph = Ros2Graph(session, core, config.msg_folder)
-        core.also_tell("ros2_warnings", self._graph.warnings)
+        self._graph = Ros2Graph(session, core)
         core.also_tell("clocks", core.clocks.status)
         core.also_tell("receive_errors", lambda: session.receive_errors)
         core.also_tell("last_receive_error", lambda: session.last_receive_error)

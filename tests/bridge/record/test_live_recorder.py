@@ -58,7 +58,7 @@ def test_the_status_is_published_and_fits_its_schema(
     assert (status["state"], status["episode"]) == ("recording", "t1")
     assert status["topics"]["/lab/event"]["received"] == 1
     assert abs(status["topics"]["/lab/event"]["clock_offset_ns"]) < 10**9
-    assert {"rates_hz", "disk_free_bytes", "recovered", "ros2_warnings"} <= set(status)
+    assert {"rates_hz", "disk_free_bytes", "recovered", "clocks"} <= set(status)
     assert not any(topic.startswith("/rec/") for topic in status["seen"])
 
 
