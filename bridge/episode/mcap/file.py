@@ -1,10 +1,9 @@
 """One finished MCAP file: its summary, its metadata, and where its messages lie."""
 
 import zlib
-from array import array
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -50,13 +49,19 @@ def _refuse(text: str) -> None:
 _FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
 
 
-@dataclass
-class LooseMessages:
-    """Messages that lie outside chunks, in file order. 18 bytes of memory each."""
+LOOSE_BYTES = 4 << 20
+"""Messages outside chunks are read so many bytes at a time; one message may be larger."""
 
-    log_times_ns: array = field(default_factory=lambda: array("Q"))  # type: ignore[type-arg]
-    offsets: array = field(default_factory=lambda: array("Q"))  # type: ignore[type-arg]
-    channel_ids: array = field(default_factory=lambda: array("H"))  # type: ignore[type-arg]
+
+@dataclass(kw_only=True, slots=True)
+class LooseMessages:
+    """Messages outside chunks that lie one behind the other."""
+
+    start: int
+    end: int
+    first_ns: int
+    last_ns: int
+    channel_ids: set[int]
 
 
 def damaged(path: Path, error: BaseException) -> EpisodeError:
@@ -83,7 +88,7 @@ class McapFile:
                 summary = rebuild_summary(stream, self.data_end)
             self.summary = summary
             self.metadata = list(self._read_metadata(stream))
-        self._loose: LooseMessages | None = None
+        self._loose: list[LooseMessages] | None = None
 
     def _read_metadata(self, stream: ByteStream) -> Iterator[records.Metadata]:
         for entry in self.summary.metadata_indexes:
@@ -117,16 +122,11 @@ class McapFile:
         """Return the schema of a channel, or None where it has none."""
         return self.summary.schemas.get(channel.schema_id)
 
-    def loose(self) -> LooseMessages:
+    def loose(self) -> list[LooseMessages]:
         """Return the messages outside chunks; found once, between the records that are indexed."""
         if self._loose is None:
-            found = LooseMessages()
             with self.path.open("rb") as stream:
-                for start, end in self._gaps():
-                    for place in walk(stream, start, end):
-                        if place.opcode == MESSAGE:
-                            _note(stream, place, found)
-            self._loose = found
+                self._loose = [each for gap in self._gaps() for each in _loose_in(stream, *gap)]
         return self._loose
 
     def _gaps(self) -> Iterator[tuple[int, int]]:
@@ -145,12 +145,25 @@ class McapFile:
             yield at, self.data_end
 
 
-def _note(stream: ByteStream, place: RecordSpan, found: LooseMessages) -> None:
-    stream.seek(place.offset)
-    head = message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
-    found.log_times_ns.append(head.log_time_ns)
-    found.offsets.append(place.offset)
-    found.channel_ids.append(head.channel_id)
+def _loose_in(stream: ByteStream, start: int, end: int) -> Iterator[LooseMessages]:
+    found: LooseMessages | None = None
+    for place in walk(stream, start, end):
+        if place.opcode != MESSAGE:
+            continue
+        stream.seek(place.offset)
+        head = message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
+        at_ns = head.log_time_ns
+        if found is None or found.end < place.offset or place.end - found.start > LOOSE_BYTES:
+            if found is not None:
+                yield found
+            found = LooseMessages(
+                start=place.offset, end=place.end, first_ns=at_ns, last_ns=at_ns, channel_ids=set()
+            )
+        found.end = place.end
+        found.first_ns, found.last_ns = min(found.first_ns, at_ns), max(found.last_ns, at_ns)
+        found.channel_ids.add(head.channel_id)
+    if found is not None:
+        yield found
 
 
 def read_header(stream: ByteStream) -> records.Header:
