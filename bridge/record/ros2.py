@@ -4,11 +4,9 @@ Messages themselves arrive like any others. What is added here: which publishers
 last messages of transient-local ones (``/tf_static``, ``/robot_description``, maps).
 """
 
-import contextlib
-import queue
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
-from bridge.errors import GstError
 from bridge.record.recorder import Recorder
 from bridge.wire import rmw
 from bridge.wire.session import WireSample, WireSession
@@ -33,16 +31,13 @@ class Ros2Graph:
         self._recorder = recorder
         self._publishers: dict[str, str] = {}
         self._lock = threading.Lock()
-        self._arrived: queue.SimpleQueue[rmw.RosPublisher | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._work, name="ros2 history", daemon=True)
-        self._thread.start()
+        self._fetcher = ThreadPoolExecutor(1, thread_name_prefix="ros2 history")
         self._watching = session.watch_alive(rmw.TOKENS, self._on_token)
 
     def close(self) -> None:
         """Stop watching."""
         self._watching.close()
-        self._arrived.put(None)
-        self._thread.join(timeout=2 * HISTORY_TIMEOUT_S + 1.0)
+        self._fetcher.shutdown(cancel_futures=True)
 
     def _on_token(self, key: str, alive: bool) -> None:
         """Note who came or went, on the network thread; nothing here may wait."""
@@ -58,16 +53,11 @@ class Ros2Graph:
         if alive:
             if endpoint.transient_local:
                 self._recorder.declare_latched(topic)
-                self._arrived.put(endpoint)
+                self._fetcher.submit(self._fetch_history, endpoint)
             self._recorder.presence.publisher(topic, is_there=True)
         elif was_there and is_last:
             self._recorder.presence.publisher(topic, is_there=False)
             self._recorder.forget(topic)
-
-    def _work(self) -> None:
-        while (endpoint := self._arrived.get()) is not None:
-            with contextlib.suppress(GstError):  # the session is closing, or the key is no key
-                self._fetch_history(endpoint)
 
     def _fetch_history(self, endpoint: rmw.RosPublisher) -> None:
         """Hand over what the publisher sent before we listened, and nothing twice."""
