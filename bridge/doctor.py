@@ -1,64 +1,33 @@
 """What is installed, what is missing, and how to get it."""
 
+import re
 import shutil
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
-
-@dataclass(frozen=True)
-class Extra:
-    """Packages that come together, and what for."""
-
-    purpose: str
-    packages: tuple[str, ...]
-    is_optional: bool = False
-    """Nothing is wrong without it: the demo and all it shows run on one machine's CPU."""
-
-
 EXTRAS = {
-    "base": Extra(
-        "read, write, check and list episodes",
-        (
-            *("numpy", "mcap", "cyclopts", "rich", "zstandard", "jaxtyping"),
-            *("jsonschema-rs", "msgspec", "lz4"),
-        ),
-    ),
-    "record": Extra(
-        "record from zenoh; ROS 2 messages; colour images",
-        ("eclipse-zenoh", "simplejpeg", "rosbags", "pillow", "ruamel.yaml"),
-    ),
-    "replay": Extra(
-        "rebuild, render, replay, gate, calibrate",
-        ("open3d", "pybullet", "pin", "scipy", "example-robot-data", "python-fcl"),
-    ),
-    "report": Extra(
-        "evaluate: tables, figures, report",
-        ("jinja2", "pandas", "pyarrow", "scipy", "openpyxl", "pillow"),
-    ),
-    "dashboard": Extra(
-        "review pages, Rerun view", ("starlette", "uvicorn", "rerun-sdk", "simplejpeg")
-    ),
-    "policies": Extra(
-        "policies in the loop", ("gymnasium", "websockets", "pillow"), is_optional=True
-    ),
-    "cluster": Extra("replays on Ray", ("ray",), is_optional=True),
-    "standin": Extra(
-        "the stand-in cell of the demo", ("mujoco", "open3d", "pin", "example-robot-data", "scipy")
-    ),
-    "video": Extra("LeRobot videos", ("av",), is_optional=True),
-    "realsense": Extra("RealSense cameras", ("pyrealsense2",), is_optional=True),
-    "ur": Extra("the UR arm's model", ("example-robot-data",), is_optional=True),
-    "mujoco": Extra("replay --engine mujoco or both", ("mujoco",), is_optional=True),
-    "twin": Extra("what needs torch in the twin", ("torch",), is_optional=True),
-    "foundation": Extra(
-        "SAM 3, CLIP from folders of weights", ("transformers", "safetensors"), is_optional=True
-    ),
-    "lpips": Extra("LPIPS", ("torch", "safetensors", "torchmetrics"), is_optional=True),
-    "gpu": Extra("drawing on CUDA", ("gsplat",), is_optional=True),
+    "base": "read, write, check and list episodes",
+    "record": "record from zenoh; ROS 2 messages; colour images",
+    "replay": "rebuild, render, replay, gate, calibrate",
+    "report": "evaluate: tables, figures, report",
+    "dashboard": "review pages, Rerun view",
+    "policies": "policies in the loop",
+    "cluster": "replays on Ray",
+    "standin": "the stand-in cell of the demo",
+    "video": "LeRobot videos",
+    "realsense": "RealSense cameras",
+    "ur": "the UR arm's model",
+    "mujoco": "replay --engine mujoco or both",
+    "twin": "what needs torch in the twin",
+    "foundation": "SAM 3, CLIP from folders of weights",
+    "lpips": "LPIPS",
+    "gpu": "drawing on CUDA",
 }
-"""As ``pyproject.toml`` has them."""
+"""What packages that come together are for; which they are, the installed package says itself."""
+NEEDED = ("base", "record", "replay", "report", "dashboard", "standin")
+"""Nothing is wrong without the others: the demo and all it shows run on one machine's CPU."""
 NATIVE = (
     ("splat rasteriser", "twin.scene._splat", "no scene can be rebuilt"),
     ("depth codec", "bridge.media._depth", "no compact depth is written or read"),
@@ -80,7 +49,7 @@ class InstallCheck:
 
 def examine() -> list[InstallCheck]:
     """Look at packages, the native extensions, system libraries and programs; import nothing."""
-    findings = [_package(name, extra) for extra in EXTRAS for name in EXTRAS[extra].packages]
+    findings = [_package(name, extra) for extra in EXTRAS for name in packages_of(extra)]
     findings.extend(_native(*each) for each in NATIVE)
     has = shutil.which("chromium") is not None
     advice = "" if has else "needed only to test the dashboard: apt install chromium"
@@ -90,8 +59,18 @@ def examine() -> list[InstallCheck]:
     return findings
 
 
+def packages_of(extra: str) -> list[str]:
+    """Packages that an extra brings by itself; ``base``: what is always there."""
+    found = []
+    for text in metadata.requires("robot-gst") or ():
+        name, of = re.split(r"[^\w.-]", text)[0], re.search(r'extra == "([^"]+)"', text)
+        if (of[1] if of else "base") == extra and name != "robot-gst":
+            found.append(name)
+    return found
+
+
 def _package(name: str, extra: str) -> InstallCheck:
-    about, found, advice = EXTRAS[extra], "", ""
+    found, advice, is_optional = "", "", extra not in NEEDED
     try:
         found = metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -99,10 +78,10 @@ def _package(name: str, extra: str) -> InstallCheck:
         advice = f"pip install {wanted}"
     return InstallCheck(
         what=f"{name} [{extra}]",
-        found=found or ("missing (optional)" if about.is_optional else "missing"),
-        ok=bool(found) or about.is_optional,
+        found=found or ("missing (optional)" if is_optional else "missing"),
+        ok=bool(found) or is_optional,
         advice=advice,
-        purpose=about.purpose,
+        purpose=EXTRAS[extra],
     )
 
 

@@ -32,9 +32,11 @@ _TOLD = {
     "record --failover": "A failing disk ends the recording; begin anew on another disk.",
     "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
     "record --split-mb --split-s": (
-        "Stop and start another episode; episodes of several parts are read as before."
+        "Stop and start another episode; mcap merge makes one of parts that are there."
     ),
-    "record --triggers": "Record with --preroll-s 5, and send robot-gst ctl snapshot.",
+    "record --triggers": "Record with --preroll-s 5, and start an episode when it has happened.",
+    "ctl pause|ctl resume": "Stop the episode, and start another one.",
+    "ctl snapshot": "Start and stop an episode: it begins with the pre-roll.",
     "publish episode --loop --paused --name": (
         "A playback begins at once and plays once; --start-s and --rate say from where, how fast."
     ),

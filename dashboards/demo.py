@@ -199,7 +199,7 @@ def cut_short(episode: Episode, outcome: Outcome | None) -> str:
     """What ended an episode before its time; empty when nothing did."""
     records = episode.metadata_records
     stopped_by = records.get("recorder", {}).get("stopped_by", "command")
-    if "recovered" in records or episode.missing_parts:
+    if "recovered" in records:
         return "its end is missing"
     if stopped_by != "command":
         return str(stopped_by)

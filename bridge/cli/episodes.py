@@ -73,8 +73,6 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         "derived": asdict(opened.derived) if opened.derived else None,
         "software": opened.metadata_records.get("software", {}),
         "duration_s": opened.duration_s,
-        "parts": [str(path) for path in opened.parts],
-        "missing_parts": [str(path) for path in opened.missing_parts],
         "recovered": opened.metadata_records.get("recovered"),
         "presence": opened.metadata_records.get(PRESENCE_RECORD),
         "findings": health["findings"],
@@ -86,8 +84,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         f"{episode.name}: {about.kind} {about.task} {about.condition}".rstrip(),
         f"  {'stand-in cell' if about.stand_in else 'cell'} {about.cell or 'not named'}, "
         f"{opened.duration_s:.1f} s, {sum(item.count for item in topics.values())} messages, "
-        f"{sum(path.stat().st_size for path in opened.parts) / 1e6:.1f} MB"
-        + (f" in {len(opened.parts)} parts" if len(opened.parts) > 1 else ""),
+        f"{episode.stat().st_size / 1e6:.1f} MB",
         f"  outcome: {_outcome('replay' if opened.derived else about.kind, outcome)}",
     ]
     if about.task and not opened.derived:
@@ -103,8 +100,6 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         lines.append(
             "  recovered: its recorder died, and the end is lost; robot-gst check says more"
         )
-    if opened.missing_parts:
-        lines.append(f"  missing: {', '.join(path.name for path in opened.missing_parts)}")
     presence = opened.metadata_records.get(PRESENCE_RECORD, {})
     lines += [f"  {text}" for text in health_lines({**presence, **health}, opened.start_ns)]
     lines += [f"  {text}" for clock in clocks for text in clock.sentences()]
@@ -154,10 +149,10 @@ def check(
     does not keep: robot-gst check --wire "lab/**" --seconds 5
 
     Args:
-        episodes: Episode files, or folders to search for them; parts go with their episode.
+        episodes: Episode files, or folders to search for them.
         contract: Hold them to this TOML file or template, not to what they were recorded under.
     """
-    from bridge.episode.check import check_all
+    from bridge.episode.check import check_episode
     from bridge.episode.contract import find_contract
     from bridge.episode.mcap.part_file import told_unfinished
     from bridge.errors import UsageError
@@ -183,9 +178,9 @@ def check(
     reports = []
     with output.progress("check", len(files)) as advance:
         asked = None if contract is None else find_contract(Path(), contract)
-        for report in check_all(files, contract=asked):
-            reports.append(report)
-            advance(min(len(reports), len(files)), report.path.name)
+        for path in dict.fromkeys(files):
+            reports.append(check_episode(path, contract=asked))
+            advance(len(reports), path.name)
     data = {
         "episodes": [report.to_json() for report in reports],
         "unfinished": [str(path) for path in unfinished],
@@ -397,8 +392,7 @@ def _row(entry: "Entry") -> tuple[str, ...]:
 
 def _notes(entry: "Entry", *, is_named: bool) -> str:
     """What is special about an episode, and why its outcome is unknown."""
-    notes = [f"{entry.parts} parts"] if entry.parts > 1 else []
-    notes += [f"{entry.lost} messages lost"] if entry.lost else []
+    notes = [f"{entry.lost} messages lost"] if entry.lost else []
     notes += ["recovered, its end is missing"] if entry.recovered else []
     notes += ["from the stand-in cell"] if entry.stand_in and is_named else []
     if entry.cause and entry.cause != UNLABELLED:

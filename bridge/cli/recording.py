@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 OUTPUT = Output()
 ABOUT = EpisodeAbout()
 RECORDER = RecorderConfig()
-Action = Literal["start", "stop", "mark", "label", "pause", "resume", "snapshot", "list", "status"]
+Action = Literal["start", "stop", "mark", "label", "list", "status"]
 
 
 def record(
@@ -121,11 +121,10 @@ def ctl(
     Example: robot-gst ctl start --id trial_0001 --task cube_into_box --cell standin
 
     Args:
-        action: start, stop, mark, label, pause, resume, list, status, or snapshot, which writes
-            the pre-roll as an episode.
+        action: start, stop, mark, label, list or status.
         text: Words of a mark or label.
-        id: Episode to start or to write (snapshot), or to label after it has been finished.
-        about: What is being recorded (start, snapshot).
+        id: Episode to start, or to label after it has been finished.
+        about: What is being recorded (start).
         result: How it went (stop, label).
         detail: What happened, in words (stop, label).
         discard: Throw the open episode away (stop).
@@ -151,16 +150,11 @@ def ctl(
         "stop": {"outcome": outcome, "discard": discard},
         "mark": {"text": text},
         "label": {"text": text, "outcome": outcome, "episode": id},
-        "pause": {},
-        "resume": {},
-        "snapshot": {"id": id, "info": asdict(about), **sent},
         "list": {"last": last},
         "status": {},
     }
-    if action in ("start", "snapshot") and id is None:
-        raise UsageError(
-            f"{action} needs the new episode's id: robot-gst ctl {action} --id trial_0001."
-        )
+    if action == "start" and id is None:
+        raise UsageError("start needs the new episode's id: robot-gst ctl start --id trial_0001.")
     with open_session(WireConfig(connect=connect, config=zenoh_config)) as session:
         answer = RecorderClient(session, recorder).ask(action, requests[action])
     describers: dict[str, Callable[[dict[str, Any]], str]]

@@ -29,9 +29,9 @@ def find_episodes(
 ) -> list[Entry]:
     """Return the episodes that pass all filters; a broken one is listed with its error."""
     found = []
-    episodes = run.episode_parts()
-    for done, name in enumerate(episodes, start=1):
-        entry = read_entry(run, run.episodes_dir / name)
+    episodes = run.episodes()
+    for done, path in enumerate(episodes, start=1):
+        entry = read_entry(run, path)
         if query.takes(entry):
             found.append(entry)
         if advance is not None:
@@ -76,20 +76,19 @@ def _finished(run: RunFolder, episode_id: str) -> Path:
 
 def read_entry(run: RunFolder, path: Path) -> Entry:
     """Open an episode and sum it up; a broken one is listed with its error."""
-    parts: tuple[Path, ...] = (path,)
+    size = path.stat().st_size if path.is_file() else 0
     name: dict[str, Any] = {"file": printable(path.name), "id": printable(path.stem)}
     try:
         episode = Episode.open(path)
-        parts = episode.parts
         info, outcome = episode.info, outcome_of(run, episode)
         messages = sum(topic.count for topic in episode.topics().values())
     except GstError as error:
-        return Entry(**name, **_extent(parts), error=printable(str(error)))
+        return Entry(**name, size_bytes=size, error=printable(str(error)))
     records = episode.metadata_records
     presence = records.get(PRESENCE_RECORD, {})
     return Entry(
         **name,
-        **_extent(parts),
+        size_bytes=size,
         kind=printable(info.kind),
         task=printable(info.task),
         instruction=printable(info.instruction),
@@ -118,11 +117,6 @@ def _cause(kind: str, outcome: Outcome | None) -> str:
     if outcome is None:
         return UNLABELLED if kind == "trial" else ""
     return outcome.detail or "" if outcome.result == "unknown" else ""
-
-
-def _extent(parts: tuple[Path, ...]) -> dict[str, Any]:
-    sizes = [part.stat().st_size for part in parts if part.is_file()]
-    return {"size_bytes": sum(sizes), "parts": len(parts)}
 
 
 def _declared_lost(drops: dict[str, Any] | None) -> int | None:

@@ -24,7 +24,6 @@ class Entry:
     """One line of ``robot-gst ls``. ``error`` is set when the files could not be read."""
 
     file: str
-    """Name of the first part."""
     id: str
     kind: str = ""
     task: str = ""
@@ -47,8 +46,6 @@ class Entry:
     duration_s: float = 0.0
     messages: int = 0
     size_bytes: int = 0
-    """Of all parts."""
-    parts: int = 1
     lost: int | None = None
     """Messages the recorder logged as dropped; None when nobody counted."""
     recovered: bool = False

@@ -1,18 +1,17 @@
 """Verify an episode: every CRC, index and stream, and say what is wrong with what it holds.
 
 Broken is what contradicts itself: damage, indexes and counts that disagree with the data, messages
-that are not what they promise, parts that are missing. ``health`` names what is wrong with a whole
+that are not what they promise. ``health`` names what is wrong with a whole
 file (``exit_code`` 3). Files of other programs are held to the format only.
 """
 
-from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bridge.episode import schema, streams
+from bridge.episode import schema
 from bridge.episode.check_file import Faults, FileCheck
-from bridge.episode.check_topics import Decoder, Pauses, TopicCheck, TopicWatch
+from bridge.episode.check_topics import Decoder, TopicCheck, TopicWatch
 from bridge.episode.contract import (
     RECORD_NAME,
     Contract,
@@ -27,8 +26,7 @@ from bridge.episode.contract import (
 )
 from bridge.episode.health import HealthFinding, drops_logged, in_order, in_words, unreadable
 from bridge.episode.metadata import BY_DISK
-from bridge.episode.reader import Episode, name_of_part, record_of
-from bridge.episode.run_folder import part_name
+from bridge.episode.reader import Episode
 from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import LIBRARY
 from bridge.errors import BridgeError, UsageError
@@ -39,8 +37,6 @@ class CheckReport:
     """What was found in one episode. ``exit_code``: 0 clean, 1 broken, 3 losses."""
 
     path: Path
-    parts: list[Path] = field(default_factory=list)
-    missing_parts: list[Path] = field(default_factory=list)
     messages: int = 0
     topics: dict[str, TopicCheck] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
@@ -77,8 +73,7 @@ class CheckReport:
         lost = f"{self.declared_losses} dropped (logged)"
         if self.undeclared_losses:
             lost += f", {self.undeclared_losses} more missing"
-        parts = f" in {len(self.parts)} parts" if len(self.parts) > 1 else ""
-        lines = [f"{self.path.name}: {self.summary}, {self.messages} messages{parts}, {lost}"]
+        lines = [f"{self.path.name}: {self.summary}, {self.messages} messages, {lost}"]
         lines += [f"  {fault}" for fault in self.faults]
         told = (each for each in self.findings if f"{each.about}: {each.text}" not in self.faults)
         lines += [f"  {found.line(self.start_ns)}" for found in told]
@@ -90,27 +85,26 @@ class CheckReport:
         """Everything, for ``--json``."""
         found = asdict(self)
         del found["path"], found["presences"], found["start_ns"]
-        paths = {name: list(map(str, found[name])) for name in ("parts", "missing_parts")}
-        return {"file": str(self.path), "state": self.summary, **found, **paths}
+        return {"file": str(self.path), "state": self.summary, **found}
 
 
 def check_episode(path: Path, *, contract: Contract | None = None) -> CheckReport:
-    """Read every byte of an episode and of its parts, and decode every type this project knows."""
+    """Read every byte of an episode, and decode every type this project knows."""
     report = CheckReport(path=path)
     faults = Faults()
     watch = _Watch()
     episode = _open(path, faults, watch)
-    report.parts = list(episode.parts) if episode else [path]
     if episode is not None:
-        watch.pauses = Pauses(_paused_spans(episode))
-        for part in report.parts:
-            watch.read(FileCheck(part, faults))
-        _check_parts(report, episode, faults)
+        watch.read(FileCheck(path, faults))
+        _find_ends(report, episode)
         _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
     if episode is not None:
         report.start_ns, records = episode.start_ns, episode.metadata_records
-        if "recorder" in records or ("recovered" in records and RECORD_NAME in records):
+        is_judged = "recorder" in records or ("recovered" in records and RECORD_NAME in records)
+        if watch.decoder.was_paused:
+            report.notes.append("it was paused: what was missing or silent then is not judged")
+        elif is_judged:
             _judge_presence(report, episode, watch, faults, contract)
     report.faults, report.num_faults = faults.listed, faults.count
     report.findings = in_order(report.findings)
@@ -130,23 +124,6 @@ def learn_from(path: Path) -> Contract:
     return learn_contract(report.presences, cell=Episode.open(path).info.cell)
 
 
-def check_all(paths: Iterable[Path], *, contract: Contract | None = None) -> Iterator[CheckReport]:
-    """Check every episode among some files; a later part goes with the first of its episode."""
-    done: set[Path] = set()
-    for path in sorted(paths, key=_by_part):
-        if path not in done:
-            report = check_episode(path, contract=contract)
-            done.update(report.parts)
-            yield report
-
-
-def _by_part(path: Path) -> tuple[Path, int, str]:
-    name = name_of_part(path)
-    if name is None:
-        return path.parent, 1, path.name
-    return path.parent, name.number, name.episode_id
-
-
 def _open(path: Path, faults: Faults, watch: "_Watch") -> Episode | None:
     """Open an episode; one that cannot be opened is walked through for what else is wrong."""
     try:
@@ -163,12 +140,11 @@ def _open(path: Path, faults: Faults, watch: "_Watch") -> Episode | None:
 
 
 class _Watch:
-    """All topics over all parts."""
+    """All topics."""
 
     def __init__(self) -> None:
         self.decoder = Decoder()
         self.topics: dict[str, TopicWatch] = {}
-        self.pauses = Pauses([])
         self.is_ours = False
 
     def read(self, file: FileCheck) -> None:
@@ -176,34 +152,25 @@ class _Watch:
         for message in file.messages():
             topic = message.channel.topic
             if topic not in self.topics:
-                self.topics[topic] = TopicWatch(topic=topic, pauses=self.pauses)
+                self.topics[topic] = TopicWatch(topic=topic)
             self.topics[topic].see(message, self.decoder)
         self.is_ours = self.is_ours or file.library.startswith(LIBRARY)
 
 
-def _check_parts(report: CheckReport, episode: Episode, faults: Faults) -> None:
-    report.missing_parts = list(episode.missing_parts)
-    for path in episode.missing_parts:
-        if path.exists():
-            faults.add(f"part {path.name} cannot be read; the others are checked without it")
-        elif path.with_name(path.name + ".part").exists():
-            faults.add(f"part {path.name} is not finished: robot-gst recover {path}.part")
-        else:
-            faults.add(f"part {path.name} of this split episode is missing")
-    name = name_of_part(episode.path)
-    if name is not None and name.number > 1:
-        before = part_name(name.episode_id, name.number - 1)
-        if not episode.path.with_name(before).exists():
-            faults.add(f"part {before} of this split episode is missing")
-    for file in episode.files:
-        stopped_by = str((record_of(file, "recorder") or {}).get("stopped_by", ""))
-        if stopped_by.startswith(BY_DISK):
-            report.find("cut_short", file.path.name, f"ended by the {stopped_by}")
-        recovered = record_of(file, "recovered")
-        if recovered:
-            lost = recovered.get("bytes_lost", "an unknown number of")
-            text = f"{recovered.get('reason', 'its recorder died')}; {lost} bytes were lost"
-            report.find("recovered", file.path.name, text)
+def _find_ends(report: CheckReport, episode: Episode) -> None:
+    """Say what ended a file before its time."""
+    name = episode.path.name
+    stopped_by = str(episode.record("recorder").get("stopped_by", ""))
+    if stopped_by.startswith(BY_DISK):
+        report.find("cut_short", name, f"ended by the {stopped_by}")
+    split = episode.record("split")
+    if split and (split.get("index") != 1 or split.get("last") is not True):
+        text = "one part of several of an earlier edition; mcap merge makes one file of them"
+        report.find("cut_short", name, text)
+    if recovered := episode.record("recovered"):
+        lost = recovered.get("bytes_lost", "an unknown number of")
+        text = f"{recovered.get('reason', 'its recorder died')}; {lost} bytes were lost"
+        report.find("recovered", name, text)
 
 
 def _check_metadata(episode: Episode, faults: Faults) -> None:
@@ -250,7 +217,7 @@ def _judge_topics(
         if result.time_steps_back:
             text = f"{topic}: its log time steps back {result.time_steps_back} times"
             (say if is_recording else report.notes.append)(text)
-        if decoder.has_drop_log and topic not in shared:
+        if decoder.has_drop_log and topic not in shared and not decoder.was_paused:
             missing = max(0, result.sequence_gaps - result.declared_losses)
             report.undeclared_losses += missing
             if missing:
@@ -288,7 +255,6 @@ def _judge_presence(
     span = Span(
         start_ns if isinstance(start_ns, int) else episode.start_ns,
         end_ns if isinstance(end_ns, int) else episode.end_ns,
-        watch.pauses.spans,
     )
     report.presences = {topic: found.presence for topic, found in watch.topics.items()}
     is_stand_in = records.get("episode", {}).get("stand_in") is True
@@ -298,26 +264,3 @@ def _judge_presence(
     for topic, found in reports.items():
         report.topics.setdefault(topic, TopicCheck()).presence = found
     report.findings += findings_of(reports, report.presences, span.end_ns)
-
-
-def _paused_spans(episode: Episode) -> list[tuple[int, int]]:
-    """When the recorder left messages out on purpose [ns]; of a recovered one, by its events."""
-    record = episode.metadata_records.get("recorder")
-    if record is not None:
-        spans = record.get("paused")
-        return [
-            span for item in (spans if isinstance(spans, list) else []) if (span := _span(item))
-        ]
-    try:
-        said = [(event["stamp_ns"], event["type"]) for event in streams.events(episode)]
-    except BridgeError:  # the walk finds what is wrong
-        return []
-    said = [each for each in said if each[1] in ("paused", "resumed")]
-    pairs = zip(said, [*(stamp_ns for stamp_ns, _ in said[1:]), episode.end_ns], strict=False)
-    return [(start_ns, end_ns) for (start_ns, kind), end_ns in pairs if kind == "paused"]
-
-
-def _span(item: object) -> tuple[int, int] | None:
-    if isinstance(item, list) and len(item) == 2 and all(type(end) is int for end in item):
-        return item[0], item[1]
-    return None

@@ -1,7 +1,7 @@
 """What one topic shows over a whole episode: numbers, times, rate, and whether it decodes."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,9 +18,9 @@ from bridge.episode.cdr.messages import (
     string_from_cdr,
     transforms_from_cdr,
 )
-from bridge.episode.check_file import ScannedMessage
-from bridge.episode.contract import Presence, Spans, TopicReport
+from bridge.episode.contract import Presence, TopicReport
 from bridge.episode.health import ContentWatch, HealthFinding, mixed_types, of_event
+from bridge.episode.mcap.data_walk import ScannedMessage
 from bridge.episode.schema import DEFINITIONS
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
@@ -48,6 +48,8 @@ class Decoder:
         """Type or encoding of topics that are kept, and that nothing here reads."""
         self.findings: list[HealthFinding] = []
         """What the recorder noticed of clocks, and of itself."""
+        self.was_paused = False
+        """By a recorder of an earlier edition, which then left messages out."""
         self._depth_sizes: dict[str, tuple[int, int]] = {}
         self._info_sizes: dict[str, tuple[int, int]] = {}
 
@@ -89,7 +91,9 @@ class Decoder:
         elif type_name == schema.DROPS:
             self._add_losses(parse_record(data, name="drops", package="bridge.episode"))
         elif type_name == schema.EVENT:
-            self.findings += of_event(parse_record(data, name="event", package="bridge.episode"))
+            event = parse_record(data, name="event", package="bridge.episode")
+            self.findings += of_event(event)
+            self.was_paused |= event["type"] == "paused"
         elif type_name in _DECODERS:
             _DECODERS[type_name](data)
         elif type_name in DEFINITIONS:
@@ -137,7 +141,6 @@ LATEST_NS, MOST_YEARS = 230 * YEAR_NS, 10
 """No recorder of today says later, or records for so long."""
 _WRAP = 1 << 32
 _MAX_OPEN_GAPS = 64
-ON_ITS_WAY_NS = 100_000_000
 
 
 class SequenceWatch:
@@ -152,14 +155,14 @@ class SequenceWatch:
         self._open: deque[tuple[int, int]] = deque(maxlen=_MAX_OPEN_GAPS)
         self._last_backward: int | None = None
 
-    def see(self, sequence: int, *, may_skip: bool = False) -> None:
+    def see(self, sequence: int) -> None:
         """Take the next number in the order of the file."""
         if self._next is None:
             self._next = (sequence + 1) % _WRAP
             return
         ahead = (sequence - self._next) % _WRAP
         if ahead < _WRAP // 2:
-            if ahead and not may_skip:
+            if ahead:
                 self.gaps += ahead
                 self._open.append((self._next, ahead))
             self._next = (sequence + 1) % _WRAP
@@ -185,21 +188,6 @@ class SequenceWatch:
                 self.gaps -= 1
                 return True
         return False
-
-
-class Pauses:
-    """The spans in which a recorder left messages out because it was told to."""
-
-    def __init__(self, spans_ns: Iterable[tuple[int, int]]) -> None:
-        """Take spans that do not overlap [ns]."""
-        self.spans: Spans = sorted(spans_ns)
-
-    def lies_between(self, before_ns: int, after_ns: int) -> bool:
-        """Say whether one lies between two messages; those on their way may be on either side."""
-        return any(
-            start_ns < after_ns and before_ns < end_ns + ON_ITS_WAY_NS
-            for start_ns, end_ns in self.spans
-        )
 
 
 @dataclass(kw_only=True)
@@ -228,10 +216,9 @@ class TopicCheck:
 
 @dataclass(kw_only=True)
 class TopicWatch:
-    """Follows one topic through all parts of an episode."""
+    """Follows one topic through an episode."""
 
     topic: str
-    pauses: Pauses
     result: TopicCheck = field(default_factory=TopicCheck)
     contents: dict[str, ContentWatch] = field(default_factory=dict)
     """By type."""
@@ -254,13 +241,11 @@ class TopicWatch:
             content.see(message.data, head.log_time_ns)
         if max(head.log_time_ns, head.publish_time_ns) > LATEST_NS:
             self.odd.append(head.log_time_ns)
-        last_ns = self.presence.last_ns
-        may_skip = self.pauses.lies_between(last_ns, head.log_time_ns)
-        self.sequences.see(head.sequence, may_skip=may_skip)
+        self.sequences.see(head.sequence)
         if head.log_time_ns < self.last_ns.get(head.channel_id, 0):
             result.time_steps_back += 1
         self.last_ns[head.channel_id] = head.log_time_ns
-        self.presence.see(head.log_time_ns, self.pauses.spans)
+        self.presence.see(head.log_time_ns)
         try:
             decoder.decode(self.topic, message)
         except BridgeError as error:

@@ -352,14 +352,13 @@ class CorrectedEpisode(Episode):
 
     def __init__(self, episode: Episode) -> None:
         """Use ``open_episode``."""
-        super().__init__(episode.files, episode.missing_parts)
+        super().__init__(episode.file)
         self._correction = StampCorrection(clocks_of(episode))
         self._definitions: dict[tuple[str, str], records.Schema] = {}
-        for file in self.files:
-            for channel in file.summary.channels.values():
-                record = file.schema_of(channel)
-                if record is not None:
-                    self._definitions[channel.topic, record.name] = record
+        for channel in self.file.summary.channels.values():
+            record = self.file.schema_of(channel)
+            if record is not None:
+                self._definitions[channel.topic, record.name] = record
 
     @property
     def corrected(self) -> frozenset[str]:

@@ -159,10 +159,6 @@ def write_contract(contract: Contract, path: Path, *, source: str) -> None:
     write_whole(path, ("\n".join(lines) + "\n").encode())
 
 
-Spans = Sequence[tuple[int, int]]
-"""Begin and end of each pause [ns], which do not overlap."""
-
-
 @dataclass(kw_only=True, slots=True)
 class Presence:
     """When the messages of one topic were there."""
@@ -172,7 +168,7 @@ class Presence:
     """0 without messages."""
     last_ns: int = 0
     longest_ns: int = 0
-    """The longest silence between two messages, pauses not counted."""
+    """The longest silence between two messages."""
     longest_at_ns: int = 0
     usual_ns: float = 0.0
     """Between two messages, as long as the rate does not fall; and how far from it they are."""
@@ -181,7 +177,7 @@ class Presence:
     """First and last of the messages that came too slowly for longest, and how many."""
     slow_now: tuple[int, int] = (0, 0)
 
-    def see(self, stamp_ns: int, pauses: Spans) -> None:
+    def see(self, stamp_ns: int) -> None:
         """Take the next message."""
         self.messages += 1
         last_ns = self.last_ns
@@ -193,9 +189,7 @@ class Presence:
         self.last_ns = stamp_ns
         self._see_rate(last_ns, stamp_ns - last_ns)
         if stamp_ns - last_ns > self.longest_ns:
-            silent_ns = _silence_ns(last_ns, stamp_ns, pauses)
-            if silent_ns > self.longest_ns:
-                self.longest_ns, self.longest_at_ns = silent_ns, last_ns
+            self.longest_ns, self.longest_at_ns = stamp_ns - last_ns, last_ns
 
     def _see_rate(self, last_ns: int, gap_ns: int) -> None:
         """Learn the usual gap, and follow gaps that are far longer in a regular stream."""
@@ -219,17 +213,11 @@ class Presence:
         return self.messages >= REGULAR_MESSAGES and self.last_ns - self.first_ns >= REGULAR_SPAN_NS
 
 
-def _silence_ns(start_ns: int, end_ns: int, pauses: Spans) -> int:
-    paused = sum(max(0, min(end_ns, end) - max(start_ns, start)) for start, end in pauses)
-    return max(0, end_ns - start_ns - paused)
-
-
 class Span(NamedTuple):
     """What was to be recorded."""
 
     start_ns: int
     end_ns: int
-    pauses: Spans = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,16 +260,16 @@ def judge(
             its clock is not the wall's, and may stand.
     """
     rules, absent = contract.topics if contract else {}, Presence()
-    total_ns = _silence_ns(span.start_ns, span.end_ns, span.pauses)
+    total_ns = max(0, span.end_ns - span.start_ns)
     reports = {}
     for topic in sorted({*presences, *rules} - OF_RECORDER):
         presence, rule = presences.get(topic, absent), rules.get(topic)
         rate_hz = rule.rate_hz if rule else None
         was_there = presence.messages > 0
-        tail_ns = _silence_ns(presence.last_ns, span.end_ns, span.pauses) if was_there else total_ns
+        tail_ns = max(0, span.end_ns - presence.last_ns) if was_there else total_ns
         is_silent = _fell_silent(topic, presence, rule, tail_ns, by_habit)
         longest_at_ns = presence.longest_at_ns - span.start_ns if presence.longest_ns else 0
-        found = _breaches(topic, presence, rule, span, lost.get(topic, 0)) if rule else ()
+        found = _breaches(presence, rule, span, lost.get(topic, 0)) if rule else ()
         reports[topic] = TopicReport(
             messages=presence.messages,
             first_s=s_from_ns(presence.first_ns - span.start_ns) if was_there else None,
@@ -313,9 +301,7 @@ def _fell_silent(
     return s_from_ns(tail_ns) > max(LEAST_SILENCE_S, HABIT * s_from_ns(presence.longest_ns))
 
 
-def _breaches(
-    topic: str, presence: Presence, rule: TopicRule, span: Span, lost: int
-) -> Iterable[str]:
+def _breaches(presence: Presence, rule: TopicRule, span: Span, lost: int) -> Iterable[str]:
     if not presence.messages:
         if rule.required:
             yield "no message, and the contract requires it"
@@ -324,8 +310,8 @@ def _breaches(
     limit_s = rule.silence_s
     if limit_s is not None:
         allowed = f"at most {limit_s:g} s is allowed{dropped}"
-        head_s = s_from_ns(_silence_ns(span.start_ns, presence.first_ns, span.pauses))
-        tail_s = s_from_ns(_silence_ns(presence.last_ns, span.end_ns, span.pauses))
+        head_s = s_from_ns(presence.first_ns - span.start_ns)
+        tail_s = s_from_ns(span.end_ns - presence.last_ns)
         longest_s = s_from_ns(presence.longest_ns)
         if head_s > limit_s and rule.required:
             yield f"silent for the first {head_s:.1f} s; {allowed}"
@@ -334,13 +320,11 @@ def _breaches(
             yield f"silent for {longest_s:.1f} s from {at_s:.1f} s on; {allowed}"
         if tail_s > limit_s:
             yield f"silent for the last {tail_s:.1f} s; {allowed}"
-    yield from _rate_breach(topic, presence, rule, span, lost)
+    yield from _rate_breach(presence, rule, lost)
 
 
-def _rate_breach(
-    topic: str, presence: Presence, rule: TopicRule, span: Span, lost: int
-) -> Iterable[str]:
-    there_s = s_from_ns(_silence_ns(presence.first_ns, presence.last_ns, span.pauses))
+def _rate_breach(presence: Presence, rule: TopicRule, lost: int) -> Iterable[str]:
+    there_s = s_from_ns(presence.last_ns - presence.first_ns)
     if rule.rate_hz is None or rule.rate_hz * there_s < FEWEST_FOR_RATE:
         return
     found_hz = (presence.messages + lost - 1) / there_s

@@ -1,6 +1,5 @@
-"""Read one episode, split or whole: metadata, topics, raw messages; ``streams`` decodes them."""
+"""Read one episode: metadata, topics, raw messages; ``streams`` decodes them."""
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,112 +10,9 @@ from bridge.episode.assigned import assigned
 from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.messages import Selection, merged
 from bridge.episode.mcap.walk import DAMAGE
-from bridge.episode.provenance import hash_files
-from bridge.episode.run_folder import EPISODE_ID, part_name
+from bridge.episode.provenance import hash_file
 from bridge.episode.topics import is_truth
 from bridge.errors import EpisodeError, PathNotFoundError, SchemaVersionError
-
-_NAME = re.compile(rf"({EPISODE_ID.pattern})(?:\.([1-9][0-9]{{0,5}}))?\.mcap")
-
-
-class PartName(NamedTuple):
-    """What a file name says."""
-
-    episode_id: str
-    number: int
-    """1 for the first part, and for an episode in one file."""
-
-
-def name_of_part(path: Path) -> PartName | None:
-    """Read a file name; None for names no recorder of ours gives."""
-    found = _NAME.fullmatch(path.name)
-    return None if found is None else PartName(found[1], int(found[2] or 1))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Parts:
-    """The files of one episode that can be read, in order."""
-
-    files: tuple[McapFile, ...]
-    missing: tuple[Path, ...]
-    """Parts that are not there or cannot be read, by the name they should have."""
-
-
-def open_parts(path: Path) -> Parts:
-    """Open a file and, where it is part of a split episode, the parts behind it.
-
-    A part says in its ``split`` record whether it is the last. Recovered parts may not say it:
-    then the highest number that is there counts as the last.
-    """
-    first = McapFile(path)
-    name = name_of_part(path)
-    if name is None or is_last_part(first):
-        return Parts(files=(first,), missing=())
-    following = path.with_name(part_name(name.episode_id, name.number + 1))
-    if split_of(first) is None and not _was_cut_off(first) and not following.exists():
-        return Parts(files=(first,), missing=())
-    return _follow(first, *name)
-
-
-def _follow(first: McapFile, episode_id: str, index: int) -> Parts:
-    files, missing = [first], []
-    highest: int | None = None
-    while not is_last_part(files[-1]):
-        index += 1
-        path = first.path.with_name(part_name(episode_id, index))
-        file = _open_later(path, of=first)
-        if file is not None:
-            files.append(file)
-            continue
-        if highest is None:  # a hole: is there anything behind it?
-            names = map(name_of_part, first.path.parent.glob(f"{episode_id}.*.mcap"))
-            highest = max((name.number for name in names if name is not None), default=1)
-        if index > highest:
-            if not _was_cut_off(files[-1]) or path.exists():
-                missing.append(path)
-            break
-        missing.append(path)
-    return Parts(files=tuple(files), missing=tuple(missing))
-
-
-def _open_later(path: Path, *, of: McapFile) -> McapFile | None:
-    if not path.is_file():
-        return None
-    try:
-        file = McapFile(path)
-    except DAMAGE:
-        return None
-    ids = {record.get("id") for record in (record_of(of, "episode"), record_of(file, "episode"))}
-    return file if len(ids - {None}) < 2 else None
-
-
-def record_of(file: McapFile, name: str) -> dict[str, Any]:
-    """Return a metadata record of one file with its values parsed, empty where there is none."""
-    values: dict[str, Any] = {}
-    for record in file.metadata:
-        if record.name == name:
-            values = metadata.from_strings(record.metadata)
-    return values
-
-
-def split_of(file: McapFile) -> dict[str, Any] | None:
-    """Return the ``split`` record, or None."""
-    return record_of(file, "split") or None
-
-
-def is_last_part(file: McapFile) -> bool:
-    """Whether a file says that no part follows."""
-    split = split_of(file)
-    return split is not None and split.get("last") is True
-
-
-def _was_cut_off(file: McapFile) -> bool:
-    """Whether the end of this part is unknown because its writer died: no part need follow."""
-    return any(record.name == "recovered" for record in file.metadata)
-
-
-LAST_PART_WINS = ("outcome", "drops", "recorder", "split")
-"""Metadata that only the end of an episode knows; every other record is that of its beginning."""
 
 Record = TypeVar("Record", metadata.EpisodeInfo, metadata.Outcome, metadata.Derived)
 
@@ -146,54 +42,40 @@ class TopicSummary:
 
 
 class Episode:
-    """An opened, finished episode: one file, or several parts that are read as one.
+    """An opened, finished episode. Cheap to make: only the summary is read."""
 
-    Cheap to make: only the summaries are read.
-    """
-
-    def __init__(self, files: tuple[McapFile, ...], missing_parts: tuple[Path, ...]) -> None:
+    def __init__(self, file: McapFile) -> None:
         """Use ``Episode.open``."""
-        self.path = files[0].path
-        self.files = files
-        self.missing_parts = missing_parts
-        """Parts of a split episode that are not there or cannot be read."""
-        self.texts = _joined_texts(files)
-        """All metadata records by name, as they stand in the files."""
+        self.path = file.path
+        self.file = file
+        self.texts = {record.name: record.metadata for record in file.metadata}
+        """All metadata records by name, as they stand in the file."""
         self._records: dict[str, dict[str, Any]] = {}
         self._topics: dict[str, TopicSummary] | None = None
 
     @staticmethod
     def open(path: Path) -> "Episode":
-        """Open a finished MCAP file, and the parts behind it where an episode was split.
-
-        A part that is missing does not prevent reading the others: see ``missing_parts``.
-        """
+        """Open a finished MCAP file."""
         if not path.is_file():
             raise PathNotFoundError(path=path, what="episode", hint="robot-gst ls RUN lists them.")
         try:
-            parts = open_parts(path)
+            episode = Episode(McapFile(path))
         except DAMAGE as error:
             raise EpisodeError(
                 path=path,
                 found=f"not a finished MCAP file ({type(error).__name__}: {str(error)[:120]})",
                 hint="If a recorder was killed while writing it: robot-gst recover FILE.",
             ) from error
-        episode = Episode(parts.files, parts.missing)
-        found = episode._record("episode").get("schema_version", metadata.SCHEMA_VERSION)
+        found = episode.record("episode").get("schema_version", metadata.SCHEMA_VERSION)
         if isinstance(found, int) and found > metadata.SCHEMA_VERSION:
             raise SchemaVersionError(
                 path=path, name="episode metadata", found=found, known=metadata.SCHEMA_VERSION
             )
         return episode
 
-    @property
-    def parts(self) -> tuple[Path, ...]:
-        """The files this episode is read from, in order."""
-        return tuple(file.path for file in self.files)
-
     def sha256(self) -> str:
-        """SHA-256 of the bytes of all parts, one after the other, in hexadecimal; reads them."""
-        return hash_files(self.parts)
+        """SHA-256 of its bytes, in hexadecimal; reads them."""
+        return hash_file(self.path)
 
     @property
     def info(self) -> metadata.EpisodeInfo:
@@ -216,7 +98,7 @@ class Episode:
         if name not in self.texts:
             return None
         try:
-            return metadata.build(of_type, self._record(name))
+            return metadata.build(of_type, self.record(name))
         except (TypeError, ValueError) as error:
             raise EpisodeError(
                 path=self.path,
@@ -227,9 +109,9 @@ class Episode:
     @property
     def metadata_records(self) -> dict[str, dict[str, Any]]:
         """All metadata records by name, values parsed where they are JSON."""
-        return {name: self._record(name) for name in self.texts}
+        return {name: self.record(name) for name in self.texts}
 
-    def _record(self, name: str) -> dict[str, Any]:
+    def record(self, name: str) -> dict[str, Any]:
         """Parse a metadata record, once; empty where there is none."""
         if name not in self._records:
             self._records[name] = metadata.from_strings(self.texts.get(name, {}))
@@ -237,19 +119,15 @@ class Episode:
 
     @property
     def start_ns(self) -> int:
-        """First log time of any part, 0 without messages."""
-        return min((start for start, _ in self._times_ns()), default=0)
+        """First log time, 0 without messages."""
+        found = self.file.summary.statistics
+        return found.message_start_time if found and found.message_count else 0
 
     @property
     def end_ns(self) -> int:
-        """Last log time of any part, 0 without messages."""
-        return max((end for _, end in self._times_ns()), default=0)
-
-    def _times_ns(self) -> Iterator[tuple[int, int]]:
-        for file in self.files:
-            statistics = file.summary.statistics
-            if statistics is not None and statistics.message_count:
-                yield statistics.message_start_time, statistics.message_end_time
+        """Last log time, 0 without messages."""
+        found = self.file.summary.statistics
+        return found.message_end_time if found and found.message_count else 0
 
     @property
     def duration_s(self) -> float:
@@ -264,13 +142,12 @@ class Episode:
 
     def _summed_up(self) -> dict[str, TopicSummary]:
         found: dict[str, dict[tuple[str, str], int]] = {}
-        for file in self.files:
-            statistics = file.summary.statistics
-            counts = statistics.channel_message_counts if statistics else {}
-            for channel in file.summary.channels.values():
-                record, kinds = file.schema_of(channel), found.setdefault(channel.topic, {})
-                kind = (record.name if record else "", channel.message_encoding)
-                kinds[kind] = kinds.get(kind, 0) + counts.get(channel.id, 0)
+        statistics = self.file.summary.statistics
+        counts = statistics.channel_message_counts if statistics else {}
+        for channel in self.file.summary.channels.values():
+            record, kinds = self.file.schema_of(channel), found.setdefault(channel.topic, {})
+            kind = (record.name if record else "", channel.message_encoding)
+            kinds[kind] = kinds.get(kind, 0) + counts.get(channel.id, 0)
         topics = {}
         for topic, kinds in sorted(found.items()):
             type_name, encoding = max(kinds, key=lambda kind: kinds[kind])
@@ -307,7 +184,7 @@ class Episode:
         if wanted is not None and not wanted:
             return
         select = Selection(topics=wanted, start_ns=start_ns, end_ns=end_ns)
-        for item in merged(self.files, select):
+        for item in merged([self.file], select):
             record = item.file.schema_of(item.channel)
             yield RawMessage(
                 item.channel.topic,
@@ -330,21 +207,7 @@ class Episode:
 
     def attachment(self, name: str) -> bytes | None:
         """Return the bytes of the first attachment of this name with its CRC checked, or None."""
-        for file in self.files:
-            try:
-                found = file.attachment(name)
-            except DAMAGE as error:
-                raise damaged(file.path, error) from error
-            if found is not None:
-                return found
-        return None
-
-
-def _joined_texts(files: tuple[McapFile, ...]) -> dict[str, dict[str, str]]:
-    joined: dict[str, dict[str, str]] = {}
-    for file in files:
-        of_part = {record.name: record.metadata for record in file.metadata}
-        for name, values in of_part.items():
-            if name in LAST_PART_WINS or name not in joined:
-                joined[name] = values
-    return joined
+        try:
+            return self.file.attachment(name)
+        except DAMAGE as error:
+            raise damaged(self.path, error) from error

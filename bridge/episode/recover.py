@@ -14,13 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from bridge.episode.check_file import Faults, FileCheck
-from bridge.episode.chunk_queue import JOURNAL, journal_path
 from bridge.episode.mcap.damaged import RecordFile, finished_data
 from bridge.episode.mcap.part_file import lock_dead, sync_folder
 from bridge.episode.mcap.scan import scan
 from bridge.episode.recovery_report import RECORD_NAME, RecoveryReport, RecoveryTally, to_metadata
 from bridge.episode.run_folder import PART, SUFFIX, RunFolder
-from bridge.episode.salvage import CopyTarget, scan_with_journal
+from bridge.episode.salvage import CopyTarget, each_chunk_once
 from bridge.errors import BridgeError, GstError, PathNotFoundError
 
 TEMPORARY, UNREADABLE = ".recovering", ".unreadable"
@@ -50,31 +49,11 @@ def recover(path: Path) -> RecoveryReport:
         source = RecordFile(descriptor)
         finished = _report_finished(path, source)
         if finished is not None:
-            _drop_journal(path, finished)
             return finished
         if shutil.disk_usage(path.parent).free < source.size + SPARE_BYTES:
             size = f"{path} needs {source.size / 1e6:.0f} MB beside it for a copy."
             raise RecoveryError(f"{size} Free some space, or move it to another disk.")
-        with _journal_of(path) as journal:
-            report = _recover_copy(path, source, journal)
-        _drop_journal(path, report)
-        return report
-
-
-@contextmanager
-def _journal_of(path: Path) -> Iterator[RecordFile | None]:
-    """Open the journal of a part, if there is one."""
-    if not path.name.endswith(PART) or not journal_path(path).is_file():
-        yield None
-        return
-    with journal_path(path).open("rb") as stream:
-        yield RecordFile(stream.fileno())
-
-
-def _drop_journal(path: Path, report: RecoveryReport) -> None:
-    """Remove the journal of a part that is finished: everything in it is there."""
-    if report.output is not None and path.name.endswith(PART):
-        journal_path(path).unlink(missing_ok=True)
+        return _recover_copy(path, source)
 
 
 def recover_parts(run: RunFolder) -> list[RecoveryReport]:
@@ -95,9 +74,6 @@ def recover_parts(run: RunFolder) -> list[RecoveryReport]:
             if report.output is None:
                 _set_aside(path)
         reports.append(report)
-    for journal in run.episodes_dir.glob(f"*{SUFFIX}{JOURNAL}"):
-        if journal.with_suffix("").exists():  # killed between the last two steps of an end
-            journal.unlink(missing_ok=True)
     return reports
 
 
@@ -139,13 +115,13 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
     return tally.report(path, _publish(path) if path.name.endswith(PART) else path, finished=True)
 
 
-def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:
+def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
     temporary = path.with_name(path.name.removesuffix(PART) + TEMPORARY)
     temporary.unlink(missing_ok=True)  # of a recovery that was killed; the lock is ours
     tally = RecoveryTally()
     target: CopyTarget | None = None
     try:
-        for found in scan_with_journal(source, journal):
+        for found in each_chunk_once(source):
             tally.take(found)
             if tally.has_data and target is None:
                 target = CopyTarget(source, temporary)

@@ -2,7 +2,6 @@
 
 import os
 import re
-from collections.abc import Collection
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -15,7 +14,6 @@ REFUSED_PLAN, PLAN_REPLAY = ".refused.json", ".replay.mcap"
 SUFFIX, PART = ".mcap", ".part"
 """What an episode's file ends in, and what stands behind that while it is being written."""
 EPISODE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,120}")
-_LATER_PART = re.compile(rf"({EPISODE_ID.pattern})\.([1-9][0-9]{{0,5}})\.mcap")
 
 
 def check_episode_id(episode_id: str) -> str:
@@ -26,29 +24,6 @@ def check_episode_id(episode_id: str) -> str:
             "Use letters, digits, '_' and '-', at most 121 characters."
         )
     return episode_id
-
-
-def part_name(episode_id: str, index: int) -> str:
-    """Return the file name of one part of an episode; the first, number 1, carries the bare id."""
-    return f"{episode_id}.mcap" if index == 1 else f"{episode_id}.{index}.mcap"
-
-
-def grouped_parts(names: Collection[str]) -> dict[str, list[str]]:
-    """Return all parts of each episode among some file names, by the first of them.
-
-    That is ``<id>.mcap``. Where it is missing, the lowest part that is there stands for it, so
-    that no file is hidden and none is listed twice.
-    """
-    episodes: dict[str, list[tuple[int, str]]] = {}
-    for name in sorted(set(names)):
-        found = _LATER_PART.fullmatch(name)  # another program's is whole
-        is_later = found is not None and found[2] != "1"
-        episode_id, index = (
-            (found[1], int(found[2])) if found and is_later else (name.removesuffix(".mcap"), 1)
-        )
-        episodes.setdefault(episode_id, []).append((index, name))
-    groups = [[name for _, name in sorted(parts)] for parts in episodes.values()]
-    return {group[0]: group for group in sorted(groups)}
 
 
 def file_names(folder: Path, ending: str = SUFFIX) -> list[str]:
@@ -125,12 +100,8 @@ class RunFolder:
         return self.path / "notes"
 
     def episodes(self) -> list[Path]:
-        """Recorded episodes, in name order; of a split one, its first part."""
-        return [*map(self.episodes_dir.joinpath, self.episode_parts())]
-
-    def episode_parts(self) -> dict[str, list[str]]:
-        """File names of each recorded episode, by the first of them, in name order."""
-        return grouped_parts(file_names(self.episodes_dir))
+        """Recorded episodes, in name order."""
+        return [*map(self.episodes_dir.joinpath, file_names(self.episodes_dir))]
 
     def unfinished(self) -> list[Path]:
         """Files in ``episodes/`` and ``derived/`` that are being written, or were left behind."""

@@ -31,30 +31,16 @@ UNKNOWN_LIBRARY = "unknown; recovered by robot-gst"
 """Of a file whose header was lost: its messages are held to no promise of ours."""
 
 
-def key_of(found: Chunk | CutChunk) -> tuple[int, int]:
-    """What tells a chunk from every other: CRC and size of its records."""
-    return found.head.crc, found.head.size
-
-
-def scan_with_journal(source: RecordFile, journal: RecordFile | None) -> Iterator[Found]:
-    """Return what a part holds, each chunk once, then the chunks that only its journal holds.
-
-    A chunk torn at the end of the part is left out where the journal has it whole.
-    """
-    written = list(scan(journal)) if journal is not None else []
-    kept = {key_of(found) for found in written if isinstance(found, Chunk)}
+def each_chunk_once(source: RecordFile) -> Iterator[Found]:
+    """Return what a file holds; a chunk that lies there twice is given once."""
     there: set[tuple[int, int]] = set()
     for found in scan(source):
-        if isinstance(found, Chunk):
-            if found.head.crc and key_of(found) in there:
+        if isinstance(found, Chunk) and found.head.crc:
+            key = found.head.crc, found.head.size
+            if key in there:
                 continue
-            there.add(key_of(found))
-        if not (isinstance(found, CutChunk) and key_of(found) in kept):
-            yield found
-    for found in written:
-        if isinstance(found, Chunk) and key_of(found) not in there:
-            there.add(key_of(found))
-            yield found
+            there.add(key)
+        yield found
 
 
 _RECORDS: dict[str, type] = {"episode": EpisodeInfo, "outcome": Outcome, "derived": Derived}
@@ -251,23 +237,18 @@ def verbatim(found: Chunk) -> EncodedChunk:
     if has_wrong_times(found):
         front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
         buffers = [front, memoryview(found.raw)[len(front) :]]
-    crc = 0
-    for buffer in buffers:
-        crc = crc32(buffer, crc)
     entry = chunk_entry(RecordSpan.between(mcap.CHUNK, 0, found.length), found.head)
     entry.message_start_time, entry.message_end_time = start_ns, end_ns
-    return EncodedChunk(buffers=buffers, crc=crc, entry=entry, index=found.contents.index)
+    return EncodedChunk(buffers=buffers, entry=entry, index=found.contents.index)
 
 
 def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
     """Return the records saved from a cut chunk as a whole one."""
-    crc = crc32(records, 0)
     return chunk_of(
         [records],
         contents.index,
         times_ns=contents.time_range(),
         size=len(records),
-        crc=crc,
+        crc=crc32(records, 0),
         compression="",
-        data_crc=crc,
     )

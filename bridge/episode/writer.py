@@ -52,8 +52,6 @@ class Channel:
 
 
 About = tuple[tuple[str, str], ...]
-SLOW_FLUSH_S = 0.05
-"""On a slow disk small messages are not held back longer than this [s]: the write takes enough."""
 REPEAT_CHUNKS = 16
 """Definitions stand in a group's first two chunks that need them, and again after so many: no one
 damaged chunk leaves messages without a name."""
@@ -225,9 +223,7 @@ class EpisodeWriter:
         self._pending: deque[EncodedChunk] = deque()
         self._queue: ChunkQueue | None = None
         if config.flush_s is not None:
-            self._queue = ChunkQueue(
-                self._section, self.part_path, header=header, monotonic=monotonic
-            )
+            self._queue = ChunkQueue(self._section, monotonic=monotonic)
         self._sync = BackgroundSync(self._file, config.sync_s) if config.sync_s else None
         self._open = True
 
@@ -415,13 +411,7 @@ class EpisodeWriter:
             self.wait_for_disk()
             return
         self._refuse_failed()
-        self._queue.tick()
-        now_s = self._monotonic()
-        before_s = now_s - self.config.flush_s
-        if self._queue.is_slow() and self._small.has_messages:
-            hurried_s = now_s - min(SLOW_FLUSH_S, self.config.flush_s)
-            if self._small.opened_s <= hurried_s:
-                self._flush(self._small)
+        before_s = self._monotonic() - self.config.flush_s
         for group in self._groups:
             if group.has_messages and group.opened_s <= before_s:
                 self._flush(group)
@@ -449,8 +439,6 @@ class EpisodeWriter:
             self._file.truncate(offset, crc)
             raise
         self._stop()
-        if self._queue is not None:
-            self._queue.remove_journal()
         return self.path
 
     def abandon(self) -> None:
@@ -466,8 +454,6 @@ class EpisodeWriter:
         if self._open:
             self.part_path.unlink(missing_ok=True)
             self._stop()
-            if self._queue is not None:
-                self._queue.remove_journal()
 
     def _stop(self) -> None:
         self._open = False

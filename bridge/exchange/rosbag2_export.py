@@ -66,10 +66,9 @@ def export_bag(
     """
     report = ExportReport()
     channels = {
-        (id(file), channel.id): found
-        for file in episode.files
-        for channel in file.summary.channels.values()
-        if (found := _channel(file, channel, report.left_out)) is not None
+        channel.id: found
+        for channel in episode.file.summary.channels.values()
+        if (found := _channel(episode.file, channel, report.left_out)) is not None
     }
     if not channels:
         listed = ", ".join(report.left_out) or "it has no topics"
@@ -77,7 +76,7 @@ def export_bag(
     with new_folder(out, force=force) as folder:
         name = f"{out.name}_0.mcap"
         with EpisodeWriter(folder / name) as writer:
-            copy_attachments(episode.files, writer)
+            copy_attachments([episode.file], writer)
             bag = _copy_messages(episode, writer, channels, advance)
         for (topic, _), channel in bag.items():
             report.topics[topic] = report.topics.get(topic, 0) + channel.count
@@ -85,7 +84,7 @@ def export_bag(
         about = "\n".join(_metadata(name, bag)) + "\n"
         (folder / "metadata.yaml").write_text(about, encoding="utf-8")
         made_by, choices = "robot-gst export rosbag2", {"left_out": report.left_out}
-        write_note(folder, made_by=made_by, sources=list(episode.parts), choices=choices)
+        write_note(folder, made_by=made_by, sources=[episode.path], choices=choices)
     return report
 
 
@@ -96,13 +95,13 @@ Bag = dict[tuple[str, str], "_Channel"]
 def _copy_messages(
     episode: Episode,
     writer: EpisodeWriter,
-    channels: dict[tuple[int, int], "_Channel"],
+    channels: dict[int, "_Channel"],
     advance: Callable[[int, str], None],
 ) -> Bag:
     bag: Bag = {}
     topics = frozenset(channel.topic for channel in channels.values())
-    for done, item in enumerate(merged(episode.files, Selection(topics)), start=1):
-        channel = channels.get((id(item.file), item.channel.id))
+    for done, item in enumerate(merged([episode.file], Selection(topics)), start=1):
+        channel = channels.get(item.channel.id)
         if channel is None:  # of a topic that also has messages that can go
             continue
         writer.write_foreign(

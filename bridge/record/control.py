@@ -1,7 +1,7 @@
 """The recorder's control keys ``rec/<recorder>/ctl/<verb>``, JSON in and out.
 
-Verbs: start, stop, mark, label, pause, resume, snapshot, list, status. Each has its own thread, so
-that a status is never behind a stop.
+Verbs: start, stop, mark, label, list, status. Each has its own thread, so that a status is never
+behind a stop.
 """
 
 import json
@@ -109,18 +109,11 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
             episode=None if episode is None else check_episode_id(str(episode)),
         )
 
-    def snapshot(request: dict[str, Any]) -> dict[str, Any]:
-        info = parse_info(request.get("id"), request.get("info", {}))
-        return recorder.snapshot(info, parse_task_file(request.get("task_file")))
-
     verbs: dict[str, tuple[set[str] | None, Callable[[dict[str, Any]], dict[str, Any]]]] = {
         "start": ({"id", "info", "anyway", "task_file"}, start),
         "stop": ({"outcome", "discard"}, stop),
         "mark": ({"text"}, lambda request: recorder.mark(_text(request))),
         "label": ({"text", "outcome", "episode"}, label),
-        "pause": (set(), lambda request: recorder.pause()),
-        "resume": (set(), lambda request: recorder.resume()),
-        "snapshot": ({"id", "info", "task_file"}, snapshot),
         "list": ({"last"}, lambda request: recorder.episodes(_whole_number(request, "last"))),
         "status": (None, lambda request: recorder.status()),
     }

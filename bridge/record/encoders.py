@@ -4,10 +4,9 @@ The work is done outside Python's lock, and nothing else ever waits behind it. A
 cannot be turned into what was asked for is recorded as it came, and flagged where it is broken.
 """
 
-import queue
-import threading
 import traceback
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 from bridge.episode import schema
@@ -95,41 +94,33 @@ class EncoderThreads:
         self._encoder = encoder
         self._done = done
         self._preview = preview
-        self._queues: dict[str, queue.SimpleQueue[Item | None]] = {}
-        self._threads: list[threading.Thread] = []
+        self._threads: dict[str, ThreadPoolExecutor] = {}
+        """By topic: a pool of one thread, which keeps the order."""
         self.is_passing = False
         """Hand images on untouched: the disk has failed and only their count matters."""
 
     def submit(self, item: Item) -> None:
         """Queue an image; never waits. For one caller at a time."""
         topic = item.sample.topic
-        waiting = self._queues.get(topic)
-        if waiting is None:
-            waiting = self._queues[topic] = self._queue_for(topic)
-        waiting.put(item)
+        thread = self._threads.get(topic)
+        if thread is None:
+            others = list(dict.fromkeys(self._threads.values()))
+            if len(others) < MAX_THREADS:
+                thread = ThreadPoolExecutor(1, thread_name_prefix=f"encode {topic}"[:60])
+            else:
+                thread = others[len(self._threads) % MAX_THREADS]
+            self._threads[topic] = thread
+        thread.submit(self._work, item)
 
-    def _queue_for(self, topic: str) -> "queue.SimpleQueue[Item | None]":
-        if len(self._threads) >= MAX_THREADS:
-            shared = list(dict.fromkeys(self._queues.values()))
-            return shared[len(self._queues) % len(shared)]
-        waiting: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
-        thread = threading.Thread(
-            target=self._work, args=(waiting,), name=f"encode {topic}"[:60], daemon=True
-        )
-        self._threads.append(thread)
-        thread.start()
-        return waiting
-
-    def _work(self, waiting: "queue.SimpleQueue[Item | None]") -> None:
-        while (item := waiting.get()) is not None:
-            before = len(item.sample.data)
-            try:
-                if not self.is_passing:
-                    self._treat(item)
-            except Exception:  # noqa: BLE001  # a bug must not end the stream: record it as it is
-                traceback.print_exc()
-                item.finding = item.finding or MessageState.UNDECODABLE
-            self._done(item, before - len(item.sample.data))
+    def _work(self, item: Item) -> None:
+        before = len(item.sample.data)
+        try:
+            if not self.is_passing:
+                self._treat(item)
+        except Exception:  # noqa: BLE001  # a bug must not end the stream: record it as it is
+            traceback.print_exc()
+            item.finding = item.finding or MessageState.UNDECODABLE
+        self._done(item, before - len(item.sample.data))
 
     def _treat(self, item: Item) -> None:
         original = item.sample
@@ -139,9 +130,6 @@ class EncoderThreads:
 
     def close(self) -> None:
         """End the threads after what they hold."""
-        for waiting in set(self._queues.values()):
-            waiting.put(None)
-        for thread in self._threads:
-            thread.join(timeout=5.0)
+        for thread in set(self._threads.values()):
+            thread.shutdown()
         self._threads.clear()
-        self._queues.clear()

@@ -35,7 +35,7 @@ from bridge.record.inspection import (
 )
 from bridge.record.ledger import Ledger
 from bridge.record.presence import News
-from bridge.record.queue import Command, Dropped, Item, second_of
+from bridge.record.queue import Dropped, Item, second_of
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.task_file import TaskFile
 from bridge.wire.rmw import ros_schema, type_hash_of
@@ -104,6 +104,8 @@ class Channels:
             self._warn(
                 f"{topic}: {type_name} was built from another definition ({sample.type_hash})"
             )
+        elif record is not None and not record.schema_encoding:
+            self._warn(f"{topic}: {type_name} is not known here; it is kept without a definition")
         look = inspector("" if is_strange else type_name, sample.message_encoding, sample.topic)
         last_ns = self._last_ns.setdefault(topic, [0])
         content = ContentWatch(topic, type_name)
@@ -185,7 +187,6 @@ class EpisodeRecording:
         self._config = config
         self._latched = latched
         self._others = others
-        self._paused_ns: list[list[int]] = []
         self._channels = Channels(config.queues.max_topics, self.ledger.warn, config.msg_folder)
         self._num_latched = 0
         self._closed_second = second_of(start_ns)
@@ -366,20 +367,6 @@ class EpisodeRecording:
         self._clock_steps_ns.append(step_ns)
         self.write_event("clock_step", stamp_ns=stamp_ns, data={"step_ns": step_ns})
 
-    def pause(self, command: Command) -> None:
-        """Leave out, and count as no loss, what comes after this command."""
-        self.write_event("paused", stamp_ns=command.received_ns)
-        self.ledger.pause(command.ticket)
-        self._paused_ns.append([command.received_ns])
-
-    def resume(self, command: Command) -> None:
-        """Record and count again what comes after this command."""
-        self.ledger.resume(command.ticket)
-        span = self._paused_ns[-1]
-        span.append(command.received_ns)
-        self.ledger.pauses.append((span[0], span[1]))
-        self.write_event("resumed", stamp_ns=command.received_ns)
-
     def refuse(self, entries: Iterable[Item | Dropped]) -> None:
         """Book messages that came before the end and can no longer be written."""
         for entry in entries:
@@ -410,8 +397,7 @@ class EpisodeRecording:
         if outcome is not None:
             writer.add_metadata("outcome", metadata.to_strings(outcome))
         writer.add_metadata("drops", self.ledger.to_metadata())
-        paused = [(span[0], span[1] if len(span) > 1 else end_ns) for span in self._paused_ns]
-        self._judge_presence(Span(self.start_ns, end_ns, paused))
+        self._judge_presence(Span(self.start_ns, end_ns))
         recorder = {
             "settings": asdict(self._config),
             "start_ns": self.start_ns,
@@ -419,7 +405,6 @@ class EpisodeRecording:
             "stopped_by": reason,
             "latched_messages_repeated": self._num_latched,
             "clock_steps_ns": self._clock_steps_ns,
-            "paused": paused,
             **{name: ask() for name, ask in self._others.items()},
         }
         values = {name: json.dumps(value, default=str) for name, value in recorder.items()}

@@ -82,27 +82,17 @@ class Ledger:
         """Start empty."""
         self.warnings: list[str] = []
         self.presences: dict[str, Presence] = {}
-        self.pauses: list[tuple[int, int]] = []
-        """Begin and end of each pause that is over [ns]."""
         self._max_topics = max_topics
         self._totals: dict[str, Tally] = {}
         self._open: dict[tuple[int, str], Tally] = {}
         self._streams: set[tuple[str, bytes]] = set()
         self._told: set[tuple[str, bytes]] = set()
         self._closing = threading.Lock()
-        self._spans: list[tuple[int, int | None]] = [(0, None)]
+        self._first = 0
 
     def begin(self, ticket: int) -> None:
         """Count what carries this ticket or a later one."""
-        self._spans = [(ticket, None)]
-
-    def pause(self, ticket: int) -> None:
-        """Count nothing from this ticket on."""
-        self._spans[-1] = (self._spans[-1][0], ticket)
-
-    def resume(self, ticket: int) -> None:
-        """Count again from this ticket on."""
-        self._spans.append((ticket, None))
+        self._first = ticket
 
     def warn(self, text: str) -> None:
         """Keep a remark about the recording; each is kept once."""
@@ -122,11 +112,7 @@ class Ledger:
     def _book(self, tally: Tally, item: Item) -> None:
         step = item.step
         tally.gaps += step.gap
-        if step.fills is not None and self._was_booked(step.fills):
-            tally.gaps -= 1
-
-    def _was_booked(self, ticket: int) -> bool:
-        return any(first <= ticket and (end is None or ticket < end) for first, end in self._spans)
+        tally.gaps -= step.fills is not None and step.fills >= self._first
 
     def count_received(self, item: Item, found: MessageState, made_ns: int | None = None) -> None:
         """Book a message that was written, and was made then."""
@@ -145,7 +131,7 @@ class Ledger:
         if presence is None and len(self.presences) < self._max_topics:
             presence = self.presences[sample.topic] = Presence()
         if presence is not None:
-            presence.see(sample.received_ns, self.pauses)
+            presence.see(sample.received_ns)
         if made_ns is not None:
             tally.see_offset(sample.received_ns - made_ns)
         if found is not GOOD:
@@ -164,7 +150,7 @@ class Ledger:
             tally = self._tally(topic, second)
             tally.queue_drops += count.messages
             tally.shed += count.shed
-            tally.gaps += count.gaps - sum(map(self._was_booked, count.fills))
+            tally.gaps += count.gaps - sum(ticket >= self._first for ticket in count.fills)
         self._told |= dropped.told
         for text in dropped.warnings:
             self.warn(text)

@@ -1,4 +1,4 @@
-"""What the recorder is doing: idle, recording or paused; and the steps between. One thread."""
+"""What the recorder is doing: idle, recording, finishing; and the steps between. One thread."""
 
 import contextlib
 import errno
@@ -161,7 +161,6 @@ class Lifecycle:
     ) -> None:
         """Begin idle."""
         self.take: EpisodeRecording | None = None
-        self.is_paused = False
         self.is_closing = False
         self.is_finishing = False
         self.error: DiskError | None = None
@@ -188,7 +187,7 @@ class Lifecycle:
     @property
     def is_quiet(self) -> bool:
         """Say whether messages are of no use now, but for what is latched."""
-        return (self.take is None or self.is_paused) and not self.ring.is_on
+        return self.take is None and not self.ring.is_on
 
     @property
     def keeps_up(self) -> bool:
@@ -202,7 +201,7 @@ class Lifecycle:
             return "failed"
         if self.take is None:
             return "idle"
-        return "finishing" if self.is_finishing else "paused" if self.is_paused else "recording"
+        return "finishing" if self.is_finishing else "recording"
 
     def _health(self) -> dict[str, int]:
         return {"queue_bytes": self._queued_bytes(), "disk_free_bytes": self.free_bytes}
@@ -214,9 +213,8 @@ class Lifecycle:
             self.ring.add(entry)
         elif isinstance(entry, Item):
             self.latched.remember(entry.sample)
-            if not self.is_paused or entry.sample.topic in self.latched.topics:
-                self._write(take, entry)
-        elif not self.is_paused:
+            self._write(take, entry)
+        else:
             take.ledger.count_dropped(entry)
 
     def _write(self, take: EpisodeRecording, item: Item) -> None:
@@ -283,7 +281,6 @@ class Lifecycle:
         self._refuse_start(info.id)
         held = self.ring.held(command.received_ns)
         self.take = self._open(info, held, command, task)
-        self.is_paused = False
         self._write_held(self.take, held)
         self.ring.empty()
         answer: Answer = {"ok": True, "episode": info.id}
@@ -291,18 +288,6 @@ class Lifecycle:
             first_ns = min([entry.received_ns for entry in held], default=command.received_ns)
             answer["preroll_s"] = s_from_ns(command.received_ns - first_ns)
         return answer
-
-    def snapshot(
-        self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
-    ) -> Answer:
-        """Write the pre-roll as an episode of its own; it is kept as well."""
-        if not self.ring.is_on:
-            raise LifecycleError("there is no pre-roll. Start the recorder with --preroll-s 10.")
-        self._refuse_start(info.id)
-        held = self.ring.held(command.received_ns)
-        self.take = self._open(info, held, command, task)
-        self._write_held(self.take, held)
-        return self.stop(None, command, discard=False, reason="snapshot")
 
     def _refuse_start(self, episode_id: str) -> None:
         if self.is_closing:
@@ -317,9 +302,6 @@ class Lifecycle:
                 f"{left} is being written, or left from a take that was cut off. "
                 "Recover it or move it away, or choose another episode id."
             )
-        later = next(self._run.episodes_dir.glob(f"{episode_id}.[0-9]*.mcap"), None)
-        if later is not None:
-            raise UsageError(f"{later} exists already. Choose another episode id.")
         lacks, free_mb, min_mb = self._space()
         if lacks:
             raise NoSpaceError(folder=self._run.path, free_mb=free_mb, wanted_mb=min_mb)
@@ -383,24 +365,6 @@ class Lifecycle:
         """Note this instant in the episode."""
         take = self._open_take()
         take.write_event(kind, stamp_ns=command.received_ns, text=text, outcome=outcome)
-        return {"ok": True, "episode": take.info.id}
-
-    def pause(self, command: Command) -> Answer:
-        """Leave messages out until ``resume``; they are not lost, they are not wanted."""
-        take = self._open_take()
-        if self.is_paused:
-            raise LifecycleError(f"episode {take.info.id!r} is paused already.")
-        take.pause(command)
-        self.is_paused = True
-        return {"ok": True, "episode": take.info.id}
-
-    def resume(self, command: Command) -> Answer:
-        """Record again."""
-        take = self._open_take()
-        if not self.is_paused:
-            raise LifecycleError(f"episode {take.info.id!r} is not paused.")
-        take.resume(command)
-        self.is_paused = False
         return {"ok": True, "episode": take.info.id}
 
     def fail(

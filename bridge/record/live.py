@@ -194,12 +194,10 @@ class LiveRecorder:
             for key in config.topics
         ]
         self._departures = PublisherLiveliness(session, core)
-        self._graph = Ros2Graph(session, core, config.msg_folder)
-        core.also_tell("ros2_warnings", self._graph.warnings)
+        self._graph = Ros2Graph(session, core)
         core.also_tell("clocks", core.clocks.status)
         core.also_tell("receive_errors", lambda: session.receive_errors)
         core.also_tell("last_receive_error", lambda: session.last_receive_error)
-        self._links = session.watch_links(self._on_link)
         self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
         queue = core.input_queue
         self._clocks = ClockAsker(
@@ -216,10 +214,6 @@ class LiveRecorder:
     def _take(self, sample: WireSample) -> None:
         if not sample.topic.startswith(CONTROL_PREFIX):
             self.core.receive(sample)
-
-    def _on_link(self, is_open: bool) -> None:
-        if not is_open:
-            self.core.presence.link_closed()
 
     def _tell(self) -> None:
         while True:
@@ -254,8 +248,6 @@ class LiveRecorder:
         for subscriber in self._subscribers:
             subscriber.close()
         self._departures.close()
-        if self._links is not None:
-            self._links.close()
         self._graph.close()
         self._thread.join(timeout=STATUS_PERIOD_S)
         try:

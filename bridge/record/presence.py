@@ -42,7 +42,7 @@ class Silence:
     silent_s: float
     required: bool = False
     cause: str = ""
-    """What else is known: its publisher left, or a link closed meanwhile."""
+    """What else is known: its publisher left."""
 
     def __str__(self) -> str:
         """Words for a status line."""
@@ -99,7 +99,6 @@ class PresenceMonitor:
         self._topics: dict[str, _Topic] = {}
         self._gone: dict[str, tuple[str, ...]] = {}
         """Beginnings of topics whose publisher left; with each, longer ones that were there."""
-        self._link_closed_s: float | None = None
         self._is_recording = False
         self._by_habit = True
         begun_s = now_s()
@@ -201,20 +200,13 @@ class PresenceMonitor:
         return topic.quiet_s > max(SILENCE_S, HABIT * topic.longest_s)
 
     def _silence(self, name: str, topic: _Topic) -> Silence:
-        cause = ""
-        if any(_is_of(name, prefix, others) for prefix, others in self._gone.items()):
-            cause = "its publisher left"
-        elif (
-            self._link_closed_s is not None
-            and self._now_s() - self._link_closed_s <= topic.quiet_s + 2 * BEAT_S
-        ):
-            cause = "a link closed"
+        has_left = any(_is_of(name, prefix, others) for prefix, others in self._gone.items())
         rule = self._rule(name)
         return Silence(
             topic=name,
             silent_s=round(topic.quiet_s, 2),
             required=rule is not None and rule.required,
-            cause=cause,
+            cause="its publisher left" if has_left else "",
         )
 
     def begin(self, *, by_habit: bool = True) -> None:
@@ -231,7 +223,7 @@ class PresenceMonitor:
             self._is_recording = True
 
     def end(self) -> None:
-        """Nothing is recorded now, or it is paused: nobody need be told."""
+        """Nothing is recorded now: nobody need be told."""
         with self._lock:
             self._is_recording = False
 
@@ -248,11 +240,6 @@ class PresenceMonitor:
                     news = self._while_recording(text, {"kind": "left", "topic": prefix})
         for each in news:
             self._tell(each)
-
-    def link_closed(self) -> None:
-        """Note that a connection to somebody ended."""
-        with self._lock:
-            self._link_closed_s = self._now_s()
 
     def silences(self) -> list[Silence]:
         """Every topic that should speak now and does not."""

@@ -28,9 +28,8 @@ from bridge.wire.errors import is_loopback
 from bridge.wire.session import open_session
 
 HELP = (
-    "keys: s start (S although topics are missing), x stop, p pause or resume, m mark, "
-    "y success, n failure, "
-    "w write the pre-roll; Ctrl-C ends"
+    "keys: s start (S although topics are missing), x stop, m mark, y success, n failure; "
+    "Ctrl-C ends"
 )
 
 
@@ -93,12 +92,6 @@ class Keys:
             return f"started {recorder.start(info, anyway=key == 'S')['episode']}"
         if key == "x":
             return _summary(recorder.stop(reason="keyboard"))
-        if key == "p":
-            if recorder.is_paused:
-                return f"resumed {recorder.resume()['episode']}"
-            return f"paused {recorder.pause()['episode']}"
-        if key == "w":
-            return _summary(recorder.snapshot(next_info(self._run, self._about)))
         if key == "m":
             return f"marked {recorder.mark('')['episode']}"
         if key in ("y", "n"):

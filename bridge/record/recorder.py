@@ -99,11 +99,6 @@ class Recorder:
         return self._life.error
 
     @property
-    def is_paused(self) -> bool:
-        """Say whether the open episode is paused."""
-        return self._life.is_paused and self._life.take is not None
-
-    @property
     def recording(self) -> str | None:
         """Id of the episode that is being recorded."""
         take = self._life.take
@@ -240,28 +235,6 @@ class Recorder:
         return self._command(
             lambda command: self._life.event("mark", command, text, None), is_barrier=False
         )
-
-    def pause(self) -> Answer:
-        """Leave messages out until ``resume``; what is latched is recorded all the same."""
-        answer = self._command(self._life.pause)
-        self.presence.end()
-        return answer
-
-    def resume(self) -> Answer:
-        """Record again."""
-        answer = self._command(self._life.resume)
-        take = self._life.take
-        self.presence.begin(by_habit=take is None or not take.info.stand_in)
-        return answer
-
-    def snapshot(self, info: metadata.EpisodeInfo, task: TaskFile | None = None) -> Answer:
-        """Write the pre-roll as an episode; needs ``preroll_s``, and no open episode."""
-        check_episode_id(info.id)
-        task = self._task_of(info) if task is None else task
-        info = described_by(info, task)
-        self.settle()
-        answer = self._command(lambda command: self._life.snapshot(info, command, task))
-        return {**answer, **self._keep(task)}
 
     def label(
         self, *, text: str = "", outcome: metadata.Outcome | None = None, episode: str | None = None

@@ -18,7 +18,6 @@ from typing import Any
 
 from bridge.episode.schema import Schema
 from bridge.errors import MissingDependencyError, UsageError
-from bridge.wire import keys
 
 NAME_PARTS = 3
 
@@ -37,11 +36,6 @@ def ros_schema(type_name: str, *, type_hash: str = "", folder: Path | None = Non
 def type_hash_of(type_name: str, *, folder: Path | None = None) -> str | None:
     """Return the RIHS01 hash of the newest definition of a type, or None when none is known."""
     return next(_hashes(type_name, folder), (None, None))[0]
-
-
-def is_known_definition(type_name: str, type_hash: str, *, folder: Path | None = None) -> bool:
-    """Say whether any release, or the folder, has the type with exactly this hash."""
-    return any(found == type_hash for found, _ in _hashes(type_name, folder))
 
 
 @cache
@@ -129,8 +123,6 @@ class RosPublisher:
 
     domain: int
     session: str
-    node: str
-    """With its namespace, as ROS prints it: ``/arm/driver``."""
     topic: str
     dds_type: str
     """As in keys: ``std_msgs::msg::dds_::String_``."""
@@ -138,11 +130,6 @@ class RosPublisher:
     """RIHS01 hash, or TypeHashNotSupported from older releases."""
     transient_local: bool
     """Late subscribers get the last messages: /tf_static, /robot_description, maps."""
-
-    @property
-    def type_name(self) -> str:
-        """As people write it: ``std_msgs/msg/String``."""
-        return keys.ros_type(self.dds_type)
 
     @property
     def key(self) -> str:
@@ -158,7 +145,7 @@ def parse_token(key: str) -> RosPublisher | None:
     if any(sign in key for sign in "*$?#"):  # would widen the questions asked about it
         return None
     _, domain, session, _, _, kind, _, *rest = parts[:_PARTS]
-    namespace, node, topic = (each.replace("%", "/") for each in rest[:3])
+    topic = rest[2].replace("%", "/")
     is_latched = is_transient_local(rest[5])
     is_one = kind == _PUBLISHER and domain.isascii() and domain.isdigit() and topic[0] == "/"
     if not is_one or is_latched is None:
@@ -166,7 +153,6 @@ def parse_token(key: str) -> RosPublisher | None:
     return RosPublisher(
         domain=int(domain),
         session=session,
-        node=f"{namespace.rstrip('/')}/{node}",
         topic=topic,
         dds_type=rest[3],
         type_hash=rest[4],

@@ -332,18 +332,6 @@ class WireSession:
         )
         return open_session(own)
 
-    def watch_links(self, callback: Callable[[bool], None]) -> Subscriber | None:
-        """Hear on zenoh's thread of links that open (True), close (False); None: it cannot tell."""
-
-        def on_event(event: Any) -> None:
-            callback(event.kind == zenoh.SampleKind.PUT)
-
-        try:
-            listener = self._inner.info.declare_transport_events_listener(on_event)
-        except (zenoh.ZError, AttributeError):
-            return None
-        return Subscriber(listener)
-
     def serve(
         self,
         key: str,

@@ -201,7 +201,7 @@ def _outdated(stored: Results | None, now: Mapping[str, Any]) -> str | None:
 
 def _files(run: RunFolder, read: _Read, trials: set[str]) -> Iterator[review_index.IndexedFile]:
     """Name what is no trial; derived files that were read well are not opened again."""
-    for name in run.episode_parts():
+    for name in file_names(run.episodes_dir):
         if name not in trials:
             yield _file(run, run.episodes_dir / name)
     for name in file_names(run.derived_dir):

@@ -16,8 +16,7 @@ from typing import TypeVar
 
 from bridge.episode.assigned import TRIAL_SUFFIX
 from bridge.episode.catalogue_query import LABEL_SUFFIX, stamp_of
-from bridge.episode.provenance import hash_file, hash_files
-from bridge.episode.reader import Episode
+from bridge.episode.provenance import hash_file
 from bridge.episode.run_folder import RunFolder, file_names
 from bridge.errors import GstError
 from bridge.process_pool import SERIAL, ProcessPool, Serial
@@ -98,19 +97,19 @@ def _take_inventory(
 ) -> tuple[list[RunFile], list[RunFile], list[Exclusion]]:
     """Hash what is new or has changed: recorded files, derived ones, and what cannot be read."""
     now_ns = time.time_ns()
-    groups = [(run.episodes_dir, parts) for parts in run.episode_parts().values()]
-    groups += [(run.derived_dir, [name]) for name in file_names(run.derived_dir)]
+    folders = (run.episodes_dir, run.derived_dir)
+    there = [(folder, each) for folder in folders for each in file_names(folder)]
     hashes: dict[str, str | Exception] = {}
-    unknown: dict[str, tuple[Path, ...]] = {}
+    unknown: dict[str, Path] = {}
     keys: dict[str, str] = {}  # what a hash is kept under; none where the stamp cannot be relied on
-    for folder, parts in groups:
-        name = f"{folder.name}/{parts[0]}"
-        stamp = stamp_of([os.path.join(folder, part) for part in parts], now_ns)  # noqa: PTH118
+    for folder, file_name in there:
+        name = f"{folder.name}/{file_name}"
+        stamp = stamp_of([os.path.join(folder, file_name)], now_ns)  # noqa: PTH118
         key = f"{name} {stamp}" if stamp else ""
         known = cache.find(FileHash, key) if key else None
         hashes[name] = known[0].sha256 if known else ""
         if not known:
-            unknown[name], keys[name] = tuple(folder / part for part in parts), key
+            unknown[name], keys[name] = folder / file_name, key
     for name, found in _hashed(unknown, output):
         hashes[name] = found
         if keys[name] and isinstance(found, str):
@@ -129,12 +128,10 @@ def _take_inventory(
     return recorded, files[len(recorded) :], left_out
 
 
-def _hashed(
-    unknown: Mapping[str, tuple[Path, ...]], output: Output
-) -> Iterator[tuple[str, str | Exception]]:
+def _hashed(unknown: Mapping[str, Path], output: Output) -> Iterator[tuple[str, str | Exception]]:
     if not unknown:
         return
-    sizes = [sum(map(_size, parts)) for parts in unknown.values()]
+    sizes = [*map(_size, unknown.values())]
     done = 0
     with (
         output.progress("hash files (MB)", -(-sum(sizes) // MEGABYTE)) as advance,
@@ -151,10 +148,10 @@ def _hashed(
             raise
 
 
-def _sha256(parts: tuple[Path, ...]) -> str | Exception:
+def _sha256(path: Path) -> str | Exception:
     try:
-        return hash_files(parts if len(parts) == 1 else Episode.open(parts[0]).parts)
-    except (GstError, OSError) as error:
+        return hash_file(path)
+    except OSError as error:
         return error
 
 

@@ -22,8 +22,8 @@ def test_packages_and_what_is_optional_are_those_of_the_project_file() -> None:
         for name, packages in extras.items()
         if name not in ("demo", "all", "bench", "dev")
     }
-    assert {name for name, extra in doctor.EXTRAS.items() if not extra.is_optional} == needed
-    assert {name: set(extra.packages) for name, extra in doctor.EXTRAS.items()} == {
+    assert set(doctor.NEEDED) == needed
+    assert {extra: set(doctor.packages_of(extra)) for extra in doctor.EXTRAS} == {
         name: {re.split(r"[^\w.-]", package)[0] for package in packages} - {"robot-gst"}
         for name, packages in wanted.items()
     }

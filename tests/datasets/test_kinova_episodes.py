@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from kinova_data import episodes as kinova
 
-from bridge.episode.reader import Episode, record_of
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import pose_track
 from bridge.errors import PathNotFoundError
@@ -212,14 +212,14 @@ def test_real_runs_say_what_the_arm_was_told_and_the_robot_comes_along(tmp_path:
     (meshes / "base.STL").chmod(0o444)
     run = RunFolder.create(tmp_path / "run")
     [(real, _), *simulated] = import_runs(folder, run)
-    motion = ScriptedMotion.from_record(record_of(Episode.open(real).files[0], RECORD_NAME))
+    motion = ScriptedMotion.from_record(Episode.open(real).record(RECORD_NAME))
     assert motion == scripted_motion("single")
     assert (run.path / motion.robot).read_text() == "<robot name='m'/>"
     copied = run.path / "robot" / "meshes" / "base.STL"
     assert copied.read_bytes() == b"solid"
     assert copied.stat().st_mode & 0o200
     for path, _ in simulated:
-        assert record_of(Episode.open(path).files[0], RECORD_NAME) == {}
+        assert Episode.open(path).record(RECORD_NAME) == {}
     # Before the robot was given, a run is imported all the same.
     bare = RunFolder.create(tmp_path / "bare")
     list(import_runs(write_folder(tmp_path / "without"), bare))

@@ -55,16 +55,16 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.fixture
 def hashed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the files whose bytes were read whole."""
+    """Names of the episodes whose bytes were read whole."""
     names: list[str] = []
-    really_hash = contents.hash_files
+    really_hash = contents.hash_file
 
-    def hash_and_note(paths: Any) -> str:
-        paths = list(paths)
-        names.extend(path.name for path in paths)
-        return really_hash(paths)
+    def hash_and_note(path: Path) -> str:
+        if path.suffix == ".mcap":
+            names.append(path.name)
+        return really_hash(path)
 
-    monkeypatch.setattr(contents, "hash_files", hash_and_note)
+    monkeypatch.setattr(contents, "hash_file", hash_and_note)
     return names
 
 

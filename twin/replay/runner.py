@@ -9,7 +9,7 @@ from typing import Any
 
 from bridge.episode import schema, streams
 from bridge.episode.executions import NO_PLAN, executed_events, whose
-from bridge.episode.reader import Episode, record_of
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import execution_ns
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION
@@ -178,7 +178,7 @@ def _nothing_to_replay(
         return Prepared(why_not=f"a {info.kind}", was_meant=False)
     joints = [t for t in episode.topics_of_type(schema.JOINT_STATE) if t.endswith(JOINT_STATES)]
     if info.kind == "imported":
-        if record_of(episode.files[0], RECORD_NAME):
+        if episode.record(RECORD_NAME):
             return Prepared(why_not="replayed as an imported motion", was_meant=False)
         hint = f": {LABEL}" if joints else ""
         why_not = f"nobody said of which task it is a trial{hint}"

@@ -71,22 +71,8 @@ class MessageTemplate:
         numbers: Float[np.ndarray, "num_messages num_values"],
     ) -> Iterator[bytes]:
         """Yield a message for each stamp and row of numbers, as ``fill`` makes them."""
-        rows = np.tile(np.frombuffer(self._bytes, dtype=np.uint8), (len(stamps_ns), 1))
-        seconds, rest = np.divmod(stamps_ns.astype(np.int64), NS_PER_S)
-        at = self._stamp_at
-        rows[:, at : at + 4] = _bytes_of(seconds.astype("<i4")[:, None])
-        rows[:, at + 4 : at + 8] = _bytes_of(rest.astype("<u4")[:, None])
-        start = 0
-        for at, layout in self._runs:
-            end = start + layout.size // 8
-            rows[:, at : at + layout.size] = _bytes_of(numbers[:, start:end].astype("<f8"))
-            start = end
-        for row in rows:
-            yield row.tobytes()
-
-
-def _bytes_of(values: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(values).view(np.uint8)
+        for stamp_ns, row in zip(stamps_ns.tolist(), numbers.tolist(), strict=True):
+            yield self.fill(stamp_ns, row)
 
 
 def joint_template(names: Sequence[str], *, velocities: bool = False) -> MessageTemplate:

@@ -8,7 +8,7 @@ the end of the 4-byte encapsulation header.
 
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
@@ -17,11 +17,6 @@ import numpy as np
 from bridge.clock import NS_PER_S
 from bridge.episode.schema import DEFINITIONS, full_name
 from bridge.errors import BridgeError
-
-# A plan is a chain of small functions. Neighbouring fields of fixed size are read by one
-# ``struct`` call; as padding depends on where such a run begins, there is one layout for each of
-# the eight positions modulo 8. Positions count from the start of the message, 4 bytes before the
-# origin that CDR aligns to.
 
 PRIMITIVES = {
     "bool": "?",
@@ -41,10 +36,6 @@ ORIGIN = 4
 
 Buffer = bytes | bytearray | memoryview
 Message = dict[str, Any]
-ReadPart = Callable[[Buffer, int, Message], int]
-"""Reads one part of a message from a position into the dict; returns the position behind it."""
-Shape = tuple[tuple[str, Any], ...]
-"""Names of a run of fixed-size fields; a nested message has a shape of its own, others None."""
 
 
 class Field(NamedTuple):
@@ -70,214 +61,62 @@ def fields_of(type_name: str) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-@cache
-def reader_of(type_name: str, order: str) -> tuple[ReadPart, ...]:
-    """Return the functions that read a message of this type; ``order`` is ``<`` or ``>``."""
-    parts: list[ReadPart] = []
-    for run, field in _runs(type_name):
-        if run is not None:
-            parts.append(_read_run(*run, order))
-        if field is not None:
-            parts.append(_read_field(field, order))
-    return tuple(parts)
+_LAYOUTS = {order + code: struct.Struct(order + code) for order in "<>" for code in "?bBhHiIqQfd"}
 
 
-@cache
-def _fixed(type_name: str) -> tuple[Shape | None, str] | None:
-    """Shape and struct codes of a type without strings and arrays, else None."""
-    if type_name in PRIMITIVES:
-        return None, PRIMITIVES[type_name]
-    if type_name == "string":
-        return None
-    shape, codes = [], ""
+def _read(type_name: str, data: memoryview, at: int, order: str) -> tuple[Message, int]:
+    """Read a message at a position; returns the position behind it."""
+    message: Message = {}
     for field in fields_of(type_name):
-        inner = _fixed(field.type_name) if field.length is None else None
-        if inner is None:
-            return None
-        shape.append((field.name, inner[0]))
-        codes += inner[1]
-    return tuple(shape), codes
-
-
-def _runs(type_name: str) -> Iterator[tuple[tuple[Shape, str] | None, Field | None]]:
-    """Split a type into runs of fixed-size fields and the field that ends each."""
-    shape: list[tuple[str, Any]] = []
-    codes = ""
-    for field in fields_of(type_name):
-        fixed = _fixed(field.type_name) if field.length is None else None
-        if fixed is None:
-            yield (tuple(shape), codes) if shape else None, field
-            shape, codes = [], ""
+        name, kind, length = field
+        if length is None:
+            message[name], at = _read_value(kind, data, at, order)
+        elif kind in PRIMITIVES:
+            message[name], at = _read_array(field, data, at, order)
         else:
-            shape.append((field.name, fixed[0]))
-            codes += fixed[1]
-    if shape:
-        yield (tuple(shape), codes), None
-
-
-def _layouts(codes: str, order: str) -> tuple[struct.Struct, ...]:
-    """The run's layout for each start position modulo 8, padding in front included."""
-    layouts = []
-    for start in range(8):
-        at, text = (start - ORIGIN) % 8, order
-        for code in codes:
-            size = struct.calcsize("<" + code)
-            padding = -at % size
-            text += "x" * padding + code
-            at += padding + size
-        layouts.append(struct.Struct(text))
-    return tuple(layouts)
-
-
-def _read_run(shape: Shape, codes: str, order: str) -> ReadPart:
-    layouts = _layouts(codes, order)
-    names = tuple(name for name, _ in shape)
-
-    def read_flat(data: Buffer, at: int, out: Message) -> int:
-        layout = layouts[at & 7]
-        out.update(zip(names, layout.unpack_from(data, at), strict=True))
-        return at + layout.size
-
-    def read_nested(data: Buffer, at: int, out: Message) -> int:
-        layout = layouts[at & 7]
-        _nest(shape, iter(layout.unpack_from(data, at)), out)
-        return at + layout.size
-
-    return read_flat if all(inner is None for _, inner in shape) else read_nested
-
-
-def _nest(shape: Shape, values: Iterator[Any], out: Message) -> None:
-    for name, inner in shape:
-        if inner is None:
-            out[name] = next(values)
-        else:
-            nested: Message = {}
-            out[name] = nested
-            _nest(inner, values, nested)
-
-
-def _counter(order: str, *, item_bytes: int = 1) -> Callable[[Buffer, int], tuple[int, int]]:
-    """Reads a sequence's length, refusing one that cannot fit into the rest of the message."""
-    unpack = struct.Struct(order + "I").unpack_from
-
-    def count(data: Buffer, at: int) -> tuple[int, int]:
-        at += -at & 3
-        (length,) = unpack(data, at)
-        at += 4
-        if length * item_bytes > len(data) - at:
-            raise ValueError(f"{length} items of {item_bytes} bytes or more run past the end")
-        return length, at
-
-    return count
-
-
-def _text(order: str) -> Callable[[Buffer, int], tuple[str, int]]:
-    unpack = struct.Struct(order + "I").unpack_from
-
-    def text(data: Buffer, at: int) -> tuple[str, int]:
-        at += -at & 3
-        end = at + 4 + unpack(data, at)[0]
-        if end > len(data):
-            raise ValueError(f"string of {end - at - 4} bytes runs past the end")
-        return str(data[at + 4 : end], "utf-8").rstrip("\0"), end
-
-    return text
-
-
-def _read_field(field: Field, order: str) -> ReadPart:
-    name = field.name
-    if field.length is not None and field.type_name in PRIMITIVES:
-        return _read_array(field, order)
-    if field.length is not None:
-        return _read_sequence(field, order)
-    if field.type_name == "string":
-        text = _text(order)
-
-        def read_text(data: Buffer, at: int, out: Message) -> int:
-            out[name], at = text(data, at)
-            return at
-
-        return read_text
-    parts = reader_of(field.type_name, order)
-
-    def read_message(data: Buffer, at: int, out: Message) -> int:
-        inner: Message = {}
-        out[name] = inner
-        for part in parts:
-            at = part(data, at, inner)
-        return at
-
-    return read_message
-
-
-def _extent(field: Field, order: str) -> Callable[[Buffer, int], tuple[int, int]]:
-    """Where an array of primitives begins and how many values it has."""
-    size = struct.calcsize("<" + PRIMITIVES[field.type_name])
-    fixed, mask = field.length, size - 1
-    count = _counter(order, item_bytes=size)
-
-    def extent(data: Buffer, at: int) -> tuple[int, int]:
-        if fixed:
-            length = fixed
-        else:
-            length, at = count(data, at)
-            if not length:  # an empty sequence is not padded
-                return at, 0
-        at += (ORIGIN - at) & mask
-        if at + length * size > len(data):
-            raise ValueError(f"array of {length} x {field.type_name} runs past the end")
-        return at, length
-
-    return extent
-
-
-def _read_array(field: Field, order: str) -> ReadPart:
-    name, extent = field.name, _extent(field, order)
-    dtype = np.dtype(order + PRIMITIVES[field.type_name])
-    size = dtype.itemsize
-    nothing = np.frombuffer(b"", dtype)
-
-    def read_bytes(data: Buffer, at: int, out: Message) -> int:
-        at, length = extent(data, at)
-        out[name] = data[at : at + length]
-        return at + length
-
-    def read_array(data: Buffer, at: int, out: Message) -> int:
-        at, length = extent(data, at)
-        out[name] = np.frombuffer(data, dtype, length, at) if length else nothing
-        return at + length * size
-
-    return read_bytes if field.type_name == "uint8" else read_array
-
-
-def _read_sequence(field: Field, order: str) -> ReadPart:
-    name, fixed = field.name, field.length
-    count = _counter(order, item_bytes=_least_bytes(field.type_name))
-    if field.type_name == "string":
-        text = _text(order)
-
-        def read_texts(data: Buffer, at: int, out: Message) -> int:
-            length, at = (fixed, at) if fixed else count(data, at)
-            out[name] = texts = []
+            if not length:
+                length, at = _count(data, at, order, _least_bytes(kind))
+            message[name] = items = []
             for _ in range(length):
-                item, at = text(data, at)
-                texts.append(item)
-            return at
+                item, at = _read_value(kind, data, at, order)
+                items.append(item)
+    return message, at
 
-        return read_texts
-    parts = reader_of(field.type_name, order)
 
-    def read_messages(data: Buffer, at: int, out: Message) -> int:
-        length, at = (fixed, at) if fixed else count(data, at)
-        out[name] = items = []
-        for _ in range(length):
-            item: Message = {}
-            for part in parts:
-                at = part(data, at, item)
-            items.append(item)
-        return at
+def _read_value(kind: str, data: memoryview, at: int, order: str) -> tuple[Any, int]:
+    code = PRIMITIVES.get(kind)
+    if code is not None:
+        layout = _LAYOUTS[order + code]
+        at += (ORIGIN - at) % layout.size
+        return layout.unpack_from(data, at)[0], at + layout.size
+    if kind == "string":
+        length, at = _count(data, at, order, 1)
+        return str(data[at : at + length], "utf-8").rstrip("\0"), at + length
+    return _read(kind, data, at, order)
 
-    return read_messages
+
+def _read_array(field: Field, data: memoryview, at: int, order: str) -> tuple[Any, int]:
+    code, length = PRIMITIVES[field.type_name], field.length or 0
+    size = _LAYOUTS[order + code].size
+    if not length:
+        length, at = _count(data, at, order, size)
+    if length:  # an empty sequence is not padded
+        at += (ORIGIN - at) % size
+    end = at + length * size
+    if end > len(data):
+        raise ValueError(f"array of {length} x {field.type_name} runs past the end")
+    if code == "B":
+        return data[at:end], end
+    return np.frombuffer(data[at:end], order + code), end
+
+
+def _count(data: memoryview, at: int, order: str, item_bytes: int) -> tuple[int, int]:
+    """Read a sequence's length, refusing one that cannot fit into the rest of the message."""
+    at += -at % 4
+    (length,) = _LAYOUTS[order + "I"].unpack_from(data, at)
+    if length * item_bytes > len(data) - at - 4:
+        raise ValueError(f"{length} items of {item_bytes} bytes or more run past the end")
+    return length, at + 4
 
 
 @cache
@@ -383,14 +222,10 @@ def decode(type_name: str, data: Buffer) -> Message:
         KeyError: When the type is none of ``ros2_definitions``.
     """
     order = _byte_order(type_name, data)
-    message: Message = {}
-    at, view = ORIGIN, memoryview(data)
     try:
-        for part in reader_of(type_name, order):
-            at = part(view, at, message)
+        return _read(type_name, memoryview(data), ORIGIN, order)[0]
     except (struct.error, ValueError) as error:
         raise MalformedMessageError(type_name=type_name, found=str(error)) from error
-    return message
 
 
 def _byte_order(type_name: str, data: Buffer) -> str:

@@ -15,7 +15,6 @@ from bridge.episode.mcap.format import (
     Payload,
     crc32,
     encoded,
-    joined_crc,
     num_bytes,
 )
 from bridge.episode.mcap.part_file import PartFile
@@ -95,7 +94,6 @@ class EncodedChunk:
     """A chunk record ready to be written."""
 
     buffers: list[Buffer]
-    crc: int
     entry: records.ChunkIndex
     """What the summary will say of it; where it lies is known when it is written."""
     index: Index
@@ -114,7 +112,6 @@ def chunk_of(
     size: int,
     crc: int,
     compression: str,
-    data_crc: int,
 ) -> EncodedChunk:
     """Make a chunk of records, packed or not; ``size`` and ``crc`` are of the records."""
     data_size = sum(map(num_bytes, data))
@@ -131,8 +128,7 @@ def chunk_of(
     )
     head = mcap_format.chunk_head(entry, crc)
     entry.chunk_length = len(head) + data_size
-    joined = joined_crc(crc32(head, 0), data_crc, data_size)
-    return EncodedChunk(buffers=[head, *data], crc=joined, entry=entry, index=index)
+    return EncodedChunk(buffers=[head, *data], entry=entry, index=index)
 
 
 class OpenChunk:
@@ -224,11 +220,11 @@ class OpenChunk:
         crc = 0
         for piece in pieces:
             crc = crc32(piece, crc)
-        data, packed_crc, compression = pieces, crc, ""
+        data, compression = pieces, ""
         if self._compressor is not None:
             packed = self._compressor.compress(pieces[0] if self._gather else b"".join(pieces))
             if len(packed) < self.size:
-                data, packed_crc, compression = [packed], crc32(packed, 0), "zstd"
+                data, compression = [packed], "zstd"
         made = chunk_of(
             data,
             self._index,
@@ -236,7 +232,6 @@ class OpenChunk:
             size=self.size,
             crc=crc,
             compression=compression,
-            data_crc=packed_crc,
         )
         self._clear()
         self.number += 1
@@ -259,16 +254,15 @@ class DataSection:
 
     def add_chunks(self, chunks: Sequence[EncodedChunk]) -> None:
         """Write chunks, each with its message indexes, all or none."""
-        start, crc = self.file.offset, self.file.crc
+        start = self.file.offset
         buffers: list[Buffer] = []
         places = []
         for chunk in chunks:
             indexes, offsets = index_records(chunk.index, start + chunk.length)
-            crc = crc32(indexes, joined_crc(crc, chunk.crc, chunk.length))
             buffers += [*chunk.buffers, indexes]
             places.append((chunk, start, offsets, len(indexes)))
             start += chunk.length + len(indexes)
-        self.file.append(buffers, crc=crc)
+        self.file.append(buffers)
         for place in places:
             self.book(*place)
 

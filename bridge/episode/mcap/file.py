@@ -1,9 +1,9 @@
 """One finished MCAP file: its summary, its metadata, and where its messages lie."""
 
 import zlib
-from array import array
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from mcap import records
 from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.data_walk import DataWalk
 from bridge.episode.mcap.format import (
     CHANNEL,
     FOOTER_FIELDS,
@@ -23,18 +24,12 @@ from bridge.episode.mcap.format import (
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
-    MessageHead,
     RecordSpan,
-    attachment_entry,
     attachment_of,
-    chunk_entry,
     message_head,
-    metadata_entry,
     parse,
-    parse_chunk,
     read_body,
     records_in,
-    unpack_chunk,
     walk,
 )
 from bridge.errors import EpisodeError
@@ -42,128 +37,31 @@ from bridge.errors import EpisodeError
 
 def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     """Read the whole data section once; every chunk is unpacked and its CRC checked."""
-    builder = _Builder()
-    for place in walk(stream, len(MAGIC), data_end):
-        builder.add(stream, place)
-    return builder.seen.to_summary()
+    found = DataWalk(stream, fault=_refuse, doubt=lambda text: None)
+    deque(found.messages(data_end), maxlen=0)
+    return found.seen.to_summary()
 
 
-@dataclass(kw_only=True)
-class Seen:
-    """What a walk through the data section found."""
-
-    schemas: dict[int, records.Schema] = field(default_factory=dict)
-    channels: dict[int, records.Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    start_ns: int | None = None
-    end_ns: int = 0
-    chunks: list[records.ChunkIndex] = field(default_factory=list)
-    """Of the chunks whose head can be read."""
-    num_chunks: int = 0
-    attachments: list[records.AttachmentIndex] = field(default_factory=list)
-    num_broken_attachments: int = 0
-    metadata: list[records.MetadataIndex] = field(default_factory=list)
-
-    def count(self, head: MessageHead) -> None:
-        """Take a message."""
-        self.counts[head.channel_id] = self.counts.get(head.channel_id, 0) + 1
-        if self.start_ns is None or head.log_time_ns < self.start_ns:
-            self.start_ns = head.log_time_ns
-        self.end_ns = max(self.end_ns, head.log_time_ns)
-
-    def define(self, place: RecordSpan, record: records.McapRecord | None) -> Iterator[str]:
-        """Take a schema, channel or metadata record; yields what is wrong with it."""
-        if isinstance(record, records.Metadata):
-            self.metadata.append(metadata_entry(place, record))
-        elif isinstance(record, records.Schema):
-            if record.id == 0:
-                yield "a schema has the id 0, which means none"
-            if self.schemas.setdefault(record.id, record) != record:
-                yield f"schema {record.id} is announced twice with different contents"
-        elif isinstance(record, records.Channel):
-            if record.schema_id and record.schema_id not in self.schemas:
-                yield f"channel {record.id} uses schema {record.schema_id}, not announced before"
-            if self.channels.setdefault(record.id, record) != record:
-                yield f"channel {record.id} is announced twice with different contents"
-
-    def to_summary(self) -> Summary:
-        """Make the summary that such a file should have."""
-        summary = Summary()
-        summary.schemas, summary.channels = self.schemas, self.channels
-        summary.chunk_indexes, summary.attachment_indexes = self.chunks, self.attachments
-        summary.metadata_indexes = self.metadata
-        summary.statistics = records.Statistics(
-            attachment_count=len(self.attachments),
-            channel_count=len(self.channels),
-            channel_message_counts=self.counts,
-            chunk_count=len(self.chunks),
-            message_count=sum(self.counts.values()),
-            message_start_time=self.start_ns or 0,
-            message_end_time=self.end_ns,
-            metadata_count=len(self.metadata),
-            schema_count=len(self.schemas),
-        )
-        return summary
-
-
-class _Builder:
-    def __init__(self) -> None:
-        self.seen = Seen()
-        self._chunk: records.ChunkIndex | None = None
-
-    def add(self, stream: ByteStream, place: RecordSpan) -> None:
-        """Take one record of the data section."""
-        if place.opcode == MESSAGE:
-            stream.seek(place.offset)
-            self._count(message_head(stream.read(MESSAGE_HEAD.size), 0, 0))
-        elif place.opcode == mcap_format.CHUNK:
-            self._add_chunk(stream, place)
-        elif place.opcode == mcap_format.ATTACHMENT:
-            found, data_size = attachment_of(stream, place, keep=False)
-            self.seen.attachments.append(attachment_entry(place, found, data_size))
-        else:
-            record = parse(place.opcode, read_body(stream, place))
-            if isinstance(record, records.MessageIndex) and self._chunk is not None:
-                self._chunk.message_index_offsets[record.channel_id] = place.offset
-                self._chunk.message_index_length += place.end - place.offset
-            self._define(place, record)
-        if place.opcode not in (mcap_format.CHUNK, mcap_format.MESSAGE_INDEX):
-            self._chunk = None
-
-    def _define(self, place: RecordSpan, record: records.McapRecord | None) -> None:
-        for fault in self.seen.define(place, record):
-            raise BrokenRecordError(fault)
-
-    def _count(self, head: MessageHead) -> None:
-        if head.channel_id not in self.seen.channels:
-            message = f"a message is of channel {head.channel_id}, which was never announced"
-            raise BrokenRecordError(message)
-        self.seen.count(head)
-
-    def _add_chunk(self, stream: ByteStream, place: RecordSpan) -> None:
-        chunk = parse_chunk(read_body(stream, place))
-        data = unpack_chunk(chunk, whose=f"the chunk at byte {place.offset}")
-        for opcode, at, length in records_in(data):
-            if opcode == MESSAGE:
-                self._count(message_head(data, at, at))
-            else:
-                body = at + RECORD_HEAD.size
-                inside = RecordSpan(opcode, at, length)
-                self._define(inside, parse(opcode, data[body : body + length]))
-        self._chunk = chunk_entry(place, chunk.head)
-        self.seen.chunks.append(self._chunk)
+def _refuse(text: str) -> None:
+    raise BrokenRecordError(text)
 
 
 _FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
 
 
-@dataclass
-class LooseMessages:
-    """Messages that lie outside chunks, in file order. 18 bytes of memory each."""
+LOOSE_BYTES = 4 << 20
+"""Messages outside chunks are read so many bytes at a time; one message may be larger."""
 
-    log_times_ns: array = field(default_factory=lambda: array("Q"))  # type: ignore[type-arg]
-    offsets: array = field(default_factory=lambda: array("Q"))  # type: ignore[type-arg]
-    channel_ids: array = field(default_factory=lambda: array("H"))  # type: ignore[type-arg]
+
+@dataclass(kw_only=True, slots=True)
+class LooseMessages:
+    """Messages outside chunks that lie one behind the other."""
+
+    start: int
+    end: int
+    first_ns: int
+    last_ns: int
+    channel_ids: set[int]
 
 
 def damaged(path: Path, error: BaseException) -> EpisodeError:
@@ -190,7 +88,7 @@ class McapFile:
                 summary = rebuild_summary(stream, self.data_end)
             self.summary = summary
             self.metadata = list(self._read_metadata(stream))
-        self._loose: LooseMessages | None = None
+        self._loose: list[LooseMessages] | None = None
 
     def _read_metadata(self, stream: ByteStream) -> Iterator[records.Metadata]:
         for entry in self.summary.metadata_indexes:
@@ -224,16 +122,11 @@ class McapFile:
         """Return the schema of a channel, or None where it has none."""
         return self.summary.schemas.get(channel.schema_id)
 
-    def loose(self) -> LooseMessages:
+    def loose(self) -> list[LooseMessages]:
         """Return the messages outside chunks; found once, between the records that are indexed."""
         if self._loose is None:
-            found = LooseMessages()
             with self.path.open("rb") as stream:
-                for start, end in self._gaps():
-                    for place in walk(stream, start, end):
-                        if place.opcode == MESSAGE:
-                            _note(stream, place, found)
-            self._loose = found
+                self._loose = [each for gap in self._gaps() for each in _loose_in(stream, *gap)]
         return self._loose
 
     def _gaps(self) -> Iterator[tuple[int, int]]:
@@ -252,12 +145,25 @@ class McapFile:
             yield at, self.data_end
 
 
-def _note(stream: ByteStream, place: RecordSpan, found: LooseMessages) -> None:
-    stream.seek(place.offset)
-    head = message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
-    found.log_times_ns.append(head.log_time_ns)
-    found.offsets.append(place.offset)
-    found.channel_ids.append(head.channel_id)
+def _loose_in(stream: ByteStream, start: int, end: int) -> Iterator[LooseMessages]:
+    found: LooseMessages | None = None
+    for place in walk(stream, start, end):
+        if place.opcode != MESSAGE:
+            continue
+        stream.seek(place.offset)
+        head = message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
+        at_ns = head.log_time_ns
+        if found is None or found.end < place.offset or place.end - found.start > LOOSE_BYTES:
+            if found is not None:
+                yield found
+            found = LooseMessages(
+                start=place.offset, end=place.end, first_ns=at_ns, last_ns=at_ns, channel_ids=set()
+            )
+        found.end = place.end
+        found.first_ns, found.last_ns = min(found.first_ns, at_ns), max(found.last_ns, at_ns)
+        found.channel_ids.add(head.channel_id)
+    if found is not None:
+        yield found
 
 
 def read_header(stream: ByteStream) -> records.Header:

@@ -14,14 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Int64, UInt16, UInt64
 from mcap import records
 
-from bridge.episode.mcap.file import McapFile, damaged
+from bridge.episode.mcap.file import LooseMessages, McapFile, damaged
 from bridge.episode.mcap.format import CHUNK, MESSAGE, MESSAGE_FIELDS, MESSAGE_HEAD, RECORD_HEAD
 from bridge.episode.mcap.walk import (
     DAMAGE,
     BrokenRecordError,
     ByteStream,
     MessageHead,
-    RecordSpan,
     message_head,
     parse_chunk,
     read_body,
@@ -155,14 +154,22 @@ class _OpenFile:
 
 
 class _Chunk:
-    """One chunk: where it lies and, once its time has come, what is wanted of it."""
+    """One chunk, or messages outside: where it lies and, in its time, what is wanted of it."""
 
-    def __init__(self, file: _OpenFile, index: records.ChunkIndex) -> None:
+    def __init__(
+        self,
+        file: _OpenFile,
+        place: records.ChunkIndex | LooseMessages,
+        *,
+        offset: int,
+        size: int,
+        next_ns: int,
+    ) -> None:
         self.file = file
-        self.index = index
-        self.offset: int = index.chunk_start_offset
-        self.size: int = index.uncompressed_size
-        self.next_ns: int = index.message_start_time
+        self.place = place
+        self.offset = offset
+        self.next_ns = next_ns
+        self.size = size
         self.is_done = False
         self._data = b""
         self._wanted: _Wanted | None = None
@@ -173,7 +180,13 @@ class _Chunk:
         return self._wanted is not None
 
     def load(self) -> None:
-        self._data, table = read_chunk(self.file.stream(), self.index, self.file.file.data_end)
+        stream = self.file.stream()
+        if isinstance(self.place, LooseMessages):
+            stream.seek(self.offset)
+            self._data = stream.read(self.size)
+            table = message_table(self._data)
+        else:
+            self._data, table = read_chunk(stream, self.place, self.file.file.data_end)
         self.size = len(self._data)
         self._wanted = _wanted_of(table, self.file)
         self._look_ahead()
@@ -233,54 +246,7 @@ def read_chunk(
     return data, message_table(data)
 
 
-class _Loose:
-    """The messages of a file that lie outside chunks, read one by one."""
-
-    size = 0
-    offset = 0
-    is_loaded = True
-
-    def __init__(self, file: _OpenFile) -> None:
-        self.file = file
-        found = file.file.loose()
-        times = np.array(found.log_times_ns, dtype=np.uint64)
-        wanted = file.wanted(times, np.array(found.channel_ids, dtype=np.uint16))
-        order = np.argsort(times[wanted], kind="stable")
-        self._times_ns = times[wanted][order]
-        self._offsets = np.array(found.offsets, dtype=np.uint64)[wanted][order]
-        self._position = 0
-        self.next_ns = 0
-        self.is_done = False
-        self._look_ahead()
-
-    def load(self) -> None:
-        """Nothing is held."""
-
-    def unload(self) -> None:
-        """Nothing is held."""
-
-    def _look_ahead(self) -> None:
-        self.is_done = self._position >= len(self._times_ns)
-        if not self.is_done:
-            self.next_ns = int(self._times_ns[self._position])
-
-    def take_until(self, limit_ns: int, wins_tie: bool) -> Iterator[tuple[MessageHead, bytes]]:
-        """Yield messages before the limit, or at it where this source comes first."""
-        stream = self.file.stream()
-        while not self.is_done and (
-            self.next_ns < limit_ns or (self.next_ns == limit_ns and wins_tie)
-        ):
-            offset = int(self._offsets[self._position])
-            self._position += 1
-            self._look_ahead()
-            stream.seek(offset)
-            head = message_head(stream.read(MESSAGE_HEAD.size), 0, offset)
-            payload_at = offset + MESSAGE_HEAD.size - RECORD_HEAD.size
-            yield head, read_body(stream, RecordSpan(MESSAGE, payload_at, head.length))
-
-
-_Source = _Chunk | _Loose
-_Entry = tuple[int, int, int, _Source]
+_Entry = tuple[int, int, int, _Chunk]
 """Log time, number of the file, offset: the order of messages; then where they come from."""
 
 
@@ -303,16 +269,23 @@ def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
             file.close()
 
 
-def _sources(file: _OpenFile) -> Iterable[_Source]:
-    if file.wanted_channels and file.file.loose().offsets:
-        loose = _Loose(file)
-        if not loose.is_done:
-            yield loose
+def _sources(file: _OpenFile) -> Iterable[_Chunk]:
+    for run in file.file.loose() if file.wanted_channels else ():
+        is_wanted = not file.wanted_channels.isdisjoint(run.channel_ids)
+        if is_wanted and file.select.overlaps(run.first_ns, run.last_ns):
+            size = run.end - run.start
+            yield _Chunk(file, run, offset=run.start, size=size, next_ns=run.first_ns)
     for index in file.file.summary.chunk_indexes:
         if not file.select.overlaps(index.message_start_time, index.message_end_time):
             continue
         if may_hold(index, file.wanted_channels):
-            yield _Chunk(file, index)
+            yield _Chunk(
+                file,
+                index,
+                offset=index.chunk_start_offset,
+                size=index.uncompressed_size,
+                next_ns=index.message_start_time,
+            )
 
 
 def may_hold(index: records.ChunkIndex, channel_ids: Set[int]) -> bool:
@@ -357,10 +330,10 @@ class _Held:
     """The chunks whose data is in memory."""
 
     def __init__(self) -> None:
-        self._sources: set[_Source] = set()
+        self._sources: set[_Chunk] = set()
         self._bytes = 0
 
-    def load(self, source: _Source) -> None:
+    def load(self, source: _Chunk) -> None:
         """Read a chunk, after those needed last made room for it."""
         while self._sources and self._bytes + source.size > MEMORY_BYTES:
             self.forget(max(self._sources, key=lambda held: held.next_ns))
@@ -368,7 +341,7 @@ class _Held:
         self._sources.add(source)
         self._bytes += source.size
 
-    def forget(self, source: _Source) -> None:
+    def forget(self, source: _Chunk) -> None:
         """Drop a chunk's data; it can be read again."""
         if source in self._sources:
             self._sources.remove(source)

@@ -42,7 +42,7 @@ class PartFile:
             raise
         return PartFile(path, descriptor)
 
-    def append(self, buffers: Sequence[Buffer], *, crc: int | None = None) -> None:
+    def append(self, buffers: Sequence[Buffer]) -> None:
         """Write one record or several, all or nothing.
 
         Raises:
@@ -56,11 +56,8 @@ class PartFile:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._descriptor, self.offset)
             raise
-        if crc is None:
-            crc = self.crc
-            for piece in buffers:
-                crc = crc32(piece, crc)
-        self.crc = crc
+        for piece in buffers:
+            self.crc = crc32(piece, self.crc)
         self.offset = offset
 
     def _write_all(self, buffers: Sequence[Buffer], offset: int) -> int:

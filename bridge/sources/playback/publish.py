@@ -102,7 +102,7 @@ class EpisodeSource:
         """Yield what is sent; the recorder's drop log stays out."""
         for item in self._latched_before():
             yield Due(self.start_ns, item)
-        for item in merged(self.episode.files, Selection(frozenset(self.topics), self.start_ns)):
+        for item in merged([self.episode.file], Selection(frozenset(self.topics), self.start_ns)):
             yield Due(item.log_time_ns, item)
 
     def _latched_before(self) -> Iterator[Stored]:
@@ -111,7 +111,7 @@ class EpisodeSource:
             return
         latched = frozenset(topic for topic in self.topics if is_latched(topic))
         last: dict[tuple[str, int], Stored] = {}
-        for item in merged(self.episode.files, Selection(latched, None, self.start_ns)):
+        for item in merged([self.episode.file], Selection(latched, None, self.start_ns)):
             topic = item.channel.topic
             last[topic, len(last) if topic == TF_STATIC else 0] = item
         yield from last.values()
@@ -122,8 +122,6 @@ class EpisodeSource:
         Returns:
             Messages sent in all and by topic, and how late they were [ms].
         """
-        for path in self.episode.missing_parts:
-            output.say(f"{path.name} is missing; what it held is not played")
         if cells := sorted({name.split("/")[1] for name in self.topics if name.count("/") > 1}):
             announce(session, *cells, has_clock=False)
         publishers = self._publishers(session)
@@ -135,7 +133,7 @@ class EpisodeSource:
                 if waited_s is None:
                     break
                 late_s.append(waited_s)
-                publisher = publishers[id(item.file), item.channel.id]
+                publisher = publishers[item.channel.id]
                 publisher.put(item.data, source_ns=min(item.publish_time_ns, LATEST_NS))
                 sent[item.channel.topic] += 1
                 advance(len(late_s), "")
@@ -147,26 +145,22 @@ class EpisodeSource:
             "late_ms": _lateness_ms(late_s),
         }
 
-    def _publishers(self, session: WireSession) -> dict[tuple[int, int], WirePublisher]:
-        """A publisher for each topic with one definition, by file and channel."""
+    def _publishers(self, session: WireSession) -> dict[int, WirePublisher]:
+        """A publisher for each topic with one definition, by channel."""
         made: dict[tuple[str, str, str], WirePublisher] = {}
-        found: dict[tuple[int, int], WirePublisher] = {}
-        for file in self.episode.files:
-            for channel in file.summary.channels.values():
-                if channel.topic not in self.topics:
-                    continue
-                record = file.schema_of(channel)
-                key = (channel.topic, record.name if record else "", channel.message_encoding)
-                if record is not None:
-                    self._define(session, record, channel.message_encoding)
-                if key not in made:
-                    made[key] = session.publisher(
-                        channel.topic,
-                        key[1],
-                        qos=Qos.PLAYBACK,
-                        message_encoding=key[2],
-                    )
-                found[id(file), channel.id] = made[key]
+        found: dict[int, WirePublisher] = {}
+        for channel in self.episode.file.summary.channels.values():
+            if channel.topic not in self.topics:
+                continue
+            record = self.episode.file.schema_of(channel)
+            key = (channel.topic, record.name if record else "", channel.message_encoding)
+            if record is not None:
+                self._define(session, record, channel.message_encoding)
+            if key not in made:
+                made[key] = session.publisher(
+                    channel.topic, key[1], qos=Qos.PLAYBACK, message_encoding=key[2]
+                )
+            found[channel.id] = made[key]
         return found
 
     def _define(self, session: WireSession, record: records.Schema, message_encoding: str) -> None:

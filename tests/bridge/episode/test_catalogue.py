@@ -69,7 +69,7 @@ def test_an_entry_says_what_the_episode_says(run: RunFolder) -> None:
     assert {name: getattr(entry, name) for name in about} == about
     assert (entry.file, entry.id, entry.outcome, entry.error) == ("t1.mcap", "t1", "success", "")
     assert (entry.start_ns, entry.duration_s, entry.messages) == (5, 2.0, 3)
-    assert (entry.size_bytes, entry.parts, entry.lost) == (path.stat().st_size, 1, 2)
+    assert (entry.size_bytes, entry.lost) == (path.stat().st_size, 2)
     assert not entry.recovered
 
 
@@ -91,9 +91,8 @@ def test_a_label_given_later_changes_the_row_at_once(run: RunFolder) -> None:
     assert find_episodes(run)[0].outcome == "success"
 
 
-def test_an_episode_of_which_a_part_was_recovered_counts_as_lossy(run: RunFolder) -> None:
-    write(run, "t1", lost=0)
-    with EpisodeWriter(run.episodes_dir / "t1.2.mcap") as writer:
+def test_an_episode_that_was_recovered_counts_as_lossy(run: RunFolder) -> None:
+    with EpisodeWriter(run.episodes_dir / "t1.mcap") as writer:
         writer.describe(EpisodeInfo(id="t1", kind="trial"))
         writer.add_metadata("recovered", {"reason": '"killed"'})
     write(run, "t2", lost=0)

@@ -113,33 +113,19 @@ def test_losses_the_ledger_does_not_list_are_named(tmp_path: Path) -> None:
     assert report.findings[0].text == "3 numbers are missing, the drop log lists 1"
 
 
-@pytest.mark.parametrize("is_recovered", [False, True])
-def test_what_a_pause_left_out_is_no_loss_and_nothing_else_is_excused(
-    tmp_path: Path, *, is_recovered: bool
+def test_what_an_earlier_editions_pause_left_out_is_not_judged_and_that_is_said(
+    tmp_path: Path,
 ) -> None:
-    second_ns = 1_000_000_000
-
     def fill(writer: EpisodeWriter) -> None:
-        write_joints(writer, [0, 1, 50, 51, 53, 90, 91], step_ns=second_ns)
-        for stamp_ns, kind in (
-            (1.5, "paused"),
-            (1.7, "resumed"),
-            (4.5, "paused"),
-            (4.9, "resumed"),
-        ):
-            event = {"schema_version": 1, "stamp_ns": int(stamp_ns * second_ns), "type": kind}
-            writer.write_json(
-                "/c/event", event, type_name=schema.EVENT, log_time_ns=event["stamp_ns"]
-            )
-        writer.write_json(DROPS, drops(JOINTS), type_name=schema.DROPS, log_time_ns=9 * second_ns)
-        if not is_recovered:
-            paused = [[3 * second_ns // 2, 17 * second_ns // 10], [9 * second_ns // 2] * 2, "x"]
-            writer.add_metadata("recorder", {"paused": json.dumps(paused)})
+        write_joints(writer, [0, 1, 50])
+        event = {"schema_version": 1, "stamp_ns": 1500, "type": "paused"}
+        writer.write_json("/c/event", event, type_name=schema.EVENT, log_time_ns=1500)
+        writer.write_json(DROPS, drops(JOINTS), type_name=schema.DROPS, log_time_ns=9000)
 
     report = check(tmp_path, fill)
-    assert report.undeclared_losses == 1
-    (found,) = (each for each in report.findings if each.name == "drops_not_logged")
-    assert (found.about, found.text) == (JOINTS, "1 numbers are missing, the drop log lists 0")
+    assert (report.undeclared_losses, report.exit_code) == (0, 0)
+    assert any("it was paused" in note for note in report.notes)
+    assert report.topics[JOINTS].sequence_gaps == 48
 
 
 def test_without_a_ledger_numbers_prove_nothing(tmp_path: Path) -> None:
@@ -206,7 +192,6 @@ def test_the_command_prints_everything_as_json(
     assert episode["state"] == "drops logged"
     assert episode["topics"][JOINTS]["sequence_gaps"] == 1
     assert episode["topics"][JOINTS]["messages"] == 2
-    assert episode["parts"] == [str(tmp_path / "e1.mcap")]
 
 
 def test_an_unfinished_file_named_alone_is_no_success(

@@ -13,11 +13,6 @@ from bridge.episode.mcap import format
 START = st.integers(0, 2**32 - 1)
 
 
-@given(a=st.binary(max_size=5000), b=st.binary(max_size=5000))
-def test_joined_crcs_are_the_crc_of_the_join(a: bytes, b: bytes) -> None:
-    assert format.joined_crc(zlib.crc32(a), zlib.crc32(b), len(b)) == zlib.crc32(a + b)
-
-
 @pytest.mark.parity
 @given(data=st.binary(max_size=700), start=START, skip=st.integers(0, 20))
 def test_any_start_length_and_place_in_memory_gives_zlibs_answer(

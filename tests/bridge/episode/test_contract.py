@@ -34,10 +34,10 @@ JOINTS = "/lab/joint_states"
 RULE = TopicRule(rate_hz=100.0, tolerance=0.2, silence_s=0.5)
 
 
-def seen(*stamps_s: float, pauses: tuple[tuple[int, int], ...] = ()) -> Presence:
+def seen(*stamps_s: float) -> Presence:
     presence = Presence()
     for stamp_s in stamps_s:
-        presence.see(round(stamp_s * NS_PER_S), pauses)
+        presence.see(round(stamp_s * NS_PER_S))
     return presence
 
 
@@ -47,9 +47,8 @@ def steady(start_s: float, end_s: float, rate_hz: float = 100.0) -> list[float]:
 
 def broken(
     presence: Presence | None, rule: TopicRule = RULE, *, end_s: float = 10.0, lost: int = 0,
-    pauses: tuple[tuple[int, int], ...] = (),
 ) -> list[str]:  # fmt: skip
-    span = Span(NS_PER_S, NS_PER_S + round(end_s * NS_PER_S), pauses)
+    span = Span(NS_PER_S, NS_PER_S + round(end_s * NS_PER_S))
     presences = {} if presence is None else {JOINTS: presence}
     return told(judge(presences, Contract(topics={JOINTS: rule}), span, {JOINTS: lost}), presences)
 
@@ -92,13 +91,6 @@ def test_a_required_topic_that_never_spoke_breaks_it_and_an_optional_one_does_no
     assert broken(None, TopicRule(rate_hz=100.0, silence_s=0.5, required=False)) == []
 
 
-def test_a_pause_is_no_silence() -> None:
-    pauses = ((4 * NS_PER_S, 7 * NS_PER_S),)
-    stamps = steady(1.0, 4.0) + steady(7.0, 11.0)
-    assert broken(seen(*stamps, pauses=pauses), pauses=pauses) == []
-    assert any("silent for 3.0 s" in text for text in broken(seen(*stamps)))
-
-
 @given(
     stamps=st.lists(st.integers(NS_PER_S, 20 * NS_PER_S), min_size=1, max_size=50).map(sorted),
     limit_s=st.floats(0.1, 5.0),
@@ -109,7 +101,7 @@ def test_a_silence_is_told_exactly_when_one_is_longer_than_allowed(
     """Law: compared with the differences of all stamps, ends included."""
     presence = Presence()
     for stamp in stamps:
-        presence.see(stamp, ())
+        presence.see(stamp)
     longest_ns = max(b - a for a, b in itertools.pairwise([NS_PER_S, *stamps, 21 * NS_PER_S]))
     found = broken(presence, TopicRule(silence_s=limit_s), end_s=20.0)
     assert bool(found) == (longest_ns / NS_PER_S > limit_s)

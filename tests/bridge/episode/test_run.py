@@ -1,10 +1,8 @@
-"""Which files of a run are episodes, and which are parts of one."""
+"""Which files of a run are episodes."""
 
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bridge.episode import run_folder
 from bridge.errors import PathNotFoundError, UsageError
@@ -19,25 +17,6 @@ def run_with(folder: Path, *names: str) -> run_folder.RunFolder:
 
 def listed(run: run_folder.RunFolder) -> list[str]:
     return [path.name for path in run.episodes()]
-
-
-def test_a_split_episode_is_listed_once_and_all_its_parts_are_found(tmp_path: Path) -> None:
-    names = [run_folder.part_name("t1", index) for index in range(1, 12)]
-    behind_a_gap = ["t3.mcap", "t3.3.mcap", "t3.4.mcap"]
-    run = run_with(tmp_path, *reversed(names), "t2.mcap", *behind_a_gap, "t4.10.mcap", "t4.2.mcap")
-    assert listed(run) == ["t1.mcap", "t2.mcap", "t3.mcap", "t4.2.mcap"]
-    groups = [names, ["t2.mcap"], behind_a_gap, ["t4.2.mcap", "t4.10.mcap"]]
-    assert [*run_folder.grouped_parts(run_folder.file_names(run.episodes_dir)).values()] == groups
-
-
-@pytest.mark.parametrize(
-    "name", ["t1.02.mcap", "t1.1.mcap", "t1.0.mcap", "t1.x.mcap", "a.b.2.mcap"]
-)
-def test_a_name_that_only_looks_like_a_part_stands_for_itself(tmp_path: Path, name: str) -> None:
-    run = run_with(tmp_path, "t1.mcap", "a.b.mcap", name)
-    assert name in listed(run)
-    groups = run_folder.grouped_parts(run_folder.file_names(run.episodes_dir))
-    assert [[first] for first in listed(run)] == [*groups.values()]
 
 
 def test_files_of_takes_still_open_are_no_episodes(tmp_path: Path) -> None:
@@ -59,14 +38,6 @@ def test_derived_files_are_found_by_a_pattern_and_unfinished_ones_are_told_apart
     assert [path.name for path in run.derived("*.replay.*")] == names[1:]
     assert run.derived("t1.*") == [run.derived_dir / name for name in names[:2]]
     assert run.unfinished() == [run.derived_dir / "t3.replay.planned.mcap.part"]
-
-
-@given(st.sets(st.integers(1, 12)))
-def test_every_file_belongs_to_exactly_one_episode(indices: set[int]) -> None:
-    names = [run_folder.part_name("a", index) for index in sorted(indices)]
-    assert list(run_folder.grouped_parts(names[::-1]).items()) == [
-        (name, names) for name in names[:1]
-    ]
 
 
 def test_a_file_is_not_called_missing(tmp_path: Path) -> None:

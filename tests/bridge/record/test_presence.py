@@ -134,7 +134,6 @@ def test_a_contract_decides_instead_of_habits(cell: Cell) -> None:
     ("happen", "cause"),
     [
         (lambda monitor: monitor.publisher("/lab/", is_there=False), "its publisher left"),
-        (lambda monitor: monitor.link_closed(), "a link closed"),
         (lambda monitor: monitor.publisher("/other/", is_there=False), ""),
     ],
 )

@@ -54,7 +54,7 @@ def outside(remote: Remote) -> list[Path]:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-@pytest.mark.parametrize("verb", ["start", "snapshot", "label", "info.cell", "recorder"])
+@pytest.mark.parametrize("verb", ["start", "label", "info.cell", "recorder"])
 def test_a_name_that_leads_elsewhere_is_refused(remote: Remote, verb: str, name: str) -> None:
     before = sorted(remote.around.rglob("*"))
     outcome = {"result": "success"}
@@ -62,7 +62,6 @@ def test_a_name_that_leads_elsewhere_is_refused(remote: Remote, verb: str, name:
         pytest.skip("an empty cell means: not said")
     requests: dict[str, tuple[str, dict[str, object]]] = {
         "start": ("start", {"id": name}),
-        "snapshot": ("snapshot", {"id": name}),
         "label": ("label", {"episode": name, "outcome": outcome}),
         "info.cell": ("start", {"id": "good", "info": {"cell": name}}),
         "recorder": ("start", {"id": "good", "path": name}),

@@ -18,8 +18,8 @@ TALKER = (
 def test_a_publisher_is_read() -> None:
     found = parse_token(TALKER)
     assert found is not None
-    assert (found.domain, found.node) == (2, "/talker")
-    assert (found.topic, found.type_name) == ("/chatter", "std_msgs/msg/String")
+    assert found.domain == 2
+    assert (found.topic, found.dds_type) == ("/chatter", "std_msgs::msg::dds_::String_")
     assert found.session == "8b20917502ee955ac4476e0266340d5c"
     assert not found.transient_local
     assert found.key == f"2/chatter/{STRING}/{STRING_HASH}"

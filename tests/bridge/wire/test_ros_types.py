@@ -9,7 +9,7 @@ import pytest
 from bridge.episode import schema
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.wire import rmw
-from bridge.wire.rmw import is_known_definition, ros_schema, type_hash_of
+from bridge.wire.rmw import ros_schema, type_hash_of
 
 # Printed by `ros2 topic info --verbose` of ROS 2 Jazzy and seen in keys of rmw_zenoh.
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -43,7 +43,7 @@ def test_our_own_definitions_have_the_fields_of_ros(name: str) -> None:
 def test_an_unknown_type_is_none(name: str) -> None:
     assert ros_schema(name) is None
     assert type_hash_of(name) is None
-    assert not is_known_definition(name, STRING_HASH)
+    assert ros_schema(name, type_hash=STRING_HASH) is None
 
 
 def test_an_older_definition_is_found_by_its_hash() -> None:
@@ -53,7 +53,7 @@ def test_an_older_definition_is_found_by_its_hash() -> None:
     changed = [
         each
         for each in old.fielddefs
-        if is_known_definition(each, old.hash_rihs01(each))
+        if ros_schema(each, type_hash=old.hash_rihs01(each)) is not None
         and type_hash_of(each) != old.hash_rihs01(each)
     ]
     assert changed, "no type of Foxy has changed since"

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
-from bridge.episode.reader import Episode, record_of
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import object_pose_topics, pose_track
 from bridge.episode.topics import TCP_POSE
@@ -83,7 +83,7 @@ def motion_of(episode: Episode) -> ScriptedMotion | None:
     """Read what an imported recording's arm was told; None for any other episode."""
     if episode.info.kind != "imported":
         return None
-    record = record_of(episode.files[0], RECORD_NAME)
+    record = episode.record(RECORD_NAME)
     return ScriptedMotion.from_record(record) if record else None
 
 

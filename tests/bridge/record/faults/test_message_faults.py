@@ -164,7 +164,7 @@ def test_an_episode_without_messages_is_whole(live: LiveCell) -> None:
     assert check_code(live.path("empty")) == 0
 
 
-VERBS = ("start", "stop", "mark", "label", "pause", "resume", "snapshot", "list", "status")
+VERBS = ("start", "stop", "mark", "label", "list", "status")
 GARBAGE = (
     b"\x00", b"\xff\xfe\xfd", b"{", b"null", b"[]", b"1e999", b'"text"', b"[" * 5000,
     b'{"id": 7}', b'{"id": null}', b'{"id": ["a"]}', b'{"id": {}}', b'{"id": "a/b"}',
@@ -192,7 +192,7 @@ def test_requests_of_rubbish_are_refused_and_cost_the_episode_nothing(live: Live
     assert (status["ok"], status["state"], status["episode"]) == (True, "recording", "asked")
     answer = live.stop()
     assert (answer["messages"], answer["lost"]) == (20, 0)
-    assert refused > 7 * len(GARBAGE)
+    assert refused > 4 * len(GARBAGE)
     assert check_code(live.path("asked")) == 0
     assert lost(ledger(live.path("asked"))["/cell/joint_states"]) == 0
 

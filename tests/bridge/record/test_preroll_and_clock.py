@@ -1,4 +1,4 @@
-"""Before, between and beside: pre-roll, pause, snapshot, split, clock steps."""
+"""Before and beside: pre-roll, clock steps."""
 
 import json
 import time
@@ -10,15 +10,12 @@ from patience import wait_until
 
 from bridge.clock import AnchoredClock, StepWatch
 from bridge.episode import schema
-from bridge.episode.check import check_episode
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
 from bridge.episode.topics import DROPS
-from bridge.errors import UsageError
 from bridge.record.config import RecorderConfig
-from bridge.record.errors import LifecycleError
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
 
@@ -101,65 +98,6 @@ def test_the_preroll_is_bounded_in_bytes(
         recorder.receive(make_sample(data=bytes([number]) * 100_000, type_name="x"))
     recorder.start(info())
     assert recorder.stop()["messages"] == 1_000_000 // 100_512
-
-
-def test_a_snapshot_writes_the_preroll_and_keeps_it(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    recorder = make_recorder(preroll_s=30.0)
-    sent = [make_sample() for _ in range(5)]
-    for sample in sent:
-        recorder.receive(sample)
-    for name in ("s1", "s2"):
-        assert recorder.snapshot(info(name))["messages"] == 5
-        assert data_of(episode_of(run, name)) == [sample.data for sample in sent]
-    recorder.start(info())
-    with pytest.raises(LifecycleError, match="'t1' is being recorded"):
-        recorder.snapshot(info("s3"))
-    assert recorder.stop()["messages"] == 5
-
-
-def test_without_a_preroll_there_is_no_snapshot(make_recorder: MakeRecorder) -> None:
-    with pytest.raises(LifecycleError, match="--preroll-s"):
-        make_recorder().snapshot(info())
-
-
-def test_a_pause_leaves_messages_out_and_calls_none_of_them_lost(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    recorder = make_recorder()
-    recorder.start(info())
-    kept = [make_sample(sequence=0)]
-    recorder.receive(kept[0])
-    recorder.pause()
-    assert recorder.status()["state"] == "paused"
-    for number in (1, 2, 5, 6):  # 3 and 4 are lost while nobody wants them
-        recorder.receive(make_sample(sequence=number))
-    recorder.receive(make_sample(topic="/tf_static", type_name=schema.TF_MESSAGE, sequence=0))
-    with pytest.raises(LifecycleError, match="paused already"):
-        recorder.pause()
-    recorder.resume()
-    with pytest.raises(LifecycleError, match="not paused"):
-        recorder.resume()
-    recorder.receive(make_sample(sequence=3))  # late: its gap was not counted
-    kept.append(make_sample(sequence=8))
-    recorder.receive(kept[-1])
-    answer = recorder.stop()
-    assert answer["lost"] == 1  # number 7
-    assert len(data_of(episode_of(run))) == 3
-    assert len(data_of(episode_of(run), "/tf_static")) == 1  # still true after the pause
-    found = events(episode_of(run))
-    assert [event["type"] for event in found] == ["paused", "resumed"]
-    span = [event["stamp_ns"] for event in found]
-    assert episode_of(run).metadata_records["recorder"]["paused"] == [span]
-    report = check_episode(run.episodes_dir / "t1.mcap")
-    assert (report.declared_losses, report.undeclared_losses, report.faults) == (1, 0, [])
-
-
-def test_a_start_beside_later_parts_is_refused(make_recorder: MakeRecorder, run: RunFolder) -> None:
-    (run.episodes_dir / "t1.2.mcap").write_bytes(b"")
-    with pytest.raises(UsageError, match=r"t1\.2\.mcap exists already"):
-        make_recorder().start(info())
 
 
 def test_a_step_of_the_system_clock_is_written_down_and_reorders_nothing(
