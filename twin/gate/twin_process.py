@@ -168,7 +168,8 @@ class TwinProcess(AbstractContextManager["TwinProcess"]):
         """Start it; it imports what it needs while the gate connects."""
         self._run_path, self._config, self._output = run_path, config, output
         self._closed = False
-        self._worker: Worker | None = self._start()
+        self._worker: Worker | None = None
+        self._start()
 
     def _start(self) -> Worker:
         worker = self._worker = Worker()

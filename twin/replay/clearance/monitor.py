@@ -173,8 +173,6 @@ happen before the next state is bounded: steps of up to twice as far need no sta
 _FINE_TRAVEL_M = 0.001
 """Motion between two states that is not looked into further: half of it is what may be missed."""
 _MAX_HALVINGS = 10
-_DIGITS = 6
-"""Of the points that a verdict keeps [m]."""
 
 
 Allowed = frozenset[frozenset[str]]
@@ -226,7 +224,7 @@ class ClearanceMonitor:
         self._contacts: dict[tuple[str, str, bool], list[Contact]] = {}
         self._last: _Look | None = None
         self._last_ns = 0
-        self._nearest: tuple[float, Pair, State] | None = None
+        self._nearest: tuple[float, Pair, int] | None = None
         self._first_centre: dict[str, Float[np.ndarray, " 3"]] = {}
 
     def measure(
@@ -357,7 +355,7 @@ class ClearanceMonitor:
             if counted_m < least_m:
                 least_m = counted_m
                 if self._nearest is None or counted_m < self._nearest[0]:
-                    self._nearest = (counted_m, pair, look.state)
+                    self._nearest = (counted_m, pair, t_ns)
         self._last_ns = t_ns
         return least_m
 
@@ -401,21 +399,11 @@ class ClearanceMonitor:
         return sorted(collected, key=lambda contact: (contact.start_ns, contact.bodies))
 
     def nearest(self) -> dict[str, Any] | None:
-        """Return where the smallest clearance so far was, as a verdict keeps it; None: nowhere.
-
-        ``t_ns``, ``distance_m``, ``bodies`` and ``p_m``, the nearest point of each, base frame.
-        """
+        """When and between what the smallest clearance so far was, as a verdict keeps it."""
         if self._nearest is None:
             return None
-        distance_m, pair, state = self._nearest
-        self.hulls.place(state.joints_rad, state.width_m)
-        points = self._around.closest_points(pair, state.Ts_base_object, state.nodes_m)
-        return {
-            "t_ns": state.t_ns,
-            "distance_m": distance_m,
-            "bodies": [pair[0], pair[2]],
-            "p_m": [[round(float(x), _DIGITS) for x in point] for point in points],
-        }
+        distance_m, (body, _, other, _), t_ns = self._nearest
+        return {"t_ns": t_ns, "distance_m": distance_m, "bodies": [body, other]}
 
     def _has_moved(self, name: str, T: Float[np.ndarray, "4 4"]) -> bool:
         start = self._scene.Ts_base_object[name]
