@@ -130,6 +130,7 @@ def findings_of(task: Task, rollout: Rollout, side: str) -> list[Any]:
             "object": finding.object_id,
             "value": finding.value,
             "detail": finding.detail,
+            "short_m": finding.short_m,
         }
         for finding in findings
     ]

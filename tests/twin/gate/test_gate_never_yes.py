@@ -158,8 +158,8 @@ def test_a_share_of_samples_that_is_asked_for_is_asked_for() -> None:
 
 
 def test_settings_with_which_no_gate_works_are_refused() -> None:
-    with pytest.raises(UsageError, match="--samples 16"):
-        GateConfig(min_p_success=0.5)
+    with pytest.raises(UsageError, match="leave --samples 0 out"):
+        GateConfig(min_p_success=0.5, samples=0)
     with pytest.raises(OptionError, match="--deadline-s"):
         GateConfig(deadline_s=-1.0)
 

@@ -46,22 +46,6 @@ def test_the_smallest_clearance_is_kept_with_when_and_between_what(script: Simpl
     assert nearest["bodies"][1] == "table"
 
 
-def test_the_wall_is_named_where_it_is_nearest(script: SimpleNamespace) -> None:
-    """19 mm straight up from its top, which is 0.056 m high, to the finger's."""
-    scene = script.scene()
-    monitor = monitor_of(script, scene, allowed_contacts=())
-    joints = joints_over(scene, 0.5 + 0.078, 0.19, 0.085)
-    monitor.measure(0, joints, 0.0, {})
-    nearest = monitor.nearest()
-    assert nearest is not None
-    assert nearest["bodies"][1] == "box"
-    assert nearest["distance_m"] == pytest.approx(0.075 - 0.056, abs=2e-5)
-    again = monitor_of(script, scene, allowed_contacts=())
-    again.measure(0, joints_over(scene, 0.6, 0.1, 0.3), 0.08, {})
-    again.measure(1, joints, 0.0, {})
-    assert again.nearest() == nearest | {"t_ns": 1}, "whatever was asked before"
-
-
 def test_the_margin_decides_between_close_and_too_close(script: SimpleNamespace) -> None:
     scene = script.scene()
     for tips_m, causes in ((0.0025, []), (0.0015, ["too_close"]), (-0.001, ["collision"])):
