@@ -52,7 +52,7 @@ class Verdict:
     """What does not change the verdict but a reader should know: the goal held before anything
     moved, a shape that was stood in for."""
     findings: tuple[dict[str, Any], ...] = ()
-    """What each predicate said: side (replayed or recorded), kind, object, value, detail."""
+    """What each predicate said, by side: kind, object, value, detail, short_m (the schema)."""
     checks: Mapping[str, Factor] = field(default_factory=dict)
     """Further factors, see docs/gate.md: start, task, limits, audit; absent: not asked for."""
     grasps: tuple[dict[str, Any], ...] = ()
