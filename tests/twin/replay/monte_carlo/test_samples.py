@@ -204,7 +204,7 @@ def test_samples_that_succeed_as_often_as_asked_seldom_decide_anything(share: fl
     chances, wrong = np.ones(1), 0.0
     for n in range(1, 201):
         chances = np.convolve(chances, [1 - share, share])
-        over = [decided(k, n, share) for k in range(n + 1)]
+        over = [decided(float(k), n, share) for k in range(n + 1)]
         wrong += chances[over].sum()
         chances[over] = 0.0
     assert wrong <= 0.05
