@@ -88,11 +88,11 @@ def answer(question: Question) -> Verdict:
         kept = limited_to_task(plan, scene.task)
         audited = audit(nominal, kept, scene, config)
         verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
-    # A yes that knows less than it might says so.
     verdict = replace(verdict, warnings=(*verdict.warnings, *scene.notes))
+    early = verdict.terminal.value is None  # else samples are replayed as all other replays are
     return with_samples(
         replace(verdict, reason=reason_of(verdict)),
-        lambda there, varied: replay_plan(plan, there, varied, refuse_early=True).verdict,
+        lambda there, varied: replay_plan(plan, there, varied, refuse_early=early).verdict,
         scene,
         replace(config, samples=min(config.samples, most_samples)),
         identity=plan.start_id or plan.id,
