@@ -206,7 +206,7 @@ def gate_of(stage: Stage, endpoint: str, log: Path) -> Iterator[Any]:
     from bridge.wire.session import open_session
 
     wire = WireConfig(mode="router", connect=(), listen=(endpoint,))
-    command = ["gate", str(stage.run), "--cell", CELL, "--connect", endpoint]
+    command = ["gate", str(stage.run), "--cell", CELL, "--connect", endpoint, "--samples", "0"]
     with open_session(wire) as cell, log.open("w") as said:
         process = subprocess.Popen(
             [sys.executable, "-m", "robot_gst", *command], cwd=ROOT, stdout=said, stderr=said

@@ -47,7 +47,7 @@ def gate(
 ) -> int:
     """Judge plans live over zenoh, before the robot moves; stop with Ctrl-C.
 
-    Example: robot-gst gate runs/today --cell standin --task cube_into_box --samples 16
+    Example: robot-gst gate runs/today --cell standin --task cube_into_box
 
     Args:
         run: Run folder with the rebuilt scene.

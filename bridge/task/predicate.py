@@ -59,6 +59,8 @@ class PredicateResult:
     value: bool | None
     detail: str
     object_id: str = ""
+    short_m: float | None = None
+    """How far it is from holding [m], negative where it holds; None: no length decides it."""
 
 
 def evaluate_success(task: Task, rollout: Rollout) -> list[PredicateResult]:
@@ -106,14 +108,14 @@ def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Predicat
         raise UsageError(f"success predicate {kind!r} is unknown. Known: {', '.join(_RULES)}.")
     asked = [] if kind == ALLOWED_CONTACTS else bodies_of(spec)
     lost = [key for key in asked if key not in rollout.Ts_base_object]
-    value, detail = (None, f"{lost[0]} was not localised") if lost else rule(spec, task, rollout)
-    return PredicateResult(
-        kind=kind, value=value, detail=detail, object_id=str(spec.get("object", ""))
-    )
+    found = (None, f"{lost[0]} was not localised") if lost else rule(spec, task, rollout)
+    value, detail, short_m = (*found, None)[:3]
+    name = str(spec.get("object", ""))
+    return PredicateResult(kind=kind, value=value, detail=detail, object_id=name, short_m=short_m)
 
 
-Found = tuple[bool | None, str]
-"""Whether a predicate holds, None where nobody can tell, and what was found."""
+Found = tuple[bool | None, str] | tuple[bool | None, str, float | None]
+"""Whether a predicate holds, None where nobody can tell, what was found, and how short it is."""
 
 
 def bodies_of(spec: Mapping[str, Any]) -> list[str]:
@@ -138,7 +140,8 @@ def _relation(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
         boxes[key] = box
     found = RELATIONS[spec["kind"]](spec, boxes)
     holds = all(bool(each.excess <= 0) for each in found)
-    return holds, said + "; ".join(each.told() for each in found)
+    short_m = max((float(each.excess) for each in found if each.unit == "m"), default=None)
+    return holds, said + "; ".join(each.told() for each in found), short_m
 
 
 def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
@@ -194,11 +197,8 @@ def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> 
     if not wrong:
         return True, "nothing touched what it may not touch"
     first = min(wrong, key=lambda contact: contact.start_ns)
-    detail = (
-        f"{first.bodies[0]} touched {first.bodies[1]} at {first.start_ns * 1e-9:.2f} s, "
-        f"{-first.min_distance_m * 1e3:.1f} mm deep"
-    )
-    return False, detail
+    told = f"{' touched '.join(first.bodies)} at {first.start_ns * 1e-9:.2f} s"
+    return False, f"{told}, {-first.min_distance_m * 1e3:.1f} mm deep"
 
 
 def objects_done(

@@ -52,15 +52,15 @@ class Verdict:
     """What does not change the verdict but a reader should know: the goal held before anything
     moved, a shape that was stood in for."""
     findings: tuple[dict[str, Any], ...] = ()
-    """What each predicate said: side (replayed or recorded), kind, object, value, detail."""
+    """What each predicate said, by side: kind, object, value, detail, short_m (the schema)."""
     checks: Mapping[str, Factor] = field(default_factory=dict)
     """Further factors, see docs/gate.md: start, task, limits, audit; absent: not asked for."""
     grasps: tuple[dict[str, Any], ...] = ()
     """What became of each grasp in the simulation: object, held (yes or no), and T_base_object,
     where it was at the end; a planner steers by them."""
     nearest: Mapping[str, Any] | None = None
-    """Where the smallest clearance was, of the pairs that may not touch: t_ns, distance_m, bodies,
-    and p_m, the nearest point of each in the base frame. None where nothing was measured."""
+    """Where the smallest clearance was, of the pairs that may not touch: t_ns, distance_m, bodies.
+    None where nothing was measured."""
     basis: Mapping[str, Any] | None = None
     """What a yes holds for: plan_sha256 of the bytes that were judged, joints_rad, objects (p_m and
     margin_m of each), judged_ns on the cell's clock, and valid_s from then on."""

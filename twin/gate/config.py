@@ -36,13 +36,11 @@ class GateConfig:
     deadline_s: Annotated[float, Parameter(name="--deadline", converter=convert_duration)] = 300.0
     """Last resort against what hangs: without an answer after this long on the wall clock (20s,
     5min or plain seconds) there is no verdict, and its reason names this limit."""
-    valid_s: Annotated[float, Parameter(parse=False)] = 5.0
-    """A yes holds for so long on the cell's clock, if neither the arm nor an object moves."""
     waiting: int = 4
     """Plans that may wait while one is judged; more are turned away at once."""
-    samples: int = 0
+    samples: int = 32
     """Varied replays behind each verdict, for its success probability: as many of them as fit into
-    --max-steps."""
+    --max-steps, and none once they decide whether more than --min-p-success succeed (0: half)."""
     min_p_success: float = 0.0
     """Refuse a plan that the nominal replay accepts when fewer of its samples succeed, as a
     fraction; 0 leaves the nominal replay alone to decide."""
@@ -61,7 +59,6 @@ class GateConfig:
             {
                 "max_steps": (1, 10**9),
                 "deadline_s": (0, day_s),
-                "valid_s": (0, 600),
                 "waiting": (0, 1000),
                 "samples": (0, 100_000),
                 "min_p_success": (0, 1),
@@ -69,6 +66,4 @@ class GateConfig:
             },
         )
         if self.min_p_success > 0 and self.samples == 0:
-            raise UsageError(
-                "--min-p-success needs samples to count: add, for example, --samples 16."
-            )
+            raise UsageError("--min-p-success needs samples to count: leave --samples 0 out.")

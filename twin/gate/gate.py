@@ -106,6 +106,8 @@ def _sigmas(item: Any) -> tuple[float, float]:
     return float(np.sqrt(np.trace(covariance[:3, :3]))), float(np.sqrt(covariance[5, 5]))
 
 
+VALID_S = 5.0
+"""A yes holds for so long on the cell's clock, if neither the arm nor an object moves."""
 ENGINE_NONE = "none"
 ROUNDING = 1e-9
 POLL_S = 0.05
@@ -377,7 +379,7 @@ class Gate:
             "joints_rad": start_rad.tolist(),
             "objects": objects,
             "judged_ns": self._perception.newest_ns(),
-            "valid_s": self._config.valid_s,
+            "valid_s": VALID_S,
             "scene_hash": verdict.scene_hash,
             "calibration_id": verdict.calibration_id,
         }
@@ -451,7 +453,7 @@ class Gate:
         told = f"{p['k']:g} of {p['n']:g} varied replays succeed"
         if abs(p["value"] - p["k"] / p["n"]) > ROUNDING:
             told += f", and with what this session's trials say of them {p['value']:.0%} would"
-        detail = f"{told}, {wanted:.0%} are asked for"
+        detail = "; ".join(filter(None, (f"{told}, {wanted:.0%} are asked for", verdict.reason)))
         unlikely = Factor(value=False, cause=Cause.PROBABILITY, detail=detail)
         return replace(
             verdict, terminal=unlikely, reason=f"terminal: {Cause.PROBABILITY}: {detail}"

@@ -22,6 +22,9 @@ from twin.gate.gate import UndecidedError
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
 
+SOFT = 2
+"""A sample costs as much as so many more rigid ones for each soft object in it."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Question:
@@ -35,6 +38,8 @@ class Question:
     config: ReplayConfig
     max_steps: int
     """Simulated steps, the samples' among them."""
+    until: float | None = None
+    """Samples end once it is decided whether more than this share of them succeed."""
     any_robot: bool = False
     """The scene may be another robot's, for somebody named the robot (``--robot``)."""
 
@@ -74,7 +79,8 @@ def answer(question: Question) -> Verdict:
     run, plan = RunFolder.open(question.run_path), question.plan
     scene = _scene_of(question, run)
     config = for_task(question.config, read_calibration(run), question.seen.task)
-    most_samples = question.max_steps // _steps_of(question, config) - 1
+    steps, costs = _steps_of(question, config), 1 + SOFT * len(scene.task.soft_objects)
+    most_samples = (question.max_steps - steps) // (steps * costs)
 
     nominal = replay_plan(plan, scene, config, refuse_early=True)
     verdict = nominal.verdict
@@ -82,26 +88,21 @@ def answer(question: Question) -> Verdict:
         kept = limited_to_task(plan, scene.task)
         audited = audit(nominal, kept, scene, config)
         verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
-        verdict = replace(verdict, reason=reason_of(verdict))
-    verdict = with_samples(
-        verdict,
-        lambda there, varied: replay_plan(plan, there, varied, refuse_early=True).verdict,
+    verdict = replace(verdict, warnings=(*verdict.warnings, *scene.notes))
+    early = verdict.terminal.value is None  # else samples are replayed as all other replays are
+    return with_samples(
+        replace(verdict, reason=reason_of(verdict)),
+        lambda there, varied: replay_plan(plan, there, varied, refuse_early=early).verdict,
         scene,
         replace(config, samples=min(config.samples, most_samples)),
         identity=plan.start_id or plan.id,
+        until=question.until,
     )
-    if not scene.notes:
-        return verdict
-    warnings = (*verdict.warnings, *scene.notes)  # a yes that knows less than it might says so
-    return replace(verdict, warnings=warnings, reason=verdict.reason or warnings[0])
 
 
 def _scene_of(question: Question, run: RunFolder) -> ReplayScene:
     """Where the plan is tried."""
-    from twin.replay.rebuilt_scene import (  # noqa: PLC0415
-        read_rebuilt_scene,
-        scene_of_other_robot,
-    )
+    from twin.replay.rebuilt_scene import read_rebuilt_scene, scene_of_other_robot  # noqa: PLC0415
 
     plan = question.plan
     other = "" if question.any_robot else scene_of_other_robot(run, plan.robot)
@@ -152,13 +153,14 @@ def _asked(gate: GateConfig, run_path: Path, plan: Plan, seen: ReplayScene) -> Q
         seen=seen,
         config=config,
         max_steps=gate.max_steps,
+        until=gate.min_p_success or 0.5,
         any_robot=bool(gate.robot),
     )
 
 
 def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
-    """Judge here as a gate does in its own process; UndecidedError: a replay has too many steps."""
-    return lambda plan: answer(_asked(GateConfig(), run_path, plan, scene))
+    """Judge here as a gate does without samples; UndecidedError: a replay has too many steps."""
+    return lambda plan: answer(_asked(GateConfig(samples=0), run_path, plan, scene))
 
 
 class TwinProcess(AbstractContextManager["TwinProcess"]):
@@ -168,7 +170,8 @@ class TwinProcess(AbstractContextManager["TwinProcess"]):
         """Start it; it imports what it needs while the gate connects."""
         self._run_path, self._config, self._output = run_path, config, output
         self._closed = False
-        self._worker: Worker | None = self._start()
+        self._worker: Worker | None = None
+        self._start()
 
     def _start(self) -> Worker:
         worker = self._worker = Worker()

@@ -243,7 +243,11 @@ def free_start(scene: ReplayScene, soft: Mapping[str, SoftShape]) -> ReplayScene
     shapes = {
         name: convex_hull(outline_m(scene.task.objects[name], soft.get(name))) for name in movable
     }
-    fixed = _fixed_solids(scene)
+    fixed = [
+        _Solid(name, coal.Box(*extents), T_base_panel, fixed=True)
+        for name, T in scene.containers().items()
+        for T_base_panel, extents in placed_panels(scene.task.objects[name], T)
+    ]
     moved = {name: T.copy() for name, T in movable.items()}
     for _ in range(ROUNDS):
         solids = [_Solid(n, shapes[n], T, soft=n in soft) for n, T in moved.items()]
@@ -280,14 +284,6 @@ def _separate(
                 moved[other.name][:3, 3] += share * (depth + GAP_M) * normal
             anything = True
     return anything
-
-
-def _fixed_solids(scene: ReplayScene) -> list[_Solid]:
-    return [
-        _Solid(name, coal.Box(*extents), T_base_panel, fixed=True)
-        for name, T in scene.containers().items()
-        for T_base_panel, extents in placed_panels(scene.task.objects[name], T)
-    ]
 
 
 def _overlap(first: _Solid, second: _Solid) -> tuple[float, Float[np.ndarray, "3"]]:

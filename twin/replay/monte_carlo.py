@@ -6,7 +6,8 @@ order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
 """
 
 import hashlib
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxtyping import Float
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
-from bridge.task.verdict import Verdict
+from bridge.task.verdict import Factor, Verdict
 from twin.physics.unseen import Unseen
 from twin.replay.config import (
     UNKNOWN_POSE_M,
@@ -189,6 +190,8 @@ def _moved(
 
 
 LEVEL = 0.95
+NEAR_M = 0.01
+"""Samples that miss their goal by no more might succeed with a little more."""
 
 
 def with_samples(
@@ -198,43 +201,86 @@ def with_samples(
     config: ReplayConfig,
     *,
     identity: str,
+    until: float | None = None,
 ) -> Verdict:
     """Add the share of ``config.samples`` varied replays that succeed, with its Wilson interval.
 
     A sample that could not be decided or replayed counts among those that were not accepted. Where
     there is a posterior, each sample counts with the chance that its answer is right in this
-    session. UsageError for kinematic replays, which move no objects.
+    session. A yes also gets what decides it as its reason. UsageError for kinematic replays, which
+    move no objects.
+
+    Args:
+        until: Stop once it is decided whether more or fewer than this share succeed.
     """
-    n = config.samples
-    if not n:
+    if not config.samples:
         return verdict
     if config.mode != "dynamic":
         message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
         raise UsageError(message)
     from scipy.stats import norm  # noqa: PLC0415  # half a second, and only with samples
 
-    accepted = [_accepts(replay, scene, config, identity, index) for index in range(n)]
-    k = sum(accepted)
-    value = sum(_probability(yes, config, index) for index, yes in enumerate(accepted)) / n
+    samples: list[Verdict] = []
+    total = 0.0
+    while (n := len(samples)) < config.samples:
+        if until is not None and decided(total, n, until):
+            break
+        rng = sample_rng(config.seed, identity, n)
+        try:
+            samples.append(replay(*draw_variation(rng, scene, config, index=n)))
+        except GstError:  # this variation cannot be replayed; the others can
+            samples.append(replace(verdict, terminal=Factor(value=None), findings=()))
+        total += _probability(samples[n].accepted is True, config, n)
+    k = sum(sample.accepted is True for sample in samples)
+    value = total / n
     z = float(norm.ppf(0.5 + LEVEL / 2))
     centre = (value + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * float(np.sqrt(value * (1 - value) / n + (z / (2 * n)) ** 2))
     low, high = max(0.0, min(centre - half, value)), min(1.0, max(centre + half, value))
-    return replace(verdict, p_success={"value": value, "low": low, "high": high, "k": k, "n": n})
+    verdict = replace(verdict, p_success={"value": value, "low": low, "high": high, "k": k, "n": n})
+    if verdict.accepted is not True:
+        return verdict
+    why = (verdict.reason, *_what_decides(verdict, samples))
+    return replace(verdict, reason="; ".join(filter(None, why)) or None)
 
 
-def _accepts(
-    replay: Callable[[ReplayScene, ReplayConfig], Verdict],
-    scene: ReplayScene,
-    config: ReplayConfig,
-    identity: str,
-    index: int,
-) -> bool:
-    rng = sample_rng(config.seed, identity, index)
-    try:
-        return replay(*draw_variation(rng, scene, config, index=index)).accepted is True
-    except GstError:  # this variation cannot be replayed; the others can
-        return False
+def decided(total: float, n: int, share: float) -> bool:
+    """Whether ``total`` of n succeed more or less often than a share: wrong once in 20, ever.
+
+    How likely they are on average over all shares, against how likely at this one: at this one it
+    is a martingale, which ever exceeds 20 once in 20 (Ville 1939; Robbins 1970).
+    """
+    from scipy.special import betaln, xlog1py, xlogy  # noqa: PLC0415
+
+    likely = xlogy(total, share) + xlog1py(n - total, -share)
+    return bool(betaln(total + 1, n - total + 1) - likely >= np.log(1 / (1 - LEVEL)))
+
+
+def _what_decides(verdict: Verdict, samples: Sequence[Verdict]) -> Iterator[str]:
+    """The goal that is nearest to its edge, what a little more would bring, and what else fails."""
+    failed = [each for each in samples if each.accepted is not True]
+    lengths = [item for item in verdict.findings if item.get("short_m") is not None]
+    if lengths:
+        goal = max(lengths, key=lambda item: item["short_m"])
+        yield f"{goal['detail']}, {-goal['short_m'] * 1e3:.0f} mm to spare"
+        missed_m = [_missed_m(each, verdict.findings.index(goal)) for each in failed]
+        near_m = [m for m in missed_m if m <= NEAR_M]
+        failed = [each for each, m in zip(failed, missed_m, strict=True) if m > NEAR_M]
+        if near_m:
+            told = f"with {np.ceil(max(near_m) * 1e3):.0f} mm more {len(samples) - len(failed)}"
+            yield f"{told} of {len(samples)} varied replays would succeed"
+    causes = Counter(
+        each.factors()[each.first_failing].cause if each.first_failing else "having no answer"
+        for each in failed
+    )
+    yield from (f"{times} fail by {cause}" for cause, times in causes.most_common(1))
+
+
+def _missed_m(sample: Verdict, goal: int) -> float:
+    """By how much a sample missed a goal [m]; infinite where anything else failed."""
+    wrong = [place for place, item in enumerate(sample.findings) if item["value"] is False]
+    alone = sample.first_failing == "terminal" and wrong == [goal]
+    return float(sample.findings[goal]["short_m"]) if alone else np.inf
 
 
 def _probability(accepted: bool, config: ReplayConfig, index: int) -> float:

@@ -17,7 +17,6 @@ from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, GstError
 from bridge.robots.robot import Robot, read_robot, robot_of
 from bridge.task.plan import Plan
-from bridge.task.predicate import evaluate_success
 from bridge.task.verdict import SAME_ENGINE, Verdict, is_same_engine
 from twin.replay.config import ReplayConfig
 from twin.replay.divergence import diverge
@@ -292,10 +291,7 @@ def compare(
     task = job.task
     findings = {
         "executed": _findings(findings_of(task, result, "replayed")),
-        "recorded": {
-            (finding.kind, finding.object_id): finding.value
-            for finding in evaluate_success(task, states_of_recording(recording, robot))
-        },
+        "recorded": _findings(findings_of(task, states_of_recording(recording, robot), "recorded")),
     }
     planned = _planned(job, recording)
     if planned is not None:

@@ -130,6 +130,7 @@ def findings_of(task: Task, rollout: Rollout, side: str) -> list[Any]:
             "object": finding.object_id,
             "value": finding.value,
             "detail": finding.detail,
+            "short_m": finding.short_m,
         }
         for finding in findings
     ]
@@ -166,7 +167,8 @@ def replay_plan(
             path itself must then keep clear, too.
     """
     robot = load_robot(scene.urdf)
-    free = posture_clearance(scene, hulls_of(robot), config)
+    open_ = any(waypoint.joints_rad is None for waypoint in plan.tau)
+    free = posture_clearance(scene, hulls_of(robot), config) if open_ else None
     path, failures, unreachable_ns = path_of_plan(
         plan, robot, clearance=free, start_rad=scene.start_rad
     )

@@ -7,16 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gate_fakes import (
-    HOME,
-    PLAN,
-    URDF,
-    FakePerception,
-    accept,
-    found,
-    gate_with,
-    raising,
-)
+from gate_fakes import HOME, PLAN, URDF, FakePerception, accept, found, gate_with, raising
 
 from bridge.task.find import chosen_task_file, find_task_file
 from bridge.task.plan import Plan

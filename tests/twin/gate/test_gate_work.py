@@ -100,10 +100,11 @@ NOMINAL_STEPS = 60 + 240
 """A plan that stands settles for 0.25 s before and 1 s after, at 240 Hz."""
 
 
-@pytest.mark.parametrize(("more_steps", "count"), [(0, 0), (299, 0), (300, 1), (1500, 5)])
+@pytest.mark.parametrize(("more_steps", "count"), [(0, 0), (899, 0), (900, 1), (4500, 5)])
 def test_as_many_samples_are_run_as_fit_into_the_steps_on_any_machine(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch, more_steps: int, count: int
 ) -> None:
+    """One with a soft object costs as much as three rigid ones."""
     question = question_of(
         run, config=ReplayConfig(samples=5), max_steps=NOMINAL_STEPS + more_steps
     )

@@ -25,7 +25,7 @@ SEEN_NS = 5_000_000_000
 
 def verdict(plan: Plan, accepted: bool) -> Verdict:
     terminal = Factor(value=accepted, cause=None if accepted else "inside", bodies=("cube", "box"))
-    nearest = {"t_ns": 0, "distance_m": 0.1, "bodies": ["gripper", "box"], "p_m": [[0.0] * 3] * 2}
+    nearest = {"t_ns": 0, "distance_m": 0.1, "bodies": ["gripper", "box"]}
     return verdict_of(plan.id, terminal=terminal, nearest=nearest)
 
 

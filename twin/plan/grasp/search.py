@@ -74,6 +74,8 @@ DEPTHS_M = (0.0, -0.005, 0.012)
 PREGRASP_M = 0.08
 ROBOT_ERROR_M = 0.0015
 """Standard deviation of the tool in any direction."""
+CLEARANCE_M = 0.003
+"""Between each pad and the object, and between the hand and anything else."""
 SEED = 0
 
 
@@ -83,8 +85,6 @@ class GraspConfig:
 
     samples: int = 800
     """Points of the surface that closing lines start from."""
-    clearance_m: float = 0.003
-    """Between each pad and the object, and between the hand and anything else [m]."""
     least_margin: float = 1.0
     """Standard deviations that a grasp must bear."""
     most: int = 60
@@ -157,9 +157,9 @@ class GraspSearcher:
         pairs, rejected = self._pairs(object_id)
         found = self._hands_on(pairs, T, rejected)
         points = self._surface(object_id).points(_TARGET_POINTS, SEED)[0]
-        table_m = self.problem.scene.table_height_m + self.config.clearance_m
+        table_m = self.problem.scene.table_height_m + CLEARANCE_M
         found.keep(self._hand.lowest_m(T @ found.lines.Ts_object_tcp) >= table_m, "table")
-        hits = self._hand.hits(in_tools(found.lines, points), self.config.clearance_m / 2)
+        hits = self._hand.hits(in_tools(found.lines, points), CLEARANCE_M / 2)
         fingers = hits["fingers"][~hits["palm"]]
         found.keep(~hits["palm"], "palm")
         found.keep(~fingers, "fingers")
@@ -233,7 +233,7 @@ class GraspSearcher:
             return pairs.chosen(mask)
 
         pairs = keep(pairs, pairs.cosines >= np.cos(CONE_RAD), "cone")
-        pairs = keep(pairs, pairs.widths_m <= self._hand.open_m - 2 * config.clearance_m, "width")
+        pairs = keep(pairs, pairs.widths_m <= self._hand.open_m - 2 * CLEARANCE_M, "width")
         seen = pairs.lowest_m >= shape.trusted_from_m
         if np.isfinite(shape.trusted_from_m):
             seen &= pairs.downward <= _UNDERSIDE
@@ -277,7 +277,7 @@ class GraspSearcher:
             if name == object_id:
                 continue
             sigma_m = float(np.sqrt(np.abs(np.diag(self._covariance(name))[:3]).max()))
-            margin_m = self.config.clearance_m + sigma_m
+            margin_m = CLEARANCE_M + sigma_m
             points = self._surface(name).points(_NEIGHBOUR_POINTS, SEED)[0]
             points = in_tools(found.lines, se3.apply(T_object_base @ T, points))
             hits = self._hand.hits(points, margin_m)

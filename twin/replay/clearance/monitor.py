@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.robots.robot import Gripper
 from bridge.task.causes import Cause
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
@@ -173,8 +172,6 @@ happen before the next state is bounded: steps of up to twice as far need no sta
 _FINE_TRAVEL_M = 0.001
 """Motion between two states that is not looked into further: half of it is what may be missed."""
 _MAX_HALVINGS = 10
-_DIGITS = 6
-"""Of the points that a verdict keeps [m]."""
 
 
 Allowed = frozenset[frozenset[str]]
@@ -204,7 +201,6 @@ class ClearanceMonitor:
         self.config = config
         self.hulls = hulls
         self._allowed_at = allowed_at(plan.stages)
-        self._gripper = hulls.robot.record.gripper
         self.failures: list[Failure] = []
         self._scene = scene
         self._around = Surroundings(scene, hulls, config.eps_col_m)
@@ -220,13 +216,16 @@ class ClearanceMonitor:
         }
         self.lacking_m: dict[tuple[str, ...], float] = {}  # of bodies: how much farther apart
         self._late_m = np.zeros(len(self._links))
-        self._hand = [k for k, s in enumerate(self._links) if s.body in self._gripper.links]
+        # The most by which a pair must keep more than ``eps_col_m``.
+        self._more_m = max(self._sigma_m.values(), default=0.0)
+        gripper = hulls.robot.record.gripper
+        self._hand = [k for k, s in enumerate(self._links) if s.body in gripper.links]
         self._object_late_m: dict[str, float] = {}
         self._reach = Reach(hulls)
         self._contacts: dict[tuple[str, str, bool], list[Contact]] = {}
         self._last: _Look | None = None
         self._last_ns = 0
-        self._nearest: tuple[float, Pair, State] | None = None
+        self._nearest: tuple[float, Pair, int] | None = None
         self._first_centre: dict[str, Float[np.ndarray, " 3"]] = {}
 
     def measure(
@@ -276,6 +275,8 @@ class ClearanceMonitor:
             if name in places
         }  # a leap is no speed
         self._object_late_m = {n: m * share for n, m in steps.items() if m <= MAX_LEAP_M}
+        late_m = max([float(self._late_m.max()), *self._object_late_m.values()])
+        self._more_m = min(late_m, MAX_LEAP_M) + max(self._sigma_m.values(), default=0.0)
 
     def least_m(self, pair: Pair) -> float:
         """How far a pair that may not touch must be apart now: farther when it is fast."""
@@ -292,17 +293,12 @@ class ClearanceMonitor:
         distances, cut = self._around.measure(
             state.Ts_base_object,
             moved,
-            near_m=self.config.eps_col_m + self._more_m() + _LOOK_AHEAD_M,
-            counts=lambda body, other: not _may_touch(body, other, allowed, self._gripper),
+            near_m=self.config.eps_col_m + self._more_m + _LOOK_AHEAD_M,
+            counts=lambda body, other: not _may_touch(body, other, allowed, self.hulls.robot),
         )
         distances |= self._around.measure_nodes(self._links, state.nodes_m, soft)
         centres = np.matmul(self.hulls.rotations, self._centres)[:, :, 0] + self.hulls.translations
         return _Look(state, distances, cut, allowed, centres)
-
-    def _more_m(self) -> float:
-        """The most by which a pair must keep more than ``eps_col_m``."""
-        late_m = max([float(self._late_m.max()), *self._object_late_m.values()])
-        return min(late_m, MAX_LEAP_M) + max(self._sigma_m.values(), default=0.0)
 
     def _between(self, a: _Look, b: _Look, halvings: int) -> list[_Look]:
         """States between two that must be measured because the bound allows a touch."""
@@ -321,7 +317,7 @@ class ClearanceMonitor:
         farthest = float(links_m.max()) + max(
             (travel for travel in objects_m.values() if travel <= MAX_LEAP_M), default=0.0
         )
-        most_m = self.config.eps_col_m + self._more_m()
+        most_m = self.config.eps_col_m + self._more_m
         if farthest <= _FINE_TRAVEL_M:
             return False  # objects that leapt are nobody's way
         if a.cut_m + b.cut_m - farthest < 2 * most_m:
@@ -337,7 +333,7 @@ class ClearanceMonitor:
             if max(objects_m.get(body, 0.0), objects_m.get(other, 0.0)) > MAX_LEAP_M:
                 continue
             limit = eps
-            if any(_may_touch(body, other, look.allowed, self._gripper) for look in (a, b)):
+            if any(_may_touch(body, other, look.allowed, self.hulls.robot) for look in (a, b)):
                 # Objects push each other and the fingers; only what stands still can be run into.
                 if piece < 0 or other in objects_m:
                     continue
@@ -357,7 +353,7 @@ class ClearanceMonitor:
             if counted_m < least_m:
                 least_m = counted_m
                 if self._nearest is None or counted_m < self._nearest[0]:
-                    self._nearest = (counted_m, pair, look.state)
+                    self._nearest = (counted_m, pair, t_ns)
         self._last_ns = t_ns
         return least_m
 
@@ -401,21 +397,11 @@ class ClearanceMonitor:
         return sorted(collected, key=lambda contact: (contact.start_ns, contact.bodies))
 
     def nearest(self) -> dict[str, Any] | None:
-        """Return where the smallest clearance so far was, as a verdict keeps it; None: nowhere.
-
-        ``t_ns``, ``distance_m``, ``bodies`` and ``p_m``, the nearest point of each, base frame.
-        """
+        """When and between what the smallest clearance so far was, as a verdict keeps it."""
         if self._nearest is None:
             return None
-        distance_m, pair, state = self._nearest
-        self.hulls.place(state.joints_rad, state.width_m)
-        points = self._around.closest_points(pair, state.Ts_base_object, state.nodes_m)
-        return {
-            "t_ns": state.t_ns,
-            "distance_m": distance_m,
-            "bodies": [pair[0], pair[2]],
-            "p_m": [[round(float(x), _DIGITS) for x in point] for point in points],
-        }
+        distance_m, (body, _, other, _), t_ns = self._nearest
+        return {"t_ns": t_ns, "distance_m": distance_m, "bodies": [body, other]}
 
     def _has_moved(self, name: str, T: Float[np.ndarray, "4 4"]) -> bool:
         start = self._scene.Ts_base_object[name]
@@ -430,7 +416,7 @@ class ClearanceMonitor:
     def _judge(self, t_ns: int, pair: Pair, distance: float, allowed: Allowed) -> float:
         """Note a pair that is too close; returns its distance if the pair may not touch."""
         body, _, other, _ = pair
-        may_touch = _may_touch(body, other, allowed, self._gripper)
+        may_touch = _may_touch(body, other, allowed, self.hulls.robot)
         if distance < self.config.eps_col_m:
             self._note(t_ns, (body, other), distance, may_touch)
         if may_touch:
@@ -515,5 +501,6 @@ def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:
 
 
 @lru_cache(maxsize=4096)
-def _may_touch(body: str, other: str, allowed: Allowed, gripper: Gripper) -> bool:
-    return any(frozenset((name, other)) in allowed for name in names_of(body, gripper))
+def _may_touch(body: str, other: str, allowed: Allowed, robot: RobotModel) -> bool:
+    names = names_of(body, robot.record.gripper)
+    return any(frozenset((name, other)) in allowed for name in names)

@@ -7,9 +7,7 @@ from functools import lru_cache
 import coal
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
 
-from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from twin.replay.clearance.bodies import (
     SCENE,
@@ -26,13 +24,10 @@ from twin.replay.clearance.bodies import (
     solid_of,
 )
 from twin.replay.clearance.bounding_spheres import (
-    ARM_FINE_M,
-    FINE_M,
     BoundingSpheres,
     bounding_spheres_of,
     grid_distances_m,
     robot_bounding_spheres,
-    surface_points,
 )
 from twin.replay.clearance.static_obstacles import (
     static_obstacles,
@@ -41,7 +36,7 @@ from twin.replay.clearance.static_obstacles import (
 )
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
-from twin.robot.collision import RobotHulls, convex_hull, signed_distance
+from twin.robot.collision import RobotHulls, signed_distance
 from twin.scene.shape.sdf import SdfGrid
 
 Pair = tuple[str, int, str, int]
@@ -220,57 +215,6 @@ class Surroundings:
                 found[name, -1, SCENE, 0] = float(grid_distances_m(self.grid, nodes).min())
         return found
 
-    def closest_points(
-        self, pair: Pair, Ts_base_object: Poses, nodes_m: Mapping[str, Float[np.ndarray, "_ 3"]]
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Return where a pair of ``measure`` or ``measure_nodes`` is nearest, base frame [m].
-
-        Of bodies that overlap, the points by which they would be parted soonest. Beside what the
-        scene's grid shows, the distance of the two is more than was measured, by what the points
-        of a surface leave uncovered.
-        """
-        body, index, other, piece = pair
-        own_m, is_soft = self._points_of(body, index, Ts_base_object, nodes_m)
-        if other == TABLE:
-            p = own_m[own_m[:, 2].argmin()]
-            return p, np.array([p[0], p[1], self._table_height_m])
-        if other == SCENE and self.grid is not None:
-            fine_m = FINE_M if index < 0 else ARM_FINE_M
-            spread_m = own_m if is_soft else surface_points(own_m, fine_m)
-            return _nearest_in_grid(self.grid, spread_m)
-        panel = next((box for name, at, box in self._panels if (name, at) == (other, piece)), None)
-        if panel is None:
-            other_m, other_is_soft = self._points_of(other, -1, Ts_base_object, nodes_m)
-        else:
-            other_m, other_is_soft = se3.apply(panel[0], box_corners(panel[1])), False
-        if is_soft:
-            own_m = _nearest_node(own_m, other_m)
-        elif other_is_soft:
-            other_m = _nearest_node(other_m, own_m)
-        # Shapes made anew: which of several equally near points comes out depends on what was
-        # asked of a shape before, and the same replay gives the same bytes.
-        found = coal.DistanceResult()
-        in_base = coal.Transform3s.Identity()
-        signed_distance(convex_hull(own_m), in_base, convex_hull(other_m), in_base, found)
-        return np.array(found.getNearestPoint1()), np.array(found.getNearestPoint2())
-
-    def _points_of(
-        self,
-        body: str,
-        index: int,
-        Ts_base_object: Poses,
-        nodes_m: Mapping[str, Float[np.ndarray, "_ 3"]],
-    ) -> tuple[Float[np.ndarray, "num_points 3"], bool]:
-        """Corners of a link's hull or of an object's box, or the nodes of a soft object."""
-        if index >= 0:
-            R, t = self._hulls.rotations[index], self._hulls.translations[index]
-            return self._hulls.hulls[index].points_m @ R.T + t, False
-        if body in nodes_m:
-            return nodes_m[body], True
-        solid = self.objects[body]
-        corners_m = solid.centre + box_corners(2 * solid.half_m)
-        return se3.apply(Ts_base_object[body], corners_m), False
-
     def _to_scene(self, moved: Sequence[str], Ts_base_object: Poses) -> dict[Pair, float]:
         """Distances to the unmodelled scene: of every link that moves, and of moved objects."""
         if self.grid is None or self._link_spheres is None:
@@ -288,34 +232,6 @@ class Surroundings:
                 R, t = np.ascontiguousarray(T[:, :3, :3]), np.ascontiguousarray(T[:, :3, 3])
                 found[name, -1, SCENE, 0] = float(spheres.distances_m(self.grid, R, t)[0])
         return found
-
-
-_POINT_M = 1e-6
-"""Half the size of the octahedron that stands for a node."""
-
-
-def _nearest_node(
-    nodes_m: Float[np.ndarray, "num_nodes 3"], corners_m: Float[np.ndarray, "num_corners 3"]
-) -> Float[np.ndarray, "6 3"]:
-    """Corners of a tiny body at the node deepest in a hull, or least far above one of its faces."""
-    equations = ConvexHull(corners_m).equations
-    heights = nodes_m @ equations[:, :3].T + equations[:, 3]
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    return np.asarray(nodes_m[heights.max(axis=1).argmin()] + _POINT_M * axes)
-
-
-def _nearest_in_grid(
-    grid: SdfGrid, points_m: Float[np.ndarray, "num_points 3"]
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The point that is nearest to a grid's surface, and that surface along the slope there."""
-    distances = grid_distances_m(grid, points_m)
-    p = points_m[distances.argmin()]
-    steps = np.concatenate([np.eye(3), -np.eye(3)]) * grid.voxel_m / 2
-    ahead = grid_distances_m(grid, p + steps)
-    slope = ahead[:3] - ahead[3:]
-    length = float(np.linalg.norm(slope))
-    toward = slope / length if length > 0 else slope
-    return p, p - float(distances.min()) * toward
 
 
 @lru_cache(maxsize=32)

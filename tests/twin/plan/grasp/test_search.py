@@ -12,6 +12,7 @@ from bridge.robots.robot import read_robot
 from bridge.task.task_file import Task, load_task
 from twin.plan.grasp.search import (
     CAUSES,
+    CLEARANCE_M,
     CONE_RAD,
     MOST_TILT_RAD,
     GraspConfig,
@@ -90,7 +91,7 @@ def test_there_are_many_grasps_and_none_is_wider_than_the_hand(name: str, key: s
     task = load_task(name)
     poses = task.draw_start(np.random.default_rng(1))
     found = GraspSearcher(problem(task, poses)).search(key)
-    limit_m = read_robot(UR5).gripper.max_width_m - 2 * GraspConfig().clearance_m
+    limit_m = read_robot(UR5).gripper.max_width_m - 2 * CLEARANCE_M
     assert len(found.grasps) >= 50
     assert max(grasp.width_m for grasp in found.grasps) <= limit_m
     margins = [grasp.margin for grasp in found.grasps]

@@ -17,12 +17,7 @@ from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.replay.config import UNKNOWN_POSE_M, ReplayConfig, ReplayRunConfig, VariationConfig
-from twin.replay.monte_carlo import (
-    draw_variation,
-    given_upright,
-    sample_rng,
-    with_samples,
-)
+from twin.replay.monte_carlo import decided, draw_variation, given_upright, sample_rng, with_samples
 from twin.replay.path import path_of_plan
 from twin.replay.rebuilt_scene import calibrated
 from twin.replay.scene import ReplayScene
@@ -166,7 +161,9 @@ def test_a_lost_object_does_not_change_what_the_others_draw(script: SimpleNamesp
     assert set(part.Ts_base_object) == {"cube"}
 
 
-def asked(scene: ReplayScene, answers: list[Any]) -> tuple[Any, list[tuple[ReplayScene, Any]]]:
+def asked(
+    scene: ReplayScene, answers: list[Any], until: float | None = None
+) -> tuple[Any, list[tuple[ReplayScene, Any]]]:
     """The success probability when varied replays answer so, and what was replayed."""
     seen: list[tuple[ReplayScene, ReplayConfig]] = []
 
@@ -178,8 +175,61 @@ def asked(scene: ReplayScene, answers: list[Any]) -> tuple[Any, list[tuple[Repla
         return verdict(answer)
 
     config = ReplayConfig(samples=len(answers))
-    p = with_samples(verdict(True), replay, scene, config, identity="start").p_success
-    return p, seen
+    said = with_samples(verdict(True), replay, scene, config, identity="start", until=until)
+    return said.p_success, seen
+
+
+NOWHERE = ReplayScene(task=load_task("cube_into_box"), Ts_base_object={}, urdf="")
+
+
+@pytest.mark.parametrize(
+    ("answers", "until", "n"),
+    [
+        ([True] * 32, 0.5, 8),
+        ([False] * 32, 0.5, 8),
+        ([True, False] * 16, 0.5, 32),
+        ([True] * 32, None, 32),
+        ([True] * 3 + [False] * 29, 1.0, 4),
+    ],
+)
+def test_samples_end_once_they_decide(answers: list[bool], until: float | None, n: int) -> None:
+    """By hand: all of n succeed 2^n / (n + 1) times as likely on average as by a fair coin."""
+    p, seen = asked(NOWHERE, answers, until)
+    assert (p["k"], p["n"], len(seen)) == (sum(answers[:n]), n, n)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.65, 0.9])
+def test_samples_that_succeed_as_often_as_asked_seldom_decide_anything(share: float) -> None:
+    """However often one looks: the exact chance over 200 samples, by counting."""
+    chances, wrong = np.ones(1), 0.0
+    for n in range(1, 201):
+        chances = np.convolve(chances, [1 - share, share])
+        over = [decided(float(k), n, share) for k in range(n + 1)]
+        wrong += chances[over].sum()
+        chances[over] = 0.0
+    assert wrong <= 0.05
+
+
+def test_a_yes_says_what_decides_it_and_what_a_little_more_would_bring() -> None:
+    """Two miss by 1.2 and 2.4 mm; one by 80 mm, one touched the box."""
+    inside = {"kind": "inside", "value": False, "detail": "the middle is 2 mm within the cavity"}
+    missed = [
+        replace(verdict(False), findings=({**inside, "short_m": short_m},))
+        for short_m in (0.0012, 0.0024, 0.08)
+    ]
+    touched = replace(missed[0], clearance=Factor(value=False, cause="too_close"))
+    nominal = replace(verdict(True), findings=({**inside, "value": True, "short_m": -0.002},))
+    answers = iter([*missed, touched, nominal, nominal])
+
+    def replay(*_: Any) -> Verdict:
+        return next(answers)
+
+    config = ReplayConfig(samples=6)
+    said = with_samples(nominal, replay, NOWHERE, config, identity="start")
+    assert said.reason == (
+        "the middle is 2 mm within the cavity, 2 mm to spare; with 3 mm more 4 of 6 varied replays "
+        "would succeed; 1 fail by inside"
+    )
 
 
 def test_every_sample_is_another_draw_and_the_share_has_wilsons_interval(
@@ -203,7 +253,7 @@ def test_every_sample_is_another_draw_and_the_share_has_wilsons_interval(
 
 @given(st.lists(st.sampled_from([True, False, None]), max_size=30))
 def test_the_interval_holds_the_share_and_undecided_is_no_success(said: list[bool | None]) -> None:
-    p, _ = asked(ReplayScene(task=load_task("cube_into_box"), Ts_base_object={}, urdf=""), said)
+    p, _ = asked(NOWHERE, said)
     if not said:
         assert p is None
         return

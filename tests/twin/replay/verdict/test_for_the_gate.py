@@ -47,7 +47,9 @@ def test_the_gates_process_says_what_the_replay_says_and_adds_samples(
         # Beside what a replay checks, the gate knows where the arm is, and audits its yes.
         more = {name: first.checks[name].value for name in ("start", "audit")}
         assert more == {"start": True, "audit": True}
-        assert replace(first, p_success=None, checks=good.verdict.checks) == good.verdict
+        same = replace(first, p_success=None, reason=None, checks=good.verdict.checks)
+        assert same == good.verdict
+        assert "within the cavity of box" in str(first.reason)
         assert first.checks.items() >= good.verdict.checks.items()
         nowhere = replace(plan.tau[3], p_m=(math.nan, 0.0, 0.2))
         lost = replace(plan, tau=(*plan.tau[:3], nowhere, *plan.tau[4:]))
