@@ -39,6 +39,13 @@ CORE: tuple[leaves.Command, ...] = (
         doctor | Show what is installed, what is missing and how to get it. | --json
         """,
     ),
+    leaves.Command(
+        "open",
+        "dashboards.cli:open_path",
+        "Say what is in a file or folder of yours, and import it.",
+        "bags/monday runs/monday",
+        leaves.START,
+    ),
     *leaves.commands_of(
         leaves.RECORD,
         "bridge.cli.recording",

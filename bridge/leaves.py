@@ -180,11 +180,16 @@ LEAVES: dict[str, Leaf] = {
         modules=("bridge.exchange.lerobot",),
         extra="video",
         purpose="exchange with LeRobot",
+        entries={
+            "read_info": "bridge.exchange.lerobot.layout:read_info",
+            "read_episodes": "bridge.exchange.lerobot.importing:read_episodes",
+            "import": "bridge.exchange.lerobot.cli:import_lerobot",
+        },
         commands=commands_of(
             EXCHANGE,
             "bridge.exchange.lerobot.cli",
             """
-            import lerobot | A LeRobotDataset v3.0. | DIR runs/x --episodes 0-9
+            import lerobot | A LeRobotDataset v3.0 or v2. | DIR runs/x --episodes 0-9
             export lerobot | Trials as a LeRobotDataset v3.0. | runs/x DIR
             """,
         ),

@@ -1,4 +1,4 @@
-"""Episodes of a LeRobotDataset v3.0 as episodes of ours, one file each.
+"""Episodes of a LeRobotDataset v3.0 or v2 as episodes of ours, one file each.
 
 Times are nominal: row k is k / fps after 0, because the format keeps no clock. Numbers are kept as
 they are, whatever their unit. Video frames become JPEG, which is one more lossy step and is said
@@ -101,28 +101,47 @@ def read_episodes(info: DatasetInfo, wanted: Sequence[range] | None) -> list[Epi
     Args:
         wanted: Ranges of episode indices; None for all.
     """
+    entries: dict[int, EpisodeEntry] = {}
+    for path, number, row in _lines_of(info) if info.is_v2 else _rows_of(info):
+        entry = _entry(info, path, number, row)
+        if wanted is None or any(entry.index in part for part in wanted):
+            entries[entry.index] = entry
+    if not entries:
+        raise UsageError(f"none of the wanted episodes is listed in {info.folder / 'meta'}.")
+    return [entries[index] for index in sorted(entries)]
+
+
+def _rows_of(info: DatasetInfo) -> Iterator[tuple[Path, int, dict[str, Any]]]:
+    """Yield the rows of ``meta/episodes``, each with its file and its number."""
     _, pq = parquet()
     paths = sorted((info.folder / "meta" / "episodes").glob("*/*.parquet"))
     if not paths:
         raise LeRobotFormatError(
             path=info.folder / "meta" / "episodes", found="no Parquet files", hint=_RESTORE
         )
-    entries: dict[int, EpisodeEntry] = {}
     for path in paths:
         with _readable(path):
             file = pq.ParquetFile(path)
             names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-            number = 0
-            for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=names):
-                for row in batch.to_pylist():
-                    number += 1
-                    entry = _entry(info, path, number, row)
-                    if wanted is None or any(entry.index in part for part in wanted):
-                        entries[entry.index] = entry
-    if not entries:
-        message = f"none of the wanted episodes is in {info.folder}. It has those in {paths[0]}."
-        raise UsageError(message)
-    return [entries[index] for index in sorted(entries)]
+            batches = file.iter_batches(batch_size=BATCH_ROWS, columns=names)
+            rows = (row for batch in batches for row in batch.to_pylist())
+            for number, row in enumerate(rows, start=1):
+                yield path, number, row
+
+
+def _lines_of(info: DatasetInfo) -> Iterator[tuple[Path, int, dict[str, Any]]]:
+    """Yield the lines of version 2's ``meta/episodes.jsonl`` as version 3 has them."""
+    path = info.folder / "meta" / "episodes.jsonl"
+    with _readable(path), path.open(encoding="utf-8") as lines:
+        for number, line in enumerate(lines, start=1):
+            row = json.loads(line)
+            index = int(row["episode_index"])
+            place = {"chunk_index": index // info.chunks_size, "file_index": index}
+            for key, feature in info.features.items():
+                if feature.dtype == "video":
+                    row |= {f"videos/{key}/{name}": at for name, at in place.items()}
+                    row[f"videos/{key}/from_timestamp"] = 0.0
+            yield path, number, row | {f"data/{name}": at for name, at in place.items()}
 
 
 @contextmanager
@@ -242,6 +261,8 @@ def _check(path: Path, rows: EpisodeRows) -> None:
 SNAP_S = 1e-3
 """Stamps are 32-bit floats: closer than this to the grid they are on it."""
 _UNSAFE = re.compile(r"[^A-Za-z0-9_]+")
+MOST_OF_NAME = 60
+"""Letters of an instruction that become the name of a task."""
 
 
 @dataclass(kw_only=True)
@@ -279,7 +300,7 @@ def import_lerobot(
 
     Args:
         wanted: Numbers of episodes; None is all.
-        task: Name of the task they are trials of; "": they are not known to be any.
+        task: Name of the task they are trials of; "": that which the dataset names for each.
     """
     info = read_info(folder)
     plan = _plan(info, cell)
@@ -462,10 +483,11 @@ def _images(info: DatasetInfo, rows: EpisodeRows, key: str) -> Iterator[bytes]:
 
 
 def _about(info: DatasetInfo, rows: EpisodeRows, cell: str, task: str) -> EpisodeInfo:
+    instruction = rows.entry.tasks[0] if rows.entry.tasks else ""
     return imported_info(
         _episode_id(rows.entry),
-        task,
-        instruction=rows.entry.tasks[0] if rows.entry.tasks else "",
+        task or _UNSAFE.sub("_", instruction.lower()).strip("_")[:MOST_OF_NAME],
+        instruction=instruction,
         trial=rows.entry.index,
         robot=info.robot_type,
         cell=cell,

@@ -2,7 +2,8 @@
 
 Source: the format's documentation and the ``huggingface/lerobot`` repository (``datasets/utils.py``
 for path templates and default features, ``dataset_metadata.py`` for the episode columns). Many
-episodes share a data file and a video file; ``meta/episodes`` says where each lies.
+episodes share a data file and a video file; ``meta/episodes`` says where each lies. In version 2
+each episode has files of its own, and ``meta/episodes.jsonl`` lists them.
 """
 
 import json
@@ -44,6 +45,8 @@ FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 EPISODES_PATH = f"meta/episodes/{FILE}.parquet"
 DATA_PATH = f"data/{FILE}.parquet"
 VIDEO_PATH = f"videos/{{video_key}}/{FILE}.mp4"
+V2_FIELDS = {"{episode_chunk": "{chunk_index", "{episode_index": "{file_index"}
+"""Fields of version 2's path templates as version 3 calls them."""
 CHUNKS_SIZE = 1000
 """Files per chunk folder."""
 DATA_FILE_MB = 100
@@ -101,6 +104,13 @@ class DatasetInfo:
     video_path: str | None
     features: dict[str, Feature]
     version: str
+    chunks_size: int = CHUNKS_SIZE
+    """Version 2: episodes per chunk folder."""
+
+    @property
+    def is_v2(self) -> bool:
+        """Whether each episode has files of its own."""
+        return self.version.startswith("v2.")
 
     def data_file(self, chunk_index: int, file_index: int) -> Path:
         """Return a data file by its indices."""
@@ -148,25 +158,30 @@ def read_info(folder: Path) -> DatasetInfo:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         version = str(record["codebase_version"])
-        if not version.startswith("v3."):
+        if not version.startswith(("v2.", "v3.")):
             raise LeRobotFormatError(
                 path=path,
-                found=f"version {version}, and only v3 is read",
-                hint="lerobot converts it: convert_dataset_v21_to_v30.",
+                found=f"version {version}, and only v2 and v3 are read",
+                hint="lerobot converts version 1: convert_dataset_v1_to_v2.",
             )
         fps = float(record["fps"])
         if not 0 < fps < 10_000:
             message = f"fps is {fps}"
             raise ValueError(message)
         features = {key: _feature(key, value) for key, value in record["features"].items()}
+        places = [str(record.get(name) or "") for name in ("data_path", "video_path")]
+        if version.startswith("v2."):  # episode i is alone in file i of its chunk
+            for theirs, ours in V2_FIELDS.items():
+                places = [place.replace(theirs, ours) for place in places]
         return DatasetInfo(
             folder=folder,
             fps=fps,
             robot_type=str(record.get("robot_type") or ""),
-            data_path=str(record.get("data_path") or DATA_PATH),
-            video_path=record.get("video_path"),
+            data_path=places[0] or DATA_PATH,
+            video_path=places[1] or None,
             features=features,
             version=version,
+            chunks_size=max(1, int(record.get("chunks_size") or CHUNKS_SIZE)),
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise LeRobotFormatError(
