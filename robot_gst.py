@@ -39,12 +39,10 @@ CORE: tuple[leaves.Command, ...] = (
         doctor | Show what is installed, what is missing and how to get it. | --json
         """,
     ),
-    leaves.Command(
-        "open",
-        "dashboards.cli:open_path",
-        "Say what is in a file or folder of yours, and import it.",
-        "bags/monday runs/monday",
+    *leaves.commands_of(
         leaves.START,
+        "dashboards.cli",
+        "open | Say what a file or folder holds, or import it. | bags/monday runs/monday",
     ),
     *leaves.commands_of(
         leaves.RECORD,

@@ -39,7 +39,7 @@ def dashboard(
     return serve(runs, config, output)
 
 
-def open_path(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> int:
+def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> int:
     """Say what a file or folder of yours holds, what it lacks and what comes next; or import it.
 
     Bags, LeRobot datasets, RGB-D and posed images, splats, tables of trials, runs.

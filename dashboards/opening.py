@@ -193,7 +193,9 @@ def _of_topics(
     views = []
     if not any(len(has) == len(STREAMS) for has in cameras.values()):
         lacks = [f"{c}{s}" for c, has in cameras.items() for s in STREAMS if s not in has]
-        views.append(", ".join(lacks) or "a camera with colour, depth and the calibration of both")
+        views.append(
+            _some(lacks) if lacks else "a camera with colour, depth and the calibration of both"
+        )
     if not {named.TF, named.TF_STATIC} & set(seen.types):
         views.append(f"where the cameras are ({named.TF}, {named.TF_STATIC})")
     return holds, views, robot, robots

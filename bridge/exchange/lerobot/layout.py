@@ -64,10 +64,13 @@ DEFAULT_FEATURES = {
 _FIELD = re.compile(r"\{(\w+)(?::0?(\d+)d)?\}")
 
 
+RESTORE = "Restore it from the original dataset."
+
+
 class LeRobotFormatError(BridgeError):
     """A dataset does not look as its format says."""
 
-    def __init__(self, *, path: Path, found: str, hint: str) -> None:
+    def __init__(self, *, path: Path, found: str, hint: str = RESTORE) -> None:
         """Remember the file and what was found."""
         self.path = path
         self.found = found
@@ -143,7 +146,6 @@ class DatasetInfo:
             raise LeRobotFormatError(
                 path=self.folder / INFO_PATH,
                 found=f"path template {template!r} leads out of the dataset",
-                hint="Restore the file from the original dataset.",
             )
         return path
 
@@ -185,9 +187,7 @@ def read_info(folder: Path) -> DatasetInfo:
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise LeRobotFormatError(
-            path=path,
-            found=f"cannot be read ({type(error).__name__}: {error})",
-            hint="Restore it from the original dataset.",
+            path=path, found=f"cannot be read ({type(error).__name__}: {error})"
         ) from error
 
 
