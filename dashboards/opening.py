@@ -4,7 +4,8 @@ Heads, summaries and small texts are read; nothing is unpickled or run. Commands
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -245,11 +246,18 @@ def _lerobot(path: Path) -> Found:
     )
 
 
-def _rgbd(path: Path) -> Found:
+@contextmanager
+def _options_of(command: str) -> Iterator[None]:
+    """Say which command takes the options that an error asks for."""
     try:
-        index = read_index(path)
+        yield
     except UsageError as error:
-        raise UsageError(f"{error} Options go to: robot-gst import rgbd {path} RUN") from error
+        raise UsageError(f"{error} Options go to: robot-gst {command}") from error
+
+
+def _rgbd(path: Path) -> Found:
+    with _options_of(f"import rgbd {path} RUN"):
+        index = read_index(path)
     return Found(
         what=f"RGB-D images, {index.summary}",
         holds=tuple(f"assumed {name}: {value}" for name, value in index.assumed.items()),
@@ -289,7 +297,8 @@ def _splat(path: Path) -> Found:
 
 
 def _table(path: Path) -> Found:
-    taken = take(path)
+    with _options_of(f"evaluate {path}"):
+        taken = take(path)
 
     def keep(path: Path, run: Path, *, output: Output) -> int:
         file = keep_trials(taken.trials, RunFolder.create(run), force=False)
@@ -297,7 +306,8 @@ def _table(path: Path) -> Found:
         return 0
 
     return Found(
-        what=f"a table of {taken.kind}, understood as {taken.summary}",
+        what=f"a table of {len(taken.trials) or len(taken.rates)} {taken.kind}",
+        holds=(f"understood as {taken.summary}",),
         rebuild="recordings: a table has none",
         replay="recordings: a table has none",
         bring=keep if taken.trials else None,

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import stranger_inputs as strangers
@@ -13,6 +12,7 @@ from mcap.writer import Writer
 
 MakeTrial = Callable[..., Path]
 Say = Callable[..., str]
+Rates = Callable[[Path], dict[str, float]]
 
 
 @pytest.fixture
@@ -29,14 +29,15 @@ def say(capsys: pytest.CaptureFixture[str]) -> Say:
 
 
 @pytest.fixture
-def numbers(capsys: pytest.CaptureFixture[str]) -> Callable[[Path], dict[str, Any]]:
-    """Evaluate something; its measurements that have a value."""
+def rates(capsys: pytest.CaptureFixture[str]) -> Rates:
+    """Evaluate something; the success rate of each task."""
 
-    def found(source: Path) -> dict[str, Any]:
+    def found(source: Path) -> dict[str, float]:
         capsys.readouterr()
         assert run("evaluate", source, "--json") == 0
         measured = json.loads(capsys.readouterr().out)["measurements"]
-        return {item["id"]: item["value"] for item in measured if item["value"] is not None}
+        rates = [item for item in measured if item["id"].startswith("rate.recorded.")]
+        return {item["id"].split(".")[2]: item["value"] for item in rates}
 
     return found
 
@@ -60,10 +61,7 @@ def test_a_bag_of_a_camera_driver_can_be_rebuilt_and_says_whose_arm_is_missing(
 
 
 def test_a_bag_of_an_arm_in_a_database_becomes_a_trial_with_a_rate(
-    make_trial: MakeTrial,
-    tmp_path: Path,
-    say: Say,
-    numbers: Callable[[Path], dict[str, Any]],
+    make_trial: MakeTrial, tmp_path: Path, say: Say, rates: Rates
 ) -> None:
     bag = strangers.franka(make_trial, tmp_path / "franka")
     text = say(bag)
@@ -75,16 +73,12 @@ def test_a_bag_of_an_arm_in_a_database_becomes_a_trial_with_a_rate(
     step = f"label {made} franka --task NAME --result success"
     assert f"next: robot-gst {step}" in say(bag, made)
     assert run(*step.replace("NAME", "cube_into_box").split()) == 0
-    assert numbers(made)["success.recorded"] == 1.0
+    assert rates(made) == {"cube_into_box": 1.0}
 
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])
 def test_a_lerobot_dataset_ends_in_a_rate_of_each_of_its_tasks(
-    dataset: Dataset,
-    tmp_path: Path,
-    say: Say,
-    numbers: Callable[[Path], dict[str, Any]],
-    version: str,
+    dataset: Dataset, tmp_path: Path, say: Say, rates: Rates, version: str
 ) -> None:
     folder = dataset.write() if version == "v3.0" else dataset.write_v2()
     text = say(folder)
@@ -98,9 +92,7 @@ def test_a_lerobot_dataset_ends_in_a_rate_of_each_of_its_tasks(
     assert "a run of 3 episodes" in text
     assert "label" not in text
     assert f"next: robot-gst evaluate {tmp_path / 'new'}" in text
-    found = numbers(tmp_path / "new")
-    assert found["success.recorded.pick_the_cube"] == 0.5
-    assert found["success.recorded.fold_the_towel"] == 1.0
+    assert rates(tmp_path / "new") == {"pick_the_cube": 0.5, "fold_the_towel": 1.0}
 
 
 def test_a_tum_folder_is_rebuilt_next(make_trial: MakeTrial, tmp_path: Path, say: Say) -> None:
@@ -116,19 +108,20 @@ def test_posed_images_are_to_look_at(tmp_path: Path, say: Say) -> None:
     assert "rebuild needs depth images" in text
 
 
-def test_a_spreadsheet_ends_in_a_rate(
-    tmp_path: Path, say: Say, numbers: Callable[[Path], dict[str, Any]]
-) -> None:
+def test_a_spreadsheet_ends_in_a_rate(tmp_path: Path, say: Say, rates: Rates) -> None:
     book = strangers.workbook(tmp_path / "lab.xlsx")
-    assert "a table of trials, understood as lab.xlsx: 4 trials" in say(book)
+    assert "a table of 4 trials\n  understood as lab.xlsx: " in say(book)
     text = say(book, tmp_path / "new")
     assert "a run of 0 episodes, a table of trials" in text
-    assert numbers(tmp_path / "new")["success.recorded"] == 0.75
+    assert rates(tmp_path / "new") == {"stack": 0.75}
     assert "exists already" in say(book, tmp_path / "new", code=2)
-    rates = tmp_path / "rates.csv"
-    rates.write_text("policy,task,real,sim,n\na,stack,0.5,0.6,10\nb,stack,0.7,0.9,10\n")
-    assert f"next: robot-gst evaluate {rates}" in say(rates)
-    assert "It cannot be imported." in say(rates, tmp_path / "other", code=2)
+    doubtful = tmp_path / "doubtful.csv"
+    doubtful.write_text("task,policy,success\nstack,act,5\n")
+    assert f"Options go to: robot-gst evaluate {doubtful}" in say(doubtful, code=2)
+    shares = tmp_path / "shares.csv"
+    shares.write_text("policy,task,real,sim,n\na,stack,0.5,0.6,10\nb,stack,0.7,0.9,10\n")
+    assert f"next: robot-gst evaluate {shares}" in say(shares)
+    assert "It cannot be imported." in say(shares, tmp_path / "other", code=2)
 
 
 def test_a_splat_says_what_it_is_compared_with(tmp_path: Path, say: Say) -> None:
