@@ -40,11 +40,6 @@ CORE: tuple[leaves.Command, ...] = (
         """,
     ),
     *leaves.commands_of(
-        leaves.START,
-        "dashboards.cli",
-        "open | Say what a file or folder holds, or import it. | bags/monday runs/monday",
-    ),
-    *leaves.commands_of(
         leaves.RECORD,
         "bridge.cli.recording",
         """

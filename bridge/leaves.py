@@ -60,6 +60,16 @@ def commands_of(use: str, module: str, table: str) -> tuple[Command, ...]:
 
 
 LEAVES: dict[str, Leaf] = {
+    "open": Leaf(
+        modules=("dashboards.opening",),
+        extra="record",
+        purpose="opening what others recorded",
+        commands=commands_of(
+            START,
+            "dashboards.opening",
+            "open | Say what a file or folder holds, or import it. | bags/monday runs/monday",
+        ),
+    ),
     "planner": Leaf(
         modules=("twin.plan",),
         extra="replay",

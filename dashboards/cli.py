@@ -39,33 +39,6 @@ def dashboard(
     return serve(runs, config, output)
 
 
-def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> int:
-    """Say what a file or folder of yours holds, what it lacks and what comes next; or import it.
-
-    Bags, LeRobot datasets, RGB-D and posed images, splats, tables of trials, runs.
-    Example: robot-gst open bags/monday runs/monday
-
-    Args:
-        path: A file or folder; without RUN it is only read.
-        run: Run folder to import it into; made where needed.
-    """
-    from bridge.errors import UsageError
-    from dashboards.opening import look_at
-
-    found = look_at(path)
-    lines = found.lines(path)
-    if run is None:
-        record = {name: value for name, value in vars(found).items() if name != "bring"}
-        output.result({"path": str(path), **record}, "\n".join(lines))
-        return 0
-    if found.bring is None:
-        raise UsageError("\n".join([*lines, "It cannot be imported."]))
-    output.say("\n".join(lines[: 1 + len(found.holds)]))
-    code = found.bring(path, run, output=output)
-    output.say("\n".join(look_at(run).lines(run)))
-    return code
-
-
 def share(run: Path, /, *, config: ShareConfig = SHARE, output: Output = OUTPUT) -> int:
     """Write chosen trials with clips, figures and tables into one file that opens anywhere.
 

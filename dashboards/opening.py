@@ -21,7 +21,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.exchange.driver_names import mapped
-from bridge.exchange.rosbag2 import Survey, count_messages, survey
+from bridge.exchange.rosbag2 import METADATA_FILE, Survey, count_messages, survey
 from bridge.exchange.trials_csv import keep_trials, trials_path
 from bridge.leaves import load_leaf
 from bridge.robots.robot import Robot, read_robot, robot_of
@@ -30,17 +30,18 @@ from bridge.sources.folder.posed_index import COLMAP_FOLDERS, TRANSFORMS, read_p
 from bridge.sources.folder.scene_json import INDEX_NAME
 from bridge.sources.folder.tum import find_lists
 from bridge.terminal import Output
-from evaluator.compare.intake import take
 
+OUTPUT = Output()
 MOST_INSIDE, MOST_NAMED, MOST_EPISODES = 200, 5, 50
 """Things of a folder that are looked at, and that a message names; episodes that are opened."""
-MOST_HEAD_BYTES = 1 << 16
+MOST_HEAD_BYTES, MOST_TABLE_BYTES = 1 << 16, 1 << 26
 HEADS = {b"\x89MCAP0\r\n": "bag", b"SQLite format 3\0": "bag", b"#ROSBAG": "ROS 1 bag"}
 HEADS |= {b"ply\n": "splat", b"ply\r": "splat"}
 ENDINGS = {
     "bag": (".mcap", ".db3", ".mcap.zstd", ".db3.zstd"),
-    "table": (".csv", ".tsv", ".txt", ".md", ".xlsx", ".xlsm"),
+    "table": (".csv", ".tsv", ".xlsx", ".xlsm"),
 }
+OF_BAG = (*ENDINGS["bag"], METADATA_FILE)
 SPLAT_FIELDS = frozenset({"x", "f_dc_0", "opacity", "scale_0", "rot_0"})
 STREAMS = (named.COLOR_IMAGE, named.COLOR_INFO, named.DEPTH_IMAGE, named.DEPTH_INFO)
 STREAM = re.compile(f"{named.CAMERAS}([^/]+)({'|'.join(STREAMS)})$")
@@ -72,6 +73,30 @@ class Found:
             lines.append(f"  {use} needs {lack}" if lack else f"  {use}: ready")
         steps = (f"open {path} RUN",) if self.bring else self.then
         return [*lines, *(f"next: robot-gst {step}" for step in steps)]
+
+
+def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> int:
+    """Say what a file or folder of yours holds, what it lacks and what comes next; or import it.
+
+    Bags, LeRobot datasets, RGB-D and posed images, splats, tables of trials, runs.
+    Example: robot-gst open bags/monday runs/monday
+
+    Args:
+        path: A file or folder; without RUN it is only read.
+        run: Run folder to import it into; made where needed.
+    """
+    found = look_at(path)
+    lines = found.lines(path)
+    if run is None:
+        record = {name: value for name, value in vars(found).items() if name != "bring"}
+        output.result({"path": str(path), **record}, "\n".join(lines))
+        return 0
+    if found.bring is None:
+        raise UsageError("\n".join([*lines, "It cannot be imported."]))
+    output.say("\n".join(lines[: 1 + len(found.holds)]))
+    code = found.bring(path, run, output=output)
+    output.say("\n".join(look_at(run).lines(run)))
+    return code
 
 
 def look_at(path: Path) -> Found:
@@ -143,7 +168,7 @@ def _is_rlds(folder: Path) -> bool:
 
 FOLDERS: dict[str, Callable[[Path], bool]] = {
     "run": _is_run,
-    "bag": lambda folder: any(each.name.endswith(ENDINGS["bag"]) for each in folder.glob("*.*")),
+    "bag": lambda folder: any(each.name.endswith(OF_BAG) for each in folder.glob("*.*")),
     "LeRobot dataset": lambda folder: (folder / "meta/info.json").is_file(),
     "RLDS dataset": _is_rlds,
     "RGB-D folder": _is_rgbd,
@@ -154,24 +179,23 @@ FOLDERS: dict[str, Callable[[Path], bool]] = {
 def _bag(path: Path) -> Found:
     seen = survey(path)
     names = mapped(seen.types)
-    holds, views, robot, _ = _of_topics(seen, names)
+    cameras, views = _cameras(seen, names)
+    robot, lacks, _ = _robot(seen)
     count = count_messages(path)
     renamed = [f"{old} will be {new}" for old, new in names.items() if not old.endswith("_info")]
     return Found(
         what=f"a bag of {f'{count} messages on ' if count else ''}{len(seen.types)} topics",
-        holds=(*holds, *renamed),
+        holds=(*robot, *cameras, *renamed),
         record="the same nodes, live (docs/recording.md, section 4)",
         rebuild="; ".join(views),
-        replay="; ".join(robot + views),
+        replay="; ".join(lacks + views),
         evaluate="its task and outcome: label it when it is imported",
         bring=import_rosbag2,
     )
 
 
-def _of_topics(
-    seen: Survey, names: Mapping[str, str]
-) -> tuple[list[str], list[str], list[str], list[Robot]]:
-    """What topics hold, what the cameras and the robot lack for a replay, and which robot it is.
+def _cameras(seen: Survey, names: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    """What is known of the cameras, and what they lack for a scene.
 
     Args:
         names: What an episode calls topics that have other names in a recording.
@@ -186,29 +210,25 @@ def _of_topics(
             cameras.setdefault(place[1], {})[place[2]] = text
         elif type_name in (schema.IMAGE, schema.COMPRESSED_IMAGE):
             images.append(topic)
-    holds, robot, robots = _robot(seen)
-    holds += [f"camera {name}: {', '.join(has.values())}" for name, has in cameras.items()]
+    holds = [f"camera {name}: {', '.join(has.values())}" for name, has in cameras.items()]
     if images and not cameras:
         new = f"{named.CAMERAS}NAME{named.COLOR_IMAGE}"
         holds.append(f"images by an unknown name: import rosbag2 --remap {images[0]}={new}")
-    views = []
+    lacks = []
     if not any(len(has) == len(STREAMS) for has in cameras.values()):
-        lacks = [f"{c}{s}" for c, has in cameras.items() for s in STREAMS if s not in has]
-        views.append(
-            _some(lacks) if lacks else "a camera with colour, depth and the calibration of both"
-        )
+        streams = [f"{c}{s}" for c, has in cameras.items() for s in STREAMS if s not in has]
+        lacks.append(_some(streams) if streams else "a calibrated camera with colour and depth")
     if not {named.TF, named.TF_STATIC} & set(seen.types):
-        views.append(f"where the cameras are ({named.TF}, {named.TF_STATIC})")
-    return holds, views, robot, robots
+        lacks.append(f"where the cameras are ({named.TF}, {named.TF_STATIC})")
+    return holds, lacks
 
 
 def _robot(seen: Survey) -> tuple[list[str], list[str], list[Robot]]:
     """What is known of the robot, what is missing, and the robots that it may be."""
-    joint_topics = [topic for topic in seen.first if topic.endswith(named.JOINT_STATES)]
     tracks = {
-        topic: JointSample.from_cdr(seen.first[topic]).names
-        for topic in joint_topics
-        if seen.types.get(topic) == schema.JOINT_STATE
+        topic: JointSample.from_cdr(data).names
+        for topic, data in seen.first.items()
+        if topic.endswith(named.JOINT_STATES) and seen.types.get(topic) == schema.JOINT_STATE
     }
     if not tracks:
         return [], [f"joint states on a topic that ends in {named.JOINT_STATES}"], []
@@ -297,6 +317,10 @@ def _splat(path: Path) -> Found:
 
 
 def _table(path: Path) -> Found:
+    from evaluator.compare.intake import take  # noqa: PLC0415 - only tables need what it loads
+
+    if path.stat().st_size > MOST_TABLE_BYTES:
+        raise UsageError(f"{path} is larger than any table of trials. Open what it was made of.")
     with _options_of(f"evaluate {path}"):
         taken = take(path)
 
@@ -317,36 +341,40 @@ def _table(path: Path) -> Found:
 
 def _converted(kind: str, into: str, path: Path) -> Found:
     made = f"{into.format(path=path, stem=path.stem)} makes one: open that"
-    return Found(what=f"an {kind}, not read here", rebuild=made, replay=made, evaluate=made)
+    return Found(what=f"{kind}, not read here", rebuild=made, replay=made, evaluate=made)
 
 
 def _run(path: Path) -> Found:
     """What a run holds and lacks, and the commands from there to a page with numbers."""
     run = RunFolder.open(path)
     entries = find_episodes(run)
-    holds, views, robot, robots = _of_topics(_survey(run), {})
+    seen = _survey(run)
+    cameras, views = _cameras(seen, {})
+    robot, lacks, robots = _robot(seen)
     has_scene = (run.scene_dir / "scene.json").is_file()
+    has_table = trials_path(run).is_file()
     trials = [e for e in entries if not e.error and e.kind in ("trial", "imported")]
     unknown = [entry for entry in trials if entry.outcome == "unknown"]
-    broken = len([entry for entry in entries if entry.error])
+    broken = [entry.id for entry in entries if entry.error]
     steps = [f"recover {path}"] * bool(run.unfinished())
     steps += [f"rebuild {path}"] * (not views and not has_scene)
     if unknown and (views or robots):
         task = "" if unknown[0].kind == "trial" else " --task NAME"
         steps.append(f"label {path} {unknown[0].id}{task} --result success")
-    if trials and not robot and not views:
-        steps.append(f"replay {path}" + f" --robot {robots[0].name}" * (len(robots) > 1))
-    parts = {"a scene": has_scene, "a table of trials": trials_path(run).is_file()}
-    parts |= {f"{broken} of them broken": bool(broken)}
+    if trials and not lacks and not views:
+        is_told = named.ROBOT_DESCRIPTION in seen.types
+        steps.append(f"replay {path}" + ("" if is_told else f" --robot {robots[0].name}"))
+    can_count = bool(trials or has_table or has_scene or not views)
+    steps += [f"evaluate {path}"] * can_count
+    more = [f"unreadable: {_some(broken)}"] * bool(broken)
+    more += ["a scene"] * has_scene + ["a table of trials"] * has_table
     return Found(
-        what=", ".join(
-            [f"a run of {len(entries)} episodes", *(p for p, is_in in parts.items() if is_in)]
-        ),
-        holds=tuple(holds),
+        what=f"a run of {len(entries)} episodes",
+        holds=(*more, *robot, *cameras),
         rebuild="; ".join(views),
-        replay="; ".join(robot + views),
+        replay="; ".join(lacks + views),
         evaluate=f"task and outcome of {len(unknown)} episodes" if unknown else "",
-        then=(*steps, f"evaluate {path}", f"dashboard {path}"),
+        then=(*steps, f"dashboard {path}"),
     )
 
 
@@ -377,9 +405,9 @@ KINDS: dict[str, Callable[[Path], Found]] = {
     "splat": _splat,
     "table": _table,
     "ROS 1 bag": partial(
-        _converted, "ROS 1 bag", "a ROS 2 bag; rosbags-convert --src {path} --dst {stem}"
+        _converted, "a ROS 1 bag", "a ROS 2 bag; rosbags-convert --src {path} --dst {stem}"
     ),
     "RLDS dataset": partial(
-        _converted, "RLDS dataset", "a LeRobot dataset; openx2lerobot of any4lerobot"
+        _converted, "an RLDS dataset", "a LeRobot dataset; openx2lerobot of any4lerobot"
     ),
 }

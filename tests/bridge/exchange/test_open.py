@@ -112,7 +112,7 @@ def test_a_spreadsheet_ends_in_a_rate(tmp_path: Path, say: Say, rates: Rates) ->
     book = strangers.workbook(tmp_path / "lab.xlsx")
     assert "a table of 4 trials\n  understood as lab.xlsx: " in say(book)
     text = say(book, tmp_path / "new")
-    assert "a run of 0 episodes, a table of trials" in text
+    assert "a run of 0 episodes\n  a table of trials" in text
     assert rates(tmp_path / "new") == {"stack": 0.75}
     assert "exists already" in say(book, tmp_path / "new", code=2)
     doubtful = tmp_path / "doubtful.csv"
@@ -152,7 +152,7 @@ def test_a_run_says_what_comes_next(make_trial: MakeTrial, tmp_path: Path, say: 
     assert "evaluate needs task and outcome of 1 episodes" in text
     assert f"open {tmp_path / 'run'}" in say(tmp_path / "run" / "episodes", code=2)
     (tmp_path / "run" / "episodes" / "broken.mcap").write_bytes(b"\x89MCAP0\r\n")
-    assert "1 of them broken" in say(tmp_path / "run")
+    assert "unreadable: broken" in say(tmp_path / "run")
 
 
 def unfinished(folder: Path) -> Path:
@@ -182,10 +182,11 @@ def pickled(folder: Path) -> Path:
     return folder / "demo.pkl"
 
 
-def huge(folder: Path) -> Path:
-    with (folder / "huge.bin").open("wb") as stream:
+def huge(path: Path) -> Path:
+    with path.open("wb") as stream:
+        stream.write(b"a,b")
         stream.truncate(1 << 40)
-    return folder / "huge.bin"
+    return path
 
 
 @pytest.mark.parametrize(
@@ -198,7 +199,8 @@ def huge(folder: Path) -> Path:
         (two_things, 2, "is a bag and a folder of posed images at once"),
         (things_inside, 2, "holds garden (folder of posed images), s.ply (splat). Open one"),
         (pickled, 2, "is nothing known here"),
-        (huge, 2, "is nothing known here"),
+        (lambda folder: huge(folder / "huge.bin"), 2, "is nothing known here"),
+        (lambda folder: huge(folder / "huge.csv"), 2, "is larger than any table of trials"),
     ],
 )
 def test_bad_input_is_a_clear_sentence(
