@@ -243,7 +243,7 @@ def _robot(seen: Survey) -> tuple[list[str], list[str], list[Robot]]:
     fingers = {joint for robot in fits for joint in robot.finger_joints}
     if not fingers & set(joints) and not any(t.endswith(named.GRIPPER_STATE) for t in seen.types):
         lacks.append(f"the gripper's width on a topic that ends in {named.GRIPPER_STATE}")
-    rate_hz = seen.rates_hz[topic]
+    rate_hz = seen.rates_hz.get(topic, 0.0)
     return [f"robot: {name}; {_some(joints)} at {rate_hz:.3g} Hz on {topic}"], lacks, fits
 
 
@@ -305,7 +305,7 @@ def _splat(path: Path) -> Found:
     counts = [word[-1] for word in words if word[:2] == ["element", "vertex"]]
     is_splat = set(fields) >= SPLAT_FIELDS
     least = 4 * len(fields) * int(counts[0]) if counts and counts[0].isdecimal() else 0
-    if not end or not least or (is_splat and path.stat().st_size < len(head) + least):
+    if not end or not least or (is_splat and path.stat().st_size < len(head + end) + least):
         raise UsageError(f"{path} ends early or has no PLY header. Copy it again from its origin.")
     return Found(
         what=f"a splat of {counts[0]} Gaussians" if is_splat else "a PLY file without Gaussians",
@@ -358,8 +358,8 @@ def _run(path: Path) -> Found:
     broken = [entry.id for entry in entries if entry.error]
     steps = [f"recover {path}"] * bool(run.unfinished())
     steps += [f"rebuild {path}"] * (not views and not has_scene)
-    if unknown and (views or robots):
-        task = "" if unknown[0].kind == "trial" else " --task NAME"
+    task = " --task NAME" if unknown and unknown[0].kind == "imported" else ""
+    if unknown and (views or robots or not task):
         steps.append(f"label {path} {unknown[0].id}{task} --result success")
     if trials and not lacks and not views:
         is_told = named.ROBOT_DESCRIPTION in seen.types
@@ -369,11 +369,11 @@ def _run(path: Path) -> Found:
     more = [f"unreadable: {_some(broken)}"] * bool(broken)
     more += ["a scene"] * has_scene + ["a table of trials"] * has_table
     return Found(
-        what=f"a run of {len(entries)} episodes",
+        what=f"a run of {len(entries)} episode{'' if len(entries) == 1 else 's'}",
         holds=(*more, *robot, *cameras),
         rebuild="; ".join(views),
         replay="; ".join(lacks + views),
-        evaluate=f"task and outcome of {len(unknown)} episodes" if unknown else "",
+        evaluate=f"task and outcome of {len(unknown)} of {len(trials)} trials" if unknown else "",
         then=(*steps, f"dashboard {path}"),
     )
 

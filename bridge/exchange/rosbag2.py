@@ -9,7 +9,6 @@ how often a topic was silent) is kept in the metadata record ``source``. Layout 
 import heapq
 import json
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -181,17 +180,16 @@ class Survey(NamedTuple):
 
 def survey(source: Path) -> Survey:
     """Look at the topics of a bag and at its first messages."""
-    counts: Counter[str] = Counter()
+    times: dict[str, list[int]] = {}
     first: dict[str, bytes] = {}
     with _unpacked(find_files(source), None) as bag:
-        times = [0]
-        for number, item in enumerate(islice(bag.messages(), MOST_SURVEYED)):
-            counts[item.topic] += 1
+        for item in islice(bag.messages(), MOST_SURVEYED):
+            times.setdefault(item.topic, []).append(item.log_time_ns)
             first.setdefault(item.topic, item.data)
-            times = [times[0] if number else item.log_time_ns, item.log_time_ns]
-        seconds = max(times[-1] - times[0], 1) / NS_PER_S
-        rates_hz = {topic: count / seconds for topic, count in counts.items()}
-        return Survey(types=bag.types(), rates_hz=rates_hz, first=first)
+        types = bag.types()
+    spans = {topic: (len(t) - 1, (t[-1] - t[0]) / NS_PER_S) for topic, t in times.items()}
+    rates_hz = {topic: steps / seconds for topic, (steps, seconds) in spans.items() if seconds}
+    return Survey(types=types, rates_hz=rates_hz, first=first)
 
 
 def _import(

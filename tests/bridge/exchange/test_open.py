@@ -8,7 +8,6 @@ import pytest
 import stranger_inputs as strangers
 from commands import run
 from lerobot_dataset import Dataset
-from mcap.writer import Writer
 
 MakeTrial = Callable[..., Path]
 Say = Callable[..., str]
@@ -67,7 +66,7 @@ def test_a_bag_of_an_arm_in_a_database_becomes_a_trial_with_a_rate(
     text = say(bag)
     assert "robot: panda; panda_joint1" in text
     assert "and 2 more at 125 Hz on /franka/joint_states" in text
-    assert "rebuild needs a camera with colour, depth" in text
+    assert "rebuild needs a calibrated camera with colour and depth" in text
     assert "replay needs the gripper's width" in text
     made = tmp_path / "new"
     step = f"label {made} franka --task NAME --result success"
@@ -115,9 +114,9 @@ def test_a_spreadsheet_ends_in_a_rate(tmp_path: Path, say: Say, rates: Rates) ->
     assert "a run of 0 episodes\n  a table of trials" in text
     assert rates(tmp_path / "new") == {"stack": 0.75}
     assert "exists already" in say(book, tmp_path / "new", code=2)
-    doubtful = tmp_path / "doubtful.csv"
-    doubtful.write_text("task,policy,success\nstack,act,5\n")
-    assert f"Options go to: robot-gst evaluate {doubtful}" in say(doubtful, code=2)
+    other = tmp_path / "other.csv"
+    other.write_text("width,height\n1,2\n")
+    assert f"Options go to: robot-gst evaluate {other}" in say(other, code=2)
     shares = tmp_path / "shares.csv"
     shares.write_text("policy,task,real,sim,n\na,stack,0.5,0.6,10\nb,stack,0.7,0.9,10\n")
     assert f"next: robot-gst evaluate {shares}" in say(shares)
@@ -147,9 +146,10 @@ def test_what_is_not_read_is_named_with_what_converts_it(tmp_path: Path, say: Sa
 def test_a_run_says_what_comes_next(make_trial: MakeTrial, tmp_path: Path, say: Say) -> None:
     make_trial(result=None)
     text = say(tmp_path / "run")
-    assert "a run of 1 episodes" in text
+    assert "a run of 1 episode\n" in text
     assert f"next: robot-gst rebuild {tmp_path / 'run'}" in text
-    assert "evaluate needs task and outcome of 1 episodes" in text
+    assert "evaluate needs task and outcome of 1 of 1 trials" in text
+    assert f"next: robot-gst label {tmp_path / 'run'} trial_0001 --result success" in text
     assert f"open {tmp_path / 'run'}" in say(tmp_path / "run" / "episodes", code=2)
     (tmp_path / "run" / "episodes" / "broken.mcap").write_bytes(b"\x89MCAP0\r\n")
     assert "unreadable: broken" in say(tmp_path / "run")
@@ -166,7 +166,7 @@ def nothing(folder: Path) -> Path:
 
 
 def two_things(folder: Path) -> Path:
-    Writer(str(folder / "x.mcap")).start()
+    (folder / "x.mcap").write_bytes(b"x")
     strangers.colmap(folder)
     return folder
 
