@@ -93,7 +93,7 @@ def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> 
         return 0
     if found.bring is None:
         raise UsageError("\n".join([*lines, "It cannot be imported."]))
-    output.say("\n".join(lines[: 1 + len(found.holds)]))
+    output.say(lines[0])
     code = found.bring(path, run, output=output)
     output.say("\n".join(look_at(run).lines(run)))
     return code

@@ -112,7 +112,9 @@ def read_episodes(info: DatasetInfo, wanted: Sequence[range] | None) -> list[Epi
         wanted: Ranges of episode indices; None for all.
     """
     entries: dict[int, EpisodeEntry] = {}
-    for path, number, row in _lines_of(info) if info.is_v2 else _rows_of(info):
+    per_chunk = info.episodes_per_chunk
+    rows = _rows_of(info) if per_chunk is None else _lines_of(info, per_chunk)
+    for path, number, row in rows:
         entry = _entry(info, path, number, row)
         if wanted is None or any(entry.index in part for part in wanted):
             entries[entry.index] = entry
@@ -137,14 +139,14 @@ def _rows_of(info: DatasetInfo) -> Iterator[tuple[Path, int, dict[str, Any]]]:
                 yield path, number, row
 
 
-def _lines_of(info: DatasetInfo) -> Iterator[tuple[Path, int, dict[str, Any]]]:
+def _lines_of(info: DatasetInfo, per_chunk: int) -> Iterator[tuple[Path, int, dict[str, Any]]]:
     """Yield the lines of version 2's ``meta/episodes.jsonl`` as version 3 has them."""
     path = info.folder / "meta" / "episodes.jsonl"
     with _readable(path), path.open(encoding="utf-8") as lines:
         for number, line in enumerate(lines, start=1):
             row = json.loads(line)
             index = int(row["episode_index"])
-            place = {"chunk_index": index // info.chunks_size, "file_index": index}
+            place = {"chunk_index": index // per_chunk, "file_index": index}
             for key, feature in info.features.items():
                 if feature.dtype == "video":
                     row |= {f"videos/{key}/{name}": at for name, at in place.items()}

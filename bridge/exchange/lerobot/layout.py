@@ -107,13 +107,8 @@ class DatasetInfo:
     video_path: str | None
     features: dict[str, Feature]
     version: str
-    chunks_size: int = CHUNKS_SIZE
-    """Version 2: episodes per chunk folder."""
-
-    @property
-    def is_v2(self) -> bool:
-        """Whether each episode has files of its own."""
-        return self.version.startswith("v2.")
+    episodes_per_chunk: int | None = None
+    """Of version 2, where each episode has files of its own; None in version 3."""
 
     def data_file(self, chunk_index: int, file_index: int) -> Path:
         """Return a data file by its indices."""
@@ -172,7 +167,9 @@ def read_info(folder: Path) -> DatasetInfo:
             raise ValueError(message)
         features = {key: _feature(key, value) for key, value in record["features"].items()}
         places = [str(record.get(name) or "") for name in ("data_path", "video_path")]
+        per_chunk = None
         if version.startswith("v2."):  # episode i is alone in file i of its chunk
+            per_chunk = max(1, int(record.get("chunks_size") or CHUNKS_SIZE))
             for theirs, ours in V2_FIELDS.items():
                 places = [place.replace(theirs, ours) for place in places]
         return DatasetInfo(
@@ -183,7 +180,7 @@ def read_info(folder: Path) -> DatasetInfo:
             video_path=places[1] or None,
             features=features,
             version=version,
-            chunks_size=max(1, int(record.get("chunks_size") or CHUNKS_SIZE)),
+            episodes_per_chunk=per_chunk,
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise LeRobotFormatError(
