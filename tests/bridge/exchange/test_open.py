@@ -8,6 +8,10 @@ import pytest
 import stranger_inputs as strangers
 from commands import run
 from lerobot_dataset import Dataset
+from starlette.testclient import TestClient
+
+from dashboards.app import create_app
+from dashboards.library import Library
 
 MakeTrial = Callable[..., Path]
 Say = Callable[..., str]
@@ -39,6 +43,12 @@ def rates(capsys: pytest.CaptureFixture[str]) -> Rates:
         return {item["id"].split(".")[2]: item["value"] for item in rates}
 
     return found
+
+
+def first_page(made: Path) -> str:
+    app = create_app(Library.open([made]))
+    with TestClient(app, base_url="http://127.0.0.1") as browser:
+        return browser.get("/").text
 
 
 @pytest.mark.parametrize("driver", strangers.DRIVERS)
@@ -92,6 +102,7 @@ def test_a_lerobot_dataset_ends_in_a_rate_of_each_of_its_tasks(
     assert "label" not in text
     assert f"next: robot-gst evaluate {tmp_path / 'new'}" in text
     assert rates(tmp_path / "new") == {"pick_the_cube": 0.5, "fold_the_towel": 1.0}
+    assert "1 of 2" in first_page(tmp_path / "new")
 
 
 def test_a_tum_folder_is_rebuilt_next(make_trial: MakeTrial, tmp_path: Path, say: Say) -> None:
@@ -113,6 +124,7 @@ def test_a_spreadsheet_ends_in_a_rate(tmp_path: Path, say: Say, rates: Rates) ->
     text = say(book, tmp_path / "new")
     assert "a run of 0 episodes\n  a table of trials" in text
     assert rates(tmp_path / "new") == {"stack": 0.75}
+    assert "3 of 4" in first_page(tmp_path / "new")
     assert "exists already" in say(book, tmp_path / "new", code=2)
     other = tmp_path / "other.csv"
     other.write_text("width,height\n1,2\n")
