@@ -60,6 +60,16 @@ def commands_of(use: str, module: str, table: str) -> tuple[Command, ...]:
 
 
 LEAVES: dict[str, Leaf] = {
+    "open": Leaf(
+        modules=("dashboards.opening",),
+        extra="record",
+        purpose="opening what others recorded",
+        commands=commands_of(
+            START,
+            "dashboards.opening",
+            "open | Say what a file or folder holds, or import it. | bags/monday runs/monday",
+        ),
+    ),
     "planner": Leaf(
         modules=("twin.plan",),
         extra="replay",
@@ -180,11 +190,16 @@ LEAVES: dict[str, Leaf] = {
         modules=("bridge.exchange.lerobot",),
         extra="video",
         purpose="exchange with LeRobot",
+        entries={
+            "read_info": "bridge.exchange.lerobot.layout:read_info",
+            "read_episodes": "bridge.exchange.lerobot.importing:read_episodes",
+            "import": "bridge.exchange.lerobot.cli:import_lerobot",
+        },
         commands=commands_of(
             EXCHANGE,
             "bridge.exchange.lerobot.cli",
             """
-            import lerobot | A LeRobotDataset v3.0. | DIR runs/x --episodes 0-9
+            import lerobot | A LeRobotDataset v3.0 or v2. | DIR runs/x --episodes 0-9
             export lerobot | Trials as a LeRobotDataset v3.0. | runs/x DIR
             """,
         ),

@@ -153,13 +153,27 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
 
 
 def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
-    """Choose the numbers to read first; where nobody planned, of what was executed."""
+    """Choose the numbers to read first; where nobody planned, of what was executed.
+
+    Without any of the twin, the recorded success of the first tasks.
+    """
     by_id = {each.id: each for each in judgement.measurements}
     side = agreeing_side(by_id)
+    agreed = [each.value for name, each in by_id.items() if name.startswith("agreement.")]
+    if not any(value is not None for value in agreed):
+        rates = [each for name, each in by_id.items() if name.startswith("rate.recorded.")]
+        known = [each for each in rates if each.value is not None][: len(NUMBERS)]
+        yield from ((f"Recorded success, {_group_of(each)}", each) for each in known)
     for name, title in NUMBERS.items():
         found = by_id.get(name.replace(SIM_SIDE, side))
         if found is not None:
             yield (title if found.id == name else UNPLANNED), found
+
+
+def _group_of(rate: Measurement) -> str:
+    """Name task, condition and policy, as far as they have names."""
+    names = [name for name in rate.id.split(".")[2:] if name != "-"]
+    return " · ".join(names).replace("_", " ")
 
 
 def worst_disagreement(run: RunFolder, judgement: Judgement) -> Disagreement | None:

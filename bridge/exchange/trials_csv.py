@@ -199,9 +199,15 @@ def trials_path(run: RunFolder) -> Path:
 def import_trials(table: Path, run: RunFolder, *, force: bool) -> list[TrialRecord]:
     """Check a trials CSV and keep it in the run, with all columns and in one spelling."""
     trials = read_trials(table)
+    keep_trials(trials, run, force=force)
+    return trials
+
+
+def keep_trials(trials: Iterable[TrialRecord], run: RunFolder, *, force: bool) -> Path:
+    """Write the run's imported trials."""
     path = trials_path(run)
     if path.exists() and not force:
         raise UsageError(f"{path} exists already. Replace it with --force, or use another run.")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, trials_text(trials).encode())
-    return trials
+    return path

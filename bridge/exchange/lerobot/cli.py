@@ -60,7 +60,7 @@ def import_lerobot(
     task: str | None = None,
     output: Output = OUTPUT,
 ) -> int:
-    """Turn a LeRobotDataset v3.0 into episodes: joints, actions, images, one file per episode.
+    """Turn a LeRobotDataset v3.0 or v2 into episodes: joints, actions, images, one file each.
 
     Episodes already imported are passed over, so an interrupted import goes on where it stopped.
     Example: robot-gst import lerobot datasets/pusht runs/pusht --episodes 0-9
@@ -70,7 +70,7 @@ def import_lerobot(
         run: Run folder; made where needed.
         cell: Name of the cell in topics.
         episodes: Which ones, for example 0-9,12; all without it.
-        task: Name or file of the task they are trials of.
+        task: Name or file of the task they are trials of; without it, what the dataset names.
     """
     from bridge.episode.catalogue import task_of_run
     from bridge.episode.run_folder import RunFolder

@@ -1,4 +1,4 @@
-"""Episodes of a LeRobotDataset v3.0 as episodes of ours, one file each.
+"""Episodes of a LeRobotDataset v3.0 or v2 as episodes of ours, one file each.
 
 Times are nominal: row k is k / fps after 0, because the format keeps no clock. Numbers are kept as
 they are, whatever their unit. Video frames become JPEG, which is one more lossy step and is said
@@ -33,14 +33,19 @@ from bridge.episode.topics import (
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange.lerobot import layout
-from bridge.exchange.lerobot.layout import DatasetInfo, LeRobotFormatError, parquet, read_info
+from bridge.exchange.lerobot.layout import (
+    RESTORE,
+    DatasetInfo,
+    LeRobotFormatError,
+    parquet,
+    read_info,
+)
 from bridge.exchange.lerobot.video import read_frames
 from bridge.exchange.output import is_of_stand_in
 from bridge.media.color import JPEG_MAGIC, JPEG_QUALITY, encode_jpeg
 from bridge.terminal import Advance
 
 BATCH_ROWS = 1024
-_RESTORE = "Restore it from the original dataset."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +85,11 @@ class EpisodeRows:
             return np.asarray(values.flatten()).reshape(len(values), -1)
         return np.asarray(values)
 
+    def broken(self, found: str, *, row: int = 0, hint: str = RESTORE) -> LeRobotFormatError:
+        """Build the error that names a row of the episode, counted from 0."""
+        found = f"row {self.first_row + row}: {found}"
+        return LeRobotFormatError(path=self.entry.data_path, found=found, hint=hint)
+
 
 def parse_selection(text: str | None) -> list[range] | None:
     """Read "0-9,12": which episodes are wanted; None is all."""
@@ -101,28 +111,47 @@ def read_episodes(info: DatasetInfo, wanted: Sequence[range] | None) -> list[Epi
     Args:
         wanted: Ranges of episode indices; None for all.
     """
+    entries: dict[int, EpisodeEntry] = {}
+    per_chunk = info.episodes_per_chunk
+    rows = _rows_of(info) if per_chunk is None else _lines_of(info, per_chunk)
+    for path, number, row in rows:
+        entry = _entry(info, path, number, row)
+        if wanted is None or any(entry.index in part for part in wanted):
+            entries[entry.index] = entry
+    if not entries:
+        raise UsageError(f"none of the wanted episodes is listed in {info.folder / 'meta'}.")
+    return [entries[index] for index in sorted(entries)]
+
+
+def _rows_of(info: DatasetInfo) -> Iterator[tuple[Path, int, dict[str, Any]]]:
+    """Yield the rows of ``meta/episodes``, each with its file and its number."""
     _, pq = parquet()
     paths = sorted((info.folder / "meta" / "episodes").glob("*/*.parquet"))
     if not paths:
-        raise LeRobotFormatError(
-            path=info.folder / "meta" / "episodes", found="no Parquet files", hint=_RESTORE
-        )
-    entries: dict[int, EpisodeEntry] = {}
+        raise LeRobotFormatError(path=info.folder / "meta" / "episodes", found="no Parquet files")
     for path in paths:
         with _readable(path):
             file = pq.ParquetFile(path)
             names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-            number = 0
-            for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=names):
-                for row in batch.to_pylist():
-                    number += 1
-                    entry = _entry(info, path, number, row)
-                    if wanted is None or any(entry.index in part for part in wanted):
-                        entries[entry.index] = entry
-    if not entries:
-        message = f"none of the wanted episodes is in {info.folder}. It has those in {paths[0]}."
-        raise UsageError(message)
-    return [entries[index] for index in sorted(entries)]
+            batches = file.iter_batches(batch_size=BATCH_ROWS, columns=names)
+            rows = (row for batch in batches for row in batch.to_pylist())
+            for number, row in enumerate(rows, start=1):
+                yield path, number, row
+
+
+def _lines_of(info: DatasetInfo, per_chunk: int) -> Iterator[tuple[Path, int, dict[str, Any]]]:
+    """Yield the lines of version 2's ``meta/episodes.jsonl`` as version 3 has them."""
+    path = info.folder / "meta" / "episodes.jsonl"
+    with _readable(path), path.open(encoding="utf-8") as lines:
+        for number, line in enumerate(lines, start=1):
+            row = json.loads(line)
+            index = int(row["episode_index"])
+            place = {"chunk_index": index // per_chunk, "file_index": index}
+            for key, feature in info.features.items():
+                if feature.dtype == "video":
+                    row |= {f"videos/{key}/{name}": at for name, at in place.items()}
+                    row[f"videos/{key}/from_timestamp"] = 0.0
+            yield path, number, row | {f"data/{name}": at for name, at in place.items()}
 
 
 @contextmanager
@@ -135,7 +164,6 @@ def _readable(path: Path) -> Iterator[None]:
         raise LeRobotFormatError(
             path=path,
             found=f"cannot be read ({type(error).__name__}: {str(error)[:120]})",
-            hint=_RESTORE,
         ) from error
 
 
@@ -164,9 +192,7 @@ def _entry(info: DatasetInfo, path: Path, number: int, row: dict[str, Any]) -> E
         raise LeRobotFormatError(
             path=path,
             found=f"row {number}: {type(error).__name__} {error}",
-            hint="The columns are those of LeRobotDataset v3.0; "
-            + _RESTORE[0].lower()
-            + _RESTORE[1:],
+            hint=f"The columns are those of LeRobotDataset v3.0. {RESTORE}",
         ) from error
 
 
@@ -180,19 +206,14 @@ def iterate_rows(entries: Sequence[EpisodeEntry]) -> Iterator[EpisodeRows]:
         for index, first_row, table in _episodes_of(path, set(wanted)):
             rows = EpisodeRows(entry=wanted[index], first_row=first_row, table=table)
             if index in found:
-                raise LeRobotFormatError(
-                    path=path,
-                    found=f"row {first_row}: episode {index} begins a second time",
-                    hint="Rows of an episode lie together; " + _RESTORE,
-                )
+                raise rows.broken(f"episode {index} begins a second time; its rows lie together")
             found.add(index)
-            _check(path, rows)
+            _check(rows)
             yield rows
         if set(wanted) - found:
             raise LeRobotFormatError(
                 path=path,
                 found=f"no rows of episode {min(set(wanted) - found)}, listed as here",
-                hint=_RESTORE,
             )
 
 
@@ -220,28 +241,22 @@ def _episodes_of(path: Path, wanted: set[int]) -> Iterator[tuple[int, int, Any]]
             yield current, first, pa.Table.from_batches(held)
 
 
-def _check(path: Path, rows: EpisodeRows) -> None:
-    entry = rows.entry
-    if rows.table.num_rows != entry.length:
-        raise LeRobotFormatError(
-            path=path,
-            found=f"row {rows.first_row}: episode {entry.index} has {rows.table.num_rows} rows, "
-            f"meta/episodes says {entry.length}",
-            hint=_RESTORE,
-        )
+def _check(rows: EpisodeRows) -> None:
+    entry, count = rows.entry, rows.table.num_rows
+    if count != entry.length:
+        said = f"meta/episodes says {entry.length}"
+        raise rows.broken(f"episode {entry.index} has {count} rows, {said}")
     if "frame_index" in rows.table.column_names:
         wrong = np.flatnonzero(rows.column("frame_index") != np.arange(entry.length))
         if len(wrong):
-            raise LeRobotFormatError(
-                path=path,
-                found=f"row {rows.first_row + int(wrong[0])}: frame_index does not count from 0",
-                hint=_RESTORE,
-            )
+            raise rows.broken("frame_index does not count from 0", row=int(wrong[0]))
 
 
 SNAP_S = 1e-3
 """Stamps are 32-bit floats: closer than this to the grid they are on it."""
 _UNSAFE = re.compile(r"[^A-Za-z0-9_]+")
+MOST_OF_NAME = 60
+"""Letters of an instruction that become the name of a task."""
 
 
 @dataclass(kw_only=True)
@@ -279,7 +294,7 @@ def import_lerobot(
 
     Args:
         wanted: Numbers of episodes; None is all.
-        task: Name of the task they are trials of; "": they are not known to be any.
+        task: Name of the task they are trials of; "": that which the dataset names for each.
     """
     info = read_info(folder)
     plan = _plan(info, cell)
@@ -404,12 +419,7 @@ def _stamps_ns(info: DatasetInfo, rows: EpisodeRows) -> Int[np.ndarray, " num_ro
     if "timestamp" in rows.table.column_names:
         said_s = rows.column("timestamp").astype(np.float64)
         if not np.isfinite(said_s).all() or (said_s < 0).any() or (np.diff(said_s) <= 0).any():
-            raise LeRobotFormatError(
-                path=rows.entry.data_path,
-                found=f"row {rows.first_row}: the timestamps of episode {rows.entry.index} do "
-                "not rise",
-                hint="Restore the file from the original dataset.",
-            )
+            raise rows.broken(f"the timestamps of episode {rows.entry.index} do not rise")
         if (np.abs(said_s - grid_s) > SNAP_S).any():
             grid_s = said_s
     return np.array([ns_from_s(second) for second in grid_s.tolist()], dtype=np.int64)
@@ -420,26 +430,14 @@ def _numbers(
 ) -> Float[np.ndarray, "num_rows num_values"]:
     feature = info.features[key]
     if key not in rows.table.column_names:
-        raise LeRobotFormatError(
-            path=rows.entry.data_path,
-            found=f"no column {key!r}, which {layout.INFO_PATH} lists",
-            hint="Restore the file from the original dataset.",
-        )
+        raise rows.broken(f"no column {key!r}, which {layout.INFO_PATH} lists")
     try:
         values = rows.column(key).astype(np.float64).reshape(rows.entry.length, -1)
     except (TypeError, ValueError) as error:
-        raise LeRobotFormatError(
-            path=rows.entry.data_path,
-            found=f"row {rows.first_row}: column {key!r} holds no numbers ({error})",
-            hint="Restore the file from the original dataset.",
-        ) from error
+        raise rows.broken(f"column {key!r} holds no numbers ({error})") from error
     if values.shape[1] != feature.shape[0]:
-        raise LeRobotFormatError(
-            path=rows.entry.data_path,
-            found=f"row {rows.first_row}: {key!r} has {values.shape[1]} numbers, "
-            f"{layout.INFO_PATH} says {feature.shape[0]}",
-            hint="Restore the file from the original dataset.",
-        )
+        said = f"{layout.INFO_PATH} says {feature.shape[0]}"
+        raise rows.broken(f"{key!r} has {values.shape[1]} numbers, {said}")
     return values
 
 
@@ -453,19 +451,17 @@ def _images(info: DatasetInfo, rows: EpisodeRows, key: str) -> Iterator[bytes]:
     for number, value in enumerate(rows.table.column(key)):
         data = (value.as_py() or {}).get("bytes")
         if not data:
-            raise LeRobotFormatError(
-                path=rows.entry.data_path,
-                found=f"row {rows.first_row + number}: {key!r} holds no image",
-                hint="Images outside the Parquet files are not read.",
-            )
+            hint = "Images outside the Parquet files are not read."
+            raise rows.broken(f"{key!r} holds no image", row=number, hint=hint)
         yield data
 
 
 def _about(info: DatasetInfo, rows: EpisodeRows, cell: str, task: str) -> EpisodeInfo:
+    instruction = rows.entry.tasks[0] if rows.entry.tasks else ""
     return imported_info(
         _episode_id(rows.entry),
-        task,
-        instruction=rows.entry.tasks[0] if rows.entry.tasks else "",
+        task or _UNSAFE.sub("_", instruction.lower()).strip("_")[:MOST_OF_NAME],
+        instruction=instruction,
         trial=rows.entry.index,
         robot=info.robot_type,
         cell=cell,

@@ -2,7 +2,8 @@
 
 Source: the format's documentation and the ``huggingface/lerobot`` repository (``datasets/utils.py``
 for path templates and default features, ``dataset_metadata.py`` for the episode columns). Many
-episodes share a data file and a video file; ``meta/episodes`` says where each lies.
+episodes share a data file and a video file; ``meta/episodes`` says where each lies. In version 2
+each episode has files of its own, and ``meta/episodes.jsonl`` lists them.
 """
 
 import json
@@ -44,6 +45,8 @@ FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 EPISODES_PATH = f"meta/episodes/{FILE}.parquet"
 DATA_PATH = f"data/{FILE}.parquet"
 VIDEO_PATH = f"videos/{{video_key}}/{FILE}.mp4"
+V2_FIELDS = {"{episode_chunk": "{chunk_index", "{episode_index": "{file_index"}
+"""Fields of version 2's path templates as version 3 calls them."""
 CHUNKS_SIZE = 1000
 """Files per chunk folder."""
 DATA_FILE_MB = 100
@@ -61,10 +64,13 @@ DEFAULT_FEATURES = {
 _FIELD = re.compile(r"\{(\w+)(?::0?(\d+)d)?\}")
 
 
+RESTORE = "Restore it from the original dataset."
+
+
 class LeRobotFormatError(BridgeError):
     """A dataset does not look as its format says."""
 
-    def __init__(self, *, path: Path, found: str, hint: str) -> None:
+    def __init__(self, *, path: Path, found: str, hint: str = RESTORE) -> None:
         """Remember the file and what was found."""
         self.path = path
         self.found = found
@@ -101,6 +107,8 @@ class DatasetInfo:
     video_path: str | None
     features: dict[str, Feature]
     version: str
+    episodes_per_chunk: int | None = None
+    """Of version 2, where each episode has files of its own; None in version 3."""
 
     def data_file(self, chunk_index: int, file_index: int) -> Path:
         """Return a data file by its indices."""
@@ -133,7 +141,6 @@ class DatasetInfo:
             raise LeRobotFormatError(
                 path=self.folder / INFO_PATH,
                 found=f"path template {template!r} leads out of the dataset",
-                hint="Restore the file from the original dataset.",
             )
         return path
 
@@ -148,31 +155,36 @@ def read_info(folder: Path) -> DatasetInfo:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         version = str(record["codebase_version"])
-        if not version.startswith("v3."):
+        if not version.startswith(("v2.", "v3.")):
             raise LeRobotFormatError(
                 path=path,
-                found=f"version {version}, and only v3 is read",
-                hint="lerobot converts it: convert_dataset_v21_to_v30.",
+                found=f"version {version}, and only v2 and v3 are read",
+                hint="lerobot converts version 1: convert_dataset_v1_to_v2.",
             )
         fps = float(record["fps"])
         if not 0 < fps < 10_000:
             message = f"fps is {fps}"
             raise ValueError(message)
         features = {key: _feature(key, value) for key, value in record["features"].items()}
+        places = [str(record.get(name) or "") for name in ("data_path", "video_path")]
+        per_chunk = None
+        if version.startswith("v2."):  # episode i is alone in file i of its chunk
+            per_chunk = max(1, int(record.get("chunks_size") or CHUNKS_SIZE))
+            for theirs, ours in V2_FIELDS.items():
+                places = [place.replace(theirs, ours) for place in places]
         return DatasetInfo(
             folder=folder,
             fps=fps,
             robot_type=str(record.get("robot_type") or ""),
-            data_path=str(record.get("data_path") or DATA_PATH),
-            video_path=record.get("video_path"),
+            data_path=places[0] or DATA_PATH,
+            video_path=places[1] or None,
             features=features,
             version=version,
+            episodes_per_chunk=per_chunk,
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise LeRobotFormatError(
-            path=path,
-            found=f"cannot be read ({type(error).__name__}: {error})",
-            hint="Restore it from the original dataset.",
+            path=path, found=f"cannot be read ({type(error).__name__}: {error})"
         ) from error
 
 

@@ -18,9 +18,7 @@ def read_frames(path: Path, times_s: Sequence[float], tolerance_s: float) -> Ite
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
-                raise LeRobotFormatError(
-                    path=path, found="no video in it", hint="Restore it from the dataset."
-                )
+                raise LeRobotFormatError(path=path, found="no video in it")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             if times_s[0] > 0:

@@ -59,32 +59,8 @@ def read_index(folder: Path, config: FolderConfig = DEFAULTS) -> FolderIndex:
         return read_tum(folder, config)
     if find_frames(folder):
         return read_sevenscenes(folder, config)
-    raise _unknown(folder)
-
-
-def _unknown(folder: Path) -> FolderError | PathNotFoundError:
-    """Say what was looked for, and where it may be instead."""
-    below = sorted(
-        path.name
-        for path in folder.iterdir()
-        if path.is_dir() and ((path / INDEX_NAME).is_file() or find_lists(path))
-    )
-    below += sorted(path.name for path in folder.iterdir() if path.is_dir() and find_frames(path))
-    if below:
-        return FolderError(
-            path=folder,
-            found=f"no frames of its own, but {', '.join(below[:5])} below it hold some",
-            hint="Give one of those folders.",
-        )
-    return PathNotFoundError(
-        path=folder / INDEX_NAME,
-        what="index",
-        hint=(
-            "Known layouts: scene.json; TUM (rgb.txt, depth.txt, groundtruth.txt); 7-Scenes "
-            "(frame-000000.color.png, .depth.png, .pose.txt); images without depth: robot-gst "
-            "import images. docs/rgbd_folder.md describes them."
-        ),
-    )
+    hint = "robot-gst open says what is there; docs/rgbd_folder.md has the layouts."
+    raise PathNotFoundError(path=folder / INDEX_NAME, what="index", hint=hint)
 
 
 WORLD = "world"

@@ -1,4 +1,4 @@
-"""A small dataset in LeRobot's v3.0 layout, by hand, from the format's description alone."""
+"""A small dataset in LeRobot's layouts, by hand, from the formats' descriptions alone."""
 
 import io
 import json
@@ -127,8 +127,8 @@ class Dataset:
             "task_index": number // 2,
         }
 
-    def write(self) -> Path:
-        schema = pa.schema(
+    def schema(self) -> Any:
+        return pa.schema(
             [
                 ("observation.state", pa.list_(pa.float32(), 3)),
                 ("action", pa.list_(pa.float32())),
@@ -146,17 +146,45 @@ class Dataset:
                 ("task_index", pa.int64()),
             ]
         )
+
+    def write(self) -> Path:
         for file in (0, 1):
             rows = [row for row in self.rows if row["episode_index"] // 2 == file]
             path = self.folder / f"data/chunk-000/file-{file:03d}.parquet"
             path.parent.mkdir(parents=True, exist_ok=True)
             # Small row groups that do not end where an episode does.
-            table = pa.Table.from_pylist(rows, schema=schema)
+            table = pa.Table.from_pylist(rows, schema=self.schema())
             pq.write_table(table, path, row_group_size=4)
             video = self.folder / f"videos/{CAMERA}/chunk-000/file-{file:03d}.mp4"
             write_video(video, [row["index"] for row in rows])
         path = self.folder / "meta/episodes/chunk-000/file-000.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.Table.from_pylist(self.episodes), path)
+        (self.folder / "meta/info.json").write_text(json.dumps(self.info))
+        return self.folder
+
+    def write_v2(self) -> Path:
+        """The same in v2.1: files of its own for each episode, lists in JSON lines."""
+        chunk, number = "chunk-{episode_chunk:03d}", "episode_{episode_index:06d}"
+        self.info |= {
+            "codebase_version": "v2.1",
+            "chunks_size": 2,
+            "data_path": f"data/{chunk}/{number}.parquet",
+            "video_path": f"videos/{chunk}/{{video_key}}/{number}.mp4",
+        }
+        lines = []
+        for episode in self.episodes:
+            index = episode["episode_index"]
+            place = {"episode_chunk": index // 2, "episode_index": index, "video_key": CAMERA}
+            rows = [row for row in self.rows if row["episode_index"] == index]
+            path = self.folder / self.info["data_path"].format(**place)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pq.write_table(pa.Table.from_pylist(rows, schema=self.schema()), path)
+            video = self.folder / self.info["video_path"].format(**place)
+            write_video(video, [row["index"] for row in rows])
+            lines.append({name: episode[name] for name in ("episode_index", "tasks", "length")})
+        (self.folder / "meta").mkdir(exist_ok=True)
+        listed = "".join(json.dumps(line) + "\n" for line in lines)
+        (self.folder / "meta/episodes.jsonl").write_text(listed)
         (self.folder / "meta/info.json").write_text(json.dumps(self.info))
         return self.folder

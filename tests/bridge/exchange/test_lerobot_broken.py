@@ -9,7 +9,7 @@ from lerobot_dataset import CAMERA, Dataset
 
 
 def break_version(dataset: Dataset) -> None:
-    dataset.info["codebase_version"] = "v2.1"
+    dataset.info["codebase_version"] = "v1.6"
 
 
 def break_template(dataset: Dataset) -> None:
@@ -60,7 +60,7 @@ def break_time(dataset: Dataset) -> None:
 @pytest.mark.parametrize(
     ("damage", "code", "match"),
     [
-        (break_version, 1, "info.json: version v2.1, and only v3 is read"),
+        (break_version, 1, "info.json: version v1.6, and only v2 and v3 are read"),
         (break_template, 1, "leads out of the dataset"),
         (break_field, 1, "with the field 'episode_chunk'"),
         (break_fps, 1, "info.json: cannot be read (ValueError: fps is 0.0)"),

@@ -61,13 +61,41 @@ def test_each_row_has_the_video_frame_of_its_time(dataset: Dataset, tmp_path: Pa
         assert run("check", path) == 0
 
 
+def test_version_2_brings_the_same_episodes(tmp_path: Path) -> None:
+    for name in ("write", "write_v2"):
+        folder = getattr(Dataset(tmp_path / name), name)()
+        assert run("import", "lerobot", folder, tmp_path / f"{name}_run") == 0
+    topics = ("/lerobot/joint_states", "/lerobot/action", "/lerobot/next/reward")
+    for number, length in enumerate(LENGTHS):
+        pair = [tmp_path / f"{n}_run/episodes/ep_{number:06d}.mcap" for n in ("write", "write_v2")]
+        old, new = ([m.data for m in Episode.open(p).messages(topics)] for p in pair)
+        assert old == new
+        pictures = [colors(path, "/lerobot/cam/front/color/image") for path in pair]
+        assert [len(each) for each in pictures] == [length, length]
+        for one, other in zip(*pictures, strict=True):
+            assert one.stamp_ns == other.stamp_ns
+            means = [decode_color(c.data).astype(float).mean(axis=(0, 1)) for c in (one, other)]
+            np.testing.assert_allclose(*means, atol=4)
+        assert Episode.open(pair[0]).outcome == Episode.open(pair[1]).outcome
+
+
+@pytest.mark.parametrize("line", ["", "{", "[]", '{"episode_index": 0}', '{"episode_index": "x"}'])
+def test_a_broken_list_of_version_2_is_named(
+    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
+) -> None:
+    (dataset.write_v2() / "meta/episodes.jsonl").write_text(f"{line}\n")
+    assert run("import", "lerobot", dataset.folder, tmp_path / "run") == 1
+    assert "episodes.jsonl" in capsys.readouterr().err
+
+
 def test_the_episode_says_what_it_is_made_of(dataset: Dataset, tmp_path: Path) -> None:
     assert run("import", "lerobot", dataset.write(), tmp_path / "run", "--cell", "lab") == 0
     episodes = [Episode.open(p) for p in sorted((tmp_path / "run" / "episodes").iterdir())]
     assert [e.info.instruction for e in episodes] == ["pick the cube"] * 2 + ["fold the towel"]
     assert {(e.info.kind, e.info.cell, e.info.robot) for e in episodes} == {
-        ("imported", "lab", "so100")
+        ("trial", "lab", "so100")
     }
+    assert [e.info.task for e in episodes] == ["pick_the_cube"] * 2 + ["fold_the_towel"]
     assert [e.outcome.result for e in episodes if e.outcome] == ["success", "failure", "success"]
     source = episodes[2].metadata_records["source"]
     assert source["episode_index"] == 2

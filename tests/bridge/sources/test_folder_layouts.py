@@ -16,6 +16,7 @@ from bridge.errors import PathNotFoundError, UsageError
 from bridge.sources.folder.config import FolderConfig, FolderError
 from bridge.sources.folder.messages import folder_messages, frame_times_ns, read_index
 from bridge.sources.folder.tum import StampedFile, associate
+from dashboards.opening import look_at
 
 SMALL = FolderConfig(depth_intrinsics=(9.0, 9.5, 4.0, 3.0), color_intrinsics=(8.0, 8.5, 4.1, 3.1))
 TUM = FolderConfig(depth_intrinsics=(9.0, 9.5, 4.0, 3.0))
@@ -216,8 +217,10 @@ def test_lost_tracking_and_missing_files_of_a_sevenscenes_folder(scenes: Path) -
 
 
 def test_a_folder_of_sequences_points_to_them(scenes: Path) -> None:
-    with pytest.raises(FolderError, match=r"but seq-01 below it hold some"):
+    with pytest.raises(PathNotFoundError, match="robot-gst open says what is there"):
         read_index(scenes.parent)
+    with pytest.raises(UsageError, match=r"holds seq-01 \(RGB-D folder\)"):
+        look_at(scenes.parent)
 
 
 def test_options_that_a_scene_json_answers_itself_are_refused(tmp_path: Path) -> None:

@@ -1,0 +1,413 @@
+"""What somebody's files are, what they lack for each use, how they come in, and what follows.
+
+Heads, summaries and small texts are read; nothing is unpickled or run. Commands that import do so.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+from bridge.cli.exchange import import_images, import_rgbd, import_rosbag2
+from bridge.data_files import datasets_folder
+from bridge.episode import schema
+from bridge.episode import topics as named
+from bridge.episode.catalogue import find_episodes
+from bridge.episode.cdr.messages import JointSample, string_from_cdr
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.exchange.driver_names import mapped
+from bridge.exchange.rosbag2 import METADATA_FILE, Survey, count_messages, survey
+from bridge.exchange.trials_csv import keep_trials, trials_path
+from bridge.leaves import load_leaf
+from bridge.robots.robot import Robot, read_robot, robot_of
+from bridge.sources.folder.messages import find_frames, read_index
+from bridge.sources.folder.posed_index import COLMAP_FOLDERS, TRANSFORMS, read_posed_index
+from bridge.sources.folder.scene_json import INDEX_NAME
+from bridge.sources.folder.tum import find_lists
+from bridge.terminal import Output
+
+OUTPUT = Output()
+MOST_INSIDE, MOST_NAMED, MOST_EPISODES = 200, 5, 50
+"""Things of a folder that are looked at, and that a message names; episodes that are opened."""
+MOST_HEAD_BYTES, MOST_TABLE_BYTES = 1 << 16, 1 << 26
+HEADS = {b"\x89MCAP0\r\n": "bag", b"SQLite format 3\0": "bag", b"#ROSBAG": "ROS 1 bag"}
+HEADS |= {b"ply\n": "splat", b"ply\r": "splat"}
+ENDINGS = {
+    "bag": (".mcap", ".db3", ".mcap.zstd", ".db3.zstd"),
+    "table": (".csv", ".tsv", ".xlsx", ".xlsm"),
+}
+OF_BAG = (*ENDINGS["bag"], METADATA_FILE)
+SPLAT_FIELDS = frozenset({"x", "f_dc_0", "opacity", "scale_0", "rot_0"})
+STREAMS = (named.COLOR_IMAGE, named.COLOR_INFO, named.DEPTH_IMAGE, named.DEPTH_INFO)
+STREAM = re.compile(f"{named.CAMERAS}([^/]+)({'|'.join(STREAMS)})$")
+USES = ("record", "rebuild", "replay", "evaluate")
+ONLY_SEEN = "joint states and a task"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """What lies at a path."""
+
+    what: str
+    holds: tuple[str, ...] = ()
+    record: str = "a robot and cameras that publish (docs/recording.md)"
+    """What each use lacks; "": nothing."""
+    rebuild: str = ""
+    replay: str = ""
+    evaluate: str = ""
+    bring: Callable[..., int] | None = None
+    """Imports it into a run."""
+    then: tuple[str, ...] = ()
+    """Commands that lead on."""
+
+    def lines(self, path: Path) -> list[str]:
+        """Say it to a person."""
+        lines = [f"{path}: {self.what}", *(f"  {text}" for text in self.holds)]
+        for use in USES:
+            lack = getattr(self, use)
+            lines.append(f"  {use} needs {lack}" if lack else f"  {use}: ready")
+        steps = (f"open {path} RUN",) if self.bring else self.then
+        return [*lines, *(f"next: robot-gst {step}" for step in steps)]
+
+
+def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> int:
+    """Say what a file or folder of yours holds, what it lacks and what comes next; or import it.
+
+    Bags, LeRobot datasets, RGB-D and posed images, splats, tables of trials, runs.
+    Example: robot-gst open bags/monday runs/monday
+
+    Args:
+        path: A file or folder; without RUN it is only read.
+        run: Run folder to import it into; made where needed.
+    """
+    found = look_at(path)
+    lines = found.lines(path)
+    if run is None:
+        record = {name: value for name, value in vars(found).items() if name != "bring"}
+        output.result({"path": str(path), **record}, "\n".join(lines))
+        return 0
+    if found.bring is None:
+        raise UsageError("\n".join([*lines, "It cannot be imported."]))
+    output.say(lines[0])
+    code = found.bring(path, run, output=output)
+    output.say("\n".join(look_at(run).lines(run)))
+    return code
+
+
+def look_at(path: Path) -> Found:
+    """Find out what lies at a path.
+
+    Raises:
+        UsageError: Naming what is there, where it is nothing known or several things.
+    """
+    if not path.exists():
+        raise PathNotFoundError(path=path, what="file or folder", hint="Check the path.")
+    kinds = kinds_of(path)
+    if not kinds:
+        raise _unknown(path)
+    if len(kinds) > 1:
+        each = " and ".join(f"a {kind}" for kind in kinds)
+        raise UsageError(f"{path} is {each} at once. Put each into a folder of its own.")
+    of_run = next((p for p in (path, path.parent) if p.name in ("episodes", "derived")), None)
+    if of_run is not None and kinds == ["bag"]:
+        raise UsageError(f"{path} is part of a run. Open that: robot-gst open {of_run.parent}")
+    return KINDS[kinds[0]](path)
+
+
+def kinds_of(path: Path) -> list[str]:
+    """Say what a path looks like: by the first bytes of a file, by the files of a folder."""
+    if path.is_dir():
+        return [kind for kind, is_it in FOLDERS.items() if is_it(path)]
+    if not path.is_file() or not path.stat().st_size:
+        return []
+    with path.open("rb") as stream:
+        start = stream.read(16)
+    found = [kind for magic, kind in HEADS.items() if start.startswith(magic)]
+    return found or [kind for kind, ends in ENDINGS.items() if path.name.lower().endswith(ends)]
+
+
+def _unknown(path: Path) -> UsageError:
+    inside = sorted(islice(path.iterdir(), MOST_INSIDE)) if path.is_dir() else []
+    known = [f"{each.name} ({', '.join(kinds)})" for each in inside if (kinds := kinds_of(each))]
+    if known:
+        return UsageError(f"{path} holds {_some(known)}. Open one: robot-gst open {path}/NAME")
+    if path.name.endswith(".part"):
+        return UsageError(f"{path} was not finished. Repair it: robot-gst recover {path}")
+    is_empty = not inside if path.is_dir() else not path.stat().st_size
+    found = "is empty" if is_empty else "is nothing known here"
+    return UsageError(f"{path} {found}. Known are: {', '.join(KINDS)}.")
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return (", ".join(names[:MOST_NAMED]) or "none") + more
+
+
+def _is_run(folder: Path) -> bool:
+    return any((folder / "episodes").glob("*.mcap*")) or trials_path(RunFolder(folder)).is_file()
+
+
+def _is_rgbd(folder: Path) -> bool:
+    return bool((folder / INDEX_NAME).is_file() or find_lists(folder) or find_frames(folder))
+
+
+def _is_posed(folder: Path) -> bool:
+    models = (folder / p / f"images.{end}" for p in COLMAP_FOLDERS for end in ("txt", "bin"))
+    return (folder / TRANSFORMS).is_file() or any(path.is_file() for path in models)
+
+
+def _is_rlds(folder: Path) -> bool:
+    found = (folder.glob(f"{deep}dataset_info.json") for deep in ("", "*/", "*/*/"))
+    return any(any(path.parent.glob("*.tfrecord*")) for paths in found for path in paths)
+
+
+FOLDERS: dict[str, Callable[[Path], bool]] = {
+    "run": _is_run,
+    "bag": lambda folder: any(each.name.endswith(OF_BAG) for each in folder.glob("*.*")),
+    "LeRobot dataset": lambda folder: (folder / "meta/info.json").is_file(),
+    "RLDS dataset": _is_rlds,
+    "RGB-D folder": _is_rgbd,
+    "folder of posed images": _is_posed,
+}
+
+
+def _bag(path: Path) -> Found:
+    seen = survey(path)
+    names = mapped(seen.types)
+    cameras, views = _cameras(seen, names)
+    robot, lacks, _ = _robot(seen)
+    count = count_messages(path)
+    renamed = [f"{old} will be {new}" for old, new in names.items() if not old.endswith("_info")]
+    return Found(
+        what=f"a bag of {f'{count} messages on ' if count else ''}{len(seen.types)} topics",
+        holds=(*robot, *cameras, *renamed),
+        record="the same nodes, live (docs/recording.md, section 4)",
+        rebuild="; ".join(views),
+        replay="; ".join(lacks + views),
+        evaluate="its task and outcome: label it when it is imported",
+        bring=import_rosbag2,
+    )
+
+
+def _cameras(seen: Survey, names: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    """What is known of the cameras, and what they lack for a scene.
+
+    Args:
+        names: What an episode calls topics that have other names in a recording.
+    """
+    cameras: dict[str, dict[str, str]] = {}
+    images = []
+    for topic, type_name in seen.types.items():
+        place = STREAM.search(names.get(topic, topic))
+        if place and not named.is_truth(topic):
+            rate = f" {seen.rates_hz[topic]:.3g} Hz" if topic in seen.rates_hz else ""
+            text = place[2][1:].replace("/", " ") + (rate if "image" in place[2] else "")
+            cameras.setdefault(place[1], {})[place[2]] = text
+        elif type_name in (schema.IMAGE, schema.COMPRESSED_IMAGE):
+            images.append(topic)
+    holds = [f"camera {name}: {', '.join(has.values())}" for name, has in cameras.items()]
+    if images and not cameras:
+        new = f"{named.CAMERAS}NAME{named.COLOR_IMAGE}"
+        holds.append(f"images by an unknown name: import rosbag2 --remap {images[0]}={new}")
+    lacks = []
+    if not any(len(has) == len(STREAMS) for has in cameras.values()):
+        streams = [f"{c}{s}" for c, has in cameras.items() for s in STREAMS if s not in has]
+        lacks.append(_some(streams) if streams else "a calibrated camera with colour and depth")
+    if not {named.TF, named.TF_STATIC} & set(seen.types):
+        lacks.append(f"where the cameras are ({named.TF}, {named.TF_STATIC})")
+    return holds, lacks
+
+
+def _robot(seen: Survey) -> tuple[list[str], list[str], list[Robot]]:
+    """What is known of the robot, what is missing, and the robots that it may be."""
+    tracks = {
+        topic: JointSample.from_cdr(data).names
+        for topic, data in seen.first.items()
+        if topic.endswith(named.JOINT_STATES) and seen.types.get(topic) == schema.JOINT_STATE
+    }
+    if not tracks:
+        return [], [f"joint states on a topic that ends in {named.JOINT_STATES}"], []
+    topic, joints = max(tracks.items(), key=lambda item: len(item[1]))
+    files = sorted((datasets_folder() / "robots").glob("*.toml"))
+    urdf = seen.first.get(named.ROBOT_DESCRIPTION)
+    known = [robot_of(string_from_cdr(urdf))] if urdf else [read_robot(f.stem) for f in files]
+    fits = [robot for robot in known if set(robot.joints) <= set(joints)]
+    fits = [robot for robot in fits if len(robot.joints) == max(len(r.joints) for r in fits)]
+    name = " or ".join(robot.name for robot in fits) or "none of the robot files"
+    lacks = [] if fits else ["a robot file with its joints (docs/robots.md)"]
+    fingers = {joint for robot in fits for joint in robot.finger_joints}
+    if not fingers & set(joints) and not any(t.endswith(named.GRIPPER_STATE) for t in seen.types):
+        lacks.append(f"the gripper's width on a topic that ends in {named.GRIPPER_STATE}")
+    rate_hz = seen.rates_hz.get(topic, 0.0)
+    return [f"robot: {name}; {_some(joints)} at {rate_hz:.3g} Hz on {topic}"], lacks, fits
+
+
+def _lerobot(path: Path) -> Found:
+    info = load_leaf("lerobot", "read_info")(path)
+    episodes = load_leaf("lerobot", "read_episodes")(info, None)
+    state = info.features.get("observation.state")
+    images = [key for key, each in info.features.items() if each.dtype in ("video", "image")]
+    return Found(
+        what=f"a LeRobot dataset {info.version}: {len(episodes)} episodes at {info.fps:g} Hz",
+        holds=(
+            f"robot: {info.robot_type or 'not named'}, {_some(state.names if state else ())}",
+            f"cameras: {_some(images)}",
+            f"tasks: {_some(sorted({task for each in episodes for task in each.tasks}))}",
+        ),
+        rebuild="depth images, which the format has none of",
+        replay="depth images, and the gripper's width in metres",
+        evaluate="" if "next.success" in info.features else "outcomes: label them when imported",
+        bring=load_leaf("lerobot", "import"),
+    )
+
+
+@contextmanager
+def _options_of(command: str) -> Iterator[None]:
+    """Say which command takes the options that an error asks for."""
+    try:
+        yield
+    except UsageError as error:
+        raise UsageError(f"{error} Options go to: robot-gst {command}") from error
+
+
+def _rgbd(path: Path) -> Found:
+    with _options_of(f"import rgbd {path} RUN"):
+        index = read_index(path)
+    return Found(
+        what=f"RGB-D images, {index.summary}",
+        holds=tuple(f"assumed {name}: {value}" for name, value in index.assumed.items()),
+        replay=ONLY_SEEN,
+        bring=import_rgbd,
+    )
+
+
+def _posed(path: Path) -> Found:
+    index = read_posed_index(path)
+    return Found(
+        what=f"{len(index.images)} posed images without depth, {index.layout}: to look at",
+        rebuild="depth images",
+        replay=f"depth images, {ONLY_SEEN}",
+        evaluate="depth images, or trials",
+        bring=import_images,
+    )
+
+
+def _splat(path: Path) -> Found:
+    with path.open("rb") as stream:
+        head, end, _ = stream.read(MOST_HEAD_BYTES).partition(b"end_header\n")
+    words = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    fields = [word[-1] for word in words if word[:1] == ["property"]]
+    counts = [word[-1] for word in words if word[:2] == ["element", "vertex"]]
+    is_splat = set(fields) >= SPLAT_FIELDS
+    least = 4 * len(fields) * int(counts[0]) if counts and counts[0].isdecimal() else 0
+    if not end or not least or (is_splat and path.stat().st_size < len(head + end) + least):
+        raise UsageError(f"{path} ends early or has no PLY header. Copy it again from its origin.")
+    return Found(
+        what=f"a splat of {counts[0]} Gaussians" if is_splat else "a PLY file without Gaussians",
+        rebuild="the RGB-D images that it was made of: scenes are fitted, not imported",
+        replay=f"RGB-D images, {ONLY_SEEN}",
+        evaluate="recorded images and renders of it: "
+        "robot-gst evaluate --reference DIR --renders NAME=DIR",
+    )
+
+
+def _table(path: Path) -> Found:
+    from evaluator.compare.intake import take  # noqa: PLC0415 - only tables need what it loads
+
+    if path.stat().st_size > MOST_TABLE_BYTES:
+        raise UsageError(f"{path} is larger than any table of trials. Open what it was made of.")
+    with _options_of(f"evaluate {path}"):
+        taken = take(path)
+
+    def keep(path: Path, run: Path, *, output: Output) -> int:
+        file = keep_trials(taken.trials, RunFolder.create(run), force=False)
+        output.result({"file": str(file), "trials": len(taken.trials)}, f"{file}: {taken.summary}")
+        return 0
+
+    return Found(
+        what=f"a table of {len(taken.trials) or len(taken.rates)} {taken.kind}",
+        holds=(f"understood as {taken.summary}",),
+        rebuild="recordings: a table has none",
+        replay="recordings: a table has none",
+        bring=keep if taken.trials else None,
+        then=(f"evaluate {path}",),
+    )
+
+
+def _converted(kind: str, into: str, path: Path) -> Found:
+    made = f"{into.format(path=path, stem=path.stem)} makes one: open that"
+    return Found(what=f"{kind}, not read here", rebuild=made, replay=made, evaluate=made)
+
+
+def _run(path: Path) -> Found:
+    """What a run holds and lacks, and the commands from there to a page with numbers."""
+    run = RunFolder.open(path)
+    entries = find_episodes(run)
+    seen = _survey(run)
+    cameras, views = _cameras(seen, {})
+    robot, lacks, robots = _robot(seen)
+    has_scene = (run.scene_dir / "scene.json").is_file()
+    has_table = trials_path(run).is_file()
+    trials = [e for e in entries if not e.error and e.kind in ("trial", "imported")]
+    unknown = [entry for entry in trials if entry.outcome == "unknown"]
+    broken = [entry.id for entry in entries if entry.error]
+    steps = [f"recover {path}"] * bool(run.unfinished())
+    steps += [f"rebuild {path}"] * (not views and not has_scene)
+    task = " --task NAME" if unknown and unknown[0].kind == "imported" else ""
+    if unknown and (views or robots or not task):
+        steps.append(f"label {path} {unknown[0].id}{task} --result success")
+    if trials and not lacks and not views:
+        is_told = named.ROBOT_DESCRIPTION in seen.types
+        steps.append(f"replay {path}" + ("" if is_told else f" --robot {robots[0].name}"))
+    can_count = bool(trials or has_table or has_scene or not views)
+    steps += [f"evaluate {path}"] * can_count
+    more = [f"unreadable: {_some(broken)}"] * bool(broken)
+    more += ["a scene"] * has_scene + ["a table of trials"] * has_table
+    return Found(
+        what=f"a run of {len(entries)} episode{'' if len(entries) == 1 else 's'}",
+        holds=(*more, *robot, *cameras),
+        rebuild="; ".join(views),
+        replay="; ".join(lacks + views),
+        evaluate=f"task and outcome of {len(unknown)} of {len(trials)} trials" if unknown else "",
+        then=(*steps, f"dashboard {path}"),
+    )
+
+
+def _survey(run: RunFolder) -> Survey:
+    """The topics of a run's first episodes, as those of one recording."""
+    types: dict[str, str] = {}
+    rates_hz: dict[str, float] = {}
+    first: dict[str, bytes] = {}
+    for path in run.episodes()[:MOST_EPISODES]:
+        try:
+            episode = Episode.open(path)
+            for topic, about in episode.topics().items():
+                if topic not in types and about.count:
+                    types[topic] = about.type_name
+                    rates_hz[topic] = about.count / max(episode.duration_s, 1e-9)
+                    first[topic] = next(episode.messages([topic])).data
+        except GstError:  # ls and check say what is wrong with it
+            continue
+    return Survey(types=types, rates_hz=rates_hz, first=first)
+
+
+KINDS: dict[str, Callable[[Path], Found]] = {
+    "run": _run,
+    "bag": _bag,
+    "LeRobot dataset": _lerobot,
+    "RGB-D folder": _rgbd,
+    "folder of posed images": _posed,
+    "splat": _splat,
+    "table": _table,
+    "ROS 1 bag": partial(
+        _converted, "a ROS 1 bag", "a ROS 2 bag; rosbags-convert --src {path} --dst {stem}"
+    ),
+    "RLDS dataset": partial(
+        _converted, "an RLDS dataset", "a LeRobot dataset; openx2lerobot of any4lerobot"
+    ),
+}

@@ -1,0 +1,155 @@
+"""What strangers come with, each as small as it can be: bags, datasets, folders, tables, a run."""
+
+import json
+import sqlite3
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import Writer
+
+from bridge.episode.reader import Episode
+from bridge.episode.schema import DEFINITIONS, schema_text
+from bridge.media.color import encode_jpeg
+
+CAMERA = ("color/image", "color/info", "depth/image", "depth/info")
+POSES = {"/tf": "/tf", "/tf_static": "/tf_static"}
+DRIVERS = {
+    "realsense": (
+        "/camera/camera/color/image_raw/compressed",
+        "/camera/camera/color/camera_info",
+        "/camera/camera/aligned_depth_to_color/image_raw",
+        "/camera/camera/aligned_depth_to_color/camera_info",
+    ),
+    "zed": (
+        "/zed/zed_node/rgb/image_rect_color/compressed",
+        "/zed/zed_node/rgb/camera_info",
+        "/zed/zed_node/depth/depth_registered",
+        "/zed/zed_node/depth/camera_info",
+    ),
+    "azure": (
+        "/rgb/image_raw/compressed",
+        "/rgb/camera_info",
+        "/depth_to_rgb/image_raw",
+        "/depth_to_rgb/camera_info",
+    ),
+}
+"""Topics of three drivers' colour and depth, each with its calibration."""
+PANDA = tuple(f"panda_joint{n}" for n in range(1, 8))
+
+
+def driver_names(driver: str, camera: str) -> dict[str, str]:
+    """New names by those of an episode of the cell ``lab``."""
+    topics = zip(CAMERA, DRIVERS[driver], strict=True)
+    return {f"/lab/cam/{camera}/{ours}": theirs for ours, theirs in topics} | POSES
+
+
+def mcap_bag(episode: Path, path: Path, names: Mapping[str, str]) -> Path:
+    """The messages of some topics of an episode, as ``ros2 bag record`` writes them."""
+    opened = Episode.open(episode)
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        channels = {}
+        for topic, about in opened.topics().items():
+            if topic in names:
+                text = schema_text(about.type_name).encode()
+                kind = writer.register_schema(about.type_name, "ros2msg", text)
+                channels[topic] = writer.register_channel(names[topic], "cdr", kind)
+        for item in opened.messages(channels):
+            channel = channels[item.topic]
+            writer.add_message(channel, item.log_time_ns, item.data, item.publish_time_ns)
+        writer.finish()
+    return path
+
+
+def sqlite_bag(episode: Path, folder: Path, names: Mapping[str, str]) -> Path:
+    """The same as a folder with a database and ``metadata.yaml``."""
+    opened = Episode.open(episode)
+    folder.mkdir()
+    database = sqlite3.connect(folder / "b_0.db3")
+    database.executescript(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, "
+        "serialization_format TEXT, offered_qos_profiles TEXT);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
+        "data BLOB);"
+    )
+    numbers = {topic: number for number, topic in enumerate(names, start=1)}
+    for topic, number in numbers.items():
+        type_name = opened.topics()[topic].type_name
+        assert type_name in DEFINITIONS
+        row = (number, names[topic], type_name, "cdr", "")
+        database.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?)", row)
+    for item in opened.messages(names):
+        row = (numbers[item.topic], item.log_time_ns, bytes(item.data))
+        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", row)
+    database.commit()
+    database.close()
+    (folder / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: sqlite3\n"
+        "  relative_file_paths:\n    - b_0.db3\n"
+    )
+    return folder
+
+
+def rlds(folder: Path) -> Path:
+    """A dataset as TensorFlow Datasets keeps it."""
+    version = folder / "1.0.0"
+    version.mkdir(parents=True)
+    record: dict[str, Any] = {"name": "bridge", "version": "1.0.0"}
+    record["splits"] = [{"name": "train", "shardLengths": ["3", "4"]}]
+    (version / "dataset_info.json").write_text(json.dumps(record))
+    (version / "features.json").write_text("{}")
+    (version / "bridge-train.tfrecord-00000-of-00001").write_bytes(bytes(64))
+    return folder
+
+
+def colmap(folder: Path) -> Path:
+    """Two images and a text model."""
+    (folder / "images").mkdir(parents=True)
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text("1 PINHOLE 32 24 30 30 16 12\n")
+    lines = []
+    for number in (1, 2):
+        picture = encode_jpeg(np.full((24, 32, 3), 60 * number, np.uint8))
+        (folder / "images" / f"{number}.jpg").write_bytes(picture)
+        lines += [f"{number} 1 0 0 0 {0.1 * number} 0 2 1 {number}.jpg", ""]
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    (model / "points3D.txt").write_text("1 0 0 0 9 9 9 0.5 1 0\n")
+    return folder
+
+
+def workbook(path: Path) -> Path:
+    """A spreadsheet as a laboratory keeps it: its own words, no ids."""
+    from openpyxl import Workbook
+
+    book = Workbook()
+    rows = [("Task", "Policy", "Outcome"), *[("stack", "act", "success")] * 3]
+    for row in (*rows, ("stack", "act", "failure")):
+        book.active.append(row)
+    book.save(path)
+    return path
+
+
+def splat(path: Path, *, fields: str = "x y z f_dc_0 opacity scale_0 rot_0") -> Path:
+    """A PLY file of five points with some fields."""
+    names = fields.split()
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 5\n"
+    head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    path.write_bytes(head.encode() + bytes(4 * 5 * len(names)))
+    return path
+
+
+def franka(make_trial: Callable[..., Path], folder: Path) -> Path:
+    """A Franka arm without cameras, in a database."""
+    trial = make_trial(id="arm", kind="imported", task="", cameras=(), joints=PANDA, result=None)
+    return sqlite_bag(trial, folder, {"/lab/joint_states": "/franka/joint_states"})
+
+
+def camera_bag(make_trial: Callable[..., Path], path: Path, driver: str) -> Path:
+    """A camera of a driver, posed, and an arm of six joints that nobody knows."""
+    trial = make_trial(id=driver, joints=tuple("abcdef"))
+    names = driver_names(driver, "wrist") | {"/lab/joint_states": "/joint_states"}
+    return mcap_bag(trial, path, names)

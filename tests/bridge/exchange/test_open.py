@@ -1,0 +1,224 @@
+"""``open``: what a stranger's input is, what it lacks, and the way to a page with a number."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import stranger_inputs as strangers
+from commands import run
+from lerobot_dataset import Dataset
+from starlette.testclient import TestClient
+
+from dashboards.app import create_app
+from dashboards.library import Library
+
+MakeTrial = Callable[..., Path]
+Say = Callable[..., str]
+Rates = Callable[[Path], dict[str, float]]
+
+
+@pytest.fixture
+def say(capsys: pytest.CaptureFixture[str]) -> Say:
+    """Run ``open`` and return what it says."""
+
+    def said(*words: object, code: int = 0) -> str:
+        capsys.readouterr()
+        assert run("open", *words) == code
+        shown = capsys.readouterr()
+        return shown.out + shown.err
+
+    return said
+
+
+@pytest.fixture
+def rates(capsys: pytest.CaptureFixture[str]) -> Rates:
+    """Evaluate something; the success rate of each task."""
+
+    def found(source: Path) -> dict[str, float]:
+        capsys.readouterr()
+        assert run("evaluate", source, "--json") == 0
+        measured = json.loads(capsys.readouterr().out)["measurements"]
+        rates = [item for item in measured if item["id"].startswith("rate.recorded.")]
+        return {item["id"].split(".")[2]: item["value"] for item in rates}
+
+    return found
+
+
+def first_page(made: Path) -> str:
+    app = create_app(Library.open([made]))
+    with TestClient(app, base_url="http://127.0.0.1") as browser:
+        return browser.get("/").text
+
+
+@pytest.mark.parametrize("driver", strangers.DRIVERS)
+def test_a_bag_of_a_camera_driver_can_be_rebuilt_and_says_whose_arm_is_missing(
+    make_trial: MakeTrial, tmp_path: Path, say: Say, driver: str
+) -> None:
+    bag = strangers.camera_bag(make_trial, tmp_path / "b.mcap", driver)
+    text = say(bag)
+    assert "color image 30" in text
+    assert "depth info" in text
+    assert f"{strangers.DRIVERS[driver][0]} will be /cam/" in text
+    assert "robot: none of the robot files; a, b, c, d, e and 1 more" in text
+    assert "rebuild: ready" in text
+    assert "replay needs a robot file with its joints" in text
+    assert f"next: robot-gst open {bag} RUN" in text
+    text = say(bag, tmp_path / "new")
+    assert "rebuild: ready" in text
+    assert f"next: robot-gst rebuild {tmp_path / 'new'}" in text
+
+
+def test_a_bag_of_an_arm_in_a_database_becomes_a_trial_with_a_rate(
+    make_trial: MakeTrial, tmp_path: Path, say: Say, rates: Rates
+) -> None:
+    bag = strangers.franka(make_trial, tmp_path / "franka")
+    text = say(bag)
+    assert "robot: panda; panda_joint1" in text
+    assert "and 2 more at 125 Hz on /franka/joint_states" in text
+    assert "rebuild needs a calibrated camera with colour and depth" in text
+    assert "replay needs the gripper's width" in text
+    made = tmp_path / "new"
+    step = f"label {made} franka --task NAME --result success"
+    assert f"next: robot-gst {step}" in say(bag, made)
+    assert run(*step.replace("NAME", "cube_into_box").split()) == 0
+    assert rates(made) == {"cube_into_box": 1.0}
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_a_lerobot_dataset_ends_in_a_rate_of_each_of_its_tasks(
+    dataset: Dataset, tmp_path: Path, say: Say, rates: Rates, version: str
+) -> None:
+    folder = dataset.write() if version == "v3.0" else dataset.write_v2()
+    text = say(folder)
+    assert f"a LeRobot dataset {version}: 3 episodes at 10 Hz" in text
+    assert "robot: so100, pan, lift, grip" in text
+    assert "cameras: observation.images.front, observation.images.still" in text
+    assert "tasks: fold the towel, pick the cube" in text
+    assert "rebuild needs depth images" in text
+    assert "evaluate: ready" in text
+    text = say(folder, tmp_path / "new")
+    assert "a run of 3 episodes" in text
+    assert "label" not in text
+    assert f"next: robot-gst evaluate {tmp_path / 'new'}" in text
+    assert rates(tmp_path / "new") == {"pick_the_cube": 0.5, "fold_the_towel": 1.0}
+    assert "1 of 2" in first_page(tmp_path / "new")
+
+
+def test_a_tum_folder_is_rebuilt_next(make_trial: MakeTrial, tmp_path: Path, say: Say) -> None:
+    assert run("export", "tum", make_trial(), tmp_path / "tum") == 0
+    assert "TUM layout with its own times: 12 frames" in say(tmp_path / "tum")
+    (tmp_path / "tum" / "camera.json").unlink()
+    assert f"import rgbd {tmp_path / 'tum'} RUN" in say(tmp_path / "tum", code=2)
+
+
+def test_posed_images_are_to_look_at(tmp_path: Path, say: Say) -> None:
+    text = say(strangers.colmap(tmp_path / "garden"))
+    assert "2 posed images without depth, COLMAP: to look at" in text
+    assert "rebuild needs depth images" in text
+
+
+def test_a_spreadsheet_ends_in_a_rate(tmp_path: Path, say: Say, rates: Rates) -> None:
+    book = strangers.workbook(tmp_path / "lab.xlsx")
+    assert "a table of 4 trials\n  understood as lab.xlsx: " in say(book)
+    text = say(book, tmp_path / "new")
+    assert "a run of 0 episodes\n  a table of trials" in text
+    assert rates(tmp_path / "new") == {"stack": 0.75}
+    assert "3 of 4" in first_page(tmp_path / "new")
+    assert "exists already" in say(book, tmp_path / "new", code=2)
+    other = tmp_path / "other.csv"
+    other.write_text("width,height\n1,2\n")
+    assert f"Options go to: robot-gst evaluate {other}" in say(other, code=2)
+    shares = tmp_path / "shares.csv"
+    shares.write_text("policy,task,real,sim,n\na,stack,0.5,0.6,10\nb,stack,0.7,0.9,10\n")
+    assert f"next: robot-gst evaluate {shares}" in say(shares)
+    assert "It cannot be imported." in say(shares, tmp_path / "other", code=2)
+
+
+def test_a_splat_says_what_it_is_compared_with(tmp_path: Path, say: Say) -> None:
+    text = say(strangers.splat(tmp_path / "s.ply"))
+    assert "a splat of 5 Gaussians" in text
+    assert "evaluate --reference DIR --renders NAME=DIR" in text
+    points = strangers.splat(tmp_path / "p.ply", fields="x y z")
+    assert "a PLY file without Gaussians" in say(points)
+    whole = (tmp_path / "s.ply").read_bytes()
+    (tmp_path / "s.ply").write_bytes(whole[:-9])
+    assert "ends early or has no PLY header" in say(tmp_path / "s.ply", code=2)
+
+
+def test_what_is_not_read_is_named_with_what_converts_it(tmp_path: Path, say: Say) -> None:
+    text = say(strangers.rlds(tmp_path / "bridge"))
+    assert "an RLDS dataset, not read here" in text
+    assert "openx2lerobot of any4lerobot makes one" in text
+    assert "It cannot be imported." in say(tmp_path / "bridge", tmp_path / "new", code=2)
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(99))
+    assert "rosbags-convert --src" in say(tmp_path / "a.bag")
+
+
+def test_a_run_says_what_comes_next(make_trial: MakeTrial, tmp_path: Path, say: Say) -> None:
+    make_trial(result=None)
+    text = say(tmp_path / "run")
+    assert "a run of 1 episode\n" in text
+    assert f"next: robot-gst rebuild {tmp_path / 'run'}" in text
+    assert "evaluate needs task and outcome of 1 of 1 trials" in text
+    assert f"next: robot-gst label {tmp_path / 'run'} trial_0001 --result success" in text
+    assert f"open {tmp_path / 'run'}" in say(tmp_path / "run" / "episodes", code=2)
+    (tmp_path / "run" / "episodes" / "broken.mcap").write_bytes(b"\x89MCAP0\r\n")
+    assert "unreadable: broken" in say(tmp_path / "run")
+
+
+def unfinished(folder: Path) -> Path:
+    (folder / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(20))
+    return folder / "x.mcap"
+
+
+def nothing(folder: Path) -> Path:
+    (folder / "x.mcap").write_bytes(b"")
+    return folder / "x.mcap"
+
+
+def two_things(folder: Path) -> Path:
+    (folder / "x.mcap").write_bytes(b"x")
+    strangers.colmap(folder)
+    return folder
+
+
+def things_inside(folder: Path) -> Path:
+    strangers.colmap(folder / "garden")
+    strangers.splat(folder / "s.ply")
+    return folder
+
+
+def pickled(folder: Path) -> Path:
+    (folder / "demo.pkl").write_bytes(b"\x80\x04N.")
+    return folder / "demo.pkl"
+
+
+def huge(path: Path) -> Path:
+    with path.open("wb") as stream:
+        stream.write(b"a,b")
+        stream.truncate(1 << 40)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "code", "sentence"),
+    [
+        (lambda folder: folder / "gone", 2, "file or folder not found"),
+        (lambda folder: folder, 2, "is empty. Known are: run, bag"),
+        (nothing, 2, "is empty. Known are"),
+        (unfinished, 1, "robot-gst recover makes a finished copy"),
+        (two_things, 2, "is a bag and a folder of posed images at once"),
+        (things_inside, 2, "holds garden (folder of posed images), s.ply (splat). Open one"),
+        (pickled, 2, "is nothing known here"),
+        (lambda folder: huge(folder / "huge.bin"), 2, "is nothing known here"),
+        (lambda folder: huge(folder / "huge.csv"), 2, "is larger than any table of trials"),
+    ],
+)
+def test_bad_input_is_a_clear_sentence(
+    tmp_path: Path, say: Say, make: Callable[[Path], Path], code: int, sentence: str
+) -> None:
+    (tmp_path / "in").mkdir()
+    text = say(make(tmp_path / "in"), code=code)
+    assert sentence in text
+    assert len(text.splitlines()) == 1
