@@ -26,6 +26,7 @@ from bridge.episode.metadata import WITHOUT, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
+from bridge.heartbeat import BEAT
 from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED
 from bridge.task.find import chosen_task_file
 from bridge.task.protocol import SEEDS_PER_SESSION
@@ -378,7 +379,8 @@ def step(
     stdout = None if show_result and not output.json else subprocess.DEVNULL
     process = start_command([*arguments, *quiet], stdout=stdout)
     try:
-        code = process.wait()
+        with BEAT.doing(None):  # it speaks for itself
+            code = process.wait()
     finally:
         stop_command(process)
     for background in needed:
