@@ -9,7 +9,6 @@ import shlex
 import sys
 import tomllib
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -178,11 +177,11 @@ def _help(command: leaves.Command) -> str:
 def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code (0, 1, 2, 3 or 130; see docs/cli.md)."""
     try:
+        from cyclopts.config import Toml
+
         app = build_app()
         tokens, config = _take_config(list(arguments))
         if config is not None:
-            from cyclopts.config import Toml
-
             app.config = Toml(config, must_exist=True)
         refuse_gone(tokens)
         leaves.refuse_missing_command(tokens)
@@ -217,10 +216,8 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _prepare_streams()
     end_with_starter()
-    arguments = sys.argv[1:]
-    is_quiet = {"-q", "--quiet"} & {*arguments}
-    with nullcontext() if is_quiet else BEAT.watching(" ".join(arguments[:1])):
-        code = run(arguments)
+    with BEAT.watching(sys.argv[1:]):
+        code = run(sys.argv[1:])
     sys.exit(code)
 
 

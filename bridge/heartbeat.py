@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 
@@ -12,7 +12,7 @@ class Heartbeat:
 
     def __init__(self, first_s: float = 0.7, silence_s: float = 4.0) -> None:
         """Nothing is being done; the first word of a command comes sooner."""
-        self._first_s, self._silence_s = first_s, silence_s
+        self._first_s, self._later_s, self._silence_s = first_s, silence_s, silence_s
         self.said_s = time.monotonic()
         self._now: Callable[[], str] | None = None
 
@@ -25,32 +25,32 @@ class Heartbeat:
         finally:
             self._now = before
 
-    def beat(self, silence_s: float | None = None) -> None:
+    def beat(self) -> None:
         """Say it, where nothing was said for so long."""
         text, now = self._now, time.monotonic()
-        wanted_s = self._silence_s if silence_s is None else silence_s
-        if text is not None and now - self.said_s >= wanted_s:
-            self.said_s = now
+        if text is not None and now - self.said_s >= self._silence_s:
+            self.said_s, self._silence_s = now, self._later_s
             with suppress(OSError, ValueError):  # nobody listens any more
                 sys.stderr.write(f"{text()}\n")
                 sys.stderr.flush()
 
     @contextmanager
-    def watching(self, command: str) -> Iterator[None]:
-        """Beat while a command works, from a thread of its own."""
+    def watching(self, words: Sequence[str]) -> Iterator[None]:
+        """Beat while a command works, from a thread of its own, unless its words say quiet."""
         began = self.said_s = time.monotonic()
-        ended = threading.Event()
+        ended, self._silence_s = threading.Event(), self._first_s
 
         def watch() -> None:
-            if not ended.wait(self._first_s):
-                self.beat(self._first_s)
-            while not ended.wait(0.2):
+            while not ended.wait(0.1):
                 self.beat()
+
+        def text() -> str:
+            return f"{' '.join(words[:1])}: at work, {time.monotonic() - began:.0f} s"
 
         watcher = threading.Thread(target=watch, name="heartbeat", daemon=True)
         watcher.start()
         try:
-            with self.doing(lambda: f"{command}: at work, {time.monotonic() - began:.0f} s"):
+            with self.doing(None if {"-q", "--quiet"} & {*words} else text):
                 yield
         finally:  # no thread may write while Python ends
             ended.set()

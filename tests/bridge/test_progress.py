@@ -40,7 +40,7 @@ def test_a_command_that_says_nothing_is_at_work_or_waits_for_others(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     heart, said = Heartbeat(first_s=0.0, silence_s=0.0), ""
-    with heart.watching("rebuild"):
+    with heart.watching(["rebuild", "runs/x"]):
         while said.count("\n") < 2:
             said += capsys.readouterr().err
             time.sleep(0.01)
