@@ -10,16 +10,16 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-from cyclopts import App, Group, Parameter
-from cyclopts.config import Toml
-from rich.console import Console
+from typing import TYPE_CHECKING, Any
 
 from bridge import leaves
 from bridge.ending import end_with_starter
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.gone import refuse_gone
+from bridge.heartbeat import BEAT
+
+if TYPE_CHECKING:  # it takes a second on a busy machine, in which Ctrl-C may come already
+    from cyclopts import App
 
 HELP = (
     "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, replay every plan and "
@@ -27,9 +27,6 @@ HELP = (
 )
 RESUMED = ("demo", "trials", "rebuild", "replay", "evaluate")
 """Commands that keep what they did when they are interrupted, and go on from there."""
-
-LISTS = Parameter(consume_multiple=True, negative_iterable="")
-"""``--policies nominal loose`` and ``--policies nominal --policies loose`` say the same."""
 
 CORE: tuple[leaves.Command, ...] = (
     *leaves.commands_of(
@@ -143,8 +140,11 @@ def commands() -> tuple[leaves.Command, ...]:
     return CORE + leaves.leaf_commands()
 
 
-def build_app() -> App:
+def build_app() -> "App":
     """Make the command tree; nothing heavy is imported."""
+    from cyclopts import App, Group, Parameter
+    from rich.console import Console
+
     app = App(
         name="robot-gst",
         help=HELP,
@@ -153,7 +153,8 @@ def build_app() -> App:
         suppress_keyboard_interrupt=False,
         console=Console(),
         error_console=Console(stderr=True),
-        default_parameter=LISTS,
+        # --policies nominal loose and --policies nominal --policies loose say the same.
+        default_parameter=Parameter(consume_multiple=True, negative_iterable=""),
     )
     headings = {use: Group(use, sort_key=place) for place, use in enumerate(leaves.USES)}
     groups = {
@@ -175,8 +176,10 @@ def _help(command: leaves.Command) -> str:
 
 def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code (0, 1, 2, 3 or 130; see docs/cli.md)."""
-    app = build_app()
     try:
+        from cyclopts.config import Toml
+
+        app = build_app()
         tokens, config = _take_config(list(arguments))
         if config is not None:
             app.config = Toml(config, must_exist=True)
@@ -213,7 +216,9 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _prepare_streams()
     end_with_starter()
-    sys.exit(run(sys.argv[1:]))
+    with BEAT.watching(sys.argv[1:]):
+        code = run(sys.argv[1:])
+    sys.exit(code)
 
 
 def _prepare_streams() -> None:

@@ -17,8 +17,7 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-PLAIN_PERIOD_S = 10.0
-"""Without a terminal, progress is one line each this many seconds."""
+from bridge.heartbeat import BEAT
 
 Advance = Callable[[int, str], None]
 """Called as ``advance(done, note)`` by long work."""
@@ -44,6 +43,7 @@ class Output:
         """Print a remark on stderr unless quiet."""
         if not self.quiet:
             _err().print(text, highlight=False, markup=False)
+            BEAT.said_s = time.monotonic()
 
     def detail(self, text: str) -> None:
         """Print a remark on stderr when verbose."""
@@ -60,11 +60,12 @@ class Output:
 
     @contextmanager
     def progress(self, label: str, total: int) -> Iterator[Advance]:
-        """Show progress: a bar on a terminal, otherwise a plain line each ten seconds."""
+        """Show progress: a bar on a terminal, otherwise a plain line after each silence."""
         if self.quiet:
             yield lambda done, note: None
         elif sys.stderr.isatty():
-            yield from _bar(label, total)
+            with BEAT.doing(None):
+                yield from _bar(label, total)
         else:
             yield from _plain(label, total)
 
@@ -101,18 +102,20 @@ def _bar(label: str, total: int) -> Iterator[Advance]:
 
 
 def _plain(label: str, total: int) -> Iterator[Advance]:
-    began = last = time.monotonic()
+    began = time.monotonic()
+    done, note = 0, ""
 
-    def advance(done: int, note: str) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= PLAIN_PERIOD_S:
-            last = now
-            left = _left((now - began) * (total - done) / done) if done else ""
-            sys.stderr.write(f"{label}: {done} of {total}{left} {note}\n")
-            sys.stderr.flush()
+    def text() -> str:
+        left = _left((time.monotonic() - began) * (total - done) / done) if done else ""
+        return f"{label}: {done} of {total}{left} {note}".rstrip()
 
-    yield advance
+    def advance(now_done: int, now_note: str) -> None:
+        nonlocal done, note
+        done, note = now_done, now_note
+        BEAT.beat()
+
+    with BEAT.doing(text):
+        yield advance
 
 
 def _left(seconds: float) -> str:
@@ -144,7 +147,8 @@ def stop_signals() -> Iterator[threading.Event]:
         for number in (signal.SIGINT, signal.SIGTERM)
     }
     try:
-        yield stopped
+        with BEAT.doing(None):
+            yield stopped
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -24,8 +24,9 @@ from bridge.episode.catalogue import outcome_of, sidecar_path
 from bridge.episode.mcap.part_file import lock_dead
 from bridge.episode.metadata import WITHOUT, Outcome
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import RunFolder, refuse_full
 from bridge.errors import GstError, UsageError
+from bridge.heartbeat import BEAT
 from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED
 from bridge.task.find import chosen_task_file
 from bridge.task.protocol import SEEDS_PER_SESSION
@@ -224,6 +225,7 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
     for each in config.tasks:
         chosen_task_file(each).task()  # refuse an unknown one before anything is made
     run = RunFolder.create(path)
+    refuse_full(run.path)
     with ending_on_signals():
         void = _record(run, config, output).void
         replay = ["replay", str(path), "--samples", str(config.samples)]
@@ -378,7 +380,8 @@ def step(
     stdout = None if show_result and not output.json else subprocess.DEVNULL
     process = start_command([*arguments, *quiet], stdout=stdout)
     try:
-        code = process.wait()
+        with BEAT.doing(None):  # it speaks for itself
+            code = process.wait()
     finally:
         stop_command(process)
     for background in needed:

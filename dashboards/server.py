@@ -15,6 +15,7 @@ from types import FrameType
 
 import uvicorn
 
+from bridge.heartbeat import BEAT
 from bridge.terminal import Output
 from dashboards.app import create_app
 from dashboards.comparison import judge, stop_updates
@@ -102,7 +103,7 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
     others = set(threading.enumerate())
     judge(library.pick(None))  # what changed is read while the reader is still opening the page
     app.state.pages.is_ending = lambda: server.should_exit
-    with listener, _ending_on_signals(server):
+    with listener, _ending_on_signals(server), BEAT.doing(None):
         output.result(record, text)
         server.run(sockets=[listener])
     app.state.pages.end_live()

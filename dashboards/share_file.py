@@ -99,7 +99,7 @@ def share(run: RunFolder, config: ShareConfig) -> tuple[Path, Shared]:
         write_whole(out, made.text.encode())
     except OSError as error:
         message = f"cannot write {out}: {error.strerror}. Choose another file with --out."
-        raise UsageError(message) from error
+        raise GstError(message) from error
     if is_beside:
         name_shared(run.results_dir / "report.html")
     return out, made

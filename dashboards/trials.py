@@ -21,7 +21,7 @@ from bridge.episode.catalogue import outcome_of
 from bridge.episode.mcap.part_file import lock_dead
 from bridge.episode.metadata import CONDITION_OF, RETRY, retried_trial
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import RunFolder, refuse_full
 from bridge.episode.streams import verdicts
 from bridge.errors import GstError, UsageError
 from bridge.process_pool import cores
@@ -102,6 +102,7 @@ def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
         learned = learned_in(RunFolder.open(config.calibration), protocol)
         protocol = learned.named_in(protocol)
     run = RunFolder.create(path)
+    refuse_full(run.path)
     jobs = jobs_of(protocol, chosen)
     with ending_on_signals():
         keep_protocol(run.path, protocol, has_trials=bool(run.episodes()))

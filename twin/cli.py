@@ -1,12 +1,16 @@
 """Commands of the package ``twin``; imports stay late so that --help is quick."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.gate.config import GateConfig
 from twin.replay.config import ReplayRunConfig
 from twin.scene.settings import RebuildConfig, RenderConfig
+
+if TYPE_CHECKING:
+    from bridge.episode.run_folder import RunFolder
 
 OUTPUT = Output()
 REPLAY = ReplayRunConfig()
@@ -31,7 +35,8 @@ def replay(run: Path, /, *, config: ReplayRunConfig = REPLAY, output: Output = O
     from twin.replay.summary import describe_run
 
     folder = RunFolder.open(run)
-    summary = replay_run(folder, config, output, replay_imported(folder, config, output))
+    with folder.alone_in(folder.derived_dir):
+        summary = replay_run(folder, config, output, replay_imported(folder, config, output))
     output.result(summary, describe_run(summary))
     if summary["skipped_episodes"] or any(row["error"] for row in summary["rows"]):
         return 1
@@ -69,7 +74,9 @@ def rebuild(run: Path, /, *, config: RebuildConfig = REBUILD, output: Output = O
     from twin.scene.rebuild.record import describe_scene
     from twin.scene.rebuild.run import rebuild as rebuild_scene
 
-    record = rebuild_scene(RunFolder.open(run), config, output)
+    folder = RunFolder.open(run)
+    with folder.alone_in(folder.scene_dir):
+        record = rebuild_scene(folder, config, output)
     output.result(record, describe_scene(record))
     return 0
 
@@ -119,29 +126,35 @@ def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Outp
     Args:
         run: Run folder.
     """
-    from bridge.episode.run_folder import RunFolder
+    from bridge.episode.run_folder import RunFolder, refuse_full
     from bridge.errors import UsageError
 
-    run_folder = RunFolder.open(run)
     if config.cameras + config.physics + config.posterior != 1:
         message = "say what to calibrate: RUN with --cameras, --physics or --posterior."
         raise UsageError(message)
+    folder = RunFolder.open(run)
+    with folder.alone_in(folder.scene_dir):
+        refuse_full(folder.scene_dir)
+        output.result(*_calibrated(folder, config, output))
+    return 0
+
+
+def _calibrated(
+    run: "RunFolder", config: CalibrateConfig, output: Output
+) -> tuple[dict[str, Any], str]:
     if config.posterior:
         from twin.calibrate.posterior import calibrate_posterior, describe_posterior
 
         posterior, calibration_id = calibrate_posterior(
-            run_folder, num_draws=config.draws, workers=config.workers, output=output
+            run, num_draws=config.draws, workers=config.workers, output=output
         )
         record = {**posterior, "calibration_id": calibration_id}
-        output.result(record, describe_posterior(posterior, calibration_id))
-        return 0
+        return record, describe_posterior(posterior, calibration_id)
     if config.physics:
         from twin.calibrate.physics.arm_motion import calibrate_physics
 
-        output.result(*calibrate_physics(run_folder, config, output))
-        return 0
+        return calibrate_physics(run, config, output)
     from twin.calibrate.cameras import calibrate_cameras, describe_cameras
 
-    record = calibrate_cameras(run_folder, config, output)
-    output.result(record, describe_cameras(record))
-    return 0
+    record = calibrate_cameras(run, config, output)
+    return record, describe_cameras(record)

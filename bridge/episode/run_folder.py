@@ -1,13 +1,17 @@
 """The run folder: one run is one cell."""
 
+import fcntl
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryFile
 
-from bridge.errors import PathNotFoundError, UsageError
+from bridge.errors import BridgeError, GstError, PathNotFoundError, UsageError
 
 REFUSED_PLAN, PLAN_REPLAY = ".refused.json", ".replay.mcap"
 """What files in ``plans/`` end in: plans that the twin did not accept, and its replays of plans."""
@@ -33,6 +37,36 @@ def file_names(folder: Path, ending: str = SUFFIX) -> list[str]:
     except OSError:  # not there, or not ours to read
         return []
     return sorted(name for name in found if name.endswith(ending))
+
+
+ROOM_MB = 64
+"""Free space without which no long work begins; a scene, or some dozens of replays, take less."""
+
+
+def refuse_full(folder: Path) -> None:
+    """Find out before an hour of work that a folder cannot be written; it is made where needed."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder) as probe:
+            os.posix_fallocate(probe.fileno(), 0, ROOM_MB << 20)
+    except OSError as error:
+        found = f"cannot write {ROOM_MB} MB into {folder}: {error.strerror}"
+        message = f"{found}. Free some space, or copy the run to another disk; nothing was changed."
+        raise BridgeError(message) from error
+
+
+def lock_folder(folder: Path, taken: GstError, *, shared: bool = False) -> int | None:
+    """Keep others out of a folder until the descriptor is closed, or raise ``taken``."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise taken from None
+    except OSError:  # some network file systems lock no folders
+        os.close(descriptor)
+        return None
+    return descriptor
 
 
 @dataclass(frozen=True)
@@ -113,6 +147,19 @@ class RunFolder:
         if not file_names(self.episodes_dir):
             message = f"no episodes in {self.path}. Record some: robot-gst record {self.path}."
             raise UsageError(message)
+
+    @contextmanager
+    def alone_in(self, folder: Path) -> Iterator[None]:
+        """Let no second command write into one of its folders while the block lasts."""
+        self.refuse_empty()
+        folder.mkdir(parents=True, exist_ok=True)
+        message = f"another command writes into {folder}. Wait for its end, or stop it."
+        lock = lock_folder(folder, UsageError(message))
+        try:
+            yield
+        finally:
+            if lock is not None:
+                os.close(lock)
 
     def derived(self, pattern: str = "*") -> list[Path]:
         """Derived episode files, in name order."""

@@ -43,7 +43,7 @@ class VideoWriter:
         av = pyav()
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self.num_frames = 0
+        self.num_frames, self._is_refused = 0, False
         self._frame_class = av.VideoFrame
         self._intra = av.video.frame.PictureType.I
         self._container = av.open(str(path), "w")
@@ -63,8 +63,7 @@ class VideoWriter:
         if first:
             frame.pict_type = self._intra
         frame.pts = self.num_frames
-        for packet in self._stream.encode(frame):
-            self._container.mux(packet)
+        self._mux(frame)
         self.num_frames += 1
 
     @property
@@ -73,7 +72,17 @@ class VideoWriter:
         return self.path.stat().st_size if self.path.is_file() else 0
 
     def close(self) -> None:
-        """Write what the encoder still holds, and the index."""
-        for packet in self._stream.encode(None):
-            self._container.mux(packet)
-        self._container.close()
+        """Write what the encoder still holds, and the index, unless the disk refused before."""
+        if not self._is_refused:
+            self._mux(None)
+
+    def _mux(self, frame: Any) -> None:
+        try:
+            for packet in self._stream.encode(frame):
+                self._container.mux(packet)
+            if frame is None:
+                self._container.close()
+        except OSError:
+            self._is_refused = True  # to write on, or to close it, may crash libav
+            self.path.unlink(missing_ok=True)
+            raise

@@ -1,7 +1,6 @@
 """A recorder on the wire: session, recorder, control keys, status, previews."""
 
 import contextlib
-import fcntl
 import json
 import os
 import threading
@@ -16,7 +15,7 @@ from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.contract import find_contract
 from bridge.episode.recover import recover_parts
 from bridge.episode.recovery_report import RecoveryReport
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import RunFolder, lock_folder
 from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.clocks import ClockAsker
@@ -173,7 +172,9 @@ class LiveRecorder:
             read_definitions(config.msg_folder)
         find_contract(run.path, config.contract)  # the same
         self.run = run
-        self._folder_lock = _lock_folder(run, shared=config.shares_folder)
+        self._folder_lock = lock_folder(
+            run.episodes_dir, FolderTakenError(run=run.path), shared=config.shares_folder
+        )
         self._recorder = config.recorder
         self.session = session
         reports = recover_parts(run)
@@ -255,20 +256,6 @@ class LiveRecorder:
         finally:
             if self._folder_lock is not None:
                 os.close(self._folder_lock)
-
-
-def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
-    """Keep other recorders out of a run folder, until the process ends."""
-    descriptor = os.open(run.episodes_dir, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(descriptor)
-        raise FolderTakenError(run=run.path) from error
-    except OSError:  # some network file systems lock no folders
-        os.close(descriptor)
-        return None
-    return descriptor
 
 
 def _describe_recovery(report: RecoveryReport) -> str:

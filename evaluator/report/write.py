@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bridge.exchange.trials_csv import TrialRecord, write_trials
+from bridge.whole_file import write_whole
 from evaluator.compare.rows import Comparison
 from evaluator.compare.spreadsheet import record_from_row
 from evaluator.errors import EvaluatorError
@@ -62,7 +63,7 @@ def write_report(
         files = {folder / "report.html": text.encode()} | figures | tables
         for place, data in files.items():
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_bytes(data)
+            write_whole(place, data)
         name_shared(folder / "report.html")
         for one in set(old) - {*files, *extra, *parquet}:
             one.unlink(missing_ok=True)

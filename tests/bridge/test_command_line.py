@@ -31,6 +31,18 @@ def test_a_missing_episode_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> N
     assert "episode not found: nowhere.mcap" in capsys.readouterr().err
 
 
+def test_ctrl_c_while_the_program_loads_is_answered_in_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(robot_gst, "build_app", interrupt)
+    assert robot_gst.run(["replay", "runs/x"]) == 130
+    said = "robot-gst: interrupted; continue with: robot-gst replay runs/x\n"
+    assert capsys.readouterr().err == said
+
+
 def test_an_unknown_command_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> None:
     assert robot_gst.run(["fly"]) == 2
     assert "fly" in capsys.readouterr().err

@@ -7,6 +7,7 @@ import sys
 import zlib
 from pathlib import Path
 
+import cyclopts
 import numpy as np
 import pytest
 from joint_samples import at_positions
@@ -220,7 +221,7 @@ def test_every_parameter_of_every_command_is_explained() -> None:
     assert silent == []
 
 
-def _commands(app: robot_gst.App, prefix: str = "") -> list[tuple[str, robot_gst.App]]:
+def _commands(app: cyclopts.App, prefix: str = "") -> list[tuple[str, robot_gst.App]]:
     found = []
     for name in app:
         if not name.startswith("-"):

@@ -1,8 +1,10 @@
 """What long work tells about itself without a terminal: how much is done, how long it will take."""
 
+import time
+
 import pytest
 
-from bridge import terminal
+from bridge.heartbeat import BEAT, Heartbeat
 from bridge.terminal import Output
 
 
@@ -24,10 +26,26 @@ def test_a_line_says_how_much_is_left_judging_by_what_it_took(
     told: str,
 ) -> None:
     clock = [100.0]
-    monkeypatch.setattr(terminal.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(BEAT, "said_s", clock[0])
     with Output().progress("replay", total) as advance:
         clock[0] += seconds
         advance(done, "trial_1")
         clock[0] += 1.0
         advance(done + 1, "too soon for another line")
     assert capsys.readouterr().err == told
+
+
+def test_a_command_that_says_nothing_is_at_work_or_waits_for_others(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    heart, said = Heartbeat(first_s=0.0, silence_s=0.0), ""
+    with heart.watching(["rebuild", "runs/x"]):
+        while said.count("\n") < 2:
+            said += capsys.readouterr().err
+            time.sleep(0.01)
+    assert all(line.startswith("rebuild: at work, ") for line in said.splitlines())
+    capsys.readouterr()
+    with heart.doing(lambda: "works"), heart.doing(None):
+        heart.beat()
+    assert capsys.readouterr().err == ""

@@ -4,8 +4,10 @@ import multiprocessing
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from bridge.media.video_writer import VideoWriter
 from bridge.whole_file import part_of, write_whole
 
 ROUNDS = 100
@@ -36,7 +38,24 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_half_written(tmp_path: Path
     path = tmp_path / "results.json"
     write_whole(path, b"old")
     part_of(path).symlink_to("/dev/full")
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match=r"No space left .*results\.json"):
         write_whole(path, b"new")
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["results.json"]  # noqa: PTH208
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_video_on_a_full_disk_is_refused_and_removed(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    path = tmp_path / "trial.mp4"
+    path.symlink_to("/dev/full")
+    video = VideoWriter(path, fps=10, width=32, height=24, crf=18)
+
+    def write(frame: np.ndarray) -> None:
+        for index in range(60):
+            video.write(frame, first=index == 0)
+
+    with pytest.raises(OSError, match="No space left"):
+        write(np.zeros((24, 32, 3), dtype=np.uint8))
+    video.close()  # libav crashed here
+    assert not path.is_symlink()

@@ -46,6 +46,11 @@ print(guilty)
     assert printed(code) == "{}"
 
 
+def test_the_front_door_loads_in_an_instant_for_ctrl_c_to_be_heard() -> None:
+    code = "import robot_gst, sys; print({'cyclopts', 'rich', 'numpy'} & {*sys.modules})"
+    assert printed(code) == "set()"
+
+
 def test_hugging_face_datasets_would_not_be_hidden() -> None:
     assert not list((ROOT / "datasets").rglob("__init__.py"))
     assert not list((ROOT / "tests").rglob("__init__.py"))

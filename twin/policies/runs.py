@@ -11,7 +11,7 @@ from bridge.episode.catalogue import find_episodes
 from bridge.episode.catalogue_query import CatalogueQuery
 from bridge.episode.metadata import CHECKPOINT_TAG, ROLLOUT, WITH, tagged
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import RunFolder, refuse_full
 from bridge.errors import UsageError
 from bridge.process_pool import Failed, runner_of
 from bridge.terminal import Output
@@ -101,6 +101,8 @@ def roll_out_run(run: RunFolder, config: RolloutConfig, output: Output) -> dict[
             todo.append(job)
         else:
             rows.append(row)
+    if todo:
+        refuse_full(run.derived_dir)
     with output.progress("rollout", len(todo)) as advance, runner_of(workers) as runner:
         for done, (job, answer) in enumerate(runner.run(roll_out, todo, RolloutJob.cost), start=1):
             if isinstance(answer, Failed):

@@ -10,7 +10,7 @@ from typing import Any
 from bridge.episode import schema, streams
 from bridge.episode.executions import NO_PLAN, executed_events, whose
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import RunFolder, refuse_full
 from bridge.episode.streams import execution_ns
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, PathNotFoundError, UsageError
@@ -278,7 +278,7 @@ def _replay_trajectories(
             output.say(note)
     rows, todo = there_already(jobs, force=config.force)
     if todo:
-        run.derived_dir.mkdir(parents=True, exist_ok=True)  # each node is asked whether it is there
+        refuse_full(run.derived_dir)  # and make it: each node is asked whether it is there
     told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
     with output.progress("replay", len(todo)) as advance:
         for done, row in enumerate(_replayed(todo, runner, output), start=1):

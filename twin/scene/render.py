@@ -18,6 +18,7 @@ from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
 from bridge.media.depth import from_metres
 from bridge.media.image_quality import as_float
+from bridge.whole_file import write_whole
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface
@@ -256,7 +257,7 @@ def _writer(
                 path = out.with_name(f"{out.stem}{ending}.png") if ending else out
                 if config.is_sequence:
                     path = out / f"{since_ns // 1_000_000:07d}{ending}.png"
-                path.write_bytes(encode_png(pixels))
+                write_whole(path, encode_png(pixels))
                 written.append(str(path))
             return [str(out)] if config.is_sequence else written
 

@@ -1,11 +1,13 @@
 """Which files of a run are episodes."""
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
 from bridge.episode import run_folder
-from bridge.errors import PathNotFoundError, UsageError
+from bridge.errors import BridgeError, PathNotFoundError, UsageError
 
 
 def run_with(folder: Path, *names: str) -> run_folder.RunFolder:
@@ -51,3 +53,26 @@ def test_a_file_is_not_called_missing(tmp_path: Path) -> None:
 def test_a_folder_that_is_not_there_is_called_missing(tmp_path: Path) -> None:
     with pytest.raises(PathNotFoundError, match="run folder not found"):
         run_folder.RunFolder.open(tmp_path / "nowhere")
+
+
+def test_two_commands_do_not_write_into_one_folder_at_once(tmp_path: Path) -> None:
+    run = run_with(tmp_path, "t1.mcap")
+    taken = pytest.raises(UsageError, match="another command writes into")
+    with run.alone_in(run.derived_dir), run.alone_in(run.scene_dir), taken:
+        run.alone_in(run.derived_dir).__enter__()
+    with run.alone_in(run.derived_dir):
+        assert list(run.derived_dir.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_takes_nothing_is_found_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    run_folder.refuse_full(tmp_path / "scene")
+    assert list((tmp_path / "scene").iterdir()) == []
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    with pytest.raises(BridgeError, match=os.strerror(number)):
+        run_folder.refuse_full(tmp_path / "scene")

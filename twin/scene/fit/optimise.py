@@ -444,7 +444,7 @@ def fit(
     for at in _steps(config, state, clock):
         events.keep(state, at)
         learner.step(state, at)
-        advance(round(100 * at.fraction), _note(state, at, len(views)))
+        advance(round(100 * at.fraction), _note(state, len(views)))
     state.last.put_mean_into(state.session.cloud)
     state.surface.hold(state.session.cloud)
     return FitResult(
@@ -475,13 +475,10 @@ def _recent_psnr_db(state: FitState, num_views: int) -> float | None:
     return psnr_db(float(np.mean(state.errors[-num_views:]))) if state.errors else None
 
 
-def _note(state: FitState, at: Progress, num_views: int) -> str:
+def _note(state: FitState, num_views: int) -> str:
     recent = _recent_psnr_db(state, num_views)
     quality = "" if recent is None else f", training PSNR {recent:.2f} dB"
-    left = at.seconds / at.fraction - at.seconds if at.fraction > 0 else None
-    return f"image {state.session.steps}{quality}" + (
-        "" if left is None else f", {left:.0f} s left"
-    )
+    return f"image {state.session.steps}{quality}"
 
 
 class _Learner:

@@ -29,6 +29,7 @@ def find(
 
     from bridge.episode.run_folder import RunFolder
     from bridge.media.color import encode_png
+    from bridge.whole_file import write_whole
     from twin.naming.phrases import Asker
     from twin.scene.foundation.find import about, line_of, look_at, meaning_of, picture_of
 
@@ -46,8 +47,8 @@ def find(
         view = looked.view_of(answer)
         mask = path.with_name(f"{path.stem}_mask.png")
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encode_png(picture_of(view, answer)))
-        mask.write_bytes(encode_png(view.numbers(answer).astype(np.uint8)))
+        write_whole(path, encode_png(picture_of(view, answer)))
+        write_whole(mask, encode_png(view.numbers(answer).astype(np.uint8)))
         data |= {"picture": str(path), "mask": str(mask), "camera": view.name}
     lines = [line_of(number, item) for number, item in enumerate(answer.found, start=1)]
     lines += [str(data[key]) for key in ("picture", "mask") if key in data]

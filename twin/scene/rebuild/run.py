@@ -12,7 +12,7 @@ from typing import Any
 
 from bridge.episode import provenance
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import RunFolder, refuse_full
 from bridge.errors import BridgeError
 from bridge.leaves import has_leaf, load_leaf
 from bridge.terminal import Output
@@ -65,11 +65,11 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     if done is not None:
         output.say("the scene is up to date (same episodes, same settings); --force redoes it")
         return done
+    refuse_full(run.scene_dir)
     began_s = time.monotonic()
     chosen = choose_frames(sources, config.frames, output, calibration)
     placements = find_placements(sources, chosen.choices, output)
     training = read_training_set(chosen.choices, config, output, placements)
-    run.scene_dir.mkdir(parents=True, exist_ok=True)
     fitted = _fit(training, config, output)
     raster = RasterConfig(threads=config.fit.threads)
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
