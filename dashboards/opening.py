@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 from bridge.cli.exchange import import_images, import_rgbd, import_rosbag2
+from bridge.clock import NS_PER_S
 from bridge.data_files import datasets_folder
 from bridge.episode import schema
 from bridge.episode import topics as named
@@ -21,7 +23,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.exchange.driver_names import mapped
-from bridge.exchange.rosbag2 import METADATA_FILE, Survey, count_messages, survey
+from bridge.exchange.rosbag2 import METADATA_FILE, count_messages, find_files, unpacked
 from bridge.exchange.trials_csv import keep_trials, trials_path
 from bridge.leaves import load_leaf
 from bridge.robots.robot import Robot, read_robot, robot_of
@@ -32,8 +34,9 @@ from bridge.sources.folder.tum import find_lists
 from bridge.terminal import Output
 
 OUTPUT = Output()
-MOST_INSIDE, MOST_NAMED, MOST_EPISODES = 200, 5, 50
-"""Things of a folder that are looked at, and that a message names; episodes that are opened."""
+MOST_INSIDE, MOST_NAMED, MOST_EPISODES, MOST_SURVEYED = 200, 5, 50, 500
+"""Things of a folder that are looked at, and that a message names; episodes that are opened, and
+messages of a bag that are read."""
 MOST_HEAD_BYTES, MOST_TABLE_BYTES = 1 << 16, 1 << 26
 HEADS = {b"\x89MCAP0\r\n": "bag", b"SQLite format 3\0": "bag", b"#ROSBAG": "ROS 1 bag"}
 HEADS |= {b"ply\n": "splat", b"ply\r": "splat"}
@@ -73,6 +76,29 @@ class Found:
             lines.append(f"  {use} needs {lack}" if lack else f"  {use}: ready")
         steps = (f"open {path} RUN",) if self.bring else self.then
         return [*lines, *(f"next: robot-gst {step}" for step in steps)]
+
+
+class Survey(NamedTuple):
+    """What a recording says of its topics before all of it is read."""
+
+    types: Mapping[str, str]
+    rates_hz: Mapping[str, float]
+    """Of its first messages."""
+    first: Mapping[str, bytes]
+
+
+def survey(source: Path) -> Survey:
+    """Look at the topics of a bag and at its first messages."""
+    times: dict[str, list[int]] = {}
+    first: dict[str, bytes] = {}
+    with unpacked(find_files(source), None) as bag:
+        for item in islice(bag.messages(), MOST_SURVEYED):
+            times.setdefault(item.topic, []).append(item.log_time_ns)
+            first.setdefault(item.topic, item.data)
+        types = bag.types()
+    spans = {topic: (len(t) - 1, (t[-1] - t[0]) / NS_PER_S) for topic, t in times.items()}
+    rates_hz = {topic: steps / seconds for topic, (steps, seconds) in spans.items() if seconds}
+    return Survey(types=types, rates_hz=rates_hz, first=first)
 
 
 def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> int:

@@ -9,16 +9,14 @@ how often a topic was silent) is kept in the metadata record ``source``. Layout 
 import heapq
 import json
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from mcap import records
 
-from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.messages import Selection, merged
@@ -42,8 +40,6 @@ from bridge.exchange.rosbag2_storage import (
 METADATA_FILE = "metadata.yaml"
 STORAGES = ("mcap", "sqlite3")
 MAX_METADATA_BYTES = 16 << 20
-MOST_SURVEYED = 500
-"""Messages that are read to say what a bag holds."""
 OWN_RECORDS = frozenset(
     {"episode", "software", "outcome", "derived", "drops", "recorder", "split", "source"}
     | {"recovered"}
@@ -152,14 +148,14 @@ def import_bag(
     """
     check_episode_id(episode_id)
     sources = find_files(source)
-    with _unpacked(sources, run.episodes_dir.parent) as bag:
+    with unpacked(sources, run.episodes_dir.parent) as bag:
         stand_in = is_of_stand_in(source)
         info = imported_info(episode_id, task, tags=("rosbag2",), stand_in=stand_in)
         return _import(bag, sources, run, info, mapped(bag.types(), remap), advance)
 
 
 @contextmanager
-def _unpacked(sources: list[Path], beside: Path | None) -> Iterator["_McapBag | _SqliteBags"]:
+def unpacked(sources: list[Path], beside: Path | None) -> Iterator["_McapBag | _SqliteBags"]:
     """Open a bag; files that are compressed as a whole are unpacked in ``beside`` meanwhile."""
     with tempfile.TemporaryDirectory(prefix="rosbag2_", dir=beside) as folder:
         bag = _open_bag([unpack_file(path, Path(folder)) for path in sources])
@@ -167,29 +163,6 @@ def _unpacked(sources: list[Path], beside: Path | None) -> Iterator["_McapBag | 
             yield bag
         finally:
             bag.close()
-
-
-class Survey(NamedTuple):
-    """What a recording says of its topics before all of it is read."""
-
-    types: Mapping[str, str]
-    rates_hz: Mapping[str, float]
-    """Of its first messages."""
-    first: Mapping[str, bytes]
-
-
-def survey(source: Path) -> Survey:
-    """Look at the topics of a bag and at its first messages."""
-    times: dict[str, list[int]] = {}
-    first: dict[str, bytes] = {}
-    with _unpacked(find_files(source), None) as bag:
-        for item in islice(bag.messages(), MOST_SURVEYED):
-            times.setdefault(item.topic, []).append(item.log_time_ns)
-            first.setdefault(item.topic, item.data)
-        types = bag.types()
-    spans = {topic: (len(t) - 1, (t[-1] - t[0]) / NS_PER_S) for topic, t in times.items()}
-    rates_hz = {topic: steps / seconds for topic, (steps, seconds) in spans.items() if seconds}
-    return Survey(types=types, rates_hz=rates_hz, first=first)
 
 
 def _import(
