@@ -321,7 +321,9 @@ def _record_trials(
     connect, logs = ["--connect", endpoint], run.notes_dir / "logs"
     left = [(each, len(set(missing) & set(each.trials(config)))) for each in groups_of(config)]
     with ExitStack() as stack:
-        watch = running(["gate", str(run.path), *connect], logs / "gate.log", "ready")
+        watch = running(
+            ["gate", str(run.path), "--samples", "0", *connect], logs / "gate.log", "ready"
+        )
         gate = stack.enter_context(watch)
         there = [recorder, gate]
         if any(count and group.policy != BUILT_IN_POLICY for group, count in left):

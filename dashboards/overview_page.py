@@ -16,14 +16,7 @@ from dashboards.comparison import Judgement
 from dashboards.moments import Cause, cause_of
 from evaluator.report.wording import SIM_SIDE, agreeing_side
 from evaluator.result import Measurement
-from evaluator.review_index import (
-    FACETS,
-    RESULTS,
-    IndexedFile,
-    ReviewIndex,
-    Selection,
-    stamp_of,
-)
+from evaluator.review_index import FACETS, RESULTS, IndexedFile, ReviewIndex, Selection, stamp_of
 from evaluator.trial_row import TrialRow
 from twin.scene.store.library import not_scanned_in
 
@@ -153,27 +146,17 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
 
 
 def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
-    """Choose the numbers to read first; where nobody planned, of what was executed.
-
-    Without any of the twin, the recorded success of the first tasks.
-    """
+    """Choose the numbers to read first: of plans, else of motions, else what was recorded."""
     by_id = {each.id: each for each in judgement.measurements}
     side = agreeing_side(by_id)
-    agreed = [each.value for name, each in by_id.items() if name.startswith("agreement.")]
-    if not any(value is not None for value in agreed):
+    if all(each.value is None for name, each in by_id.items() if name.startswith("agreement.")):
         rates = [each for name, each in by_id.items() if name.startswith("rate.recorded.")]
-        known = [each for each in rates if each.value is not None][: len(NUMBERS)]
-        yield from ((f"Recorded success, {_group_of(each)}", each) for each in known)
+        for each in [each for each in rates if each.value is not None][: len(NUMBERS)]:
+            yield f"Recorded success, {' · '.join(each.id.split('.')[2:])}", each
     for name, title in NUMBERS.items():
         found = by_id.get(name.replace(SIM_SIDE, side))
         if found is not None:
             yield (title if found.id == name else UNPLANNED), found
-
-
-def _group_of(rate: Measurement) -> str:
-    """Name task, condition and policy, as far as they have names."""
-    names = [name for name in rate.id.split(".")[2:] if name != "-"]
-    return " · ".join(names).replace("_", " ")
 
 
 def worst_disagreement(run: RunFolder, judgement: Judgement) -> Disagreement | None:

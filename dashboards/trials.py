@@ -413,7 +413,7 @@ def _laboratory(
         own = ["--listen", endpoint, "--shares-folder"]  # each job numbers its own episodes
         recorder = start("record", ["record", str(run.path), *own])
         recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
-        start("gate", ["gate", str(run.path), *connect], "gate ready")
+        start("gate", ["gate", str(run.path), "--samples", "0", *connect], "gate ready")
         if {job.policy for job in jobs} - {BUILT_IN_POLICY, *config.acting()}:
             model = ["--model", config.model, "--model-name", config.model_name]
             asking = model if config.model else []

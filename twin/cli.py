@@ -1,16 +1,14 @@
 """Commands of the package ``twin``; imports stay late so that --help is quick."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from bridge.episode.run_folder import RunFolder, refuse_full
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.gate.config import GateConfig
 from twin.replay.config import ReplayRunConfig
 from twin.scene.settings import RebuildConfig, RenderConfig
-
-if TYPE_CHECKING:
-    from bridge.episode.run_folder import RunFolder
 
 OUTPUT = Output()
 REPLAY = ReplayRunConfig()
@@ -29,7 +27,6 @@ def replay(run: Path, /, *, config: ReplayRunConfig = REPLAY, output: Output = O
     Args:
         run: Run folder.
     """
-    from bridge.episode.run_folder import RunFolder
     from twin.calibrate.physics.imported import replay_imported
     from twin.replay.runner import replay_run
     from twin.replay.summary import describe_run
@@ -70,7 +67,6 @@ def rebuild(run: Path, /, *, config: RebuildConfig = REBUILD, output: Output = O
     Args:
         run: Run folder.
     """
-    from bridge.episode.run_folder import RunFolder
     from twin.scene.rebuild.record import describe_scene
     from twin.scene.rebuild.run import rebuild as rebuild_scene
 
@@ -90,7 +86,6 @@ def render(run: Path, /, *, config: RenderConfig = RENDER, output: Output = OUTP
     Args:
         run: Run folder.
     """
-    from bridge.episode.run_folder import RunFolder
     from twin.scene.render import describe_drawn
     from twin.scene.render import render as render_scene
 
@@ -126,7 +121,6 @@ def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Outp
     Args:
         run: Run folder.
     """
-    from bridge.episode.run_folder import RunFolder, refuse_full
     from bridge.errors import UsageError
 
     if config.cameras + config.physics + config.posterior != 1:
@@ -140,7 +134,7 @@ def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Outp
 
 
 def _calibrated(
-    run: "RunFolder", config: CalibrateConfig, output: Output
+    run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[dict[str, Any], str]:
     if config.posterior:
         from twin.calibrate.posterior import calibrate_posterior, describe_posterior

@@ -141,14 +141,13 @@ def import_trials(
         force: Replace trials imported earlier.
     """
     from bridge.episode.run_folder import RunFolder
-    from bridge.exchange.trials_csv import import_trials as keep_trials
-    from bridge.exchange.trials_csv import trials_path
+    from bridge.exchange.trials_csv import keep_trials, read_trials
 
-    folder = RunFolder(run)
-    trials = keep_trials(table, folder, force=force)
+    trials = read_trials(table)
+    file = keep_trials(trials, RunFolder(run), force=force)
     tasks = sorted({trial.task for trial in trials})
-    data = {"file": str(trials_path(folder)), "trials": len(trials), "tasks": tasks}
-    output.result(data, f"{trials_path(folder)}: {len(trials)} trials of {', '.join(tasks)}")
+    data = {"file": str(file), "trials": len(trials), "tasks": tasks}
+    output.result(data, f"{file}: {len(trials)} trials of {', '.join(tasks)}")
     return 0
 
 

@@ -196,15 +196,8 @@ def trials_path(run: RunFolder) -> Path:
     return run.notes_dir / "trials.csv"
 
 
-def import_trials(table: Path, run: RunFolder, *, force: bool) -> list[TrialRecord]:
-    """Check a trials CSV and keep it in the run, with all columns and in one spelling."""
-    trials = read_trials(table)
-    keep_trials(trials, run, force=force)
-    return trials
-
-
 def keep_trials(trials: Iterable[TrialRecord], run: RunFolder, *, force: bool) -> Path:
-    """Write the run's imported trials."""
+    """Keep trials in the run, with all columns and in one spelling."""
     path = trials_path(run)
     if path.exists() and not force:
         raise UsageError(f"{path} exists already. Replace it with --force, or use another run.")
