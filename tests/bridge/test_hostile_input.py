@@ -221,7 +221,7 @@ def test_every_parameter_of_every_command_is_explained() -> None:
     assert silent == []
 
 
-def _commands(app: cyclopts.App, prefix: str = "") -> list[tuple[str, robot_gst.App]]:
+def _commands(app: cyclopts.App, prefix: str = "") -> list[tuple[str, cyclopts.App]]:
     found = []
     for name in app:
         if not name.startswith("-"):

@@ -8,7 +8,8 @@ import pytest
 
 import dashboards
 
-COMMANDS = {"cli.py", "config.py", "demo.py", "standin_cli.py", "standin_settings.py", "trials.py"}
+COMMANDS = {"cli.py", "config.py", "demo.py", "opening.py", "trials.py"}
+COMMANDS |= {"standin_cli.py", "standin_settings.py"}
 """They run before or without a server, in one thread."""
 ANSWERING = [
     path

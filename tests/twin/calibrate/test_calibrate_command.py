@@ -269,6 +269,7 @@ def test_a_camera_that_moves_asks_for_target_poses(
 def test_wrong_use_is_exit_code_two(
     run: RunFolder, arguments: tuple[str, ...], found: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    Recording(run.episodes_dir / "scan.mcap", some_postures(1)).writer.close()
     assert calibrate(run, *arguments) == 2
     assert found in capsys.readouterr().err
 
