@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from bridge.errors import UsageError
 from twin.policies.starts import Start
 from twin.replay.config import FRICTIONS
-from twin.replay.monte_carlo import sample_rng
+from twin.replay.monte_carlo import sample_rng, wilson
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": np.pi / 180, "%": 1e-2}
 LENGTHS, ANGLES, SHARES = ("m", "cm", "mm"), ("rad", "deg"), ("%",)
@@ -119,34 +118,25 @@ def effects(
     judged = [row for row in rows if row["success"] is not None]
     if len(judged) < LEAST_ROLLOUTS:
         return
+    done = np.array([bool(row["success"]) for row in judged])
     for item in quantities:
         amount = np.array([abs(row["varied"][item.name]) for row in judged])
         most = amount > np.median(amount)
-        (k, n), (j, m) = (
-            (
-                sum(row["success"] for row, is_in in zip(judged, half, strict=True) if is_in),
-                half.sum(),
-            )
-            for half in (most, ~most)
-        )
+        (k, n), (j, m) = ((int(done[half].sum()), int(half.sum())) for half in (most, ~most))
         if not n or not m:
             continue
-        (p, low, high), (q, below, above) = _wilson(k, int(n)), _wilson(j, int(m))
+        p, q = k / n, j / m
+        (low, high), (below, above) = wilson(p, n), wilson(q, m)
         yield {
             "quantity": item.name,
-            "varied_most": [int(k), int(n)],
-            "varied_least": [int(j), int(m)],
+            "varied_most": [k, n],
+            "varied_least": [j, m],
             "from": float(np.median(amount)),
             "unit": item.unit,
             "difference": p - q,
             "low": p - q - float(np.hypot(p - low, above - q)),
             "high": p - q + float(np.hypot(high - p, q - below)),
         }
-
-
-def _wilson(k: int, n: int) -> tuple[float, float, float]:
-    interval = binomtest(k, n).proportion_ci(method="wilson")
-    return k / n, float(interval.low), float(interval.high)
 
 
 def describe_effect(effect: Mapping[str, Any]) -> str:

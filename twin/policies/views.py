@@ -156,11 +156,11 @@ class TwinCameras:
         padded = np.zeros(len(rest.cloud), dtype=bool)
         padded[: len(hidden)] = hidden
         T_base_tcp = cell.robot.T_base_tcp(joints_rad)
-        drawn = {
+        pictures = {
             name: canvas.picture(rest.cloud, over, padded if hidden.any() else None, T_base_tcp)
             for name, canvas in self._canvases.items()
         }
-        return _lit(drawn, self._drawn)
+        return _lit(pictures, self._drawn)
 
     def _what_rests(self, places: Places, nodes: Nodes) -> Resting:
         """As it was, unless some of it moved, or something else came to rest."""

@@ -218,8 +218,6 @@ def with_samples(
     if config.mode != "dynamic":
         message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
         raise UsageError(message)
-    from scipy.stats import norm  # noqa: PLC0415  # half a second, and only with samples
-
     samples: list[Verdict] = []
     total = 0.0
     while (n := len(samples)) < config.samples:
@@ -233,15 +231,22 @@ def with_samples(
         total += _probability(samples[n].accepted is True, config, n)
     k = sum(sample.accepted is True for sample in samples)
     value = total / n
-    z = float(norm.ppf(0.5 + LEVEL / 2))
-    centre = (value + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * float(np.sqrt(value * (1 - value) / n + (z / (2 * n)) ** 2))
-    low, high = max(0.0, min(centre - half, value)), min(1.0, max(centre + half, value))
+    low, high = wilson(value, n)
     verdict = replace(verdict, p_success={"value": value, "low": low, "high": high, "k": k, "n": n})
     if verdict.accepted is not True:
         return verdict
     why = (verdict.reason, *_what_decides(verdict, samples))
     return replace(verdict, reason="; ".join(filter(None, why)) or None)
+
+
+def wilson(share: float, n: int) -> tuple[float, float]:
+    """The interval of a share of n (Wilson 1927), at ``LEVEL``."""
+    from scipy.special import ndtri  # noqa: PLC0415
+
+    z = float(ndtri(0.5 + LEVEL / 2))
+    centre = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * float(np.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2))
+    return max(0.0, min(centre - half, share)), min(1.0, max(centre + half, share))
 
 
 def decided(total: float, n: int, share: float) -> bool:
