@@ -73,7 +73,7 @@ def answer(question: Question) -> Verdict:
     from twin.replay.checks import limited_to_task  # noqa: PLC0415
     from twin.replay.monte_carlo import with_samples  # noqa: PLC0415
     from twin.replay.rebuilt_scene import for_task  # noqa: PLC0415
-    from twin.replay.verdict import reason_of, replay_plan  # noqa: PLC0415
+    from twin.replay.verdict import command_of, reason_of, replay_plan  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     run, plan = RunFolder.open(question.run_path), question.plan
@@ -82,17 +82,17 @@ def answer(question: Question) -> Verdict:
     steps, costs = _steps_of(question, config), 1 + SOFT * len(scene.task.soft_objects)
     most_samples = (question.max_steps - steps) // (steps * costs)
 
-    nominal = replay_plan(plan, scene, config, refuse_early=True)
+    commanded = command_of(plan, scene, config)
+    nominal = replay_plan(plan, scene, config, commanded=commanded, refuse_early=True)
     verdict = nominal.verdict
     if verdict.accepted is True:
-        kept = limited_to_task(plan, scene.task)
-        audited = audit(nominal, kept, scene, config)
+        audited = audit(nominal, limited_to_task(plan, scene.task), scene, config)
         verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
     verdict = replace(verdict, warnings=(*verdict.warnings, *scene.notes))
     early = verdict.terminal.value is None  # else samples are replayed as all other replays are
     return with_samples(
         replace(verdict, reason=reason_of(verdict)),
-        lambda there, varied: replay_plan(plan, there, varied, refuse_early=early).verdict,
+        lambda *drawn: replay_plan(plan, *drawn, commanded=commanded, refuse_early=early).verdict,
         scene,
         replace(config, samples=min(config.samples, most_samples)),
         identity=plan.start_id or plan.id,

@@ -18,7 +18,7 @@ from twin.replay.config import ReplayConfig
 from twin.replay.scene import StartState
 from twin.replay.verdict import KINEMATIC_ENGINE, engine_of
 
-REPLAY_VERSION = 25
+REPLAY_VERSION = 26
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 

@@ -252,13 +252,15 @@ def wilson(share: float, n: int) -> tuple[float, float]:
 def decided(total: float, n: int, share: float) -> bool:
     """Whether ``total`` of n succeed more or less often than a share: wrong once in 20, ever.
 
-    How likely they are on average over all shares, against how likely at this one: at this one it
-    is a martingale, which ever exceeds 20 once in 20 (Ville 1939; Robbins 1970).
+    How likely they are on average over all shares (Jeffreys' prior), against how likely at this
+    one: at this one it is a martingale, which ever exceeds 20 once in 20 (Ville 1939; Robbins
+    1970).
     """
     from scipy.special import betaln, xlog1py, xlogy  # noqa: PLC0415
 
     likely = xlogy(total, share) + xlog1py(n - total, -share)
-    return bool(betaln(total + 1, n - total + 1) - likely >= np.log(1 / (1 - LEVEL)))
+    average = betaln(total + 0.5, n - total + 0.5) - betaln(0.5, 0.5)
+    return bool(average - likely >= np.log(1 / (1 - LEVEL)))
 
 
 def _what_decides(verdict: Verdict, samples: Sequence[Verdict]) -> Iterator[str]:

@@ -43,7 +43,7 @@ from twin.replay.trace import (
     trace_of_recording,
     trace_of_result,
 )
-from twin.replay.verdict import findings_of, replay_joints, replay_plan
+from twin.replay.verdict import command_of, findings_of, replay_joints, replay_plan
 from twin.robot.model import load_robot
 from twin.robot.posture import check_clock, width_track
 
@@ -206,13 +206,15 @@ def _recording(source: _Source, arm: streams.JointTrack, widths: streams.JointTr
 
 def _with_samples(source: _Source, result: ReplayResult) -> ReplayResult:
     """Ask varied replays too; plans of one episode are tried against the same variations."""
-    if source.scene.missing():
+    scene, config, plan = source.scene, source.job.config, source.plan_as_executed
+    if scene.missing() or not config.samples:
         return result
+    commanded = command_of(plan, scene, config)
     verdict = with_samples(
         result.verdict,
-        lambda there, varied: _run(source, there, varied).verdict,
-        source.scene,
-        source.job.config,
+        lambda *drawn: replay_plan(plan, *drawn, commanded=commanded).verdict,
+        scene,
+        config,
         identity=source.job.episode_sha256,
     )
     return replace(result, verdict=verdict)

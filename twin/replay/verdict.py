@@ -156,19 +156,16 @@ KINEMATIC_ENGINE = "pinocchio"
 SOFT_ENGINE = "xpbd"
 
 
-def replay_plan(
-    plan: Plan, scene: ReplayScene, config: ReplayConfig, *, refuse_early: bool = False
-) -> ReplayResult:
-    """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
+def command_of(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> "Commanded":
+    """What a plan commands, and what is wrong with that before anything moves.
 
-    Args:
-        plan: What is commanded; its start is checked where the scene knows where the arm is.
-        refuse_early: Simulate nothing once a check that needs no physics says no. The commanded
-            path itself must then keep clear, too.
+    Waypoints, inverse kinematics, limits and self-collision; the start is checked where the scene
+    knows where the arm is.
     """
     robot = load_robot(scene.urdf)
+    hulls = hulls_of(robot)
     open_ = any(waypoint.joints_rad is None for waypoint in plan.tau)
-    free = posture_clearance(scene, hulls_of(robot), config) if open_ else None
+    free = posture_clearance(scene, hulls, config) if open_ else None
     path, failures, unreachable_ns = path_of_plan(
         plan, robot, clearance=free, start_rad=scene.start_rad
     )
@@ -176,14 +173,33 @@ def replay_plan(
     checks = {"task": task_failures(plan, scene.task), "limits": motion_failures(path, robot, held)}
     if scene.start_rad is not None:
         checks["start"] = start_failures(plan, path, scene.start_rad, robot)
-    commanded = Commanded(
-        path=path.with_late_gripper(config.grip_delay_s),
-        failures=failures,
+    return Commanded(
+        path=path,
+        failures=failures + check_path(path, robot, hulls),
         unreachable_ns=unreachable_ns,
         trajectory="planned",
         checks=checks,
         unknown=payload_unknown(robot, held),
     )
+
+
+def replay_plan(
+    plan: Plan,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    commanded: "Commanded | None" = None,
+    refuse_early: bool = False,
+) -> ReplayResult:
+    """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
+
+    Args:
+        commanded: What ``command_of`` found, if it was asked: varied replays command the same.
+        refuse_early: Simulate nothing once a check that needs no physics says no. The commanded
+            path itself must then keep clear, too.
+    """
+    commanded = commanded or command_of(plan, scene, config)
+    commanded = replace(commanded, path=commanded.path.with_late_gripper(config.grip_delay_s))
     return _replay(commanded, plan, scene, config, refuse_early=refuse_early)
 
 
@@ -191,8 +207,11 @@ def replay_joints(
     track: JointTrack, widths: JointTrack, scene: ReplayScene, config: ReplayConfig, *, plan: Plan
 ) -> ReplayResult:
     """Replay what the joint encoders and the gripper said during an execution."""
+    robot = load_robot(scene.urdf)
     path = path_of_execution(track, widths, plan, config, robot_of(scene.urdf))
-    return _replay(Commanded(path=path, trajectory="executed"), plan, scene, config)
+    failures = check_path(path, robot, hulls_of(robot))
+    commanded = Commanded(path=path, trajectory="executed", failures=failures)
+    return _replay(commanded, plan, scene, config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +221,7 @@ class Commanded:
     path: JointPath
     trajectory: str
     failures: list[Failure] = field(default_factory=list)
-    """Of inverse kinematics."""
+    """Of inverse kinematics and of the path itself."""
     unreachable_ns: int | None = None
     checks: dict[str, list[Failure]] = field(default_factory=dict)
     """Of the checks beside I(tau)."""
@@ -231,9 +250,6 @@ def _replay(
     *,
     refuse_early: bool = False,
 ) -> ReplayResult:
-    robot = load_robot(scene.urdf)
-    failures = commanded.failures + check_path(commanded.path, robot, hulls_of(robot))
-    commanded = replace(commanded, failures=failures)
     plan = limited_to_task(plan, scene.task)
     if config.mode == "dynamic":
         scene = free_start(scene, soft_models(scene))

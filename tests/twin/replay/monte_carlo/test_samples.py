@@ -185,15 +185,15 @@ NOWHERE = ReplayScene(task=load_task("cube_into_box"), Ts_base_object={}, urdf="
 @pytest.mark.parametrize(
     ("answers", "until", "n"),
     [
-        ([True] * 32, 0.5, 8),
-        ([False] * 32, 0.5, 8),
+        ([True] * 32, 0.5, 7),
+        ([False] * 32, 0.5, 7),
         ([True, False] * 16, 0.5, 32),
         ([True] * 32, None, 32),
         ([True] * 3 + [False] * 29, 1.0, 4),
     ],
 )
 def test_samples_end_once_they_decide(answers: list[bool], until: float | None, n: int) -> None:
-    """By hand: all of n succeed 2^n / (n + 1) times as likely on average as by a fair coin."""
+    """By hand: all of n, C(2 n, n) / 2^n times as likely on average as by a fair coin: 14, 27."""
     p, seen = asked(NOWHERE, answers, until)
     assert (p["k"], p["n"], len(seen)) == (sum(answers[:n]), n, n)
 
