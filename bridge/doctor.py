@@ -19,7 +19,7 @@ EXTRAS = {
     "video": "LeRobot videos",
     "realsense": "RealSense cameras",
     "ur": "the UR arm's model",
-    "mujoco": "replay --engine mujoco or both",
+    "mujoco": "replay --engine mujoco",
     "twin": "what needs torch in the twin",
     "foundation": "SAM 3, CLIP from folders of weights",
     "lpips": "LPIPS",

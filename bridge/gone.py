@@ -12,7 +12,7 @@ _FIXED = (
 """Settings of a replay that are constants now."""
 
 _TOLD = {
-    "design --width": "Give --gain with --rate; at a given size use --starts.",
+    "design --width --rate-width": "Give --gain with --rate; at a given size use --starts.",
     "design --agrees-above --agreement": "Use evaluate --fail-under.",
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
@@ -34,9 +34,8 @@ _TOLD = {
     "record --split-mb --split-s": (
         "Stop and start another episode; mcap merge makes one of parts that are there."
     ),
-    "record --triggers": "Record with --preroll-s 5, and start an episode when it has happened.",
+    "record --triggers|ctl snapshot": "Record with --preroll-s 5; start when it has happened.",
     "ctl pause|ctl resume": "Stop the episode, and start another one.",
-    "ctl snapshot": "Start and stop an episode: it begins with the pre-roll.",
     "publish episode --loop --paused --name": (
         "A playback begins at once and plays once; --start-s and --rate say from where, how fast."
     ),
@@ -48,8 +47,7 @@ _TOLD = {
         "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them."
     ),
     "rebuild --correct-geometry": "Import again: import rgbd --depth-unit-m, --depth-intrinsics.",
-    "rebuild --features": "Nothing read them; with --clip robot-gst find goes by meaning.",
-    "rebuild --feature-channels --feature-stride": "Nothing read features; see rebuild --clip.",
+    "rebuild --features --feature-channels --feature-stride": "Nothing read them; see --clip.",
     "rebuild --depth-model": "rebuild needs depth images: it finds no depth of its own.",
     "rebuild --generator --generator-timeout-s": "Shapes are carved from what the cameras saw.",
     "evaluate --live --recorder --connect --goal": (
@@ -61,7 +59,6 @@ _TOLD = {
     "evaluate --axes": "Evaluate the rows of each setting as a table of their own.",
     "evaluate --names": "Spell names alike that are one, and others further apart.",
     "design --past": "Say what is expected: --rate, --gain.",
-    "design --rate-width": "--width is that of the gain's interval.",
     "design --per-task": "A study asks for its gain over all tasks together.",
     "evaluate --force": "Delete RUN/results/cache; nothing else remembers a file.",
     "evaluate --lpips-alex": "--lpips-vgg makes LPIPS as papers on splatting compute it.",
@@ -78,9 +75,8 @@ _TOLD = {
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
     "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",
     "plan --send-images": "A model gets the marked picture of the start; leave the flag out.",
-    "publish standin --probes": "Trials teach as much: robot-gst calibrate RUN --posterior.",
     "calibrate --pairs": "Record /CELL/cam/ID/target/pose, then robot-gst calibrate RUN --cameras.",
-    "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
+    "calibrate --samples|publish standin --probes": "calibrate RUN --posterior learns of trials.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
     f"replay {_FIXED}|gate {_FIXED} --max-audit-distances --frames --max-frame-age-s "
     "--max-silence-s --max-joint-age-s --other-scene-m --moved-m --moved-rad|plan --candidates "

@@ -61,9 +61,10 @@ def commands_of(use: str, module: str, table: str) -> tuple[Command, ...]:
 
 LEAVES: dict[str, Leaf] = {
     "open": Leaf(
-        modules=("dashboards.opening",),
+        modules=("dashboards.opening", "dashboards.robot_file"),
         extra="record",
         purpose="opening what others recorded",
+        entries={"robot_in": "dashboards.robot_file:robot_in"},
         commands=commands_of(
             START,
             "dashboards.opening",

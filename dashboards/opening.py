@@ -32,6 +32,7 @@ from bridge.sources.folder.posed_index import COLMAP_FOLDERS, TRANSFORMS, read_p
 from bridge.sources.folder.scene_json import INDEX_NAME
 from bridge.sources.folder.tum import find_lists
 from bridge.terminal import Output
+from dashboards.robot_file import propose, write_robot_file
 
 OUTPUT = Output()
 MOST_INSIDE, MOST_NAMED, MOST_EPISODES, MOST_SURVEYED = 200, 5, 50, 500
@@ -43,6 +44,7 @@ HEADS |= {b"ply\n": "splat", b"ply\r": "splat"}
 ENDINGS = {
     "bag": (".mcap", ".db3", ".mcap.zstd", ".db3.zstd"),
     "table": (".csv", ".tsv", ".xlsx", ".xlsm"),
+    "robot description": (".urdf", ".xacro"),
 }
 OF_BAG = (*ENDINGS["bag"], METADATA_FILE)
 SPLAT_FIELDS = frozenset({"x", "f_dc_0", "opacity", "scale_0", "rot_0"})
@@ -74,7 +76,7 @@ class Found:
         for use in USES:
             lack = getattr(self, use)
             lines.append(f"  {use} needs {lack}" if lack else f"  {use}: ready")
-        steps = (f"open {path} RUN",) if self.bring else self.then
+        steps = self.then or ((f"open {path} RUN",) if self.bring else ())
         return [*lines, *(f"next: robot-gst {step}" for step in steps)]
 
 
@@ -104,12 +106,12 @@ def survey(source: Path) -> Survey:
 def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> int:
     """Say what a file or folder of yours holds, what it lacks and what comes next; or import it.
 
-    Bags, LeRobot datasets, RGB-D and posed images, splats, tables of trials, runs.
+    Bags, LeRobot datasets, RGB-D and posed images, splats, tables of trials, runs, URDFs.
     Example: robot-gst open bags/monday runs/monday
 
     Args:
         path: A file or folder; without RUN it is only read.
-        run: Run folder to import it into; made where needed.
+        run: Run folder to import it into, made where needed; of a URDF the robot file to write.
     """
     found = look_at(path)
     lines = found.lines(path)
@@ -121,7 +123,8 @@ def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> 
         raise UsageError("\n".join([*lines, "It cannot be imported."]))
     output.say(lines[0])
     code = found.bring(path, run, output=output)
-    output.say("\n".join(look_at(run).lines(run)))
+    if run.is_dir():
+        output.say("\n".join(look_at(run).lines(run)))
     return code
 
 
@@ -422,6 +425,25 @@ def _survey(run: RunFolder) -> Survey:
     return Survey(types=types, rates_hz=rates_hz, first=first)
 
 
+def _description(path: Path) -> Found:
+    robot, notes = propose(path)
+    fingers = ", ".join(robot.finger_joints)
+    opens = f"{fingers}, 0 to {robot.gripper.max_width_m:g} m" if fingers else "none"
+    return Found(
+        what=f"a robot description with an arm of {len(robot.joints)} joints",
+        holds=(
+            f"joints: {', '.join(robot.joints)}",
+            f"base {robot.base_frame}, tool {robot.tool_frame}, gripper {opens}",
+            *notes,
+        ),
+        rebuild="images of a cell",
+        replay="trials, recorded with it or replayed with --robot FILE.toml",
+        evaluate="trials",
+        bring=write_robot_file,
+        then=(f"robot check {path}", f"open {path} {path.stem}.toml"),
+    )
+
+
 KINDS: dict[str, Callable[[Path], Found]] = {
     "run": _run,
     "bag": _bag,
@@ -430,6 +452,7 @@ KINDS: dict[str, Callable[[Path], Found]] = {
     "folder of posed images": _posed,
     "splat": _splat,
     "table": _table,
+    "robot description": _description,
     "ROS 1 bag": partial(
         _converted, "a ROS 1 bag", "a ROS 2 bag; rosbags-convert --src {path} --dst {stem}"
     ),

@@ -26,6 +26,7 @@ import numpy as np
 
 from bridge.data_files import dataset_file, datasets_folder
 from bridge.errors import MissingDependencyError, UsageError
+from bridge.leaves import load_leaf
 
 SCHEMA_VERSION = 1
 Width = TypeVar("Width", float, np.ndarray)
@@ -290,7 +291,9 @@ _ODD = (msgspec.ValidationError, AttributeError, TypeError, ValueError)
 
 
 def read_robot(name: str) -> Robot:
-    """Read a robot file by its name in ``datasets/robots``, or by its path."""
+    """Read a robot file by its name in ``datasets/robots``, or by its path; or guess at a URDF."""
+    if name.endswith((".urdf", ".xacro")):
+        return typing.cast(Robot, load_leaf("open", "robot_in")(Path(name)))
     path = dataset_file("robots", name)
     try:
         table = tomllib.loads(path.read_text())

@@ -1,0 +1,268 @@
+"""A robot file for a URDF that comes without one: its arm, its tool and what may open its gripper.
+
+A URDF says how links hang together, not which of them are an arm. What is chosen here by the
+order of the joints and by the names of links is a proposal, to be looked at.
+"""
+
+import json
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from bridge.errors import UsageError
+from bridge.robots.robot import NUM_JOINTS, PACKAGE, Finger, Gripper, Robot, number_of, robot_name
+from bridge.terminal import Output
+
+FINGERS = re.compile(
+    r"finger|grip|jaw|knuckle|thumb|index|middle|little|pinky|(^|_)(ring|hand)_", re.IGNORECASE
+)
+JAWS = re.compile(r"finger|jaw|knuckle", re.IGNORECASE)
+FINGER_M = 0.15
+"""A joint at the end that slides by less opens something."""
+TOOLS = ("tcp", "tool0", "grasp", "ee", "eef", "effector", "tool", "flange")
+"""What frames of tools are called, the surest first."""
+MOST_NAMED = 5
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint of a URDF, as far as it says what hangs on what."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    lower: float
+    upper: float
+    leader: str
+    """The joint that it follows; "": none."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether somebody drives it."""
+        return self.kind in ("revolute", "continuous", "prismatic") and not self.leader
+
+    @property
+    def opens(self) -> bool:
+        """Whether it looks like a finger's."""
+        slides = self.kind == "prismatic" and self.upper - self.lower < FINGER_M
+        return slides or bool(FINGERS.search(self.name) or JAWS.search(self.child))
+
+
+def robot_in(path: Path) -> Robot:
+    """Return the robot that ``propose`` finds in a URDF."""
+    return propose(path)[0]
+
+
+def propose(path: Path) -> tuple[Robot, list[str]]:
+    """Propose a robot file for a URDF; also what was chosen and nobody said.
+
+    Raises:
+        UsageError: It cannot be read, or no chain of its joints is an arm.
+    """
+    robot = Robot(name=path.stem, urdf=path.name, joints=(), folder=path.absolute().parent)
+    robot = _with_meshes(robot, path)
+    joints = _joints(ET.fromstring(robot.urdf_text()))
+    arm, notes = _arm(joints, path)
+    below = _below(arm[-1].child, joints)
+    gripper, told = _gripper([joint for joint in below if joint.kind != "fixed"], below)
+    driven = {joint.name for joint in arm} | {finger.joint for finger in gripper.fingers}
+    tool_frame, unsure = _tool(arm[-1].child, below, gripper)
+    proposed = Robot(
+        name=re.sub(r"\W+", "_", robot_name(path.read_text()) or path.stem),
+        urdf=path.name,
+        joints=tuple(joint.name for joint in arm),
+        base_frame=_root(arm[0].parent, joints),
+        tool_frame=tool_frame,
+        gripper=gripper,
+        held=tuple(each.name for each in joints if each.moves and each.name not in driven),
+        mesh_folders=robot.mesh_folders,
+        folder=robot.folder,
+    )
+    return proposed, notes + told + unsure
+
+
+def _with_meshes(robot: Robot, path: Path) -> Robot:
+    """Find the folders of packages that its meshes name above the file or beside what is above."""
+    text = path.read_text(errors="replace")
+    folders = {}
+    for package in sorted(set(re.findall(r"package:/{2,}([^/\"']+)/", text)) - {PACKAGE}):
+        for above in path.absolute().parents:
+            found = above if above.name == package else above / package
+            if found.is_dir():
+                folders[package] = str(found)
+                break
+    return Robot(**{**vars(robot), "mesh_folders": folders})
+
+
+def _joints(root: ET.Element) -> list[Joint]:
+    found = []
+    for item in root.findall("joint"):
+        ends = {tag: item.find(tag) for tag in ("parent", "child", "limit", "mimic")}
+        read = {tag: {} if e is None else e.attrib for tag, e in ends.items()}
+        lower, upper = (number_of(read["limit"].get(key, "0")) for key in ("lower", "upper"))
+        found.append(
+            Joint(
+                name=item.get("name", ""),
+                kind=item.get("type", ""),
+                parent=read["parent"].get("link", ""),
+                child=read["child"].get("link", ""),
+                lower=lower,
+                upper=upper,
+                leader=read["mimic"].get("joint", ""),
+            )
+        )
+    return found
+
+
+def _arm(joints: list[Joint], path: Path) -> tuple[list[Joint], list[str]]:
+    """The joints of the longest chain that is an arm by its names, or else of the longest.
+
+    What opens at its end is left out, and what also moves other chains at its beginning.
+    """
+    chains = _chains(joints)
+    long = sorted((chain for chain in chains if len(chain) >= NUM_JOINTS[0]), key=_rank)
+    if not long:
+        most = max(chains, key=len, default=[])
+        names = ", ".join(joint.name for joint in most) or "none"
+        raise UsageError(
+            f"{path}: no arm of {NUM_JOINTS[0]} to {NUM_JOINTS[-1]} joints was found. The longest "
+            f"chain has {len(most)}: {names}."
+        )
+    arm, others = long[0], [chain for chain in chains if chain != long[0]]
+    while len(arm) > NUM_JOINTS[0] and any(arm[0] in chain for chain in others):
+        arm = arm[1:]
+    arm = arm[-NUM_JOINTS[-1] :]
+    held = [f"{each[0].name} to {each[-1].name} ({len(each)})" for each in long[1:]]
+    return arm, [f"other chains are held: {', '.join(held)}"] if held else []
+
+
+def _chains(joints: list[Joint]) -> list[list[Joint]]:
+    """The joints that move each end, without what opens there; none that is part of another."""
+    above = {joint.child: joint for joint in joints}
+    parents = {joint.parent for joint in joints}
+    chains = []
+    for leaf in (joint.child for joint in joints if joint.child not in parents):
+        chain, link = list[Joint](), leaf
+        while link in above and above[link] not in chain:
+            chain.append(above[link])
+            link = above[link].parent
+        moving = [joint for joint in reversed(chain) if joint.moves]
+        while moving and moving[-1].opens:
+            moving.pop()
+        chains.append(moving)
+    return [
+        chain
+        for index, chain in enumerate(chains)
+        if chain not in chains[:index]
+        and not any(len(c) > len(chain) and c[: len(chain)] == chain for c in chains)
+    ]
+
+
+def _rank(chain: list[Joint]) -> tuple[bool, int]:
+    is_arm = sum("arm" in (joint.name + joint.child).lower() for joint in chain) > 1
+    return not is_arm, -len(chain)
+
+
+def _below(link: str, joints: list[Joint]) -> list[Joint]:
+    """What hangs on a link."""
+    return [
+        each
+        for joint in joints
+        if joint.parent == link
+        for each in (joint, *_below(joint.child, joints))
+    ]
+
+
+def _root(link: str, joints: list[Joint]) -> str:
+    above = {joint.child: joint.parent for joint in joints}
+    while link in above:
+        link = above[link]
+    return link
+
+
+def _gripper(moving: list[Joint], below: list[Joint]) -> tuple[Gripper, list[str]]:
+    """Two jaws that slide, where there are such; what turns or is more than two is held."""
+    jaws = [joint for joint in moving if joint.kind == "prismatic" and joint.opens]
+    span_m = sum(joint.upper - joint.lower for joint in jaws)
+    if len(jaws) != 2 or len(moving) != 2 or not 0 < span_m < math.inf:
+        names = [joint.name for joint in moving if joint.moves]
+        some = ", ".join(names[:MOST_NAMED]) + (", ..." if len(names) > MOST_NAMED else "")
+        told = f"a URDF does not say how wide a gripper is, so it is held: {some}"
+        return Gripper(), [told] if names else []
+    fingers = []
+    for jaw in (joint for joint in jaws if joint.moves):
+        closed, open_ = sorted((jaw.lower, jaw.upper), key=abs)
+        fingers.append(Finger(joint=jaw.name, closed=closed, per_m=(open_ - closed) / span_m))
+    hands = {joint.parent for joint in jaws}
+    links = (*sorted(hands), *(joint.child for joint in jaws))
+    gripper = Gripper(
+        links=links,
+        finger_links=links[len(hands) :],
+        fingers=tuple(fingers),
+        max_width_m=round(span_m, 6),
+    )
+    return gripper, ["the gripper is taken for closed where its joints are next to 0"]
+
+
+def _tool(last: str, below: list[Joint], gripper: Gripper) -> tuple[str, list[str]]:
+    """The frame that is called like a tool's, else the last one that hangs fixed on the arm."""
+    fixed = [joint.child for joint in _below(last, [j for j in below if j.kind == "fixed"])]
+    for word in TOOLS:
+        named = [name for name in fixed if word in re.split(r"[_\W]+", name.lower())]
+        if named:
+            return named[-1], []
+    fixed = fixed or [last]
+    where = "" if not gripper.fingers else "; it should lie between the pads"
+    return fixed[-1], [f"no frame is named like a tool's, so {fixed[-1]} was taken{where}"]
+
+
+def write_robot_file(urdf: Path, path: Path, /, *, output: Output) -> int:
+    """Write a proposal beside nothing that is there."""
+    if path.suffix != ".toml":
+        raise UsageError(f"a robot file ends with .toml: robot-gst open {urdf} {urdf.stem}.toml")
+    text = toml_of(propose(urdf)[0], str(urdf.absolute()))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with path.open("x") as stream:
+            stream.write(text)
+    except FileExistsError:
+        raise UsageError(f"{path} is there already; name another file.") from None
+    output.say(f"{path} was written; look at it: robot-gst robot check {path}")
+    return 0
+
+
+def toml_of(robot: Robot, urdf: str) -> str:
+    """Return the robot file's text, with a URDF's path as it is to name it."""
+    lines = [
+        "# A proposal made from the URDF alone; every field is explained in docs/robots.md.",
+        "schema_version = 1",
+        f"name = {json.dumps(robot.name)}",
+        f"urdf = {json.dumps(urdf)}",
+        f"base_frame = {json.dumps(robot.base_frame)}",
+        f"tool_frame = {json.dumps(robot.tool_frame)}",
+        f"joints = {json.dumps(robot.joints)}",
+        *([f"held = {json.dumps(robot.held)}"] if robot.held else []),
+        "# payload_kg = 5.0 # what it may carry; without it the gate says nothing of what is held",
+        "# home_rad = [] # a posture free of contact",
+        *_table("mesh_folders", robot.mesh_folders),
+    ]
+    gripper = robot.gripper
+    if gripper.fingers:
+        lines += _table(
+            "gripper",
+            {key: getattr(gripper, key) for key in ("links", "finger_links", "max_width_m")},
+        )
+    for finger in gripper.fingers:
+        row = {key: getattr(finger, key) for key in ("joint", "closed", "per_m")}
+        lines += _table("[gripper.fingers]", row)
+    return "\n".join(lines) + "\n"
+
+
+def _table(name: str, values: Mapping[str, object]) -> list[str]:
+    keys = {key: key if re.fullmatch(r"[\w-]+", key) else json.dumps(key) for key in values}
+    rows = [f"{keys[key]} = {json.dumps(value)}" for key, value in values.items()]
+    return ["", f"[{name}]", *rows] if rows else []
