@@ -92,7 +92,7 @@ def test_a_disagreement_has_a_cause_a_margin_and_says_how_often_it_happens(
             page = browser.get(address).text
             assert "margin with 3 mm more 24 of 24 varied replays would succeed" in words(page)
             assert "cube along x: +2.0 mm where it succeeds, -3.0 mm where not" in words(page)
-            assert 'aria-label="strength 1.00 of 1"><rect width="72.0"' in page
+            assert 'aria-label="strength 1.00 of 1"><rect width="72"' in page
 
 
 def test_a_picture_is_drawn_once_and_again_when_the_recording_changes(
