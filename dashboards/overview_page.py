@@ -5,13 +5,16 @@ Measurements are chosen by id; nothing is computed.
 
 import shlex
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import DEPTH_IMAGE
 from bridge.errors import GstError
+from bridge.task.scripted_motion import RECORD_NAME
 from dashboards.comparison import Judgement
 from dashboards.moments import Cause, cause_of
 from evaluator.report.wording import SIM_SIDE, agreeing_side
@@ -230,8 +233,22 @@ def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
     trials, recorded, replayed = judgement.index.totals()
     if not trials and next(run.episodes_dir.glob("*.mcap"), None) is None:
         return None if judgement.has_results else f"robot-gst record {path}"
-    if recorded and not replayed:
-        has_scene = (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap"))
-        return f"robot-gst {'replay' if has_scene else 'rebuild'} {path}"
     is_due = judgement.about["results_reason"] or judgement.about["outdated"]
-    return f"robot-gst evaluate {path}" if is_due else None
+    step = _step_to_replays(run) if recorded and not replayed else ""
+    if is_due and step in ("", "open"):
+        step = "evaluate"
+    return f"robot-gst {step} {path}" if step else None
+
+
+def _step_to_replays(run: RunFolder) -> str:
+    """The command that recordings lack; ``open`` says what is missing where there is no depth."""
+    if (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap")):
+        return "replay"
+    for path in run.episodes()[:MOST_FILES]:
+        with suppress(GstError):  # its own page says what is wrong
+            episode = Episode.open(path)
+            if any(topic.endswith(DEPTH_IMAGE) for topic in episode.topics()):
+                return "rebuild"
+            if episode.record(RECORD_NAME):
+                return "replay"
+    return "open"
