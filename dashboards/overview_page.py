@@ -5,18 +5,17 @@ Measurements are chosen by id; nothing is computed.
 
 import shlex
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.topics import DEPTH_IMAGE
 from bridge.errors import GstError
 from bridge.task.scripted_motion import RECORD_NAME
 from dashboards.comparison import Judgement
 from dashboards.moments import Cause, cause_of
+from dashboards.twin_page import any_recorded, has_depth
 from evaluator.report.wording import SIM_SIDE, agreeing_side
 from evaluator.result import Measurement
 from evaluator.review_index import FACETS, RESULTS, IndexedFile, ReviewIndex, Selection, stamp_of
@@ -155,7 +154,8 @@ def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
     if all(each.value is None for name, each in by_id.items() if name.startswith("agreement.")):
         rates = [each for name, each in by_id.items() if name.startswith("rate.recorded.")]
         for each in [each for each in rates if each.value is not None][: len(NUMBERS)]:
-            yield f"Recorded success, {' · '.join(each.id.split('.')[2:])}", each
+            parts = [part.replace("_", " ") for part in each.id.split(".")[2:] if part != "-"]
+            yield f"Recorded success, {' · '.join(parts)}", each
     for name, title in NUMBERS.items():
         found = by_id.get(name.replace(SIM_SIDE, side))
         if found is not None:
@@ -244,11 +244,6 @@ def _step_to_replays(run: RunFolder) -> str:
     """The command that recordings lack; ``open`` says what is missing where there is no depth."""
     if (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap")):
         return "replay"
-    for path in run.episodes()[:MOST_FILES]:
-        with suppress(GstError):  # its own page says what is wrong
-            episode = Episode.open(path)
-            if any(topic.endswith(DEPTH_IMAGE) for topic in episode.topics()):
-                return "rebuild"
-            if episode.record(RECORD_NAME):
-                return "replay"
-    return "open"
+    if any_recorded(run, has_depth):
+        return "rebuild"
+    return "replay" if any_recorded(run, lambda episode: episode.record(RECORD_NAME)) else "open"

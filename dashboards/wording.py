@@ -49,8 +49,7 @@ def verdict_text(verdict: Verdict) -> str:
     elif verdict.accepted is None and verdict.reason:
         text += f"; {verdict.reason}"
     if verdict.p_success:
-        found = "; ".join(goes_with_success(verdict))
-        text += f"; {success_share(verdict.p_success)}: {found}"
+        text += "; ".join(["", success_share(verdict.p_success), *goes_with_success(verdict)])
     return text
 
 

@@ -119,3 +119,20 @@ def test_what_is_next_can_be_done_with_what_was_recorded(
 def test_an_imported_motion_needs_no_scene(synthetic: ModuleType, own_run: RunFolder) -> None:
     add(own_run, "motion", "/lab/cam/side/color/image", motion=True)
     assert next_command(synthetic, own_run) == "replay"
+
+
+def test_a_scene_is_offered_where_depth_was_recorded(
+    synthetic: ModuleType, own_run: RunFolder
+) -> None:
+    rebuild = f"robot-gst rebuild {own_run.path}"
+    assert rebuild not in synthetic.browser_of(own_run).get("/twin").text
+    add(own_run, "scan", "/lab/cam/side/depth/image")
+    assert rebuild in synthetic.browser_of(own_run).get("/twin").text
+
+
+def test_long_names_in_a_notice_may_break_behind_their_joints(
+    synthetic: ModuleType, copy: RunFolder
+) -> None:
+    copy.derived("trial_0001.replay.planned*")[0].unlink()
+    page = synthetic.browser_of(copy).get("/").text
+    assert "replay.<wbr>planned" in page
