@@ -10,18 +10,12 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor, Verdict
+from dashboards import trial_plots
 from dashboards.figures import StageChart, TimePlot
 from dashboards.frames import RENDERED, CameraTrack
 from dashboards.library import derived_paths, episode_path
 from dashboards.moments import Cause, Moment, cause_of, moment_of
 from dashboards.recording import PageClock, Problems, Recording, read_recording
-from dashboards.trial_plots import (
-    PLANNED,
-    main_plots,
-    plots_of_joints,
-    shown_replays,
-    trial_lanes,
-)
 from dashboards.wording import event_words
 from evaluator.trial_row import TrialRow
 from twin.scene.store.library import not_scanned_in
@@ -138,7 +132,7 @@ def build_page(
     failure_t_s = next(failures_s, None)
     moment = None if row is None else moment_of(run, row)
     divergence_t_s = None if moment is None else clock.of_plan_time(moment.plan_id, moment.t_ns)
-    shown = shown_replays(replays, sent_plan)
+    shown = trial_plots.shown_replays(replays, sent_plan)
     failed = {name for name, answer in (row.stages if row else ()) if answer is False}
     known = (t for t in (t_s, divergence_t_s, failure_t_s) if t is not None)
     cursor = clock.clamp(next(known, clock.end_s))
@@ -150,9 +144,9 @@ def build_page(
         label=problems.attempt(lambda: outcome_of(run, Episode.open(path)), recording.outcome),
         verdicts=verdicts,
         gated=any(view.title == GATE_BEFORE and view.of_sent_plan for view in verdicts),
-        stages=trial_lanes(recording, shown, clock, failure_t_s, failed),
-        plots=main_plots(recording, replays, sent_plan, row, clock),
-        joint_plots=plots_of_joints(recording, shown, clock),
+        stages=trial_plots.trial_lanes(recording, shown, clock, failure_t_s, failed),
+        plots=trial_plots.main_plots(recording, replays, sent_plan, row, clock),
+        joint_plots=trial_plots.plots_of_joints(recording, shown, clock),
         cameras=tuple(
             _camera(track, replays, clock, cursor)
             for name, track in recording.cameras.items()
@@ -299,7 +293,7 @@ def _twin_view(
         if track is None or made is None or made.plan_id not in clock.starts_ns:
             continue
         if clock.recorded_ns[0] <= track.stamps_ns[0] <= clock.recorded_ns[1]:
-            found.append((made.trajectory == PLANNED, age, replay, track))
+            found.append((made.trajectory == trial_plots.PLANNED, age, replay, track))
     if not found:
         return None
     _, _, replay, track = max(found, key=lambda each: each[:2])

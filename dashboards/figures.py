@@ -5,7 +5,7 @@ Only the layout of a drawing is worked out here; every number that is shown come
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -96,6 +96,11 @@ class StageChart:
     """Name and stages of each, from top to bottom."""
     marks: tuple[tuple[float, str, str], ...]
     """Page time [s], text and style."""
+
+    def at(self, width: int) -> "StageChart":
+        """The same at another width [px]."""
+        x = axis(self.x.low, self.x.high, LANE_LABEL_WIDTH, width - 8, wanted=width // 110)
+        return replace(self, width=width, x=x)
 
     def bar(self, span: Span) -> tuple[float, float, str]:
         """Where a stretch begins and how wide it is [px], and its label where that fits."""
@@ -219,7 +224,7 @@ def time_plot(
     )
 
 
-LANE_LABEL_WIDTH = 92
+LANE_LABEL_WIDTH, WIDE = 92, 1130
 
 
 def stage_chart(
@@ -227,7 +232,6 @@ def stage_chart(
     marks: Sequence[tuple[float, str, str]],
     *,
     span_s: tuple[float, float],
-    width: int = 1130,
 ) -> StageChart | None:
     """Lay out stages in named lanes; None when no lane holds any.
 
@@ -236,6 +240,6 @@ def stage_chart(
     filled = tuple((name, tuple(spans)) for name, spans in lanes if spans)
     if not filled:
         return None
-    x = axis(span_s[0], span_s[1], LANE_LABEL_WIDTH, width - 8, wanted=10)
-    inside = tuple(mark for mark in marks if x.low <= mark[0] <= x.high)
-    return StageChart(width=width, x=x, lanes=filled, marks=inside)
+    bare = axis(*span_s, 0, 1)
+    inside = tuple(mark for mark in marks if bare.low <= mark[0] <= bare.high)
+    return StageChart(width=0, x=bare, lanes=filled, marks=inside).at(WIDE)

@@ -15,6 +15,7 @@ from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 from evaluator.compare.attribution import SAID, attributed
 from evaluator.trial_row import TrialRow
+from twin.replay.deciding import goes_with_success, what_decides
 
 MOST_WORDS = 20
 """Of a cause."""
@@ -81,6 +82,8 @@ class Cause:
     """How far what decides is from the other answer; empty where the verdict does not say."""
     varied: Mapping[str, float] | None
     """How many varied replays succeed; None where nothing was varied."""
+    goes_with: Mapping[str, float]
+    """What goes with their success, in words, and how strongly, 0 to 1; or why nothing does: 0."""
 
 
 def cause_of(run: RunFolder, row: TrialRow) -> Cause | None:
@@ -89,28 +92,20 @@ def cause_of(run: RunFolder, row: TrialRow) -> Cause | None:
         return None
     moment, verdict = moment_of(run, row), _verdict_of(run, row)
     text = moment.text if moment else row.failing_detail or "no replay tells what differs first"
-    words, decides = (SAID.get(attributed(row) or "", "") + text).split(), None
-    if verdict is not None:  # what fails decides, else the goal
-        decides = verdict.factors().get(verdict.first_failing or "", verdict.terminal)
+    words = (SAID.get(attributed(row) or "", "") + text).split()
+    margin = "" if verdict is None else (verdict.terminal.detail or "").partition(";")[0]
     return Cause(
         text=" ".join(words[:MOST_WORDS]) + (" …" if len(words) > MOST_WORDS else ""),
-        margin=(decides.detail or "").partition(";")[0] if decides else "",
-        varied=None if verdict is None else verdict.p_success,
+        margin="; ".join(what_decides(verdict)) or margin if verdict else "",
+        varied=verdict.p_success if verdict else None,
+        goes_with=goes_with_success(verdict) if verdict else {},
     )
 
 
 def _verdict_of(run: RunFolder, row: TrialRow) -> Verdict | None:
     path = run.derived_dir / (row.twin_replay or "")
-    if not path.is_file():
-        return None
-    status = path.stat()
-    return _verdict(path, status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(maxsize=64)
-def _verdict(path: Path, _mtime_ns: int, _size: int) -> Verdict | None:
     try:
-        return streams.verdicts(Episode.open(path))[-1][1]
+        return streams.verdicts(Episode.open(path))[-1][1] if path.is_file() else None
     except (GstError, IndexError):  # the trial's own page says what is wrong with the file
         return None
 

@@ -12,8 +12,10 @@ from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
+from bridge.task.scripted_motion import RECORD_NAME
 from dashboards.comparison import Judgement
 from dashboards.moments import Cause, cause_of
+from dashboards.twin_page import any_recorded, has_depth
 from evaluator.report.wording import SIM_SIDE, agreeing_side
 from evaluator.result import Measurement
 from evaluator.review_index import FACETS, RESULTS, IndexedFile, ReviewIndex, Selection, stamp_of
@@ -152,7 +154,8 @@ def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
     if all(each.value is None for name, each in by_id.items() if name.startswith("agreement.")):
         rates = [each for name, each in by_id.items() if name.startswith("rate.recorded.")]
         for each in [each for each in rates if each.value is not None][: len(NUMBERS)]:
-            yield f"Recorded success, {' · '.join(each.id.split('.')[2:])}", each
+            parts = [part.replace("_", " ") for part in each.id.split(".")[2:] if part != "-"]
+            yield f"Recorded success, {' · '.join(parts)}", each
     for name, title in NUMBERS.items():
         found = by_id.get(name.replace(SIM_SIDE, side))
         if found is not None:
@@ -230,8 +233,17 @@ def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
     trials, recorded, replayed = judgement.index.totals()
     if not trials and next(run.episodes_dir.glob("*.mcap"), None) is None:
         return None if judgement.has_results else f"robot-gst record {path}"
-    if recorded and not replayed:
-        has_scene = (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap"))
-        return f"robot-gst {'replay' if has_scene else 'rebuild'} {path}"
     is_due = judgement.about["results_reason"] or judgement.about["outdated"]
-    return f"robot-gst evaluate {path}" if is_due else None
+    step = _step_to_replays(run) if recorded and not replayed else ""
+    if is_due and step in ("", "open"):
+        step = "evaluate"
+    return f"robot-gst {step} {path}" if step else None
+
+
+def _step_to_replays(run: RunFolder) -> str:
+    """The command that recordings lack; ``open`` says what is missing where there is no depth."""
+    if (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap")):
+        return "replay"
+    if any_recorded(run, has_depth):
+        return "rebuild"
+    return "replay" if any_recorded(run, lambda episode: episode.record(RECORD_NAME)) else "open"

@@ -25,34 +25,13 @@ from bridge.episode.run_folder import RunFolder, refuse_full
 from bridge.episode.streams import verdicts
 from bridge.errors import GstError, UsageError
 from bridge.process_pool import cores
+from bridge.task import protocol as study
 from bridge.task.find import chosen_task_file
 from bridge.task.model_policy import server_of
 from bridge.task.plan import STUDY_ARMS
-from bridge.task.protocol import (
-    FILE_NAME,
-    SEEDS_PER_SESSION,
-    PolicyArms,
-    Protocol,
-    StudyTask,
-    read_protocol,
-    with_coins,
-)
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
-from dashboards.demo import (
-    Background,
-    StepFailedError,
-    answers,
-    cut_short,
-    ending_on_signals,
-    free_port,
-    running,
-    scan_task,
-    set_aside,
-    start_command,
-    step,
-    stop_command,
-)
+from dashboards import demo
 from dashboards.standin_settings import BUILT_IN_POLICY, TrialsConfig
 
 EVERY_TASK = "all"
@@ -79,7 +58,7 @@ class Job:
     @property
     def start_seed(self) -> int:
         """Of its start."""
-        return self.session_seed * SEEDS_PER_SESSION + self.start
+        return self.session_seed * study.SEEDS_PER_SESSION + self.start
 
     @property
     def key(self) -> tuple[str, str, int]:
@@ -104,7 +83,7 @@ def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
     run = RunFolder.create(path)
     refuse_full(run.path)
     jobs = jobs_of(protocol, chosen)
-    with ending_on_signals():
+    with demo.ending_on_signals():
         keep_protocol(run.path, protocol, has_trials=bool(run.episodes()))
         if learned is not None:
             learned.put_into(run)
@@ -114,10 +93,10 @@ def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
             _do(run, config, left, output)
         if config.acting():
             roll_out(path, config, output)
-        step(
+        demo.step(
             output, "replaying every plan", ["replay", str(path), "--samples", f"{config.samples}"]
         )
-        step(output, "evaluating", ["evaluate", str(path)], show_result=True)
+        demo.step(output, "evaluating", ["evaluate", str(path)], show_result=True)
     return 0
 
 
@@ -130,16 +109,17 @@ def acting_command(run: Path, config: TrialsConfig, policy: str) -> list[str]:
 def roll_out(run: Path, config: TrialsConfig, output: Output) -> None:
     """Rebuild the scene where there is none, and let those who acted in the cell act in it."""
     if not (run / "scene" / "scene.json").is_file():
-        step(output, "rebuilding the scene", ["rebuild", str(run), "--iterations", "3000"])
+        demo.step(output, "rebuilding the scene", ["rebuild", str(run), "--iterations", "3000"])
     for policy in config.acting():
         try:
-            step(output, f"rolling {policy} out in the twin", acting_command(run, config, policy))
-        except StepFailedError as error:  # 2: some say nothing of it, which was printed
+            command = acting_command(run, config, policy)
+            demo.step(output, f"rolling {policy} out in the twin", command)
+        except demo.StepFailedError as error:  # 2: some say nothing of it, which was printed
             if error.code != 2:
                 raise
 
 
-def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
+def protocol_of(config: TrialsConfig) -> tuple[study.Protocol, dict[str, str]]:
     """What the study will do, and by name how each of its tasks was asked for."""
     names = list(config.task)
     if EVERY_TASK in names:
@@ -150,7 +130,7 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
         if arm not in CONDITION_OF:
             raise UsageError(f"--arms {arm!r} is unknown. There are: {', '.join(STUDY_ARMS)}.")
     tasks = tuple(
-        StudyTask(
+        study.StudyTask(
             task=file.task().name,
             task_sha256=file.sha256,
             session_seed=config.seed,
@@ -161,12 +141,14 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
     )
     first, *others = dict.fromkeys(each.split("=", 1)[0] for each in config.policies)
     policies = (
-        PolicyArms(policy=first, arms=("without",) if first in config.acting() else config.arms),
-        *(PolicyArms(policy=each, arms=("without",)) for each in others),
+        study.PolicyArms(
+            policy=first, arms=("without",) if first in config.acting() else config.arms
+        ),
+        *(study.PolicyArms(policy=each, arms=("without",)) for each in others),
     )
     if config.model:
         server_of(config.model)  # refuses secrets in the address
-    protocol = Protocol(
+    protocol = study.Protocol(
         tasks=tasks,
         policies=policies,
         model_name=config.model_name,
@@ -180,10 +162,10 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
     return _with_coins(protocol, config), chosen
 
 
-def _with_coins(protocol: Protocol, config: TrialsConfig) -> Protocol:
+def _with_coins(protocol: study.Protocol, config: TrialsConfig) -> study.Protocol:
     names = [each.task for each in protocol.tasks]
     if config.coin is not None:
-        return with_coins(protocol, dict.fromkeys(names, config.coin), "given by --coin")
+        return study.with_coins(protocol, dict.fromkeys(names, config.coin), "given by --coin")
     if config.development is None:
         raise UsageError(
             "the arm control needs the chance of yes to each plan: --coin, or --development RUN "
@@ -197,7 +179,9 @@ def _with_coins(protocol: Protocol, config: TrialsConfig) -> Protocol:
         )
     words = ", ".join(f"{name} {k} of {n}" for name, (k, n) in sorted(shares.items()))
     coins = {name: round(k / n, 6) for name, (k, n) in shares.items()}
-    return with_coins(protocol, coins, f"the gate's share of yes on development seeds: {words}")
+    return study.with_coins(
+        protocol, coins, f"the gate's share of yes on development seeds: {words}"
+    )
 
 
 def yes_shares(run: RunFolder) -> dict[str, tuple[int, int]]:
@@ -214,7 +198,7 @@ def yes_shares(run: RunFolder) -> dict[str, tuple[int, int]]:
     return counts
 
 
-def jobs_of(protocol: Protocol, chosen: dict[str, str]) -> list[Job]:
+def jobs_of(protocol: study.Protocol, chosen: dict[str, str]) -> list[Job]:
     """Every start under every policy, numbered in the protocol's order."""
     jobs: list[Job] = []
     for task in protocol.tasks:
@@ -273,7 +257,7 @@ def _clear(
     left = [job for job in jobs if there.lacks(job, retry=retry)]
     for job in left:
         for path in there.files(job):
-            set_aside(run, path, "its start was interrupted", output)
+            demo.set_aside(run, path, "its start was interrupted", output)
     return left
 
 
@@ -302,7 +286,7 @@ def _there(run: RunFolder, jobs: Sequence[Job]) -> _There:
         key = (info.task, info.policy, info.start_seed or 0)
         if key not in there.trials:
             continue
-        if cut_short(episode, outcome):
+        if demo.cut_short(episode, outcome):
             there.broken.setdefault(key, []).append(path)
         if info.kind == RETRY:
             there.retries[retried_trial(info)] = path
@@ -324,20 +308,20 @@ def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Out
     for path in run.episodes():
         with suppress(GstError):
             episode = Episode.open(path)
-            if episode.info.kind == "scan" and not cut_short(episode, episode.outcome):
+            if episode.info.kind == "scan" and not demo.cut_short(episode, episode.outcome):
                 there.add(episode.info.task)
     wanted = {job.task: job for job in reversed(jobs) if job.task not in there}
     if not wanted:
         return
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = f"tcp/127.0.0.1:{demo.free_port()}"
     log = run.notes_dir / "logs" / "record_scans.log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    with running(["record", str(run.path), "--listen", endpoint], log) as recorder:
-        recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
+    with demo.running(["record", str(run.path), "--listen", endpoint], log) as recorder:
+        recorder.wait_until(lambda: demo.answers(endpoint, "rec/main/ctl/status"))
         for job in wanted.values():
             standin = ["publish", "standin", "--connect", endpoint]
             standin += ["--seed", str(job.session_seed), "--first-start", str(job.start)]
-            scan_task(job.chosen, standin, output, recorder)
+            demo.scan_task(job.chosen, standin, output, recorder)
 
 
 def _do(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Output) -> None:
@@ -396,23 +380,23 @@ def _next(left: "queue.SimpleQueue[Job]") -> Job | None:
 @contextmanager
 def _laboratory(
     run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], index: int
-) -> Iterator[tuple[str, list[Background]]]:
+) -> Iterator[tuple[str, list[demo.Background]]]:
     """Recorder, gate and planner of one worker, on an endpoint of their own."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = f"tcp/127.0.0.1:{demo.free_port()}"
     logs = run.notes_dir / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     connect = ["--connect", endpoint]
     with ExitStack() as stack:
-        there: list[Background] = []
+        there: list[demo.Background] = []
 
-        def start(name: str, arguments: list[str], words: str = "") -> Background:
+        def start(name: str, arguments: list[str], words: str = "") -> demo.Background:
             log = logs / f"{name}_{index}.log"
-            there.append(stack.enter_context(running(arguments, log, words)))
+            there.append(stack.enter_context(demo.running(arguments, log, words)))
             return there[-1]
 
         own = ["--listen", endpoint, "--shares-folder"]  # each job numbers its own episodes
         recorder = start("record", ["record", str(run.path), *own])
-        recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
+        recorder.wait_until(lambda: demo.answers(endpoint, "rec/main/ctl/status"))
         start("gate", ["gate", str(run.path), "--samples", "0", *connect], "gate ready")
         if {job.policy for job in jobs} - {BUILT_IN_POLICY, *config.acting()}:
             model = ["--model", config.model, "--model-name", config.model_name]
@@ -426,7 +410,7 @@ def _try(
     job: Job,
     config: TrialsConfig,
     endpoint: str,
-    background: Sequence[Background],
+    background: Sequence[demo.Background],
     stop: threading.Event,
     run: RunFolder,
 ) -> None:
@@ -437,19 +421,19 @@ def _try(
         if job.policy in config.acting():
             own = [*acting_command(run.path, config, job.policy), "--cell", CELL]
             own += ["--connect", endpoint]
-            stack.enter_context(running(own, log.with_suffix(".policy.log"), "policy ready"))
+            stack.enter_context(demo.running(own, log.with_suffix(".policy.log"), "policy ready"))
         stream = stack.enter_context(log.open("wb"))
-        process = start_command(arguments, stdout=stream, stderr=subprocess.STDOUT)
+        process = demo.start_command(arguments, stdout=stream, stderr=subprocess.STDOUT)
         try:
             while process.poll() is None and not stop.is_set():
                 time.sleep(POLL_S / 4)
         finally:
-            stop_command(process)
+            demo.stop_command(process)
     for each in background:
         each.check()
     if process.returncode != 0 and not stop.is_set():
         command = f"robot-gst {' '.join(arguments)}"
-        raise StepFailedError(command=command, code=process.returncode, log=log)
+        raise demo.StepFailedError(command=command, code=process.returncode, log=log)
 
 
 def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
@@ -485,21 +469,21 @@ CARRIED_OUT = (
 """What whoever carries a study out decides, too; the rest is the design's alone."""
 
 
-def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> None:
+def keep_protocol(run_path: Path, protocol: study.Protocol, *, has_trials: bool) -> None:
     """Write a protocol before the first trial, or check that it is the one that was written.
 
     A design that is there stays as it is, where what carries it out fits it.
     """
-    path, there = run_path / FILE_NAME, read_protocol(run_path)
+    path, there = run_path / study.FILE_NAME, study.read_protocol(run_path)
     if there is None and has_trials:
-        message = f"{run_path} holds trials and no {FILE_NAME}: use a new folder for a study."
+        message = f"{run_path} holds trials and no {study.FILE_NAME}: use a new folder for a study."
         raise UsageError(message)
     if there is None:
         write_whole(path, protocol.to_json())
         return
     if there.edited:
         raise UsageError(f"{path} was edited after it was written: put the written text back.")
-    compared = CARRIED_OUT if protocol.primary is None else Protocol.__dataclass_fields__
+    compared = CARRIED_OUT if protocol.primary is None else study.Protocol.__dataclass_fields__
     hidden = ("sha256", "edited")
     names = [
         name

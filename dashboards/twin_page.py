@@ -1,13 +1,15 @@
 """What the twin page shows: held-out views, recorded beside rendered."""
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import DEPTH_IMAGE
 from bridge.errors import GstError
 from dashboards.comparison import Judgement
 from dashboards.errors import NotHereError
@@ -15,6 +17,8 @@ from dashboards.frames import RENDERED, camera_tracks, read_frame
 from dashboards.library import episode_path
 from evaluator.result import Measurement
 
+MOST_FILES = 100
+"""Recordings that are looked at."""
 FIRST = tuple(
     f"views.all.{name}" for name in ("psnr_db", "psnr_gain_db", "ssim", "depth_median_abs_m")
 )
@@ -44,7 +48,7 @@ class TwinPage:
     """The numbers to read first."""
     problems: tuple[str, ...]
     next_command: str
-    """Empty where there is no recording to rebuild from."""
+    """Empty where no recording has depth."""
 
 
 def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
@@ -57,11 +61,12 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
     problems = []
     rated = {(v["file"], v["camera"], v["stamp_ns"]): v for v in judgement.about["views"]}
     paths = run.derived("*.views.*")
-    for path in paths:
+    for file in paths:
         try:
-            views += _views(path, rated)
+            views += _views(file, rated)
         except GstError as error:
             problems.append(str(error))
+    path = shlex.quote(str(run.path))
     views.sort(key=lambda v: (v.psnr_db is None, v.psnr_db or 0.0, v.stamp_ns))
     return TwinPage(
         files=tuple(path.name for path in paths),
@@ -69,10 +74,22 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
         rated=any(view.psnr_db is not None for view in views),
         first=tuple(m for m in judgement.measurements if m.id in FIRST),
         problems=tuple(problems),
-        next_command=""
-        if judgement.only_motions or not run.episodes()
-        else f"robot-gst rebuild {shlex.quote(str(run.path))}",
+        next_command=f"robot-gst rebuild {path}" if any_recorded(run, has_depth) else "",
     )
+
+
+def any_recorded(run: RunFolder, holds: Callable[[Episode], Any]) -> bool:
+    """Whether something holds of any of the first recordings."""
+    for path in run.episodes()[:MOST_FILES]:
+        with suppress(GstError):  # its own page says what is wrong
+            if holds(Episode.open(path)):
+                return True
+    return False
+
+
+def has_depth(episode: Episode) -> bool:
+    """Whether a camera recorded depth: a scene is made of nothing else."""
+    return any(topic.endswith(DEPTH_IMAGE) for topic in episode.topics())
 
 
 def _views(path: Path, rated: Mapping[tuple[Any, ...], Mapping[str, Any]]) -> list[HeldOutView]:

@@ -4,15 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from bridge.task.verdict import Factor, Verdict
-from evaluator.report.wording import (
-    count_text,
-    ends_text,
-    method_text,
-    minus,
-    number,
-    value_text,
-)
+from evaluator.report import wording as report
 from evaluator.result import Measurement
+from twin.replay.deciding import goes_with_success
 
 MISSING = "missing"
 NARROW = "\u00a0"
@@ -54,6 +48,8 @@ def verdict_text(verdict: Verdict) -> str:
         text += f"; {name} {factor_word(factor)}" + (f" ({why})" if why else "")
     elif verdict.accepted is None and verdict.reason:
         text += f"; {verdict.reason}"
+    if verdict.p_success:
+        text += "; ".join(["", success_share(verdict.p_success), *goes_with_success(verdict)])
     return text
 
 
@@ -69,27 +65,28 @@ def answer_tone(answer: str) -> str:
 
 def length_text(length_m: float | None) -> str:
     """Print a length [m] in millimetres, or that it is missing."""
-    return MISSING if length_m is None else unbroken(number(length_m, "m"))
+    return MISSING if length_m is None else unbroken(report.number(length_m, "m"))
 
 
 def unbroken(text: str) -> str:
     """Keep a number with its unit and its sign."""
-    return minus(text).replace(" ", NARROW)
+    return report.minus(text).replace(" ", NARROW)
 
 
 def measured(measurement: Measurement) -> str:
     """Print a value as the report does, or that it is undefined."""
-    return unbroken(value_text(measurement))
+    return unbroken(report.value_text(measurement))
 
 
 def evidence(measurement: Measurement) -> str:
     """Print what a value rests on: its count, its interval, or why there is none."""
     if measurement.value is None:
         return measurement.reason_if_undefined or ""
-    parts = [count_text(measurement)]
+    parts = [report.count_text(measurement)]
     if measurement.interval is not None:
         lies = "without the noise of counting " if measurement.is_beyond else ""
-        parts.append(f"{lies}{minus(ends_text(measurement))} ({method_text(measurement)})")
+        ends, how = report.ends_text(measurement), report.method_text(measurement)
+        parts.append(f"{lies}{report.minus(ends)} ({how})")
     elif measurement.reason_without_interval:
         parts.append(f"no interval: {measurement.reason_without_interval}")
     return ", ".join(filter(None, parts))

@@ -47,6 +47,8 @@ class Verdict:
     scene_hash: str | None = None
     calibration_id: str | None = None
     p_success: dict[str, int | float] | None = None
+    samples: Mapping[str, Any] | None = None
+    """Of each varied replay, in columns (the schema); None where there are none."""
     reason: str | None = None
     warnings: tuple[str, ...] = ()
     """What does not change the verdict but a reader should know: the goal held before anything
@@ -91,7 +93,7 @@ class Verdict:
         record = json.loads(json.dumps(record))
         if not record["grasps"]:
             del record["grasps"]
-        for name in ("nearest", "basis"):
+        for name in ("nearest", "basis", "samples"):
             if record[name] is None:
                 del record[name]
         check_record(record, name="verdict")

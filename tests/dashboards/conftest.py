@@ -397,6 +397,8 @@ def make_run(folder: Path) -> RunFolder:
     with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
         writer.describe(EpisodeInfo(id="scan", kind="scan", cell="standin", stand_in=True))
         _Log(writer).image("/standin/cam/side/color/image", picture(0.0, 0), START_NS)
+        topic = "/standin/cam/side/depth/image"
+        writer.write(topic, b"", type_name=schema.IMAGE, log_time_ns=START_NS)
     write_views(run)
     write_results(compare_run(run).results(), run.results_dir / "results.json")
     refresh(run)

@@ -71,3 +71,18 @@ def test_stage_bars_keep_their_order_and_lose_labels_that_do_not_fit() -> None:
     assert (first[2], second[2]) == ("approach", "")
     assert sum(chart.bar(late)[:2]) <= chart.x.px_high
     assert chart.marks == ()
+
+
+def test_a_slim_chart_has_the_same_stages_at_the_same_times() -> None:
+    span = figures.Span(start_s=2, end_s=5, label="grasp", style="stage-0")
+    wide = figures.stage_chart([("planned", [span])], [(3.0, "replan", "replan")], span_s=(0, 10))
+    assert wide is not None
+    slim = wide.at(350)
+    assert (slim.lanes, slim.marks) == (wide.lanes, wide.marks)
+    for chart in (wide, slim):
+        start, width, label = chart.bar(span)
+        scale = (chart.x.px_high - chart.x.px_low) / 10
+        assert start == pytest.approx(chart.x.px_low + 2 * scale, abs=0.02)
+        assert width == pytest.approx(3 * scale - 1.5, abs=0.02)
+        assert label == "grasp"
+        assert chart.x.px_high < chart.width

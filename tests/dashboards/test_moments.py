@@ -54,7 +54,8 @@ def test_a_disagreement_has_a_cause_a_margin_and_says_how_often_it_happens(
 ) -> None:
     (row,) = judged(disagreement).rows
     dropped = "the cube left the gripper during carry"
-    assert cause_of(disagreement, row) == Cause(text=dropped, margin=dropped, varied=None)
+    told = Cause(text=dropped, margin=dropped, varied=None, goes_with={})
+    assert cause_of(disagreement, row) == told
     assert cause_of(disagreement, replace(row, recorded=False)) is None
     rolled = replace(row, plan_id=ROLLOUT, sim_executed=row.recorded)
     moved = cause_of(disagreement, rolled)
@@ -69,6 +70,16 @@ def test_a_disagreement_has_a_cause_a_margin_and_says_how_often_it_happens(
         terminal=replace(said.terminal, detail="2 mm within the box; it is still"),
         p_success={"k": 4, "n": 8, "value": 0.5, "low": 0.2, "high": 0.8},
     )
+    ends = [True, False] * 12
+    kept = replace(
+        said,
+        samples={
+            "accepted": ends,
+            "cause": ["" if each else "inside" for each in ends],
+            "missed_m": [None if each else 0.0021 for each in ends],
+            "drawn": {"cube along x m": [(2 if each else -3) * 1e-3 for each in ends]},
+        },
+    )
     browser = synthetic.browser_of(disagreement)
     for address in ("/", "/episode/trial_0002"):
         assert "varied nothing was varied" in words(browser.get(address).text)
@@ -76,6 +87,12 @@ def test_a_disagreement_has_a_cause_a_margin_and_says_how_often_it_happens(
             patch.setattr(moments, "_verdict_of", lambda *_: said)
             text = words(browser.get(address).text)
             assert "margin 2 mm within the box varied 4 of 8 varied replays succeed" in text
+            assert "what they varied was not kept: replay once more" in text
+            patch.setattr(moments, "_verdict_of", lambda *_: kept)
+            page = browser.get(address).text
+            assert "margin with 3 mm more 24 of 24 varied replays would succeed" in words(page)
+            assert "cube along x: +2.0 mm where it succeeds, -3.0 mm where not" in words(page)
+            assert 'aria-label="strength 1.00 of 1"><rect width="72"' in page
 
 
 def test_a_picture_is_drawn_once_and_again_when_the_recording_changes(

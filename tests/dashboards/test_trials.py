@@ -16,7 +16,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.task.protocol import read_protocol
 from bridge.terminal import Output
-from dashboards import trials
+from dashboards import demo, trials
 from dashboards.standin_settings import TrialsConfig
 from dashboards.trials import (
     Job,
@@ -181,7 +181,7 @@ def test_a_model_is_named_to_the_planner_and_to_nothing_else(
         started.append(arguments)
         yield Started()
 
-    monkeypatch.setattr(trials, "running", running)
+    monkeypatch.setattr(demo, "running", running)
     with trials._laboratory(run, config, made, 0) as (endpoint, _):
         commands = [*started, *(command_of(job, config, endpoint) for job in made)]
     named = [words[0] for words in commands if "--model" in words or "stub" in " ".join(words)]
@@ -224,8 +224,8 @@ def test_each_task_is_scanned_once_before_its_first_trial(
 ) -> None:
     run, asked = RunFolder.create(tmp_path / "run"), list[str]()
     recorder = SimpleNamespace(wait_until=lambda ready: None)
-    monkeypatch.setattr(trials, "running", lambda *_: nullcontext(recorder))
-    monkeypatch.setattr(trials, "scan_task", lambda task, *_: asked.append(task))
+    monkeypatch.setattr(demo, "running", lambda *_: nullcontext(recorder))
+    monkeypatch.setattr(demo, "scan_task", lambda task, *_: asked.append(task))
     both = jobs_of(*protocol_of(replace(STUDY, task=("cube_into_box", "stack_two_cubes"))))
     with EpisodeWriter(run.episodes_dir / "scan_0001.mcap") as writer:
         writer.describe(EpisodeInfo(id="scan_0001", kind="scan", task="cube_into_box"))

@@ -59,9 +59,8 @@ def task_failures(plan: Plan, task: Task) -> list[Failure]:
             failures.append(_stage_failure(stage, Cause.UNKNOWN_STAGE, detail))
             continue
         if stage.id in begun:
-            failures.append(
-                _stage_failure(stage, Cause.REPEATED_STAGE, f"{stage.id!r} is there twice")
-            )
+            detail = f"{stage.id!r} is there twice"
+            failures.append(_stage_failure(stage, Cause.REPEATED_STAGE, detail))
         elif stage.t_start_ns < latest_ns or stage.t_end_ns < stage.t_start_ns:
             detail = (
                 f"stage {stage.id!r} runs from {_s(stage.t_start_ns)} to {_s(stage.t_end_ns)}, the "

@@ -103,14 +103,10 @@ def render_replay(
                 T = result.Ts_base_tcp[index] @ T_tcp_camera
             cloud = stage.at(*_state(result, scene, index))
             drawn = stage.parts.draw(rasteriser, cloud, info.camera, T)
+            jpeg, name = encode_jpeg(drawn.marked_u8()), info.frame_id
             yield (
                 camera_id,
-                CompressedColor(
-                    stamp_ns=stamp_ns,
-                    frame_id=info.frame_id,
-                    format="jpeg",
-                    data=encode_jpeg(drawn.marked_u8()),
-                ),
+                CompressedColor(stamp_ns=stamp_ns, frame_id=name, format="jpeg", data=jpeg),
             )
 
 

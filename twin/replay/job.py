@@ -15,6 +15,7 @@ from bridge.task.record import parse_record
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from twin.replay.config import ReplayConfig
+from twin.replay.deciding import goes_with_success, what_decides
 from twin.replay.scene import StartState
 from twin.replay.verdict import KINEMATIC_ENGINE, engine_of
 
@@ -126,6 +127,7 @@ class ReplayJob:
         if self.robot:
             found["robot"] = hash_settings({"urdf": read_robot(self.robot).description()})
         if self.config.samples:
+            found["keeps"] = "what each sample drew"
             spreads = self.start.covariances
             found["covariances"] = {name: spreads[name].tolist() for name in sorted(spreads)}
         if self.trajectory == "executed":
@@ -200,6 +202,7 @@ def judged(
         "warnings": list(verdict.warnings),
         "predicates": predicates_hold(verdict),
         "p_success": verdict.p_success,
+        "decides": [*what_decides(verdict), *goes_with_success(verdict)],
         "divergence": None if divergence is None else dict(divergence),
     }
 

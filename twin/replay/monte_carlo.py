@@ -6,9 +6,9 @@ order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
 """
 
 import hashlib
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +25,7 @@ from twin.replay.config import (
     PosteriorDraw,
     ReplayConfig,
 )
+from twin.replay.deciding import LEVEL, goes_with_success, what_decides
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
 
@@ -189,11 +190,6 @@ def _moved(
     return moved
 
 
-LEVEL = 0.95
-NEAR_M = 0.01
-"""Samples that miss their goal by no more might succeed with a little more."""
-
-
 def with_samples(
     verdict: Verdict,
     replay: Callable[[ReplayScene, ReplayConfig], Verdict],
@@ -218,25 +214,72 @@ def with_samples(
     if config.mode != "dynamic":
         message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
         raise UsageError(message)
-    samples: list[Verdict] = []
-    total = 0.0
+    samples, drawn, total = list[Verdict](), list[dict[str, float]](), 0.0
     while (n := len(samples)) < config.samples:
         if until is not None and decided(total, n, until):
             break
-        rng = sample_rng(config.seed, identity, n)
+        varied = draw_variation(sample_rng(config.seed, identity, n), scene, config, index=n)
+        drawn.append(_drawn(scene, config, *varied))
         try:
-            samples.append(replay(*draw_variation(rng, scene, config, index=n)))
+            samples.append(replay(*varied))
         except GstError:  # this variation cannot be replayed; the others can
             samples.append(replace(verdict, terminal=Factor(value=None), findings=()))
         total += _probability(samples[n].accepted is True, config, n)
-    k = sum(sample.accepted is True for sample in samples)
-    value = total / n
+    k, value = sum(sample.accepted is True for sample in samples), total / n
     low, high = wilson(value, n)
-    verdict = replace(verdict, p_success={"value": value, "low": low, "high": high, "k": k, "n": n})
+    verdict = replace(
+        verdict,
+        p_success={"value": value, "low": low, "high": high, "k": k, "n": n},
+        samples=_kept(samples, drawn),
+    )
     if verdict.accepted is not True:
         return verdict
-    why = (verdict.reason, *_what_decides(verdict, samples))
+    beyond_chance = [text for text, strength in goes_with_success(verdict).items() if strength]
+    why = (verdict.reason, *what_decides(verdict), *beyond_chance[:1])
     return replace(verdict, reason="; ".join(filter(None, why)) or None)
+
+
+def _drawn(
+    scene: ReplayScene, config: ReplayConfig, there: ReplayScene, varied: ReplayConfig
+) -> dict[str, float]:
+    """What a sample has otherwise than the nominal replay, by quantity and unit."""
+    found = {"grip delay s": varied.grip_delay_s - config.grip_delay_s}
+    for name, value in asdict(varied.physics).items():
+        words = name.removesuffix("_N").replace("_", " ")
+        found[f"{words} times"] = value / getattr(config.physics, name)
+    for name, model in there.task.objects.items():
+        nominal = scene.task.objects[name]
+        found[f"mass of {name} times"] = model.mass_kg / nominal.mass_kg
+        if model.soft is not None and nominal.soft is not None:
+            found[f"stiffness of {name} times"] = model.soft.young_pa / nominal.soft.young_pa
+    for name, T in there.Ts_base_object.items():
+        before = scene.Ts_base_object[name]
+        turned = se3.vector_from_rotation(T[:3, :3] @ before[:3, :3].T)
+        for axis, shift, turn in zip("xyz", T[:3, 3] - before[:3, 3], turned, strict=True):
+            found |= {f"{name} along {axis} m": shift, f"{name} turned about {axis} rad": turn}
+    return found
+
+
+def _kept(samples: Sequence[Verdict], drawn: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """What a verdict keeps of its samples: how each ended, and what was drawn where it varies."""
+    columns = {name: [float(f"{each[name]:.3g}") for each in drawn] for name in drawn[0]}
+    return {
+        "accepted": [each.accepted for each in samples],
+        "cause": [_cause(each) for each in samples],
+        "missed_m": [_missed_m(each) for each in samples],
+        "drawn": {name: values for name, values in columns.items() if len(set(values)) > 1},
+    }
+
+
+def _cause(sample: Verdict) -> str:
+    failing = sample.factors().get(sample.first_failing or "")
+    return "" if sample.accepted is True else (failing and failing.cause) or "having no answer"
+
+
+def _missed_m(sample: Verdict) -> float | None:
+    """By how much a sample missed its goal [m]; None where it holds or anything else failed."""
+    wrong = [item.get("short_m") for item in sample.findings if item["value"] is False]
+    return wrong[0] if sample.first_failing == "terminal" and len(wrong) == 1 else None
 
 
 def wilson(share: float, n: int) -> tuple[float, float]:
@@ -261,33 +304,6 @@ def decided(total: float, n: int, share: float) -> bool:
     likely = xlogy(total, share) + xlog1py(n - total, -share)
     average = betaln(total + 0.5, n - total + 0.5) - betaln(0.5, 0.5)
     return bool(average - likely >= np.log(1 / (1 - LEVEL)))
-
-
-def _what_decides(verdict: Verdict, samples: Sequence[Verdict]) -> Iterator[str]:
-    """The goal that is nearest to its edge, what a little more would bring, and what else fails."""
-    failed = [each for each in samples if each.accepted is not True]
-    lengths = [item for item in verdict.findings if item.get("short_m") is not None]
-    if lengths:
-        goal = max(lengths, key=lambda item: item["short_m"])
-        yield f"{goal['detail']}, {-goal['short_m'] * 1e3:.0f} mm to spare"
-        missed_m = [_missed_m(each, verdict.findings.index(goal)) for each in failed]
-        near_m = [m for m in missed_m if m <= NEAR_M]
-        failed = [each for each, m in zip(failed, missed_m, strict=True) if m > NEAR_M]
-        if near_m:
-            told = f"with {np.ceil(max(near_m) * 1e3):.0f} mm more {len(samples) - len(failed)}"
-            yield f"{told} of {len(samples)} varied replays would succeed"
-    causes = Counter(
-        each.factors()[each.first_failing].cause if each.first_failing else "having no answer"
-        for each in failed
-    )
-    yield from (f"{times} fail by {cause}" for cause, times in causes.most_common(1))
-
-
-def _missed_m(sample: Verdict, goal: int) -> float:
-    """By how much a sample missed a goal [m]; infinite where anything else failed."""
-    wrong = [place for place, item in enumerate(sample.findings) if item["value"] is False]
-    alone = sample.first_failing == "terminal" and wrong == [goal]
-    return float(sample.findings[goal]["short_m"]) if alone else np.inf
 
 
 def _probability(accepted: bool, config: ReplayConfig, index: int) -> float:

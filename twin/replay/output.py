@@ -11,26 +11,11 @@ import numpy as np
 from jaxtyping import Int
 
 from bridge.episode import schema
+from bridge.episode import topics as named
 from bridge.episode.cdr.batch import joint_messages, pose_messages
 from bridge.episode.cdr.messages import CompressedColor, PointCloudSample, string_to_cdr
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import Derived, EpisodeInfo
-from bridge.episode.topics import (
-    CLEARANCE,
-    CONTACT,
-    DIVERGENCE,
-    EVENT,
-    GRIPPER_STATE,
-    JOINT_STATES,
-    PLAN,
-    RENDERED_IMAGE,
-    ROBOT_DESCRIPTION,
-    TCP_POSE,
-    VERDICT,
-    camera_topic,
-    cell_topic,
-    object_topic,
-)
 from bridge.episode.writer import EpisodeWriter
 from bridge.robots.robot import GRIPPER_WIDTH, robot_of
 from bridge.task.plan import Plan, Stage
@@ -88,19 +73,20 @@ def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOri
 def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
     prefix, start = f"/{origin.cell}", origin.start_ns
     robot = robot_of(origin.urdf)
-    yield _Message(start, ROBOT_DESCRIPTION, schema.STRING, string_to_cdr(origin.urdf))
+    yield _Message(start, named.ROBOT_DESCRIPTION, schema.STRING, string_to_cdr(origin.urdf))
     if plan.id != NO_PLAN:
-        yield _Message(start, f"{prefix}{PLAN}", schema.PLAN, plan.to_json())
+        yield _Message(start, f"{prefix}{named.PLAN}", schema.PLAN, plan.to_json())
     stamps = start + result.stamps_ns
     for topic, names, values in (
-        (JOINT_STATES, robot.joints, result.joints_rad),
-        (GRIPPER_STATE, (GRIPPER_WIDTH,), result.width_m[:, None]),
-        (CLEARANCE, (MIN_CLEARANCE,), result.clearance_m[:, None]),
+        (named.JOINT_STATES, robot.joints, result.joints_rad),
+        (named.GRIPPER_STATE, (GRIPPER_WIDTH,), result.width_m[:, None]),
+        (named.CLEARANCE, (MIN_CLEARANCE,), result.clearance_m[:, None]),
     ):
         rows = joint_messages(stamps, names, values)
         yield from _stamped(stamps, f"{prefix}{topic}", schema.JOINT_STATE, rows)
-    poses = {f"{prefix}{TCP_POSE}": result.Ts_base_tcp} | {
-        object_topic(origin.cell, name, "pose"): Ts for name, Ts in result.Ts_base_object.items()
+    poses = {f"{prefix}{named.TCP_POSE}": result.Ts_base_tcp} | {
+        named.object_topic(origin.cell, name, "pose"): Ts
+        for name, Ts in result.Ts_base_object.items()
     }
     for topic, Ts in poses.items():
         rows = pose_messages(stamps, robot.base_frame, Ts)
@@ -108,13 +94,13 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
     yield from _nodes(result, origin.cell, start, robot.base_frame)
     yield from _contacts(result, prefix, start)
     for camera_id, image in origin.images:
-        topic = camera_topic(origin.cell, camera_id, RENDERED_IMAGE)
+        topic = named.camera_topic(origin.cell, camera_id, named.RENDERED_IMAGE)
         yield _Message(image.stamp_ns, topic, schema.COMPRESSED_IMAGE, image.to_cdr())
     end = start + int(result.stamps_ns[-1])
-    yield _Message(end, f"{prefix}{VERDICT}", schema.VERDICT, result.verdict.to_json())
+    yield _Message(end, f"{prefix}{named.VERDICT}", schema.VERDICT, result.verdict.to_json())
     if origin.divergence is not None:
         data = json.dumps(origin.divergence, separators=(",", ":")).encode()
-        yield _Message(end, f"{prefix}{DIVERGENCE}", schema.DIVERGENCE, data)
+        yield _Message(end, f"{prefix}{named.DIVERGENCE}", schema.DIVERGENCE, data)
 
 
 def _nodes(result: ReplayResult, cell: str, start_ns: int, frame_id: str) -> Iterator[_Message]:
@@ -125,7 +111,7 @@ def _nodes(result: ReplayResult, cell: str, start_ns: int, frame_id: str) -> Ite
                 continue
             due_ns = t_ns + NODES_PERIOD_NS
             sample = PointCloudSample(stamp_ns=start_ns + t_ns, frame_id=frame_id, points_m=points)
-            topic = object_topic(cell, name, "nodes")
+            topic = named.object_topic(cell, name, "nodes")
             yield _Message(sample.stamp_ns, topic, schema.POINT_CLOUD, sample.to_cdr())
 
 
@@ -149,7 +135,7 @@ def _contacts(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Mes
             "source": source,
         }
         data = json.dumps(record, separators=(",", ":")).encode()
-        yield _Message(start_ns + first_ns, f"{prefix}{CONTACT}", schema.CONTACT, data)
+        yield _Message(start_ns + first_ns, f"{prefix}{named.CONTACT}", schema.CONTACT, data)
 
 
 def _stamped(
@@ -161,7 +147,7 @@ def _stamped(
 
 def _events(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
     """Events: execution and stages."""
-    topic = cell_topic(origin.cell, EVENT)
+    topic = named.cell_topic(origin.cell, named.EVENT)
     end_ns = int(result.stamps_ns[-1])
     events: list[tuple[int, dict[str, object]]] = [(0, {"type": "execution_started"})]
     for stage in origin.stages:

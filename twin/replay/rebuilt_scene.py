@@ -150,11 +150,9 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> ReplayScene:
             notes.append(f"{key}: {found}")
         else:
             lattices[key] = found
-    path, static = run.scene_dir / "sdf.npz", None
-    if path.is_file():
-        static = _load_static(path, path.stat().st_mtime_ns)
-    else:
-        notes.append(NO_DISTANCES)
+    path = run.scene_dir / "sdf.npz"
+    static = _load_static(path, path.stat().st_mtime_ns) if path.is_file() else None
+    notes += [] if static else [NO_DISTANCES]
     heights = _mapping(_mapping(record, "sdf"), "rim_height_m")
     return ReplayScene(
         task=with_heights(task, {key: float(height_m) for key, height_m in heights.items()}),
@@ -173,9 +171,7 @@ def scene_of_other_robot(run: RunFolder, robot: str) -> str:
     """
     sources: list[dict[str, Any]] = (read_record(run) or {}).get("sources") or []
     names = {str(source.get("id", "")) for source in sources}
-    for path in run.episodes() if names else ():
-        if path.stem not in names:
-            continue
+    for path in (each for each in run.episodes() if each.stem in names):
         try:
             other = _robot_of_recording(path)
         except BridgeError:

@@ -1,6 +1,6 @@
 """Do one replay: open its episode, replay in each engine, compare, write, report a row."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -107,9 +107,8 @@ def _replay(job: ReplayJob) -> tuple[Verdict, dict[str, Any] | None]:
 
 def _open(job: ReplayJob) -> _Source:
     episode = Episode.open(job.episode_path)
-    urdf = streams.robot_description(episode)
-    if job.robot:
-        urdf = read_robot(job.robot).description()
+    named = read_robot(job.robot).description() if job.robot else None
+    urdf = named or streams.robot_description(episode)
     if urdf is None:
         raise EpisodeError(
             path=job.episode_path,
@@ -168,8 +167,7 @@ def recorded_joints(
     if not near.any() or not set(joints) <= set(track.names):
         return None
     order = [track.names.index(name) for name in joints]
-    found: Float[np.ndarray, " num_joints"] = track.at(np.array([stamp_ns]))[0, order]
-    return found
+    return np.asarray(track.at(np.array([stamp_ns]))[0, order])
 
 
 def _run(source: _Source, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
@@ -288,12 +286,10 @@ def compare(
     """Lay the executed replay over the planned one, if it is there, and over the recording."""
     robot = load_robot(recording.scene.urdf)
     executed = trace_of_result(result, "executed", end_ns)
-    recorded = trace_of_recording(recording, robot, job.config.states_hz)
-    traces = [executed, recorded]
-    task = job.task
+    traces = [executed, trace_of_recording(recording, robot, job.config.states_hz)]
     findings = {
-        "executed": _findings(findings_of(task, result, "replayed")),
-        "recorded": _findings(findings_of(task, states_of_recording(recording, robot), "recorded")),
+        "executed": _findings(findings_of(job.task, result, "replayed")),
+        "recorded": _findings(recorded_findings(recording)),
     }
     planned = _planned(job, recording)
     if planned is not None:
@@ -310,10 +306,10 @@ def _planned(job: ReplayJob, recording: Recording) -> tuple[Trace, Findings] | N
         verdict = streams.verdicts(Episode.open(path))[-1][1]
     except (GstError, IndexError, StopIteration):
         return None
-    return trace, _findings([f for f in verdict.findings if f["side"] == "replayed"])
+    return trace, _findings(f for f in verdict.findings if f["side"] == "replayed")
 
 
-def _findings(found: list[dict[str, Any]]) -> Findings:
+def _findings(found: Iterable[dict[str, Any]]) -> Findings:
     return {(item["kind"], str(item.get("object", ""))): item["value"] for item in found}
 
 

@@ -374,11 +374,10 @@ def chosen_episodes(run: RunFolder, config: ReplayRunConfig) -> list[str]:
     there = [path.stem for path in run.episodes()]
     unknown = [name for name in config.episode if name not in there]
     if unknown:
-        message = (
+        raise UsageError(
             f"no episode named {', '.join(unknown)} in {run.episodes_dir}. "
             f"There are: {', '.join(there) or 'none'}."
         )
-        raise UsageError(message)
     return list(dict.fromkeys(config.episode)) or there
 
 

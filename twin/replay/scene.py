@@ -1,7 +1,7 @@
 """What a replay happens in: the task, the robot, and where the objects were localised before it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -137,11 +137,8 @@ def localised_starts(
 
 
 def _state_of(phase: Phase, task: Task, records: list[dict[str, object]]) -> StartState:
-    poses: dict[str, Float[np.ndarray, "4 4"]] = {}
-    covariances: dict[str, Float[np.ndarray, "6 6"]] = {}
-    extents = {}
+    state = StartState(reasons=dict.fromkeys(task.objects, "no localisation record"))
     seen_ns: int | None = None
-    reasons = dict.fromkeys(task.objects, "no localisation record")
     for record in records:
         if (record.get("phase"), record.get("plan_id")) != (phase.name, phase.plan_id):
             continue
@@ -149,20 +146,14 @@ def _state_of(phase: Phase, task: Task, records: list[dict[str, object]]) -> Sta
         if name not in task.objects:
             continue
         if record["found"] and isinstance(pose, dict):
-            poses[name] = se3.pose_from_record(pose)
-            reasons.pop(name, None)
+            state.Ts_base_object[name] = se3.pose_from_record(pose)
+            state.reasons.pop(name, None)
             seen_ns = max(seen_ns or 0, int(str(record["stamp_ns"])))
-            soft = record.get("soft_shape")
+            soft, covariance = record.get("soft_shape"), record.get("covariance")
             if isinstance(soft, dict):
-                extents[name] = np.array(soft["extents_m"], dtype=np.float64)
-            if record.get("covariance") is not None:
-                covariances[name] = np.array(record["covariance"], dtype=np.float64).reshape(6, 6)
+                state.extents_m[name] = np.array(soft["extents_m"], dtype=np.float64)
+            if covariance is not None:
+                state.covariances[name] = np.array(covariance, dtype=np.float64).reshape(6, 6)
         else:
-            reasons[name] = str(record.get("reason") or "not found")
-    return StartState(
-        Ts_base_object=poses,
-        reasons=reasons,
-        covariances=covariances,
-        extents_m=extents,
-        seen_ns=seen_ns,
-    )
+            state.reasons[name] = str(record.get("reason") or "not found")
+    return replace(state, seen_ns=seen_ns)

@@ -103,14 +103,10 @@ def _reason_lines(rows: Rows) -> list[str]:
 
     A kinematic replay leaves objects alone and decides nothing by itself, which needs no list.
     """
-    undecided = [
-        row
-        for row in rows
-        if row["accepted"] is None and not row["error"] and row["mode"] == "dynamic"
-    ]
+    opened = [row for row in rows if row["accepted"] is None and row["mode"] == "dynamic"]
     lists = (
         ("rejected:", [row for row in rows if row["accepted"] is False]),
-        ("undecided:", undecided),
+        ("undecided:", [row for row in opened if not row["error"]]),
         ("not evaluated:", [row for row in rows if row["error"]]),
     )
     lines = []
@@ -142,6 +138,7 @@ def _sample_lines(rows: Rows) -> list[str]:
                 f"  {row['episode']} {row['plan']} {row['trajectory']}: "
                 f"{p['k']:g} of {p['n']:g}, {p['value']:.0%} [{p['low']:.0%}, {p['high']:.0%}]"
             )
+            lines += [f"    {text}" for text in row.get("decides", ())]
     return ["", "varied replays that succeed:", *lines] if lines else []
 
 

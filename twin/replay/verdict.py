@@ -9,18 +9,10 @@ from jaxtyping import Float, Int
 
 from bridge.episode.streams import JointTrack
 from bridge.robots.robot import robot_of
+from bridge.task import predicate
 from bridge.task.causes import Cause
 from bridge.task.check import REFERENCES
 from bridge.task.plan import Plan
-from bridge.task.predicate import (
-    ALLOWED_CONTACTS,
-    PredicateResult,
-    Rollout,
-    all_hold,
-    already_true_at_start,
-    evaluate_contacts,
-    evaluate_success,
-)
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from twin.physics.engines import engine_version
@@ -77,8 +69,8 @@ def terminal_factor(
     for name, found in states.broken.items():
         failure = Failure(t_ns=end_ns, cause=Cause.SHAPE, bodies=(name,), detail=f"{name} {found}")
         return factor_from([failure])
-    findings = evaluate_success(scene.task, states)
-    value = all_hold(findings)
+    findings = predicate.evaluate_success(scene.task, states)
+    value = predicate.all_hold(findings)
     if value is True:
         many = len(findings) > MANY
         why = "every object is where it belongs" if many else _once(f.detail for f in findings)
@@ -96,7 +88,7 @@ def terminal_factor(
     )
 
 
-def _why_open(findings: list[PredicateResult], scene: ReplayScene) -> str:
+def _why_open(findings: list[predicate.PredicateResult], scene: ReplayScene) -> str:
     """What was not localised is said in the words of the clearance, which is open for it too."""
     if not findings:
         return "the task asks for nothing"
@@ -114,15 +106,15 @@ def _once(sentences: Iterable[str]) -> str:
     return "; ".join(dict.fromkeys(sentences))
 
 
-def findings_of(task: Task, rollout: Rollout, side: str) -> list[Any]:
+def findings_of(task: Task, rollout: predicate.Rollout, side: str) -> list[Any]:
     """What each predicate says of a recorded or replayed rollout, as the verdict keeps it.
 
     Where contacts are known they are asked for, whether or not the task does.
     """
-    findings = evaluate_success(task, rollout)
-    asked = any(finding.kind == ALLOWED_CONTACTS for finding in findings)
+    findings = predicate.evaluate_success(task, rollout)
+    asked = any(finding.kind == predicate.ALLOWED_CONTACTS for finding in findings)
     if rollout.contacts is not None and not asked:
-        findings.append(evaluate_contacts(task, rollout))
+        findings.append(predicate.evaluate_contacts(task, rollout))
     return [
         {
             "side": side,
@@ -360,7 +352,7 @@ def _judge(
         ik=factor_from(commanded.failures),
         clearance=factor_from(moved.monitor.failures, undecided=undecided),
         terminal=terminal,
-        warnings=(HELD_BEFORE,) if already_true_at_start(scene.task, states) else (),
+        warnings=(HELD_BEFORE,) if predicate.already_true_at_start(scene.task, states) else (),
         findings=tuple(findings),
         checks={
             name: factor_from(found, undecided=commanded.unknown if name == "limits" else None)

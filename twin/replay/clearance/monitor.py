@@ -71,10 +71,7 @@ def half_way(a: State, b: State) -> State:
     for name in a.Ts_base_object.keys() & b.Ts_base_object.keys():
         if object_travel_m(a, b, name, 0.0) > MAX_LEAP_M:
             continue
-        (q_a, p_a), (q_b, p_b) = (
-            se3.split(a.Ts_base_object[name]),
-            se3.split(b.Ts_base_object[name]),
-        )
+        (q_a, p_a), (q_b, p_b) = (se3.split(each.Ts_base_object[name]) for each in (a, b))
         q = se3.interpolate_quaternion(q_a, q_b, np.array(0.5))
         poses[name] = se3.transform_from(q, (p_a + p_b) / 2)
     return State(

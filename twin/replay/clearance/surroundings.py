@@ -9,20 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry.mesh import box_corners
-from twin.replay.clearance.bodies import (
-    SCENE,
-    TABLE,
-    NearPairs,
-    Solid,
-    box_solid,
-    distance_to_planes_m,
-    distances_to_boxes_m,
-    own_links_touch,
-    placed_panels,
-    placement_of,
-    planes_of,
-    solid_of,
-)
+from twin.replay.clearance import bodies as geometry
 from twin.replay.clearance.bounding_spheres import (
     BoundingSpheres,
     bounding_spheres_of,
@@ -49,7 +36,7 @@ Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 class _Pairing:
     """The pairs that are measured while the same objects are known and have moved."""
 
-    near: NearPairs
+    near: geometry.NearPairs
     names: list[Pair]
     bodies: list[tuple[int, int]]
     """Two of the links, the objects and what stands, in this order."""
@@ -66,7 +53,7 @@ def scene_grid(scene: ReplayScene, hulls: RobotHulls) -> SdfGrid | None:
     panels = [
         panel
         for name, T in scene.containers().items()
-        for panel in placed_panels(scene.task.objects[name], T)
+        for panel in geometry.placed_panels(scene.task.objects[name], T)
     ]
     return unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
 
@@ -82,15 +69,17 @@ class Surroundings:
         self._panels = [
             (name, piece, panel)
             for name, T in scene.containers().items()
-            for piece, panel in enumerate(placed_panels(scene.task.objects[name], T))
+            for piece, panel in enumerate(geometry.placed_panels(scene.task.objects[name], T))
         ]
         self.static = static_obstacles(self._panels, scene.table_height_m)
         self._pairings: dict[tuple[tuple[str, ...], tuple[str, ...]], _Pairing] = {}
         stationary, _ = stationary_links(hulls)
         self._mobile = [i for i, hull in enumerate(hulls.hulls) if hull.link not in stationary]
-        self.links = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
+        self.links = [
+            geometry.solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls
+        ]
         self.objects = {
-            name: box_solid(name, np.array(scene.task.objects[name].size_m))
+            name: geometry.box_solid(name, np.array(scene.task.objects[name].size_m))
             for name in scene.movable()
         }
         self.grid = scene_grid(scene, hulls)
@@ -168,7 +157,7 @@ class Surroundings:
         names: list[Pair] = []
         bodies: list[tuple[int, int]] = []
         for other, (solid, number, _) in enumerate(self.static, start=first):
-            links = self._mobile if solid.body == TABLE else range(num_links)
+            links = self._mobile if solid.body == geometry.TABLE else range(num_links)
             for index in (*links, *movers):
                 piece = index if index < num_links else -1
                 names.append((solids[index].body, piece, solid.body, number))
@@ -176,7 +165,7 @@ class Surroundings:
         for other, name in enumerate(known, start=num_links):
             names += [(link.body, index, name, 0) for index, link in enumerate(self.links)]
             bodies += [(index, other) for index in range(num_links)]
-        near = NearPairs(solids, bodies)
+        near = geometry.NearPairs(solids, bodies)
         for index, (_, _, T) in enumerate(self.static, start=first):
             near.R[index], near.t[index] = T[:3, :3], T[:3, 3]
         pairing = _Pairing(
@@ -184,14 +173,14 @@ class Surroundings:
             names=names,
             bodies=bodies,
             shapes=[solid.shape for solid in solids],
-            placements=[None] * first + [placement_of(T) for _, _, T in self.static],
+            placements=[None] * first + [geometry.placement_of(T) for _, _, T in self.static],
         )
         self._pairings[known, moved] = pairing
         return pairing
 
     def measure_nodes(
         self,
-        links: list[Solid],  # in the order of the robot's hulls, which are placed already
+        links: list[geometry.Solid],  # in the order of the robot's hulls, which are placed already
         nodes_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],  # base frame
         moved_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],  # that left where they rested
     ) -> dict[Pair, float]:
@@ -204,15 +193,19 @@ class Surroundings:
                 R, t = self._hulls.rotations[index], self._hulls.translations[index]
                 gap = float(np.linalg.norm(R @ link.centre + t - centre)) - radius - link.radius_m
                 if gap < self._eps_m:
-                    gap = distance_to_planes_m(planes_of(self._hulls)[index], nodes, R, t)
+                    gap = geometry.distance_to_planes_m(
+                        geometry.planes_of(self._hulls)[index], nodes, R, t
+                    )
                 found[link.body, index, name, 0] = gap
         for name, nodes in moved_m.items():
-            found[name, -1, TABLE, 0] = float(nodes[:, 2].min()) - self._table_height_m
-            distances = distances_to_boxes_m(nodes, [panel for _, _, panel in self._panels])
+            found[name, -1, geometry.TABLE, 0] = float(nodes[:, 2].min()) - self._table_height_m
+            distances = geometry.distances_to_boxes_m(
+                nodes, [panel for _, _, panel in self._panels]
+            )
             for (container, piece, _), distance in zip(self._panels, distances, strict=True):
                 found[name, -1, container, piece] = float(distance)
             if self.grid is not None:
-                found[name, -1, SCENE, 0] = float(grid_distances_m(self.grid, nodes).min())
+                found[name, -1, geometry.SCENE, 0] = float(grid_distances_m(self.grid, nodes).min())
         return found
 
     def _to_scene(self, moved: Sequence[str], Ts_base_object: Poses) -> dict[Pair, float]:
@@ -222,7 +215,7 @@ class Surroundings:
         R, t = self._hulls.rotations, self._hulls.translations
         links = self._link_spheres.distances_m(self.grid, R[self._mobile], t[self._mobile])
         found: dict[Pair, float] = {
-            (self.links[index].body, index, SCENE, 0): distance
+            (self.links[index].body, index, geometry.SCENE, 0): distance
             for index, distance in zip(self._mobile, links.tolist(), strict=True)
         }
         for name in moved:
@@ -230,7 +223,7 @@ class Surroundings:
             if spheres is not None:
                 T = Ts_base_object[name][None]
                 R, t = np.ascontiguousarray(T[:, :3, :3]), np.ascontiguousarray(T[:, :3, 3])
-                found[name, -1, SCENE, 0] = float(spheres.distances_m(self.grid, R, t)[0])
+                found[name, -1, geometry.SCENE, 0] = float(spheres.distances_m(self.grid, R, t)[0])
         return found
 
 
@@ -249,7 +242,7 @@ def posture_clearance(
     hulls.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
-    links_touch, gripper = own_links_touch(hulls), hulls.robot.record.gripper
+    links_touch, gripper = geometry.own_links_touch(hulls), hulls.robot.record.gripper
     hand = frozenset(gripper.links)
 
     def one(joints_rad: Float[np.ndarray, " num_joints"]) -> float:

@@ -1,7 +1,7 @@
 """Episodes in, scene out: choose frames, fuse, fit, render what was held out, store.
 
 The order of things is here; each stage lives in a module of its own. Nothing that is learnt from
-sees a held-out frame, and ``scene.json`` is written last: it vouches for all the rest.
+sees a held-out frame. A new scene takes the old one's place when it is whole.
 """
 
 import time
@@ -17,10 +17,7 @@ from bridge.errors import BridgeError
 from bridge.leaves import has_leaf, load_leaf
 from bridge.terminal import Output
 from twin.scene.backdrop import Backdrop, backdrop_of
-from twin.scene.dataset.training_set import (
-    TrainingSet,
-    read_training_set,
-)
+from twin.scene.dataset.training_set import TrainingSet, read_training_set
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FitResult, fit
 from twin.scene.frames.selection import Sources, choose_frames, find_sources
@@ -35,9 +32,9 @@ from twin.scene.settings import DEFAULT_BUDGET_S, RebuildConfig
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import (
     BACKGROUND,
-    SCENE_FILE,
     background_hash,
     read_record,
+    scene_beside,
     write_record,
 )
 
@@ -71,29 +68,32 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     placements = find_placements(sources, chosen.choices, output)
     training = read_training_set(chosen.choices, config, output, placements)
     fitted = _fit(training, config, output)
-    raster = RasterConfig(threads=config.fit.threads)
-    (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     links = training.robot.links(config.initialise.max_splats)
     decomposed = decompose(placements, fitted.cloud, training.views_of, output, links.lighting)
-    write_ply(run.scene_dir / BACKGROUND, decomposed.background)
-    backdrop = backdrop_of(fitted.cloud, training.bare_views, Rasteriser(raster))
-    views = _hold_out(run, training, fitted, backdrop, decomposed, links, config, output)
-    extras = _write_parts(run, sources, training, decomposed, links, config, output)
-    record = make_record(
-        key=key,
-        scene_hash=background_hash(run),
-        sources=sources,
-        left_out=chosen.left_out,
-        training=training,
-        config=config,
-        fitted=fitted,
-        views=views,
-        num_background=len(decomposed.background),
-        num_completed=int(decomposed.background.completed.sum()),
-        seconds=time.monotonic() - began_s,
-    )
-    record |= extras | {"backdrop": backdrop.write(run.scene_dir)}
-    write_record(run, record)
+    rasteriser = Rasteriser(RasterConfig(threads=config.fit.threads))
+    backdrop = backdrop_of(fitted.cloud, training.bare_views, rasteriser)
+    with scene_beside(run) as new:
+        write_ply(new.scene_dir / BACKGROUND, decomposed.background)
+        views = _hold_out(new, training, fitted, backdrop, decomposed, links, config, output)
+        extras = _write_parts(new, sources, training, decomposed, links, config, output)
+        record = make_record(
+            key=key,
+            scene_hash=background_hash(new),
+            sources=sources,
+            left_out=chosen.left_out,
+            training=training,
+            config=config,
+            fitted=fitted,
+            views=views,
+            num_background=len(decomposed.background),
+            num_completed=int(decomposed.background.completed.sum()),
+            seconds=time.monotonic() - began_s,
+        )
+        record |= extras | {"backdrop": backdrop.write(new.scene_dir)}
+        write_record(new, record)
+    for path in run.derived("*.views.*"):  # ours of earlier scenes; others are compared with ours
+        if path.name not in views["files"] and _is_ours(path):
+            path.unlink()
     return record
 
 
@@ -122,10 +122,7 @@ def _hold_out(
     config: RebuildConfig,
     output: Output,
 ) -> dict[str, Any]:
-    """Render what was held out, and say how well it came out; our views of earlier scenes go.
-
-    Views that another program drew stay: they are compared with ours.
-    """
+    """Render what was held out, and say how well it came out."""
     choices = training.choices
     job = ViewsJob(
         training=training,
@@ -140,9 +137,6 @@ def _hold_out(
         numbers = write_views(run, job, advance)
     scene_hash = background_hash(run)
     present = {views_path(run, c.episode, scene_hash).name for c in choices if c.holdout_ns}
-    for path in run.derived("*.views.*"):
-        if path.name not in present and _is_ours(path):
-            path.unlink()
     return summarise_views(numbers, sorted(present))
 
 

@@ -1,7 +1,10 @@
 """The scene folder: ``scene.json`` and ``background.ply``, whole or not at all."""
 
+import ctypes
 import json
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,6 +86,43 @@ def read_scene(run: RunFolder) -> Scene:
         hint = "Make it again: robot-gst rebuild RUN --force."
         raise UnreadableSceneError(path=run.scene_dir / SCENE_FILE, found=found, hint=hint)
     return scene
+
+
+class _Beside(RunFolder):
+    """A run whose scene is the one that is being made."""
+
+    @property
+    def scene_dir(self) -> Path:
+        return self.path / "scene.part"
+
+
+@contextmanager
+def scene_beside(run: RunFolder) -> Iterator[RunFolder]:
+    """Make a new scene beside the old one; they change places when the block has ended well.
+
+    Until then readers have the old one, whatever happens. It begins as a copy without its record,
+    for a calibration lies there too.
+    """
+    new = _Beside(run.path)
+    shutil.rmtree(new.scene_dir, ignore_errors=True)  # of one that was killed
+    try:
+        shutil.copytree(run.scene_dir, new.scene_dir)
+        (new.scene_dir / SCENE_FILE).unlink(missing_ok=True)
+        yield new
+        _exchange(new.scene_dir, run.scene_dir)
+    finally:
+        shutil.rmtree(new.scene_dir, ignore_errors=True)
+
+
+def _exchange(one: Path, other: Path) -> None:
+    """Give two folders each other's name at one instant, where the file system can."""
+    here, both = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of Linux
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    if rename is None or rename(here, bytes(one), here, bytes(other), both):
+        old = other.with_name(f"{other.name}.old")
+        other.rename(old)
+        one.rename(other)
+        old.rename(one)
 
 
 def write_record(run: RunFolder, record: Mapping[str, Any]) -> Path:
