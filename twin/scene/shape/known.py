@@ -1,4 +1,6 @@
-"""The surface of a known shape, and where to begin laying it onto points."""
+"""The surface of a known shape, and how it may be turned."""
+
+from itertools import permutations, product
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -34,47 +36,29 @@ def turned_alike(
     T_base_expected: Float[np.ndarray, "4 4"],
     model: ObjectModel,
 ) -> Float[np.ndarray, "4 4"]:
-    """Of the poses in which an object looks the same, the one turned nearest to another."""
+    """Of the poses in which an object looks the same, the one turned nearest to another.
+
+    A solid box may also stand on any of its other sides.
+    """
     period = yaw_period_rad(model)
     turns = [
         se3.rotation_from_vector(np.array([0.0, 0.0, k * period]))
         for k in range(round(2 * np.pi / period))
     ]
+    if model.shape == "box":
+        axes = (
+            np.diag(s)[list(p)] for s in product((1, -1), repeat=3) for p in permutations((0, 1, 2))
+        )
+        turns = [
+            R
+            for R in axes
+            if np.linalg.det(R) > 0 and np.allclose(abs(R) @ model.size_m, model.size_m)
+        ]
     best = min(
         (T_base_object[:3, :3] @ turn for turn in turns),
         key=lambda R: float(se3.rotation_angle_rad(R.T @ T_base_expected[:3, :3])),
     )
     return se3.from_rotation(best, T_base_object[:3, 3])
-
-
-def starts(
-    points: Float[np.ndarray, "num_points 3"], model: ObjectModel
-) -> list[Float[np.ndarray, "4"]]:
-    """Candidate states: where a side is cut off, the known size is laid along either end."""
-    z = model.rest_height_m
-    if model.origin_at_centre:
-        z = float(np.percentile(points[:, 2], 95)) - model.size_m[2] / 2
-    yaw = rectangle_yaw_rad(points[:, :2])
-    turns = np.arange(0.0, yaw_period_rad(model) - 1e-9, np.pi / 2)
-    states = []
-    for turn in turns:
-        c, s = np.cos(yaw + turn), np.sin(yaw + turn)
-        local = points[:, :2] @ np.array([[c, -s], [s, c]])
-        low, high = np.percentile(local, [1, 99], axis=0)
-        choices = []
-        for axis in (0, 1):
-            size = model.size_m[axis]
-            whole = abs(high[axis] - low[axis] - size) < max(0.01, size / 4)
-            middle = (low[axis] + high[axis]) / 2
-            choices.append(
-                (middle,) if whole else (low[axis] + size / 2, middle, high[axis] - size / 2)
-            )
-        states += [
-            np.array([c * u - s * v, s * u + c * v, z, yaw + turn])
-            for u in choices[0]
-            for v in choices[1]
-        ]
-    return states
 
 
 def rectangle_yaw_rad(xy: Float[np.ndarray, "num_points 2"], kept_percent: float = 98.0) -> float:
