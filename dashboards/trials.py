@@ -316,8 +316,8 @@ def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Out
     endpoint = f"tcp/127.0.0.1:{demo.free_port()}"
     log = run.notes_dir / "logs" / "record_scans.log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    with demo.running(["record", str(run.path), "--listen", endpoint], log) as recorder:
-        recorder.wait_until(lambda: demo.answers(endpoint, "rec/main/ctl/status"))
+    recording = ["record", str(run.path), "--listen", endpoint]
+    with demo.running(recording, log, demo.RECORDER_READY) as recorder:
         for job in wanted.values():
             standin = ["publish", "standin", "--connect", endpoint]
             standin += ["--seed", str(job.session_seed), "--first-start", str(job.start)]
@@ -389,14 +389,12 @@ def _laboratory(
     with ExitStack() as stack:
         there: list[demo.Background] = []
 
-        def start(name: str, arguments: list[str], words: str = "") -> demo.Background:
+        def start(name: str, arguments: list[str], words: str) -> None:
             log = logs / f"{name}_{index}.log"
             there.append(stack.enter_context(demo.running(arguments, log, words)))
-            return there[-1]
 
         own = ["--listen", endpoint, "--shares-folder"]  # each job numbers its own episodes
-        recorder = start("record", ["record", str(run.path), *own])
-        recorder.wait_until(lambda: demo.answers(endpoint, "rec/main/ctl/status"))
+        start("record", ["record", str(run.path), *own], demo.RECORDER_READY)
         start("gate", ["gate", str(run.path), "--samples", "0", *connect], "gate ready")
         if {job.policy for job in jobs} - {BUILT_IN_POLICY, *config.acting()}:
             model = ["--model", config.model, "--model-name", config.model_name]
