@@ -7,6 +7,7 @@ import numpy as np
 
 from bridge.episode.run_folder import RunFolder
 from twin.policies.cell import TwinCell
+from twin.policies.colours import gains_of
 from twin.policies.config import RolloutConfig
 from twin.policies.errors import PolicyError, StoppedError
 from twin.policies.gap import describe_gap, visual_gap
@@ -21,7 +22,8 @@ def check_policy(run: RunFolder, config: RolloutConfig) -> dict[str, Any]:
 
     Returns:
         ``sent`` and ``answered``: shape, type and range by key; ``first``: the first target, how
-        far it is from where the arm stands, and what refuses it; ``gap``: the visual gap.
+        far it is from where the arm stands, and what refuses it; ``gains`` of
+        the trials' light; ``gap``: the visual gap.
     """
     episode = trial_episodes(run, config.task)[0]
     start = open_start(run, episode)
@@ -43,7 +45,9 @@ def check_policy(run: RunFolder, config: RolloutConfig) -> dict[str, Any]:
             "rate_hz": mapping.rate_hz,
         }
         found |= _first(speak, cell, rows)
-        return found | {"gap": visual_gap(run, episode, policy, speak, config.seed)}
+        gains = gains_of(run, episode, list(cameras.viewpoints))
+        gap = visual_gap(run, episode, policy, speak, config.seed, gains)
+        return found | {"gains": gains, "gap": gap}
     finally:
         policy.close()
         cell.close()

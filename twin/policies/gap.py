@@ -18,7 +18,7 @@ from bridge.episode.run_folder import RunFolder
 from twin.policies.errors import PolicyError
 from twin.policies.mapping import Interpreter
 from twin.policies.policy import Policy
-from twin.policies.views import Pictures
+from twin.policies.views import Gains, Pictures, lit
 from twin.robot.posture import Posture
 from twin.scene.movable_scene import Frame
 from twin.scene.raster.backend import open_rasteriser
@@ -31,7 +31,7 @@ INSTANTS = 12
 
 
 @dataclass(frozen=True, kw_only=True)
-class _State:
+class State:
     """One recorded instant, and the picture that came next."""
 
     posture: Posture
@@ -41,17 +41,23 @@ class _State:
 
 
 def visual_gap(
-    run: RunFolder, episode: Episode, policy: Policy, speak: Interpreter, seed: int
+    run: RunFolder,
+    episode: Episode,
+    policy: Policy,
+    speak: Interpreter,
+    seed: int,
+    gains: Gains,
 ) -> dict[str, Any]:
     """Ask a policy about recorded states, in pictures of the cell and of the twin.
 
     Returns:
         Root mean squares over an answer's numbers, the gripper's left out, and over instants:
-        ``rendered`` pictures instead of recorded ones (all, and of each camera alone), the
-        ``following`` picture, and the same one ``again``; empty where nothing was recorded.
+        ``rendered`` pictures instead of recorded ones (all, and of each camera alone; ``lit``: all
+        of them in the light of other trials), the ``following`` picture, and the same one
+        ``again``; empty where nothing was recorded.
     """
     names = speak.cameras() or tuple(streams.camera_ids(episode))
-    states = list(_states(run, episode, names))
+    states = list(recorded_states(run, episode, names, INSTANTS))
     if not states:
         return {}
 
@@ -65,6 +71,7 @@ def visual_gap(
     for state in states:
         first = answer(state.recorded, state.posture)
         others = {"again": state.recorded, "following": state.following, "all": state.rendered}
+        others |= {"lit": lit(state.rendered, gains)} if gains else {}
         others |= {name: {**state.recorded, name: state.rendered[name]} for name in names}
         for what, pictures in others.items():
             rows = answer(pictures, state.posture)
@@ -82,7 +89,10 @@ def visual_gap(
     }
 
 
-def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[_State]:
+def recorded_states(
+    run: RunFolder, episode: Episode, names: Sequence[str], instants: int
+) -> Iterator[State]:
+    """Instants of a trial, spread over it, as cameras saw them and as the twin draws them."""
     scene = read_scene(run)
     trial = open_trial(run, scene, episode)
     pictures = {name: list(streams.color_images(episode, name)) for name in names}
@@ -92,7 +102,7 @@ def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[
     seen = [t for t in clock if trial.postures.covers(t)]
     if not seen:
         return
-    chosen = np.unique(np.linspace(0, len(seen) - 1, INSTANTS).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(seen) - 1, instants).round().astype(int))
     cameras = {name: streams.camera_info(episode, name).camera for name in names}
     rasteriser = open_rasteriser()
     stamps = np.array([seen[k] for k in chosen], dtype=np.int64)
@@ -113,7 +123,7 @@ def _states(run: RunFolder, episode: Episode, names: Sequence[str]) -> Iterator[
             name: min(range(len(items) - 1), key=lambda k: abs(items[k].stamp_ns - stamp_ns))
             for name, items in pictures.items()
         }
-        yield _State(
+        yield State(
             posture=posture,
             recorded={name: pictures[name][k].image_u8() for name, k in near.items()},
             following={name: pictures[name][k + 1].image_u8() for name, k in near.items()},
@@ -136,7 +146,10 @@ def describe_gap(gap: Mapping[str, Any]) -> list[str]:
     if not max(step, rendered["all"]):
         return ["visual gap: not measured, the policy's first answer is the same whatever it sees"]
     times = f", {rendered['all'] / step:.1f} x as much" if step > 0 else ""
-    alone = ", ".join(f"{name} {value:.3g}" for name, value in rendered.items() if name != "all")
+    other = {name: value for name, value in rendered.items() if name not in ("all", "lit")}
+    alone = ", ".join(f"{name} {value:.3g}" for name, value in other.items())
+    if "lit" in rendered:
+        alone += f"; in the light of other trials {rendered['lit']:.3g}"
     return [
         f"visual gap: the twin's pictures of {gap['instants']} states of {gap['episode']} change "
         f"its actions by {rendered['all']:.3g} (rms; {alone}); the next recorded picture does by "

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from bridge.episode import streams
 from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import ROLLOUT, Derived, EpisodeInfo
 from bridge.episode.provenance import hash_file, hash_settings
@@ -18,6 +19,7 @@ from bridge.errors import GstError
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan
 from twin.policies.cell import TwinCell
+from twin.policies.colours import gains_of
 from twin.policies.config import is_driven
 from twin.policies.errors import PolicyError, RefusedError, StoppedError
 from twin.policies.mapping import Interpreter, PolicyMap, is_end
@@ -29,7 +31,7 @@ from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.result import ReplayResult
 from twin.replay.run_job import cell_of
 
-ROLLOUT_VERSION = 1
+ROLLOUT_VERSION = 2
 """Raise it when the same inputs give another rollout, so that old files are redone."""
 LOOK_S = 0.5
 """How often it is asked whether the task is done."""
@@ -131,7 +133,9 @@ def _roll_out(
     cell = TwinCell(start)
     try:
         speak = Interpreter(job.mapping, cell.robot, start.task.instruction)
-        cameras = TwinCameras(run, start, speak.cameras(), speak.sizes(), drawn)
+        names = speak.cameras() or tuple(streams.camera_ids(episode))
+        gains = gains_of(run, episode, names)
+        cameras = TwinCameras(run, start, names, speak.sizes(), drawn, gains)
         policy.reset(job.seed + job.number)
         acted = act(cell, cameras, policy, speak, max_s=job.max_s, latency_s=job.latency_s)
         cell.rest(start.config.settle_after_s)
@@ -139,6 +143,7 @@ def _roll_out(
         result, plan = cell.judged(info)
         row = _row(job, info, start.id, acted, result)
         row["varied"] = {q.name: round(q.amount(drawn[q.name]), 6) for q in job.vary}
+        row["gains"] = dict(gains)
         row["checkpoint"] = who_acts(job.policy, job.mapping, policy.metadata)
         _write(job, episode, start, (result, plan), acted, row, policy.metadata)
         return row

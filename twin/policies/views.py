@@ -29,6 +29,8 @@ from twin.scene.standpoint import sized_camera
 from twin.scene.store.calibration import read_calibration
 
 Pictures = Mapping[str, UInt8[np.ndarray, "height width 3"]]
+Gains = Mapping[str, tuple[float, float, float]]
+"""Of red, green and blue, by camera."""
 Places = Mapping[str, Float[np.ndarray, "4 4"]]
 """Of objects, ``T_base_object``."""
 Nodes = Mapping[str, Float32[np.ndarray, "num_nodes 3"]]
@@ -112,6 +114,7 @@ class TwinCameras:
         cameras: Sequence[str] = (),
         sizes: Mapping[str, tuple[int, int]] | None = None,
         drawn: Drawn | None = None,
+        gains: Gains | None = None,
     ) -> None:
         """Read the scene.
 
@@ -120,6 +123,7 @@ class TwinCameras:
             sizes: Width and height in which the picture of a camera is to fit; others are drawn
                 as they were recorded.
             drawn: Conditions that differ from the recorded ones.
+            gains: Of the light, where it is another than when the scene was scanned.
         """
         self._drawn = drawn or {}
         episode = Episode.open(start.episode_path)
@@ -139,6 +143,7 @@ class TwinCameras:
             )
             for name in cameras or known
         }
+        self._gains = _varied(gains or {}, self._drawn, self.viewpoints)
         backdrop = self._drawable.parts.backdrop
         self._canvases = {name: Canvas(at, backdrop) for name, at in self.viewpoints.items()}
 
@@ -160,7 +165,7 @@ class TwinCameras:
             name: canvas.picture(rest.cloud, over, padded if hidden.any() else None, T_base_tcp)
             for name, canvas in self._canvases.items()
         }
-        return _lit(pictures, self._drawn)
+        return lit(pictures, self._gains)
 
     def _what_rests(self, places: Places, nodes: Nodes) -> Resting:
         """As it was, unless some of it moved, or something else came to rest."""
@@ -228,15 +233,22 @@ def _moved(place: Viewpoint, camera_id: str, drawn: Drawn) -> Viewpoint:
     )
 
 
-def _lit(pictures: Pictures, drawn: Drawn) -> Pictures:
-    """Pictures as bright as another light makes them."""
-    gain = 1.0 + drawn.get("light", (0.0,))[0]
-    if gain == 1.0:
-        return pictures
-    return {
-        name: np.clip(np.rint(gain * image.astype(np.float32)), 0, 255).astype(np.uint8)
-        for name, image in pictures.items()
-    }
+def _varied(gains: Gains, drawn: Drawn, cameras: Iterable[str]) -> Gains:
+    """Gains of the light with what ``drawn`` changes of it."""
+    share = 1.0 + drawn.get("light", (0.0,))[0]
+    if share == 1.0:
+        return gains
+    found = ((name, gains.get(name, (1.0, 1.0, 1.0))) for name in cameras)
+    return {name: (share * red, share * green, share * blue) for name, (red, green, blue) in found}
+
+
+def lit(pictures: Pictures, gains: Gains) -> Pictures:
+    """Pictures as another light makes them."""
+    found = dict(pictures)
+    for name in gains.keys() & found.keys():
+        image = np.rint(found[name] * np.array(gains[name], dtype=np.float32))
+        found[name] = np.clip(image, 0, 255).astype(np.uint8)
+    return found
 
 
 def _fitted_in(camera: Camera, size: tuple[int, int]) -> Camera:

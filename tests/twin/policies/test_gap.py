@@ -9,19 +9,19 @@ from twin.policies.gap import describe_gap, visual_gap
 from twin.policies.mapping import DEFAULT, Interpreter
 from twin.policies.policy import open_policy
 from twin.policies.starts import open_start
-from twin.policies.views import TwinCameras
+from twin.policies.views import Gains, TwinCameras
 from twin.robot.model import load_robot
 from twin.scene.render import render
 from twin.scene.settings import RenderConfig
 
 
-def gap_of(run: RunFolder, policy: str) -> dict[str, object]:
+def gap_of(run: RunFolder, policy: str, gains: Gains | None = None) -> dict[str, object]:
     episode = Episode.open(run.episodes()[0])
     start = open_start(run, episode)
     assert TwinCameras(run, start).viewpoints.keys() == {"side", "wrist"}
     speak = Interpreter(DEFAULT, load_robot(start.scene.urdf), "do it")
     opened = open_policy(f"scripted_policies:{policy}", 1.0)
-    return visual_gap(run, episode, opened, speak, 0)
+    return visual_gap(run, episode, opened, speak, 0, gains or {})
 
 
 def test_brightness_is_what_it_goes_by(run: RunFolder) -> None:
@@ -49,6 +49,10 @@ def test_brightness_is_what_it_goes_by(run: RunFolder) -> None:
     }
     assert found["rendered"] == pytest.approx(rms, abs=2e-3)
     assert rms["all"] > 0.05
+    dark = {"side": (0.0, 0.0, 0.0), "wrist": (0.0, 0.0, 0.0)}
+    found = gap_of(run, "brightness", dark)
+    assert found["rendered"]["lit"] == pytest.approx(np.sqrt(np.mean(grey**2)), abs=1e-6)
+    assert f"in the light of other trials {found['rendered']['lit']:.3g}" in describe_gap(found)[0]
     text = describe_gap(found)[0]
     assert f"by {rms['all']:.3g}"[:6] in text
     assert "10 states of trial_1" in text
