@@ -1,6 +1,7 @@
 """Photograph every page of a run: at 1440 and 390 px, light and dark, side by side.
 
-PYTHONPATH=tests:tests/dashboards .venv/bin/python docs/images/pages.py docs/images/pages_demo.webp runs/demo
+export PYTHONPATH=tests:tests/dashboards
+.venv/bin/python docs/images/pages.py docs/images/pages_demo.webp runs/demo
 """
 
 import argparse
@@ -9,9 +10,9 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from serving import dashboard
 from headless import Browser, chromium
 from PIL import Image
+from serving import dashboard
 
 from bridge.episode.run_folder import RunFolder
 
