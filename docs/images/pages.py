@@ -51,11 +51,14 @@ def main() -> None:
     options = parser.parse_args()
     run = RunFolder.open(options.run)
     rows = []
-    with TemporaryDirectory() as home, dashboard(run) as (_, url):
-        with chromium(Path(home), webgl=True) as tab:
-            for page in pages_of(run):
-                rows.append([photograph(tab, f"{url}{page}", *look) for look in LOOKS])
-                print(page or "first page", tab.complaints)
+    with (
+        TemporaryDirectory() as home,
+        dashboard(run) as (_, url),
+        chromium(Path(home), webgl=True) as tab,
+    ):
+        for page in pages_of(run):
+            rows.append([photograph(tab, f"{url}{page}", *look) for look in LOOKS])
+            print(page or "first page", tab.complaints)
     heights = [max(each.height for each in row) + GAP_PX for row in rows]
     sheet = Image.new("RGB", (sum(WIDTHS_PX[w] + GAP_PX for w, _ in LOOKS), sum(heights)), "gray")
     top = 0
