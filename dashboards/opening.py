@@ -45,6 +45,7 @@ ENDINGS = {
     "bag": (".mcap", ".db3", ".mcap.zstd", ".db3.zstd"),
     "table": (".csv", ".tsv", ".xlsx", ".xlsm"),
     "robot description": (".urdf", ".xacro"),
+    "HDF5 file": (".h5", ".hdf5"),
 }
 OF_BAG = (*ENDINGS["bag"], METADATA_FILE)
 SPLAT_FIELDS = frozenset({"x", "f_dc_0", "opacity", "scale_0", "rot_0"})
@@ -458,5 +459,10 @@ KINDS: dict[str, Callable[[Path], Found]] = {
     ),
     "RLDS dataset": partial(
         _converted, "an RLDS dataset", "a LeRobot dataset; openx2lerobot of any4lerobot"
+    ),
+    "HDF5 file": partial(
+        _converted,
+        "an HDF5 file (ALOHA, robomimic)",
+        "a LeRobot dataset; convert_aloha_data_to_lerobot.py of openpi, or a script like it,",
     ),
 }

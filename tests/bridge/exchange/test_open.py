@@ -153,6 +153,8 @@ def test_what_is_not_read_is_named_with_what_converts_it(tmp_path: Path, say: Sa
     assert "It cannot be imported." in say(tmp_path / "bridge", tmp_path / "new", code=2)
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(99))
     assert "rosbags-convert --src" in say(tmp_path / "a.bag")
+    (tmp_path / "episode_0.hdf5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(99))
+    assert "a LeRobot dataset; convert_aloha_data" in say(tmp_path / "episode_0.hdf5")
 
 
 def test_a_run_says_what_comes_next(make_trial: MakeTrial, tmp_path: Path, say: Say) -> None:
