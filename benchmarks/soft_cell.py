@@ -154,16 +154,9 @@ def body_of(trial: Trial, key: str) -> SoftModel:
 
 @cache
 def scene_lattice(mesh: str, size_m: tuple[float, float, float]) -> dict[str, np.ndarray]:
-    """The arrays that rebuilding a scene would write of a toy that was seen from all sides."""
+    """The lattice of a toy that was seen from all sides."""
     surface = toy_mesh(mesh, size_m)
-    points = surface.vertices_m
-    found = lattice(shape_of_mesh(points, surface.triangles))
-    return {
-        "nodes_m": found.nodes_m,
-        "tets": found.tets,
-        "mass_fraction": found.mass_fraction,
-        "spacing_m": np.array(found.spacing_m),
-    }
+    return lattice(shape_of_mesh(surface.vertices_m, surface.triangles).sdf)
 
 
 def furnished(trial: Trial) -> World:

@@ -12,11 +12,10 @@ from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.plan.problem import Covariance, Joints, Pose, Problem, Shape, Vector
 from twin.replay.rebuilt_scene import MOST_OFF, read_rebuilt_scene
 from twin.robot.model import load_robot
-from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import UnreadableMeshError, read_mesh
 from twin.scene.store.folder import read_record
-from twin.scene.store.library import NOT_SCANNED, Library
+from twin.scene.store.library import MESH, NOT_SCANNED, TASK_SHAPE, Library
 
 GUESSED_SHARE = 0.1
 """Of its largest extent, a scanned object may be off that no scan has shown yet."""

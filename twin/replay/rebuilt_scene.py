@@ -25,12 +25,14 @@ from twin.npz import UnreadableArraysError
 from twin.physics.config import PhysicsConfig
 from twin.replay.config import PosteriorDraw, ReplayConfig
 from twin.replay.scene import ReplayScene
+from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.from_training import with_heights
-from twin.scene.shape.lattice import Lattice
+from twin.scene.shape.lattice import lattice
+from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import read_record
-from twin.scene.store.library import NOT_SCANNED, Library
+from twin.scene.store.library import NOT_SCANNED, SDF, Library
 
 
 class UnreadablePosteriorError(TwinError):
@@ -150,7 +152,7 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> ReplayScene:
             notes.append(f"{key}: {found}")
         else:
             lattices[key] = found
-    path, static = run.scene_dir / "sdf.npz", None
+    path, static = run.scene_dir / SDF, None
     if path.is_file():
         static = _load_static(path, path.stat().st_mtime_ns)
     else:
@@ -194,7 +196,7 @@ def _robot_of_recording(path: Path) -> str:
 def shape_hashes(run: RunFolder) -> dict[str, str]:
     """SHA-256 of the scene's files that a replay reads, by their names in the scene folder."""
     folder = run.scene_dir
-    paths = [folder / "sdf.npz", *sorted(folder.glob("objects/*/soft.npz"))]
+    paths = [folder / SDF, *sorted(folder.glob(f"objects/*/{SDF}"))]
     return {
         path.relative_to(folder).as_posix(): provenance.hash_file(path)
         for path in paths
@@ -206,29 +208,24 @@ def _lattice(folder: Path | None, model: ObjectModel) -> Mapping[str, np.ndarray
     """The scene's lattice of one object; or why the task file's shape stands in, in words."""
     if folder is None:
         return f"{TASK_SHAPE} ({NOT_SCANNED})"
-    path = folder / "soft.npz"
+    path = folder / SDF
     if not path.is_file():
-        return f"{TASK_SHAPE} (the scene has no lattice of it)"
+        return f"{TASK_SHAPE} (the scene has no shape of it)"
     if not _watertight(folder / "object.json"):
         return f"{TASK_SHAPE} (the scene's mesh of it is not watertight)"
     try:
         found = _load_lattice(path, path.stat().st_mtime_ns)
-    except UnreadableArraysError as error:
+    except (UnreadableArraysError, ShapeError) as error:
         return f"{TASK_SHAPE} ({error})"
-    off = float(np.max(np.abs(np.ptp(found.nodes_m, axis=0) / np.array(model.size_m) - 1.0)))
+    off = float(np.max(np.abs(np.ptp(found["nodes_m"], axis=0) / np.array(model.size_m) - 1.0)))
     if off > MOST_OFF:
         return f"{TASK_SHAPE} (an extent of the scene's lattice is {off:.0%} off)"
-    return {
-        "nodes_m": found.nodes_m,
-        "tets": found.tets,
-        "mass_fraction": found.mass_fraction,
-        "spacing_m": np.array(found.spacing_m),
-    }
+    return found
 
 
 @lru_cache(maxsize=16)
-def _load_lattice(path: Path, mtime_ns: int) -> Lattice:
-    return Lattice.load(path)
+def _load_lattice(path: Path, mtime_ns: int) -> Mapping[str, np.ndarray]:
+    return lattice(SdfGrid.load(path))
 
 
 def _watertight(path: Path) -> bool:

@@ -35,11 +35,10 @@ from twin.scene.object_tracks import ObjectTracks, localised_tracks
 from twin.scene.objects.closing import closed_object
 from twin.scene.objects.decompose import ObjectSplats
 from twin.scene.settings import FrameConfig
-from twin.scene.shape.files import MESH
 from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import Mesh, read_mesh
 from twin.scene.store.folder import Scene
-from twin.scene.store.library import NOT_SCANNED, Library, objects_folder, task_of
+from twin.scene.store.library import MESH, NOT_SCANNED, Library, objects_folder, task_of
 
 FIRST_FRAMES = 8
 """Of each camera before the first motion, for the colours of what was not scanned."""

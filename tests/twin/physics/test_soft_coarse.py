@@ -24,15 +24,9 @@ def sloth() -> ObjectModel:
 
 @pytest.fixture(scope="module")
 def rebuilt(sloth: ObjectModel) -> dict[str, np.ndarray]:
-    """What rebuilding a scene writes of a sloth that was seen from all sides."""
+    """The lattice of a sloth that was seen from all sides."""
     mesh = toy_mesh("sloth", sloth.size_m)
-    found = lattice(shape_of_mesh(mesh.vertices_m, mesh.triangles))
-    return {
-        "nodes_m": found.nodes_m,
-        "tets": found.tets,
-        "mass_fraction": found.mass_fraction,
-        "spacing_m": np.array(found.spacing_m),
-    }
+    return lattice(shape_of_mesh(mesh.vertices_m, mesh.triangles).sdf)
 
 
 def test_a_fine_box_becomes_the_same_box_of_larger_cells(box_of_cells: Boxes) -> None:

@@ -11,10 +11,9 @@ from bridge.episode.run_folder import RunFolder
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import SCANNED, Task, load_task
 from twin.plan.shapes import GUESSED_SHARE, problem_of, shapes_of
-from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import mesh_ply
-from twin.scene.store.library import Library
+from twin.scene.store.library import MESH, TASK_SHAPE, Library
 
 SHIFT_M = np.array([0.004, -0.002, -0.001])
 TRUNCATION_M = 0.006

@@ -25,11 +25,10 @@ from twin.scene.frames.downscaled import pixels_of
 from twin.scene.least_squares import normal_equations, tukey_weights
 from twin.scene.localise.outline import Outline, find_outlines, outline_distances
 from twin.scene.localise.points import CameraView, Cluster
-from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.known import pose_of, shape_mesh, starts, yaw_period_rad
 from twin.scene.shape.mesh import face_normals, read_mesh
 from twin.scene.store.folder import UnreadableSceneError, read_record
-from twin.scene.store.library import Library
+from twin.scene.store.library import MESH, TASK_SHAPE, Library
 
 NUM_SAMPLES = 2500
 """Points on the surface of a mesh."""

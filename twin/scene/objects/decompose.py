@@ -39,14 +39,13 @@ from twin.scene.gaussians import (
 )
 from twin.scene.objects.closing import closed_object
 from twin.scene.objects.placement import Placements
-from twin.scene.shape.files import MESH, SDF, TASK_SHAPE, write_shape
 from twin.scene.shape.from_training import ObjectViews, is_known, shapes_of, write_static
 from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.store.folder import UnreadableSceneError
-from twin.scene.store.library import objects_folder
+from twin.scene.store.library import MESH, SDF, TASK_SHAPE, objects_folder
 
 SPACING_M, WIDER = 0.004, 1.4
 """Of Gaussians that fill holes, and how much wider than that they are."""
@@ -159,8 +158,7 @@ class LibraryObject:
     def write(self, place: Path) -> dict[str, Any]:
         """Write Gaussians, mesh and ``object.json``, and return what ``scene.json`` says.
 
-        A reconstructed object also gets ``sdf.npz`` and, when it is soft, ``soft.npz``, both in the
-        object frame.
+        A reconstructed object also gets ``sdf.npz``, in the object frame.
         """
         place.mkdir(parents=True, exist_ok=True)
         write_ply(place / "gaussians.ply", self.splats.cloud)
@@ -180,13 +178,22 @@ class LibraryObject:
 
     def _write_geometry(self, place: Path) -> tuple[list[str], dict[str, Any]]:
         """Write the reconstructed shape, or the known one with the reason why."""
-        if not isinstance(self.shape, str):
-            names, geometry = write_shape(place, self.shape, soft=self.model.soft is not None)
-            made = "stated by the task, seen in" if is_known(self.model) else "reconstructed from"
-            source = f"{made} {self.shape.num_views} views"
-            return names, {"shape_source": source, "geometry": geometry}
-        write_whole(place / MESH, mesh_ply(*shape_mesh(self.model)))
-        return [MESH], {"shape_source": TASK_SHAPE, "shape_remark": self.shape}
+        shape = self.shape
+        if isinstance(shape, str):
+            write_whole(place / MESH, mesh_ply(*shape_mesh(self.model)))
+            return [MESH], {"shape_source": TASK_SHAPE, "shape_remark": shape}
+        write_whole(place / MESH, mesh_ply(shape.vertices_m, shape.faces))
+        shape.sdf.save(place / SDF)
+        made = "stated by the task, seen in" if is_known(self.model) else "reconstructed from"
+        geometry = {
+            "watertight": shape.is_watertight,
+            "volume_m3": shape.volume_m3,
+            "voxel_m": shape.sdf.voxel_m,
+            "truncation_m": shape.truncation_m,
+            "num_views": shape.num_views,
+        }
+        source = f"{made} {shape.num_views} views"
+        return [MESH, SDF], {"shape_source": source, "geometry": geometry}
 
     def _record(self) -> dict[str, Any]:
         cloud = self.splats.cloud

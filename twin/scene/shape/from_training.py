@@ -29,8 +29,8 @@ from twin.scene.shape.reconstruct import (
     shape_of_mesh,
 )
 from twin.scene.shape.static import everything_in, static_sdf
+from twin.scene.store.library import SDF
 
-STATIC_FILE = "sdf.npz"
 MASK_MARGIN_M = 0.008
 """A measured point this near to the known surface is the object's."""
 TABLE_M = 0.003
@@ -256,7 +256,7 @@ def write_static(
 
     Only a task says that z = 0 is a table; without one nothing closes the scene below.
     """
-    path = folder / STATIC_FILE
+    path = folder / SDF
     path.unlink(missing_ok=True)
     heights_m = _rim_heights_m(scans)
     objects = [
@@ -271,7 +271,7 @@ def write_static(
         return {"file": None, "remark": str(error), "rim_height_m": heights_m}
     static.save(path)
     sha256 = provenance.hash_file(path)
-    return {"file": STATIC_FILE, "sha256": sha256, "rim_height_m": heights_m}
+    return {"file": SDF, "sha256": sha256, "rim_height_m": heights_m}
 
 
 def from_outside_m(

@@ -17,6 +17,10 @@ from bridge.errors import GstError
 from bridge.task.task_file import Task
 from twin.scene.store.folder import read_record
 
+MESH, SDF = "mesh.ply", "sdf.npz"
+"""Geometry files in an object's folder."""
+TASK_SHAPE = "task file"
+"""Source of a shape that no view gave."""
 NOT_SCANNED = "not scanned"
 FROM_TASK = f"{NOT_SCANNED}: drawn from the task's shape, with colours from before the first motion"
 

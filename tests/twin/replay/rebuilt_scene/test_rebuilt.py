@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from bridge.episode.run_folder import RunFolder
+from bridge.task.meshes.catalogue import toy_mesh
 from bridge.task.task_file import load_task
 from twin.npz import UnreadableArraysError
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.replay.config import ReplayConfig
 from twin.replay.rebuilt_scene import calibrated, read_rebuilt_scene, shape_hashes
-from twin.scene.shape.lattice import Lattice
+from twin.scene.shape.reconstruct import shape_of_mesh
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration
@@ -22,25 +23,19 @@ from twin.scene.store.calibration import Calibration
 TASK = load_task("sloth_into_basket")
 
 
-def lattice_of_task(stretch: float = 1.0) -> Lattice:
-    """The task's own lattice as a scene would hold it."""
-    body = SoftModel.from_task(TASK.objects["sloth"])
-    nodes = body.nodes_m * np.array([stretch, 1.0, 1.0], dtype=np.float32)
-    return Lattice(
-        nodes_m=nodes.astype(np.float32),
-        tets=body.tets,
-        mass_fraction=body.mass_fraction,
-        spacing_m=body.spacing_m,
-    )
+def shape_of_task(stretch: float = 1.0) -> SdfGrid:
+    """The task's own shape as a scene would hold it."""
+    mesh = toy_mesh("sloth", TASK.objects["sloth"].size_m)
+    return shape_of_mesh(mesh.vertices_m * np.array([stretch, 1.0, 1.0]), mesh.triangles).sdf
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> RunFolder:
-    """A scene with a lattice of the sloth and nothing else."""
+    """A scene with a shape of the sloth and nothing else."""
     folder = RunFolder.create(tmp_path / "run")
     place = folder.scene_dir / "objects" / "sloth"
     place.mkdir(parents=True)
-    lattice_of_task().save(place / "soft.npz")
+    shape_of_task().save(place / "sdf.npz")
     write_object(folder, watertight=True)
     record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
               "sources": [], "views": [], "objects": {"sloth": {}}}  # fmt: skip
@@ -63,7 +58,8 @@ def test_the_lattice_of_the_scene_is_taken_and_named(run: RunFolder) -> None:
     assert place.scene_hash == "abc"
     assert not any("sloth" in note for note in place.notes)
     body = SoftModel.from_lattice(place.lattices["sloth"], TASK.objects["sloth"])
-    assert len(body.nodes_m) == len(SoftModel.from_task(TASK.objects["sloth"]).nodes_m)
+    own = SoftModel.from_task(TASK.objects["sloth"])
+    assert body.volume_m3() == pytest.approx(own.volume_m3(), rel=0.1)
     assert any("sdf.npz" in note for note in place.notes)
 
 
@@ -75,17 +71,17 @@ def test_a_mesh_that_is_not_watertight_is_not_believed(run: RunFolder) -> None:
 
 
 def test_a_lattice_of_another_size_is_another_body(run: RunFolder) -> None:
-    lattice_of_task(stretch=1.5).save(run.scene_dir / "objects" / "sloth" / "soft.npz")
+    shape_of_task(stretch=1.5).save(run.scene_dir / "objects" / "sloth" / "sdf.npz")
     place = read_rebuilt_scene(run, TASK)
     assert not place.lattices
     assert "% off)" in place.notes[0]
 
 
 def test_a_damaged_lattice_is_passed_over_with_the_reason(run: RunFolder) -> None:
-    (run.scene_dir / "objects" / "sloth" / "soft.npz").write_bytes(b"no arrays")
+    (run.scene_dir / "objects" / "sloth" / "sdf.npz").write_bytes(b"no arrays")
     place = read_rebuilt_scene(run, TASK)
     assert not place.lattices
-    assert "soft.npz" in place.notes[0]
+    assert "sdf.npz" in place.notes[0]
     assert any("sloth: shape of the task file" in note for note in place.notes)
 
 
@@ -130,6 +126,6 @@ def test_calibrated_physics_is_used_where_the_user_said_nothing() -> None:
 
 def test_other_shapes_are_other_replays(run: RunFolder) -> None:
     before = shape_hashes(run)
-    assert list(before) == ["objects/sloth/soft.npz"]
-    lattice_of_task(stretch=1.1).save(run.scene_dir / "objects" / "sloth" / "soft.npz")
+    assert list(before) == ["objects/sloth/sdf.npz"]
+    shape_of_task(stretch=1.1).save(run.scene_dir / "objects" / "sloth" / "sdf.npz")
     assert shape_hashes(run) != before
