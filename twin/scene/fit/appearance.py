@@ -27,13 +27,9 @@ class Allowance:
     until_s: float = math.inf
     """On that clock; infinite when images are counted instead of time."""
 
-    def left_s(self) -> float:
-        """Seconds that are left; negative when it is over."""
-        return self.until_s - self.clock()
-
     def is_over(self) -> bool:
         """Say whether nothing more should be begun."""
-        return self.left_s() <= 0
+        return self.clock() >= self.until_s
 
 
 UNLIMITED = Allowance()
@@ -43,8 +39,6 @@ RIDGE_COLOR = 0.05
 """Pull of a colour towards its start, in squared weights of a pixel."""
 RIDGE_HARMONICS = 0.5
 """Stronger: a Gaussian seen from few directions says little about the others."""
-LEAST_STEPS = 2
-"""With fewer steps a solution is not worth its time: Adam uses it better."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,22 +73,17 @@ def solve_appearance(
 
     Args:
         steps: Conjugate gradient steps, at most; more than six follow the noise.
-        allowance: Fewer steps are made, or none, when so many do not fit; what is begun and does
-            not end in time is dropped.
+        allowance: What is begun and does not end in time is dropped.
 
     Returns:
         The cloud, and the conjugate gradient steps done; 0: it is as it was.
     """
     model = _ImageModel(cloud, observations, rasteriser, allowance)
     start = np.concatenate([cloud.colors[:, None], cloud.harmonics], axis=1)
-    affordable = model.affordable_passes(start) - 1  # one pass sets the equations up
-    equations = None if affordable < min(steps, LEAST_STEPS) else model.right_side(start)
+    equations = model.right_side(start)
     if equations is None:
         return cloud, 0
-    right, diagonal = equations
-    change, done = conjugate_gradients(
-        model.normal, right, diagonal, steps=int(min(steps, affordable))
-    )
+    change, done = conjugate_gradients(model.normal, *equations, steps=steps)
     solved = start + change
     harmonics = as_float32(solved[:, 1:])
     return replace(cloud, colors=as_float32(solved[:, 0]), harmonics=harmonics), done
@@ -158,17 +147,6 @@ class _ImageModel:
         ridge = np.array([RIDGE_COLOR] + [RIDGE_HARMONICS] * cloud.num_harmonics)
         self._ridge = ridge.astype(np.float32)[None, :, None]
 
-    def affordable_passes(self, start: np.ndarray) -> float:
-        """How often all images fit into the allowance, judged by the first."""
-        if self._allowance.until_s == np.inf:
-            return np.inf
-        if self._allowance.is_over():
-            return 0.0
-        began_s = self._allowance.clock()
-        self._lifted(start, self._observations[0])
-        took_s = max(self._allowance.clock() - began_s, 1e-9) * len(self._observations)
-        return float(np.floor(self._allowance.left_s() / took_s))
-
     def right_side(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Pull of all images on the start, and the preconditioner.
 
@@ -196,15 +174,11 @@ class _ImageModel:
         for item in self._observations:
             if self._allowance.is_over():
                 return None
-            total += self._lifted(x, item)
+            squared = np.square(item.gain).astype(np.float32)[:, None, None]
+            drawn = squared * self._draw(x, item)[:3]
+            lifted = self._rasteriser.lift(drawn * item.target.static_mask)
+            total += self._basis(item)[:, :, None] * lifted[:, None, :]
         return np.asarray(total)
-
-    def _lifted(self, x: np.ndarray, item: ImageObservation) -> np.ndarray:
-        """A change of colours carried into one image and back."""
-        squared = np.square(item.gain).astype(np.float32)[:, None, None]
-        drawn = squared * self._draw(x, item)[:3]
-        lifted = self._rasteriser.lift(drawn * item.target.static_mask)
-        return np.asarray(self._basis(item)[:, :, None] * lifted[:, None, :])
 
     def _basis(self, item: ImageObservation) -> Float32[np.ndarray, "num_splats num_terms"]:
         """Value of each unknown's harmonic along the ray to each Gaussian; 1 for the colour."""

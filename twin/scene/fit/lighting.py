@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Int
 
+from bridge.geometry import se3
 from twin.scene.gaussians import GaussianCloud, as_float32
 
 NUM_COEFFICIENTS = 9
@@ -41,7 +42,8 @@ class Lighting:
         """Flat Gaussians in this light; their normals are their third axes, base frame."""
         if self == EVEN or len(cloud) == 0:
             return cloud
-        lit = cloud.colors * self.brightness(_normals(cloud.quats_wxyz))[:, None]
+        turned = se3.rotation_from_quaternion(cloud.quats_wxyz.astype(np.float64))
+        lit = cloud.colors * self.brightness(turned[:, :, 2])[:, None]
         return replace(cloud, colors=as_float32(lit))
 
     def to_record(self) -> dict[str, Any]:
@@ -100,16 +102,6 @@ def fit_lighting(seen: Sequence[Patches]) -> Lighting:
         found = np.linalg.solve(left, right)
         found /= max(float(np.average(basis @ found, weights=weights)), 1e-6)
     return Lighting(coefficients=tuple(found.tolist()))
-
-
-def _normals(
-    quats_wxyz: Float32[np.ndarray, "num_splats 4"],
-) -> Float[np.ndarray, "num_splats 3"]:
-    """The third columns of their rotation matrices."""
-    unit = quats_wxyz / np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
-    q = np.ascontiguousarray(unit.T, dtype=np.float64)
-    w, x, y, z = q / np.linalg.norm(q, axis=0)
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
 
 
 def _basis(normals: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 9"]:
