@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -46,11 +46,9 @@ class ViewCloud:
         return ViewCloud(p_m=self.p_m[index], normals=self.normals[index])
 
 
-NUM_POINTS = 6000
-NUM_TRIALS = 400
-NEAR_M = 0.008
-NEAR_FRACTION = 0.006
-"""A point within 8 mm + 0.6 % of its distance to the camera lies on the plane."""
+NUM_POINTS, NUM_TRIALS = 6000, 400
+NEAR_M = 0.012
+"""A point this near to a plane lies on it."""
 MIN_SHARE = 0.05
 """Of all points; smaller planes are parts of things."""
 MAX_PLANES = 3
@@ -75,52 +73,31 @@ def find_planes(views: Sequence[RobotView]) -> list[LevelPlane]:
     Gravity is not known: a wall that faces the camera is told from a table by the camera's upper
     edge, which points up, and what is left over is told by where the robot fits.
     """
+    import open3d  # noqa: PLC0415  # heavy, and only a camera that nobody placed needs it
+
     step = max(1, sum(len(view.cloud.p_m) for view in views) // NUM_POINTS)
     clouds = [view.cloud.take(np.arange(0, len(view.cloud.p_m), step)) for view in views]
     p = np.concatenate(
         [se3.apply(v.T_source_camera, c.p_m) for v, c in zip(views, clouds, strict=True)]
     )
-    range_m = np.concatenate([np.linalg.norm(c.p_m, axis=1) for c in clouds])
     up = -np.mean([view.T_source_camera[:3, 1] for view in views], axis=0)
     back = -np.mean([view.T_source_camera[:3, 2] for view in views], axis=0)
     eye = np.mean([view.T_source_camera[:3, 3] for view in views], axis=0)
-    rng = np.random.default_rng(0)
     planes: list[LevelPlane] = []
-    left = np.ones(len(p), dtype=bool)
+    open3d.utility.random.seed(0)
+    left = p
     for _ in range(2 * MAX_PLANES):
-        if left.sum() < 50 or len(planes) == MAX_PLANES:
+        if len(left) < 50 or len(planes) == MAX_PLANES:
             break
-        normal, offset, on = _largest(p, range_m, left, eye, rng)
-        if on.mean() < MIN_SHARE:
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(left))
+        plane, on = cloud.segment_plane(NEAR_M, 3, NUM_TRIALS)
+        if len(on) < MIN_SHARE * len(p):
             break
-        left &= ~on
-        if normal @ up > UPRIGHT or normal @ back > LOOKING_DOWN:
-            planes.append(_level(p[on], normal, offset, eye))
+        plane = plane if plane[:3] @ eye + plane[3] > 0 else -plane
+        if plane[:3] @ up > UPRIGHT or plane[:3] @ back > LOOKING_DOWN:
+            planes.append(_level(left[on], plane[:3], -float(plane[3]), eye))
+        left = np.delete(left, on, axis=0)
     return planes
-
-
-def _largest(
-    p: np.ndarray, range_m: np.ndarray, left: np.ndarray, eye: np.ndarray, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "3"], float, Bool[np.ndarray, " num_points"]]:
-    """Normal towards the eye, offset (normal @ p = offset), and the points on the plane."""
-    ids = np.flatnonzero(left)
-    near = NEAR_M + NEAR_FRACTION * range_m
-    triples = p[ids[rng.integers(len(ids), size=(NUM_TRIALS, 3))]]
-    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    offsets = np.einsum("ij,ij->i", normals, triples[:, 0])
-    some = ids[:: max(1, len(ids) // 2000)]
-    counts = (np.abs(p[some] @ normals.T - offsets) < near[some, None]).sum(axis=0)
-    normal, offset = normals[int(np.argmax(counts))], float(offsets[int(np.argmax(counts))])
-    on = left & (np.abs(p @ normal - offset) < near)
-    for _ in range(3):
-        centre = p[on].mean(axis=0)
-        _, _, Vt = np.linalg.svd(p[on] - centre, full_matrices=False)
-        normal, offset = Vt[2], float(Vt[2] @ centre)
-        on = left & (np.abs(p @ normal - offset) < near)
-    if normal @ eye < offset:
-        normal, offset = -normal, -offset
-    return normal, offset, on
 
 
 def _level(p: np.ndarray, normal: np.ndarray, offset: float, eye: np.ndarray) -> LevelPlane:
