@@ -37,8 +37,7 @@ class FrameConfig:
     max_train_frames: int = 100
     """Frames to fit, shared evenly by episodes and cameras."""
     train_every: Annotated[int, RARE] = 0
-    """Learn from every this many frames, whatever they show: a fixed protocol. 0: from the
-    stillest frame of each stretch of the camera's path."""
+    """Learn from every this many frames: a fixed protocol. 0: evenly along the camera's path."""
     holdout_every: int = 8
     """Every this many frames of a camera, the middle one is kept out of everything: initialisation,
     poses, exposure, fit, objects."""

@@ -1,8 +1,7 @@
 """Choose posed RGB-D frames of a run: some to train on, some held out.
 
-A scan holds far more frames than a fit can use. Frames a camera took while it moved fast are
-smeared, and their pose is as wrong as the clocks of camera and robot differ: of each stretch of the
-camera's path the slowest frame is taken.
+A scan holds far more frames than a fit can use: they are taken at even distances along the
+camera's path, so that one that pauses gives no more of them there.
 """
 
 from collections.abc import Iterator
@@ -16,8 +15,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.topics import COLOR_IMAGE, COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO, is_truth
-from bridge.episode.transforms import TransformTree
-from bridge.errors import BridgeError, EpisodeError
+from bridge.errors import BridgeError
 from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.errors import TwinError
@@ -37,35 +35,14 @@ from twin.scene.store.calibration import Calibration
 
 TURN_M_PER_RAD = 0.5
 """How much path a turn counts for: what a camera sees at this distance moves by as much."""
-MOTION_WINDOW_NS = 20_000_000
-"""Motion is the difference of poses this long before and after an image."""
-TYPICAL_DEPTH_M = 0.7
-EXPOSURE_S = 0.01
-SMEAR_PX = 0.5
-"""Smear in one exposure below this cannot be seen."""
-UNKNOWN_PX = 1e6
-"""Instead of a smear that cannot be known."""
 
 
 def pick(
-    stamps_ns: Int[np.ndarray, " num_frames"],
-    path_m: Float[np.ndarray, " num_frames"],
-    smear_px: Float[np.ndarray, " num_frames"],
-    count: int,
+    stamps_ns: Int[np.ndarray, " num_frames"], path_m: Float[np.ndarray, " num_frames"], count: int
 ) -> Int[np.ndarray, " num_picked"]:
-    """Return the stamps of at most ``count`` frames, in order; the same input picks the same.
-
-    The path is cut into stretches of equal length, as many as give at most ``count`` that hold
-    a frame. Of the frames of a stretch the first that smears least is taken.
-
-    Args:
-        path_m: Distance the camera has come since the first frame, see ``path_length_m``.
-    """
-    if len(stamps_ns) == 0 or count < 1:
-        return stamps_ns[:0]
-    stretch, seen_px = _stretches(path_m, count), np.maximum(smear_px, SMEAR_PX)
-    groups = [np.flatnonzero(stretch == k) for k in np.unique(stretch)]
-    return np.asarray(stamps_ns[[ids[np.argmin(seen_px[ids])] for ids in groups]])
+    """The stamps of at most ``count`` frames at even distances along a path, in order."""
+    places = np.linspace(path_m[0], path_m[-1], count)
+    return np.asarray(stamps_ns[np.unique(np.searchsorted(path_m, places))])
 
 
 def path_length_m(
@@ -79,49 +56,6 @@ def path_length_m(
     shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     steps = shift + TURN_M_PER_RAD * turn
     return np.concatenate([[0.0], np.cumsum(steps + max(1e-6, 1e-3 * float(steps.mean())))])
-
-
-def smear_px(
-    tree: TransformTree, frame_id: str, stamps_ns: Int[np.ndarray, " num_frames"], focal_px: float
-) -> Float[np.ndarray, " num_frames"]:
-    """How far the image of something at a typical distance moves during one exposure [px]."""
-    with np.errstate(invalid="ignore"):  # a pose beside one that is not finite: motion unknown
-        before = tree.Ts_root_frame(frame_id, stamps_ns - MOTION_WINDOW_NS)
-        after = tree.Ts_root_frame(frame_id, stamps_ns + MOTION_WINDOW_NS)
-        turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
-        shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1) / TYPICAL_DEPTH_M
-    found = focal_px * (turn + shift) * EXPOSURE_S / (2e-9 * MOTION_WINDOW_NS)
-    return np.asarray(np.nan_to_num(found, nan=UNKNOWN_PX, posinf=UNKNOWN_PX))
-
-
-def robot_smear_px(
-    episode: Episode, stamps_ns: Int[np.ndarray, " num_frames"], focal_px: float
-) -> Float[np.ndarray, " num_frames"]:
-    """The same for a robot in front of a camera that stands still, by its fastest joint.
-
-    0 where no joints were recorded.
-    """
-    try:
-        track = streams.joint_track(episode)
-    except EpisodeError:
-        return np.zeros(len(stamps_ns))
-    change = track.at(stamps_ns + MOTION_WINDOW_NS) - track.at(stamps_ns - MOTION_WINDOW_NS)
-    fastest = np.abs(change).max(axis=1, initial=0.0)
-    return np.asarray(focal_px * fastest * EXPOSURE_S / (2e-9 * MOTION_WINDOW_NS))
-
-
-def _stretches(path_m: np.ndarray, count: int) -> np.ndarray:
-    """Number the stretch of each frame, so that at most ``count`` stretches hold any."""
-    total = max(float(path_m[-1]), 1e-12)
-    if len(path_m) <= count:
-        return np.arange(len(path_m))
-    best = np.zeros(len(path_m), dtype=np.int64)
-    for parts in range(count, 4 * count + 1, max(1, count // 16)):
-        stretch = np.minimum((path_m / total * parts).astype(np.int64), parts - 1)
-        if len(np.unique(stretch)) > count:
-            break
-        best = stretch
-    return best
 
 
 STATIONARY_TRAIN_FRAMES = 4
@@ -314,12 +248,11 @@ def _choose(
         train_count = min(train_count, STATIONARY_TRAIN_FRAMES)
         holdout_count = min(holdout_count, STATIONARY_HOLDOUT_FRAMES)
     held = np.setdiff1d(held, unposed)
-    if config.train_every:
-        rest = np.setdiff1d(stamps[:: config.train_every], np.concatenate([held, unposed]))
-        train = spread(rest, train_count)
-    else:
-        rest = np.setdiff1d(stamps, np.concatenate([held, unposed]))
-        train = _pick(episode, camera_id, poses, rest, train_count, stationary=stationary)
+    rest = np.setdiff1d(stamps[:: max(config.train_every, 1)], np.concatenate([held, unposed]))
+    train = spread(rest, train_count)
+    if not config.train_every and len(rest) > train_count:
+        path_m = path_length_m(poses.tree.Ts_root_frame(frame_id, rest))
+        train = pick(rest, path_m, train_count)
     return FrameChoice(
         episode=episode,
         camera_id=camera_id,
@@ -329,26 +262,6 @@ def _choose(
         poses=poses,
         spare_ns=frozenset(np.setdiff1d(rest, train).tolist()),
     )
-
-
-def _pick(
-    episode: Episode,
-    camera_id: str,
-    poses: CameraPoses,
-    stamps: Int[np.ndarray, " num_frames"],
-    count: int,
-    *,
-    stationary: bool,
-) -> Int[np.ndarray, " num_picked"]:
-    if len(stamps) == 0:
-        return stamps
-    info = streams.camera_info(episode, camera_id)
-    if stationary:
-        smear = robot_smear_px(episode, stamps, info.camera.fx)
-    else:
-        smear = smear_px(poses.tree, info.frame_id, stamps, info.camera.fx)
-    path = path_length_m(poses.tree.Ts_root_frame(info.frame_id, stamps))
-    return pick(stamps, path, smear, count)
 
 
 def spread(values: np.ndarray, count: int) -> np.ndarray:

@@ -72,7 +72,7 @@ def protocol_of(
 ) -> dict[str, Any]:
     """How the scene was made, as far as whoever rates its views must know."""
     frames = config.frames
-    training = "of the others the stillest of each stretch of the camera's path"
+    training = "of the others, evenly along the camera's path"
     if frames.train_every:
         training = f"frame 0 and every {frames.train_every}th after it, but no held-out one"
     return {

@@ -41,7 +41,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 29
+METHOD_VERSION = 30
 """Counts changes of method that make older scenes out of date."""
 SEARCHED_SPLATS = 80_000
 """Points of the fused surface in which things are looked for, at most."""

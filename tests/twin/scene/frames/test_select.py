@@ -19,18 +19,9 @@ def test_a_camera_that_pauses_gives_no_more_frames_there() -> None:
     path = np.concatenate(
         [np.linspace(0, 1, 10), 1 + 1e-6 * np.arange(80), np.linspace(1.1, 2, 10)]
     )
-    picked = selection.pick(stamps, path, np.zeros(100), 10)
+    picked = selection.pick(stamps, path, 10)
     assert len(picked) <= 10
     assert ((picked >= 10) & (picked < 90)).sum() <= 2
-
-
-def test_the_first_of_the_stillest_frames_of_a_stretch_is_taken() -> None:
-    stamps = np.arange(30)
-    smear = np.where(stamps % 10 < 5, 10.0, 0.1)
-    smear[stamps % 10 == 7] = 0.01  # less than can be seen
-    assert (selection.pick(stamps, np.linspace(0, 1, 30), smear, 3) % 10).tolist() == [5, 5, 5]
-    fast = np.where(stamps % 10 == 7, 4.0, 10.0)
-    assert (selection.pick(stamps, np.linspace(0, 1, 30), fast, 3) % 10).tolist() == [7, 7, 7]
 
 
 @given(st.integers(1, 60), st.integers(1, 30), st.integers(0, 1000))
@@ -42,25 +33,11 @@ def test_never_more_frames_than_wanted_always_in_order_always_the_same(
     path = (
         np.cumsum(rng.exponential(size=num_frames) * rng.integers(0, 2, num_frames)) + 1e-6 * stamps
     )
-    path -= path[0]
-    smear = rng.uniform(0, 2, num_frames)
-    picked = selection.pick(stamps, path, smear, count)
-    again = selection.pick(stamps, path, smear, count)
+    picked = selection.pick(stamps, path, count)
+    again = selection.pick(stamps, path, count)
     assert 1 <= len(picked) <= count
     assert picked.tolist() == sorted(set(picked.tolist())) == again.tolist()
     assert set(picked.tolist()) <= set(stamps.tolist())
-
-
-def test_smear_is_focal_length_times_angular_speed_times_exposure(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path)
-    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
-    (choice,) = selection.choose_frames(selection.find_sources(run), FrameConfig()).choices
-    stamps = np.array([1_400_000_000])
-    (found,) = selection.smear_px(choice.poses.tree, "wrist_color_optical", stamps, 60.0)
-    a, b = textured_room.camera_pose(3, 9), textured_room.camera_pose(5, 9)
-    speed = np.linalg.norm(a[:3, 3] - b[:3, 3]) / 0.2 / 0.7
-    turn = np.arccos((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2) / 0.2
-    assert found == pytest.approx(60.0 * 0.01 * (speed + turn), rel=0.05)
 
 
 def test_a_fixed_protocol_learns_from_every_fifth_and_holds_out_the_one_two_after(
