@@ -1,57 +1,32 @@
 """Where the objects of an episode were at any instant: as localised, and carried in between.
 
-A trial is localised while nothing is executed. In between nobody looks, but the joints and the
-fingers say what happened: an object between the fingers when they stop closing goes with the tool
-until they open. Closing, they push a box until it fits between the pads, as far apart as recorded.
-What localisation and joints disagree about is spread evenly over the carry, so that nothing jumps
-where it is put down; but for its height: what was let go above where it is found fell there. An
-object that is found far from where it was let go fell as well; one that was never held was moved by
-something else, and changes place when that is known.
+A trial is localised while nothing is executed. In between the joints and the fingers say what
+happened: an object between the fingers when they stop closing goes with the tool until they open,
+as cameras saw it in the hand on the way, else as it lay before. What is let go elsewhere than it is
+found fell there, in the time that gravity takes. One that was never held was moved by something
+else, and changes place when that is known.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
 
-from bridge.episode import streams
-from bridge.episode.executions import executed_events
 from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
-from twin.robot.model import RobotModel, load_robot
+from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack
+from twin.scene.localise.held import BETWEEN_M, Grip, executions_ns, grips_between
 from twin.scene.shape.known import turned_alike
 
-BETWEEN_M = 0.03
-"""An object this near to the tool, beside half its largest side, is between the fingers."""
-PLATEAU_M = 0.003
-"""Fingers that are this near to the least opening of a grasp grasp what is between them."""
 FELL_M = 0.05
 """An object found this far from where it was let go did not stay there."""
 MOVED_M = 0.005
 """Less than this is the scatter of localisation."""
-EMPTY_M = 0.002
-"""Fingers that close to less have nothing between them."""
 GRAVITY_M_S2 = 9.81
-PAD_M = 0.0015
-"""So much more or less than the recorded opening a box between the pads may measure."""
-_TURNS_RAD = np.radians(sorted(np.arange(-45.0, 45.5, 0.5), key=abs))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Grip:
-    """A stretch of time in which the fingers were closed around something."""
-
-    closing_ns: int
-    """From here on they came nearer to each other than half way."""
-    start_ns: int
-    end_ns: int
-    width_m: float
-    """Between the pads when they stopped."""
-    T_base_tcp_start: Float[np.ndarray, "4 4"]
-    T_base_tcp_end: Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,18 +104,7 @@ def localised_tracks(
     postures: PostureTrack | None,
 ) -> ObjectTracks:
     """Where a recorded episode's objects were: localised, and carried in between."""
-    events = executed_events(episode)
-    plan_ids = {
-        str(event["plan_id"])
-        for event in events
-        if event["type"] == "execution_ended" and event.get("plan_id") is not None
-    }
-    executions = {}
-    for plan_id in plan_ids:
-        start_ns, end_ns = streams.execution_ns(events, plan_id)
-        if start_ns is not None and end_ns is not None:
-            executions[plan_id] = (start_ns, end_ns)
-    return carried_tracks(localised, executions, task, postures)
+    return carried_tracks(localised, executions_ns(episode), task, postures)
 
 
 def carried_tracks(
@@ -173,43 +137,12 @@ def carried_tracks(
                 if track is not None and robot is not None and not model.fixed
                 else []
             )
+            grasps = _grasps(model, spans[name][-1].T_end, grips, _held(name, plan_id, localised))
             after = seen.get(plan_id)
-            added, note = _moved(model, spans[name], grips, after, end_ns)
+            added, note = _moved(model, spans[name][-1].T_end, grasps, after, end_ns)
             spans[name] += added
             notes += [f"{name} {note}"] if note else []
     return ObjectTracks(spans=spans, absent=frozenset(absent), notes=tuple(notes))
-
-
-def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns: int) -> list[Grip]:
-    """When the fingers stood closed around something, by their recorded opening."""
-    widths = track.widths
-    if widths is None:
-        return []
-    inside = (widths.stamps_ns >= start_ns) & (widths.stamps_ns <= end_ns)
-    stamps, width_m = widths.stamps_ns[inside], widths.position[inside, 0]
-    if len(stamps) == 0 or np.ptp(width_m) < PLATEAU_M:
-        return []
-    is_closed = width_m < (width_m.min() + width_m.max()) / 2
-    edges = np.flatnonzero(np.diff(is_closed.astype(np.int8), prepend=0, append=0))
-    grips = []
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        least_m = float(width_m[first:last].min())
-        held = first + np.flatnonzero(width_m[first:last] <= least_m + PLATEAU_M)
-        if least_m < EMPTY_M:
-            continue
-        t0, t1 = int(stamps[held[0]]), int(stamps[held[-1]])
-        T0, T1 = (robot.T_base_tcp(track.at(t).joints_rad) for t in (t0, t1))
-        grips.append(
-            Grip(
-                closing_ns=int(stamps[first]),
-                start_ns=t0,
-                end_ns=t1,
-                width_m=float(width_m[held[0]]),
-                T_base_tcp_start=T0,
-                T_base_tcp_end=T1,
-            )
-        )
-    return grips
 
 
 def _seen(
@@ -225,38 +158,15 @@ def _seen(
     }
 
 
-def _moved(
-    model: ObjectModel,
-    before: Sequence[_Span],
-    grips: Sequence[Grip],
-    after: Float[np.ndarray, "4 4"] | None,
-    end_ns: int,
-) -> tuple[list[_Span], str]:
-    """What one execution did to an object, and what had to be assumed."""
-    T = before[-1].T_end
-    grasps = _grasps(model, T, grips)
-    added = [span for grasp in grasps[:-1] for span in _carried(grasp, grasp.T_base_put)]
-    if grasps:
-        T = _put(model, grasps[-1], after)
-        added += _carried(grasps[-1], T)
-    if after is None:
-        note = (
-            "was not found after an execution: left where the hand put it"
-            if grasps
-            else "was not found after an execution: left where it was"
-        )
-        return added, note
-    away_m = float(np.linalg.norm(after[:3, 3] - T[:3, 3]))
-    if away_m <= MOVED_M:
-        return added, ""
-    note = (
-        f"lay {away_m * 100:.0f} cm from where it was let go: drawn there from then on"
-        if grasps
-        else f"was moved by {away_m * 100:.0f} cm without being held: drawn there afterwards"
-    )
-    if not grasps:
-        return [_rest(end_ns, after)], note
-    return [*added[:-2], *_fallen(grasps[-1].grip.end_ns, T, after)], note
+def _held(
+    name: str, plan_id: str, localised: Sequence[Mapping[str, object]]
+) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """Poses ``T_tcp_object`` as cameras saw them in an execution, by the start of the grip."""
+    entries: list[Any] = []
+    for record in localised:
+        if (record["object"], record.get("plan_id")) == (name, plan_id):
+            entries += cast("list[Any]", record.get("in_hand", []))
+    return {int(each["grip_ns"]): se3.pose_from_record(each["T_tcp_object"]) for each in entries}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,85 +184,72 @@ class _Grasp:
         """Pose of the object when they opened, if it did not slip."""
         return np.asarray(self.grip.T_base_tcp_end @ self.T_tcp_object)
 
+    def spans(self) -> list[_Span]:
+        """Pushed by the closing fingers, carried, and left where they opened."""
+        grip, T = self.grip, self.T_tcp_object
+        return [
+            _Span(
+                start_ns=grip.closing_ns,
+                end_ns=grip.start_ns,
+                T_start=self.T_base_lay,
+                T_end=grip.T_base_tcp_start @ T,
+            ),
+            _Span(in_hand=True, start_ns=grip.start_ns, end_ns=grip.end_ns, T_start=T, T_end=T),
+            _rest(grip.end_ns, self.T_base_put),
+        ]
+
 
 def _grasps(
-    model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"], grips: Sequence[Grip]
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+    grips: Sequence[Grip],
+    held: Mapping[int, Float[np.ndarray, "4 4"]],
 ) -> list[_Grasp]:
     """Those grips that had this object between the fingers, each from where the last one put it."""
     reach_m = BETWEEN_M + max(model.size_m) / 2
     T, grasps = T_base_object, []
     for grip in grips:
-        T_tcp_lay = se3.invert(grip.T_base_tcp_start) @ T
-        if np.linalg.norm(T_tcp_lay[:3, 3]) >= reach_m:
-            continue
-        in_hand = _between_pads(model, T_tcp_lay, grip.width_m)
-        grasps.append(_Grasp(grip=grip, T_base_lay=T, T_tcp_object=in_hand))
-        T = grasps[-1].T_base_put
+        T_tcp_object = se3.invert(grip.T_base_tcp_start) @ T
+        if grip.start_ns in held:
+            T_tcp_object = turned_alike(held[grip.start_ns], T_tcp_object, model)
+        if np.linalg.norm(T_tcp_object[:3, 3]) < reach_m:
+            grasps.append(_Grasp(grip=grip, T_base_lay=T, T_tcp_object=T_tcp_object))
+            T = grasps[-1].T_base_put
     return grasps
 
 
-def _put(
-    model: ObjectModel, grasp: _Grasp, after: Float[np.ndarray, "4 4"] | None
-) -> Float[np.ndarray, "4 4"]:
-    """Pose ``T_base_object`` when the fingers opened: as found later, if it is near enough."""
+def _moved(
+    model: ObjectModel,
+    T_base_lay: Float[np.ndarray, "4 4"],
+    grasps: Sequence[_Grasp],
+    after: Float[np.ndarray, "4 4"] | None,
+    end_ns: int,
+) -> tuple[list[_Span], str]:
+    """What one execution did to an object, and what had to be assumed."""
+    added = [span for grasp in grasps for span in grasp.spans()]
+    T = grasps[-1].T_base_put if grasps else T_base_lay
     if after is None:
-        return grasp.T_base_put
-    found = turned_alike(after, grasp.T_base_put, model)
-    is_there = np.linalg.norm(found[:3, 3] - grasp.T_base_put[:3, 3]) < FELL_M
-    return found if is_there else grasp.T_base_put
-
-
-def _carried(grasp: _Grasp, T_base_put: Float[np.ndarray, "4 4"]) -> list[_Span]:
-    """Pushed by the closing fingers, carried, let go, and fallen as low as it is found then."""
-    grip, T_let_go = grasp.grip, T_base_put.copy()
-    T_let_go[2, 3] = max(T_base_put[2, 3], grasp.T_base_put[2, 3])
-    return [
-        _Span(
-            start_ns=grip.closing_ns,
-            end_ns=grip.start_ns,
-            T_start=grasp.T_base_lay,
-            T_end=grip.T_base_tcp_start @ grasp.T_tcp_object,
-        ),
-        _Span(
-            in_hand=True,
-            start_ns=grip.start_ns,
-            end_ns=grip.end_ns,
-            T_start=grasp.T_tcp_object,
-            T_end=se3.invert(grip.T_base_tcp_end) @ T_let_go,
-        ),
-        *_fallen(grip.end_ns, T_let_go, T_base_put),
-    ]
+        where = "where the hand put it" if grasps else "where it was"
+        return added, f"was not found after an execution: left {where}"
+    away_m = float(np.linalg.norm(after[:3, 3] - T[:3, 3]))
+    if grasps:
+        fell = _fallen(grasps[-1].grip.end_ns, T, turned_alike(after, T, model))
+        note = f"lay {away_m * 100:.0f} cm from where it was let go: drawn there from then on"
+        return [*added[:-1], *fell], note if away_m >= FELL_M else ""
+    if away_m <= MOVED_M:
+        return [], ""
+    note = f"was moved by {away_m * 100:.0f} cm without being held: drawn there afterwards"
+    return [_rest(end_ns, after)], note
 
 
 def _fallen(
     start_ns: int, T_start: Float[np.ndarray, "4 4"], T_end: Float[np.ndarray, "4 4"]
 ) -> list[_Span]:
-    """From one place to another, as long as a free fall takes."""
-    fall_m = max(float(T_start[2, 3] - T_end[2, 3]), 0.0)
+    """From one place to another, as long as a free fall takes over that distance."""
+    fall_m = float(np.linalg.norm(T_start[:3, 3] - T_end[:3, 3]))
     end_ns = start_ns + round(1e9 * float(np.sqrt(2 * fall_m / GRAVITY_M_S2)))
     fall = _Span(start_ns=start_ns, end_ns=end_ns, T_start=T_start, T_end=T_end, power=2)
     return [fall, _rest(end_ns, T_end)]
-
-
-def _between_pads(
-    model: ObjectModel, T_tcp_object: Float[np.ndarray, "4 4"], width_m: float
-) -> Float[np.ndarray, "4 4"]:
-    """Push a box as closing fingers do: between the pads, turned until it fits their distance.
-
-    The pads stand across the tool's y axis, equally far from it. A box that fits at no turn was
-    tilted in a way that nobody saw: it is put midway as it lay. The sides of any other shape are
-    not known as well: it stays where it was.
-    """
-    if model.shape != "box":
-        return T_tcp_object
-    T = T_tcp_object.copy()
-    T[1, 3] = 0.0  # a box has its origin at its centre
-    turns = (se3.rotation_from_vector(np.array([0.0, 0.0, turn])) for turn in _TURNS_RAD)
-    for R in (turn @ T_tcp_object[:3, :3] for turn in turns):  # the least one that fits
-        if abs(np.abs(R[1]) @ np.array(model.size_m) - width_m) <= PAD_M:
-            T[:3, :3] = R
-            break
-    return T
 
 
 def _between(

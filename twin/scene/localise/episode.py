@@ -21,6 +21,7 @@ from bridge.task.task_file import Task
 from twin.scene.align.moved_camera import MovedCamera, moved_camera
 from twin.scene.frames.camera_poses import CameraPoses, base_tree, poses_shifted
 from twin.scene.frames.selection import rgbd_camera_ids
+from twin.scene.localise.held import held_objects
 from twin.scene.localise.mesh_fit import MeshSurface, ScannedSurfaces, scanned_surfaces
 from twin.scene.localise.objects import MAX_FRAMES, MAX_VIEWS, localise_objects
 from twin.scene.localise.result import LocalisedObject
@@ -38,7 +39,7 @@ MOVED = "moved"
 """In the settings of a localisation: cameras that were found to have moved since the scan."""
 STILL_FRAMES = 3
 """Of each camera, for that."""
-LOCALISE_VERSION = 3
+LOCALISE_VERSION = 4
 """Counts changes of method that make older localisations out of date."""
 
 
@@ -168,12 +169,15 @@ def write_localised(
     if moved:
         about = {key: item.to_record() for key, item in moved.items()}
         derived = replace(derived, settings={**derived.settings, MOVED: about})
-    phases = _localised_phases(episode, task, scanned, trial_cameras(run, episode, moved))
+    poses = trial_cameras(run, episode, moved)
+    phases = _localised_phases(episode, task, scanned, poses)
+    held = held_objects(episode, task, scanned.surfaces, poses)
     path.unlink(missing_ok=True)
     with EpisodeWriter(path) as writer:
         writer.describe(episode.info, derived=derived)
         for phase, objects in phases:
-            _write_phase(writer, _cell_of(episode), phase, objects, base_frame)
+            in_hand = held.get(phase.plan_id or "", {})
+            _write_phase(writer, _cell_of(episode), phase, objects, base_frame, in_hand)
     return path
 
 
@@ -274,10 +278,13 @@ def _write_phase(
     phase: Phase,
     objects: dict[str, LocalisedObject],
     base_frame: str,
+    in_hand: Mapping[str, Any],
 ) -> None:
     for object_id, found in objects.items():
         stamp_ns = found.stamp_ns or phase.after_ns or phase.before_ns or 0
         record = {**found.to_record(), "phase": phase.name, "plan_id": phase.plan_id}
+        if object_id in in_hand:
+            record["in_hand"] = in_hand[object_id]
         writer.write_json(
             cell_topic(cell, LOCALISATION),
             record,

@@ -1,5 +1,7 @@
 """The surface of a known shape, and where to begin laying it onto points."""
 
+from itertools import permutations, product
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
@@ -34,12 +36,24 @@ def turned_alike(
     T_base_expected: Float[np.ndarray, "4 4"],
     model: ObjectModel,
 ) -> Float[np.ndarray, "4 4"]:
-    """Of the poses in which an object looks the same, the one turned nearest to another."""
+    """Of the poses in which an object looks the same, the one turned nearest to another.
+
+    A solid box may also stand on any of its other sides.
+    """
     period = yaw_period_rad(model)
     turns = [
         se3.rotation_from_vector(np.array([0.0, 0.0, k * period]))
         for k in range(round(2 * np.pi / period))
     ]
+    if model.shape == "box":
+        axes = (
+            np.diag(s)[list(p)] for s in product((1, -1), repeat=3) for p in permutations((0, 1, 2))
+        )
+        turns = [
+            R
+            for R in axes
+            if np.linalg.det(R) > 0 and np.allclose(abs(R) @ model.size_m, model.size_m)
+        ]
     best = min(
         (T_base_object[:3, :3] @ turn for turn in turns),
         key=lambda R: float(se3.rotation_angle_rad(R.T @ T_base_expected[:3, :3])),

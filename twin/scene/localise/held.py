@@ -1,0 +1,173 @@
+"""How objects lie in the hand while they are carried: seen by all cameras in the tool's frame.
+
+Fingers that come down on a thing push and tilt it in ways that no joint tells of. Between them it
+stands still: frames taken on the way are views of one scene in the tool's frame.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import streams
+from bridge.episode.executions import executed_events
+from bridge.episode.reader import Episode
+from bridge.episode.streams import RgbdFrame
+from bridge.errors import GstError
+from bridge.geometry import se3
+from bridge.task.task_file import SCANNED, ObjectModel, Task
+from twin.robot.model import RobotModel, load_robot
+from twin.robot.posture import PostureTrack, posture_track
+from twin.scene.frames.camera_poses import CameraPoses, base_tree
+from twin.scene.frames.pairing import paired_stamps_ns
+from twin.scene.frames.selection import rgbd_camera_ids, spread, with_true_depth
+from twin.scene.localise.mesh_fit import MIN_EXPLAINED, MeshSurface, fit_mesh, known_surface
+from twin.scene.localise.points import MIN_POINTS, fuse_stationary, object_points
+from twin.scene.localise.stationary_frames import Poses
+
+BETWEEN_M = 0.03
+"""An object this near to the tool, beside half its largest side, is between the fingers."""
+PLATEAU_M = 0.003
+"""Fingers that are this near to the least opening of a grasp grasp what is between them."""
+EMPTY_M = 0.002
+"""Fingers that close to less have nothing between them."""
+SETTLES_NS = 200_000_000
+"""After closing and before opening the object may move in the hand."""
+FRAMES = 4
+"""Of each camera."""
+MAX_SEEN_THROUGH = 0.1
+"""With more of its surface seen through it lies in the hand in another way."""
+ANY_TILT_RAD = 10.0
+UPWARDS = np.diag([1.0, -1.0, -1.0, 1.0])
+"""The tool's frame with z out of the hand, where cameras look from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip:
+    """A stretch of time in which the fingers were closed around something."""
+
+    closing_ns: int
+    """From here on they came nearer to each other than half way."""
+    start_ns: int
+    end_ns: int
+    T_base_tcp_start: Float[np.ndarray, "4 4"]
+    T_base_tcp_end: Float[np.ndarray, "4 4"]
+
+
+def executions_ns(episode: Episode) -> dict[str, tuple[int, int]]:
+    """When each plan was executed, from start to end."""
+    events = executed_events(episode)
+    found = {}
+    for event in events:
+        if event["type"] == "execution_ended" and event.get("plan_id") is not None:
+            start_ns, end_ns = streams.execution_ns(events, str(event["plan_id"]))
+            if start_ns is not None and end_ns is not None:
+                found[str(event["plan_id"])] = (start_ns, end_ns)
+    return found
+
+
+def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns: int) -> list[Grip]:
+    """When the fingers stood closed around something, by their recorded opening."""
+    widths = track.widths
+    if widths is None:
+        return []
+    inside = (widths.stamps_ns >= start_ns) & (widths.stamps_ns <= end_ns)
+    stamps, width_m = widths.stamps_ns[inside], widths.position[inside, 0]
+    if len(stamps) == 0 or np.ptp(width_m) < PLATEAU_M:
+        return []
+    is_closed = width_m < (width_m.min() + width_m.max()) / 2
+    edges = np.flatnonzero(np.diff(is_closed.astype(np.int8), prepend=0, append=0))
+    grips = []
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        least_m = float(width_m[first:last].min())
+        held = first + np.flatnonzero(width_m[first:last] <= least_m + PLATEAU_M)
+        if least_m < EMPTY_M:
+            continue
+        t0, t1 = int(stamps[held[0]]), int(stamps[held[-1]])
+        T0, T1 = (robot.T_base_tcp(track.at(t).joints_rad) for t in (t0, t1))
+        grips.append(
+            Grip(
+                closing_ns=int(stamps[first]),
+                start_ns=t0,
+                end_ns=t1,
+                T_base_tcp_start=T0,
+                T_base_tcp_end=T1,
+            )
+        )
+    return grips
+
+
+def held_objects(
+    episode: Episode, task: Task, surfaces: Mapping[str, MeshSurface], poses: Poses
+) -> dict[str, dict[str, list[dict[str, Any]]]]:
+    """What localisation records say of rigid objects in the hand, by plan and object.
+
+    Each entry has ``grip_ns``, when the fingers stood closed, and ``T_tcp_object``.
+    """
+    try:
+        track = posture_track(episode)
+        robot = load_robot(track.urdf)
+    except GstError:
+        return {}
+    shapes = {
+        name: surfaces[name] if model.shape == SCANNED else known_surface(model)
+        for name, model in task.objects.items()
+        if not model.fixed and model.soft is None and (model.shape != SCANNED or name in surfaces)
+    }
+    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for plan_id, ends_ns in executions_ns(episode).items():
+        for grip in grips_between(track, robot, *ends_ns):
+            frames = list(_in_tool_frame(episode, grip, track, robot, poses))
+            for name, surface in shapes.items():
+                T = fitted_in_hand(frames, task, task.objects[name], surface)
+                if T is not None:
+                    entry = {"grip_ns": grip.start_ns, "T_tcp_object": se3.pose_record(T)}
+                    found.setdefault(plan_id, {}).setdefault(name, []).append(entry)
+    return found
+
+
+def _in_tool_frame(
+    episode: Episode, grip: Grip, track: PostureTrack, robot: RobotModel, poses: Poses
+) -> Iterator[RgbdFrame]:
+    """Frames of all cameras during a grip, posed in the tool's frame turned ``UPWARDS``."""
+    tree = base_tree(episode)
+    for camera_id in rgbd_camera_ids(episode):
+        with suppress(GstError):  # others may see it
+            known = poses.get(camera_id) or CameraPoses(tree=tree, source="tf")
+            stamps = paired_stamps_ns(episode, camera_id)
+            stamps = stamps[(stamps > grip.start_ns + SETTLES_NS)]
+            stamps = np.setdiff1d(stamps[stamps < grip.end_ns - SETTLES_NS], [*known.unposed_ns])
+            wanted = set(spread(stamps, FRAMES).tolist())
+            if (
+                known.tree.root_of(streams.camera_info(episode, camera_id).frame_id)
+                == robot.record.base_frame
+            ):
+                for frame in streams.rgbd_frames(episode, camera_id, known.tree, wanted):
+                    T_base_tcp = robot.T_base_tcp(track.at(frame.stamp_ns).joints_rad)
+                    T = UPWARDS @ se3.invert(T_base_tcp)
+                    yield replace(
+                        with_true_depth(frame, known),
+                        T_base_color=T @ frame.T_base_color,
+                        T_base_depth=T @ frame.T_base_depth,
+                    )
+
+
+def fitted_in_hand(
+    frames: Sequence[RgbdFrame], task: Task, model: ObjectModel, surface: MeshSurface
+) -> Float[np.ndarray, "4 4"] | None:
+    """Pose ``T_tcp_object`` of an object between the fingers; None where none is seen there."""
+    views = fuse_stationary(frames, FRAMES, FRAMES, replace(task, start={}))
+    reach_m = BETWEEN_M + max(model.size_m) / 2
+    near = [
+        group
+        for group in object_points(views, model, -np.inf)
+        if len(group) >= MIN_POINTS and np.linalg.norm(group.p_base.mean(axis=0)) < reach_m
+    ]
+    if not near:
+        return None
+    fit = fit_mesh(near[0], views, surface, tilt_sigma_rad=ANY_TILT_RAD, lying=True)
+    is_it = fit.explained >= MIN_EXPLAINED and fit.seen_through <= MAX_SEEN_THROUGH
+    return UPWARDS @ fit.T_base_object if is_it else None
