@@ -25,7 +25,7 @@ from twin.scene.frames.downscaled import pixels_of
 from twin.scene.least_squares import normal_equations, tukey_weights
 from twin.scene.localise.outline import Outline, find_outlines, outline_distances
 from twin.scene.localise.points import CameraView, Cluster
-from twin.scene.shape.known import pose_of, shape_mesh, starts, yaw_period_rad
+from twin.scene.shape.known import pose_of, shape_mesh, yaw_period_rad
 from twin.scene.shape.mesh import face_normals, read_mesh
 from twin.scene.store.folder import UnreadableSceneError, read_record
 from twin.scene.store.library import MESH, TASK_SHAPE, Library
@@ -201,8 +201,8 @@ _SIDES = [
 ]
 
 
-NUM_STARTS = 12
-"""Turns about the vertical that are tried."""
+START_STEP_RAD = np.radians(30)
+"""Between turns about the vertical that are tried."""
 NUM_REFINED = 3
 """Of them, the best are followed to the end."""
 COARSE_POINTS = 150
@@ -263,8 +263,7 @@ def fit_mesh(
         views: What the cameras saw, in the order of the cluster's ``view_ids``.
         tilt_sigma_rad: Prior of roll and pitch: small for what stands, large for what may lie.
         lying: Try all six sides, each in half as many turns.
-        box: It starts along the smallest rectangle around the points instead, and is laid onto
-            its outlines in a shrinking window.
+        box: It is laid onto its outlines, too, in a shrinking window.
     """
     cluster = cluster.thinned(MAX_POINTS)
     centre = cluster.p_base.mean(axis=0)
@@ -288,11 +287,9 @@ def fit_mesh(
         cluster=few,
         points=few.by_view(len(views)),
     )
-    sides, count = (_SIDES, NUM_STARTS // 2) if lying else (_SIDES[:1], NUM_STARTS)
-    if box is None:
-        first = [T for side in sides for T in _starts(problem, count, side, yaw_period_rad)]
-    else:
-        first = [pose_of(state) for state in starts(cluster.p_base, box)]
+    sides, step_rad = (_SIDES, 2 * START_STEP_RAD) if lying else (_SIDES[:1], START_STEP_RAD)
+    yaws = np.arange(0.0, yaw_period_rad - 1e-9, step_rad)
+    first = [T for side in sides for T in _starts(problem, yaws, side)]
     unshifted = np.zeros((len(views), _PER_VIEW))
     tried = [_icp(T, unshifted, coarse, iterations=6, wide=4.0)[0] for T in first]
     scores = [_score(T, unshifted, coarse)[0] for T in tried]
@@ -329,7 +326,7 @@ def fit_box(cluster: Cluster, views: Sequence[CameraView], model: ObjectModel) -
 
 
 def _starts(
-    problem: _Problem, count: int, side: Float[np.ndarray, "3 3"], period_rad: float
+    problem: _Problem, yaws_rad: Float[np.ndarray, " num_yaws"], side: Float[np.ndarray, "3 3"]
 ) -> list[Float[np.ndarray, "4 4"]]:
     """Standing on one side, turned about the vertical, the middle over that of the points."""
     p = problem.cluster.p_base
@@ -337,10 +334,7 @@ def _starts(
     top = float((problem.surface.p_m @ side[2]).max())
     standing = se3.from_rotation(side, np.zeros(3))
     state = np.array([*(low + high)[:2] / 2, high[2] - top, 0.0])
-    return [
-        pose_of(state + np.array([0, 0, 0, yaw])) @ standing
-        for yaw in np.arange(count) * period_rad / count
-    ]
+    return [pose_of(state + np.array([0, 0, 0, yaw])) @ standing for yaw in yaws_rad]
 
 
 def _residuals(

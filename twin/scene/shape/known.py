@@ -1,4 +1,4 @@
-"""The surface of a known shape, and where to begin laying it onto points."""
+"""The surface of a known shape, and how it may be turned."""
 
 from itertools import permutations, product
 
@@ -59,36 +59,6 @@ def turned_alike(
         key=lambda R: float(se3.rotation_angle_rad(R.T @ T_base_expected[:3, :3])),
     )
     return se3.from_rotation(best, T_base_object[:3, 3])
-
-
-def starts(
-    points: Float[np.ndarray, "num_points 3"], model: ObjectModel
-) -> list[Float[np.ndarray, "4"]]:
-    """Candidate states: where a side is cut off, the known size is laid along either end."""
-    z = model.rest_height_m
-    if model.origin_at_centre:
-        z = float(np.percentile(points[:, 2], 95)) - model.size_m[2] / 2
-    yaw = rectangle_yaw_rad(points[:, :2])
-    turns = np.arange(0.0, yaw_period_rad(model) - 1e-9, np.pi / 2)
-    states = []
-    for turn in turns:
-        c, s = np.cos(yaw + turn), np.sin(yaw + turn)
-        local = points[:, :2] @ np.array([[c, -s], [s, c]])
-        low, high = np.percentile(local, [1, 99], axis=0)
-        choices = []
-        for axis in (0, 1):
-            size = model.size_m[axis]
-            whole = abs(high[axis] - low[axis] - size) < max(0.01, size / 4)
-            middle = (low[axis] + high[axis]) / 2
-            choices.append(
-                (middle,) if whole else (low[axis] + size / 2, middle, high[axis] - size / 2)
-            )
-        states += [
-            np.array([c * u - s * v, s * u + c * v, z, yaw + turn])
-            for u in choices[0]
-            for v in choices[1]
-        ]
-    return states
 
 
 def rectangle_yaw_rad(xy: Float[np.ndarray, "num_points 2"], kept_percent: float = 98.0) -> float:

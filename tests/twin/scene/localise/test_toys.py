@@ -61,7 +61,7 @@ def test_what_looks_the_same_from_behind_is_said_to_be_doubtful(
     group = Cluster(
         p_base=points, view_ids=np.repeat(np.arange(len(views)), [len(rows) for rows in seen])
     )
-    monkeypatch.setattr(mesh_fit, "NUM_REFINED", mesh_fit.NUM_STARTS)
+    monkeypatch.setattr(mesh_fit, "NUM_REFINED", 12)
     fit = mesh_fit.fit_mesh(group, views, surface, tilt_sigma_rad=0.01)
     assert np.degrees(np.sqrt(fit.covariance[5, 5])) > 45.0
 
