@@ -46,11 +46,11 @@ class _Span:
     @property
     def stands(self) -> bool:
         """Whether it does not move in the base frame."""
-        return self.T_start is self.T_end
+        return self.T_start is self.T_end and not self.in_hand
 
     def pose(self, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
         """Where it is then."""
-        if self.stands:
+        if self.T_start is self.T_end:
             return self.T_end
         share = (stamp_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
         return _between(self.T_start, self.T_end, float(np.clip(share, 0.0, 1.0)) ** self.power)
@@ -137,9 +137,10 @@ def carried_tracks(
                 if track is not None and robot is not None and not model.fixed
                 else []
             )
-            grasps = _grasps(model, spans[name][-1].T_end, grips, _held(name, plan_id, localised))
+            T, held = spans[name][-1].T_end, _held(name, plan_id, localised)
+            carried = _carried(model, T, grips, held)
             after = seen.get(plan_id)
-            added, note = _moved(model, spans[name][-1].T_end, grasps, after, end_ns)
+            added, note = _moved(model, carried or [_rest(end_ns, T)], after, held=bool(carried))
             spans[name] += added
             notes += [f"{name} {note}"] if note else []
     return ObjectTracks(spans=spans, absent=frozenset(absent), notes=tuple(notes))
@@ -169,77 +170,61 @@ def _held(
     return {int(each["grip_ns"]): se3.pose_from_record(each["T_tcp_object"]) for each in entries}
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Grasp:
-    """A grip that had the object between the fingers."""
-
-    grip: Grip
-    T_base_lay: Float[np.ndarray, "4 4"]
-    """Pose of the object before the fingers closed."""
-    T_tcp_object: Float[np.ndarray, "4 4"]
-    """Its pose in the hand when they had closed."""
-
-    @property
-    def T_base_put(self) -> Float[np.ndarray, "4 4"]:
-        """Pose of the object when they opened, if it did not slip."""
-        return np.asarray(self.grip.T_base_tcp_end @ self.T_tcp_object)
-
-    def spans(self) -> list[_Span]:
-        """Pushed by the closing fingers, carried, and left where they opened."""
-        grip, T = self.grip, self.T_tcp_object
-        return [
-            _Span(
-                start_ns=grip.closing_ns,
-                end_ns=grip.start_ns,
-                T_start=self.T_base_lay,
-                T_end=grip.T_base_tcp_start @ T,
-            ),
-            _Span(in_hand=True, start_ns=grip.start_ns, end_ns=grip.end_ns, T_start=T, T_end=T),
-            _rest(grip.end_ns, self.T_base_put),
-        ]
-
-
-def _grasps(
+def _carried(
     model: ObjectModel,
     T_base_object: Float[np.ndarray, "4 4"],
     grips: Sequence[Grip],
     held: Mapping[int, Float[np.ndarray, "4 4"]],
-) -> list[_Grasp]:
-    """Those grips that had this object between the fingers, each from where the last one put it."""
+) -> list[_Span]:
+    """Pushed by closing fingers, carried, and left where they opened; each from there again."""
     reach_m = BETWEEN_M + max(model.size_m) / 2
-    T, grasps = T_base_object, []
+    T, spans = T_base_object, []
     for grip in grips:
-        T_tcp_object = se3.invert(grip.T_base_tcp_start) @ T
+        T_hand = se3.invert(grip.T_base_tcp_start) @ T
         if grip.start_ns in held:
-            T_tcp_object = turned_alike(held[grip.start_ns], T_tcp_object, model)
-        if np.linalg.norm(T_tcp_object[:3, 3]) < reach_m:
-            grasps.append(_Grasp(grip=grip, T_base_lay=T, T_tcp_object=T_tcp_object))
-            T = grasps[-1].T_base_put
-    return grasps
+            T_hand = turned_alike(held[grip.start_ns], T_hand, model)
+        if np.linalg.norm(T_hand[:3, 3]) < reach_m:
+            start_ns, taken = grip.start_ns, grip.T_base_tcp_start @ T_hand
+            spans += [
+                _Span(start_ns=grip.closing_ns, end_ns=start_ns, T_start=T, T_end=taken),
+                _Span(
+                    in_hand=True,
+                    start_ns=start_ns,
+                    end_ns=grip.end_ns,
+                    T_start=T_hand,
+                    T_end=T_hand,
+                ),
+                _rest(grip.end_ns, grip.T_base_tcp_end @ T_hand),
+            ]
+            T = spans[-1].T_end
+    return spans
 
 
 def _moved(
     model: ObjectModel,
-    T_base_lay: Float[np.ndarray, "4 4"],
-    grasps: Sequence[_Grasp],
+    spans: Sequence[_Span],
     after: Float[np.ndarray, "4 4"] | None,
-    end_ns: int,
+    *,
+    held: bool,
 ) -> tuple[list[_Span], str]:
-    """What one execution did to an object, and what had to be assumed."""
-    added = [span for grasp in grasps for span in grasp.spans()]
-    T = grasps[-1].T_base_put if grasps else T_base_lay
+    """What one execution did to an object, and what had to be assumed.
+
+    Args:
+        spans: By the joints; the last one is where it lies then.
+    """
+    *before, rest = spans
     if after is None:
-        where = "where the hand put it" if grasps else "where it was"
-        return added, f"was not found after an execution: left {where}"
-    away_m = float(np.linalg.norm(after[:3, 3] - T[:3, 3]))
-    if grasps:
-        fell = _fallen(grasps[-1].grip.end_ns, T, turned_alike(after, T, model))
+        where = "where the hand put it" if held else "where it was"
+        return [*before, rest], f"was not found after an execution: left {where}"
+    away_m = float(np.linalg.norm(after[:3, 3] - rest.T_end[:3, 3]))
+    if held:
+        fell = _fallen(rest.start_ns, rest.T_end, turned_alike(after, rest.T_end, model))
         note = f"lay {away_m * 100:.0f} cm from where it was let go: drawn there from then on"
-        return [*added[:-1], *fell], note if away_m >= FELL_M else ""
+        return [*before, *fell], note if away_m >= FELL_M else ""
     if away_m <= MOVED_M:
         return [], ""
     note = f"was moved by {away_m * 100:.0f} cm without being held: drawn there afterwards"
-    return [_rest(end_ns, after)], note
+    return [_rest(rest.start_ns, after)], note
 
 
 def _fallen(

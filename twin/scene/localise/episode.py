@@ -177,7 +177,7 @@ def write_localised(
         writer.describe(episode.info, derived=derived)
         for phase, objects in phases:
             in_hand = held.get(phase.plan_id or "", {})
-            _write_phase(writer, _cell_of(episode), phase, objects, base_frame, in_hand)
+            _write_phase(writer, episode.info.cell or "cell", phase, objects, base_frame, in_hand)
     return path
 
 
@@ -262,14 +262,6 @@ def _made_from(path: Path, derived: Derived) -> bool:
         and provenance.hash_settings({k: v for k, v in found.settings.items() if k != MOVED})
         == provenance.hash_settings(derived.settings)
     )
-
-
-def _cell_of(episode: Episode) -> str:
-    if episode.info.cell:
-        return episode.info.cell
-    for topic in episode.topics_of_type(schema.COMPRESSED_IMAGE):
-        return topic.split("/")[1]
-    return "cell"
 
 
 def _write_phase(
