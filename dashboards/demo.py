@@ -13,7 +13,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,6 +36,7 @@ from dashboards.standin_settings import BUILT_IN_POLICY, DemoConfig
 
 ENOUGH_TRIALS = 20
 """In a group, before the correlation over groups is believed; robot-gst trials makes so many."""
+RECORDER_READY = "listens on"
 START_TIMEOUT_S = 300.0
 STOP_TIMEOUT_S = 60.0
 
@@ -64,12 +65,12 @@ class Background:
         if code is not None:
             raise StepFailedError(command=self.command, code=code, log=self.log)
 
-    def wait_until(self, ready: Callable[[], bool]) -> None:
-        """Wait until it answers; raises when it ends or stays silent."""
+    def wait_for(self, words: str) -> None:
+        """Wait until it has said something; raises when it ends or stays silent."""
         deadline = time.monotonic() + START_TIMEOUT_S
         while time.monotonic() < deadline:
             self.check()
-            if ready():
+            if words in self.log.read_text(errors="replace"):
                 return
             time.sleep(0.1)
         message = f"'{self.command}' did not answer in {START_TIMEOUT_S:.0f} s; see {self.log}."
@@ -267,8 +268,8 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
     logs.mkdir(parents=True, exist_ok=True)
     standin = ["publish", "standin", "--connect", endpoint, "--seed", str(config.seed)]
     output.say("1/6 starting the recorder (zenoh on the loopback address)")
-    with running(["record", path, "--listen", endpoint], logs / "record.log") as recorder:
-        recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
+    record = ["record", path, "--listen", endpoint]
+    with running(record, logs / "record.log", RECORDER_READY) as recorder:
         if not found.unscanned:
             output.say("2/6 the scans are recorded; they are kept and used")
         for task in found.unscanned:  # each from a start of its own: what one hides another shows
@@ -407,28 +408,15 @@ def start_command(
 
 
 @contextmanager
-def running(arguments: list[str], log: Path, words: str = "") -> Iterator[Background]:
+def running(arguments: list[str], log: Path, words: str) -> Iterator[Background]:
     """Leave a command running while the context lasts, which begins when it has said something."""
     with ExitStack() as stack, log.open("wb") as stream:
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
         process = start_command(arguments, stdout=stream, stderr=subprocess.STDOUT, env=environment)
         stack.callback(stop_command, process)
         started = Background(command=f"robot-gst {' '.join(arguments)}", process=process, log=log)
-        started.wait_until(lambda: words in log.read_text(errors="replace"))
+        started.wait_for(words)
         yield started
-
-
-def answers(endpoint: str, key: str) -> bool:
-    """Whether somebody answers a question at an endpoint."""
-    from bridge.wire.config import WireConfig  # noqa: PLC0415  # zenoh only when recording
-    from bridge.wire.session import open_session  # noqa: PLC0415
-
-    try:
-        with open_session(WireConfig(connect=(endpoint,))) as session:
-            session.query(key, b"{}", timeout_s=1.0)
-    except GstError:
-        return False
-    return True
 
 
 def free_port() -> int:

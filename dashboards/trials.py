@@ -40,9 +40,9 @@ from bridge.task.protocol import (
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
 from dashboards.demo import (
+    RECORDER_READY,
     Background,
     StepFailedError,
-    answers,
     cut_short,
     ending_on_signals,
     free_port,
@@ -332,8 +332,7 @@ def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Out
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     log = run.notes_dir / "logs" / "record_scans.log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    with running(["record", str(run.path), "--listen", endpoint], log) as recorder:
-        recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
+    with running(["record", str(run.path), "--listen", endpoint], log, RECORDER_READY) as recorder:
         for job in wanted.values():
             standin = ["publish", "standin", "--connect", endpoint]
             standin += ["--seed", str(job.session_seed), "--first-start", str(job.start)]
@@ -405,14 +404,12 @@ def _laboratory(
     with ExitStack() as stack:
         there: list[Background] = []
 
-        def start(name: str, arguments: list[str], words: str = "") -> Background:
+        def start(name: str, arguments: list[str], words: str) -> None:
             log = logs / f"{name}_{index}.log"
             there.append(stack.enter_context(running(arguments, log, words)))
-            return there[-1]
 
         own = ["--listen", endpoint, "--shares-folder"]  # each job numbers its own episodes
-        recorder = start("record", ["record", str(run.path), *own])
-        recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
+        start("record", ["record", str(run.path), *own], RECORDER_READY)
         start("gate", ["gate", str(run.path), "--samples", "0", *connect], "gate ready")
         if {job.policy for job in jobs} - {BUILT_IN_POLICY, *config.acting()}:
             model = ["--model", config.model, "--model-name", config.model_name]

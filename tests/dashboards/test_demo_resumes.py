@@ -74,10 +74,10 @@ def without_commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
     def command(words: list[str]) -> list[str]:
         asked.append(words)
-        return [sys.executable, "-c", "print('ready', flush=True); import time; time.sleep(0.2)"]
+        said = "print('ready, listens on', flush=True)"
+        return [sys.executable, "-c", f"{said}; import time; time.sleep(0.2)"]
 
     monkeypatch.setattr(demo, "_command", command)
-    monkeypatch.setattr(demo, "answers", lambda *_: True)
     monkeypatch.setattr(demo.Background, "check", lambda _: None)
     return asked
 

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -223,8 +222,7 @@ def test_each_task_is_scanned_once_before_its_first_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, asked = RunFolder.create(tmp_path / "run"), list[str]()
-    recorder = SimpleNamespace(wait_until=lambda ready: None)
-    monkeypatch.setattr(trials, "running", lambda *_: nullcontext(recorder))
+    monkeypatch.setattr(trials, "running", lambda *_: nullcontext())
     monkeypatch.setattr(trials, "scan_task", lambda task, *_: asked.append(task))
     both = jobs_of(*protocol_of(replace(STUDY, task=("cube_into_box", "stack_two_cubes"))))
     with EpisodeWriter(run.episodes_dir / "scan_0001.mcap") as writer:

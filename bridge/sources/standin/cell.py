@@ -21,6 +21,7 @@ from bridge.sources.standin.surfaces import (
     robot_surfaces,
 )
 from bridge.sources.standin.world import World
+from bridge.task.causes import Cause
 from bridge.task.predicate import Rollout
 from bridge.task.task_file import Task
 
@@ -30,6 +31,8 @@ GRIPPER_NS = ns_from_s(1 / 50)
 FRAMES_NS = ns_from_s(1 / 60)
 """Of ``/tf``; the wrist camera moves less than a millimetre off a straight line in between."""
 TRUTH_NS = ns_from_s(1 / 30)
+PRESSED_NS, FORCE_N = ns_from_s(0.04), ROBOT.contact_force_N or np.inf
+"""Pressed harder for so long the arm stops by itself."""
 FINGER_SPEED_M_S = 0.15
 """How fast the gripper's controller closes the opening."""
 HOME_SEED_RAD = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
@@ -116,6 +119,7 @@ class StandinCell:
         self._should_stop = should_stop
         self.target_rad, self._width_m = self.home_rad, MAX_WIDTH_M
         self._width_target_m = MAX_WIDTH_M
+        self.stopped, self._pressed_ns = "", 0
         self._due = dict.fromkeys(("gripper", "truth", "camera", "frames"), start_ns)
         self.cameras_running = False
 
@@ -137,6 +141,7 @@ class StandinCell:
             Ts_base_object = self.hidden.deviations.put_down(self.world.task, Ts_base_object)
         self.target_rad = self.home_rad
         self._width_m = self._width_target_m = MAX_WIDTH_M
+        self.stopped, self._pressed_ns = "", 0
         self.world.reset(self.home_rad - self.hidden.joint_offset_rad, Ts_base_object)
         self.truth = TruthLog()
 
@@ -168,10 +173,12 @@ class StandinCell:
         times_ns: Int[np.ndarray, " num_waypoints"],
         joints_rad: Float[np.ndarray, "num_waypoints 6"],
     ) -> None:
-        """Send joint targets, interpolated between waypoints; times count from now."""
+        """Send joint targets, interpolated between waypoints, from now on; a stop ends it."""
         ticks_ns = np.arange(1, round(int(times_ns[-1]) / TICK_NS) + 1) * TICK_NS
         columns = [np.interp(ticks_ns, times_ns, joints_rad[:, joint]) for joint in range(6)]
         for row in np.stack(columns, axis=1):
+            if self.stopped:
+                return
             self.target_rad = row
             self._tick()
 
@@ -186,17 +193,36 @@ class StandinCell:
         self._width_m += float(np.clip(self._width_target_m - self._width_m, -step, step))
         # The controller closes its loop on encoder readings, which are off by a constant.
         self.world.command(self.target_rad - self.hidden.joint_offset_rad, self._width_m)
-        efforts_Nm = np.zeros(6)
+        efforts_Nm, pressed_N = np.zeros(6), np.zeros(3)
         for _ in range(self._steps_per_tick):
             self.world.step()
             efforts_Nm += self.world.joint_efforts_Nm / self._steps_per_tick
+            pressed_N += self.world.arm_force_N() / self._steps_per_tick
         self.now_ns += TICK_NS
+        self._stop_where_pressed(float(np.linalg.norm(pressed_N)))
         self._publish_robot(efforts_Nm)
         if self._is_due("truth", TRUTH_NS):
             self._publish_truth()
         rate = self.config.rate_hz
         if self.cameras_running and rate > 0 and self._is_due("camera", ns_from_s(1 / rate)):
             self.capture()
+
+    def _stop_where_pressed(self, force_N: float) -> None:
+        """The protective stop: the arm holds where it is until the next reset, and says so."""
+        self._pressed_ns = self._pressed_ns + TICK_NS if force_N > FORCE_N else 0
+        if self.stopped or self._pressed_ns < PRESSED_NS:
+            return
+        self.target_rad = self.encoders_rad
+        detail = f"the arm is pressed with {force_N:.0f} N, the limit is {FORCE_N:g} N"
+        self.stopped = f"{Cause.CONTACT_FORCE}: {detail}"
+        data = {"cause": Cause.CONTACT_FORCE, "force_N": round(force_N, 1), "limit_N": FORCE_N}
+        self.streams.event("mark", self.now_ns, text=f"protective stop: {detail}", data=data)
+
+    @property
+    def encoders_rad(self) -> Float[np.ndarray, "6"]:
+        """Where the controller believes the arm to be, but for the noise of its encoders."""
+        world = self.world
+        return np.asarray(world.joints_rad + world.slack_rad + self.hidden.joint_offset_rad)
 
     def _is_due(self, name: str, period_ns: int) -> bool:
         if self.now_ns < self._due[name]:
@@ -207,7 +233,7 @@ class StandinCell:
     def _publish_robot(self, efforts_Nm: Float[np.ndarray, "6"]) -> None:
         world, streams = self.world, self.streams
         noise = self._rng.normal(0.0, self.file.sensors.encoder_noise_rad, 6)
-        encoders = world.joints_rad + world.slack_rad + self.hidden.joint_offset_rad + noise
+        encoders = self.encoders_rad + noise
         streams.joints(encoders, world.joint_speeds_rad_s, efforts_Nm, self.now_ns)
         streams.tcp(self.kinematics.T_base_tcp(encoders), self.now_ns)
         if self._is_due("frames", FRAMES_NS):

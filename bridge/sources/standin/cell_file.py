@@ -200,12 +200,10 @@ def _clutter_from(table: dict[str, Any]) -> Clutter:
     if shape != "box" and shape not in CLUTTER:
         message = f"clutter shape {shape!r}; known: box, {', '.join(sorted(CLUTTER))}"
         raise ValueError(message)
-    yaw = table["yaw_rad"]
-    q = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
     return Clutter(
         shape=shape,
         size_m=tuple(table["size_m"]),
-        T_base_clutter=se3.transform_from(q, np.array(table["p_m"])),
+        T_base_clutter=se3.small_motion(np.array([0.0, 0.0, table["yaw_rad"], *table["p_m"]])),
         color_srgb=tuple(table.get("color_srgb", (128, 128, 128))),
     )
 
@@ -232,8 +230,7 @@ def _mount_pose(table: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     if "eye_m" in table:
         up = np.array([0.0, 0.0, 1.0])
         return se3.look_at(np.array(table["eye_m"]), np.array(table["target_m"]), up)
-    c, s = np.cos(table["tilt_rad"]), np.sin(table["tilt_rad"])
-    tilt = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    tilt = se3.rotation_from_vector(np.array([table["tilt_rad"], 0.0, 0.0]))
     return se3.from_rotation(np.array(table["R_columns"]).T @ tilt, table["p_m"])
 
 
@@ -282,7 +279,7 @@ def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenPa
     for camera_id in sorted(cell.cameras):
         shift = rng.normal(0.0, cell.normal[f"{camera_id}_camera_m"], 3)
         turn = rng.normal(0.0, cell.normal[f"{camera_id}_camera_rad"], 3)
-        errors[camera_id] = small_transform(shift, turn)
+        errors[camera_id] = se3.small_motion(np.concatenate([turn, shift]))
     offset = rng.normal(0.0, cell.normal["joint_offset_rad"], len(ARM_JOINTS))
     deviations = None
     if cell.deviations:
@@ -296,16 +293,6 @@ def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenPa
     return HiddenParameters(
         joint_offset_rad=offset, camera_errors=errors, deviations=deviations, **uniform
     )
-
-
-def small_transform(
-    shift_m: Float[np.ndarray, "3"], turn_rad: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """Build a transform from a translation and a rotation vector [rad]."""
-    angle = float(np.linalg.norm(turn_rad))
-    axis = turn_rad / angle if angle > 0 else np.array([1.0, 0.0, 0.0])
-    q = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
-    return se3.transform_from(q, shift_m)
 
 
 def read_tables(path: Path) -> dict[str, Any]:

@@ -189,10 +189,11 @@ class Decider:
         cell, plan, verdict = self._cell, decision.plan, decision.verdict
         if plan is None or verdict is None:
             return decision
-        joints = cell.world.joints_rad + cell.world.slack_rad + cell.hidden.joint_offset_rad
         places = cell.world.Ts_base_object()
         moved = {name: T[:3, 3] - self._stood[name] for name, T in places.items()}
-        why = why_stale(verdict, plan.to_json(), cell.now_ns, joints, moved, self._judged_in())
+        why = why_stale(
+            verdict, plan.to_json(), cell.now_ns, cell.encoders_rad, moved, self._judged_in()
+        )
         return decision if not why else self._unverified(plan, f"the gate's yes is void: {why}")
 
     def _judged_in(self) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M, ROBOT
 from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.sources.standin.cell import TICK_NS, StandinCell
 from bridge.sources.standin.streams import Session
+from bridge.task.causes import Cause
 from bridge.task.predicate import all_hold, evaluate_success
 
 HOLD_NS, STOP_NS = ns_from_s(0.2), ns_from_s(1.0)
@@ -60,7 +61,7 @@ class Controller:
             return "", f"no policy acts: {error}"
         except (ValueError, KeyError, TypeError) as error:
             return "", f"what answers on {self._key} is no policy's runner ({error!r})"
-        if stopped.startswith(("limits", "tracking")):
+        if stopped.startswith((Cause.CONTACT_FORCE, "limits", "tracking")):
             return stopped, ""
         if told.get("done"):
             return "", ""
@@ -90,8 +91,9 @@ class Controller:
                 line.hold(cell.now_ns)
             cell.follow(np.array([TICK_NS]), line.at(cell.now_ns + TICK_NS)[None])
             sent.append(cell.target_rad)
-            there_rad = cell.world.joints_rad + cell.hidden.joint_offset_rad
-            off_rad = np.abs(there_rad - np.array(sent)).min(axis=0)
+            if cell.stopped:
+                return cell.stopped
+            off_rad = np.abs(cell.encoders_rad - np.array(sent)).min(axis=0)
             if off_rad.max() > TRACKING_RAD:
                 joint = ARM_JOINTS[int(np.argmax(off_rad))]
                 return f"tracking: {joint} is {off_rad.max():.3f} rad from where it was sent"

@@ -164,12 +164,9 @@ def slerp_poses(
     fractions: Float[np.ndarray, " num_poses"],
 ) -> Float[np.ndarray, "num_poses 4 4"]:
     """Straight line in position, constant axis in rotation."""
-    q_start, p_start = se3.split(T_start)
-    q_end, p_end = se3.split(T_end)
-    count = len(fractions)
-    q = se3.interpolate_quaternion(
-        np.tile(q_start, (count, 1)), np.tile(q_end, (count, 1)), fractions
-    )
+    (q_start, p_start), (q_end, p_end) = se3.split(T_start), se3.split(T_end)
+    q_starts, q_ends = (np.tile(q, (len(fractions), 1)) for q in (q_start, q_end))
+    q = se3.interpolate_quaternion(q_starts, q_ends, fractions)
     return se3.transform_from(q, p_start + fractions[:, None] * (p_end - p_start))
 
 

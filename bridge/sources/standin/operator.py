@@ -43,8 +43,10 @@ LIFTED_M = 0.05
 RESULTS = {True: "success", False: "failure", None: "unknown"}
 
 
-def label_trial(task: Task, truth: TruthLog, *, executed: bool, remark: str = "") -> Outcome:
-    """Say how a trial ended, as a person would from looking.
+def label_trial(
+    task: Task, truth: TruthLog, *, executed: bool, remark: str = "", stopped: str = ""
+) -> Outcome:
+    """Say how a trial ended, as a person would from looking; one that a limit stopped is a failure.
 
     A task with several objects is counted by object: k of n are where they belong.
     """
@@ -56,10 +58,11 @@ def label_trial(task: Task, truth: TruthLog, *, executed: bool, remark: str = ""
     # With several objects only what went wrong is worth reading.
     told = [item for item in findings if not several or item.value is not True]
     detail = "; ".join(finding.detail for finding in told) or "every object is where it belongs"
+    result, remark = RESULTS[False if stopped else verdict], stopped or remark
     return Outcome(
-        result=RESULTS[verdict],
+        result=result,
         unit="object" if several else "trial",
-        k=sum(value is True for value in done.values()) if several else int(verdict is True),
+        k=sum(value is True for value in done.values()) if several else int(result == "success"),
         n=len(task.manipulated),
         by=OPERATOR,
         detail=f"{remark}: {detail}" if remark else detail,
@@ -136,6 +139,8 @@ def execute_plan(cell: StandinCell, plan: Plan) -> None:
     stage_id: str | None = None
     gripper: tuple[int, float | None] | None = None
     for first, last in _pieces(plan):
+        if cell.stopped:
+            break
         stage = plan.stage_at(int(times[first]))
         if stage is not None and stage.id != stage_id:
             _end_stage(cell, plan, stage_id)
@@ -296,8 +301,7 @@ class Operator:
         rng = np.random.default_rng([RESET_STREAM, start_seed, index])
         for T in poses.values():
             turn = rng.normal(0.0, noise.reset_rad)
-            q = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
-            T[:3, :3] = se3.rotation_from_quaternion(q) @ T[:3, :3]
+            T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, turn])) @ T[:3, :3]
             T[:2, 3] += rng.normal(0.0, noise.reset_m, 2)
         return poses
 
@@ -389,10 +393,8 @@ class Operator:
         cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
         if problem:
             return void_trial(cell.task, problem)
-        outcome = label_trial(cell.world.task, cell.truth, executed=True, remark=stopped)
-        if not stopped:
-            return outcome
-        return replace(outcome, result="failure", k=0 if outcome.unit == "trial" else outcome.k)
+        stopped = stopped or cell.stopped
+        return label_trial(cell.world.task, cell.truth, executed=True, stopped=stopped)
 
     def _plan(self, info: EpisodeInfo, treatment: Treatment, seed: int) -> Outcome:
         """Plan, execute and label."""
@@ -404,8 +406,9 @@ class Operator:
             cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
         if decision.void and not treatment.study_arm:
             return void_trial(cell.task, decision.remark)
-        executed = decision.plan is not None
-        return label_trial(cell.world.task, cell.truth, executed=executed, remark=decision.remark)
+        executed, remark, stopped = decision.plan is not None, decision.remark, cell.stopped
+        task, truth = cell.world.task, cell.truth
+        return label_trial(task, truth, executed=executed, remark=remark, stopped=stopped)
 
     def _info(self, episode_id: str, *, kind: str, **fields: Any) -> EpisodeInfo:
         task = self._cell.task

@@ -175,8 +175,7 @@ def perceive(
     for object_id in sorted(Ts_base_object):
         T = Ts_base_object[object_id].copy()
         turn = rng.normal(0.0, noise.perception_rad)
-        q = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
-        T[:3, :3] = se3.rotation_from_quaternion(q) @ T[:3, :3]
+        T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, turn])) @ T[:3, :3]
         T[:2, 3] += rng.normal(0.0, noise.perception_m, 2)
         seen[object_id] = T
     return seen

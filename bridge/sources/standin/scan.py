@@ -74,8 +74,11 @@ def _reach(
     """Turn the camera about its axis until the arm gets there by a short, safe way."""
     best, best_move = None, LARGEST_MOVE_RAD
     for roll in ROLLS_RAD:
+        T_base_tcp = (
+            T_base_camera @ se3.small_motion(np.array([0, 0, roll, 0, 0, 0])) @ T_camera_tcp
+        )
         try:
-            joints = kinematics.joints_for(T_base_camera @ _roll(roll) @ T_camera_tcp, joints_rad)
+            joints = kinematics.joints_for(T_base_tcp, joints_rad)
         except UnreachablePoseError:
             continue
         move = float(np.max(np.abs(joints - joints_rad)))
@@ -84,13 +87,6 @@ def _reach(
         if best_move < GOOD_MOVE_RAD:
             break
     return best
-
-
-def _roll(angle_rad: float) -> Float[np.ndarray, "4 4"]:
-    T = np.eye(4)
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    T[:2, :2] = [[c, -s], [s, c]]
-    return T
 
 
 def _is_safe(

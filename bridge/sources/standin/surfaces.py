@@ -266,15 +266,9 @@ def smooth_normals(
     """Normals at the corners of triangles, weighted by area, without creases."""
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
-    total = np.stack(
-        [
-            np.bincount(
-                triangles.ravel(), np.repeat(weighted[:, axis], 3), minlength=len(vertices_m)
-            )
-            for axis in range(3)
-        ],
-        axis=1,
-    )
+    ids, count = triangles.ravel(), len(vertices_m)
+    sums = [np.bincount(ids, np.repeat(along, 3), minlength=count) for along in weighted.T]
+    total = np.stack(sums, axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.asarray((total / np.maximum(length, 1e-12))[triangles], dtype=np.float32)
 

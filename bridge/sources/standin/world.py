@@ -374,6 +374,7 @@ class World:
         self._fingers = [self._joint_address(name) for name in FINGER_JOINTS]
         self._arm_dofs = [int(self._model.joint(name).dofadr[0]) for name in ARM_JOINTS]
         self._links = [link.name for link in robot_links() if link.shapes]
+        self._link_bodies = [int(self._model.body(name).id) for name in self._links]
         self._finger_geoms = {int(self._model.geom(f"{name}_0").id) for name in FINGER_LINKS}
         own = {} if hidden.deviations is None else hidden.deviations.objects
         self._objects = {
@@ -467,6 +468,11 @@ class World:
         """Torques of the arm's motors, with those that carry its own weight."""
         servos = self._data.actuator_force[: len(ARM_JOINTS)]
         return np.array(servos + self._data.qfrc_gravcomp[self._arm_dofs])
+
+    def arm_force_N(self) -> Float[np.ndarray, "3"]:
+        """Force of all rigid bodies on arm and fingers together; what a grasp presses cancels."""
+        mujoco.mj_rnePostConstraint(self._model, self._data)
+        return np.asarray(self._data.cfrc_ext[self._link_bodies, 3:].sum(axis=0))
 
     @property
     def width_m(self) -> float:

@@ -1,6 +1,7 @@
 """What the physics of the stand-in cell must get right, and what it must keep apart."""
 
 import hashlib
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +13,30 @@ import pytest
 from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import Outcome
 from bridge.errors import UsageError
-from bridge.sources.standin.cell import StandinCell
+from bridge.sources.standin.cell import FORCE_N, StandinCell
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
+from bridge.sources.standin.kinematics import tool_down
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import NO_ERROR, GraspError, plan_pick_and_place
 from bridge.sources.standin.world import STEP_S, World
+from bridge.task.plan import Plan
 from bridge.task.task_file import Task
+
+
+def planned(
+    task: Task, starts: Any, error: GraspError, cell: StandinCell, cell_file: CellFile
+) -> Plan:
+    return plan_pick_and_place(
+        task,
+        starts,
+        error,
+        kinematics=cell.kinematics,
+        joints_start_rad=cell.home_rad,
+        max_joint_speed_rad_s=cell_file.max_joint_speed_rad_s,
+        plan_id="plan_0",
+        condition="without_replanning",
+        start_id="cube_into_box/9000000",
+    )
 
 
 @pytest.fixture
@@ -32,18 +51,7 @@ def attempt(
         session = make_session()
         cell = make_cell(session, seed=seed)
         cell.reset(starts)
-        plan = plan_pick_and_place(
-            task,
-            starts,
-            error,
-            kinematics=cell.kinematics,
-            joints_start_rad=cell.home_rad,
-            max_joint_speed_rad_s=cell_file.max_joint_speed_rad_s,
-            plan_id="plan_0",
-            condition="without_replanning",
-            start_id="cube_into_box/9000000",
-        )
-        execute_plan(cell, plan)
+        execute_plan(cell, planned(task, starts, error, cell, cell_file))
         return label_trial(task, cell.truth, executed=True), session
 
     return run
@@ -68,6 +76,82 @@ def test_a_grasp_six_centimetres_off_fails(
     outcome, _ = attempt(replace(NO_ERROR, **{axis: 0.06}))
     assert outcome.result == "failure"
     assert outcome.stages[0]["result"] == "failure"
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_arm_bears_the_weight_that_it_carries_and_no_grasp_comes_near_its_limit(
+    make_session: Callable[..., Any],
+    make_cell: Callable[..., StandinCell],
+    starts: dict[str, np.ndarray],
+    task: Task,
+    cell_file: CellFile,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Newton's second law for the cube between the fingers: force is mass times (a + g)."""
+    cell, rows = make_cell(make_session()), list[tuple[float, ...]]()
+    cell.reset(starts)
+    stop = cell._stop_where_pressed
+
+    def weighed(force_N: float) -> None:
+        rows.append((force_N, *cell.world.T_base_body("cube")[:3, 3]))
+        stop(force_N)
+
+    monkeypatch.setattr(cell, "_stop_where_pressed", weighed)
+    execute_plan(cell, planned(task, starts, NO_ERROR, cell, cell_file))
+    force_N, place_m = np.array(rows)[:, 0], np.array(rows)[:, 1:]
+    speed_m_s = np.gradient(place_m, 0.008, axis=0)
+    faster = np.gradient(speed_m_s, 0.008, axis=0) + np.array([0.0, 0.0, 9.81])
+    mass_kg = task.objects["cube"].mass_kg * cell.hidden.mass_scale
+    ratio = force_N / (mass_kg * np.linalg.norm(faster, axis=1))
+    assert np.median(ratio[place_m[:, 2] > 0.2]) == pytest.approx(1.0, abs=0.02)
+    assert np.median(np.abs(ratio[place_m[:, 2] > 0.2] - 1.0)) < 0.05
+    assert 0 < force_N.max() < FORCE_N / 4
+    assert cell.stopped == ""
+
+
+def test_a_press_beyond_the_robots_limit_stops_the_arm_and_fails_the_trial(
+    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell],
+    starts: dict[str, np.ndarray], task: Task,
+) -> None:  # fmt: skip
+    session = make_session()
+    cell = make_cell(session)
+    cell.reset(starts)
+    way = [cell.home_rad]
+    for height_m in (0.06, -0.03):
+        way.append(
+            cell.kinematics.joints_for(tool_down(np.array([0.45, 0.0, height_m]), 0.0), way[-1])
+        )
+    cell.follow(np.array([0, 2_000_000_000, 4_000_000_000]), np.stack(way))
+    (event,) = session.events()
+    assert (event["type"], event["data"]["cause"]) == ("mark", "contact_force")
+    assert FORCE_N < event["data"]["force_N"] < 2 * FORCE_N
+    assert re.match(
+        r"contact_force: the arm is pressed with \d+ N, the limit is 150 N", cell.stopped
+    )
+    held, stopped_ns = cell.target_rad, cell.now_ns
+    cell.follow(np.array([0, 1_000_000_000]), np.stack([held, cell.home_rad]))
+    cell.wait(1.0)
+    assert cell.now_ns == stopped_ns + 1_000_000_000  # nothing was followed
+    np.testing.assert_allclose(cell.encoders_rad, held, atol=0.005)
+    label = label_trial(task, cell.truth, executed=True, remark="no", stopped=cell.stopped)
+    assert (label.result, label.k) == ("failure", 0)
+    assert label.detail.startswith(cell.stopped)
+    cell.reset(starts)
+    assert cell.stopped == ""
+
+
+@pytest.mark.parametrize(("ticks", "stops"), [(4, False), (5, True)])
+def test_a_blow_shorter_than_40_ms_stops_nothing(
+    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell],
+    starts: dict[str, np.ndarray], ticks: int, stops: bool, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    cell = make_cell(make_session())
+    cell.reset(starts)
+    hard, steps = np.array([0.0, 0.6, 0.8]) * (FORCE_N + 1), ticks * cell._steps_per_tick
+    forces = iter([hard] * steps + [0 * hard] * 4 + [hard] * steps + [0 * hard] * 99)
+    monkeypatch.setattr(cell.world, "arm_force_N", lambda: next(forces))
+    cell.wait(0.1)
+    assert bool(cell.stopped) is stops
 
 
 def test_the_same_seed_gives_the_same_joint_log_and_another_seed_another(

@@ -65,6 +65,13 @@ def nodding(observation: dict[str, Any]) -> np.ndarray:
     return rows
 
 
+def pressing(observation: dict[str, Any]) -> np.ndarray:
+    """Brings the arm down, through the table."""
+    rows = np.repeat(np.array(observation["agent_pos"], dtype=np.float64)[None], 10, axis=0)
+    rows[:, 1] += 0.03 * np.arange(1, 11)
+    return rows
+
+
 def nodding_until_it_turned(observation: dict[str, Any]) -> Any:
     """Is done once its arm stands 0.1 rad from where arms start."""
     return {"done": True} if observation["agent_pos"][0] > 0.1 else nodding(observation)

@@ -109,6 +109,14 @@ def test_a_policy_that_is_done_ends_its_trial_and_is_judged(laboratory: Laborato
     assert np.ptp(streams.joint_track(episode).stamps_ns) < 30e9  # the cell's clock
 
 
+def test_an_arm_that_is_pressed_too_hard_stops_and_its_trial_fails(laboratory: Laboratory) -> None:
+    with laboratory.acting("scripted_policies:pressing"):
+        _, episode, label, _ = laboratory.trial(max_s=30.0)
+    assert re.match(r"failure: contact_force: .* with \d+ N, the limit is 150 N: the middle", label)
+    (mark,) = (event for event in streams.events(episode) if event["type"] == "mark")
+    assert mark["data"]["force_N"] > 150
+
+
 def lasting(data: bytes) -> bytes:
     time.sleep(3.0)
     return data
