@@ -106,9 +106,10 @@ LEAVES: dict[str, Leaf] = {
             *commands_of(
                 EVALUATE,
                 "twin.policies.cli",
-                """
-                rollout | Let a policy act in the twin. | runs/x --policy ws://127.0.0.1:8000
-                """,
+                "rollout | Let a policy act in the twin. | runs/x --policy ws://127.0.0.1:8000",
+            ),
+            *commands_of(
+                EXCHANGE, "twin.policies.cli", "export env | The twin for LeRobot. | runs/x DIR"
             ),
         ),
     ),

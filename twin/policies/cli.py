@@ -8,6 +8,24 @@ from twin.policies.config import RolloutConfig
 OUTPUT = Output()
 
 
+def export_env(run: Path, folder: Path, /, *, output: Output = OUTPUT) -> int:
+    """Write a folder whose env.py gives the twin of a run to LeRobot, and to Gymnasium.
+
+    Example: robot-gst export env runs/monday envs/monday
+
+    Args:
+        run: Run folder with a rebuilt scene and trials.
+        folder: Where env.py goes; what it gives can be changed in it.
+    """
+    from bridge.episode.run_folder import RunFolder
+    from twin.policies.hub import write_env
+
+    found = write_env(RunFolder.open(run), folder)
+    tasks, cameras = (", ".join(found[key]) for key in ("tasks", "cameras"))
+    output.result(found, f"{found['file']}: {tasks}; cameras {cameras}")
+    return 0
+
+
 def rollout(run: Path, /, *, config: RolloutConfig, output: Output = OUTPUT) -> int:
     """Let a policy act in the twin from recorded starts, and compare with the cell.
 

@@ -4,6 +4,7 @@ Importing ``twin.policies.environment`` registers it. Observations and ``info["i
 LeRobot has them. The same actions from the same start give the same bytes.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,7 @@ class TwinEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             latency_s: An action takes effect so much later; a whole number of steps.
         """
         self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": rate_hz}
         self._run = RunFolder.open(Path(run))
         episodes = trial_episodes(self._run, task)
         first = episodes[0].info.task
@@ -70,12 +72,14 @@ class TwinEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._late = round(latency_s * rate_hz)
         self._cell: TwinCell | None = None
         start = self._recorded(next(iter(self._episodes)))
+        self.task, self.task_description = first, start.task.instruction  # LeRobot asks for them
+        self._max_episode_steps = math.ceil(max_s * rate_hz)
         robot = load_robot(start.scene.urdf)
         mapping = PolicyMap(rate_hz=rate_hz, actions=Actions(kind=control))
         self._speak = Interpreter(mapping, robot, start.task.instruction)
-        known = tuple(cameras) or streams.camera_ids(episodes[0])
-        sizes = None if size is None else dict.fromkeys(known, size)
-        self._cameras = TwinCameras(self._run, start, known, sizes)
+        self.cameras = tuple(cameras) or streams.camera_ids(episodes[0])
+        sizes = None if size is None else dict.fromkeys(self.cameras, size)
+        self._cameras = TwinCameras(self._run, start, self.cameras, sizes)
         low, high = action_limits(control, robot, self._period_s)
         width = robot.record.gripper.max_width_m
         self.action_space = spaces.Box(
