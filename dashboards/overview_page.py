@@ -38,12 +38,14 @@ COLUMNS = (
     ("distance", "Tool path, lag"),
     ("cause", "Cause in the twin"),
 )
+CORRELATION = "agreement.pearson_r"
 NUMBERS = {
     f"agreement.{SIM_SIDE}.rate": "Twin predicts the outcome",
     "agreement.bias_pp": "Success rates, twin minus recorded",
-    "agreement.pearson_r": "Success rates, correlation r",
+    CORRELATION: "Success rates, correlation r",
+    "views.all.psnr_db": "PSNR of held-out views, raw",
 }
-"""The numbers to read first, by id, with their titles."""
+"""The numbers to read first, by id, with their titles; three, without r where it may be none."""
 UNPLANNED = "Executed in the twin, agrees with the outcome"
 Facets = tuple[tuple[str, tuple[tuple[str, str, int], ...]], ...]
 """What to filter by, each with slugs, names and numbers of trials."""
@@ -132,7 +134,7 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         selection=selection,
         tasks=tuple(tasks[:MOST_TASKS]),
         more_tasks=max(0, len(tasks) - MOST_TASKS),
-        numbers=tuple(first_numbers(judgement)),
+        numbers=tuple(first_numbers(judgement))[:3],
         disagreement=worst_disagreement(run, judgement),
         worst_view=next((v for v in views if stamp_of(run.derived_dir / v["file"])), None),
         not_scanned=tuple(not_scanned(run, judgement)),
@@ -158,8 +160,12 @@ def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
             yield f"Recorded success, {' · '.join(parts)}", each
     for name, title in NUMBERS.items():
         found = by_id.get(name.replace(SIM_SIDE, side))
-        if found is not None:
+        if found is not None and (name != CORRELATION or _excludes_zero(found)):
             yield (title if found.id == name else UNPLANNED), found
+
+
+def _excludes_zero(found: Measurement) -> bool:
+    return found.interval is not None and not found.interval.low <= 0 <= found.interval.high
 
 
 def worst_disagreement(run: RunFolder, judgement: Judgement) -> Disagreement | None:

@@ -2,8 +2,9 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,9 +18,10 @@ from dashboards.errors import NotHereError
 from dashboards.guard import COOKIE, Admission
 from dashboards.library import Library, derived_path, episode_path
 from dashboards.moments import Moment
+from dashboards.overview_page import first_numbers
 from dashboards.twin_page import build_twin
 from evaluator.report.front import front
-from evaluator.result import load_results
+from evaluator.result import Interval, load_results
 from robot_gst import run as type_here
 
 
@@ -31,9 +33,24 @@ def test_the_overview_shows_the_numbers_of_results_json(
     assert answer.status_code == 200
     text = words(answer.text)
     assert f"{agreement.k} of {agreement.n}" in text
-    assert "2 groups; it needs at least 3" in text
+    assert "correlation r" not in text  # two groups have none
+    assert "PSNR of held-out views, raw" in text
     assert "95 % Wilson" in text
     assert "Stand-in cell" in text
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "is_first"), [(0.1, 0.9, True), (-0.9, -0.2, True), (-0.9, 1.0, False)]
+)
+def test_a_correlation_that_may_be_none_is_no_first_number(
+    copy: RunFolder, low: float, high: float, is_first: bool
+) -> None:
+    (old,) = (m for m in judged(copy).measurements if m.id == "agreement.pearson_r")
+    interval = Interval(low=low, high=high, level=0.95, method="hand")
+    r = replace(old, value=(low + high) / 2, interval=interval, reason_if_undefined=None)
+    found: Any = SimpleNamespace(measurements=(r,))
+    titles = [name for name, _ in first_numbers(found)]
+    assert titles == ["Success rates, correlation r"] * is_first
 
 
 def test_the_first_page_begins_with_the_answer_and_the_worst(
