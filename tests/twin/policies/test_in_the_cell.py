@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from loopback import recording
+from patience import wait_until
 from test_openpi import pack, served
 
 from bridge.episode import schema, streams
@@ -70,7 +71,9 @@ class Laboratory(NamedTuple):
         )  # fmt: skip
         with self.join() as session:
             summary = run_session(session, config, QUIET)
-        episode = Episode.open(self.run.episodes_dir / f"trial_{number:04d}.mcap")
+        path = self.run.episodes_dir / f"trial_{number:04d}.mcap"
+        wait_until(path.is_file, f"{path.name} that somebody else may have ended", within_s=60.0)
+        episode = Episode.open(path)
         assert episode.outcome is not None
         moved = float(np.ptp(streams.joint_track(episode).position, axis=0).max())
         return summary, episode, f"{episode.outcome.result}: {episode.outcome.detail}", moved
