@@ -30,7 +30,7 @@ def registry_table(families: Iterable[str]) -> str:
     rows: dict[tuple[str, str], list[str]] = {}
     for each in REGISTRY:
         if each.id.partition(".")[0] in wanted:
-            words = re.sub(r"\{(protocol|where|without)\}", "", each.definition)
+            words = re.sub(r",? ?(in )?\{(protocol|where|without|what)\}", "", each.definition)
             words = re.sub(r"[:;,]? ?\{(words|about|after)\}$", "", words)
             words = _capitals(words).partition("; ")[0].replace("|", "/").strip(" :,;")
             usual = (each.low, each.high) == RANGES[each.unit]

@@ -100,7 +100,7 @@ def robot_check(robot: str, /, *, urdf_out: Path | None = None, output: Output =
     Example: robot-gst robot check mine.toml --urdf-out mine.urdf
 
     Args:
-        robot: Robot file, or the name of one that ships with the package.
+        robot: Robot file, the name of one that ships, or a URDF.
         urdf_out: Write the description that carries the record there, to be published.
     """
     from twin.robot.check import check_robot, describe_robot

@@ -26,7 +26,7 @@ class LeRobotConfig:
     """plan: what the executed plan commands for the next row; auto: that if all trials have it."""
     episodes: tuple[str, ...] = ()
     """Only those with these ids, of any kind; or a pattern, rollouts in the twin too:
-    '*.rollout.me.*'."""
+    `*.rollout.me.*`."""
     crf: int = 23
     """Quality of the H.264 video, lower is better."""
     clock: ClockChoice = "recorded"
