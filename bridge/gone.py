@@ -31,9 +31,7 @@ _TOLD = {
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
     "record --failover": "A failing disk ends the recording; begin anew on another disk.",
     "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
-    "record --split-mb --split-s": (
-        "Stop and start another episode; mcap merge makes one of parts that are there."
-    ),
+    "record --split-mb --split-s": "Stop and start another episode; mcap merge joins old parts.",
     "record --triggers|ctl snapshot": "Record with --preroll-s 5; start when it has happened.",
     "ctl pause|ctl resume": "Stop the episode, and start another one.",
     "publish episode --loop --paused --name": (
@@ -53,9 +51,7 @@ _TOLD = {
     "evaluate --live --recorder --connect --goal": (
         "evaluate says how many more trials would likely decide a comparison."
     ),
-    "evaluate --interval|design --interval": (
-        "Intervals are Wilson's; results.json holds k and n for others."
-    ),
+    "evaluate --interval|design --interval": "Intervals are Wilson's; results.json has k and n.",
     "evaluate --axes": "Evaluate the rows of each setting as a table of their own.",
     "evaluate --names": "Spell names alike that are one, and others further apart.",
     "design --past": "Say what is expected: --rate, --gain.",

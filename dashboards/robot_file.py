@@ -86,15 +86,16 @@ def propose(path: Path) -> tuple[Robot, list[str]]:
 
 
 def _with_meshes(robot: Robot, path: Path) -> Robot:
-    """Find the folders of packages that its meshes name above the file or beside what is above."""
+    """Find the folders of packages that its meshes name, among those above it and beside them."""
     text = path.read_text(errors="replace")
-    folders = {}
-    for package in sorted(set(re.findall(r"package:/{2,}([^/\"']+)/", text)) - {PACKAGE}):
-        for above in path.absolute().parents:
-            found = above if above.name == package else above / package
-            if found.is_dir():
-                folders[package] = str(found)
-                break
+    folders: dict[str, str] = {}
+    for package, mesh in re.findall(r"package:/{2,}([^/\"']+)/([^\"']+)", text):
+        if package in (*folders, PACKAGE):
+            continue
+        places = [place for above in path.absolute().parents for place in (above / package, above)]
+        there = next((place for place in places if (place / mesh).is_file()), None)
+        if there is not None:
+            folders[package] = str(there)
     return Robot(**{**vars(robot), "mesh_folders": folders})
 
 

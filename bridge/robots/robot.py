@@ -186,7 +186,7 @@ class Robot:
             UsageError: A file or a mesh is missing, or an attached file hangs on nothing.
         """
         arm = self._parsed(self.urdf)
-        for element in [item for item in arm if item.tag in ("transmission", "gazebo")]:
+        for element in arm.findall("transmission"):
             arm.remove(element)
         for name in self.attached:
             part = self._parsed(name)
@@ -219,8 +219,8 @@ class Robot:
 
     def _parsed(self, uri: str) -> ET.Element:
         path = self._file(uri)
-        text = path.read_text()
-        if "<xacro:" in re.sub("<!--.*?-->", "", text, flags=re.DOTALL):
+        text = _UNREAD.sub(lambda found: "\n" * found[0].count("\n"), path.read_text())
+        if "<xacro:" in text:
             raise UsageError(
                 f"{path} is a xacro file; expand it first: xacro {path} > {path.stem}.urdf, and "
                 "name that."
@@ -271,6 +271,8 @@ class Robot:
         return resolve_mesh(uri if uri.startswith("package:/") else str(self.folder / uri))
 
 
+_UNREAD = re.compile(r"<!--.*?-->|<gazebo\b[^>]*/>|<gazebo\b.*?</gazebo>", re.DOTALL)
+"""Simulators read these, with prefixes that nothing declares."""
 _OF_FILES = ("attached", "flange", "prefix", "held", "mesh_folders", "folder")
 """Fields that say how the URDF is put together: a description is put together already."""
 

@@ -120,7 +120,11 @@ def test_a_tool_frame_does_not_move_with_a_finger(tmp_path: Path) -> None:
     assert propose(written(tmp_path, inside))[0].tool_frame == "tcp"
 
 
-def test_meshes_of_the_package_that_the_file_lies_in_are_found(tmp_path: Path) -> None:
+@pytest.mark.parametrize("package", ["my_arm", "my_arm_description"])
+def test_meshes_of_the_package_that_the_file_lies_in_are_found(
+    tmp_path: Path, package: str
+) -> None:
+    """Also where somebody named the package's folder anew."""
     meshes = tmp_path / "my_arm" / "meshes"
     meshes.mkdir(parents=True)
     corners = np.vstack([np.zeros(3), np.eye(3)])
@@ -132,7 +136,8 @@ def test_meshes_of_the_package_that_the_file_lies_in_are_found(tmp_path: Path) -
     )
     (meshes / "part.stl").write_text(f"solid part\n{faces}endsolid part\n")
     (tmp_path / "my_arm" / "urdf").mkdir()
-    shape = '<geometry><mesh filename="package://my_arm/meshes/part.stl"/></geometry>'
+    mesh = f"package://{package}/meshes/part.stl"
+    shape = f'<geometry><mesh filename="{mesh}"/></geometry>'
     text = chain("arm", 6, "base").replace("<collision>", f"<visual>{shape}</visual><collision>")
     path = written(tmp_path / "my_arm" / "urdf", text)
     assert str(meshes / "part.stl") in propose(path)[0].description()
@@ -175,6 +180,16 @@ def test_what_holds_no_arm_is_refused_with_what_there_is(
 ) -> None:
     with pytest.raises(UsageError, match=told):
         look_at(written(tmp_path, inside, name))
+
+
+def test_what_only_simulators_read_is_passed_over(tmp_path: Path) -> None:
+    sensor = '<gazebo reference="base"/><gazebo><sensor:camera name="c"/></gazebo>'
+    path = written(tmp_path, sensor + chain("arm", 6, "base"))
+    assert len(propose(path)[0].joints) == 6
+    assert "camera" not in propose(path)[0].description()
+    path.write_text(path.read_text().replace("</gazebo>", "</gazebo>\n<broken"))
+    with pytest.raises(UsageError, match="line 2"):
+        propose(path)
 
 
 def test_no_file_is_overwritten_and_only_robot_files_are_made(tmp_path: Path) -> None:
