@@ -118,7 +118,6 @@ CORE: tuple[leaves.Command, ...] = (
         import rgbd | An RGB-D folder: scene.json, TUM, 7-Scenes. | DIR runs/x
         import images | Posed images without depth: COLMAP, transforms.json. | DIR runs/x
         import rosbag2 | A rosbag2 recording, byte for byte. | BAG runs/x
-        import trials | A trials CSV, for evaluate. | trials.csv runs/x
         export tum | Cameras as folders of the TUM RGB-D layout. | EPISODE DIR
         export rosbag2 | An episode as a rosbag2 folder. | EPISODE DIR
         export csv | Joints, poses, events ... as tidy CSV files. | runs/x DIR

@@ -39,6 +39,7 @@ _TOLD = {
     ),
     "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
     "recover --in-place": "Free some space, or use another disk: a copy is made beside it.",
+    "import trials": "robot-gst open TABLE RUN keeps any table of trials in a run.",
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": "robot-gst rebuild makes scenes; splat viewers open scene/background.ply.",
     "rebuild --align-poses --refine-poses --align-holdout": (

@@ -355,7 +355,7 @@ def _table(path: Path) -> Found:
         taken = take(path)
 
     def keep(path: Path, run: Path, *, output: Output) -> int:
-        file = keep_trials(taken.trials, RunFolder.create(run), force=False)
+        file = keep_trials(taken.trials, RunFolder.create(run))
         output.result({"file": str(file), "trials": len(taken.trials)}, f"{file}: {taken.summary}")
         return 0
 

@@ -127,30 +127,6 @@ def export_rosbag2(
     return 0
 
 
-def import_trials(
-    table: Path, run: Path, /, *, force: bool = False, output: Output = OUTPUT
-) -> int:
-    """Check a trials CSV and keep it in the run as notes/trials.csv, where evaluate reads it.
-
-    A trial whose id is also that of a recorded episode does not count twice: the episode wins.
-    Example: robot-gst import trials experiment.csv runs/monday
-
-    Args:
-        table: One row per trial; docs/exchange.md lists the columns.
-        run: Run folder; made where needed.
-        force: Replace trials imported earlier.
-    """
-    from bridge.episode.run_folder import RunFolder
-    from bridge.exchange.trials_csv import keep_trials, read_trials
-
-    trials = read_trials(table)
-    file = keep_trials(trials, RunFolder(run), force=force)
-    tasks = sorted({trial.task for trial in trials})
-    data = {"file": str(file), "trials": len(trials), "tasks": tasks}
-    output.result(data, f"{file}: {len(trials)} trials of {', '.join(tasks)}")
-    return 0
-
-
 FOLDER = FolderConfig()
 
 

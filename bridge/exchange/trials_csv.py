@@ -196,11 +196,11 @@ def trials_path(run: RunFolder) -> Path:
     return run.notes_dir / "trials.csv"
 
 
-def keep_trials(trials: Iterable[TrialRecord], run: RunFolder, *, force: bool) -> Path:
+def keep_trials(trials: Iterable[TrialRecord], run: RunFolder) -> Path:
     """Keep trials in the run, with all columns and in one spelling."""
     path = trials_path(run)
-    if path.exists() and not force:
-        raise UsageError(f"{path} exists already. Replace it with --force, or use another run.")
+    if path.exists():
+        raise UsageError(f"{path} exists already. Delete it to replace it, or use another run.")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, trials_text(trials).encode())
     return path

@@ -224,7 +224,7 @@ def design_text(made: Design, written: Protocol, run_path: Path) -> str:
         f"Locked: {run_path / protocols.FILE_NAME}, sha256 {written.sha256}",
         f"Order: {run_path / ORDER_FILE}, interleaved by --study-seed {protocol.study_seed}"
         + (", arms by code" if protocol.codes else ""),
-        f"Then: fill in {ORDER_FILE}, robot-gst import trials {run_path / ORDER_FILE} "
+        f"Then: fill in {ORDER_FILE}, robot-gst open {run_path / ORDER_FILE} "
         f"{run_path}, robot-gst evaluate {run_path}",
     ]
     return "\n".join(lines)

@@ -170,5 +170,5 @@ def test_the_text_names_the_hash_and_the_command(tmp_path: Path, made: Design) -
     written = lock(tmp_path, made)
     text = design_text(made, written, tmp_path)
     assert written.sha256 in text
-    assert f"fill in {ORDER_FILE}, robot-gst import trials" in text
+    assert f"fill in {ORDER_FILE}, robot-gst open" in text
     assert Protocol.from_json((tmp_path / FILE_NAME).read_bytes()) == made.protocol

@@ -1,4 +1,4 @@
-"""``import trials``: a spreadsheet becomes part of a run, or is refused with its row."""
+"""``open TABLE RUN``: a spreadsheet becomes part of a run, or is refused with its row."""
 
 import json
 from collections.abc import Callable
@@ -25,8 +25,8 @@ def test_an_imported_table_is_what_evaluate_compares(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = table(tmp_path, HEAD + ROWS)
-    assert run("import", "trials", source, tmp_path / "run") == 0
-    assert "2 trials of cube" in capsys.readouterr().out
+    assert run("open", source, tmp_path / "run") == 0
+    assert "trials, 2 rows" in capsys.readouterr().out
     kept = tmp_path / "run" / "notes" / "trials.csv"
     assert read_trials(kept) == read_trials(source)
     assert run("evaluate", tmp_path / "run", "--json") == 0
@@ -41,7 +41,7 @@ def test_a_recorded_trial_is_not_counted_twice(
 ) -> None:
     make_trial(id="t1", cameras=(), num_frames=3)
     source = table(tmp_path, HEAD + ROWS)
-    assert run("import", "trials", source, tmp_path / "run") == 0
+    assert run("open", source, tmp_path / "run") == 0
     comparison = compare_run(RunFolder.open(tmp_path / "run"))
     assert [row.episode for row in comparison.rows] == ["t1", "t2"]
     (doubled,) = [item for item in comparison.exclusions if "trials.csv" in item.reason]
@@ -49,26 +49,29 @@ def test_a_recorded_trial_is_not_counted_twice(
 
 
 @pytest.mark.parametrize(
-    ("text", "match"),
+    ("text", "match", "code"),
     [
-        (HEAD + "t1,cube,,,maybe,,\r\n", "table.csv row 2: recorded is 'maybe'"),
-        (HEAD + ROWS + "t1,cube,,,,,\r\n", "row 4: trial_id 't1' stands in row 2 already"),
-        (HEAD + "t1,cube\r\n", "row 2: 2 fields where the header has 7"),
-        ("trial_id\r\nt1\r\n", "no column 'task'"),
-        ("", "table.csv: empty"),
+        (HEAD + "t1,cube,,,maybe,,\r\n", "table.csv row 2: recorded is 'maybe'", 1),
+        (HEAD + ROWS + "t1,cube,,,,,\r\n", "row 4: trial_id 't1' stands in row 2 already", 1),
+        (HEAD + "t1,cube\r\n", "row 2: 2 fields where the header has 7", 1),
+        ("trial_id\r\nt1\r\n", "is neither a table of trials", 2),
+        ("", "table.csv is empty", 2),
     ],
 )
 def test_a_bad_row_is_named_and_nothing_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, match: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, match: str, code: int
 ) -> None:
-    assert run("import", "trials", table(tmp_path, text), tmp_path / "run") == 1
+    assert run("open", table(tmp_path, text), tmp_path / "run") == code
     assert match in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
-def test_a_second_import_needs_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_second_import_waits_until_the_first_one_is_deleted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source = table(tmp_path, HEAD + ROWS)
-    assert run("import", "trials", source, tmp_path / "run") == 0
-    assert run("import", "trials", source, tmp_path / "run") == 2
-    assert "Replace it with --force" in capsys.readouterr().err
-    assert run("import", "trials", source, tmp_path / "run", "--force") == 0
+    assert run("open", source, tmp_path / "run") == 0
+    assert run("open", source, tmp_path / "run") == 2
+    assert "Delete it to replace it" in capsys.readouterr().err
+    (tmp_path / "run" / "notes" / "trials.csv").unlink()
+    assert run("open", source, tmp_path / "run") == 0
