@@ -61,7 +61,7 @@ def commands_of(use: str, module: str, table: str) -> tuple[Command, ...]:
 
 LEAVES: dict[str, Leaf] = {
     "open": Leaf(
-        modules=("dashboards.opening", "dashboards.robot_file"),
+        modules=("dashboards.opening", "dashboards.robot_file", "dashboards.scene_index"),
         extra="record",
         purpose="opening what others recorded",
         entries={"robot_in": "dashboards.robot_file:robot_in"},

@@ -33,6 +33,7 @@ from bridge.sources.folder.scene_json import INDEX_NAME
 from bridge.sources.folder.tum import find_lists
 from bridge.terminal import Output
 from dashboards.robot_file import propose, write_robot_file
+from dashboards.scene_index import is_paired, propose_index, write_index
 
 OUTPUT = Output()
 MOST_INSIDE, MOST_NAMED, MOST_EPISODES, MOST_SURVEYED = 200, 5, 50, 500
@@ -203,6 +204,9 @@ FOLDERS: dict[str, Callable[[Path], bool]] = {
     "RLDS dataset": _is_rlds,
     "RGB-D folder": _is_rgbd,
     "folder of posed images": _is_posed,
+    "RGB-D folder without an index": lambda folder: (
+        is_paired(folder) and not _is_rgbd(folder) and not _is_posed(folder)
+    ),
 }
 
 
@@ -445,11 +449,25 @@ def _description(path: Path) -> Found:
     )
 
 
+def _unindexed(path: Path) -> Found:
+    _, notes = propose_index(path)
+    return Found(
+        what="colour and depth images in folders of their own",
+        holds=tuple(notes),
+        rebuild=f"an index: robot-gst open {path} {path / INDEX_NAME} writes it",
+        replay=f"an index, {ONLY_SEEN}",
+        evaluate="trials",
+        bring=write_index,
+        then=(f"open {path} {path / INDEX_NAME}",),
+    )
+
+
 KINDS: dict[str, Callable[[Path], Found]] = {
     "run": _run,
     "bag": _bag,
     "LeRobot dataset": _lerobot,
     "RGB-D folder": _rgbd,
+    "RGB-D folder without an index": _unindexed,
     "folder of posed images": _posed,
     "splat": _splat,
     "table": _table,
