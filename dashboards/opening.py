@@ -4,13 +4,15 @@ Heads, summaries and small texts are read; nothing is unpickled or run. Commands
 """
 
 import re
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from inspect import signature
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from bridge.cli.exchange import import_images, import_rgbd, import_rosbag2
 from bridge.clock import NS_PER_S
@@ -51,6 +53,8 @@ ENDINGS = {
 OF_BAG = (*ENDINGS["bag"], METADATA_FILE)
 SPLAT_FIELDS = frozenset({"x", "f_dc_0", "opacity", "scale_0", "rot_0"})
 STREAMS = (named.COLOR_IMAGE, named.COLOR_INFO, named.DEPTH_IMAGE, named.DEPTH_INFO)
+JOINTS = (named.JOINT_STATES, named.GRIPPER_STATE)
+IMAGES = {schema.IMAGE: "image", schema.COMPRESSED_IMAGE: "image", schema.CAMERA_INFO: "info"}
 STREAM = re.compile(f"{named.CAMERAS}([^/]+)({'|'.join(STREAMS)})$")
 USES = ("record", "rebuild", "replay", "evaluate")
 ONLY_SEEN = "joint states and a task"
@@ -105,7 +109,9 @@ def survey(source: Path) -> Survey:
     return Survey(types=types, rates_hz=rates_hz, first=first)
 
 
-def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> int:
+def open(
+    path: Path, run: Path | None = None, /, *, map: Path | None = None, output: Output = OUTPUT
+) -> int:
     """Say what a file or folder of yours holds, what it lacks and what comes next; or import it.
 
     Bags, LeRobot datasets, RGB-D and posed images, splats, tables of trials, runs, URDFs.
@@ -114,6 +120,7 @@ def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> 
     Args:
         path: A file or folder; without RUN it is only read.
         run: Run folder to import it into, made where needed; of a URDF the robot file to write.
+        map: TOML file with options of the import (docs/exchange.md): task, robot, topics.
     """
     found = look_at(path)
     lines = found.lines(path)
@@ -124,18 +131,31 @@ def open(path: Path, run: Path | None = None, /, *, output: Output = OUTPUT) -> 
     if found.bring is None:
         raise UsageError("\n".join([*lines, "It cannot be imported."]))
     output.say(lines[0])
-    code = found.bring(path, run, output=output)
+    robot, options = _mapped(map, found.bring)
+    code = found.bring(path, run, output=output, **options)
     if run.is_dir():
-        output.say("\n".join(look_at(run).lines(run)))
+        output.say("\n".join(_run(run, robot).lines(run)))
     return code
 
 
-def look_at(path: Path) -> Found:
-    """Find out what lies at a path.
+def _mapped(file: Path | None, bring: Callable[..., int]) -> tuple[str, dict[str, Any]]:
+    """The robot and the options of an import that a map names."""
+    known = signature(bring).parameters
+    try:
+        said = {} if file is None else tomllib.loads(file.read_text("utf-8"))
+        robot = str(said.pop("robot", ""))
+        if topics := dict(said.pop("topics", {})):
+            said["remap"] = tuple(f"{old}={new}" for old, new in topics.items())
+        if "config" in known:
+            said = {"config": type(known["config"].default)(**said)}
+        signature(bring).bind(Path(), Path(), output=OUTPUT, **said)
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(f"--map {file}: {error}") from error
+    return robot, said
 
-    Raises:
-        UsageError: Naming what is there, where it is nothing known or several things.
-    """
+
+def look_at(path: Path) -> Found:
+    """Find out what lies at a path; UsageError where it is nothing known, or several things."""
     if not path.exists():
         raise PathNotFoundError(path=path, what="file or folder", hint="Check the path.")
     kinds = kinds_of(path)
@@ -179,10 +199,6 @@ def _some(names: Sequence[str]) -> str:
     return (", ".join(names[:MOST_NAMED]) or "none") + more
 
 
-def _is_run(folder: Path) -> bool:
-    return any((folder / "episodes").glob("*.mcap*")) or trials_path(RunFolder(folder)).is_file()
-
-
 def _is_rgbd(folder: Path) -> bool:
     return bool((folder / INDEX_NAME).is_file() or find_lists(folder) or find_frames(folder))
 
@@ -198,7 +214,7 @@ def _is_rlds(folder: Path) -> bool:
 
 
 FOLDERS: dict[str, Callable[[Path], bool]] = {
-    "run": _is_run,
+    "run": lambda at: any(at.glob("episodes/*.mcap*")) or trials_path(RunFolder(at)).is_file(),
     "bag": lambda folder: any(each.name.endswith(OF_BAG) for each in folder.glob("*.*")),
     "LeRobot dataset": lambda folder: (folder / "meta/info.json").is_file(),
     "RLDS dataset": _is_rlds,
@@ -214,12 +230,13 @@ def _bag(path: Path) -> Found:
     seen = survey(path)
     names = mapped(seen.types)
     cameras, views = _cameras(seen, names)
-    robot, lacks, _ = _robot(seen)
+    robot, lacks, robots = _robot(seen)
+    file = [*(each.name for each in robots), "FILE.toml"][0] if robot else ""
     count = count_messages(path)
     renamed = [f"{old} will be {new}" for old, new in names.items() if not old.endswith("_info")]
     return Found(
         what=f"a bag of {f'{count} messages on ' if count else ''}{len(seen.types)} topics",
-        holds=(*robot, *cameras, *renamed),
+        holds=(*robot, *cameras, *renamed, *_proposal(seen, names, file)),
         record="the same nodes, live (docs/recording.md, section 4)",
         rebuild="; ".join(views),
         replay="; ".join(lacks + views),
@@ -228,26 +245,31 @@ def _bag(path: Path) -> Found:
     )
 
 
-def _cameras(seen: Survey, names: Mapping[str, str]) -> tuple[list[str], list[str]]:
-    """What is known of the cameras, and what they lack for a scene.
+def _proposal(seen: Survey, names: Mapping[str, str], robot: str) -> Iterator[str]:
+    """A map to fill in, of topics as they will be called and of those that are not understood."""
+    topics = dict(names)
+    for topic, kind in seen.types.items():
+        if kind in IMAGES and not STREAM.search(names.get(topic, topic)):
+            stream = "depth" if "depth" in topic else "color"
+            topics[topic] = f"{named.CAMERAS}NAME/{stream}/{IMAGES[kind]}"
+        elif kind == schema.JOINT_STATE and not topic.endswith(JOINTS):
+            topics[topic] = f"/NAME{named.JOINT_STATES}"
+    if robot == "FILE.toml" or topics.keys() != names.keys():
+        yield "a map for --map FILE, to be corrected:"
+        yield from [f'robot = "{robot}"'] * bool(robot)
+        yield from ("[topics]", *(f'"{old}" = "{new}"' for old, new in topics.items()))
 
-    Args:
-        names: What an episode calls topics that have other names in a recording.
-    """
+
+def _cameras(seen: Survey, names: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    """What is known of the cameras by what an episode calls topics, and what a scene lacks."""
     cameras: dict[str, dict[str, str]] = {}
-    images = []
-    for topic, type_name in seen.types.items():
+    for topic in seen.types:
         place = STREAM.search(names.get(topic, topic))
         if place and not named.is_truth(topic):
             rate = f" {seen.rates_hz[topic]:.3g} Hz" if topic in seen.rates_hz else ""
             text = place[2][1:].replace("/", " ") + (rate if "image" in place[2] else "")
             cameras.setdefault(place[1], {})[place[2]] = text
-        elif type_name in (schema.IMAGE, schema.COMPRESSED_IMAGE):
-            images.append(topic)
     holds = [f"camera {name}: {', '.join(has.values())}" for name, has in cameras.items()]
-    if images and not cameras:
-        new = f"{named.CAMERAS}NAME{named.COLOR_IMAGE}"
-        holds.append(f"images by an unknown name: import rosbag2 --remap {images[0]}={new}")
     lacks = []
     if not any(len(has) == len(STREAMS) for has in cameras.values()):
         streams = [f"{c}{s}" for c, has in cameras.items() for s in STREAMS if s not in has]
@@ -257,7 +279,7 @@ def _cameras(seen: Survey, names: Mapping[str, str]) -> tuple[list[str], list[st
     return holds, lacks
 
 
-def _robot(seen: Survey) -> tuple[list[str], list[str], list[Robot]]:
+def _robot(seen: Survey, asked: str = "") -> tuple[list[str], list[str], list[Robot]]:
     """What is known of the robot, what is missing, and the robots that it may be."""
     tracks = {
         topic: JointSample.from_cdr(data).names
@@ -270,9 +292,11 @@ def _robot(seen: Survey) -> tuple[list[str], list[str], list[Robot]]:
     files = sorted((datasets_folder() / "robots").glob("*.toml"))
     urdf = seen.first.get(named.ROBOT_DESCRIPTION)
     known = [robot_of(string_from_cdr(urdf))] if urdf else [read_robot(f.stem) for f in files]
+    known = [read_robot(asked)] if asked else known
     fits = [robot for robot in known if set(robot.joints) <= set(joints)]
     fits = [robot for robot in fits if len(robot.joints) == max(len(r.joints) for r in fits)]
     name = " or ".join(robot.name for robot in fits) or "none of the robot files"
+    name += ", by the names of its joints" if fits and not (urdf or asked) else ""
     lacks = [] if fits else ["a robot file with its joints (docs/robots.md)"]
     fingers = {joint for robot in fits for joint in robot.finger_joints}
     if not fingers & set(joints) and not any(t.endswith(named.GRIPPER_STATE) for t in seen.types):
@@ -378,13 +402,13 @@ def _converted(kind: str, into: str, path: Path) -> Found:
     return Found(what=f"{kind}, not read here", rebuild=made, replay=made, evaluate=made)
 
 
-def _run(path: Path) -> Found:
+def _run(path: Path, robot_file: str = "") -> Found:
     """What a run holds and lacks, and the commands from there to a page with numbers."""
     run = RunFolder.open(path)
     entries = find_episodes(run)
     seen = _survey(run)
     cameras, views = _cameras(seen, {})
-    robot, lacks, robots = _robot(seen)
+    robot, lacks, robots = _robot(seen, robot_file)
     has_scene = (run.scene_dir / "scene.json").is_file()
     has_table = trials_path(run).is_file()
     trials = [e for e in entries if not e.error and e.kind in ("trial", "imported")]
@@ -397,7 +421,10 @@ def _run(path: Path) -> Found:
         steps.append(f"label {path} {unknown[0].id}{task} --result success")
     if trials and not lacks and not views:
         is_told = named.ROBOT_DESCRIPTION in seen.types
-        steps.append(f"replay {path}" + ("" if is_told else f" --robot {robots[0].name}"))
+        steps.append(
+            f"replay {path}"
+            + ("" if is_told and not robot_file else f" --robot {robot_file or robots[0].name}")
+        )
     can_count = bool(trials or has_table or has_scene or not views)
     steps += [f"evaluate {path}"] * can_count
     more = [f"unreadable: {_some(broken)}"] * bool(broken)

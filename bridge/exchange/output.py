@@ -76,8 +76,10 @@ def new_folder(out: Path, *, force: bool) -> Iterator[Path]:
         if out.is_dir():
             shutil.rmtree(out)
         part.rename(out)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(part, ignore_errors=True)
+        if isinstance(error, OSError):  # a full disk does not say where
+            error.filename = error.filename or str(out)
         raise
 
 
@@ -97,10 +99,9 @@ def _refuse_strangers(out: Path, *, force: bool) -> None:
 
 
 def _sync(folder: Path) -> None:
-    for path in sorted(folder.rglob("*")):
-        if path.is_file():
-            with path.open("rb") as stream:
-                os.fsync(stream.fileno())
+    for path in (each for each in sorted(folder.rglob("*")) if each.is_file()):
+        with path.open("rb") as stream:
+            os.fsync(stream.fileno())
 
 
 def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict[str, Any]) -> None:

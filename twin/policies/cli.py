@@ -53,6 +53,7 @@ def rollout(run: Path, /, *, config: RolloutConfig, output: Output = OUTPUT) -> 
         found = check_policy(folder, config)
         output.result(found, describe_check(found))
         return 0
-    summary = roll_out_run(folder, config, output)
+    with folder.alone_in(folder.derived_dir):
+        summary = roll_out_run(folder, config, output)
     output.result(summary, describe_rollouts(summary))
     return 2 if any(row["problem"] for row in summary["rows"]) else 0

@@ -17,8 +17,9 @@ from scipy import ndimage
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry.camera import Camera
-from bridge.media.color import decode_color, encode_png
+from bridge.media.color import UnreadableImageError, decode_color, encode_png
 from bridge.whole_file import write_whole
+from twin.errors import UnreadableFileError
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser, View
@@ -129,4 +130,8 @@ def read_backdrop(run: RunFolder, record: Mapping[str, Any]) -> Backdrop | None:
     path = run.scene_dir / BACKDROP
     if not record.get("backdrop") or not path.is_file():
         return None
-    return Backdrop(colors=decode_color(path.read_bytes()).astype(np.float32) / np.float32(255.0))
+    try:
+        colors = decode_color(path.read_bytes()).astype(np.float32)
+    except UnreadableImageError as error:
+        raise UnreadableFileError(path=path, found=error.found) from error
+    return Backdrop(colors=colors / np.float32(255.0))

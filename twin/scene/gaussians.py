@@ -174,8 +174,6 @@ MAX_SPLATS = 50_000_000
 class UnreadablePlyError(UnreadableFileError):
     """The file is not a splat PLY of the kind we write."""
 
-    hint = f"Expected a binary little-endian PLY with float columns {', '.join(COLUMNS)}."
-
 
 def write_ply(path: Path, cloud: GaussianCloud) -> None:
     """Write a cloud; the file appears under its name only when it is complete.

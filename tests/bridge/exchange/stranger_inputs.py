@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
 
 from bridge.episode.reader import Episode
 from bridge.episode.schema import DEFINITIONS, schema_text
@@ -153,3 +156,94 @@ def camera_bag(make_trial: Callable[..., Path], path: Path, driver: str) -> Path
     trial = make_trial(id=driver, joints=tuple("abcdef"))
     names = driver_names(driver, "wrist") | {"/lab/joint_states": "/joint_states"}
     return mcap_bag(trial, path, names)
+
+
+REALSENSE = ("/camera/camera/color", "/camera/camera/aligned_depth_to_color")
+
+
+def xarm(
+    folder: Path, joints: int, *, arm: str = "/xarm", camera: tuple[str, str] = REALSENSE
+) -> Path:
+    """An xArm with its driver's joint states and a RealSense in the hand, by rosbags alone."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    msgs = store.types
+    color, depth = camera
+    names = [*(f"joint{n}" for n in range(1, joints + 1)), "drive_joint"]
+    image = np.zeros((24, 32, 3), np.uint8)
+    depth_mm = np.full((24, 32), 500, "<u2")
+
+    def header(ns: int, frame: str) -> Any:
+        stamp = msgs["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
+        return msgs["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
+
+    def picture(ns: int, encoding: str, data: np.ndarray) -> Any:
+        return msgs["sensor_msgs/msg/Image"](
+            header=header(ns, "camera_color_optical_frame"),
+            height=24,
+            width=32,
+            encoding=encoding,
+            is_bigendian=0,
+            step=data.strides[0],
+            data=data.view(np.uint8).ravel(),
+        )
+
+    def lens(ns: int) -> Any:
+        region = msgs["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
+        return msgs["sensor_msgs/msg/CameraInfo"](
+            header=header(ns, "camera_color_optical_frame"),
+            height=24,
+            width=32,
+            distortion_model="plumb_bob",
+            d=np.zeros(5),
+            k=np.array([30.0, 0, 16, 0, 30, 12, 0, 0, 1]),
+            r=np.eye(3).ravel(),
+            p=np.array([30.0, 0, 16, 0, 0, 30, 12, 0, 0, 0, 1, 0]),
+            binning_x=0,
+            binning_y=0,
+            roi=region,
+        )
+
+    def turned(ns: int) -> Any:
+        return msgs["sensor_msgs/msg/JointState"](
+            header=header(ns, ""),
+            name=names,
+            position=np.full(len(names), ns % 10**9 * 1e-9),
+            velocity=np.zeros(0),
+            effort=np.zeros(0),
+        )
+
+    def mounted(ns: int) -> Any:
+        turn = msgs["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        place = msgs["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.1)
+        motion = msgs["geometry_msgs/msg/Transform"](translation=place, rotation=turn)
+        one = msgs["geometry_msgs/msg/TransformStamped"](
+            header=header(ns, "link_eef"),
+            child_frame_id="camera_color_optical_frame",
+            transform=motion,
+        )
+        return msgs["tf2_msgs/msg/TFMessage"](transforms=[one])
+
+    said = {
+        f"{arm}/joint_states": (10, turned),
+        f"{color}/image_raw": (100, lambda ns: picture(ns, "rgb8", image)),
+        f"{color}/camera_info": (100, lens),
+        f"{depth}/image_raw": (
+            100,
+            lambda ns: picture(ns, "16UC1", depth_mm),
+        ),
+        f"{depth}/camera_info": (100, lens),
+        "/tf_static": (1000, mounted),
+    }
+    with Writer2(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        channels = {
+            topic: writer.add_connection(topic, make(0).__msgtype__, typestore=store)
+            for topic, (_, make) in said.items()
+        }
+        for step_ms in range(0, 1000, 10):
+            ns = 1_760_000_000_000_000_000 + step_ms * 10**6
+            for topic, (every_ms, make) in said.items():
+                if step_ms % every_ms == 0:
+                    message = make(ns)
+                    data = store.serialize_cdr(message, message.__msgtype__)
+                    writer.write(channels[topic], ns, data)
+    return folder

@@ -15,6 +15,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.streams import joint_track, pose_track
 from bridge.episode.writer import EpisodeWriter
+from bridge.exchange.output import new_folder
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -119,3 +120,11 @@ def test_an_empty_run_is_wrong_use(tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "run").mkdir()
     assert run("export", "csv", tmp_path / "run", tmp_path / "out") == 2
     assert "no episodes in" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(OSError, match="No space") as error, new_folder(out, force=False):
+        raise OSError(28, "No space left on device")
+    assert error.value.filename == str(out)
+    assert not list(tmp_path.iterdir())

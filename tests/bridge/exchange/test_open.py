@@ -1,6 +1,7 @@
 """``open``: what a stranger's input is, what it lacks, and the way to a page with a number."""
 
 import json
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from commands import run
 from lerobot_dataset import Dataset
 from starlette.testclient import TestClient
 
+from bridge.data_files import datasets_folder
+from bridge.episode.reader import Episode
 from dashboards.app import create_app
 from dashboards.library import Library
 
@@ -74,7 +77,7 @@ def test_a_bag_of_an_arm_in_a_database_becomes_a_trial_with_a_rate(
 ) -> None:
     bag = strangers.franka(make_trial, tmp_path / "franka")
     text = say(bag)
-    assert "robot: panda; panda_joint1" in text
+    assert "robot: panda, by the names of its joints; panda_joint1" in text
     assert "and 2 more at 125 Hz on /franka/joint_states" in text
     assert "rebuild needs a calibrated camera with colour and depth" in text
     assert "replay needs the gripper's width" in text
@@ -83,6 +86,66 @@ def test_a_bag_of_an_arm_in_a_database_becomes_a_trial_with_a_rate(
     assert f"next: robot-gst {step}" in say(bag, made)
     assert run(*step.replace("NAME", "cube_into_box").split()) == 0
     assert rates(made) == {"cube_into_box": 1.0}
+
+
+def test_a_bag_of_an_xarm_and_a_realsense_is_named(tmp_path: Path, say: Say) -> None:
+    text = say(strangers.xarm(tmp_path / "seven", 7))
+    assert "robot: xarm7_parallel_gripper, by the names of its joints; joint1" in text
+    assert "at 100 Hz on /xarm/joint_states" in text
+    assert "camera camera_camera: color image 10 Hz, color info, depth image 10 Hz" in text
+    assert "rebuild: ready" in text
+    assert "--map" not in text
+
+
+def test_a_map_names_what_a_bag_does_not_say(tmp_path: Path, say: Say) -> None:
+    bag = strangers.xarm(
+        tmp_path / "six", 6, arm="/ufactory", camera=("/head/seen", "/head/depth_seen")
+    )
+    text = say(bag)
+    assert "robot: z1, by the names of its joints; joint1, joint2" in text
+    assert "rebuild needs" in text
+    _, _, told = text.partition("a map for --map FILE, to be corrected:\n")
+    proposed, _, _ = told.partition("  record needs")
+    proposal = tomllib.loads(proposed)
+    assert proposal["robot"] == "z1"
+    names, stem = proposal["topics"], "/head/depth_seen"
+    assert names[f"{stem}/image_raw"].endswith("/depth/image")
+    assert names[f"{stem}/camera_info"].endswith("/depth/info")
+    robots, robot = datasets_folder() / "robots", tmp_path / "mine.toml"
+    robot.write_text((robots / "z1.toml").read_text().replace('name = "z1"', 'name = "six"'))
+    (tmp_path / "z1_tcp.urdf").write_bytes((robots / "z1_tcp.urdf").read_bytes())
+    new = {old: f"/cam/head/{name.partition('NAME/')[2]}" for old, name in names.items()}
+    lines = [f'robot = "{robot}"', 'task = "cube_into_box"', "[topics]"]
+    lines += [f'"{old}" = "{name}"' for old, name in new.items()]
+    file = tmp_path / "map.toml"
+    file.write_text("\n".join(lines))
+    text = say(bag, tmp_path / "run", "--map", file)
+    assert "robot: six; joint1" in text
+    assert "camera head: color image" in text
+    assert f"next: robot-gst rebuild {tmp_path / 'run'}" in text
+    (path,) = (tmp_path / "run" / "episodes").iterdir()
+    assert Episode.open(path).info.task == "cube_into_box"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("topics = 3", "--map"),
+        ("task = [", "Invalid value"),
+        ('tasks = "a"', "unexpected keyword argument 'tasks'"),
+        (None, "No such file"),
+    ],
+)
+def test_a_map_that_is_none_is_a_clear_sentence(
+    tmp_path: Path, say: Say, text: str | None, sentence: str
+) -> None:
+    bag, file = strangers.xarm(tmp_path / "bag", 7), tmp_path / "map.toml"
+    if text is not None:
+        file.write_text(text)
+    said = say(bag, tmp_path / "run", "--map", file, code=2)
+    assert f"robot-gst: --map {file}: " in said
+    assert sentence in said
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])

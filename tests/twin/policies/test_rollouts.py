@@ -20,6 +20,7 @@ from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.run import compare_run, read_run
 from twin.policies.check import check_policy, describe_check
+from twin.policies.cli import rollout
 from twin.policies.config import RolloutConfig
 from twin.policies.policy import open_policy
 from twin.policies.runs import TABLE, describe_rollouts, roll_out_run
@@ -217,3 +218,10 @@ def test_another_checkpoint_in_the_cell_ends_the_evaluation(run: RunFolder) -> N
     roll_out_run(run, config("Scripted", max_s=1.0), QUIET)
     with pytest.raises(UsageError, match=r"policy 'Scripted' is map .* in trial_6"):
         compare_run(run)
+
+
+def test_no_second_command_writes_replays_meanwhile(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path)
+    (run.episodes_dir / "trial.mcap").write_bytes(b"")
+    with run.alone_in(run.derived_dir), pytest.raises(UsageError, match="another command writes"):
+        rollout(run.path, config=RolloutConfig(policy="a:b"))

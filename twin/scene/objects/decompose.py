@@ -343,4 +343,4 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     try:
         return se3.pose_from_record(json.loads(path.read_text())["T_base_object"])
     except (OSError, ValueError, KeyError, TypeError, InvalidRecordError) as error:
-        raise UnreadableSceneError(path=path, found=f"no pose ({error!r})") from error
+        raise UnreadableSceneError(path=path, found=f"no pose ({error})") from error

@@ -90,7 +90,7 @@ def read_calibration(run: RunFolder) -> Calibration | None:
             raise UnreadableCalibrationError(path=path, found=found)
         cameras = {key: _mount(value) for key, value in record["cameras"].items()}
     except (ValueError, KeyError, TypeError, AttributeError, InvalidRecordError) as error:
-        raise UnreadableCalibrationError(path=path, found=f"no calibration ({error!r})") from error
+        raise UnreadableCalibrationError(path=path, found=f"no calibration ({error})") from error
     return Calibration(record=record, cameras=cameras)
 
 

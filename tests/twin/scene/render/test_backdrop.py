@@ -10,6 +10,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import decode_color
+from twin.errors import UnreadableFileError
 from twin.scene import backdrop
 from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.gaussians import GaussianCloud
@@ -138,6 +139,10 @@ def test_it_comes_back_as_it_was_written_and_is_missing_without_harm(tmp_path: P
     assert back is not None
     np.testing.assert_allclose(back.colors, shell().colors, atol=0.5 / 255 + 1e-6)
     assert backdrop.read_backdrop(run, {}) is None
+    path = run.scene_dir / backdrop.BACKDROP
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(UnreadableFileError, match=r"backdrop\.png: .*robot-gst rebuild"):
+        backdrop.read_backdrop(run, {"backdrop": about})
     (run.scene_dir / backdrop.BACKDROP).unlink()
     assert backdrop.read_backdrop(run, {"backdrop": about}) is None
 
