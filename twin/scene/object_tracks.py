@@ -9,7 +9,7 @@ else, and changes place when that is known.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -99,7 +99,7 @@ class ObjectTracks:
 
 def localised_tracks(
     episode: Episode,
-    localised: Sequence[Mapping[str, object]],
+    localised: Sequence[Mapping[str, Any]],
     task: Task,
     postures: PostureTrack | None,
 ) -> ObjectTracks:
@@ -108,7 +108,7 @@ def localised_tracks(
 
 
 def carried_tracks(
-    localised: Sequence[Mapping[str, object]],
+    localised: Sequence[Mapping[str, Any]],
     executions_ns: Mapping[str, tuple[int, int]],
     task: Task,
     track: PostureTrack | None,
@@ -147,27 +147,20 @@ def carried_tracks(
 
 
 def _seen(
-    name: str, localised: Sequence[Mapping[str, object]]
+    name: str, localised: Sequence[Mapping[str, Any]]
 ) -> dict[str | None, Float[np.ndarray, "4 4"]]:
     """Poses by the plan after which they were found; None: before the first. In that order."""
     own = [record for record in localised if record["object"] == name and record["found"]]
-    return {
-        None if record.get("plan_id") is None else str(record["plan_id"]): se3.pose_from_record(
-            record["T_base_object"]
-        )
-        for record in own
-    }
+    return {each.get("plan_id"): se3.pose_from_record(each["T_base_object"]) for each in own}
 
 
 def _held(
-    name: str, plan_id: str, localised: Sequence[Mapping[str, object]]
+    name: str, plan_id: str, localised: Sequence[Mapping[str, Any]]
 ) -> dict[int, Float[np.ndarray, "4 4"]]:
     """Poses ``T_tcp_object`` as cameras saw them in an execution, by the start of the grip."""
-    entries: list[Any] = []
-    for record in localised:
-        if (record["object"], record.get("plan_id")) == (name, plan_id):
-            entries += cast("list[Any]", record.get("in_hand", []))
-    return {int(each["grip_ns"]): se3.pose_from_record(each["T_tcp_object"]) for each in entries}
+    own = [each for each in localised if (each["object"], each.get("plan_id")) == (name, plan_id)]
+    entries = [entry for record in own for entry in record.get("in_hand", [])]
+    return {each["grip_ns"]: se3.pose_from_record(each["T_tcp_object"]) for each in entries}
 
 
 def _carried(

@@ -18,7 +18,7 @@ from twin.errors import TwinError
 from twin.robot.model import RobotModel
 from twin.robot.surface import PosedSurface, sample_surface
 from twin.scene.align.refine import COARSE, FINE, Equations, ScenePose, refine
-from twin.scene.align.view import LevelPlane, RobotView, find_planes
+from twin.scene.align.view import RobotView, find_levels
 
 STRIDE_PX = 3
 ERROR_CAP_M = 0.05
@@ -61,87 +61,70 @@ def depth_errors(
     return DepthErrors(errors_m=np.concatenate(errors).astype(np.float64))
 
 
-NUM_YAWS = 60
-STEP_M = 0.07
-MAX_PLACES = 400
-MARGIN_M = 0.15
-"""The base may stand this far outside of what is seen of the surface."""
 NUM_SAMPLES = 250
 MAX_VIEWS = 3
+SECTORS = np.arange(60).reshape(6, 10) * 2 * np.pi / 60
+"""All yaws, in six sectors: the best of each is followed."""
+WIDE_M = np.linspace(-0.9, 0.9, 21)
+"""Shifts from the middle of a level surface, along either side."""
+NEAR_RAD, NEAR_M = np.linspace(-0.1, 0.1, 7), np.linspace(-0.09, 0.09, 7)
+"""Finer steps around a pose."""
 CAP_M, FINE_CAP_M = 0.08, 0.04
-"""Depth differences beyond are worth nothing; the first on the grid, then around its best."""
-NUM_NEAR = 7
-"""Yaws and places to each side of a hypothesis, tried in finer steps."""
+"""Depth differences beyond are worth nothing; the first on the whole table, then around a pose."""
 SEEN_THROUGH = 0.3
 """What a point costs that the camera looks through, in units of a point that fits."""
 APART_RAD = 0.35
 APART_M = 0.12
-"""Hypotheses nearer to each other than both of these are one."""
-PER_PLANE = 8
+"""Hypotheses nearer to each other than half of both of these are one."""
 
 
-def search(
-    views: Sequence[RobotView], robot: RobotModel, planes: Sequence[LevelPlane]
+def _starts(
+    views: Sequence[RobotView], robot: RobotModel, start: Float[np.ndarray, "4 4"] | None
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """Try 60 yaws and a grid of places on each plane; return distinct ones, best first.
+    """A known pose and the best around it; else the best of the whole table, best first.
 
-    The base frame's z = 0 is taken to lie in the plane; refinement corrects that by some
+    The base frame's z = 0 is taken to lie in a level surface; refinement corrects that by some
     centimetres.
     """
     used = list(views[:: max(1, -(-len(views) // MAX_VIEWS))])
     samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(used)]
-    yaws = np.arange(NUM_YAWS) * 2 * np.pi / NUM_YAWS
+    if start is not None:  # nearest points alone get stuck beside the start
+        return [start, _best(used, samples, start, NEAR_RAD, NEAR_M, FINE_CAP_M)[1]]
     found = []
-    for plane in planes:
-        places = _grid(plane)
-        scores = _scores(used, samples, plane, yaws, places, CAP_M)
-        for yaw, place in _distinct(scores, yaws, places):
-            found.append(_polished(used, samples, plane, yaw, place))
-    return [T for _, T in sorted(found, key=lambda item: -item[0])]
+    for T_level_source in find_levels(views):
+        for yaws_rad in SECTORS:
+            _, T = _best(used, samples, T_level_source, yaws_rad, WIDE_M, CAP_M)
+            found.append(_best(used, samples, T, NEAR_RAD, NEAR_M, FINE_CAP_M))
+    if not found:
+        raise RobotNotAlignedError(
+            found="the depth images show no level surface for the robot to stand on",
+            hint="Turn the camera so that it sees the table around the robot.",
+        )
+    found.sort(key=lambda item: -item[0])
+    return [T for _, T in found[:MAX_COARSE]]
 
 
-def _polished(
+def _best(
     views: Sequence[RobotView],
     samples: Sequence[np.ndarray],
-    plane: LevelPlane,
-    yaw: float,
-    place: Float[np.ndarray, "3"],
-) -> tuple[float, Float[np.ndarray, "4 4"]]:
-    """The best of finer steps around a yaw and a place: its score, and ``T_base_source``."""
-    near_yaws = yaw + np.linspace(-1.0, 1.0, NUM_NEAR) * 2 * np.pi / NUM_YAWS
-    step = np.linspace(-STEP_M, STEP_M, NUM_NEAR)
-    near = np.stack([*np.meshgrid(step, step), np.zeros((NUM_NEAR,) * 2)], axis=-1)
-    around = place + near.reshape(-1, 3)
-    finer = _scores(views, samples, plane, near_yaws, around, FINE_CAP_M)
-    i, k = np.unravel_index(int(np.argmax(finer)), finer.shape)
-    T_level_base = se3.small_motion(np.array([0.0, 0.0, near_yaws[i], *around[k]]))
-    return float(finer[i, k]), se3.invert(T_level_base) @ plane.T_level_source
-
-
-def _scores(
-    views: Sequence[RobotView],
-    samples: Sequence[np.ndarray],
-    plane: LevelPlane,
-    yaws: Float[np.ndarray, " num_yaws"],
-    places: Float[np.ndarray, "num_places 3"],
+    T_level_source: Float[np.ndarray, "4 4"],
+    yaws_rad: Float[np.ndarray, " num_yaws"],
+    shifts_m: Float[np.ndarray, " num_shifts"],
     cap_m: float,
-) -> Float[np.ndarray, "num_yaws num_places"]:
-    scores = np.zeros((len(yaws), len(places)))
+) -> tuple[float, Float[np.ndarray, "4 4"]]:
+    """The best place of the base on a level, and its score: ``T_base_source``."""
+    x, y = np.meshgrid(shifts_m, shifts_m)
+    places = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    scores = np.zeros((len(yaws_rad), len(places)))
     for view, p_base in zip(views, samples, strict=True):
-        T_camera_level = se3.invert(plane.T_level_source @ view.T_source_camera)
+        T_camera_level = se3.invert(T_level_source @ view.T_source_camera)
         shifts = places @ T_camera_level[:3, :3].T
-        for index, yaw in enumerate(yaws):
+        for index, yaw in enumerate(yaws_rad):
             turned = p_base @ se3.rotation_from_vector(np.array([0.0, 0.0, yaw])).T
             scores[index] += _credit(view, se3.apply(T_camera_level, turned), shifts, cap_m)
-    return np.asarray(scores / len(views))
-
-
-def _grid(plane: LevelPlane) -> Float[np.ndarray, "num_places 3"]:
-    low, high = plane.low_m - MARGIN_M, plane.high_m + MARGIN_M
-    step = max(STEP_M, float(np.sqrt(np.prod(high - low) / MAX_PLACES)))
-    x, y = (np.arange(a, b + step / 2, step) for a, b in zip(low, high, strict=True))
-    grid = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1)
-    return np.asarray(grid.reshape(-1, 3))
+    i, k = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    T_level_base = se3.small_motion(np.array([0.0, 0.0, yaws_rad[i], *places[k]]))
+    return float(scores[i, k]), se3.invert(T_level_base) @ T_level_source
 
 
 def _credit(
@@ -164,25 +147,6 @@ def _credit(
     known = inside & (behind > -z)  # depth 0 is unknown
     credit = np.maximum(0.0, 1.0 - np.abs(behind) / cap_m) - SEEN_THROUGH * (behind > cap_m)
     return np.asarray(np.where(known, credit, 0.0).mean(axis=1), dtype=np.float64)
-
-
-def _distinct(
-    scores: Float[np.ndarray, "num_yaws num_places"],
-    yaws: Float[np.ndarray, " num_yaws"],
-    places: Float[np.ndarray, "num_places 3"],
-) -> list[tuple[float, Float[np.ndarray, "3"]]]:
-    """Yaw and place of the best hypotheses none of which is another's neighbour."""
-    left = scores.copy()
-    found = []
-    for _ in range(PER_PLANE):
-        yaw, place = np.unravel_index(int(np.argmax(left)), left.shape)
-        if not np.isfinite(left[yaw, place]):
-            break
-        found.append((float(yaws[yaw]), places[place]))
-        turn = np.abs((yaws - yaws[yaw] + np.pi) % (2 * np.pi) - np.pi)
-        shift = np.linalg.norm(places - places[place], axis=1)
-        left[(turn[:, None] < APART_RAD) & (shift[None] < APART_M)] = -np.inf
-    return found
 
 
 COARSE_POINTS = 1000
@@ -260,16 +224,7 @@ def align_robot(
             found="there is no depth image", hint="Record the camera while the robot stands still."
         )
     surfaces = [PosedSurface(robot, view.posture) for view in views]
-    if start is None:
-        starts = _starts(views, robot)
-    else:  # nearest points alone get stuck beside the start: the best of what lies around it, too
-        samples = [
-            sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(views)
-        ]
-        nowhere = np.zeros(2)
-        plane = LevelPlane(T_level_source=start, low_m=nowhere, high_m=nowhere)
-        _, around = _polished(views, samples, plane, 0.0, np.zeros(3))
-        starts = [ScenePose(T_base_source=T) for T in (start, around)]
+    starts = [ScenePose(T_base_source=T) for T in _starts(views, robot, start)]
     coarse = [_refined(views, surfaces, pose, fine=False, seed=seed) for pose in starts]
     best, others = _ranked(coarse)
     finals = [
@@ -291,17 +246,6 @@ def align_robot(
         num_points=best.equations.num_points,
         num_views=len(views),
     )
-
-
-def _starts(views: Sequence[RobotView], robot: RobotModel) -> list[ScenePose]:
-    planes = find_planes(views)
-    if not planes:
-        raise RobotNotAlignedError(
-            found="the depth images show no level surface for the robot to stand on",
-            hint="Turn the camera so that it sees the table around the robot.",
-        )
-    found = search(views, robot, planes)
-    return [ScenePose(T_base_source=T) for T in found[:MAX_COARSE]]
 
 
 def _refined(

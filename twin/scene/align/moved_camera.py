@@ -28,7 +28,7 @@ LIMITS = DepthLimits(max_depth_m=5.0)
 
 
 class MovedCameraError(TwinError):
-    """A camera was moved, and nothing says where to."""
+    """A camera moved, and its poses do not say where to."""
 
 
 @dataclass(frozen=True, kw_only=True)

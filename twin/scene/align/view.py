@@ -57,18 +57,10 @@ LOOKING_DOWN = 0.9
 """Cosines: a level surface faces a camera's upper edge, or a camera that looks straight down."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class LevelPlane:
-    """A plane seen from above, with a frame ``level`` in it: z up, z = 0 in the plane."""
-
-    T_level_source: Float[np.ndarray, "4 4"]
-    low_m: Float[np.ndarray, "2"]
-    high_m: Float[np.ndarray, "2"]
-    """Where its points lie, in x and y of ``level``."""
-
-
-def find_planes(views: Sequence[RobotView]) -> list[LevelPlane]:
+def find_levels(views: Sequence[RobotView]) -> list[Float[np.ndarray, "4 4"]]:
     """Find the largest planes that can be level, largest first (Fischler and Bolles, 1981).
+
+    Each as ``T_level_source``: z = 0 in the plane, z up, the origin amid what is seen of it.
 
     Gravity is not known: a wall that faces the camera is told from a table by the camera's upper
     edge, which points up, and what is left over is told by where the robot fits.
@@ -83,11 +75,11 @@ def find_planes(views: Sequence[RobotView]) -> list[LevelPlane]:
     up = -np.mean([view.T_source_camera[:3, 1] for view in views], axis=0)
     back = -np.mean([view.T_source_camera[:3, 2] for view in views], axis=0)
     eye = np.mean([view.T_source_camera[:3, 3] for view in views], axis=0)
-    planes: list[LevelPlane] = []
+    levels: list[np.ndarray] = []
     open3d.utility.random.seed(0)
     left = p
     for _ in range(2 * MAX_PLANES):
-        if len(left) < 50 or len(planes) == MAX_PLANES:
+        if len(left) < 50 or len(levels) == MAX_PLANES:
             break
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(left))
         plane, on = cloud.segment_plane(NEAR_M, 3, NUM_TRIALS)
@@ -95,17 +87,10 @@ def find_planes(views: Sequence[RobotView]) -> list[LevelPlane]:
             break
         plane = plane if plane[:3] @ eye + plane[3] > 0 else -plane
         if plane[:3] @ up > UPRIGHT or plane[:3] @ back > LOOKING_DOWN:
-            planes.append(_level(left[on], plane[:3], -float(plane[3]), eye))
+            normal, centre = plane[:3], np.median(left[on], axis=0)
+            x = np.cross(np.eye(3)[int(np.argmin(np.abs(normal)))], normal)
+            x /= np.linalg.norm(x)
+            R = np.stack([x, np.cross(normal, x), normal])
+            levels.append(se3.from_rotation(R, [*-(R @ centre)[:2], float(plane[3])]))
         left = np.delete(left, on, axis=0)
-    return planes
-
-
-def _level(p: np.ndarray, normal: np.ndarray, offset: float, eye: np.ndarray) -> LevelPlane:
-    aside = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    x = np.cross(aside, normal)
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(normal, x), normal])
-    T = se3.from_rotation(R, -R @ (eye - normal * (normal @ eye - offset)))
-    xy = se3.apply(T, p)[:, :2]
-    low, high = np.quantile(xy, [0.02, 0.98], axis=0)
-    return LevelPlane(T_level_source=T, low_m=low, high_m=high)
+    return levels

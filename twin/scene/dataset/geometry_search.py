@@ -24,6 +24,10 @@ from twin.scene.settings import FrameConfig
 
 FACTORS = np.geomspace(0.4, 2.5, 25)
 """Depth scales and focal lengths that are tried first."""
+UNITS = (0.001, 0.1, 0.2, 5.0, 10.0, 1000.0)
+"""Depth scales of a wrong unit; also of positions in millimetres, and of TUM's 1/5000 m."""
+SHIFT_MATTERS = 0.05
+"""A unit under which cameras move less must fit better than cameras that only turn."""
 MOST_LATE_FRAMES = 8
 LEAST_LEFT = 1 / 3
 """Share of the pairs that have to lie within the recording when poses are moved in time."""
@@ -46,7 +50,8 @@ LEAST_AGREEMENT = 0.35
 SMALLEST = {"depth": 0.03, "focal": 0.03, "delay": 0.6}
 """Deviations below are within what cameras and clocks do; of the delay in frames."""
 MENDED = {
-    "depth": "Import it again with another --depth-unit-m, or set the unit of the camera's driver",
+    "depth": "Import it again with another --depth-unit-m or with positions in metres, or set the "
+    "unit of the camera's driver",
     "focal": "Import it again with --depth-intrinsics, or correct what the driver sends",
     "delay": "Record images and poses by one clock",
 }
@@ -103,8 +108,8 @@ def search_geometry(
     if recorded >= ENOUGH:
         return None
     found = [
-        _best("depth", lambda s: _agreement(pairs, depth=s), recorded),
-        _best("focal", lambda s: _agreement(pairs, focal=s), recorded),
+        _best("depth", lambda s: _agreement(pairs, depth=s), recorded, (*FACTORS, *UNITS)),
+        _best("focal", lambda s: _agreement(pairs, focal=s), recorded, tuple(FACTORS)),
     ]
     if pose_at is not None and frame_ns > 0:
         ends_ns = images[0].stamp_ns, images[-1].stamp_ns
@@ -117,9 +122,9 @@ def search_geometry(
     best = max(found, key=lambda item: item.after)
     off = abs(best.frames) if best.kind == "delay" else abs(np.log(best.value))
     is_clear = best.after >= recorded + LEAST_GAIN and best.after >= LEAST_AGREEMENT
-    if not is_clear or off < SMALLEST[best.kind]:
-        return None
-    return best
+    if best.kind == "depth" and best.value > FACTORS[-1]:
+        is_clear &= best.after >= _agreement(pairs, depth=1e9) + SHIFT_MATTERS
+    return best if is_clear and off >= SMALLEST[best.kind] else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,9 +181,10 @@ def _agreement_late(
     return _agreement(kept) if len(kept) >= LEAST_LEFT * len(pairs) else 0.0
 
 
-def _best(kind: str, score: Callable[[float], float], recorded: float) -> Correction:
-    logs = np.log(FACTORS)
-    at, after = _climbed(logs, lambda x: score(float(np.exp(x))))
+def _best(
+    kind: str, score: Callable[[float], float], recorded: float, factors: Sequence[float]
+) -> Correction:
+    at, after = _climbed(np.log(factors), lambda x: score(float(np.exp(x))))
     return Correction(kind=kind, value=float(np.exp(at)), frames=0.0, before=recorded, after=after)
 
 

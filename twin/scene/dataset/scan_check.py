@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.errors import TwinError
+from twin.scene.align.moved_camera import MovedCameraError
 from twin.scene.frames.downscaled import DownscaledDepth, Meeting, meet
 from twin.scene.frames.pairing import name_of
 from twin.scene.frames.rgbd import NEAR_M
@@ -42,23 +43,17 @@ AXES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Convention:
-    """One way of reading poses and depth."""
+    """One way of reading poses."""
 
     order: str = ""
     inverse: bool = False
     axes: str = ""
-    depth_scale: float = 1.0
 
     def describe(self) -> str:
         """Say what differs from our own reading."""
         parts = [self.order, self.axes]
         if self.inverse:
             parts.append("they are world-to-camera, not camera-to-world")
-        if self.depth_scale != 1.0:
-            parts.append(
-                f"depth is to be multiplied by {self.depth_scale:g} "
-                f"(or positions by {1 / self.depth_scale:g})"
-            )
         return " and ".join(part for part in parts if part) or "as recorded"
 
     def read(self, T_as_read: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
@@ -168,18 +163,10 @@ GAPS = (1, 2, 4, 8, 16)
 """Pairs are this many training frames apart."""
 STATIONARY_AGREEMENT = 0.7
 """Where this much agrees without any motion, the camera hardly moved and poses say nothing."""
-SHIFT_MATTERS = 0.05
-"""A unit under which cameras move less must fit better than cameras that only turn."""
-OTHER_SCALES = (0.1, 10.0, 0.2, 5.0, 0.001, 1000.0)
-"""Depth times this; also positions in millimetres, and TUM's depth of 1/5000 m."""
 
 
 class PoseConventionError(TwinError):
     """Poses fit the depth only when they are read in another way."""
-
-
-class MovedCameraError(TwinError):
-    """A camera moved while its poses say that it stood still."""
 
 
 def check_poses(images: Sequence[DownscaledDepth]) -> PoseReport:
@@ -189,24 +176,8 @@ def check_poses(images: Sequence[DownscaledDepth]) -> PoseReport:
         return PoseReport(num_pairs=0, agreement=None, overlap=0.0)
     recorded = _score(pairs, Convention())
     plain = plain_report(len(pairs), recorded)
-    better, score = _best(pairs)
-    if better.depth_scale > 1.0:
-        turned_only = _score(pairs, replace(better, depth_scale=1e9)).agreement
-        if score < turned_only + SHIFT_MATTERS:
-            return plain
+    better, score = best_of(OTHER_POSES, lambda convention: _score(pairs, convention))
     return judged(plain, recorded, better, score)
-
-
-def _best(pairs: list[tuple[DownscaledDepth, DownscaledDepth]]) -> tuple[Convention, float]:
-    """The best other convention: one thing wrong if that explains it, else a wrong unit too."""
-    units = [Convention(depth_scale=scale) for scale in OTHER_SCALES]
-    best = best_of([*OTHER_POSES, *units], lambda convention: _score(pairs, convention))
-    if best[1] >= GOOD:
-        return best
-    both = [replace(r, depth_scale=scale) for r, scale in product(OTHER_POSES, OTHER_SCALES)]
-    some = pairs[:: max(1, len(pairs) // 4)]
-    also = best_of(both, lambda convention: _score(some, convention))
-    return max(best, also, key=lambda item: item[1])
 
 
 def _score(pairs: list[tuple[DownscaledDepth, DownscaledDepth]], convention: Convention) -> Meeting:
@@ -215,10 +186,7 @@ def _score(pairs: list[tuple[DownscaledDepth, DownscaledDepth]], convention: Con
         T_base_first, T_base_second = (
             convention.read(image.T_base_depth) for image in (first, second)
         )
-        T_second_first = se3.invert(T_base_second) @ T_base_first
-        # Depth times a scale is the same as moving by the inverse, up to the tolerance.
-        T_second_first[:3, 3] /= convention.depth_scale
-        met.append(meet(first, second, T_second_first))
+        met.append(meet(first, second, se3.invert(T_base_second) @ T_base_first))
     return mean_of(met)
 
 

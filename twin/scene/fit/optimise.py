@@ -15,7 +15,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
@@ -293,17 +292,13 @@ class Events:
         self._views = views
         self._max_splats = max_splats
         self._rasteriser = rasteriser
-
-    @cached_property
-    def _schedule(self) -> list[tuple[float, float, Act]]:
+        planned: list[tuple[float, float, Act]] = [
+            *((at, SPLIT_SHARE, self._densify) for at in SPLIT_AT),
+            *((at, EXPOSURES_SHARE, self._solve_exposures) for at in EXPOSURES_AT),
+            *((at, SOLVE_SHARE, self._solve_colours) for at in SOLVE_AT),
+        ]
+        self._schedule = sorted(planned, key=lambda event: event[0])
         """When, in which share of the budget at most, and what."""
-        planned = (
-            (SPLIT_AT, SPLIT_SHARE, self._densify),
-            (EXPOSURES_AT, EXPOSURES_SHARE, self._solve_exposures),
-            (SOLVE_AT, SOLVE_SHARE, self._solve_colours),
-        )
-        events = [(at, share, act) for ats, share, act in planned for at in ats]
-        return sorted(events, key=lambda event: event[0])
 
     def keep(self, state: FitState, at: Progress) -> None:
         """Do what is due; what is already behind is not done again."""

@@ -188,8 +188,7 @@ def _turn(T: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _carry(T: np.ndarray, p: np.ndarray) -> np.ndarray:
-    moved: np.ndarray = _turn(T, p) + T[:3, 3:].astype(np.float32)
-    return moved
+    return np.asarray(_turn(T, p) + T[:3, 3:].astype(np.float32))
 
 
 def _pixels(camera: Camera, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,12 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import provenance, schema, streams
-from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.executions import EXECUTION, NO_PLAN, executed_events
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.topics import LOCALISATION, cell_topic, object_topic
+from bridge.episode.topics import LOCALISATION, cell_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError, GstError
 from bridge.task.task_file import Task
@@ -140,10 +139,10 @@ def write_localised(
 ) -> Path:
     """Write ``derived/<episode>.localised.<scene>.mcap`` and return its path.
 
-    Holds one gst localisation record per object for the start and after every execution, and a
-    PoseStamped per object that was found. Objects whose shape only a scan knows are laid out by the
-    meshes of the run's scene, and calibrated cameras are where the run's calibration says. A file
-    made from the same bytes with the same settings is kept.
+    Holds one gst localisation record per object for the start and after every execution. Objects
+    whose shape only a scan knows are laid out by the meshes of the run's scene, and calibrated
+    cameras are where the run's calibration says. A file made from the same bytes with the same
+    settings is kept.
 
     Args:
         scene_hash: The scene the poses are meant for; its first twelve digits name the file.
@@ -164,7 +163,6 @@ def write_localised(
     )
     if path.exists() and _made_from(path, derived):
         return path
-    base_frame = streams.recorded_robot(episode).base_frame
     moved = moved_cameras(run, episode)
     if moved:
         about = {key: item.to_record() for key, item in moved.items()}
@@ -177,7 +175,7 @@ def write_localised(
         writer.describe(episode.info, derived=derived)
         for phase, objects in phases:
             in_hand = held.get(phase.plan_id or "", {})
-            _write_phase(writer, episode.info.cell or "cell", phase, objects, base_frame, in_hand)
+            _write_phase(writer, episode.info.cell or "cell", phase, objects, in_hand)
     return path
 
 
@@ -269,7 +267,6 @@ def _write_phase(
     cell: str,
     phase: Phase,
     objects: dict[str, LocalisedObject],
-    base_frame: str,
     in_hand: Mapping[str, Any],
 ) -> None:
     for object_id, found in objects.items():
@@ -284,14 +281,3 @@ def _write_phase(
             log_time_ns=stamp_ns,
             publish_time_ns=stamp_ns,
         )
-        if found.T_base_object is not None:
-            sample = PoseSample(
-                stamp_ns=stamp_ns, frame_id=base_frame, T_frame_body=found.T_base_object
-            )
-            writer.write(
-                object_topic(cell, object_id, "pose"),
-                sample.to_cdr(),
-                type_name=schema.POSE_STAMPED,
-                log_time_ns=stamp_ns,
-                publish_time_ns=stamp_ns,
-            )

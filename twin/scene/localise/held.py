@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import streams
-from bridge.episode.executions import executed_events
+from bridge.episode.executions import EXECUTION, executed_events
 from bridge.episode.reader import Episode
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import GstError
@@ -60,13 +60,9 @@ class Grip:
 def executions_ns(episode: Episode) -> dict[str, tuple[int, int]]:
     """When each plan was executed, from start to end."""
     events = executed_events(episode)
-    found = {}
-    for event in events:
-        if event["type"] == "execution_ended" and event.get("plan_id") is not None:
-            start_ns, end_ns = streams.execution_ns(events, str(event["plan_id"]))
-            if start_ns is not None and end_ns is not None:
-                found[str(event["plan_id"])] = (start_ns, end_ns)
-    return found
+    ended = [event for event in events if event["type"] == EXECUTION[1] and event.get("plan_id")]
+    spans = {str(e["plan_id"]): streams.execution_ns(events, str(e["plan_id"])) for e in ended}
+    return {key: (a, b) for key, (a, b) in spans.items() if a is not None and b is not None}
 
 
 def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns: int) -> list[Grip]:
@@ -138,21 +134,20 @@ def _in_tool_frame(
         with suppress(GstError):  # others may see it
             known = poses.get(camera_id) or CameraPoses(tree=tree, source="tf")
             stamps = paired_stamps_ns(episode, camera_id)
-            stamps = stamps[(stamps > grip.start_ns + SETTLES_NS)]
-            stamps = np.setdiff1d(stamps[stamps < grip.end_ns - SETTLES_NS], [*known.unposed_ns])
+            held = (stamps > grip.start_ns + SETTLES_NS) & (stamps < grip.end_ns - SETTLES_NS)
+            stamps = np.setdiff1d(stamps[held], [*known.unposed_ns])
             wanted = set(spread(stamps, FRAMES).tolist())
-            if (
-                known.tree.root_of(streams.camera_info(episode, camera_id).frame_id)
-                == robot.record.base_frame
-            ):
-                for frame in streams.rgbd_frames(episode, camera_id, known.tree, wanted):
-                    T_base_tcp = robot.T_base_tcp(track.at(frame.stamp_ns).joints_rad)
-                    T = UPWARDS @ se3.invert(T_base_tcp)
-                    yield replace(
-                        with_true_depth(frame, known),
-                        T_base_color=T @ frame.T_base_color,
-                        T_base_depth=T @ frame.T_base_depth,
-                    )
+            frame_id = streams.camera_info(episode, camera_id).frame_id
+            if known.tree.root_of(frame_id) != robot.record.base_frame:
+                continue
+            for frame in streams.rgbd_frames(episode, camera_id, known.tree, wanted):
+                T_base_tcp = robot.T_base_tcp(track.at(frame.stamp_ns).joints_rad)
+                T = UPWARDS @ se3.invert(T_base_tcp)
+                yield replace(
+                    with_true_depth(frame, known),
+                    T_base_color=T @ frame.T_base_color,
+                    T_base_depth=T @ frame.T_base_depth,
+                )
 
 
 def fitted_in_hand(

@@ -59,9 +59,8 @@ def stationary_frames(
         known = (poses or {}).get(camera_id) or CameraPoses(tree=tree, source="tf")
         hidden = known.unposed_ns.union((held_out_ns or {}).get(camera_id, ()))
         try:
-            usable[camera_id] = _stationary(
-                episode, camera_id, replace(known, unposed_ns=hidden), after_ns, before_ns
-            )
+            known = replace(known, unposed_ns=hidden)
+            usable[camera_id] = known, *_stationary(episode, camera_id, known, after_ns, before_ns)
         except GstError as error:
             failed.append(error)
     if failed and not usable:
@@ -84,8 +83,8 @@ def _stationary(
     poses: CameraPoses,
     after_ns: int | None,
     before_ns: int | None,
-) -> tuple[CameraPoses, str, Int[np.ndarray, " num_frames"]]:
-    """Poses of a camera, the frame they are in, and when it stood still in an interval."""
+) -> tuple[str, Int[np.ndarray, " num_frames"]]:
+    """The frame a camera's poses are in, and when it stood still in an interval."""
     check_camera(episode, camera_id)
     frame_id = streams.camera_info(episode, camera_id, "color").frame_id
     check_connected(poses.tree, episode, camera_id)
@@ -99,7 +98,7 @@ def _stationary(
         for stamp in stamps.tolist()
         if stamp not in poses.unposed_ns and is_stationary(poses.tree, frame_id, stamp, before_ns)
     ]
-    return poses, poses.tree.root_of(frame_id), np.array(stationary, dtype=np.int64)
+    return poses.tree.root_of(frame_id), np.array(stationary, dtype=np.int64)
 
 
 def common_root(roots: Sequence[str], base_frame: str) -> str | None:

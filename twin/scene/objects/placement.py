@@ -46,14 +46,12 @@ class Placement:
 
     def owns(self, p_m: Float32[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
         """Which points (base frame) show an object."""
-        owned: np.ndarray = (p_m[:, 2] > LIFTED_M) & self._near(p_m, OWN_M)
-        return owned
+        return np.asarray((p_m[:, 2] > LIFTED_M) & self._near(p_m, OWN_M))
 
     def covers(self, p_m: Float32[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
         """Which points of the table an object stands on, or nearly so."""
         on_top = np.column_stack([p_m[:, :2], np.maximum(p_m[:, 2], 0.0)])
-        under: np.ndarray = (p_m[:, 2] <= LIFTED_M) & self._near(on_top, UNDER_M)
-        return under
+        return np.asarray((p_m[:, 2] <= LIFTED_M) & self._near(on_top, UNDER_M))
 
     def _near(self, p_m: np.ndarray, margin_m: float) -> Bool[np.ndarray, " num_points"]:
         mine = np.zeros(len(p_m), dtype=bool)

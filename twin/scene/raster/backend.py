@@ -66,8 +66,6 @@ class CudaRasteriser:
     Sums on the GPU are in no fixed order: results repeat to about 1e-6, not bit by bit.
     """
 
-    isa = "cuda"
-
     def __init__(self, config: RasterConfig | None = None, *, device: str = "cuda") -> None:
         """Look for the device and for gsplat.
 

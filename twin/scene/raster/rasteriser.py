@@ -160,14 +160,10 @@ class FitSession:
         self._loss = (loss == "3dgs", L1_SHARE, depth_weight)
         self._native = load_native().FitSession(self.config.threads, self.config.isa)
         self._pace = ThreadPace(self.config.threads or os.cpu_count() or 1)
-        self._cloud = _own_copy(cloud)
+        self.cloud = _own_copy(cloud)
+        """As it is now. Its arrays change with each step, and may be written to."""
         self._first = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
         self._second = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
-
-    @property
-    def cloud(self) -> GaussianCloud:
-        """The cloud as it is now. Its arrays change with each step, and may be written to."""
-        return self._cloud
 
     def step(
         self,
@@ -188,9 +184,9 @@ class FitSession:
         threads = self._pace.choose(size)
         self._native.use_threads(threads)
         loss, squared, num_static, d_gain, d_pose, seconds, serial_s = self._native.step(
-            self._tables(dict(arrays(self._cloud))),
-            self._tables(self._first),
-            self._tables(self._second),
+            _tables(dict(arrays(self.cloud))),
+            _tables(self._first),
+            _tables(self._second),
             *native_camera(target.camera, T_base_camera),
             self.config.alpha_cut,
             self.config.transmittance_stop,
@@ -221,11 +217,12 @@ class FitSession:
         """
         for moments in (self._first, self._second):
             moments |= {name: rows[parents] for name, rows in moments.items()}
-        self._cloud = _own_copy(cloud)
+        self.cloud = _own_copy(cloud)
 
-    @staticmethod
-    def _tables(named: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, ...]:
-        return tuple(named.get(name) for name in NAMES)
+
+def _tables(named: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, ...]:
+    """Arrays as the extension takes them; None for those that are not there."""
+    return tuple(named.get(name) for name in NAMES)
 
 
 def _own_copy(cloud: GaussianCloud) -> GaussianCloud:
@@ -269,16 +266,10 @@ class Rasteriser:
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
         """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
+        *rows, harmonics = _tables(dict(arrays(cloud)))
+        place, cuts = native_camera(camera, T_base_camera), self.config
         planes: np.ndarray = self._native.draw(
-            cloud.means_m,
-            cloud.quats_wxyz,
-            cloud.scales_log,
-            cloud.opacities_logit,
-            cloud.colors,
-            *native_camera(camera, T_base_camera),
-            self.config.alpha_cut,
-            self.config.transmittance_stop,
-            cloud.harmonics if cloud.num_harmonics else None,
+            *rows, *place, cuts.alpha_cut, cuts.transmittance_stop, harmonics
         )
         return planes
 
@@ -296,24 +287,15 @@ class Rasteriser:
             under: What that call returned.
             hidden: Gaussians of that call to be left out.
         """
-        planes: np.ndarray = self._native.draw_over(
-            cloud.means_m,
-            cloud.quats_wxyz,
-            cloud.scales_log,
-            cloud.opacities_logit,
-            cloud.colors,
-            under,
-            hidden,
-            cloud.harmonics if cloud.num_harmonics else None,
-        )
+        *rows, harmonics = _tables(dict(arrays(cloud)))
+        planes: np.ndarray = self._native.draw_over(*rows, under, hidden, harmonics)
         return planes
 
     def draw_features(
         self, features: Float32[np.ndarray, "num_splats num_channels"]
     ) -> Float32[np.ndarray, "num_channels height width"]:
         """Draw any channels with the weights A of the last ``draw_planes``: A F."""
-        planes: np.ndarray = self._native.draw_features(as_float32(features))
-        return planes
+        return np.asarray(self._native.draw_features(as_float32(features)))
 
     def lift(
         self, maps: Float32[np.ndarray, "num_channels height width"]
@@ -322,8 +304,7 @@ class Rasteriser:
 
         The adjoint of ``draw_features``. A map of ones gives the sum of each Gaussian's weights.
         """
-        features: np.ndarray = self._native.lift(as_float32(maps))
-        return features
+        return np.asarray(self._native.lift(as_float32(maps)))
 
     def label_map(
         self, labels: UInt16[np.ndarray, " num_splats"]
@@ -337,13 +318,11 @@ class Rasteriser:
 
     def surface_depth(self) -> Float32[np.ndarray, "height width"]:
         """Depth of what is opaque in the last ``draw_planes`` [m], as in ``View``."""
-        depth_m: np.ndarray = self._native.surface_depth()
-        return depth_m
+        return np.asarray(self._native.surface_depth())
 
     def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
         """Say which Gaussians could touch the last image."""
-        mask: np.ndarray = self._native.visible()
-        return mask
+        return np.asarray(self._native.visible())
 
     def view(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]

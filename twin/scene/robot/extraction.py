@@ -352,9 +352,5 @@ def find_robot(choices: Sequence[FrameChoice]) -> RobotFrames:
 
 def write_robot(run: RunFolder, frames: RobotFrames, links: LitLinks) -> dict[str, Any]:
     """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot."""
-    record = {
-        "remark": frames.remark,
-        "links": write_links(run, links.clouds),
-        "lighting": links.lighting.to_record(),
-    }
-    return {"robot": record}
+    links_record, lighting = write_links(run, links.clouds), links.lighting.to_record()
+    return {"robot": {"remark": frames.remark, "links": links_record, "lighting": lighting}}

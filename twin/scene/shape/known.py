@@ -1,10 +1,9 @@
 """The surface of a known shape, and how it may be turned."""
 
-from itertools import permutations, product
-
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
@@ -40,20 +39,11 @@ def turned_alike(
 
     A solid box may also stand on any of its other sides.
     """
-    period = yaw_period_rad(model)
-    turns = [
-        se3.rotation_from_vector(np.array([0.0, 0.0, k * period]))
-        for k in range(round(2 * np.pi / period))
-    ]
+    count = round(2 * np.pi / yaw_period_rad(model))
+    turns = Rotation.create_group(f"C{count}").as_matrix()
     if model.shape == "box":
-        axes = (
-            np.diag(s)[list(p)] for s in product((1, -1), repeat=3) for p in permutations((0, 1, 2))
-        )
-        turns = [
-            R
-            for R in axes
-            if np.linalg.det(R) > 0 and np.allclose(abs(R) @ model.size_m, model.size_m)
-        ]
+        cube = Rotation.create_group("O").as_matrix()
+        turns = cube[np.isclose(np.abs(cube) @ model.size_m, model.size_m).all(axis=1)]
     best = min(
         (T_base_object[:3, :3] @ turn for turn in turns),
         key=lambda R: float(se3.rotation_angle_rad(R.T @ T_base_expected[:3, :3])),

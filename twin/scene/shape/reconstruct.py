@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from bridge.task.meshes.solids import is_closed
 from twin.robot.surface import ray_scene, tensor
+from twin.scene.frames.selection import spread
 from twin.scene.shape.carve import (
     MaskedView,
     ShapeError,
@@ -100,16 +101,14 @@ def _useful(views: Sequence[MaskedView]) -> list[MaskedView]:
             "object, and at least 2 from different directions are needed. Scan it from more sides."
         )
         raise ShapeError(message)
-    if len(useful) > MAX_VIEWS:
-        ids = np.linspace(0, len(useful) - 1, MAX_VIEWS).round().astype(int)
-        useful = [useful[index] for index in ids]
+    useful = [useful[index] for index in spread(np.arange(len(useful)), MAX_VIEWS)]
     middle = np.mean([view.points_m().mean(axis=0) for view in useful], axis=0)
     rays = np.array([view.T_base_camera[:3, 3] - middle for view in useful])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
-    spread = float(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)).max())
-    if spread < MIN_SPREAD_RAD:
+    turn = float(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)).max())
+    if turn < MIN_SPREAD_RAD:
         message = (
-            f"all {len(useful)} views see the object from within {np.degrees(spread):.0f} degrees; "
+            f"all {len(useful)} views see the object from within {np.degrees(turn):.0f} degrees; "
             f"at least {np.degrees(MIN_SPREAD_RAD):.0f} are needed. Scan it from more sides."
         )
         raise ShapeError(message)

@@ -60,12 +60,7 @@ class SdfGrid:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything that ``load`` needs, by name."""
-        return {
-            "values_m": self.values_m,
-            "origin_m": self.origin_m,
-            "voxel_m": np.array(self.voxel_m),
-            "closed": np.array(self.closed),
-        }
+        return {name: np.asarray(getattr(self, name)) for name in _NAMES}
 
     @staticmethod
     def load(path: Path) -> "SdfGrid":

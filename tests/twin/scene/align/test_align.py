@@ -12,7 +12,7 @@ from twin.robot.surface import PosedSurface, sample_surface
 from twin.scene.align import align
 from twin.scene.align.align import RobotNotAlignedError, align_robot, depth_errors
 from twin.scene.align.refine import FINE, ScenePose, refine
-from twin.scene.align.view import RobotView, find_planes
+from twin.scene.align.view import RobotView, find_levels
 
 TWO = cell_views.POSTURES[:2]
 BIASED = cell_views.CellErrors(depth_scale=1.01)
@@ -56,10 +56,9 @@ def test_the_posed_surface_is_where_forward_kinematics_says() -> None:
 
 def test_the_table_is_found_and_is_level(biased: list[RobotView]) -> None:
     T_source_base = cell_views.anywhere(1)
-    planes = find_planes(moved(biased, T_source_base))
     heights, tilts = [], []
-    for plane in planes:
-        T_level_base = plane.T_level_source @ T_source_base
+    for T_level_source in find_levels(moved(biased, T_source_base)):
+        T_level_base = T_level_source @ T_source_base
         tilts.append(np.degrees(np.arccos(np.clip(T_level_base[2, 2], -1, 1))))
         heights.append(T_level_base[2, 3])
     assert any(t < 1.0 and abs(h) < 0.02 for t, h in zip(tilts, heights, strict=True))

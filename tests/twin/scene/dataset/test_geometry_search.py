@@ -10,7 +10,7 @@ import textured_room
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from twin.scene.dataset.geometry_search import WrongGeometryError, check_geometry, search_geometry
-from twin.scene.dataset.scan_check import CameraCheck, check_scan
+from twin.scene.dataset.scan_check import CameraCheck, check_poses, check_scan
 from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
 from twin.scene.frames.selection import FrameChoice, choose_frames, find_sources, load
 from twin.scene.settings import FrameConfig
@@ -71,6 +71,22 @@ def test_the_wrong_number_is_found_and_no_other(kind: str, wrong: float) -> None
     else:
         assert 1 / found.value == pytest.approx(wrong, rel=0.02)
         assert ("focal length is" if kind == "focal" else "depth reads") in found.describe()
+
+
+@pytest.mark.parametrize(("depth", "positions"), [(0.2, 1.0), (10.0, 1.0), (1.0, 1000.0)])
+def test_a_wrong_unit_is_a_wrong_depth_and_no_other_convention(
+    depth: float, positions: float
+) -> None:
+    images = []
+    for right in (downscaled_depth(textured_room.frame(k, NUM_FRAMES), 72) for k in range(10)):
+        T = right.T_base_depth.copy()
+        T[:3, 3] *= positions
+        images.append(replace(right, T_base_depth=T, depth_m=np.float32(depth) * right.depth_m))
+    assert check_poses(images).better is None
+    found = search_geometry(images)
+    assert found is not None
+    assert found.kind == "depth"
+    assert found.value == pytest.approx(positions / depth, rel=0.05)
 
 
 @pytest.fixture(scope="module")

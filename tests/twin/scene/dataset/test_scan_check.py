@@ -13,9 +13,9 @@ from bridge.episode.cdr.messages import FrameTransform
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.terminal import Output
+from twin.scene.align.moved_camera import MovedCameraError
 from twin.scene.dataset.scan_check import (
     CameraCheck,
-    MovedCameraError,
     NoDepthError,
     PoseConventionError,
     ScanReport,
