@@ -122,37 +122,6 @@ def test_what_cannot_be_sent_is_not() -> None:
             encode({"x": value})
 
 
-def test_text_is_the_servers_error() -> None:
-    with served(lambda _: "Traceback ...\nValueError: no camera named wrist\n") as (address, _):
-        policy = ServedPolicy(address, 5.0)
-        with pytest.raises(PolicyError, match="failed: ValueError: no camera named wrist"):
-            policy.infer({})
-
-
-def test_a_silent_server_is_not_waited_for() -> None:
-    gone = threading.Event()
-
-    def never(_: bytes) -> bytes:
-        gone.wait(30)
-        return b"\x80"
-
-    with served(never) as (address, _):
-        policy = ServedPolicy(address, 0.3)
-        with pytest.raises(PolicyError, match=r"said nothing for 0\.3 s"):
-            policy.infer({})
-        gone.set()
-        policy.close()
-
-
-def test_more_than_64_mb_end_the_connection() -> None:
-    with served(lambda _: b"\0" * (65 << 20)) as (address, _):
-        policy = ServedPolicy(address, 10.0)
-        with pytest.raises(PolicyError, match="closed the connection"):
-            policy.infer({})
-        with pytest.raises(PolicyError, match="closed the connection"):
-            policy.infer({})
-
-
 def test_a_gigabyte_in_pieces_is_not_taken() -> None:
     sent = list[int]()
 
@@ -164,8 +133,9 @@ def test_a_gigabyte_in_pieces_is_not_taken() -> None:
     tracemalloc.start()
     with served(pieces) as (address, _):
         policy = ServedPolicy(address, 20.0)
-        with pytest.raises(PolicyError, match="closed the connection"):
-            policy.infer({})
+        for _ in range(2):
+            with pytest.raises(PolicyError, match="closed the connection"):
+                policy.infer({})
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(sent) < 128

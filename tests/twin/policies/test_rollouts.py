@@ -110,7 +110,6 @@ def test_who_acted_stands_in_the_table_and_another_checkpoint_apart(
     [
         ("still", False, "the middle of cube is .* mm beyond the cavity of box"),
         ("reckless", False, "limits: .* moves at 10.00 rad/s"),
-        ("broken", None, "not finite from row 0 on"),
         ("raising", None, "the policy failed: KeyError: 'wrist'"),
     ],
 )
