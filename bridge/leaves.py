@@ -78,9 +78,7 @@ LEAVES: dict[str, Leaf] = {
         commands=commands_of(
             PLAN,
             "twin.plan.cli",
-            """
-            plan | Plan from words, or for a cell. | runs/x --task 'put the cube into the box'
-            """,
+            "plan | Plan from words, or for a cell. | runs/x --task 'put the cube into the box'",
         ),
     ),
     "perception": Leaf(

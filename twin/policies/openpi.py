@@ -115,7 +115,11 @@ class ServedPolicy:
             )
         except (OSError, TimeoutError, ValueError, _refusals()) as error:
             raise PolicyError(f"no policy answers at {address}: {error}") from error
-        metadata = self._receive()
+        try:
+            metadata = self._receive()
+        except PolicyError:
+            self.close()
+            raise
         self.metadata: dict[str, Any] = metadata if isinstance(metadata, dict) else {}
 
     def infer(self, observation: dict[str, Any]) -> Any:

@@ -218,6 +218,8 @@ def act(
         going = True
         while going:
             pictures = cameras.draw(cell)
+            if not acted.pictures:
+                _refuse_blind(pictures)
             acted.pictures.append((cell.t_ns, pictures))
             began = time.monotonic()
             found = policy.infer(speak.observation(pictures, *cell.posture()))
@@ -237,6 +239,15 @@ def act(
     except PolicyError as error:
         acted.problem = str(error)
     return acted
+
+
+def _refuse_blind(pictures: Pictures) -> None:
+    """Refuse cameras in whose view there is nothing of the scene."""
+    blind = [name for name, picture in pictures.items() if not picture.any()]
+    if blind:
+        raise PolicyError(
+            f"camera {', '.join(blind)} sees nothing of the scene: scan what it looks at"
+        )
 
 
 def _row(

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +48,9 @@ def jobs_of(run: RunFolder, config: RolloutConfig) -> Iterator[RolloutJob]:
         mapping = drive_mapping(tuple(streams.camera_ids(episodes[0])))
     else:
         mapping = read_mapping(config.map)
-    vary = read_quantities(config.vary)
-    for episode, drawn in _starts(episodes, config.starts):
-        _refuse_unknown(vary, episode)
+    starts, vary = list(_starts(episodes, config.starts)), read_quantities(config.vary)
+    _refuse_unknown(vary, {episode.path: episode for episode, _ in starts}.values())
+    for episode, drawn in starts:
         for number in range(config.times):
             yield RolloutJob(
                 run_path=run.path.resolve(),
@@ -95,7 +95,8 @@ def roll_out_run(run: RunFolder, config: RolloutConfig, output: Output) -> dict[
     run.refuse_empty()
     rows, todo = [], []
     workers = 1 if is_driven(config.policy) else config.workers
-    for job in jobs_of(run, config):
+    jobs = list(jobs_of(run, config))
+    for job in jobs:
         row = None if config.force else row_of_file(job.path())
         if row is None or row["problem"]:
             todo.append(job)
@@ -114,19 +115,21 @@ def roll_out_run(run: RunFolder, config: RolloutConfig, output: Output) -> dict[
         output.say(reason)
     rows.sort(key=lambda row: (row["task"], row["start_id"], row["number"]))
     found = {"run": str(run.path), "rows": rows, "table": str(write_table(run))}
-    quantities = read_quantities(config.vary)
+    quantities = jobs[0].vary
     return {**found, "effects": list(effects(rows, quantities))} if quantities else found
 
 
-def _refuse_unknown(vary: Sequence[Quantity], episode: Episode) -> None:
-    known = streams.camera_ids(episode)
-    for item in vary:
-        camera = item.name.removeprefix("camera.").rpartition(".")[0]
-        if item.name.startswith("camera.") and camera not in known:
-            raise UsageError(
-                f"--vary {item.name}: no camera {camera} in {episode.info.id}; it has: "
-                f"{', '.join(known) or 'none'}"
-            )
+def _refuse_unknown(vary: Sequence[Quantity], episodes: Iterable[Episode]) -> None:
+    names = [item.name for item in vary if item.name.startswith("camera.")]
+    for episode in episodes if names else ():
+        known = streams.camera_ids(episode)
+        for name in names:
+            camera = name.split(".")[1]
+            if camera not in known:
+                raise UsageError(
+                    f"--vary {name}: no camera {camera} in {episode.info.id}; it has: "
+                    f"{', '.join(known) or 'none'}"
+                )
 
 
 def write_table(run: RunFolder) -> Path:

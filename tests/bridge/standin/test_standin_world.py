@@ -78,19 +78,21 @@ def test_a_grasp_six_centimetres_off_fails(
     assert outcome.stages[0]["result"] == "failure"
 
 
+@pytest.fixture
+def cell(
+    make_session: Callable[..., Any], make_cell: Callable[..., Any], starts: dict[str, np.ndarray]
+) -> StandinCell:
+    found: StandinCell = make_cell(make_session())
+    found.reset(starts)
+    return found
+
+
 @pytest.mark.usefixtures("unchecked")
-def test_the_arm_bears_the_weight_that_it_carries_and_no_grasp_comes_near_its_limit(
-    make_session: Callable[..., Any],
-    make_cell: Callable[..., StandinCell],
-    starts: dict[str, np.ndarray],
-    task: Task,
-    cell_file: CellFile,
-    monkeypatch: pytest.MonkeyPatch,
+def test_the_arm_bears_what_it_carries_and_no_grasp_comes_near_its_limit(
+    cell: StandinCell, starts: Any, task: Task, cell_file: CellFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Newton's second law for the cube between the fingers: force is mass times (a + g)."""
-    cell, rows = make_cell(make_session()), list[tuple[float, ...]]()
-    cell.reset(starts)
-    stop = cell._stop_where_pressed
+    rows, stop = list[tuple[float, ...]](), cell._stop_where_pressed
 
     def weighed(force_N: float) -> None:
         rows.append((force_N, *cell.world.T_base_body("cube")[:3, 3]))
@@ -102,32 +104,26 @@ def test_the_arm_bears_the_weight_that_it_carries_and_no_grasp_comes_near_its_li
     speed_m_s = np.gradient(place_m, 0.008, axis=0)
     faster = np.gradient(speed_m_s, 0.008, axis=0) + np.array([0.0, 0.0, 9.81])
     mass_kg = task.objects["cube"].mass_kg * cell.hidden.mass_scale
-    ratio = force_N / (mass_kg * np.linalg.norm(faster, axis=1))
-    assert np.median(ratio[place_m[:, 2] > 0.2]) == pytest.approx(1.0, abs=0.02)
-    assert np.median(np.abs(ratio[place_m[:, 2] > 0.2] - 1.0)) < 0.05
+    ratio = (force_N / (mass_kg * np.linalg.norm(faster, axis=1)))[place_m[:, 2] > 0.2]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
+    assert np.median(np.abs(ratio - 1.0)) < 0.05
     assert 0 < force_N.max() < FORCE_N / 4
     assert cell.stopped == ""
 
 
 def test_a_press_beyond_the_robots_limit_stops_the_arm_and_fails_the_trial(
-    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell],
-    starts: dict[str, np.ndarray], task: Task,
-) -> None:  # fmt: skip
-    session = make_session()
-    cell = make_cell(session)
-    cell.reset(starts)
+    cell: StandinCell, starts: Any, task: Task
+) -> None:
     way = [cell.home_rad]
     for height_m in (0.06, -0.03):
-        way.append(
-            cell.kinematics.joints_for(tool_down(np.array([0.45, 0.0, height_m]), 0.0), way[-1])
-        )
+        T_base_tcp = tool_down(np.array([0.45, 0.0, height_m]), 0.0)
+        way.append(cell.kinematics.joints_for(T_base_tcp, way[-1]))
     cell.follow(np.array([0, 2_000_000_000, 4_000_000_000]), np.stack(way))
-    (event,) = session.events()
+    (event,) = cell.streams._session.events()  # type: ignore[attr-defined]
     assert (event["type"], event["data"]["cause"]) == ("mark", "contact_force")
     assert FORCE_N < event["data"]["force_N"] < 2 * FORCE_N
-    assert re.match(
-        r"contact_force: the arm is pressed with \d+ N, the limit is 150 N", cell.stopped
-    )
+    words = r"contact_force: the arm is pressed with \d+ N, the limit is 150 N"
+    assert re.fullmatch(words, cell.stopped)
     held, stopped_ns = cell.target_rad, cell.now_ns
     cell.follow(np.array([0, 1_000_000_000]), np.stack([held, cell.home_rad]))
     cell.wait(1.0)
@@ -142,11 +138,8 @@ def test_a_press_beyond_the_robots_limit_stops_the_arm_and_fails_the_trial(
 
 @pytest.mark.parametrize(("ticks", "stops"), [(4, False), (5, True)])
 def test_a_blow_shorter_than_40_ms_stops_nothing(
-    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell],
-    starts: dict[str, np.ndarray], ticks: int, stops: bool, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    cell = make_cell(make_session())
-    cell.reset(starts)
+    cell: StandinCell, ticks: int, stops: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     hard, steps = np.array([0.0, 0.6, 0.8]) * (FORCE_N + 1), ticks * cell._steps_per_tick
     forces = iter([hard] * steps + [0 * hard] * 4 + [hard] * steps + [0 * hard] * 99)
     monkeypatch.setattr(cell.world, "arm_force_N", lambda: next(forces))

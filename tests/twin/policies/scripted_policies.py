@@ -50,10 +50,6 @@ def reckless(observation: dict[str, Any]) -> np.ndarray:
     return np.asarray(observation["agent_pos"]) + 1.0
 
 
-def broken(observation: dict[str, Any]) -> np.ndarray:
-    return np.full(7, np.nan)
-
-
 def raising(observation: dict[str, Any]) -> np.ndarray:
     raise KeyError("wrist")
 

@@ -99,18 +99,6 @@ def test_time_is_up(run: RunFolder) -> None:
     env.close()
 
 
-def test_several_side_by_side(run: RunFolder) -> None:
-    """As LeRobot asks: a vector of environments, each picture its own."""
-    both = gymnasium.vector.SyncVectorEnv([lambda: TwinEnv(run.path, cameras=["side"])] * 2)
-    found, _ = both.reset(seed=[1, 2])
-    assert found["pixels"]["side"].shape == (2, 120, 160, 3)
-    assert not np.array_equal(*found["pixels"]["side"])
-    _, _, over, _, info = both.step(found["agent_pos"])
-    assert over.tolist() == [False, False]
-    assert info["is_success"].tolist() == [False, False]
-    both.close()
-
-
 def test_what_is_not_there_is_told(run: RunFolder) -> None:
     with pytest.raises(Exception, match="no camera top in trial_1; it has: side, wrist"):
         TwinEnv(run.path, cameras=["top"])

@@ -1,12 +1,12 @@
 """An exported environment, as LeRobot's loader and its rollout function use one."""
 
-import importlib.util
 import json
+import runpy
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pytest
 from scripted_plans import scene_of_test
@@ -31,7 +31,7 @@ def used(make_env, use_async_envs):
     assert isinstance(vector, gymnasium.vector.VectorEnv)
     seen, _ = vector.reset(seed=[1, 2])
     assert vector.observation_space.contains(seen)
-    assert vector.num_envs == 2
+    assert not np.array_equal(*seen["pixels"]["side"])  # each has its own start
     first, digest = seen["agent_pos"], hashlib.sha256()
     for action in (first, first + np.array([[0.0] * 7, [3.0] + [0.0] * 6])):
         seen, reward, over, cut, info = vector.step(action.astype(np.float32))
@@ -71,15 +71,6 @@ def localised(run: RunFolder) -> None:
             localising.write_localised(run, episode, task, scene_hash=scene)
 
 
-def loaded(script: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("hub_env", script)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_another_interpreter_loads_it_and_uses_it_as_lerobot_does(
     run: RunFolder, tmp_path: Path
 ) -> None:
@@ -106,17 +97,17 @@ def test_another_interpreter_loads_it_and_uses_it_as_lerobot_does(
 def test_it_finds_its_run_beside_it_or_where_it_was(run: RunFolder, tmp_path: Path) -> None:
     write_env(run, tmp_path / "envs" / "one")
     shutil.copytree(tmp_path / "envs" / "one", tmp_path / "far" / "away" / "one")
-    loaded(tmp_path / "far" / "away" / "one" / "env.py").make_env().close()
+    alone = tmp_path / "far" / "away" / "one" / "env.py"
+    runpy.run_path(str(alone))["make_env"]().close()
     (tmp_path / "moved").mkdir()
     for name in ("run", "envs"):
         shutil.move(tmp_path / name, tmp_path / "moved" / name)
-    module = loaded(tmp_path / "moved" / "envs" / "one" / "env.py")
-    module.make_env(cfg=SimpleNamespace(task=None)).close()
+    make = runpy.run_path(str(tmp_path / "moved" / "envs" / "one" / "env.py"))["make_env"]
+    make(cfg=SimpleNamespace(task=None)).close()
     with pytest.raises(GstError, match="no trial of task 'fold'"):
-        module.make_env(cfg=SimpleNamespace(task="fold"))
-    gone = loaded(tmp_path / "far" / "away" / "one" / "env.py")
+        make(cfg=SimpleNamespace(task="fold"))
     with pytest.raises(GstError, match=r"its run is neither in .*run nor in .*run\. Change RUN in"):
-        gone.make_env()
+        runpy.run_path(str(alone))["make_env"]()
 
 
 def test_a_run_without_a_scene_and_a_folder_that_is_there_are_refused(
@@ -129,5 +120,5 @@ def test_a_run_without_a_scene_and_a_folder_that_is_there_are_refused(
     with pytest.raises(GstError, match=r"scene not found: .* Make it: robot-gst rebuild"):
         write_env(run, tmp_path / "other")
     with pytest.raises(GstError, match=r"scene not found: .* Make it: robot-gst rebuild"):
-        loaded(tmp_path / "env" / "env.py").make_env()
+        runpy.run_path(str(tmp_path / "env" / "env.py"))["make_env"]()
     assert not (tmp_path / "other").exists()

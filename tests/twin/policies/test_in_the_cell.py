@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from loopback import recording
 from patience import wait_until
-from test_openpi import pack, served
+from test_openpi import Answer, pack, served
 
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import JointSample
@@ -133,7 +133,7 @@ def sending(*numbers: float) -> Callable[[bytes], bytes]:
     return lambda _: pack({"actions": np.array(numbers)})
 
 
-BAD: list[tuple[Callable[[bytes], bytes | str], str]] = [
+BAD: list[tuple[Answer, str]] = [
     (lasting, "unknown: .* said nothing for 1 s"),
     (lambda _: "Traceback\nValueError: no such key", "unknown: .* ValueError: no such key"),
     (failing, "unknown: .* closed the connection"),
@@ -149,7 +149,7 @@ BAD: list[tuple[Callable[[bytes], bytes | str], str]] = [
 
 @pytest.mark.parametrize(("answer", "words"), BAD)
 def test_a_bad_answer_moves_nothing_and_is_told(
-    laboratory: Laboratory, answer: Callable[[bytes], bytes | str], words: str
+    laboratory: Laboratory, answer: Answer, words: str
 ) -> None:
     with served(answer) as (address, _), laboratory.acting(address):
         _, _, label, moved = laboratory.trial(max_s=4.0)

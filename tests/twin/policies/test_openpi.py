@@ -1,6 +1,7 @@
 """The websocket protocol, against a server written from its description with ``msgpack``."""
 
 import threading
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -13,7 +14,7 @@ from websockets.sync.server import ServerConnection, serve
 from twin.policies.errors import PolicyError
 from twin.policies.openpi import KEY_VARIABLE, ServedPolicy, decode, encode
 
-Answer = Callable[[bytes], bytes | str]
+Answer = Callable[[bytes], bytes | str | Iterator[bytes]]
 
 
 def pack(value: Any) -> bytes:
@@ -38,14 +39,17 @@ def unpack(data: bytes) -> Any:
 
 
 @contextmanager
-def served(answer: Answer, metadata: bytes | str = b"\x80") -> Iterator[tuple[str, list[str]]]:
+def served(
+    answer: Answer, metadata: bytes | str | None = b"\x80"
+) -> Iterator[tuple[str, list[str]]]:
     """A server on the loopback address; yields its address and the keys that were sent."""
     keys: list[str] = []
 
     def talk(socket: ServerConnection) -> None:
         assert socket.request is not None
         keys.append(socket.request.headers.get("Authorization", ""))
-        socket.send(metadata)
+        if metadata is not None:
+            socket.send(metadata)
         for message in socket:
             assert isinstance(message, bytes)
             socket.send(answer(message))
@@ -118,35 +122,60 @@ def test_what_cannot_be_sent_is_not() -> None:
             encode({"x": value})
 
 
-def test_text_is_the_servers_error() -> None:
-    with served(lambda _: "Traceback ...\nValueError: no camera named wrist\n") as (address, _):
-        policy = ServedPolicy(address, 5.0)
-        with pytest.raises(PolicyError, match="failed: ValueError: no camera named wrist"):
-            policy.infer({})
+def test_a_gigabyte_in_pieces_is_not_taken() -> None:
+    sent = list[int]()
+
+    def pieces(_: bytes) -> Iterator[bytes]:
+        for number in range(1024):
+            sent.append(number)
+            yield bytes(1 << 20)
+
+    tracemalloc.start()
+    with served(pieces) as (address, _):
+        policy = ServedPolicy(address, 20.0)
+        for _ in range(2):
+            with pytest.raises(PolicyError, match="closed the connection"):
+                policy.infer({})
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(sent) < 128
+    assert most < 160 << 20  # what is sent included
 
 
-def test_a_silent_server_is_not_waited_for() -> None:
+def test_an_answer_that_comes_in_drops_is_not_waited_for() -> None:
     gone = threading.Event()
 
-    def never(_: bytes) -> bytes:
-        gone.wait(30)
-        return b"\x80"
+    def drops(_: bytes) -> Iterator[bytes]:
+        while not gone.wait(0.1):
+            yield b"\x81"
 
-    with served(never) as (address, _):
-        policy = ServedPolicy(address, 0.3)
-        with pytest.raises(PolicyError, match=r"said nothing for 0\.3 s"):
+    with served(drops) as (address, _):
+        policy = ServedPolicy(address, 0.5)
+        with pytest.raises(PolicyError, match=r"said nothing for 0\.5 s"):
             policy.infer({})
         gone.set()
         policy.close()
 
 
-def test_more_than_64_mb_end_the_connection() -> None:
-    with served(lambda _: b"\0" * (65 << 20)) as (address, _):
-        policy = ServedPolicy(address, 10.0)
-        with pytest.raises(PolicyError, match="closed the connection"):
-            policy.infer({})
-        with pytest.raises(PolicyError, match="closed the connection"):
-            policy.infer({})
+@pytest.mark.parametrize(
+    ("metadata", "words"),
+    [
+        (None, r"said nothing for 0\.5 s"),
+        ("no such key\n", "failed: no such key"),
+        (b"\xc1", "that are no msgpack"),
+        (bytes(65 << 20), "closed the connection"),
+    ],
+)
+def test_a_server_that_does_not_say_who_it_is_is_left(
+    metadata: bytes | str | None, words: str
+) -> None:
+    with served(lambda _: b"\x80", metadata) as (address, _):
+        with pytest.raises(PolicyError, match=words):
+            ServedPolicy(address, 0.5)
+        left = [t for t in threading.enumerate() if "recv_events" in t.name]
+        for thread in left:
+            thread.join(10.0)
+            assert not thread.is_alive()
 
 
 def test_nobody_there() -> None:

@@ -5,10 +5,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import drawn_run
 import numpy as np
 import pytest
+from scripted_plans import scene_of_test
 from scripted_policies import Scripted
+from test_in_the_cell import BAD
+from test_openpi import Answer, served
 
+from bridge.episode import streams
 from bridge.episode.catalogue import label_episode
 from bridge.episode.metadata import WITH, EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
@@ -16,6 +21,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import GstError, UsageError
 from bridge.exchange.trials_csv import read_trials
+from bridge.geometry import se3
+from bridge.media.color import encode_png
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.run import compare_run, read_run
@@ -104,7 +111,6 @@ def test_who_acted_stands_in_the_table_and_another_checkpoint_apart(
     [
         ("still", False, "the middle of cube is .* mm beyond the cavity of box"),
         ("reckless", False, "limits: .* moves at 10.00 rad/s"),
-        ("broken", None, "not finite from row 0 on"),
         ("raising", None, "the policy failed: KeyError: 'wrist'"),
     ],
 )
@@ -120,6 +126,46 @@ def test_what_a_policy_does_wrong_is_told(
     roll_out_run(run, config(policy), QUIET)
     again = {path: path.stat().st_mtime_ns for path in run.derived("*.rollout.*")}
     assert (again == made) is (success is not None)  # what says nothing is asked anew
+
+
+@pytest.mark.parametrize(("answer", "words"), BAD)
+def test_a_bad_answer_marks_its_rollout_as_it_marks_a_trial_in_the_cell(
+    run: RunFolder, answer: Answer, words: str
+) -> None:
+    result, _, words = words.partition(": ")
+    with served(answer) as (address, _):
+        asked = RolloutConfig(
+            policy=address, name="bad", starts="start 1", timeout_s=1.0, workers=1
+        )
+        (row,) = roll_out_run(run, asked, QUIET)["rows"]
+    assert row["success"] is {"unknown": None, "failure": False}[result]
+    assert re.match(words, row["detail"])
+    assert row["seconds"] < 5.0
+    made = streams.joint_track(Episode.open(run.derived_dir / row["file"]))
+    assert np.ptp(made.position, axis=0).max() < 0.01  # nothing moved
+
+
+def test_a_camera_that_is_not_there_marks_every_rollout(run: RunFolder, tmp_path: Path) -> None:
+    mapping = tmp_path / "map.toml"
+    mapping.write_text('[images.front]\ncamera = "front"\n')
+    found = roll_out_run(run, config("still", map=mapping), QUIET)
+    assert [row["success"] for row in found["rows"]] == [None] * 2
+    words = r"no camera front in trial_\d; it has: side, wrist"
+    assert all(re.fullmatch(words, row["detail"]) for row in found["rows"])
+
+
+def test_a_camera_that_looks_where_nothing_was_scanned_marks_its_rollout(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    away = se3.look_at(np.array([1.2, -0.8, 0.9]), np.array([9.0, -9.0, 0.9]), np.eye(3)[2])
+    monkeypatch.setattr(drawn_run, "T_BASE_SIDE", away)
+    urdf, image = scene_of_test().urdf, encode_png(np.full((120, 160, 3), 90, dtype=np.uint8))
+    drawn_run.write_recording(run, urdf, "trial_3", images=(image,) * 11, start_id="start 3")
+    found = roll_out_run(run, config("still", starts="start 3"), QUIET)
+    (row,) = found["rows"]
+    assert row["success"] is None
+    assert row["detail"] == "camera side sees nothing of the scene: scan what it looks at"
+    assert (run.path / TABLE).read_text().count("\n") == 1
 
 
 def test_the_clock_runs_on_while_it_thinks(run: RunFolder) -> None:
