@@ -36,7 +36,7 @@ NOISE_RAD = 5e-4
 """Joints that move less in 20 ms rest."""
 LATE_S = 0.2
 """A picture of the cell is up to so old when the policy is asked."""
-STEPS, BATCH, RATE = 6000, 32, 1e-3
+STEPS, BATCH, RATE = 4000, 32, 1e-3
 
 
 class Demo(NamedTuple):
@@ -90,14 +90,17 @@ class Net(nn.Module):
         self.register_buffer("open_m", torch.zeros(()))
 
     def _eye(self) -> nn.Module:
-        first = (nn.Conv2d(3, 16, 5, 2, 2), nn.ReLU(), nn.Conv2d(16, 32, 3, 2, 1), nn.ReLU())
-        return nn.Sequential(*first, nn.Conv2d(32, 32, 3, 1, 1), nn.ReLU(), nn.Conv2d(32, 32, 1))
+        layers: list[nn.Module] = []
+        for num_in, num_out, size, stride in ((3, 32, 6, 4), (32, 32, 3, 1), (32, 32, 3, 1)):
+            layers += [nn.Conv2d(num_in, num_out, size, stride, 1), nn.BatchNorm2d(num_out)]
+            layers.append(nn.ReLU())
+        return nn.Sequential(*layers, nn.Conv2d(32, 32, 1))
 
     def forward(self, pictures: torch.Tensor, posture: torch.Tensor) -> torch.Tensor:
         """Joints of the next rows, and how surely (a logit) the fingers are closed."""
         found = [(posture - self.mean) / self.spread]
         for eye, picture in zip(self.eyes, pictures.unbind(1), strict=True):
-            maps = eye(picture)
+            maps = 3 * eye(4 * picture - 2)
             weight = maps.flatten(2).softmax(-1).view_as(maps)
             for axis in (2, 3):  # where each map is largest
                 line = torch.linspace(-1, 1, maps.shape[axis])
@@ -145,6 +148,7 @@ def train(demos: list[Demo]) -> Net:
         slower.step()
         if step % 500 == 0:
             with torch.no_grad():
+                net.eval()
                 new = np.mean([error_of(net, held, rng)[0].item() for _ in range(16)])
             print(
                 f"{step}: joints off by {1e3 * joints.item():.1f} mrad, by {1e3 * new:.1f} in new"
@@ -163,6 +167,7 @@ class Clone:
         num_cameras = len({name.split(".")[1] for name in weights if name.startswith("eyes")})
         self._net = Net(num_cameras, len(weights["mean"]) - 1)
         self._net.load_state_dict(weights)
+        self._net.eval()
 
     @torch.no_grad()
     def infer(self, observation: dict) -> np.ndarray:
@@ -170,8 +175,11 @@ class Clone:
         seen = np.array([[small(picture) for picture in observation["pixels"].values()]])
         posture = torch.from_numpy(observation["agent_pos"])[None]
         rows = self._net(torch.from_numpy(seen).float() / 255, posture)[0, :FOLLOWED]
-        rows[:, -1] = self._net.open_m * (rows[:, -1] < 0)
-        return rows.numpy()
+        steps = torch.diff(rows[:, :-1], dim=0, prepend=posture[:, :-1])
+        fast = steps.abs().amax(1, keepdim=True) / (1.2 * SPEED_RAD_S * STEP_S)
+        joints = posture[:, :-1] + (steps / fast.clamp(min=1)).cumsum(0)
+        width_m = self._net.open_m * (rows[:, -1:] < 0)
+        return torch.cat([joints, width_m], 1).numpy()
 
 
 if __name__ == "__main__":

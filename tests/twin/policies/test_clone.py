@@ -79,13 +79,16 @@ def test_it_goes_where_it_sees_something(tmp_path: Path, monkeypatch: pytest.Mon
     """A bright patch says where the first joint is to go."""
     rng = np.random.default_rng(0)
 
+    def goal(column: int) -> float:
+        return 0.4 * (column - 43) / 43
+
     def demo(column: int) -> clone.Demo:
         pictures = rng.integers(0, 60, (2, 4, 3, clone.SIZE[1], clone.SIZE[0])).astype(np.uint8)
         row = int(rng.integers(60))
         pictures[0, :, 0, row : row + 10, column : column + 10] = 255
         track = np.zeros((3, 8))
-        track[:, 0], track[:, 6] = (column - 43) / 43 * np.array([0, 1, 1]), OPEN_M
-        return clone.Demo(pictures, np.zeros(4), track, np.array([0.0, 0.3, 9.0]))
+        track[:, 0], track[:, 6] = goal(column) * np.array([0, 1, 1]), OPEN_M
+        return clone.Demo(pictures, np.zeros(4), track, np.array([0.0, 0.8, 9.0]))
 
     monkeypatch.setattr(clone, "STEPS", 200)
     monkeypatch.setattr(clone, "RATE", 3e-3)
@@ -98,6 +101,6 @@ def test_it_goes_where_it_sees_something(tmp_path: Path, monkeypatch: pytest.Mon
         told = {"pixels": pixels, "agent_pos": np.array([0, 0, 0, 0, 0, 0, OPEN_M], dtype="f4")}
         rows = policy.infer(told)
         assert rows.shape == (clone.FOLLOWED, 7)
-        assert rows[-1, 0] == pytest.approx((column - 43) / 43, abs=0.3)
+        assert rows[-1, 0] == pytest.approx(goal(column), abs=0.12)
         assert rows[:, 6] == pytest.approx(OPEN_M)
     assert len(policy.metadata["checkpoint"]) == 12
