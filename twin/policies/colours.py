@@ -21,7 +21,7 @@ from twin.policies.gap import recorded_states
 from twin.policies.starts import trial_episodes
 from twin.policies.views import Gains
 
-TRIALS, INSTANTS = 4, 3
+TRIALS, INSTANTS = 4, 2
 """So many trials teach it, the nearest in time, by so many pictures of each camera."""
 BLOCK_PX = 8
 DARK, BRIGHT = 25, 250
@@ -38,10 +38,10 @@ def gains_of(run: RunFolder, episode: Episode, cameras: Sequence[str]) -> Gains:
     Args:
         episode: It teaches nothing.
     """
-    known = [each for each in trial_episodes(run, "") if each.path != episode.path]
-    known.sort(key=lambda each: abs(each.start_ns - episode.start_ns))
+    others = [each for each in _trials(run.path) if each.info.id != episode.info.id]
+    others.sort(key=lambda each: abs(each.start_ns - episode.start_ns))
+    taught = [_ratios(run.path, each.path, tuple(cameras)) for each in others[:TRIALS]]
     nothing = np.zeros((0, 3))
-    taught = [_ratios(run.path, each.path, tuple(cameras)) for each in known[:TRIALS]]
     found: dict[str, tuple[float, float, float]] = {}
     for name in cameras:
         rows = np.concatenate([ratios[name] for ratios in taught if name in ratios] or [nothing])
@@ -49,6 +49,12 @@ def gains_of(run: RunFolder, episode: Episode, cameras: Sequence[str]) -> Gains:
             red, green, blue = np.median(rows, axis=0).round(3).tolist()
             found[name] = (red, green, blue)
     return found if any(abs(x - 1) > SAME for gain in found.values() for x in gain) else {}
+
+
+@cache
+def _trials(run_path: Path) -> Sequence[Episode]:
+    """One of each start."""
+    return trial_episodes(RunFolder.open(run_path), "")
 
 
 @cache

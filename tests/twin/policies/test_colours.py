@@ -69,6 +69,7 @@ def test_one_trial_alone_teaches_nothing(run: RunFolder, monkeypatch: pytest.Mon
     last, *others = run.episodes()
     for path in others:
         path.unlink()
+    colours._trials.cache_clear()
     assert gains_of(run, Episode.open(last), CAMERAS) == {}
 
 
