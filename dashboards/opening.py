@@ -26,7 +26,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.exchange.driver_names import mapped
 from bridge.exchange.rosbag2 import METADATA_FILE, count_messages, find_files, unpacked
-from bridge.exchange.trials_csv import keep_trials, trials_path
+from bridge.exchange.trials_csv import trials_path, trials_text
 from bridge.leaves import load_leaf
 from bridge.robots.robot import Robot, read_robot, robot_of
 from bridge.sources.folder.messages import find_frames, read_index
@@ -34,6 +34,7 @@ from bridge.sources.folder.posed_index import COLMAP_FOLDERS, TRANSFORMS, read_p
 from bridge.sources.folder.scene_json import INDEX_NAME
 from bridge.sources.folder.tum import find_lists
 from bridge.terminal import Output
+from bridge.whole_file import write_whole
 from dashboards.robot_file import propose, write_robot_file
 from dashboards.scene_index import is_paired, propose_index, write_index
 
@@ -383,7 +384,11 @@ def _table(path: Path) -> Found:
         taken = take(path)
 
     def keep(path: Path, run: Path, *, output: Output) -> int:
-        file = keep_trials(taken.trials, RunFolder.create(run))
+        file = trials_path(RunFolder.create(run))
+        if file.exists():
+            raise UsageError(f"{file} exists already. Delete it to replace it, or use another run.")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file, trials_text(taken.trials).encode())
         output.result({"file": str(file), "trials": len(taken.trials)}, f"{file}: {taken.summary}")
         return 0
 

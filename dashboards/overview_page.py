@@ -38,15 +38,13 @@ COLUMNS = (
     ("distance", "Tool path, lag"),
     ("cause", "Cause in the twin"),
 )
-CORRELATION = "agreement.pearson_r"
 NUMBERS = {
     f"agreement.{SIM_SIDE}.rate": "Twin predicts the outcome",
     "agreement.bias_pp": "Success rates, twin minus recorded",
-    CORRELATION: "Success rates, correlation r",
+    "agreement.pearson_r": "Success rates, correlation r",
     "views.all.psnr_db": "PSNR of held-out views, raw",
 }
 """The numbers to read first, by id, with their titles; three, without r where it may be none."""
-UNPLANNED = "Executed in the twin, agrees with the outcome"
 Facets = tuple[tuple[str, tuple[tuple[str, str, int], ...]], ...]
 """What to filter by, each with slugs, names and numbers of trials."""
 
@@ -160,12 +158,10 @@ def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
             yield f"Recorded success, {' · '.join(parts)}", each
     for name, title in NUMBERS.items():
         found = by_id.get(name.replace(SIM_SIDE, side))
-        if found is not None and (name != CORRELATION or _excludes_zero(found)):
-            yield (title if found.id == name else UNPLANNED), found
-
-
-def _excludes_zero(found: Measurement) -> bool:
-    return found.interval is not None and not found.interval.low <= 0 <= found.interval.high
+        interval = None if found is None else found.interval
+        may_be_none = not interval or interval.low <= 0 <= interval.high
+        if found is not None and not (name.endswith("_r") and may_be_none):
+            yield (title if found.id == name else "Executed in the twin, agrees with the outcome"), found
 
 
 def worst_disagreement(run: RunFolder, judgement: Judgement) -> Disagreement | None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import UsageError
 from bridge.exchange.table_text import (
     AS_SAVED,
     ENDED,
@@ -22,7 +21,6 @@ from bridge.exchange.table_text import (
     require,
     rows_of,
 )
-from bridge.whole_file import write_whole
 
 UNITS = ("trial", "object", "subtask")
 MOST_IN_TRIAL = 10_000
@@ -194,13 +192,3 @@ def _field(name: str, value: object) -> str:
 def trials_path(run: RunFolder) -> Path:
     """Where a run keeps its imported trials."""
     return run.notes_dir / "trials.csv"
-
-
-def keep_trials(trials: Iterable[TrialRecord], run: RunFolder) -> Path:
-    """Keep trials in the run, with all columns and in one spelling."""
-    path = trials_path(run)
-    if path.exists():
-        raise UsageError(f"{path} exists already. Delete it to replace it, or use another run.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, trials_text(trials).encode())
-    return path

@@ -133,9 +133,6 @@ def limited_to_task(plan: Plan, task: Task) -> Plan:
     return replace(plan, stages=tuple(stages))
 
 
-# What the robot itself would stop at.
-
-
 def stops_of_arm(
     stamps_ns: Int[np.ndarray, " num_states"],
     off_rad: Float[np.ndarray, "num_states num_joints"],

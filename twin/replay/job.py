@@ -85,7 +85,7 @@ class ReplayJob:
     def needed_paths(self) -> tuple[Path, ...]:
         """What a process on another machine must see."""
         scene = () if self.run_path is None else (self.run_path,)
-        robot = (Path(self.robot).resolve(),) if self.robot.endswith(".toml") else ()
+        robot = (Path(self.robot).resolve(),) if self.robot.endswith((".toml", ".urdf")) else ()
         return (self.episode_path, self.folder, *scene, *robot)
 
     def path(self) -> Path:
@@ -127,15 +127,12 @@ class ReplayJob:
         if self.robot:
             found["robot"] = hash_settings({"urdf": read_robot(self.robot).description()})
         if self.config.samples:
-            found["keeps"] = "what each sample drew"
             spreads = self.start.covariances
             found["covariances"] = {name: spreads[name].tolist() for name in sorted(spreads)}
         if self.trajectory == "executed":
             found["end"] = {name: T.tolist() for name, T in self.end.Ts_base_object.items()}
         return found
 
-
-# The row of one replay in the table of a run.
 
 MAY_STAY_OPEN = ("settled", "shape", "allowed_contacts")
 """Predicates that a recording without an answer to them may succeed without."""

@@ -269,8 +269,6 @@ def _origin(
     )
 
 
-# An executed replay laid over the planned one and over the recording.
-
 Findings = dict[tuple[str, str], bool | None]
 
 

@@ -59,10 +59,6 @@ def execution_of(
 LABEL = "robot-gst label RUN EPISODE --task NAME"
 """What makes a trial of an episode."""
 
-# What is to be replayed of one episode: its objects localised, its plans and executions
-# listed.
-# Each episode is a piece of work of its own, for a process of the pool as for this one.
-
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation:

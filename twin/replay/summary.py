@@ -24,7 +24,6 @@ SIDES = {
 as they were localised before and after the execution."""
 
 Rows = Sequence[Mapping[str, Any]]
-Counts = Mapping[str, Mapping[str, int]]
 
 
 def count_verdicts(rows: Rows) -> dict[str, dict[str, int]]:
@@ -142,7 +141,7 @@ def _sample_lines(rows: Rows) -> list[str]:
     return ["", "varied replays that succeed:", *lines] if lines else []
 
 
-def _count_lines(counts: Counts) -> list[str]:
+def _count_lines(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
     width = max(len(key) for key in counts)
     lines = [
         f"{'':{width}}  {'n':>5} {'accepted':>9} {'rejected':>9} {'undecided':>9} "

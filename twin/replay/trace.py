@@ -108,10 +108,6 @@ def longest(spans: list[Touch]) -> Touch | None:
     return max(spans, key=lambda span: span[1] - span[0], default=None)
 
 
-# What a recording itself says of an execution, without physics.
-# Joints and gripper are measured. Objects are localised before and after; what happened to them in
-# between, and what touched what, is not known.
-
 EMPTY_M = 0.003
 """Fingers that come within this of the width they were sent to hold nothing."""
 REACH_M = 0.07
@@ -122,7 +118,7 @@ AWAY_M = 0.12
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """What was measured during one execution, times from its start."""
+    """What was measured during one execution, times from its start: objects before and after."""
 
     plan: Plan
     """With the stages at the times at which they were executed."""
