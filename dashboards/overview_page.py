@@ -161,7 +161,7 @@ def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
         interval = None if found is None else found.interval
         may_be_none = not interval or interval.low <= 0 <= interval.high
         if found is not None and not (name.endswith("_r") and may_be_none):
-            yield (title if found.id == name else "Executed in the twin, agrees with the outcome"), found
+            yield (title if found.id == name else "Executed in the twin, as recorded"), found
 
 
 def worst_disagreement(run: RunFolder, judgement: Judgement) -> Disagreement | None:
