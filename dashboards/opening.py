@@ -6,7 +6,7 @@ Heads, summaries and small texts are read; nothing is unpickled or run. Commands
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
@@ -42,12 +42,11 @@ messages of a bag that are read."""
 MOST_HEAD_BYTES, MOST_TABLE_BYTES = 1 << 16, 1 << 26
 HEADS = {b"\x89MCAP0\r\n": "bag", b"SQLite format 3\0": "bag", b"#ROSBAG": "ROS 1 bag"}
 HEADS |= {b"ply\n": "splat", b"ply\r": "splat"}
-ENDINGS = {
-    "bag": (".mcap", ".db3", ".mcap.zstd", ".db3.zstd"),
-    "table": (".csv", ".tsv", ".xlsx", ".xlsm"),
-}
+ENDINGS = {"bag": (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")}
+ENDINGS |= {"table": (".csv", ".tsv", ".xlsx", ".xlsm")}
 OF_BAG = (*ENDINGS["bag"], METADATA_FILE)
 SPLAT_FIELDS = frozenset({"x", "f_dc_0", "opacity", "scale_0", "rot_0"})
+POSED = (TRANSFORMS, *(f"{p}/images.{end}" for p in COLMAP_FOLDERS for end in ("txt", "bin")))
 STREAMS = (named.COLOR_IMAGE, named.COLOR_INFO, named.DEPTH_IMAGE, named.DEPTH_INFO)
 JOINTS = (named.JOINT_STATES, named.GRIPPER_STATE)
 IMAGES = {schema.IMAGE: "image", schema.COMPRESSED_IMAGE: "image", schema.CAMERA_INFO: "info"}
@@ -75,9 +74,8 @@ class Found:
     def lines(self, path: Path) -> list[str]:
         """Say it to a person."""
         lines = [f"{path}: {self.what}", *(f"  {text}" for text in self.holds)]
-        for use in USES:
-            lack = getattr(self, use)
-            lines.append(f"  {use} needs {lack}" if lack else f"  {use}: ready")
+        lacks = {use: getattr(self, use) for use in USES}
+        lines += [f"  {u} needs {lack}" if lack else f"  {u}: ready" for u, lack in lacks.items()]
         steps = (f"open {path} RUN",) if self.bring else self.then
         return [*lines, *(f"next: robot-gst {step}" for step in steps)]
 
@@ -85,16 +83,14 @@ class Found:
 class Survey(NamedTuple):
     """What a recording says of its topics before all of it is read."""
 
-    types: Mapping[str, str]
-    rates_hz: Mapping[str, float]
-    """Of its first messages."""
-    first: Mapping[str, bytes]
+    types: dict[str, str]
+    rates_hz: dict[str, float]  # of its first messages
+    first: dict[str, bytes]
 
 
 def survey(source: Path) -> Survey:
     """Look at the topics of a bag and at its first messages."""
-    times: dict[str, list[int]] = {}
-    first: dict[str, bytes] = {}
+    times, first = dict[str, list[int]](), dict[str, bytes]()
     with unpacked(find_files(source), None) as bag:
         for item in islice(bag.messages(), MOST_SURVEYED):
             times.setdefault(item.topic, []).append(item.log_time_ns)
@@ -102,7 +98,7 @@ def survey(source: Path) -> Survey:
         types = bag.types()
     spans = {topic: (len(t) - 1, (t[-1] - t[0]) / NS_PER_S) for topic, t in times.items()}
     rates_hz = {topic: steps / seconds for topic, (steps, seconds) in spans.items() if seconds}
-    return Survey(types=types, rates_hz=rates_hz, first=first)
+    return Survey(dict(types), rates_hz, first)
 
 
 def open(
@@ -194,11 +190,6 @@ def _some(names: Sequence[str]) -> str:
     return (", ".join(names[:MOST_NAMED]) or "none") + more
 
 
-def _is_posed(folder: Path) -> bool:
-    models = (folder / p / f"images.{end}" for p in COLMAP_FOLDERS for end in ("txt", "bin"))
-    return (folder / TRANSFORMS).is_file() or any(path.is_file() for path in models)
-
-
 def _is_rlds(folder: Path) -> bool:
     found = (folder.glob(f"{deep}dataset_info.json") for deep in ("", "*/", "*/*/"))
     return any(any(path.parent.glob("*.tfrecord*")) for paths in found for path in paths)
@@ -209,10 +200,8 @@ FOLDERS: dict[str, Callable[[Path], bool]] = {
     "bag": lambda folder: any(each.name.endswith(OF_BAG) for each in folder.glob("*.*")),
     "LeRobot dataset": lambda folder: (folder / "meta/info.json").is_file(),
     "RLDS dataset": _is_rlds,
-    "RGB-D folder": lambda at: bool(
-        (at / INDEX_NAME).is_file() or find_lists(at) or find_frames(at)
-    ),
-    "folder of posed images": _is_posed,
+    "RGB-D folder": lambda at: any((find_lists(at), find_frames(at), (at / INDEX_NAME).is_file())),
+    "folder of posed images": lambda at: any((at / name).is_file() for name in POSED),
 }
 
 
@@ -245,8 +234,7 @@ def _proposal(seen: Survey, names: Mapping[str, str], robot: str) -> Iterator[st
         elif kind == schema.JOINT_STATE and not topic.endswith(JOINTS):
             topics[topic] = f"/NAME{named.JOINT_STATES}"
     if robot == "FILE.toml" or topics.keys() != names.keys():
-        yield "a map for --map FILE, to be corrected:"
-        yield from [f'robot = "{robot}"'] * bool(robot)
+        yield from ("a map for --map FILE, to be corrected:", *[f'robot = "{robot}"'] * bool(robot))
         yield from ("[topics]", *(f'"{old}" = "{new}"' for old, new in topics.items()))
 
 
@@ -291,8 +279,8 @@ def _robot(seen: Survey, asked: str = "") -> tuple[list[str], list[str], list[Ro
     fingers = {joint for robot in fits for joint in robot.finger_joints}
     if not fingers & set(joints) and not any(t.endswith(named.GRIPPER_STATE) for t in seen.types):
         lacks.append(f"the gripper's width on a topic that ends in {named.GRIPPER_STATE}")
-    rate_hz = seen.rates_hz.get(topic, 0.0)
-    return [f"robot: {name}; {_some(joints)} at {rate_hz:.3g} Hz on {topic}"], lacks, fits
+    rate = f"{seen.rates_hz.get(topic, 0.0):.3g} Hz"
+    return [f"robot: {name}; {_some(joints)} at {rate} on {topic}"], lacks, fits
 
 
 def _lerobot(path: Path) -> Found:
@@ -314,18 +302,16 @@ def _lerobot(path: Path) -> Found:
     )
 
 
-@contextmanager
-def _options_of(command: str) -> Iterator[None]:
-    """Say which command takes the options that an error asks for."""
+def _read(read: Callable[[Path], Any], path: Path, command: str) -> Any:
+    """Read, or say which command takes the options that an error asks for."""
     try:
-        yield
+        return read(path)
     except UsageError as error:
         raise UsageError(f"{error} Options go to: robot-gst {command}") from error
 
 
 def _rgbd(path: Path) -> Found:
-    with _options_of(f"import rgbd {path} RUN"):
-        index = read_index(path)
+    index = _read(read_index, path, f"import rgbd {path} RUN")
     return Found(
         what=f"RGB-D images, {index.summary}",
         holds=tuple(f"assumed {name}: {value}" for name, value in index.assumed.items()),
@@ -359,8 +345,7 @@ def _splat(path: Path) -> Found:
         what=f"a splat of {counts[0]} Gaussians" if is_splat else "a PLY file without Gaussians",
         rebuild="the RGB-D images that it was made of: scenes are fitted, not imported",
         replay=f"RGB-D images, {ONLY_SEEN}",
-        evaluate="recorded images and renders of it: "
-        "robot-gst evaluate --reference DIR --renders NAME=DIR",
+        evaluate="images and renders: robot-gst evaluate --reference DIR --renders NAME=DIR",
     )
 
 
@@ -369,8 +354,7 @@ def _table(path: Path) -> Found:
 
     if path.stat().st_size > MOST_TABLE_BYTES:
         raise UsageError(f"{path} is larger than any table of trials. Open what it was made of.")
-    with _options_of(f"evaluate {path}"):
-        taken = take(path)
+    taken = _read(take, path, f"evaluate {path}")
 
     def keep(path: Path, run: Path, *, output: Output) -> int:
         file = keep_trials(taken.trials, RunFolder.create(run), force=False)
@@ -395,12 +379,10 @@ def _converted(kind: str, into: str, path: Path) -> Found:
 def _run(path: Path, robot_file: str = "") -> Found:
     """What a run holds and lacks, and the commands from there to a page with numbers."""
     run = RunFolder.open(path)
-    entries = find_episodes(run)
-    seen = _survey(run)
+    entries, seen = find_episodes(run), _survey(run)
     cameras, views = _cameras(seen, {})
     robot, lacks, robots = _robot(seen, robot_file)
-    has_scene = (run.scene_dir / "scene.json").is_file()
-    has_table = trials_path(run).is_file()
+    has_scene, has_table = (run.scene_dir / "scene.json").is_file(), trials_path(run).is_file()
     trials = [e for e in entries if not e.error and e.kind in ("trial", "imported")]
     unknown = [entry for entry in trials if entry.outcome == "unknown"]
     broken = [entry.id for entry in entries if entry.error]
@@ -410,13 +392,9 @@ def _run(path: Path, robot_file: str = "") -> Found:
     if unknown and (views or robots or not task):
         steps.append(f"label {path} {unknown[0].id}{task} --result success")
     if trials and not lacks and not views:
-        is_told = named.ROBOT_DESCRIPTION in seen.types
-        steps.append(
-            f"replay {path}"
-            + ("" if is_told and not robot_file else f" --robot {robot_file or robots[0].name}")
-        )
-    can_count = bool(trials or has_table or has_scene or not views)
-    steps += [f"evaluate {path}"] * can_count
+        which = robot_file or ("" if named.ROBOT_DESCRIPTION in seen.types else robots[0].name)
+        steps.append(f"replay {path}" + (f" --robot {which}" if which else ""))
+    steps += [f"evaluate {path}"] * bool(trials or has_table or has_scene or not views)
     more = [f"unreadable: {_some(broken)}"] * bool(broken)
     more += ["a scene"] * has_scene + ["a table of trials"] * has_table
     return Found(
@@ -431,20 +409,16 @@ def _run(path: Path, robot_file: str = "") -> Found:
 
 def _survey(run: RunFolder) -> Survey:
     """The topics of a run's first episodes, as those of one recording."""
-    types: dict[str, str] = {}
-    rates_hz: dict[str, float] = {}
-    first: dict[str, bytes] = {}
+    seen = Survey({}, {}, {})
     for path in run.episodes()[:MOST_EPISODES]:
-        try:
+        with suppress(GstError):  # ls and check say what is wrong with it
             episode = Episode.open(path)
             for topic, about in episode.topics().items():
-                if topic not in types and about.count:
-                    types[topic] = about.type_name
-                    rates_hz[topic] = about.count / max(episode.duration_s, 1e-9)
-                    first[topic] = next(episode.messages([topic])).data
-        except GstError:  # ls and check say what is wrong with it
-            continue
-    return Survey(types=types, rates_hz=rates_hz, first=first)
+                if topic not in seen.types and about.count:
+                    seen.types[topic] = about.type_name
+                    seen.rates_hz[topic] = about.count / max(episode.duration_s, 1e-9)
+                    seen.first[topic] = next(episode.messages([topic])).data
+    return seen
 
 
 KINDS: dict[str, Callable[[Path], Found]] = {
