@@ -133,16 +133,16 @@ def _mapped(file: Path | None, bring: Callable[..., int]) -> tuple[str, dict[str
     """The robot and the options of an import that a map names."""
     known = signature(bring).parameters
     try:
-        said = {} if file is None else tomllib.loads(file.read_text("utf-8"))
-        robot = str(said.pop("robot", ""))
-        if topics := dict(said.pop("topics", {})):
-            said["remap"] = tuple(f"{old}={new}" for old, new in topics.items())
+        options = {} if file is None else tomllib.loads(file.read_text("utf-8"))
+        robot = str(options.pop("robot", ""))
+        if topics := dict(options.pop("topics", {})):
+            options["remap"] = tuple(f"{old}={new}" for old, new in topics.items())
         if "config" in known:
-            said = {"config": type(known["config"].default)(**said)}
-        signature(bring).bind(Path(), Path(), output=OUTPUT, **said)
+            options = {"config": type(known["config"].default)(**options)}
+        signature(bring).bind(Path(), Path(), output=OUTPUT, **options)
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(f"--map {file}: {error}") from error
-    return robot, said
+    return robot, options
 
 
 def look_at(path: Path) -> Found:
