@@ -6,7 +6,7 @@ Heads, summaries and small texts are read; nothing is unpickled or run. Commands
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
@@ -90,16 +90,14 @@ class Found:
 class Survey(NamedTuple):
     """What a recording says of its topics before all of it is read."""
 
-    types: Mapping[str, str]
-    rates_hz: Mapping[str, float]
-    """Of its first messages."""
-    first: Mapping[str, bytes]
+    types: dict[str, str]
+    rates_hz: dict[str, float]  # of its first messages
+    first: dict[str, bytes]
 
 
 def survey(source: Path) -> Survey:
     """Look at the topics of a bag and at its first messages."""
-    times: dict[str, list[int]] = {}
-    first: dict[str, bytes] = {}
+    times, first = dict[str, list[int]](), dict[str, bytes]()
     with unpacked(find_files(source), None) as bag:
         for item in islice(bag.messages(), MOST_SURVEYED):
             times.setdefault(item.topic, []).append(item.log_time_ns)
@@ -107,7 +105,7 @@ def survey(source: Path) -> Survey:
         types = bag.types()
     spans = {topic: (len(t) - 1, (t[-1] - t[0]) / NS_PER_S) for topic, t in times.items()}
     rates_hz = {topic: steps / seconds for topic, (steps, seconds) in spans.items() if seconds}
-    return Survey(types=types, rates_hz=rates_hz, first=first)
+    return Survey(dict(types), rates_hz, first)
 
 
 def open(
@@ -143,16 +141,16 @@ def _mapped(file: Path | None, bring: Callable[..., int]) -> tuple[str, dict[str
     """The robot and the options of an import that a map names."""
     known = signature(bring).parameters
     try:
-        said = {} if file is None else tomllib.loads(file.read_text("utf-8"))
-        robot = str(said.pop("robot", ""))
-        if topics := dict(said.pop("topics", {})):
-            said["remap"] = tuple(f"{old}={new}" for old, new in topics.items())
+        options = {} if file is None else tomllib.loads(file.read_text("utf-8"))
+        robot = str(options.pop("robot", ""))
+        if topics := dict(options.pop("topics", {})):
+            options["remap"] = tuple(f"{old}={new}" for old, new in topics.items())
         if "config" in known:
-            said = {"config": type(known["config"].default)(**said)}
-        signature(bring).bind(Path(), Path(), output=OUTPUT, **said)
+            options = {"config": type(known["config"].default)(**options)}
+        signature(bring).bind(Path(), Path(), output=OUTPUT, **options)
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(f"--map {file}: {error}") from error
-    return robot, said
+    return robot, options
 
 
 def look_at(path: Path) -> Found:
@@ -256,8 +254,7 @@ def _proposal(seen: Survey, names: Mapping[str, str], robot: str) -> Iterator[st
         elif kind == schema.JOINT_STATE and not topic.endswith(JOINTS):
             topics[topic] = f"/NAME{named.JOINT_STATES}"
     if robot == "FILE.toml" or topics.keys() != names.keys():
-        yield "a map for --map FILE, to be corrected:"
-        yield from [f'robot = "{robot}"'] * bool(robot)
+        yield from ("a map for --map FILE, to be corrected:", *[f'robot = "{robot}"'] * bool(robot))
         yield from ("[topics]", *(f'"{old}" = "{new}"' for old, new in topics.items()))
 
 
@@ -302,8 +299,8 @@ def _robot(seen: Survey, asked: str = "") -> tuple[list[str], list[str], list[Ro
     fingers = {joint for robot in fits for joint in robot.finger_joints}
     if not fingers & set(joints) and not any(t.endswith(named.GRIPPER_STATE) for t in seen.types):
         lacks.append(f"the gripper's width on a topic that ends in {named.GRIPPER_STATE}")
-    rate_hz = seen.rates_hz.get(topic, 0.0)
-    return [f"robot: {name}; {_some(joints)} at {rate_hz:.3g} Hz on {topic}"], lacks, fits
+    rate = f"{seen.rates_hz.get(topic, 0.0):.3g} Hz"
+    return [f"robot: {name}; {_some(joints)} at {rate} on {topic}"], lacks, fits
 
 
 def _lerobot(path: Path) -> Found:
@@ -325,18 +322,16 @@ def _lerobot(path: Path) -> Found:
     )
 
 
-@contextmanager
-def _options_of(command: str) -> Iterator[None]:
-    """Say which command takes the options that an error asks for."""
+def _read(read: Callable[[Path], Any], path: Path, command: str) -> Any:
+    """Read, or say which command takes the options that an error asks for."""
     try:
-        yield
+        return read(path)
     except UsageError as error:
         raise UsageError(f"{error} Options go to: robot-gst {command}") from error
 
 
 def _rgbd(path: Path) -> Found:
-    with _options_of(f"import rgbd {path} RUN"):
-        index = read_index(path)
+    index = _read(read_index, path, f"import rgbd {path} RUN")
     return Found(
         what=f"RGB-D images, {index.summary}",
         holds=tuple(f"assumed {name}: {value}" for name, value in index.assumed.items()),
@@ -370,8 +365,7 @@ def _splat(path: Path) -> Found:
         what=f"a splat of {counts[0]} Gaussians" if is_splat else "a PLY file without Gaussians",
         rebuild="the RGB-D images that it was made of: scenes are fitted, not imported",
         replay=f"RGB-D images, {ONLY_SEEN}",
-        evaluate="recorded images and renders of it: "
-        "robot-gst evaluate --reference DIR --renders NAME=DIR",
+        evaluate="images and renders: robot-gst evaluate --reference DIR --renders NAME=DIR",
     )
 
 
@@ -380,8 +374,7 @@ def _table(path: Path) -> Found:
 
     if path.stat().st_size > MOST_TABLE_BYTES:
         raise UsageError(f"{path} is larger than any table of trials. Open what it was made of.")
-    with _options_of(f"evaluate {path}"):
-        taken = take(path)
+    taken = _read(take, path, f"evaluate {path}")
 
     def keep(path: Path, run: Path, *, output: Output) -> int:
         file = trials_path(RunFolder.create(run))
@@ -410,12 +403,10 @@ def _converted(kind: str, into: str, path: Path) -> Found:
 def _run(path: Path, robot_file: str = "") -> Found:
     """What a run holds and lacks, and the commands from there to a page with numbers."""
     run = RunFolder.open(path)
-    entries = find_episodes(run)
-    seen = _survey(run)
+    entries, seen = find_episodes(run), _survey(run)
     cameras, views = _cameras(seen, {})
     robot, lacks, robots = _robot(seen, robot_file)
-    has_scene = (run.scene_dir / "scene.json").is_file()
-    has_table = trials_path(run).is_file()
+    has_scene, has_table = (run.scene_dir / "scene.json").is_file(), trials_path(run).is_file()
     trials = [e for e in entries if not e.error and e.kind in ("trial", "imported")]
     unknown = [entry for entry in trials if entry.outcome == "unknown"]
     broken = [entry.id for entry in entries if entry.error]
@@ -425,13 +416,9 @@ def _run(path: Path, robot_file: str = "") -> Found:
     if unknown and (views or robots or not task):
         steps.append(f"label {path} {unknown[0].id}{task} --result success")
     if trials and not lacks and not views:
-        is_told = named.ROBOT_DESCRIPTION in seen.types
-        steps.append(
-            f"replay {path}"
-            + ("" if is_told and not robot_file else f" --robot {robot_file or robots[0].name}")
-        )
-    can_count = bool(trials or has_table or has_scene or not views)
-    steps += [f"evaluate {path}"] * can_count
+        which = robot_file or ("" if named.ROBOT_DESCRIPTION in seen.types else robots[0].name)
+        steps.append(f"replay {path}" + (f" --robot {which}" if which else ""))
+    steps += [f"evaluate {path}"] * bool(trials or has_table or has_scene or not views)
     more = [f"unreadable: {_some(broken)}"] * bool(broken)
     more += ["a scene"] * has_scene + ["a table of trials"] * has_table
     return Found(
@@ -446,20 +433,16 @@ def _run(path: Path, robot_file: str = "") -> Found:
 
 def _survey(run: RunFolder) -> Survey:
     """The topics of a run's first episodes, as those of one recording."""
-    types: dict[str, str] = {}
-    rates_hz: dict[str, float] = {}
-    first: dict[str, bytes] = {}
+    seen = Survey({}, {}, {})
     for path in run.episodes()[:MOST_EPISODES]:
-        try:
+        with suppress(GstError):  # ls and check say what is wrong with it
             episode = Episode.open(path)
             for topic, about in episode.topics().items():
-                if topic not in types and about.count:
-                    types[topic] = about.type_name
-                    rates_hz[topic] = about.count / max(episode.duration_s, 1e-9)
-                    first[topic] = next(episode.messages([topic])).data
-        except GstError:  # ls and check say what is wrong with it
-            continue
-    return Survey(types=types, rates_hz=rates_hz, first=first)
+                if topic not in seen.types and about.count:
+                    seen.types[topic] = about.type_name
+                    seen.rates_hz[topic] = about.count / max(episode.duration_s, 1e-9)
+                    seen.first[topic] = next(episode.messages([topic])).data
+    return seen
 
 
 def _description(path: Path) -> Found:

@@ -60,12 +60,12 @@ def goes_with_success(verdict: Verdict) -> dict[str, float]:
     ranks = np.array([_ranks(row) for row in values])
     weights = np.where(good, 1 / k, -1 / (n - k)) * 2 / n
     dealt = np.random.default_rng(0).permuted(np.tile(weights, (SHUFFLES, 1)), axis=1)
-    chance = np.quantile(np.abs(ranks @ dealt.T).max(axis=0), LEVEL)
+    limit = np.quantile(np.abs(ranks @ dealt.T).max(axis=0), LEVEL)
     strengths = ranks @ weights
     found: dict[str, tuple[str, float]] = {}
     for place in np.argsort(-np.abs(strengths), kind="stable"):
         name, _, unit = [*samples["drawn"]][place % len(drawn)].rpartition(" ")
-        if abs(strengths[place]) > chance and name not in found:
+        if abs(strengths[place]) > limit and name not in found:
             off = " off the middle" if place >= len(drawn) else ""
             yes, no = (_text(float(np.median(values[place][s])), unit) for s in (good, ~good))
             text = f"{name}{off}: {yes} where it succeeds, {no} where not"

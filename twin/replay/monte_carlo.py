@@ -234,8 +234,8 @@ def with_samples(
     )
     if verdict.accepted is not True:
         return verdict
-    beyond_chance = [text for text, strength in goes_with_success(verdict).items() if strength]
-    why = (verdict.reason, *what_decides(verdict), *beyond_chance[:1])
+    strong = [text for text, strength in goes_with_success(verdict).items() if strength]
+    why = (verdict.reason, *what_decides(verdict), *strong[:1])
     return replace(verdict, reason="; ".join(filter(None, why)) or None)
 
 
