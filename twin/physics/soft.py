@@ -264,7 +264,7 @@ class SoftModel:
 
     @staticmethod
     def from_lattice(arrays: Mapping[str, np.ndarray], model: ObjectModel) -> "SoftModel":
-        """Take the lattice of a rebuilt scene (``objects/<id>/soft.npz``).
+        """Take the lattice of a rebuilt scene (``twin.scene.shape.lattice``).
 
         One that is finer than the task asks for (``soft.cell_m``) is replaced by a coarser lattice
         of the same solid, with the fine surface as skin: docs/decisions/0017-contact-physics.md.

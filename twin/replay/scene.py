@@ -42,7 +42,7 @@ class ReplayScene:
     static_sdf: StaticSdf | None = None
     """Distances to what stands still; None: only the table and the containers are known."""
     lattices: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
-    """Soft objects by the arrays of the scene's ``soft.npz``; the task's mesh stands in for
+    """Soft objects by the arrays of the scene's lattice; the task's mesh stands in for
     others."""
     unseen: Mapping[str, Unseen] = field(default_factory=dict)
     """Of rigid objects: edges and centre of mass as a draw has them; full and even where absent."""
