@@ -175,6 +175,16 @@ def test_a_tum_folder_is_rebuilt_next(make_trial: MakeTrial, tmp_path: Path, say
     assert f"import rgbd {tmp_path / 'tum'} RUN" in say(tmp_path / "tum", code=2)
 
 
+def test_a_map_names_cell_and_camera_of_a_folder(
+    make_trial: MakeTrial, tmp_path: Path, say: Say
+) -> None:
+    assert run("export", "tum", make_trial(), tmp_path / "tum") == 0
+    (tmp_path / "map.toml").write_text('cell = "lab"\ncamera = "overhead"\n')
+    say(tmp_path / "tum", tmp_path / "new", "--map", tmp_path / "map.toml")
+    (path,) = (tmp_path / "new" / "episodes").iterdir()
+    assert "/lab/cam/overhead/color/image" in Episode.open(path).topics()
+
+
 def test_posed_images_are_to_look_at(tmp_path: Path, say: Say) -> None:
     text = say(strangers.colmap(tmp_path / "garden"))
     assert "2 posed images without depth, COLMAP: to look at" in text
