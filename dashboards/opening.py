@@ -294,7 +294,7 @@ def _robot(seen: Survey, asked: str = "") -> tuple[list[str], list[str], list[Ro
     fits = [robot for robot in known if set(robot.joints) <= set(joints)]
     fits = [robot for robot in fits if len(robot.joints) == max(len(r.joints) for r in fits)]
     name = " or ".join(robot.name for robot in fits) or "none of the robot files"
-    name += ", by the names of its joints" if fits and not (urdf or asked) else ""
+    name += ", by the names of its joints (another: --map)" if fits and not (urdf or asked) else ""
     lacks = [] if fits else ["a robot file with its joints (docs/robots.md)"]
     fingers = {joint for robot in fits for joint in robot.finger_joints}
     if not fingers & set(joints) and not any(t.endswith(named.GRIPPER_STATE) for t in seen.types):

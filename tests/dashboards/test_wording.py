@@ -1,5 +1,6 @@
 """Printed numbers keep their count, their interval, and their smallness."""
 
+from bridge.task.verdict import Factor, Verdict
 from dashboards import wording
 from evaluator.report.page import breakable
 from evaluator.result import Interval, Measurement
@@ -24,6 +25,26 @@ def test_a_length_keeps_its_unit_on_its_line() -> None:
 def test_a_chance_of_success_is_counts_and_whole_percentages() -> None:
     said = {"value": 1.0, "low": 0.5101091635454027, "high": 1.0, "k": 4, "n": 4}
     assert plain(wording.success_share(said)) == "4 of 4 varied replays succeed, 51 to 100 %"
+
+
+def test_a_verdict_in_rerun_says_what_its_varied_replays_show() -> None:
+    yes, p = Factor(value=True), {"value": 1.0, "low": 0.51, "high": 1.0, "k": 4, "n": 4}
+    kept = {"accepted": [True] * 4, "cause": [""] * 4, "missed_m": [None] * 4, "drawn": {}}
+    verdict = Verdict(
+        plan_id="plan",
+        trajectory="planned",
+        mode="dynamic",
+        ik=yes,
+        clearance=yes,
+        terminal=yes,
+        engine="pybullet",
+        seed=0,
+        p_success=p,
+        samples=kept,
+    )
+    shown = plain(wording.verdict_text(verdict))
+    told = "4 of 4 varied replays succeed, 51 to 100 %; all succeed, so none shows what decides"
+    assert shown == f"✓ accepted: plan, planned, dynamic, pybullet; {told}"
 
 
 def test_a_name_breaks_at_its_joints_and_a_number_never() -> None:

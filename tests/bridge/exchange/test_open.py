@@ -77,7 +77,7 @@ def test_a_bag_of_an_arm_in_a_database_becomes_a_trial_with_a_rate(
 ) -> None:
     bag = strangers.franka(make_trial, tmp_path / "franka")
     text = say(bag)
-    assert "robot: panda, by the names of its joints; panda_joint1" in text
+    assert "robot: panda, by the names of its joints (another: --map); panda_joint1" in text
     assert "and 2 more at 125 Hz on /franka/joint_states" in text
     assert "rebuild needs a calibrated camera with colour and depth" in text
     assert "replay needs the gripper's width" in text
@@ -90,11 +90,13 @@ def test_a_bag_of_an_arm_in_a_database_becomes_a_trial_with_a_rate(
 
 def test_a_bag_of_an_xarm_and_a_realsense_is_named(tmp_path: Path, say: Say) -> None:
     text = say(strangers.xarm(tmp_path / "seven", 7))
-    assert "robot: xarm7_parallel_gripper, by the names of its joints; joint1" in text
+    assert (
+        "robot: xarm7_parallel_gripper, by the names of its joints (another: --map); joint1" in text
+    )
     assert "at 100 Hz on /xarm/joint_states" in text
     assert "camera camera_camera: color image 10 Hz, color info, depth image 10 Hz" in text
     assert "rebuild: ready" in text
-    assert "--map" not in text
+    assert "a map for" not in text
 
 
 def test_a_map_names_what_a_bag_does_not_say(tmp_path: Path, say: Say) -> None:
@@ -102,7 +104,7 @@ def test_a_map_names_what_a_bag_does_not_say(tmp_path: Path, say: Say) -> None:
         tmp_path / "six", 6, arm="/ufactory", camera=("/head/seen", "/head/depth_seen")
     )
     text = say(bag)
-    assert "robot: z1, by the names of its joints; joint1, joint2" in text
+    assert "robot: z1, by the names of its joints (another: --map); joint1, joint2" in text
     assert "rebuild needs" in text
     _, _, told = text.partition("a map for --map FILE, to be corrected:\n")
     proposed, _, _ = told.partition("  record needs")
@@ -173,6 +175,16 @@ def test_a_tum_folder_is_rebuilt_next(make_trial: MakeTrial, tmp_path: Path, say
     assert "TUM layout with its own times: 12 frames" in say(tmp_path / "tum")
     (tmp_path / "tum" / "camera.json").unlink()
     assert f"import rgbd {tmp_path / 'tum'} RUN" in say(tmp_path / "tum", code=2)
+
+
+def test_a_map_names_cell_and_camera_of_a_folder(
+    make_trial: MakeTrial, tmp_path: Path, say: Say
+) -> None:
+    assert run("export", "tum", make_trial(), tmp_path / "tum") == 0
+    (tmp_path / "map.toml").write_text('cell = "lab"\ncamera = "overhead"\n')
+    say(tmp_path / "tum", tmp_path / "new", "--map", tmp_path / "map.toml")
+    (path,) = (tmp_path / "new" / "episodes").iterdir()
+    assert "/lab/cam/overhead/color/image" in Episode.open(path).topics()
 
 
 def test_posed_images_are_to_look_at(tmp_path: Path, say: Say) -> None:
