@@ -32,7 +32,7 @@ JUMP = 0.06
 """Depths of neighbours that differ by more than this share are of two surfaces."""
 LEAST_GAIN = 1.08
 """So many times as strong an agreement of edges says that something else is true."""
-SHIFT_PX, LATE_S = 2.0, 0.02
+SHIFT_PX, LATE_S = 2.0, 0.015
 """Less, at half size, is what cameras and their calibrations do."""
 DELAYS_S = np.arange(-0.2, 0.2001, 0.005)
 STEP_NS = 20_000_000

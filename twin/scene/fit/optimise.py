@@ -132,7 +132,7 @@ MAX_SCORED_VIEWS = 20
 """Views that errors are gathered from; more only cost time."""
 TRANSPARENT = 0.03
 """Gaussians with less opacity go."""
-UNSEEN_PIXELS = 0.05
+UNSEEN_PIXELS = 0.4
 """Gaussians that make up less than this many pixels of all views together go."""
 HUGE_FRACTION = 0.15
 """Gaussians whose deviation exceeds this share of an image's width go: fog before the camera."""
