@@ -131,11 +131,7 @@ def _margin_ns(event: Mapping[str, Any]) -> int:
 
 
 def write_localised(
-    run: RunFolder,
-    episode: Episode,
-    task: Task,
-    *,
-    scene_hash: str | None = None,
+    run: RunFolder, episode: Episode, task: Task, *, scene_hash: str | None = None
 ) -> Path:
     """Write ``derived/<episode>.localised.<scene>.mcap`` and return its path.
 
@@ -211,10 +207,7 @@ def trial_cameras(run: RunFolder, episode: Episode, moved: Mapping[str, MovedCam
 
 
 def _localised_phases(
-    episode: Episode,
-    task: Task,
-    scanned: ScannedSurfaces,
-    poses: Poses,
+    episode: Episode, task: Task, scanned: ScannedSurfaces, poses: Poses
 ) -> list[tuple[Phase, dict[str, LocalisedObject]]]:
     """Localise in one quiet stretch after the other; each tells the next where objects were."""
     phases: list[tuple[Phase, dict[str, LocalisedObject]]] = []
@@ -252,11 +245,7 @@ def _made_from(path: Path, derived: Derived) -> bool:
         return False
     return (
         found is not None
-        and (found.source_sha256, found.scene_hash)
-        == (
-            derived.source_sha256,
-            derived.scene_hash,
-        )
+        and (found.source_sha256, found.scene_hash) == (derived.source_sha256, derived.scene_hash)
         and provenance.hash_settings({k: v for k, v in found.settings.items() if k != MOVED})
         == provenance.hash_settings(derived.settings)
     )

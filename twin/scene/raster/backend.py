@@ -18,11 +18,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.scene.gaussians import GaussianCloud, arrays
 from twin.scene.harmonics import harmonic_terms
-from twin.scene.raster.rasteriser import (
-    RasterConfig,
-    Rasteriser,
-    View,
-)
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
 
 MIP_VARIANCE_PX2 = 0.1
 NEAR_M = 0.02

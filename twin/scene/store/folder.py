@@ -1,8 +1,6 @@
 """The scene folder: ``scene.json`` and ``background.ply``, whole or not at all."""
 
-import ctypes
 import json
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ from typing import Any
 from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import PathNotFoundError
-from bridge.whole_file import write_whole
+from bridge.whole_file import beside, write_whole
 from twin.errors import UnreadableFileError
 from twin.scene.gaussians import GaussianCloud, read_ply
 
@@ -98,31 +96,11 @@ class _Beside(RunFolder):
 
 @contextmanager
 def scene_beside(run: RunFolder) -> Iterator[RunFolder]:
-    """Make a new scene beside the old one; they change places when the block has ended well.
-
-    Until then readers have the old one, whatever happens. It begins as a copy without its record,
-    for a calibration lies there too.
-    """
+    """A new scene beside the old one, from a copy without its record: a calibration lies there."""
     new = _Beside(run.path)
-    shutil.rmtree(new.scene_dir, ignore_errors=True)  # of one that was killed
-    try:
-        shutil.copytree(run.scene_dir, new.scene_dir)
+    with beside(run.scene_dir, new.scene_dir):
         (new.scene_dir / SCENE_FILE).unlink(missing_ok=True)
         yield new
-        _exchange(new.scene_dir, run.scene_dir)
-    finally:
-        shutil.rmtree(new.scene_dir, ignore_errors=True)
-
-
-def _exchange(one: Path, other: Path) -> None:
-    """Give two folders each other's name at one instant, where the file system can."""
-    here, both = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of Linux
-    rename = getattr(ctypes.CDLL(None), "renameat2", None)
-    if rename is None or rename(here, bytes(one), here, bytes(other), both):
-        old = other.with_name(f"{other.name}.old")
-        other.rename(old)
-        one.rename(other)
-        old.rename(one)
 
 
 def write_record(run: RunFolder, record: Mapping[str, Any]) -> Path:

@@ -10,11 +10,11 @@ from typing import Any, NoReturn
 import pytest
 from small_scene import CONFIG, QUIET
 
+from bridge import whole_file
 from bridge.episode.run_folder import RunFolder
 from twin.scene.rebuild import run as rebuilding
 from twin.scene.rebuild.run import rebuild
 from twin.scene.settings import RebuildConfig
-from twin.scene.store import folder
 from twin.scene.store.folder import read_scene, scene_beside
 
 CHANGES = ("open", "os.mkdir", "os.remove", "os.rename", "os.rmdir", "ctypes.set_errno")
@@ -75,7 +75,7 @@ def test_where_folders_cannot_be_exchanged_they_are_renamed(
 ) -> None:
     run = RunFolder.create(tmp_path)
     write(run, b"old")
-    monkeypatch.setattr(folder.ctypes, "CDLL", lambda _: object())
+    monkeypatch.setattr(whole_file.ctypes, "CDLL", lambda _: object())
     with scene_beside(run) as new:
         write(new, b"new")
     assert content(run.scene_dir) == dict.fromkeys(FILES, b"new")
