@@ -347,6 +347,9 @@ def _value_columns(sheet: Sheet, labels: dict[str, Column | None]) -> tuple[list
     rest_is = "policy" if not labels["policy"] else "" if labels["task"] else "task"
     sided = [c for c in free if c.side]
     plain = [c for c in free if c.figure and not c.side and not c.rest]
+    outcomes = [c for c in plain if c.figure == "outcome"]
+    if len(outcomes) == 1 and {c.side for c in sided} == {"sim"}:
+        sided.append(replace(outcomes[0], side="real"))  # what is said of no side was recorded
     if sided:
         return _sided(sheet, sided, [c for c in plain if c.figure == "n"], labels, rest_is)
     if [c for c in plain if c.figure != "n"]:
