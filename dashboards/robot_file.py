@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bridge.errors import UsageError
-from bridge.robots.robot import NUM_JOINTS, PACKAGE, Finger, Gripper, Robot, number_of, robot_name
+from bridge.robots.robot import NUM_JOINTS, PACKAGE, Finger, Gripper, Robot, number_of
 from bridge.terminal import Output
 
 FINGERS = re.compile(
@@ -24,7 +24,7 @@ FINGER_M = 0.15
 """A joint at the end that slides by less opens something."""
 TOOLS = ("tcp", "tool0", "grasp", "ee", "eef", "effector", "tool", "flange")
 """What frames of tools are called, the surest first."""
-MOST_NAMED = 5
+MOST_NAMED, MOST_JOINTS = 5, 500
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,11 @@ class Joint:
         return self.kind in ("revolute", "continuous", "prismatic") and not self.leader
 
     @property
+    def turns(self) -> bool:
+        """Whether it may be one of an arm's: those that slide are held."""
+        return self.moves and self.kind != "prismatic"
+
+    @property
     def opens(self) -> bool:
         """Whether it looks like a finger's."""
         slides = self.kind == "prismatic" and self.upper - self.lower < FINGER_M
@@ -65,14 +70,17 @@ def propose(path: Path) -> tuple[Robot, list[str]]:
     """
     robot = Robot(name=path.stem, urdf=path.name, joints=(), folder=path.absolute().parent)
     robot = _with_meshes(robot, path)
-    joints = _joints(ET.fromstring(robot.urdf_text()))
+    root = robot.parsed(robot.urdf)
+    joints = _joints(root)
+    if len(joints) > MOST_JOINTS:
+        raise UsageError(f"{path} has {len(joints)} joints; up to {MOST_JOINTS} are looked at.")
     arm, notes = _arm(joints, path)
     below = _below(arm[-1].child, joints)
     gripper, told = _gripper([joint for joint in below if joint.kind != "fixed"], below)
     driven = {joint.name for joint in arm} | {finger.joint for finger in gripper.fingers}
     tool_frame, unsure = _tool(arm[-1].child, below, gripper)
     proposed = Robot(
-        name=re.sub(r"\W+", "_", robot_name(path.read_text()) or path.stem),
+        name=re.sub(r"\W+", "_", root.get("name") or path.stem),
         urdf=path.name,
         joints=tuple(joint.name for joint in arm),
         base_frame=_root(arm[0].parent, joints),
@@ -147,14 +155,14 @@ def _chains(joints: list[Joint]) -> list[list[Joint]]:
     parents = {joint.parent for joint in joints}
     chains = []
     for leaf in (joint.child for joint in joints if joint.child not in parents):
-        chain, link = list[Joint](), leaf
-        while link in above and above[link] not in chain:
-            chain.append(above[link])
+        chain, link = dict[str, Joint](), leaf
+        while link in above and link not in chain:
+            chain[link] = above[link]
             link = above[link].parent
-        moving = [joint for joint in reversed(chain) if joint.moves]
+        moving = [joint for joint in reversed(chain.values()) if joint.moves]
         while moving and moving[-1].opens:
             moving.pop()
-        chains.append(moving)
+        chains.append([joint for joint in moving if joint.turns])
     return [
         chain
         for index, chain in enumerate(chains)
@@ -169,13 +177,13 @@ def _rank(chain: list[Joint]) -> tuple[bool, int]:
 
 
 def _below(link: str, joints: list[Joint]) -> list[Joint]:
-    """What hangs on a link."""
-    return [
-        each
-        for joint in joints
-        if joint.parent == link
-        for each in (joint, *_below(joint.child, joints))
-    ]
+    """What hangs on a link, the nearest first."""
+    found, links = list[Joint](), {link}
+    while links:
+        hung = [joint for joint in joints if joint.parent in links and joint not in found]
+        found += hung
+        links = {joint.child for joint in hung}
+    return found
 
 
 def _root(link: str, joints: list[Joint]) -> str:

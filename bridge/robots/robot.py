@@ -185,11 +185,11 @@ class Robot:
         Raises:
             UsageError: A file or a mesh is missing, or an attached file hangs on nothing.
         """
-        arm = self._parsed(self.urdf)
+        arm = self.parsed(self.urdf)
         for element in arm.findall("transmission"):
             arm.remove(element)
         for name in self.attached:
-            part = self._parsed(name)
+            part = self.parsed(name)
             self._mount(part, arm, name)
             there = {link.get("name"): link for link in arm.findall("link")}
             for item in part:
@@ -217,17 +217,18 @@ class Robot:
         ET.SubElement(root, RECORD_TAG).text = json.dumps(record, separators=(",", ":"))
         return ET.tostring(root, encoding="unicode")
 
-    def _parsed(self, uri: str) -> ET.Element:
+    def parsed(self, uri: str) -> ET.Element:
+        """Read a URDF, its meshes as paths; UsageError says what is wrong with it."""
         path = self._file(uri)
-        text = _UNREAD.sub(lambda found: "\n" * found[0].count("\n"), path.read_text())
-        if "<xacro:" in text:
+        text = _UNREAD.sub(lambda found: b"\n" * found[0].count(b"\n"), path.read_bytes())
+        if b"<xacro:" in text:
             raise UsageError(
                 f"{path} is a xacro file; expand it first: xacro {path} > {path.stem}.urdf, and "
                 "name that."
             )
         try:
             root = ET.fromstring(text)
-        except ET.ParseError as error:
+        except (ET.ParseError, ValueError, LookupError) as error:  # an encoding, too
             raise UsageError(f"{path} is not XML ({error}).") from error
         if root.tag != "robot":
             raise UsageError(f"{path} has the root element <{root.tag}>, not <robot>.")
@@ -271,7 +272,7 @@ class Robot:
         return resolve_mesh(uri if uri.startswith("package:/") else str(self.folder / uri))
 
 
-_UNREAD = re.compile(r"<!--.*?-->|<gazebo\b[^>]*/>|<gazebo\b.*?</gazebo>", re.DOTALL)
+_UNREAD = re.compile(rb"<!--.*?-->|<gazebo\b[^>]*/>|<gazebo\b.*?</gazebo>", re.DOTALL)
 """Simulators read these, with prefixes that nothing declares."""
 _OF_FILES = ("attached", "flange", "prefix", "held", "mesh_folders", "folder")
 """Fields that say how the URDF is put together: a description is put together already."""

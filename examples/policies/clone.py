@@ -27,7 +27,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE
 
 SIZE = (96, 72)
-ROWS, FOLLOWED, STEP_S = 12, 8, 0.1
+ROWS, FOLLOWED, STEP_S = 12, 4, 0.1
 """Rows that are learned, how many of them are an answer, and the time that each has."""
 SPEED_RAD_S, RAD_PER_M = 0.5, 10.0
 """What is learned is the way and not the pace: the joint that moves most goes at this speed, and

@@ -2,8 +2,8 @@
 
 One gain for each camera and colour brings the twin's pictures to it. The gains come from other
 trials than the one that is rolled out, so no picture that is judged against is copied. Noise, blur,
-an affine map of the colours, and the recorded background changed no policy's actions and are not
-made (docs/policies.md).
+an affine map of the colours, and the recorded background brought a policy's actions hardly nearer
+to those on recorded pictures than gains alone do (docs/policies.md).
 """
 
 from collections.abc import Mapping, Sequence
