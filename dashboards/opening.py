@@ -12,6 +12,7 @@ from functools import partial
 from inspect import signature
 from itertools import islice
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple
 
 from bridge.cli.exchange import import_images, import_rgbd, import_rosbag2
@@ -84,7 +85,8 @@ class Found:
             lack = getattr(self, use)
             lines.append(f"  {use} needs {lack}" if lack else f"  {use}: ready")
         steps = self.then or ((f"open {path} RUN",) if self.bring else ())
-        return [*lines, *(f"next: robot-gst {step}" for step in steps)]
+        typed = (step.replace(str(path), quote(str(path))) for step in steps)
+        return [*lines, *(f"next: robot-gst {step}" for step in typed)]
 
 
 class Survey(NamedTuple):
@@ -149,7 +151,10 @@ def _mapped(file: Path | None, bring: Callable[..., int]) -> tuple[str, dict[str
             options = {"config": type(known["config"].default)(**options)}
         signature(bring).bind(Path(), Path(), output=OUTPUT, **options)
     except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"--map {file}: {error}") from error
+        may = known["config"].default.__dict__ if "config" in known else known
+        names = {*may, "robot", "topics"} - {"output", "remap", "config", "folder", "bag", "run"}
+        hint = f"It may have: {', '.join(sorted(names))}; topics is a table."
+        raise UsageError(f"--map {file} is not understood ({error}). {hint}") from error
     return robot, options
 
 
@@ -230,7 +235,7 @@ def _bag(path: Path) -> Found:
     names = mapped(seen.types)
     cameras, views = _cameras(seen, names)
     robot, lacks, robots = _robot(seen)
-    file = [*(each.name for each in robots), "FILE.toml"][0] if robot else ""
+    file = (robots[0].name if len(robots) == 1 else "FILE.toml") if robot else ""
     count = count_messages(path)
     renamed = [f"{old} will be {new}" for old, new in names.items() if not old.endswith("_info")]
     return Found(
@@ -250,7 +255,8 @@ def _proposal(seen: Survey, names: Mapping[str, str], robot: str) -> Iterator[st
     for topic, kind in seen.types.items():
         if kind in IMAGES and not STREAM.search(names.get(topic, topic)):
             stream = "depth" if "depth" in topic else "color"
-            topics[topic] = f"{named.CAMERAS}NAME/{stream}/{IMAGES[kind]}"
+            place = re.sub(r"\W+", "_", topic.strip("/").split("/")[0])
+            topics[topic] = f"{named.CAMERAS}{place}/{stream}/{IMAGES[kind]}"
         elif kind == schema.JOINT_STATE and not topic.endswith(JOINTS):
             topics[topic] = f"/NAME{named.JOINT_STATES}"
     if robot == "FILE.toml" or topics.keys() != names.keys():
@@ -343,7 +349,8 @@ def _rgbd(path: Path) -> Found:
 def _posed(path: Path) -> Found:
     index = read_posed_index(path)
     return Found(
-        what=f"{len(index.images)} posed images without depth, {index.layout}: to look at",
+        what=f"{len(index.images)} posed images, {index.layout}, read without depth: to look at",
+        holds=tuple(f"{what}: {why}" for what, why, _ in index.unused),
         rebuild="depth images",
         replay=f"depth images, {ONLY_SEEN}",
         evaluate="depth images, or trials",
@@ -353,7 +360,9 @@ def _posed(path: Path) -> Found:
 
 def _splat(path: Path) -> Found:
     with path.open("rb") as stream:
-        head, end, _ = stream.read(MOST_HEAD_BYTES).partition(b"end_header\n")
+        start = stream.read(MOST_HEAD_BYTES)
+    line = b"end_header\r\n" if b"end_header\r\n" in start else b"end_header\n"
+    head, end, _ = start.partition(line)
     words = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     fields = [word[-1] for word in words if word[:1] == ["property"]]
     counts = [word[-1] for word in words if word[:2] == ["element", "vertex"]]
@@ -416,7 +425,8 @@ def _run(path: Path, robot_file: str = "") -> Found:
     if unknown and (views or robots or not task):
         steps.append(f"label {path} {unknown[0].id}{task} --result success")
     if trials and not lacks and not views:
-        which = robot_file or ("" if named.ROBOT_DESCRIPTION in seen.types else robots[0].name)
+        guess = robots[0].name if len(robots) == 1 else "NAME"  # as many robots have such joints
+        which = robot_file or ("" if named.ROBOT_DESCRIPTION in seen.types else guess)
         steps.append(f"replay {path}" + (f" --robot {which}" if which else ""))
     steps += [f"evaluate {path}"] * bool(trials or has_table or has_scene or not views)
     more = [f"unreadable: {_some(broken)}"] * bool(broken)

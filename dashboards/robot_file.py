@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.errors import UsageError
+from bridge.errors import PathNotFoundError, UsageError
 from bridge.robots.robot import NUM_JOINTS, PACKAGE, Finger, Gripper, Robot, number_of
 from bridge.terminal import Output
 
@@ -68,6 +68,8 @@ def propose(path: Path) -> tuple[Robot, list[str]]:
     Raises:
         UsageError: It cannot be read, or no chain of its joints is an arm.
     """
+    if not path.is_file():
+        raise PathNotFoundError(path=path, what="robot description", hint="Check the path.")
     robot = Robot(name=path.stem, urdf=path.name, joints=(), folder=path.absolute().parent)
     robot = _with_meshes(robot, path)
     root = robot.parsed(robot.urdf)

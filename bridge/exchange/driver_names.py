@@ -23,6 +23,8 @@ _ALIGNED = ("aligned_depth_to_color", "depth_registered", "depth_to_rgb")
 def mapped(types: Mapping[str, str], asked: Sequence[str] = ()) -> dict[str, str]:
     """Say under which name each topic goes into an episode: as asked (OLD=NEW), or of a camera."""
     names = dict(_pair(text, types) for text in asked)
+    if len({*names.values()}) < len(names):
+        raise UsageError(f"two topics get one name: {', '.join(asked)}. Give each its own.")
     if any(COLOR_TOPIC.search(topic) for topic in types) or asked:
         return names
     aligned = {topic for topic in types for word in _ALIGNED if word in topic}

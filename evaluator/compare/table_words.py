@@ -11,7 +11,7 @@ from bridge.exchange.table_text import ENDED, MEASURED, UNKNOWN, answer_of
 LABELS = {
     "task": "task tasks task_name scenario scenarios aufgabe tache experiment benchmark env",
     "policy": "policy policies model models method methods algorithm checkpoint agent approach "
-    "policy_name modell modele methode",
+    "policy_name modell modele methode strategie verfahren",
     "condition": "condition study_arm bedingung",
     "trial": "trial trial_id trial_number episode episode_id rollout attempt id nr versuch essai",
     "start_id": "start_id start initial_condition init_state",

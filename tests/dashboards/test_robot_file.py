@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from bridge.errors import UsageError
+from bridge.errors import PathNotFoundError, UsageError
 from bridge.robots.robot import Robot, read_robot, resolve_mesh
 from bridge.terminal import Output
 from dashboards.opening import look_at
@@ -180,6 +180,27 @@ def test_what_holds_no_arm_is_refused_with_what_there_is(
 ) -> None:
     with pytest.raises(UsageError, match=told):
         look_at(written(tmp_path, inside, name))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "iso-8859-1", "utf-16"])
+def test_an_encoding_that_the_file_declares_is_read(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "robot.urdf"
+    text = f'<robot name="m">{link("base")}{chain("ärm", 6, "base")}</robot>'
+    path.write_bytes(
+        f'<?xml version="1.0" encoding="{encoding}"?>{text}'.replace("-sig", "").encode(encoding)
+    )
+    assert propose(path)[0].joints == tuple(f"ärm_j{i}" for i in range(6))
+
+
+def test_a_linear_axis_is_held_and_a_crowd_of_joints_refused(tmp_path: Path) -> None:
+    limit = '<limit lower="0" upper="3" velocity="1" effort="9"/>'
+    axis = link("sled") + joint("axis", "prismatic", "base", "sled", limit)
+    robot, _ = propose(written(tmp_path, axis + chain("arm", 6, "sled")))
+    assert (robot.held, len(robot.joints)) == (("axis",), 6)
+    with pytest.raises(UsageError, match="has 1500 joints"):
+        propose(written(tmp_path, chain("arm", 1500, "base")))
+    with pytest.raises(PathNotFoundError):
+        propose(tmp_path / "none.urdf")
 
 
 def test_what_only_simulators_read_is_passed_over(tmp_path: Path) -> None:

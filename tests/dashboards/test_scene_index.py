@@ -106,7 +106,8 @@ def test_without_poses_the_images_themselves_are_followed(
     [
         ("camera-intrinsics.txt", "1 2 3", "holds 3 numbers, not 3 x 3"),
         ("camera-intrinsics.txt", "1 2 x", "could not convert"),
-        ("camera_intrinsic.json", "{}", "no intrinsic_matrix"),
+        ("camera_intrinsic.json", "{}", "holds 0 numbers, not 3 x 3"),
+        ("camera_intrinsic.json", "[1", "is no JSON object"),
         ("README", "", "does not say how its camera sees"),
     ],
 )
@@ -115,6 +116,58 @@ def test_what_is_missing_is_named(tmp_path: Path, name: str, content: str, told:
     (folder / name).write_text(content)
     with pytest.raises(UsageError, match=told):
         look_at(folder)
+
+
+def test_a_log_that_names_some_frames_poses_those_alone(tmp_path: Path) -> None:
+    """Numbers of images may begin at one; a log that names fewer goes by its numbers."""
+    folder = images(tmp_path / "scan", range(1, 6))
+    open3d(folder, range(5))
+    index, _ = propose_index(folder)
+    np.testing.assert_allclose([f["T_world_cam"] for f in index["frames"]], [*map(pose, range(5))])
+    open3d(folder, range(1, 6, 2))
+    index, _ = propose_index(folder)
+    assert [f["T_world_cam"] is None for f in index["frames"]] == [False, True, False, True, False]
+    np.testing.assert_allclose(index["frames"][2]["T_world_cam"], pose(3))
+    open3d(folder, range(7))
+    with pytest.raises(UsageError, match="7 poses for 5 frames"):
+        propose_index(folder)
+
+
+def test_colour_of_another_camera_is_seen_by_that_one(tmp_path: Path) -> None:
+    """ScanNet's colour is 1296 x 968, its depth 640 x 480."""
+    folder = images(tmp_path / "scan", range(2))
+    scannet(folder, range(2))
+    for path in (folder / "color").iterdir():
+        Image.new("RGB", (130, 97)).save(path)
+    with pytest.raises(UsageError, match="130 x 97 px is not what a depth camera of 64 x 48"):
+        propose_index(folder)
+    whole = np.diag([2.0, 2.0, 1.0, 1.0])
+    whole[:3, :3] = whole[:3, :3] @ K
+    (folder / "intrinsic" / "intrinsic_color.txt").write_text(text(whole))
+    write_index(folder, folder / "scene.json", output=QUIET)
+    color = read_index(folder).color_camera
+    assert color == Camera.from_ros(
+        width=130, height=97, fx=2 * K[0, 0], fy=2 * K[1, 1], cx=2 * K[0, 2], cy=2 * K[1, 2]
+    )
+
+
+def test_replica_has_both_kinds_in_one_folder_and_says_its_unit(tmp_path: Path) -> None:
+    made = images(tmp_path / "made", range(3))
+    folder = tmp_path / "scan"
+    (folder / "results").mkdir(parents=True)
+    for path in (*(made / "color").iterdir(), *(made / "depth").iterdir()):
+        path.rename(folder / "results" / path.name)
+    replica(folder, range(3))
+    (folder / "camera-intrinsics.txt").unlink()
+    camera = {"fx": 60, "fy": 61, "cx": 31, "cy": 23, "scale": 6553.5}
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    assert "depth is taken for 0.00015259 m a number" in look_at(folder).holds
+    write_index(folder, folder / "scene.json", output=QUIET)
+    index = read_index(folder)
+    assert index.depth_unit_m == pytest.approx(1 / 6553.5)
+    assert [frame.depth_path.name for frame in index.frames] == [
+        f"depth{n:06d}.png" for n in range(3)
+    ]
 
 
 def test_a_path_that_holds_no_whole_poses_is_refused(tmp_path: Path) -> None:

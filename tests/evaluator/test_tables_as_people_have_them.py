@@ -489,3 +489,16 @@ def test_a_column_that_tells_panels_apart_is_their_condition(tmp_path: Path) -> 
         ("dark", "ACT", 0.3),
     ]
     assert "first column read as condition" in taken.summary
+
+
+@pytest.mark.parametrize(
+    "head", ["outcome,sim", "success,sim", "success,sim_success", "success,success_sim"]
+)
+def test_an_outcome_beside_the_twins_is_what_was_recorded(tmp_path: Path, head: str) -> None:
+    """Of three the twin and the cell agree on two, by hand."""
+    rows = "1,a,success,success\n2,a,failure,success\n3,a,failure,failure\n"
+    path = tmp_path / "t.csv"
+    path.write_text(f"trial,task,{head}\n{rows}")
+    trials = take(path).trials
+    assert [trial.recorded for trial in trials] == [True, False, False]
+    assert [trial.sim_planned for trial in trials] == [True, True, False]

@@ -33,7 +33,7 @@ PARAMETERS = {"SIMPLE_PINHOLE": ("f", "cx", "cy"), "PINHOLE": ("fx", "fy", "cx",
 _READ = {"frames", "w", "h", "camera_angle_x", "fl_x", "fl_y", "cx", "cy"} | {
     *("file_path", "transform_matrix")
 }
-_NEEDED = {"depth_file_path": "depth is not read here; import rgbd reads it"}
+_NEEDED = {"depth_file_path": "depth is read from scene.json alone (docs/rgbd_folder.md)"}
 MOST_PX = 65_500
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SPARSE_PERCENT = (2.0, 98.0)
