@@ -3,6 +3,7 @@
 import numpy as np
 
 from bridge.episode import schema
+from bridge.episode.cdr import codec
 from bridge.episode.cdr import messages as ros
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
@@ -16,6 +17,24 @@ KINDS = {
     ros.JointSample: schema.JOINT_STATE,
     ros.PoseSample: schema.POSE_STAMPED,
 }
+STAMP = {"sec": 1_700_000_000, "nanosec": 123_456_789}
+STAMP_NS = 1_700_000_000_123_456_789
+
+
+def raw_image(pixels: np.ndarray, encoding: str, **fields: object) -> bytes:
+    """A sensor_msgs/Image; ``fields`` replace what would be true."""
+    height, width = pixels.shape[:2]
+    message = {
+        "header": {"stamp": STAMP, "frame_id": "camera"},
+        "height": height,
+        "width": width,
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": pixels[0].nbytes if height else 0,
+        "data": pixels.tobytes(),
+        **fields,
+    }
+    return codec.encode(schema.IMAGE, message)
 
 
 def put(writer: EpisodeWriter, topic: str, record: Sent, stamp_ns: int) -> None:

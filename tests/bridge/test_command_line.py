@@ -1,10 +1,14 @@
-"""The front door: exit codes, one clear sentence, JSON on stdout."""
+"""The front door: exit codes, one clear sentence, JSON on stdout, any standard streams, signals."""
 
 import dataclasses
 import importlib
 import inspect
 import json
+import os
 import re
+import signal
+import subprocess
+import sys
 import typing
 from pathlib import Path
 
@@ -159,3 +163,81 @@ def test_no_help_text_holds_what_the_terminal_would_swallow(target: str) -> None
         if dataclasses.is_dataclass(kind):
             texts.extend(help_sources(kind))
     assert [token for text in texts for token in re.findall(r"<[a-z_ ]+>", text)] == []
+
+
+PROGRAM = (sys.executable, "-m", "robot_gst")
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    """A run with one scan, whose instruction not every terminal can show."""
+    run = RunFolder.create(tmp_path / "run")
+    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan", kind="scan", condition="früh → spät"))
+    return run
+
+
+@pytest.mark.slow
+def test_a_sign_that_cannot_be_shown_is_replaced(run: RunFolder) -> None:
+    said = subprocess.run(
+        [*PROGRAM, "ls", str(run.path)],
+        env=os.environ | {"PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        check=False,
+    )
+    assert (said.returncode, said.stderr) == (0, b"")
+    assert b"fr?h ? sp?t" in said.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_closed_stream_ends_no_command_and_lends_its_number_to_no_file(
+    run: RunFolder, closed: str
+) -> None:
+    script = (
+        "import os, sys, robot_gst; sys.argv = ['robot-gst', 'ls', sys.argv[1]]; "
+        "robot_gst.run = lambda words, run=robot_gst.run: run(words) or 40 + min(3, "
+        "os.open(os.devnull, os.O_RDONLY)); robot_gst.main()"
+    )
+    command = f'exec "$0" -c "$1" "$2" {closed}'
+    shell = ["bash", "-c", command, sys.executable, script, str(run.path)]
+    assert subprocess.run(shell, check=False, capture_output=True).returncode == 43
+
+
+@pytest.mark.slow
+def test_json_is_the_same_whatever_the_terminal_can_show(run: RunFolder) -> None:
+    command = [*PROGRAM, "ls", str(run.path), "--json"]
+    found = [
+        subprocess.run(
+            command, env=os.environ | {"PYTHONIOENCODING": name}, capture_output=True, check=True
+        ).stdout
+        for name in ("ascii", "utf-8")
+    ]
+    assert found[0] == found[1]
+    assert json.loads(found[0])["episodes"][0]["condition"] == "früh → spät"
+
+
+ROOT = Path(__file__).resolve().parents[2]
+INSIDE_THE_EVENT = """
+import os, sys
+from bridge.terminal import stop_signals
+with stop_signals() as stopped:
+    with stopped._cond:  # as the main thread holds it now and then while it waits
+        os.kill(os.getpid(), int(sys.argv[1]))
+        sum(range(1000))
+    print(stopped.wait(20))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_interrupts_the_waiting_itself_is_heard(number: signal.Signals) -> None:
+    """A handler that takes the event's lock would wait for the code it has interrupted."""
+    done = subprocess.run(
+        [sys.executable, "-c", INSIDE_THE_EVENT, str(int(number))],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=ROOT,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")

@@ -169,9 +169,8 @@ def test_a_file_that_is_no_task_or_cell_is_one_sentence(tmp_path: Path, text: by
 
 
 def test_a_disk_that_refuses_is_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = RunFolder.create(tmp_path / "run")
     with EpisodeWriter(run.episodes_dir / "t1.mcap") as writer:
         writer.describe(EpisodeInfo(id="t1", kind="trial"))
     run.notes_dir.write_text("in the way")

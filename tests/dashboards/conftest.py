@@ -4,7 +4,7 @@ import asyncio
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,7 +13,9 @@ import httpx
 import numpy as np
 import pytest
 from joint_samples import at_positions
+from small_plans import plan_of
 from starlette.applications import Starlette
+from verdicts import verdict_of
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import CompressedColor, PoseSample
@@ -45,13 +47,14 @@ BASE = "http://127.0.0.1:8600"
 STAGES = (("approach", 0.0, 1.5), ("grasp", 1.5, 2.2), ("carry", 2.2, 3.8), ("release", 3.8, 4.5))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Trial:
     """What one synthetic trial should say."""
 
     id: str
     condition: str
     start_id: str
+    _: KW_ONLY
     recorded: bool
     planned: bool | None
     executed: bool | None = None
@@ -59,32 +62,18 @@ class Trial:
 
 
 TRIALS = (
+    Trial("trial_0001", "without_replanning", "s1", recorded=False, planned=False, executed=False),
+    Trial("trial_0002", "without_replanning", "s2", recorded=True, planned=False, executed=True),
     Trial(
-        id="trial_0001",
-        condition="without_replanning",
-        start_id="s1",
-        recorded=False,
-        planned=False,
-        executed=False,
-    ),
-    Trial(
-        id="trial_0002",
-        condition="without_replanning",
-        start_id="s2",
-        recorded=True,
-        planned=False,
-        executed=True,
-    ),
-    Trial(
-        id="trial_0003",
-        condition="with_replanning",
-        start_id="s1",
+        "trial_0003",
+        "with_replanning",
+        "s1",
         recorded=True,
         planned=True,
         executed=True,
         rejected_first=True,
     ),
-    Trial(id="trial_0004", condition="with_replanning", start_id="s2", recorded=True, planned=None),
+    Trial("trial_0004", "with_replanning", "s2", recorded=True, planned=None),
 )
 
 
@@ -109,17 +98,15 @@ def _pose(p_m: np.ndarray) -> np.ndarray:
 
 def make_plan(trial: Trial, number: int = 1, parent: str | None = None) -> Plan:
     """Build a plan of four stages."""
-    return Plan(
-        id=f"{trial.id}_p{number}",
+    return plan_of(
+        f"{trial.id}_p{number}",
         parent_id=parent,
         round=number - 1,
         planner="scripted",
-        policy="scripted",
         condition=trial.condition,
         task="cube_into_box",
         start_id=trial.start_id,
         robot="ur5_parallel_gripper",
-        frame="base_link",
         instruction="Put the cube into the box.",
         joint_names=ARM_JOINTS,
         stages=tuple(
@@ -151,15 +138,11 @@ def make_verdict(plan_id: str, accepted: bool | None, trajectory: str, engine: s
             bodies=("cube", "table"),
             detail="the cube left the gripper during carry",
         )
-    return Verdict(
-        plan_id=plan_id,
+    return verdict_of(
+        plan_id,
         trajectory=trajectory,
-        mode="dynamic",
-        ik=Factor(value=True),
-        clearance=Factor(value=True),
         terminal=terminal,
         engine=engine,
-        seed=0,
         scene_hash="5ce4e0" * 8,
         reason="the object was lost" if accepted is None else None,
     )

@@ -36,13 +36,6 @@ def feed(endpoint: str) -> Iterator[LiveFeed]:
     made.end()
 
 
-@pytest.fixture
-def speaker(endpoint: str) -> Iterator[WireSession]:
-    """A session that says whatever a recorder, or something that pretends to be one, says."""
-    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
-        yield session
-
-
 def state_when(feed: LiveFeed, is_so: Callable[[LiveState], object]) -> LiveState:
     end_s = time.monotonic() + WAIT_S
     while not is_so(state := feed.state()):
@@ -112,7 +105,7 @@ def test_a_recorder_is_heard_with_its_topics_pictures_and_losses(
 
 
 def test_what_is_silent_stands_first_and_what_is_no_record_is_counted(
-    feed: LiveFeed, speaker: WireSession
+    feed: LiveFeed, router: WireSession
 ) -> None:
     status = {
         "state": "recording", "episode": "e", "rates_hz": {"/a": 1e300, "/b": 2.0, "/z": 3.0},
@@ -120,7 +113,7 @@ def test_what_is_silent_stands_first_and_what_is_no_record_is_counted(
         "silent": [{"topic": "/z", "silent_s": 2.25}, "nonsense", {"silent_s": "x"}],
         "topics": {"/b": {"gaps": 2, "queue_drops": 1, "shed": 0}}, "clocks": "none",
     }  # fmt: skip
-    say(speaker, "/rec/main/status", schema.STATUS, status)
+    say(router, "/rec/main/status", schema.STATUS, status)
     state = state_when(feed, lambda s: s.is_heard)
     noted = [(line.topic, line.trouble) for line in state.topics]
     assert noted == [
@@ -135,7 +128,7 @@ def test_what_is_silent_stands_first_and_what_is_no_record_is_counted(
         ("/lab/verdict", schema.VERDICT),
         ("/rec/main/preview/side", schema.COMPRESSED_IMAGE),
     ):
-        say(speaker, name, type_name, b"\xff[1]")
+        say(router, name, type_name, b"\xff[1]")
     state = state_when(feed, lambda s: s.malformed == 3)
     assert state.is_heard
     assert not state.previews
@@ -171,12 +164,12 @@ def test_without_a_recorder_and_after_it_left_it_is_said_plainly(
 
 
 def test_a_session_is_open_only_while_somebody_looks(
-    endpoint: str, speaker: WireSession, monkeypatch: pytest.MonkeyPatch
+    endpoint: str, router: WireSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live_page, "LINGER_S", 0.0)
     monkeypatch.setattr(live_page, "MOST_VIEWERS", 2)
     feed = feed_of(DashboardConfig(connect=(endpoint,)))
-    status = speaker.publisher("/rec/main/status", schema.STATUS)
+    status = router.publisher("/rec/main/status", schema.STATUS)
     assert not status.has_subscribers()
     assert feed.enter()
     assert feed.enter()
@@ -219,7 +212,7 @@ def test_only_parts_that_changed_are_sent_and_a_viewer_too_many_is_told(
 
 
 def test_the_page_is_there_without_a_recorder_and_hostile_words_are_text(
-    shared_run: RunFolder, synthetic: ModuleType, endpoint: str, speaker: WireSession
+    shared_run: RunFolder, synthetic: ModuleType, endpoint: str, router: WireSession
 ) -> None:
     app = synthetic.create_app(
         Library.open([shared_run.path]), live=DashboardConfig(connect=(endpoint,))
@@ -233,7 +226,7 @@ def test_the_page_is_there_without_a_recorder_and_hostile_words_are_text(
     assert feed.enter()
     try:
         status = {"state": HOSTILE, "seen": {HOSTILE: 1}, "episode": HOSTILE, "warnings": [HOSTILE]}
-        say(speaker, "/rec/main/status", schema.STATUS, status)
+        say(router, "/rec/main/status", schema.STATUS, status)
         state_when(feed, lambda s: s.is_heard)
         text = browser.get("/live").text
         assert "<script>alert" not in text

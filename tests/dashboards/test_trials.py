@@ -122,8 +122,7 @@ def record(
     return path
 
 
-def test_a_failed_start_is_whole_with_its_retry_and_goes_with_it(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
+def test_a_failed_start_is_whole_with_its_retry_and_goes_with_it(run: RunFolder) -> None:
     job, other = (job for job in jobs() if job.policy == "single")
     record(run, job, "without", failed=True)
     assert trials._clear(run, [job], QUIET) == [], "nobody asked for a retry"
@@ -139,8 +138,7 @@ def test_a_failed_start_is_whole_with_its_retry_and_goes_with_it(tmp_path: Path)
     assert not unfinished.exists()
 
 
-def test_only_whole_starts_are_kept_and_the_others_are_begun_anew(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
+def test_only_whole_starts_are_kept_and_the_others_are_begun_anew(run: RunFolder) -> None:
     nominal = [job for job in jobs() if job.policy == "nominal"]
     single = [job for job in jobs() if job.policy == "single"]
     whole = [record(run, nominal[0], arm) for arm in ARMS]
@@ -169,9 +167,8 @@ class Started:
 
 @pytest.mark.parametrize("config", [MODEL, STUDY])
 def test_a_model_is_named_to_the_planner_and_to_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: TrialsConfig
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, config: TrialsConfig
 ) -> None:
-    run = RunFolder.create(tmp_path / "run")
     made = jobs_of(*protocol_of(config))
     started: list[list[str]] = []
 

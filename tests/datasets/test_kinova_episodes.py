@@ -73,16 +73,14 @@ def test_a_made_folder_becomes_episodes_that_say_what_they_are(tmp_path: Path) -
         np.testing.assert_allclose(track.q_wxyz, [[1, 0, 0, 0]] * 5)
 
 
-def test_importing_twice_changes_nothing(tmp_path: Path) -> None:
+def test_importing_twice_changes_nothing(tmp_path: Path, run: RunFolder) -> None:
     folder = write_folder(tmp_path / "data")
-    run = RunFolder.create(tmp_path / "run")
     first = {path: path.read_bytes() for path, _ in import_runs(folder, run)}
     assert {path: path.read_bytes() for path, _ in import_runs(folder, run)} == first
 
 
-def test_samples_in_which_a_body_was_not_seen_are_left_out(tmp_path: Path) -> None:
+def test_samples_in_which_a_body_was_not_seen_are_left_out(tmp_path: Path, run: RunFolder) -> None:
     folder = write_folder(tmp_path / "data", seen=False)
-    run = RunFolder.create(tmp_path / "run")
     path, made = next(import_runs(folder, run))
     assert made.num_lost[CUBE_TOPIC] == 3
     assert CUBE_TOPIC not in Episode.open(path).topics()
@@ -130,8 +128,7 @@ def test_a_file_that_cannot_be_used_is_listed_and_the_others_are_imported(tmp_pa
 
 @needs_data
 @pytest.mark.slow
-def test_recorded_values_equal_the_rows_of_the_file(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
+def test_recorded_values_equal_the_rows_of_the_file(run: RunFolder) -> None:
     path, _ = next(import_runs(FOLDER, run))
     source = FOLDER / "real" / "Experiment1" / "Single0001_6D.tsv"
     with source.open(newline="") as stream:

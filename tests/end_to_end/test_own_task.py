@@ -1,7 +1,5 @@
 """Replays, rebuilds and evaluations judge by the task file an episode was recorded with."""
 
-from pathlib import Path
-
 import pytest
 
 from bridge.data_files import datasets_folder
@@ -34,11 +32,6 @@ def recorded(run: RunFolder, name: str, file: TaskFile | None, task: str = "") -
         if file is not None:
             writer.attach(ATTACHMENT, file.data, media_type=MEDIA_TYPE, log_time_ns=1)
     return Episode.open(path)
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 def test_an_episode_of_a_task_nobody_ships_is_judged_by_its_own_file(run: RunFolder) -> None:

@@ -12,6 +12,8 @@ from typing import Any
 import lean_checks
 import numpy as np
 import pytest
+import small_plans
+import verdicts
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import PoseSample
@@ -38,27 +40,15 @@ def verdict_of(accepted: bool | None, *, plan_id: str, trajectory: str = "planne
         )
     if accepted is None:
         terminal = Factor(value=None)
-    return Verdict(
-        plan_id=plan_id,
-        trajectory=trajectory,
-        mode="dynamic",
-        ik=Factor(value=True),
-        clearance=clearance,
-        terminal=terminal,
-        engine="test",
-        seed=1,
+    return verdicts.verdict_of(
+        plan_id, trajectory=trajectory, clearance=clearance, terminal=terminal, seed=1
     )
 
 
 def plan_of(plan_id: str) -> Plan:
     """Build the smallest plan the schema accepts."""
-    return Plan(
-        id=plan_id,
-        planner="test",
-        policy="scripted",
-        condition="without_replanning",
-        robot="ur5",
-        frame="base_link",
+    return small_plans.plan_of(
+        plan_id,
         instruction="Put the cube into the box.",
         stages=(Stage(id="grasp", text="Grasp."),),
         tau=(

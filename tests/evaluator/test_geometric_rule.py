@@ -1,15 +1,21 @@
-"""The forecast without a twin: hand-worked plans, and what may not change its answer."""
+"""Forecasts without a twin: a rule worked out by hand, and baselines beside the twin's answers."""
 
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from jaxtyping import Float
+from small_plans import plan_of, waypoint
 
 from bridge.geometry import se3
-from bridge.task.plan import Plan, Waypoint
+from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
+from evaluator.compare.baselines import GEOMETRIC_RULE, RuleSummary, baseline_results, with_rule
+from evaluator.compare.rows import TrialRow
+from evaluator.compare.success import WITHOUT
 from evaluator.metrics.geometric_rule import RuleAnswer, judge_by_geometry
+from evaluator.result import Measurement
+from evaluator.statistics.differences import paired_points
 
 TASK = load_task("cube_into_box")
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -42,29 +48,11 @@ def plan(
     """Close at one pose, carry, open at another; all of it moved by a rigid motion."""
     moved = np.eye(4) if moved is None else moved
     steps = [(grasp, 0), (grasp, 1), (release, 1), (release, 0)]
-    tau = []
-    for t_s, (p_m, g) in enumerate(steps):
-        q, p = se3.split(moved @ pose(p_m, R=DOWN))
-        tau.append(
-            Waypoint(
-                t_ns=t_s * 1_000_000_000,
-                p_m=tuple(p),
-                q_wxyz=tuple(q),
-                g=g,
-                width_m=None if g else width_m,
-            )
-        )
-    return Plan(
-        id="p",
-        planner="test",
-        policy="test",
-        condition="without_replanning",
-        robot="ur5_parallel_gripper",
-        frame="base_link",
-        instruction="",
-        stages=(),
-        tau=tuple(tau),
+    tau = tuple(
+        waypoint(t_s, moved @ pose(p_m, R=DOWN), None if g else width_m, g)
+        for t_s, (p_m, g) in enumerate(steps)
     )
+    return plan_of(robot="ur5_parallel_gripper", tau=tau)
 
 
 def answer(made: Plan, *, yaw_rad: float = 0.0, moved: Pose | None = None) -> RuleAnswer:
@@ -133,3 +121,92 @@ def test_what_was_not_localised_leaves_the_answer_open() -> None:
     found = judge_by_geometry(plan(), TASK, {"cube": pose(CUBE)})
     assert found.value is None
     assert found.detail == "box: not localised at the start"
+
+
+def trial(
+    number: int,
+    recorded: bool,
+    twin: bool | None,
+    rule: bool | None,
+    *,
+    task: str = "cube_into_box",
+) -> TrialRow:
+    """One trial without replanning; the rule may be unknown."""
+    return TrialRow(
+        episode=f"trial_{number:04d}",
+        task=task,
+        condition=WITHOUT,
+        policy="nominal",
+        start_id=None,
+        cell="cell",
+        stand_in=True,
+        recorded=recorded,
+        sim_planned=twin,
+        verdict=twin,
+        baselines=() if rule is None else ((GEOMETRIC_RULE, rule),),
+    )
+
+
+def study() -> list[TrialRow]:
+    """60 trials: the twin is right in 50, the rule in 40; 15 only the twin, 5 only the rule."""
+    made = []
+    for count, twin_right, rule_right in (
+        (35, True, True),
+        (15, True, False),
+        (5, False, True),
+        (5, False, False),
+    ):
+        for k in range(count):
+            outcome = k % 2 == 0
+            made.append((outcome, outcome == twin_right, outcome == rule_right))
+    return [
+        trial(number, *answers, task="stack" if number % 3 else "push")
+        for number, answers in enumerate(made)
+    ]
+
+
+def by_id(measurements: Sequence[Measurement]) -> dict[str, Measurement]:
+    return {m.id: m for m in measurements}
+
+
+def test_the_paired_difference_counts_the_trials_only_one_got_right() -> None:
+    found = by_id(baseline_results(study()))
+    gain = found["baseline.sim_planned.geometric_rule.twin_gain_pp"]
+    expected = paired_points(15, 5, 60)[1]
+    assert gain.value == pytest.approx(100 * 10 / 60)
+    assert (gain.interval.low, gain.interval.high) == pytest.approx((expected.low, expected.high))
+    accuracy = found["baseline.sim_planned.geometric_rule.rate"]
+    assert (accuracy.k, accuracy.n) == (40, 60)
+
+
+def test_always_yes_is_right_as_often_as_trials_succeed() -> None:
+    rows = study()
+    succeeded = sum(row.recorded for row in rows)
+    base = by_id(baseline_results(rows))["baseline.sim_planned.base_rate"]
+    assert (base.k, base.n) == (succeeded, 60)
+
+
+def test_both_are_judged_over_the_trials_where_both_spoke() -> None:
+    rows = [trial(0, True, True, True), trial(1, True, True, None), trial(2, False, None, False)]
+    found = by_id(baseline_results(rows))
+    assert found["baseline.sim_planned.geometric_rule.rate"].n == 1
+    assert found["baseline.sim_planned.base_rate"].n == 2
+
+
+def test_a_run_without_the_rules_answers_still_names_its_base_rate() -> None:
+    found = by_id(baseline_results([trial(0, True, True, None)]))
+    assert found["baseline.sim_planned.base_rate"].value == 1.0
+    assert not any(GEOMETRIC_RULE.replace(" ", "_") in key for key in found)
+
+
+def test_without_answers_of_the_twin_nothing_is_compared() -> None:
+    assert baseline_results([trial(0, True, None, True)]) == []
+
+
+def test_the_rule_enters_the_row_of_its_trial_only() -> None:
+    rows = [trial(0, True, True, None), trial(1, True, True, None)]
+    plain, judged = with_rule(rows, [RuleSummary(episode="trial_0001", value=False)])
+    assert plain == rows[0]
+    assert judged.baselines == ((GEOMETRIC_RULE, False),)
+    unknown = [RuleSummary(episode="trial_0001", value=None)]
+    assert with_rule(rows, unknown) == rows

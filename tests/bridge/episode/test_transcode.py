@@ -5,33 +5,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from written_messages import STAMP_NS
+from written_messages import raw_image as image
 
 from bridge.episode import schema
-from bridge.episode.cdr import codec
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.images import COLOR_LAYOUTS, depth_to_compact, image_header, image_to_jpeg
 from bridge.episode.cdr.messages import CompressedColor, DepthImage, RawColor, color_from_message
 from bridge.errors import BridgeError
 from bridge.media.color import UnreadableImageError
 
-STAMP = {"sec": 1_700_000_000, "nanosec": 123_456_789}
-STAMP_NS = 1_700_000_000_123_456_789
 ORDERS = {"RGB": [0, 1, 2], "BGR": [2, 1, 0], "RGBA": [0, 1, 2, 3], "BGRA": [2, 1, 0, 3]}
-
-
-def image(pixels: np.ndarray, encoding: str, **fields: object) -> bytes:
-    height, width = pixels.shape[:2]
-    message = {
-        "header": {"stamp": STAMP, "frame_id": "camera"},
-        "height": height,
-        "width": width,
-        "encoding": encoding,
-        "is_bigendian": 0,
-        "step": pixels[0].nbytes if height else 0,
-        "data": pixels.tobytes(),
-        **fields,
-    }
-    return codec.encode(schema.IMAGE, message)
 
 
 def padded(pixels: np.ndarray, encoding: str, padding: int, **fields: object) -> bytes:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.episode import metadata, schema, streams
 from bridge.episode.cdr import messages
@@ -20,13 +21,7 @@ INFO = metadata.EpisodeInfo(id="e1", kind="trial", task="cube_into_box", tags=("
 
 
 def joint(stamp_ns: int) -> bytes:
-    return messages.JointSample(
-        stamp_ns=stamp_ns,
-        names=("a", "b"),
-        position=np.array([stamp_ns * 1e-9, 2.0]),
-        velocity=np.zeros(2),
-        effort=np.zeros(0),
-    ).to_cdr()
+    return at_positions(stamp_ns, ("a", "b"), np.array([stamp_ns * 1e-9, 2.0])).to_cdr()
 
 
 def write_episode(path: Path) -> Path:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from joint_samples import at_positions
+from small_plans import plan_of
+from verdicts import verdict_of
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import (
@@ -28,7 +30,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan, Stage, Waypoint
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Factor
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -100,11 +102,8 @@ class MadeTrial:
                 )
             )
         stage = Stage(id="s", text="move", t_start_ns=0, t_end_ns=waypoints[-1].t_ns)
-        return Plan(
-            id="p1",
-            planner="test",
-            policy="scripted",
-            condition="without_replanning",
+        return plan_of(
+            "p1",
             robot="arm",
             frame="base",
             instruction=self.instruction,
@@ -219,13 +218,10 @@ def _event(stamp_ns: int, **fields: object) -> bytes:
 
 
 def _verdict() -> bytes:
-    return Verdict(
-        plan_id="p1",
-        trajectory="planned",
-        mode="dynamic",
-        ik=Factor(value=True),
+    return verdict_of(
+        "p1",
         clearance=Factor(value=False, first_t_ns=7, cause="touched"),
-        terminal=Factor(value=None),
+        terminal=None,
         engine="bullet",
         seed=3,
         p_success={"value": 0.1, "low": 0.0, "high": 0.3},

@@ -1,4 +1,4 @@
-"""``open TABLE RUN``: a spreadsheet becomes part of a run, or is refused with its row."""
+"""What others recorded or counted becomes a part of a run, or is refused with its row."""
 
 import json
 from collections.abc import Callable
@@ -7,8 +7,16 @@ from pathlib import Path
 import pytest
 from commands import run
 
+from bridge.cli.exchange import export_rosbag2, import_rosbag2
+from bridge.episode import schema
+from bridge.episode.cdr.messages import string_to_cdr
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
 from bridge.exchange.trials_csv import read_trials
+from bridge.terminal import Output
 from evaluator.compare import compare_run
 
 HEAD = "trial_id,task,condition,start_id,recorded,sim_planned,stand_in\r\n"
@@ -75,3 +83,28 @@ def test_a_second_import_waits_until_the_first_one_is_deleted(
     assert "Delete it to replace it" in capsys.readouterr().err
     (tmp_path / "run" / "notes" / "trials.csv").unlink()
     assert run("open", source, tmp_path / "run") == 0
+
+
+QUIET = Output(quiet=True)
+
+
+@pytest.mark.parametrize("stand_in", [True, False])
+def test_a_bag_imported_with_a_task_is_a_trial(tmp_path: Path, stand_in: bool) -> None:
+    path = tmp_path / "trial.mcap"
+    with EpisodeWriter(path) as writer:
+        writer.describe(EpisodeInfo(id="trial", kind="trial", stand_in=stand_in))
+        text = string_to_cdr("<robot/>")
+        writer.write("/robot_description", text, type_name=schema.STRING, log_time_ns=1)
+    export_rosbag2(path, tmp_path / "bag", output=QUIET)
+    run = tmp_path / "run"
+    import_rosbag2(tmp_path / "bag", run, episode="a", output=QUIET)
+    import_rosbag2(tmp_path / "bag", run, episode="b", task="cube_into_box", output=QUIET)
+    infos = [Episode.open(run / "episodes" / f"{name}.mcap").info for name in "ab"]
+    assert [(info.kind, info.task) for info in infos] == [
+        ("imported", ""),
+        ("trial", "cube_into_box"),
+    ]
+    assert [info.stand_in for info in infos] == [stand_in, stand_in]
+    with pytest.raises(UsageError, match="no task named 'cube_in_box'"):
+        import_rosbag2(tmp_path / "bag", run, episode="c", task="cube_in_box", output=QUIET)
+    assert not (run / "episodes" / "c.mcap").exists()

@@ -1,4 +1,4 @@
-"""Laws of rigid transforms, against SciPy where it has the same routine."""
+"""Laws of rigid transforms, their trajectories and the pinhole camera, against SciPy."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,8 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation, Slerp
 
 from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.geometry.trajectory import PoseTrajectory
 
 finite = st.floats(-10, 10, allow_nan=False, width=64)
 quaternions = hnp.arrays(np.float64, 4, elements=st.floats(-1, 1)).filter(
@@ -78,3 +80,119 @@ def test_a_camera_that_looks_at_a_point_sees_it_straight_ahead() -> None:
     np.testing.assert_allclose(seen, [0, 0, np.linalg.norm(target - eye)], atol=1e-12)
     assert np.linalg.det(T_world_camera[:3, :3]) == pytest.approx(1.0)
     assert T_world_camera[2, 1] < 0  # image "down" points towards the floor
+
+
+DIRECTIONS = st.integers(0, 10**6).map(lambda seed: np.random.default_rng(seed).normal(size=3))
+ANGLES = st.one_of(st.floats(0.0, np.pi - 1e-6), st.floats(0.0, 1e-10))
+
+
+@given(DIRECTIONS, ANGLES)
+def test_vectors_and_matrices_are_those_of_scipy(direction: np.ndarray, angle: float) -> None:
+    vector = angle * direction / np.linalg.norm(direction)
+    R = se3.rotation_from_vector(vector)
+    np.testing.assert_allclose(R, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(se3.vector_from_rotation(R), vector, atol=1e-8)
+
+
+@given(DIRECTIONS, st.floats(0.0, 20.0))
+def test_a_vector_is_never_longer_than_half_a_turn(direction: np.ndarray, angle: float) -> None:
+    R = se3.rotation_from_vector(angle * direction / np.linalg.norm(direction))
+    vector = se3.vector_from_rotation(R)
+    assert np.linalg.norm(vector) <= np.pi + 1e-9
+    np.testing.assert_allclose(Rotation.from_rotvec(vector).as_matrix(), R, atol=1e-7)
+
+
+def spiral(num_poses: int = 20) -> PoseTrajectory:
+    t = np.linspace(0, 1, num_poses)
+    p = np.stack([np.cos(6 * t), np.sin(6 * t), t], axis=1)
+    q = Rotation.from_rotvec(np.outer(t, [0.2, 0.5, 1.5])).as_quat(scalar_first=True)
+    return PoseTrajectory((t * 1e9).astype(np.int64), p, q)
+
+
+def test_asking_at_the_stamps_returns_the_poses() -> None:
+    track = spiral()
+    again = track.at(track.stamps_ns)
+    np.testing.assert_allclose(again.p_m, track.p_m, atol=1e-12)
+    np.testing.assert_allclose(np.abs(np.sum(again.q_wxyz * track.q_wxyz, axis=1)), 1, atol=1e-12)
+
+
+def test_before_the_start_and_after_the_end_the_ends_are_held() -> None:
+    track = spiral()
+    held = track.at(np.array([-5_000, 9_000_000_000]))
+    np.testing.assert_allclose(held.p_m, track.p_m[[0, -1]])
+
+
+def test_halfway_between_two_poses_is_the_mean_position() -> None:
+    track = spiral()
+    middle = (track.stamps_ns[:1] + track.stamps_ns[1:2]) // 2
+    np.testing.assert_allclose(track.at(middle).p_m[0], track.p_m[:2].mean(axis=0), atol=1e-6)
+
+
+def test_one_pose_answers_every_stamp() -> None:
+    track = spiral()
+    single = PoseTrajectory(track.stamps_ns[:1], track.p_m[:1], track.q_wxyz[:1])
+    np.testing.assert_allclose(single.at(np.array([0, 10])).p_m, track.p_m[[0, 0]])
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_positions_alone_are_those_with_rotations_to_the_bit(count: int) -> None:
+    rng = np.random.default_rng(count)
+    stamps_ns = np.cumsum(rng.integers(1, 9_000_000, count))
+    poses = PoseTrajectory(
+        stamps_ns, rng.normal(size=(count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+    )
+    asked = np.concatenate([stamps_ns, rng.integers(-9_000_000, 400_000_000, 100)])
+    assert poses.positions_at(asked).tobytes() == poses.at(asked).p_m.tobytes()
+
+
+CAMERA = Camera(width=64, height=48, fx=60.0, fy=58.0, cx=31.0, cy=25.0)
+
+
+def test_unprojecting_and_projecting_returns_the_pixel_centres() -> None:
+    depth_m = np.linspace(0.3, 2.0, 64 * 48).reshape(48, 64)
+    uv, z = CAMERA.project(CAMERA.unproject(depth_m))
+    columns, rows = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+    np.testing.assert_allclose(uv[..., 0], columns, atol=1e-9)
+    np.testing.assert_allclose(uv[..., 1], rows, atol=1e-9)
+    np.testing.assert_allclose(z, depth_m)
+
+
+def test_ros_intrinsics_put_the_first_pixel_centre_at_zero() -> None:
+    camera = Camera.from_ros(width=64, height=48, fx=60.0, fy=60.0, cx=0.0, cy=0.0)
+    uv, _ = camera.project(np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(uv, [0.5, 0.5])
+    assert camera.to_ros() == (60.0, 60.0, 0.0, 0.0)
+
+
+@given(st.sampled_from([0.25, 0.5, 2.0]))
+def test_a_scaled_camera_sees_the_same_directions(factor: float) -> None:
+    scaled = CAMERA.scaled(factor)
+    p = np.array([0.2, -0.1, 1.3])
+    uv, _ = CAMERA.project(p)
+    uv_scaled, _ = scaled.project(p)
+    np.testing.assert_allclose(uv_scaled, uv * factor, atol=1e-9)
+
+
+def test_missing_depth_stays_at_the_origin() -> None:
+    points = CAMERA.unproject(np.zeros((48, 64)))
+    assert not points.any()
+
+
+def test_rays_have_unit_depth() -> None:
+    rays = CAMERA.rays()
+    assert rays.shape == (48, 64, 3)
+    assert rays[..., 2] == pytest.approx(1.0)
+
+
+@given(st.floats(0.2, 3.0))
+def test_the_corners_of_a_scaled_image_are_its_corners_whatever_the_rounding(factor: float) -> None:
+    """Width and height round differently, so the image is not scaled the same both ways."""
+    scaled = CAMERA.scaled(factor)
+    assert (scaled.width, scaled.height) == (round(64 * factor), round(48 * factor))
+    corners = np.array([[0.0, 0.0], [64.0, 0.0], [0.0, 48.0], [64.0, 48.0]])
+    rays = np.column_stack(
+        [(corners[:, 0] - 31.0) / 60.0, (corners[:, 1] - 25.0) / 58.0, np.ones(4)]
+    )
+    uv, _ = scaled.project(rays)
+    size = [scaled.width, scaled.height]
+    np.testing.assert_allclose(uv, corners / [64.0, 48.0] * size, atol=1e-9)

@@ -1,6 +1,7 @@
 """Samples and recorders for these tests."""
 
 import itertools
+import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -10,10 +11,12 @@ from joint_samples import at_positions
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
 from bridge.episode.run_folder import RunFolder
+from bridge.record.config import RecorderConfig
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
 
 MakeSample = Callable[..., WireSample]
+MakeRecorder = Callable[..., Recorder]
 
 
 @pytest.fixture
@@ -44,3 +47,20 @@ def recorder(run: RunFolder) -> Iterator[Recorder]:
     made = Recorder(run, now_ns=AnchoredClock().now_ns)
     yield made
     made.close()
+
+
+@pytest.fixture
+def make_recorder(run: RunFolder) -> Iterator[MakeRecorder]:
+    made: list[Recorder] = []
+
+    def make(
+        *, run: RunFolder = run, wall_ns: Callable[[], int] = time.time_ns, **settings: object
+    ) -> Recorder:
+        clock = AnchoredClock()
+        config = RecorderConfig(**settings)  # type: ignore[arg-type]
+        made.append(Recorder(run, now_ns=clock.now_ns, config=config, wall_ns=wall_ns))
+        return made[-1]
+
+    yield make
+    for recorder in made:
+        recorder.close()

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from written_messages import STAMP_NS, raw_image
 
 from bridge.episode import schema
-from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import DepthImage
 from bridge.episode.check import check_episode
 from bridge.episode.metadata import EpisodeInfo
@@ -19,22 +19,11 @@ from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
 
 Make = Callable[..., WireSample]
-STAMP_NS = 1_700_000_000_123_456_789
 
 
 def image(encoding: str, pixels: np.ndarray, *, big: bool = False) -> bytes:
-    sec, nanosec = divmod(STAMP_NS, 10**9)
     data = pixels.astype(pixels.dtype.newbyteorder(">" if big else "<")).tobytes()
-    message = {
-        "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "eye"},
-        "height": pixels.shape[0],
-        "width": pixels.shape[1],
-        "encoding": encoding,
-        "is_bigendian": int(big),
-        "step": len(data) // pixels.shape[0],
-        "data": data,
-    }
-    return codec.encode(schema.IMAGE, message)
+    return raw_image(pixels, encoding, is_bigendian=int(big), data=data)
 
 
 def recorded(recorder: Recorder, run: RunFolder, samples: list[WireSample]) -> Path:

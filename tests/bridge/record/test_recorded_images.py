@@ -2,22 +2,22 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from patience import wait_until
+from written_messages import STAMP_NS, raw_image
 
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
-from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.media.color import decode_color, encode_jpeg
-from bridge.record.config import QueueConfig, RecorderConfig
+from bridge.record.config import QueueConfig
 from bridge.record.live import WIDTH, small_picture
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
@@ -30,19 +30,6 @@ CLOCK = AnchoredClock()
 def smooth(height: int = 24, width: int = 32) -> np.ndarray:
     rows, columns = np.mgrid[0:height, 0:width]
     return np.stack([rows * 8 % 256, columns * 6 % 256, rows + columns], -1).astype(np.uint8)
-
-
-def raw_image(pixels: np.ndarray, encoding: str, *, step: int | None = None) -> bytes:
-    height, width = pixels.shape[:2]
-    message = {
-        "header": {"stamp": {"sec": 3, "nanosec": 4}, "frame_id": "eye"},
-        "height": height,
-        "width": width,
-        "encoding": encoding,
-        "step": pixels.nbytes // height if step is None else step,
-        "data": pixels.tobytes(),
-    }
-    return codec.encode(schema.IMAGE, message)
 
 
 def depth_image(height: int = 24, width: int = 32) -> bytes:
@@ -66,18 +53,13 @@ def sample_of(
 
 
 @pytest.fixture
-def make_recorder(run: RunFolder) -> Iterator[MakeRecorder]:
-    made: list[Recorder] = []
+def started(make_recorder: MakeRecorder) -> MakeRecorder:
+    def start(**settings: object) -> Recorder:
+        recorder = make_recorder(**settings)
+        recorder.start(EpisodeInfo(id="t1", kind="trial", cell="cell"))
+        return recorder
 
-    def make(**settings: object) -> Recorder:
-        config = RecorderConfig(**settings)  # type: ignore[arg-type]
-        made.append(Recorder(run, now_ns=CLOCK.now_ns, config=config))
-        made[-1].start(EpisodeInfo(id="t1", kind="trial", cell="cell"))
-        return made[-1]
-
-    yield make
-    for recorder in made:
-        recorder.close()
+    return start
 
 
 def messages_of(run: RunFolder, topic: str) -> list[tuple[str, bytes]]:
@@ -89,24 +71,22 @@ def messages_of(run: RunFolder, topic: str) -> list[tuple[str, bytes]]:
     ("encoding", "order"), [("rgb8", [0, 1, 2]), ("bgr8", [2, 1, 0]), ("bgra8", [2, 1, 0, 0])]
 )
 def test_raw_colour_is_recorded_as_jpeg(
-    make_recorder: MakeRecorder, run: RunFolder, encoding: str, order: list[int]
+    started: MakeRecorder, run: RunFolder, encoding: str, order: list[int]
 ) -> None:
-    recorder = make_recorder()
+    recorder = started()
     recorder.receive(sample_of(COLOR, raw_image(smooth()[..., order], encoding)))
     answer = recorder.stop()
     assert (answer["messages"], answer["undecodable"]) == (1, 0)
     [(type_name, data)] = messages_of(run, COLOR)
     assert type_name == schema.COMPRESSED_IMAGE
     image = CompressedColor.from_cdr(data)
-    assert (image.format, image.frame_id, image.stamp_ns) == ("jpeg", "eye", 3 * 10**9 + 4)
+    assert (image.format, image.frame_id, image.stamp_ns) == ("jpeg", "camera", STAMP_NS)
     difference = decode_color(image.data).astype(int) - smooth()
     assert np.abs(difference).mean() < 6
 
 
-def test_colour_as_is_and_depth_raw_keep_every_byte(
-    make_recorder: MakeRecorder, run: RunFolder
-) -> None:
-    recorder = make_recorder(color="as_is")
+def test_colour_as_is_and_depth_raw_keep_every_byte(started: MakeRecorder, run: RunFolder) -> None:
+    recorder = started(color="as_is")
     color, depth = raw_image(smooth(), "rgb8"), depth_image()
     recorder.receive(sample_of(COLOR, color))
     recorder.receive(sample_of(DEPTH, depth))
@@ -127,9 +107,9 @@ def test_colour_as_is_and_depth_raw_keep_every_byte(
     ],
 )
 def test_what_cannot_be_encoded_is_recorded_as_it_came(
-    make_recorder: MakeRecorder, run: RunFolder, data: bytes, undecodable: int
+    started: MakeRecorder, run: RunFolder, data: bytes, undecodable: int
 ) -> None:
-    recorder = make_recorder(depth="compact")
+    recorder = started(depth="compact")
     recorder.receive(sample_of(COLOR, data))
     answer = recorder.stop()
     assert (answer["messages"], answer["lost"], answer["undecodable"]) == (1, 0, undecodable)
@@ -137,9 +117,9 @@ def test_what_cannot_be_encoded_is_recorded_as_it_came(
 
 
 def test_each_stream_keeps_its_order_and_a_stop_waits_for_all_encoders(
-    make_recorder: MakeRecorder, run: RunFolder
+    started: MakeRecorder, run: RunFolder
 ) -> None:
-    recorder = make_recorder()
+    recorder = started()
     topics = [f"/cell/cam/{name}/color/image" for name in "abcd"]
     data = raw_image(smooth(120, 160), "rgb8")
     for number in range(20):
@@ -153,7 +133,7 @@ def test_each_stream_keeps_its_order_and_a_stop_waits_for_all_encoders(
 
 
 def test_small_messages_do_not_wait_for_an_encoder(
-    make_recorder: MakeRecorder,
+    started: MakeRecorder,
     monkeypatch: pytest.MonkeyPatch,
     make_sample: Callable[..., WireSample],
 ) -> None:
@@ -161,7 +141,7 @@ def test_small_messages_do_not_wait_for_an_encoder(
     monkeypatch.setattr(
         "bridge.record.encoders.image_to_jpeg", lambda data, quality: gate.wait(10.0) and None
     )
-    recorder = make_recorder()
+    recorder = started()
     recorder.receive(sample_of(COLOR, raw_image(smooth(), "rgb8")))
     for _ in range(10):
         recorder.receive(make_sample())
@@ -172,7 +152,7 @@ def test_small_messages_do_not_wait_for_an_encoder(
 
 
 def test_overload_is_shed_in_order_and_every_image_accounted_for(
-    make_recorder: MakeRecorder,
+    started: MakeRecorder,
     monkeypatch: pytest.MonkeyPatch,
     make_sample: Callable[..., WireSample],
 ) -> None:
@@ -185,7 +165,7 @@ def test_overload_is_shed_in_order_and_every_image_accounted_for(
     qualities: list[int] = []
     monkeypatch.setattr("bridge.record.encoders.image_to_jpeg", slow)
     monkeypatch.setattr("bridge.record.encoders.depth_to_compact", lambda data: slow(data, 0))
-    recorder = make_recorder(depth="compact", queues=QueueConfig(camera_queue_mb=4))
+    recorder = started(depth="compact", queues=QueueConfig(camera_queue_mb=4))
     color, depth = raw_image(smooth(120, 160), "rgb8"), depth_image(120, 240)
     for number in range(300):
         recorder.receive(sample_of(COLOR, color, number))

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from joint_samples import at_positions
 from loopback import free_endpoint
 from mcap.reader import make_reader
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import DepthImage, JointSample, string_to_cdr
+from bridge.episode.cdr.messages import DepthImage, string_to_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.schema import Schema
 from bridge.episode.writer import EpisodeWriter
@@ -35,13 +36,8 @@ QUIET = Output(quiet=True)
 
 
 def joints(number: int) -> bytes:
-    return JointSample(
-        stamp_ns=START_NS + number,
-        names=("a", "b"),
-        position=np.array([number, -number], dtype=float),
-        velocity=np.zeros(2),
-        effort=np.zeros(0),
-    ).to_cdr()
+    position = np.array([number, -number], dtype=float)
+    return at_positions(START_NS + number, ("a", "b"), position).to_cdr()
 
 
 def depth(number: int) -> bytes:

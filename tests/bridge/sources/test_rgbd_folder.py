@@ -309,9 +309,8 @@ def test_names_that_cannot_be_topics_are_refused() -> None:
         FolderConfig(rate_hz=0.0)
 
 
-def test_a_failed_import_leaves_no_episode(folder: Path, tmp_path: Path) -> None:
+def test_a_failed_import_leaves_no_episode(folder: Path, run: RunFolder) -> None:
     (folder / "c.png").write_bytes(b"no image")
-    run = RunFolder.create(tmp_path / "run")
     messages = (m for frame in folder_messages(read_index(folder), FolderConfig()) for m in frame)
     with pytest.raises(GstError, match="unreadable image"):
         write_scan(run, EpisodeInfo(id="scan", kind="scan"), messages, source={})

@@ -100,6 +100,11 @@ def task() -> Task:
 
 
 @pytest.fixture(scope="session")
+def push() -> Task:
+    return load_task("push_cube_to_mark")
+
+
+@pytest.fixture(scope="session")
 def reserved_seed(cell_file: CellFile) -> int:
     return cell_file.test_seeds[0]
 

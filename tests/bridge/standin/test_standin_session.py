@@ -1,6 +1,5 @@
 """Sessions on a wire in memory: what is published, when, and what is kept back."""
 
-import hashlib
 import json
 import struct
 from collections.abc import Callable
@@ -8,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from standin_verdicts import verdict_on
 
 from bridge.episode.cdr.messages import (
     CameraInfo,
@@ -26,32 +26,14 @@ from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import TRUTH_PARAMETERS
 from bridge.task.plan import Plan
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Factor
 from bridge.terminal import Output
 
 QUIET = Output(quiet=True)
 
 
 def verdict_record(plan: dict, accepted: bool | None) -> dict:
-    as_sent = json.dumps(plan, separators=(",", ":")).encode()
-    verdict = Verdict(
-        plan_id=plan["id"],
-        trajectory="planned",
-        mode="dynamic",
-        ik=Factor(value=True),
-        clearance=Factor(value=True),
-        terminal=Factor(value=accepted, cause="dropped"),
-        engine="test",
-        seed=0,
-        basis={
-            "plan_sha256": hashlib.sha256(as_sent).hexdigest(),
-            "joints_rad": plan["tau"][0]["joints_rad"] if "tau" in plan else [0.0],
-            "objects": {},
-            "judged_ns": 0,
-            "valid_s": 1e12,
-        },
-    )
-    return json.loads(verdict.to_json())
+    return verdict_on(plan, Factor(value=accepted, cause="dropped"))
 
 
 def settings(**more: Any) -> SessionConfig:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import standin_plans
 
 from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import Outcome
@@ -17,7 +18,7 @@ from bridge.sources.standin.cell import FORCE_N, StandinCell
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.kinematics import tool_down
 from bridge.sources.standin.operator import execute_plan, label_trial
-from bridge.sources.standin.planner import NO_ERROR, GraspError, plan_pick_and_place
+from bridge.sources.standin.planner import NO_ERROR, GraspError
 from bridge.sources.standin.world import STEP_S, World
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
@@ -26,16 +27,13 @@ from bridge.task.task_file import Task
 def planned(
     task: Task, starts: Any, error: GraspError, cell: StandinCell, cell_file: CellFile
 ) -> Plan:
-    return plan_pick_and_place(
+    return standin_plans.planned(
         task,
         starts,
         error,
         kinematics=cell.kinematics,
         joints_start_rad=cell.home_rad,
         max_joint_speed_rad_s=cell_file.max_joint_speed_rad_s,
-        plan_id="plan_0",
-        condition="without_replanning",
-        start_id="cube_into_box/9000000",
     )
 
 

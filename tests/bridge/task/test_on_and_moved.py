@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from upright import upright as pose
 
 import bridge.task
 from bridge.geometry import se3
@@ -21,11 +22,6 @@ TASK = TaskFile(TEXT, "template.toml").task()
 ON = {"kind": "on", "object": "cube", "support": "block"}
 MOVED = {"kind": "moved", "object": "cube"}
 metres = st.floats(-0.1, 0.1)
-
-
-def pose(x: float, y: float, z: float, yaw_rad: float = 0.0) -> np.ndarray:
-    q = np.array([np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2)])
-    return se3.transform_from(q, np.array([x, y, z], dtype=np.float64))
 
 
 def asked(

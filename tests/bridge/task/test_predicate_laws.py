@@ -1,4 +1,4 @@
-"""Laws of the hard predicates: what decides each of them, and what does not."""
+"""Laws of the hard predicates, of contacts outside the allowed pairs too: what decides each."""
 
 from dataclasses import replace
 from typing import Any
@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from verdicts import verdict_of
 
 from bridge.geometry import se3
+from bridge.task import predicate
 from bridge.task.predicate import Rollout, all_hold, already_true_at_start, evaluate_success
 from bridge.task.task_file import Task, load_task
+from bridge.task.verdict import Verdict
 
 STEP_NS = 20_000_000
 STEPS = 100
@@ -150,3 +152,90 @@ def test_a_verdict_is_the_and_of_its_factors_and_names_the_first_that_fails(
     # Kleene's logic: false beats unknown, unknown beats true.
     order = {False: 0, None: 1, True: 2}
     assert verdict.accepted is min(factors.values(), key=lambda value: order[value])
+
+
+CUBE = load_task("cube_into_box")
+
+
+def touch(depth_m: float, *, allowed: bool = False, start_s: float = 1.0) -> predicate.Contact:
+    return predicate.Contact(
+        start_ns=round(start_s * 1e9),
+        end_ns=round(start_s * 1e9) + 10,
+        bodies=("forearm_link", "box"),
+        allowed=allowed,
+        min_distance_m=-depth_m,
+    )
+
+
+def rollout(*contacts: predicate.Contact, **change: object) -> predicate.Rollout:
+    state = predicate.Rollout(
+        stamps_ns=np.array([0, 1]), Ts_base_object={}, finger_contact={}, contacts=contacts
+    )
+    return replace(state, **change)
+
+
+def test_nothing_is_said_where_contacts_are_not_known() -> None:
+    assert predicate.evaluate_contacts(CUBE, rollout(contacts=None)).value is None
+
+
+@pytest.mark.parametrize(
+    ("contacts", "holds"),
+    [
+        ((), True),
+        ((touch(0.02, allowed=True),), True),
+        ((touch(-0.001),), True),
+        ((touch(0.0),), False),
+        ((touch(0.001),), False),
+    ],
+)
+def test_only_a_touch_that_was_not_allowed_breaks_it(
+    contacts: tuple[predicate.Contact, ...], holds: bool
+) -> None:
+    assert predicate.evaluate_contacts(CUBE, rollout(*contacts)).value is holds
+
+
+def test_the_first_wrong_touch_is_told_with_its_time_and_depth() -> None:
+    finding = predicate.evaluate_contacts(
+        CUBE, rollout(touch(0.004, start_s=3.0), touch(0.002, start_s=2.0))
+    )
+    assert "forearm_link touched box at 2.00 s, 2.0 mm deep" in finding.detail
+
+
+def test_a_task_may_ask_for_it_like_for_any_other_predicate() -> None:
+    task = replace(CUBE, success=({"kind": predicate.ALLOWED_CONTACTS, "tolerance_m": 0.003},))
+    assert predicate.all_hold(predicate.evaluate_success(task, rollout(touch(0.002)))) is True
+    assert predicate.all_hold(predicate.evaluate_success(task, rollout(touch(0.004)))) is False
+    listed = predicate.evaluate_contacts(task, rollout(touch(0.002)))
+    assert listed.value is True, "the task's own tolerance counts"
+
+
+def test_a_task_may_ask_it_of_one_object_only() -> None:
+    task = replace(CUBE, success=({"kind": predicate.ALLOWED_CONTACTS, "object": "cube"},))
+    assert predicate.all_hold(predicate.evaluate_success(task, rollout(touch(0.01)))) is True
+
+
+def test_a_broken_body_has_no_shape_whatever_its_extents() -> None:
+    task = load_task("sloth_into_basket")
+    size = np.array(task.objects["sloth"].size_m)
+    state = rollout(
+        Ts_base_object={"sloth": np.tile(np.eye(4), (2, 1, 1))},
+        extents_m={"sloth": np.tile(size, (2, 1))},
+        broken={"sloth": "burst: an edge is 9.0 times as long as at rest"},
+    )
+    task = replace(task, success=({"kind": "shape", "object": "sloth", "tolerance_fraction": 0.2},))
+    (finding,) = predicate.evaluate_success(task, state)
+    assert (finding.value, "burst" in finding.detail) == (False, True)
+    whole = predicate.evaluate_success(task, replace(state, broken={}))
+    assert whole[0].value is True
+    nowhere = replace(state, broken={}, extents_m={"sloth": np.full((2, 3), np.nan)})
+    assert predicate.evaluate_success(task, nowhere)[0].value is False
+
+
+def test_a_verdict_keeps_warnings_and_findings_on_disk() -> None:
+    verdict = verdict_of(
+        trajectory="executed", mode="kinematic", terminal=None,
+        warnings=("the goal held before anything moved",),
+        findings=({"side": "recorded", "kind": "inside", "object": "cube", "value": None,
+                   "detail": "cube was not localised"},),
+    )  # fmt: skip
+    assert Verdict.from_json(verdict.to_json()) == verdict

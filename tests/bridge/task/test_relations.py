@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
+from upright import upright as pose
 
 import bridge.task
 from bridge.geometry import se3
@@ -29,11 +30,6 @@ BOX = load_task("cube_into_box").objects["box"]
 TASK = replace(BASE, objects=BASE.objects | {"long": LONG, "box": BOX})
 angles = st.floats(-np.pi, np.pi)
 metres = st.floats(-0.3, 0.3)
-
-
-def pose(x: float, y: float, z: float, yaw_rad: float = 0.0) -> np.ndarray:
-    q = np.array([np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2)])
-    return se3.transform_from(q, np.array([x, y, z], dtype=np.float64))
 
 
 def gap_m(a: Box, b: Box) -> float:

@@ -1,4 +1,6 @@
-"""Topics, keys and encodings."""
+"""Topics, keys, encodings, and the attachment's bytes against zenoh's own serialiser."""
+
+import struct
 
 import pytest
 from hypothesis import given
@@ -6,6 +8,7 @@ from hypothesis import strategies as st
 
 from bridge.wire.errors import BadTopicError, is_loopback
 from bridge.wire.keys import encoding_of, key_from_topic, parse_encoding, read_key
+from bridge.wire.publisher import Attachment, decode, encode
 
 PART = st.text("abcXYZ019_-. äß", min_size=1, max_size=8)
 
@@ -49,3 +52,46 @@ def test_encodings_name_the_type() -> None:
 )
 def test_loopback_is_recognised(endpoint: str, expected: bool) -> None:
     assert is_loopback(endpoint) is expected
+
+
+INT64 = st.integers(-(2**63), 2**63 - 1)
+GIDS = st.binary(min_size=16, max_size=16)
+
+
+@given(INT64, INT64, GIDS)
+def test_what_is_encoded_is_decoded(sequence: int, source_ns: int, gid: bytes) -> None:
+    attachment = Attachment(sequence=sequence, source_ns=source_ns, gid=gid)
+    assert decode(encode(attachment)) == attachment
+
+
+@pytest.mark.parity
+def test_the_bytes_are_those_of_the_zenoh_serialiser() -> None:
+    from zenoh.ext import Int64, z_serialize
+
+    reference = z_serialize((Int64(7), Int64(-3), bytes(range(16)))).to_bytes()
+    assert encode(Attachment(sequence=7, source_ns=-3, gid=bytes(range(16)))) == reference
+    assert len(reference) == 33
+
+
+@given(INT64, INT64, GIDS)
+def test_the_form_with_field_names_is_read(sequence: int, source_ns: int, gid: bytes) -> None:
+    data = b"".join(
+        (
+            bytes([15]) + b"sequence_number" + struct.pack("<q", sequence),
+            bytes([16]) + b"source_timestamp" + struct.pack("<q", source_ns),
+            bytes([10]) + b"source_gid" + bytes([16]) + gid,
+        )
+    )
+    assert len(data) == 77
+    assert decode(data) == Attachment(sequence=sequence, source_ns=source_ns, gid=gid)
+
+
+@given(st.one_of(st.none(), st.binary(max_size=100)))
+def test_anything_else_is_no_attachment_and_no_error(data: bytes | None) -> None:
+    found = decode(data)
+    assert found is None or len(data or b"") in (33, 77)
+
+
+def test_a_wrong_length_field_is_no_attachment() -> None:
+    good = encode(Attachment(sequence=1, source_ns=2, gid=bytes(16)))
+    assert decode(good[:16] + b"\x0f" + good[17:]) is None

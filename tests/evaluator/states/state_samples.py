@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import small_plans
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import PoseSample
@@ -12,7 +13,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
-from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.plan import Plan, Stage
 
 START_NS = 10_000_000_000
 STEP_NS = 100_000_000
@@ -34,14 +35,9 @@ def pose_record(T: np.ndarray) -> dict[str, list[float]]:
 
 def plan_of(stages: dict[str, dict[str, np.ndarray]]) -> Plan:
     """A plan whose stages predict these poses; each lasts a second."""
-    return Plan(
-        id=PLAN_ID,
-        planner="test",
-        policy="scripted",
+    return small_plans.plan_of(
+        PLAN_ID,
         condition="with_replanning",
-        robot="ur5",
-        frame="base_link",
-        instruction="Put it there.",
         stages=tuple(
             Stage(
                 id=name,
@@ -52,7 +48,6 @@ def plan_of(stages: dict[str, dict[str, np.ndarray]]) -> Plan:
             )
             for index, (name, poses) in enumerate(stages.items())
         ),
-        tau=(Waypoint(t_ns=0, p_m=(0.4, 0.0, 0.2), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0),),
     )
 
 

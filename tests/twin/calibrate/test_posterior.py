@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import integrate, stats
+from small_plans import plan_of
+from verdicts import verdict_of
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
@@ -40,28 +41,8 @@ from twin.scene.store.calibration import Calibration, read_calibration, write_pa
 
 QUIET = Output(quiet=True)
 TASK = load_task("slippery_block_into_box")
-PLAN = Plan(
-    id="p",
-    planner="",
-    policy="",
-    condition="",
-    robot="",
-    frame="",
-    instruction="",
-    stages=(),
-    tau=(Waypoint(t_ns=0, p_m=(0.0, 0.0, 0.0), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0),),
-)
-YES = Factor(value=True)
-VERDICT = Verdict(
-    plan_id="p",
-    trajectory="planned",
-    mode="dynamic",
-    ik=YES,
-    clearance=YES,
-    terminal=YES,
-    engine="fake",
-    seed=0,
-)
+PLAN = plan_of()
+VERDICT = verdict_of()
 
 
 def scene() -> ReplayScene:
@@ -296,8 +277,7 @@ def test_a_task_is_weighed_by_its_own_trials_alone(
     assert rebuilt_scene.posterior_of(known, TASK) != rebuilt_scene.posterior_of(known, other)
 
 
-def test_a_run_without_executed_trials_says_so(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
+def test_a_run_without_executed_trials_says_so(run: RunFolder) -> None:
     with pytest.raises(UsageError, match="no executed trial"):
         calibrate_posterior(run, num_draws=2, workers=1, output=QUIET)
     assert not (run.scene_dir / "calibration.json").exists()

@@ -6,11 +6,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from small_plans import plan_of
 from verdicts import verdict_of
 
 from bridge.robots.default import ARM_JOINTS
 from bridge.task.find import chosen_task_file
-from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.plan import Plan
 from bridge.task.verdict import Verdict
 from twin.gate.config import GateConfig
 from twin.gate.gate import Gate, JudgedTasks
@@ -18,20 +19,7 @@ from twin.gate.gate import Gate, JudgedTasks
 TASK_FILE = chosen_task_file("cube_into_box")
 TASK = TASK_FILE.task()
 URDF = '<?xml version="1.0"?><robot xmlns:x="y" name="ur5_parallel_gripper"><link/></robot>'
-PLAN = Plan(
-    id="plan_1",
-    planner="scripted",
-    policy="scripted",
-    condition="without_replanning",
-    robot="ur5_parallel_gripper",
-    frame="base_link",
-    instruction="Put the red cube into the box.",
-    task="cube_into_box",
-    stages=(Stage(id="grasp", text="Grasp the cube."),),
-    tau=(Waypoint(t_ns=0, p_m=(0.4, 0.0, 0.3), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0),),
-)
-
-
+PLAN = plan_of("plan_1", robot="ur5_parallel_gripper", task="cube_into_box")
 JUDGED = JudgedTasks(only=TASK_FILE)
 HOME = SimpleNamespace(names=ARM_JOINTS, position=np.zeros(6), stamp_ns=42, received_ns=1)
 

@@ -15,6 +15,7 @@ import pytest
 from gate_fakes import JUDGED, accept
 from joint_samples import at_positions
 from own_process import ROOT
+from small_plans import plan_of
 
 from bridge.episode.cdr.messages import (
     CameraInfo,
@@ -28,7 +29,7 @@ from bridge.episode.topics import type_of_topic
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.robots.default import ARM_JOINTS
-from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
@@ -93,17 +94,7 @@ def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
 
 
 def plan_for(robot: str, plan_id: str = "plan_1") -> bytes:
-    return Plan(
-        id=plan_id,
-        planner="test",
-        policy="test",
-        condition="with_replanning",
-        robot=robot,
-        frame="base_link",
-        instruction="Put the red cube into the box.",
-        stages=(Stage(id="grasp", text="Grasp the cube."),),
-        tau=(Waypoint(t_ns=0, p_m=(0.4, 0.0, 0.3), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0),),
-    ).to_json()
+    return plan_of(plan_id, robot=robot).to_json()
 
 
 def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(

@@ -4,13 +4,14 @@ import itertools
 import json
 import time
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from foreign_scene import write_scene_of
+from small_plans import plan_of
+from verdicts import verdict_of
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
@@ -29,11 +30,6 @@ from twin.replay.scene import ReplayScene
 from twin.scene.store.calibration import write_physics
 
 STANDS = Waypoint(t_ns=0, p_m=(0.4, 0.0, 0.3), q_wxyz=(0.0, 1.0, 0.0, 0.0), g=0)
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 class SeenError(Exception):
@@ -58,13 +54,9 @@ def question_of(run: RunFolder, **changes: Any) -> Question:
     """A plan for the sloth, which lies somewhere."""
     task = load_task("sloth_into_basket")
     lying = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([0.5, -0.1, 0.03]))
-    plan = Plan(
-        id="p", planner="", policy="", condition="without_replanning", robot=ROBOT_NAME,
-        frame="base_link", instruction="", stages=(), tau=(STANDS,),
-    )  # fmt: skip
     question = Question(
         run_path=run.path,
-        plan=plan,
+        plan=plan_of(robot=ROBOT_NAME, tau=(STANDS,)),
         seen=ReplayScene(
             task=task,
             Ts_base_object={"sloth": lying, "basket": np.eye(4)},
@@ -77,10 +69,7 @@ def question_of(run: RunFolder, **changes: Any) -> Question:
 
 
 YES = Factor(value=True)
-ACCEPTED = Verdict(
-    plan_id="p", trajectory="planned", mode="dynamic", ik=YES, clearance=YES, terminal=YES,
-    engine="fake", seed=0,
-)  # fmt: skip
+ACCEPTED = verdict_of()
 
 
 def accepting(monkeypatch: pytest.MonkeyPatch) -> list[ReplayConfig]:

@@ -1,4 +1,4 @@
-"""Both engines do what a replay asks of a world, and refuse what they cannot do."""
+"""Both engines do what a replay asks of a world: fall, rest, grip, the same on every run."""
 
 import hashlib
 import subprocess
@@ -11,10 +11,14 @@ import pytest
 from cells import ENGINES, HOME, URDF, T_base_tcp, at, cell
 
 from bridge.errors import MissingDependencyError, UsageError
+from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners
 from bridge.robots.robot import read_robot
-from twin.physics.arm import PhysicsError
+from twin.physics import engine
+from twin.physics.arm import Arm, PhysicsError, write_description
 from twin.physics.config import PhysicsConfig, require_engine
 from twin.physics.engines import open_world
+from twin.physics.world import World
 from twin.replay.config import ReplayConfig
 from twin.replay.dynamics import mesh_hulls
 from twin.robot.collision import hulls_of
@@ -214,3 +218,91 @@ def test_an_engine_that_is_not_installed_is_named_with_its_extra(
     with pytest.raises(MissingDependencyError, match="--engine mujoco needs it"):
         ReplayConfig(engine="mujoco")
     require_engine("pybullet")
+
+
+def test_what_a_world_before_was_told_changes_nothing(urdf: str) -> None:
+    """Clients are used again: settings, bodies and constraints of one world end with it."""
+    while engine._IDLE:
+        engine._IDLE.pop().disconnect()
+    first = dropped("pybullet")
+    odd = PhysicsConfig(rate_hz=480, solver_iterations=7, solver_residual=1e-2, gravity_m_s2=1.0)
+    with World(urdf, {}, odd) as world:
+        client = world.client
+        client.setPhysicsEngineParameter(
+            enableConeFriction=0,
+            erp=0.9,
+            contactERP=0.9,
+            frictionERP=0.9,
+            numSubSteps=3,
+            reportSolverAnalytics=1,
+        )
+        world.add_free("left", CUBE, 0.05, at(0.5, 0.0, 0.3))
+        for _ in range(20):
+            world.step()
+    with World(urdf, {}, PhysicsConfig()) as world:
+        assert world.client == client, "this is about one client"
+    assert dropped("pybullet") == first
+
+
+def test_two_worlds_at_once_are_apart(urdf: str) -> None:
+    with World(urdf, {}, PhysicsConfig()) as one, World(urdf, {}, PhysicsConfig()) as other:
+        assert one.client != other.client
+        one.add_free("cube", CUBE, 0.05, at(0.5, 0.0, 0.3))
+        assert not other.free_ids
+    assert len(engine._IDLE) == 1
+
+
+def test_orders_given_once_do_what_repeated_ones_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    once = dropped("pybullet")
+    command = Arm.command
+
+    def again(self: Arm, joints: np.ndarray, velocity: np.ndarray, width_m: float) -> None:
+        self._arm_order = self._finger_order = None
+        command(self, joints, velocity, width_m)
+
+    monkeypatch.setattr(Arm, "command", again)
+    assert dropped("pybullet") == once
+
+
+def test_a_link_may_be_called_what_no_file_can_be(urdf: str, tmp_path: Path) -> None:
+    other = urdf.replace('"forearm_link"', '"left/forearm_link"')
+    assert other != urdf
+    path = write_description(other, {"left/forearm_link": [box_corners(CUBE)]}, tmp_path)
+    assert "left/forearm_link" in path.read_text()
+    assert len(list(tmp_path.glob("*.obj"))) == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wall_reaches_as_far_as_its_pose_says(urdf: str, seed: int) -> None:
+    """Rays along the box's axes meet its faces at half of its extents: asked of the engine."""
+    rng = np.random.default_rng(seed)
+    extents = np.array([0.1, 0.2, 0.4])
+    T = se3.transform_from(rng.normal(size=4), np.array([2.0, 2.0, 2.0]))
+    with World(urdf, {}, PhysicsConfig()) as world:
+        world.add_static([(np.array([0.05, 0.0, 0.0]), extents)], T)
+        for axis in range(3):
+            centre = np.array([0.05, 0.0, 0.0])
+            start = centre + np.eye(3)[axis]
+            ends = (se3.apply(T, point).tolist() for point in (start, centre))
+            (hit,) = world.client.rayTest(*ends)
+            assert hit[2] == pytest.approx(1.0 - extents[axis] / 2, abs=1e-3)
+
+
+def test_a_cube_comes_to_rest_on_a_table_of_any_height(urdf: str) -> None:
+    with World(urdf, {}, PhysicsConfig()) as world:
+        world.add_table(-0.3)
+        T = np.eye(4)
+        T[:3, 3] = (0.6, 0.3, -0.27)
+        world.add_free("cube", CUBE, 0.05, T)
+        for _ in range(120):
+            world.step()
+        assert world.T_base_object("cube")[2, 3] == pytest.approx(-0.28, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_object_lies_where_and_as_it_was_put(urdf: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T = se3.transform_from(rng.normal(size=4), np.array([0.5, 0.1, 0.8]))
+    with World(urdf, {}, PhysicsConfig()) as world:
+        world.add_free("a", np.array([0.02, 0.04, 0.06]), 0.05, T)
+        np.testing.assert_allclose(world.T_base_object("a"), T, atol=1e-6)

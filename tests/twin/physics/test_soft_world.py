@@ -1,15 +1,18 @@
-"""Soft bodies in the world of the robot: gripped, lifted, let go, and the same on every run."""
+"""Soft bodies: what they are made of, and what the world of the robot does with them."""
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from bridge.geometry import se3
+from bridge.task.meshes.lattice import volumes_m3
+from bridge.task.task_file import ObjectModel, load_task
 from twin.physics.arm import PhysicsError
 from twin.physics.config import PhysicsConfig
-from twin.physics.soft import SoftModel
+from twin.physics.soft import SoftBodyError, SoftModel, bind_points, rigid_fit, surface_triangles
 from twin.physics.world import World
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
@@ -105,3 +108,104 @@ def test_an_unknown_object_is_named_with_those_there_are(urdf: str, box_of_cells
         world.soft_bodies().add("toy", box_of_cells((2, 2, 2)), at(0.5, 0.0, 0.5))
         with pytest.raises(PhysicsError, match="There are: toy"):
             world.T_base_object("cube")
+
+
+@pytest.fixture(scope="module")
+def duck() -> ObjectModel:
+    return load_task("five_ducks_into_basket").objects["duck_1"]
+
+
+@pytest.fixture(scope="module")
+def model(duck: ObjectModel) -> SoftModel:
+    return SoftModel.from_task(duck)
+
+
+def test_a_task_gives_a_lattice_with_its_mass_and_material(
+    duck: ObjectModel, model: SoftModel
+) -> None:
+    assert 80 <= len(model.nodes_m) <= 250
+    assert model.mass_fraction.sum() == pytest.approx(1.0, abs=1e-5)
+    assert (model.mass_kg, model.young_pa, model.poisson) == (0.03, 8e4, 0.2)
+    assert model.size_m == duck.size_m
+    assert model.skin_m is not None
+    np.testing.assert_allclose(np.ptp(model.skin_m, axis=0), duck.size_m, atol=1e-6)
+
+
+def test_the_surface_is_closed_and_points_outward(model: SoftModel) -> None:
+    triangles = surface_triangles(model.tets)
+    edges = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    forward, backward = {tuple(e) for e in edges}, {tuple(e[::-1]) for e in edges}
+    assert forward == backward
+    a, b, c = (model.nodes_m[triangles[:, k]].astype(np.float64) for k in range(3))
+    enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    assert enclosed == pytest.approx(model.volume_m3(), rel=1e-5)
+
+
+def test_points_bound_to_tetrahedra_follow_any_affine_map(model: SoftModel) -> None:
+    nodes = model.nodes_m.astype(np.float64)
+    points = np.random.default_rng(0).uniform(nodes.min(axis=0), nodes.max(axis=0), (60, 3))
+    skin = bind_points(points, nodes, model.tets)
+    affine = np.eye(3) + 0.2 * np.random.default_rng(1).normal(size=(3, 3))
+    np.testing.assert_allclose(
+        skin.points_m(nodes @ affine.T + 0.3), points @ affine.T + 0.3, atol=1e-9
+    )
+
+
+def test_a_rigid_fit_recovers_the_motion(model: SoftModel) -> None:
+    nodes = model.nodes_m.astype(np.float64)
+    R, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))
+    R *= np.sign(np.linalg.det(R))
+    T = rigid_fit(nodes, nodes @ R.T + [1.0, 2.0, 3.0], model.mass_fraction.astype(np.float64))
+    np.testing.assert_allclose(T[:3, :3], R, atol=1e-9)
+    np.testing.assert_allclose(T[:3, 3], [1, 2, 3], atol=1e-9)
+    assert np.isnan(rigid_fit(nodes, nodes * np.nan, np.ones(len(nodes)))[:3]).all()
+
+
+def test_a_scene_gives_its_own_lattice(duck: ObjectModel, model: SoftModel) -> None:
+    arrays = {
+        "nodes_m": model.nodes_m,
+        "tets": model.tets,
+        "mass_fraction": model.mass_fraction,
+        "spacing_m": np.float32(0.009),
+    }
+    found = SoftModel.from_lattice(arrays, duck)
+    assert found.spacing_m == pytest.approx(0.009)
+    assert found.young_pa == model.young_pa
+    del arrays["tets"]
+    with pytest.raises(SoftBodyError, match="without tets"):
+        SoftModel.from_lattice(arrays, duck)
+
+
+def test_a_rigid_object_is_no_soft_body() -> None:
+    cube = load_task("cube_into_box").objects["cube"]
+    with pytest.raises(SoftBodyError, match="cube is rigid"):
+        SoftModel.from_task(cube)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"poisson": 0.5}, "0.45 can be simulated"),
+        ({"young_pa": 0.0}, "mass, stiffness"),
+        ({"mass_kg": float("nan")}, "mass, stiffness"),
+        ({"damping_s": -1.0}, "damping time"),
+        ({"friction": -0.1}, "friction"),
+    ],
+)
+def test_impossible_material_is_refused(
+    model: SoftModel, change: dict[str, float], message: str
+) -> None:
+    with pytest.raises(SoftBodyError, match=message):
+        replace(model, **change)
+
+
+def test_unusable_tetrahedra_are_refused(model: SoftModel) -> None:
+    with pytest.raises(SoftBodyError, match="inside out at rest"):
+        replace(model, tets=model.tets[:, [1, 0, 2, 3]])
+    with pytest.raises(SoftBodyError, match="not there"):
+        replace(model, tets=model.tets + len(model.nodes_m))
+    with pytest.raises(SoftBodyError, match="no tetrahedra"):
+        replace(model, tets=model.tets[:0])
+    with pytest.raises(SoftBodyError, match="no numbers"):
+        replace(model, nodes_m=model.nodes_m * np.float32(np.nan))
+    assert (volumes_m3(model.nodes_m.astype(np.float64), model.tets) > 0).all()

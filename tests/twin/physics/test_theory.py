@@ -1,13 +1,18 @@
-"""Both engines against mechanics that can be worked out by hand, at the settings of replays."""
+"""Both engines, odd boxes and friction with anchors, against mechanics worked out by hand."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from cells import ENGINES, HOME, at, cell, poses, push
+from cells import ENGINES, HOME, at, cell, poses, push, rotations
 
+from bridge.geometry import se3
+from twin.physics import world as world_module
+from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.physics.soft_solver import SoftSolver, surface_samples
+from twin.physics.unseen import EVEN, Unseen, box_inertia
+from twin.physics.world import World
 
 RATE_HZ = 240
 G = 9.81
@@ -96,3 +101,167 @@ def test_a_cantilever_bends_as_euler_and_bernoulli_say_the_finer_the_better(
     assert fine / bent == pytest.approx(0.91, abs=0.05), "four cells across"
     too_stiff = [sheared / measured - 1 for measured in (coarse, fine)]
     assert too_stiff[1] / too_stiff[0] == pytest.approx(0.25, abs=0.05)
+
+
+SIZE = np.array([0.04, 0.04, 0.04])
+STILL = np.zeros(6)
+WEAK = PhysicsConfig(object_friction=0.5, grip_force_N=2.0)
+CARRIED_KG = 2 * WEAK.object_friction * WEAK.finger_friction * WEAK.grip_force_N / G
+
+
+def gripping(world: World, mass_kg: float) -> None:
+    """Hold a cube between the fingers, weightless."""
+    world.client.setGravity(0, 0, 0)
+    world.reset_robot(HOME, 0.041)
+    world.add_free("cube", SIZE, mass_kg, world.robot.T_base_link("tcp"))
+    for _ in range(60):
+        world.robot.command(HOME, STILL, 0.0)
+        world.step()
+
+
+def turning(world: World, angle_rad: float, speed_rad_s: float = 2.0) -> Iterator[np.ndarray]:
+    """Turn the last joint step by step; where the joints are told to be."""
+    joints, velocity = HOME.copy(), STILL.copy()
+    velocity[5] = speed_rad_s
+    steps = round(angle_rad / speed_rad_s * world.config.rate_hz)
+    yield joints
+    for _ in range(steps):
+        joints[5] += angle_rad / steps
+        world.robot.command(joints, velocity, 0.0)
+        world.step()
+        yield joints
+
+
+def weigh_down(world: World, joints: np.ndarray, steps: int) -> float:
+    """Switch gravity on; how far the cube has moved in the tool's frame [m]."""
+    world.client.setGravity(0, 0, -G)
+    start = se3.invert(world.robot.T_base_link("tcp")) @ world.T_base_object("cube")
+    for _ in range(steps):
+        world.robot.command(joints, STILL, 0.0)
+        world.step()
+    end = se3.invert(world.robot.T_base_link("tcp")) @ world.T_base_object("cube")
+    return float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
+
+
+def normal_error_rad(world: World) -> float:
+    """Angle between the fingers' closing direction and contact normals, weighted by force."""
+    finger = world.robot.T_base_link("gripper_left_finger")[:3, :3]
+    axis = finger @ np.array([0.0, 1.0, 0.0])
+    points = world.client.getContactPoints(world.robot.id, world.free_ids["cube"])
+    angles = [np.arccos(min(1.0, abs(axis @ np.array(point[7])))) for point in points]
+    return float(np.average(angles, weights=[point[9] for point in points]))
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 1.2])
+def test_fingers_hold_what_friction_carries_and_lose_what_it_does_not(
+    urdf: str, turn_rad: float
+) -> None:
+    moved = {}
+    for share in (0.9, 1.1):
+        with World(urdf, {}, WEAK) as world:
+            gripping(world, share * CARRIED_KG)
+            *_, joints = turning(world, turn_rad)
+            moved[share] = weigh_down(world, joints, 72)
+    assert moved[0.9] < 1e-3
+    assert moved[1.1] > 0.02
+
+
+def test_what_is_held_does_not_creep(urdf: str) -> None:
+    with World(urdf, {}, PhysicsConfig()) as world:
+        gripping(world, 0.05)
+        weigh_down(world, HOME, 60)
+        assert weigh_down(world, HOME, 480) < 2e-5
+
+
+def test_contact_normals_turn_with_what_is_held(urdf: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = {}
+    for every in (world_module.EVERY_STEPS, 10**9):
+        monkeypatch.setattr(world_module, "EVERY_STEPS", every)
+        with World(urdf, {}, PhysicsConfig()) as world:
+            gripping(world, 0.05)
+            found = [normal_error_rad(world) for _ in turning(world, 1.2)]
+        errors[every] = np.rad2deg(np.mean(found))
+    kept_fresh, left_alone = errors.values()
+    assert kept_fresh < 5.0
+    assert left_alone > 15.0, "the engine turns normals itself: nothing need be let go"
+
+
+MASS_KG = 0.05
+TURN = se3.rotation_from_vector(np.array([0.3, -0.5, 0.8]))
+
+
+def test_a_stepped_box_is_as_wide_as_before_and_its_faces_are_smaller() -> None:
+    size = np.array([0.03, 0.04, 0.06])
+    solids = Unseen(edge_m=0.005).solids(size)
+    np.testing.assert_allclose(np.max(solids, axis=0), size)
+    for axis, extents in enumerate(solids):
+        face = np.delete(extents, axis)
+        np.testing.assert_allclose(face, np.delete(size, axis) - 0.01)
+    assert len(EVEN.solids(size)) == 1
+    assert (np.array(Unseen(edge_m=1.0).solids(size)) > 0).all()
+
+
+@each_engine
+@pytest.mark.parametrize("edge_m", [0.0, 0.004])
+def test_a_pose_comes_out_as_it_went_in_wherever_the_weight_is(engine: str, edge_m: float) -> None:
+    T = at(2, 2, 2, TURN)
+    with cell(engine) as world:
+        unseen = Unseen(edge_m=edge_m, centre_of_mass_m=(0.006, -0.004, 0.01))
+        world.add_free("cube", CUBE, MASS_KG, T, unseen)
+        world.reset_robot(HOME, 0.08)
+        np.testing.assert_allclose(world.T_base_object("cube"), T, atol=1e-6)
+
+
+@each_engine
+def test_what_flies_turns_about_its_centre_of_mass(engine: str) -> None:
+    """The centre falls straight; the middle goes round it."""
+    centre = np.array([0.012, 0.0, 0.0])
+    with cell(engine) as world:
+        world.add_free("cube", CUBE, MASS_KG, at(2, 2, 2), Unseen(centre_of_mass_m=tuple(centre)))
+        world.reset_robot(HOME, 0.08)
+        push(world, "cube", (0, 0, 0), (0, 0, 6.0))
+        rows = poses(world, "cube", RATE_HZ // 4)
+    where = rows[:, :3] + rotations(rows) @ centre
+    drift = where[:, :2] - where[0, :2]
+    steady = np.linspace(0, 1, len(rows))[:, None] * drift[-1]
+    np.testing.assert_allclose(drift, steady, atol=2e-4)  # a straight line at an even speed
+    turned = np.abs(rows[-1, :2] - rows[0, :2]).max()
+    assert turned > 0.005
+
+
+@each_engine
+@pytest.mark.parametrize(
+    ("edge_m", "off_m", "stays"),
+    [(0.0, 0.009, True), (0.0, 0.015, False), (0.004, 0.007, True), (0.004, 0.011, False)],
+)
+def test_a_stack_stays_while_the_weight_is_over_the_lower_face(
+    engine: str, edge_m: float, off_m: float, stays: bool
+) -> None:
+    """Half a lower face is 13 mm, 9 mm with steps of 4 mm; the upper box lies in the middle."""
+    low = np.array([0.026, 0.026, 0.026])
+    with cell(engine) as world:
+        world.add_table(0.0)
+        world.add_free("low", low, MASS_KG, at(0.8, 0.3, 0.013), Unseen(edge_m=edge_m))
+        unseen = Unseen(edge_m=edge_m, centre_of_mass_m=(off_m, 0.0, 0.0))
+        world.add_free("high", CUBE, MASS_KG, at(0.8, 0.3, 0.0462), unseen)
+        world.reset_robot(HOME, 0.08)
+        height_m = poses(world, "high", 2 * RATE_HZ)[-1, 2]
+    assert (abs(height_m - 0.046) < 0.001) == stays
+
+
+def test_inertia_is_that_of_the_textbook() -> None:
+    assert box_inertia(np.array([0.1, 0.2, 0.3]), 12.0) == pytest.approx((0.13, 0.1, 0.05))
+
+
+@each_engine
+@pytest.mark.parametrize("edge_m", [0.0, 0.004])
+def test_what_rests_rests_on_its_own_face_wherever_its_weight_is(
+    engine: str, edge_m: float
+) -> None:
+    unseen = Unseen(edge_m=edge_m, centre_of_mass_m=(0.003, 0.002, -0.008))
+    with cell(engine) as world:
+        world.add_table(0.0)
+        world.add_free("cube", CUBE, MASS_KG, at(0.8, 0.3, 0.0203), unseen)
+        world.reset_robot(HOME, 0.08)
+        p = poses(world, "cube", RATE_HZ)[-1, :3]
+    np.testing.assert_allclose(p, [0.8, 0.3, 0.02], atol=5e-4)

@@ -1,17 +1,14 @@
 """A planner on the wire: what it answers, that it remembers nothing, and that there is one."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from foreign_scene import write_scene_of
 from hostile_replies import INSIDE
-from loopback import free_endpoint
 from scripted_plans import scene_of_test
 from test_model_client import Server, says, serving
 from verdicts import verdict_of
@@ -68,8 +65,7 @@ def request(**changes: Any) -> PlanRequest:
 
 
 @pytest.fixture
-def planner(tmp_path: Path) -> LivePlanner:
-    run = RunFolder.create(tmp_path / "run")
+def planner(run: RunFolder) -> LivePlanner:
     return LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text)
 
 
@@ -116,8 +112,7 @@ def test_what_cannot_be_planned_has_a_reason(
     assert words in answer.reason
 
 
-def test_a_scene_of_another_robot_is_not_planned_in(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
+def test_a_scene_of_another_robot_is_not_planned_in(run: RunFolder) -> None:
     other = read_robot("ur10_parallel_gripper")
     write_scene_of(run, other)
     asked = request().to_json()
@@ -145,9 +140,8 @@ def asking(run: RunFolder, server: Server) -> LivePlanner:
 
 
 def test_policy_model_keeps_what_the_model_adds_and_the_same_request_has_the_same_answer(
-    tmp_path: Path,
+    run: RunFolder,
 ) -> None:
-    run = RunFolder.create(tmp_path / "run")
     asked = request(policy="model")
     with serving(says(adds(LOW))) as server:
         first = asking(run, server).answer(asked.to_json())
@@ -161,14 +155,13 @@ def test_policy_model_keeps_what_the_model_adds_and_the_same_request_has_the_sam
     assert server.asked[0] == server.asked[1], "nothing is remembered, and nothing differs"
 
 
-def test_live_replies_that_are_refused_and_what_no_plan_keeps_have_a_reason(tmp_path: Path) -> None:
+def test_live_replies_that_are_refused_and_what_no_plan_keeps_have_a_reason(run: RunFolder) -> None:
     class KeepsNothing(PlanProposer):
         def propose(self, problem: Problem, **more: Any) -> Any:
             if any(stage.get("path") for stage in problem.scene.task.stages):
                 raise NoPlanError("no path keeps that.")
             return super().propose(problem, **more)
 
-    run = RunFolder.create(tmp_path / "run")
     asked = request(policy="model").to_json()
     with serving(says("Sure!")) as server:
         answer = asking(run, server).answer(asked)
@@ -191,38 +184,34 @@ def test_policy_model_without_a_model_has_a_reason(planner: LivePlanner) -> None
     assert "model" not in planner.policies
 
 
-def test_live_with_a_task_is_wrong_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = RunFolder.create(tmp_path / "run")
+def test_live_with_a_task_is_wrong_use(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
     for option in (["--task", "cube_into_box"], ["--dry"]):
         assert robot_gst.run(["plan", str(run.path), "--live", *option]) == 2
         assert "leave --task and --dry out" in capsys.readouterr().err
 
 
-def test_when_no_candidate_is_left_the_reason_says_how_many_there_were(tmp_path: Path) -> None:
+def test_when_no_candidate_is_left_the_reason_says_how_many_there_were(run: RunFolder) -> None:
     class Few(PlanProposer):
         def propose(self, problem: Any, **more: Any) -> Any:
             return islice(super().propose(problem, **more), 1)
 
-    run = RunFolder.create(tmp_path / "run")
     planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, Few)
     reason = planner.answer(request(round=2).to_json()).reason
     assert "there are 1 candidates, and 2 were tried" in reason
 
 
-def test_before_the_cell_describes_its_robot_there_is_no_plan(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
+def test_before_the_cell_describes_its_robot_there_is_no_plan(run: RunFolder) -> None:
     answer = LivePlanner(run, LivePlanConfig(), lambda: None).answer(request().to_json())
     assert "no robot description has arrived" in answer.reason
 
 
 def test_a_bug_is_a_reason_and_no_silence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Broken:
         def propose(self, *_: Any, **__: Any) -> Any:
             raise ZeroDivisionError("oops")
 
-    run = RunFolder.create(tmp_path / "run")
     planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, lambda _: Broken())
     assert "ZeroDivisionError: oops" in planner.answer(request().to_json()).reason
     assert "Traceback" in capsys.readouterr().err
@@ -231,17 +220,6 @@ def test_a_bug_is_a_reason_and_no_silence(
 def test_what_is_no_request_is_refused(planner: LivePlanner) -> None:
     with pytest.raises(InvalidRecordError):
         planner.answer(b"nonsense")
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def router(endpoint: str) -> Iterator[WireSession]:
-    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
-        yield session
 
 
 def test_a_second_planner_of_a_cell_is_refused(router: WireSession, endpoint: str) -> None:

@@ -1,4 +1,4 @@
-"""Varied rollouts: what is drawn, what it changes, and which of it goes with failure."""
+"""Varied rollouts, the light of trials, and the visual gap: what is drawn and what it changes."""
 
 from dataclasses import replace
 from typing import Any
@@ -7,15 +7,25 @@ import numpy as np
 import pytest
 from test_rollouts import QUIET, config
 
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.exchange.trials_csv import read_trials
 from bridge.geometry import se3
+from twin.policies import colours
 from twin.policies.cell import TwinCell
+from twin.policies.colours import gains_of
+from twin.policies.gap import State, describe_gap, visual_gap
+from twin.policies.mapping import DEFAULT, Interpreter
+from twin.policies.policy import open_policy
 from twin.policies.runs import TABLE, describe_rollouts, roll_out_run
 from twin.policies.starts import Start, open_start, trial_episodes
 from twin.policies.variation import draw, effects, read_quantities, varied_start
-from twin.policies.views import TwinCameras
+from twin.policies.views import Gains, TwinCameras, lit
+from twin.robot.model import load_robot
+from twin.robot.posture import Posture
+from twin.scene.render import render
+from twin.scene.settings import RenderConfig
 
 ALL = ("light=20%", "mass=30%,friction=10%", "objects.position=10mm", "camera.side.angle=3deg")
 
@@ -119,3 +129,142 @@ def test_varied_rollouts_say_what_was_drawn_and_stay_out_of_the_comparison(run: 
     assert read_trials(run.path / TABLE) == before
     with pytest.raises(UsageError, match="no camera top in trial_1; it has: side, wrist"):
         roll_out_run(run, replace(asked, vary=("camera.top.position=3mm",)), QUIET)
+
+
+LIGHT = (0.75, 0.8, 1.3)
+CAMERAS = ("side", "wrist")
+
+
+def seen(run: RunFolder, light: tuple[float, ...], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Let trials show noise in a light, one part of it something else; which were looked at."""
+    rng, asked = np.random.default_rng(0), []
+
+    def states(_: RunFolder, episode: Episode, names: tuple[str, ...], count: int) -> list[State]:
+        asked.append(episode.info.id)
+        found = []
+        for _ in range(count):
+            drawn = {name: rng.integers(0, 256, (1, 1, 3)) for name in names}
+            drawn = {name: np.tile(x, (122, 163, 1)) for name, x in drawn.items()}
+            for x in drawn.values():
+                x[::8] = rng.integers(60, 200, (1, 163, 3))
+                x[:, :80] = rng.integers(30, 180, (122, 80, 3))
+            shown = {name: x * light + rng.normal(0, 3, x.shape) for name, x in drawn.items()}
+            for x in shown.values():
+                x[:30] = 90  # somebody stands there
+            u8 = {name: np.clip(x, 0, 255).astype(np.uint8) for name, x in shown.items()}
+            posture = Posture(joints_rad=np.zeros(6), width_m=0.0)
+            rendered = {name: x.astype(np.uint8) for name, x in drawn.items()}
+            state = State(posture=posture, recorded=u8, following=u8, rendered=rendered)
+            found.append(state)
+        return found
+
+    colours._ratios.cache_clear()
+    monkeypatch.setattr(colours, "recorded_states", states)
+    return asked
+
+
+def test_another_light_is_found_in_other_trials(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = seen(run, LIGHT, monkeypatch)
+    for path in run.episodes():
+        found = gains_of(run, Episode.open(path), CAMERAS)
+        assert found.keys() == set(CAMERAS)
+        for gain in found.values():
+            assert gain == pytest.approx(LIGHT, abs=0.02)
+        assert path.stem not in asked
+        asked.clear()
+        colours._ratios.cache_clear()
+
+
+def test_the_same_light_changes_nothing(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen(run, (1.01, 0.99, 1.0), monkeypatch)
+    assert gains_of(run, Episode.open(run.episodes()[0]), CAMERAS) == {}
+
+
+def test_one_trial_alone_teaches_nothing(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen(run, LIGHT, monkeypatch)
+    last, *others = run.episodes()
+    for path in others:
+        path.unlink()
+    colours._trials.cache_clear()
+    assert gains_of(run, Episode.open(last), CAMERAS) == {}
+
+
+def test_too_little_that_is_bright_enough_teaches_nothing(run: RunFolder) -> None:
+    """The drawn run is almost black."""
+    assert gains_of(run, Episode.open(run.episodes()[0]), CAMERAS) == {}
+
+
+def test_a_policy_sees_the_light(run: RunFolder) -> None:
+    start = open_start(run, Episode.open(run.episodes()[0]))
+    cell = TwinCell(start)
+    try:
+        gains = {"wrist": LIGHT}
+        plain = TwinCameras(run, start).draw(cell)
+        found = TwinCameras(run, start, gains=gains).draw(cell)
+        dark = TwinCameras(run, start, drawn={"light": (-0.5,)}, gains=gains).draw(cell)
+    finally:
+        cell.close()
+    assert np.array_equal(found["side"], plain["side"])
+    expected = np.clip(plain["wrist"] * np.array(LIGHT), 0, 255)
+    assert np.abs(found["wrist"] - expected).max() <= 0.5 + 1e-3
+    assert found["wrist"].max() > 0
+    assert np.abs(dark["wrist"] - 0.5 * expected).max() <= 0.5 + 1e-3
+    assert np.array_equal(lit(plain, gains)["wrist"], found["wrist"])
+
+
+def gap_of(run: RunFolder, policy: str, gains: Gains | None = None) -> dict[str, object]:
+    episode = Episode.open(run.episodes()[0])
+    start = open_start(run, episode)
+    assert TwinCameras(run, start).viewpoints.keys() == {"side", "wrist"}
+    speak = Interpreter(DEFAULT, load_robot(start.scene.urdf), "do it")
+    opened = open_policy(f"scripted_policies:{policy}", 1.0)
+    return visual_gap(run, episode, opened, speak, 0, gains or {})
+
+
+def test_brightness_is_what_it_goes_by(run: RunFolder) -> None:
+    """Against pictures that `render` draws of the same instants."""
+    found = gap_of(run, "brightness")
+    assert found["instants"] == 10
+    assert found["again"] == 0.0
+    assert found["following"] == pytest.approx(20 / 255, abs=1e-6)
+    shades = {}
+    for camera in ("side", "wrist"):
+        shades[camera] = []
+        for index in range(10):
+            config = RenderConfig(
+                camera=camera, episode="trial_1", at_s=index * 0.2,
+                out=run.path / f"{camera}_{index}.png",
+            )  # fmt: skip
+            render(run, config)
+            shades[camera].append(mean_of(run, f"{camera}_{index}.png"))
+    grey = np.arange(10) * 20 / 255
+    side, wrist = (np.array(shades[name]) - grey for name in ("side", "wrist"))
+    rms = {
+        "all": np.sqrt(np.mean(((side + wrist) / 2) ** 2)),
+        "side": np.sqrt(np.mean((side / 2) ** 2)),
+        "wrist": np.sqrt(np.mean((wrist / 2) ** 2)),
+    }
+    assert found["rendered"] == pytest.approx(rms, abs=2e-3)
+    assert rms["all"] > 0.05
+    dark = {"side": (0.0, 0.0, 0.0), "wrist": (0.0, 0.0, 0.0)}
+    found = gap_of(run, "brightness", dark)
+    assert found["rendered"]["lit"] == pytest.approx(np.sqrt(np.mean(grey**2)), abs=1e-6)
+    assert f"in the light of other trials {found['rendered']['lit']:.3g}" in describe_gap(found)[0]
+    text = describe_gap(found)[0]
+    assert f"by {rms['all']:.3g}"[:6] in text
+    assert "10 states of trial_1" in text
+
+
+def mean_of(run: RunFolder, name: str) -> float:
+    from PIL import Image
+
+    return float(np.asarray(Image.open(run.path / name)).mean()) / 255
+
+
+def test_a_policy_that_sees_nothing_has_no_gap(run: RunFolder) -> None:
+    found = gap_of(run, "still")
+    assert found["rendered"] == {"all": 0.0, "side": 0.0, "wrist": 0.0}
+    assert found["following"] == 0.0
+    assert describe_gap(found)[0].endswith("is the same whatever it sees")

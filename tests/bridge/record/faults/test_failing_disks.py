@@ -1,21 +1,36 @@
-"""Disks that are slow or break, and files that are taken away while they are written."""
+"""Disks that are full, slow or break, files that may not grow or go, a clock that is set."""
 
 import os
 import random
+import resource
 import shutil
 import signal
+import subprocess
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from fault_account import accounts_are_exact, check_code, ledger, lost, nothing_invented, read
-from fault_cell import FaultCell, PublisherChild
-from fault_messages import GRIPPER, JOINTS, MIX
+from fault_account import (
+    accounts_are_exact,
+    check_code,
+    ledger,
+    lost,
+    metadata,
+    nothing_invented,
+    read,
+)
+from fault_cell import FaultCell, PublisherChild, Sent
+from fault_messages import GRIPPER, JOINTS, MIX, RAW
 from loopback import free_endpoint
+from mcap.reader import make_reader
 from patience import wait_until
 
 import robot_gst
+from bridge.episode.reader import Episode
+from bridge.episode.streams import events
 
 HERE = Path(__file__).parent
 IMAGES = ("color", "depth", "raw")
@@ -146,3 +161,149 @@ def test_recorders_that_share_a_folder_keep_others_out_of_it(cell: FaultCell) ->
     assert fourth.process.wait(timeout=WAIT_S) == 2, "one of two is still at work"
     second.finish()
     cell.record().finish()
+
+
+STEPPER = str(Path(__file__).with_name("stepping_recorder.py"))
+HOUR_NS = 3_600 * 10**9
+
+
+@pytest.mark.slow
+def test_a_clock_set_by_an_hour_and_back_reorders_nothing_and_is_noted(cell: FaultCell) -> None:
+    """Law: log times go on as if nothing had happened; the step itself is an event."""
+    recorder = cell.record(program=STEPPER)
+    flow, asker = cell.publisher(), cell.publisher()
+    assert asker.ask("start", {"id": "t1", "info": {"cell": "cell"}})["ok"]["ok"]
+    begin_ns = time.time_ns()
+    flow.flow(3.0, *MIX)
+    for count, number in enumerate((signal.SIGUSR1, signal.SIGUSR2), start=1):
+        recorder.send(number)
+        wait_until(lambda count=count: asker.ask("status")["ok"]["clock_steps"] >= count)
+    flow.answer()
+    answer = flow.ask("stop")["ok"]
+    end_ns = time.time_ns()
+    path = cell.path("t1")
+    accounts_are_exact(path, flow.sent())
+    assert answer["lost"] == 0
+    assert 0.0 < answer["duration_s"] < 60.0
+    times: dict[str, list[int]] = {}
+    for item in read(path):
+        times.setdefault(item.topic, []).append(item.log_ns)
+    for topic, of_topic in times.items():
+        assert of_topic == sorted(of_topic), topic
+        assert begin_ns <= of_topic[0]
+        assert of_topic[-1] <= end_ns
+    noted = [event["data"]["step_ns"] for event in events(Episode.open(path))]
+    assert [round(step / HOUR_NS) for step in noted] == [1, -1]
+    assert metadata(path, "recorder")["clock_steps_ns"] == noted
+    named = [(each["name"], each["text"][:15]) for each in answer["findings"]]
+    assert named == [("host_clock_jump", "set ahead by 36"), ("host_clock_jump", "set back by 360")]
+    assert check_code(path) == 3
+
+
+SMALL = ("--min-free-mb", "0", "--footer-mb", "6")
+
+
+@pytest.fixture
+def disk(cell: FaultCell) -> Iterator[Path]:
+    """A file system of 16 MB under the run folder."""
+    cell.run.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(cell.run)]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("mounting a small file system needs more rights than this machine gives")
+    yield cell.run
+    subprocess.run(["umount", "--lazy", str(cell.run)], check=True)
+
+
+def failed_status(publisher: PublisherChild) -> dict[str, Any]:
+    """Ask until the recorder says that it failed."""
+    end_s = time.monotonic() + 60.0
+    while time.monotonic() < end_s:
+        answer = publisher.ask("status")["ok"]
+        if not answer["ok"]:
+            return dict(answer)
+    pytest.fail("the recorder never said that its disk is full")
+
+
+def ends_at_one_instant(path: Path, sent: list[Sent]) -> int:
+    """Return how many of what was sent are accounted for; they must be the first so many."""
+    topics = ledger(path)
+    said = {
+        topic: tally["received"] - tally["repeated"] + lost(tally)
+        for topic, tally in topics.items()
+    }
+    count = sum(said.values())
+    assert Counter(item.topic for item in sent[:count]) == said
+    return count
+
+
+@pytest.mark.parametrize(
+    "streams",
+    [pytest.param(MIX, id="mix", marks=pytest.mark.slow), pytest.param((*MIX, "raw"), id="raw")],
+)
+def test_a_full_disk_is_said_at_once_and_every_message_is_accounted_for(
+    cell: FaultCell, disk: Path, streams: tuple[str, ...]
+) -> None:
+    recorder = cell.record("--episode", "t1", "--cell", "cell", *SMALL)
+    flow, asker = cell.publisher(), cell.publisher()
+    flow.flow(60.0, *streams, period_s=0.0005)
+    status = failed_status(asker)
+    assert "No space left on device" in status["error"]
+    assert recorder.process.wait(timeout=30.0) == 1
+    flow.kill()
+    assert "No space left on device. The recorder stopped. The episode was finished" in (
+        recorder.said()
+    )
+    assert "Traceback" not in recorder.said()
+    path = cell.path("t1")
+    assert [p.name for p in path.parent.iterdir()] == ["t1.mcap"]
+    sent = flow.sent()
+    nothing_invented(read(path), sent, transcoded=(RAW,))
+    count = ends_at_one_instant(path, sent)
+    print(f"{count} of {len(sent)} accounted for")
+    assert check_code(path) == 3
+
+
+@pytest.mark.slow
+def test_the_reserve_ends_an_episode_while_there_is_room(cell: FaultCell, disk: Path) -> None:
+    """Law: at --min-free-mb nothing that was received is lost, and that much is left."""
+    recorder = cell.record(
+        "--episode", "t1", "--cell", "cell", "--min-free-mb", "8", "--footer-mb", "4"
+    )
+    flow = cell.publisher()
+    flow.flow(60.0, *MIX)
+    assert recorder.process.wait(timeout=60.0) == 1
+    flow.kill()
+    assert "MB must be left. The recorder stopped. The episode was finished" in recorder.said()
+    path = cell.path("t1")
+    sent = flow.sent()
+    count = ends_at_one_instant(path, sent)
+    assert sum(lost(tally) for tally in ledger(path).values()) == 0
+    assert len(read(path)) == count
+    assert check_code(path) == 0
+    assert shutil.disk_usage(disk).free > 2_000_000
+
+
+@pytest.mark.slow
+def test_a_file_that_may_not_grow_is_recovered_with_all_but_the_refused(cell: FaultCell) -> None:
+    """Law: there is no room for an end, so the part stays, and recovery makes it whole."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, 1_500_000))
+
+    recorder = cell.record("--episode", "t1", "--cell", "cell", preexec_fn=limit)
+    flow, asker = cell.publisher(), cell.publisher()
+    flow.flow(60.0, *MIX)
+    status = failed_status(asker)
+    assert "File too large" in status["error"]
+    assert recorder.process.wait(timeout=30.0) == 1
+    flow.kill()
+    assert "robot-gst recover finishes it" in recorder.said()
+    cell.record().kill()
+    path = cell.path("t1")
+    found = read(path)
+    nothing_invented(found, flow.sent())
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert len(found) > 100
+    assert check_code(path) == 3

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
+from upright import upright as pose
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
@@ -77,11 +78,6 @@ support = "brick"
 @cache
 def blocks_task() -> Task:
     return TaskFile(TOML, "test").task()
-
-
-def pose(x: float, y: float, z: float, yaw_rad: float = 0.0) -> np.ndarray:
-    q = np.array([np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2)])
-    return se3.transform_from(q, np.array([x, y, z]))
 
 
 PLACES = {

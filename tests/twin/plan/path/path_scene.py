@@ -6,8 +6,8 @@ For tests and the benchmark of the planner's paths.
 from dataclasses import dataclass
 
 import numpy as np
+from upright import upright as at
 
-from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import ObjectModel, Task, load_task
 from twin.plan.path.world import World, build_world
@@ -35,11 +35,6 @@ def task_with_post_and_wall() -> Task:
     objects["post"] = standing("post", (0.05, 0.05, 0.5))
     objects["wall"] = standing("wall", (0.3, 0.02, 0.25))
     return Task(**{**vars(task), "objects": objects})
-
-
-def at(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
-    q = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
-    return se3.transform_from(q, np.array([x, y, z]))
 
 
 def problem_of_test(urdf: str | None = None) -> Problem:

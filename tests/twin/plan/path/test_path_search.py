@@ -1,14 +1,21 @@
-"""Paths around things: found, repeatable, checked, and clearly refused where there is none."""
+"""Paths around things and lines near contact: found, repeatable, timed within the limits."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from path_scene import EPS_M, WIDTH_M, Pairs, at, joints_at, tool_down
 
-from twin.plan.path.planner import Mover, NoPathError, PathConfig
+from bridge.geometry import se3
+from twin.plan.grasp.reach import nearest_solutions
+from twin.plan.path import planner
+from twin.plan.path.planner import Mover, NoPathError, PathConfig, limits_of, timed_path
+from twin.plan.path.transfer import Leg, PickAndPlace
 from twin.plan.path.world import Carried, build_world
-from twin.plan.problem import TimedPath
+from twin.plan.problem import Grasp, Problem, Release, TimedPath
+from twin.replay.motion import motion_failures
+from twin.replay.path import JointPath
 
 CONFIG = PathConfig()
 
@@ -180,3 +187,182 @@ def test_a_carried_object_is_taken_around_too(pairs: Pairs) -> None:
     outcome, *_, knots, _ = found(pairs, index)
     assert outcome == 0
     assert full.motion.blocked(knots) >= 0 or least > EPS_M
+
+
+def grasp_of(problem: Problem) -> Grasp:
+    T = problem.scene.Ts_base_object["cube"]
+    T_tool = tool_down(*T[:2, 3], 0.022, float(np.arctan2(T[1, 0], T[0, 0])))
+    joints = joints_at(problem, T_tool, None)
+    assert joints is not None
+    return Grasp(
+        object_id="cube", T_object_tcp=se3.invert(T) @ T_tool, width_m=0.04, open_m=0.085,
+        margin=1.0, joints_rad=joints, pregrasp_m=0.08,
+    )  # fmt: skip
+
+
+def release_of(grasp: Grasp, T_base_object: np.ndarray) -> Release:
+    return Release(
+        object_id="cube", T_base_object=T_base_object, cost=0.0,
+        T_base_tcp=T_base_object @ grasp.T_object_tcp,
+    )  # fmt: skip
+
+
+def planned(problem: Problem, grasp: Grasp, release: Release) -> tuple[Leg, ...]:
+    move = PickAndPlace(problem=problem, grasp=grasp, release=release, config=CONFIG)
+    return move.legs(problem.robot.home_rad)
+
+
+def test_a_straight_line_is_straight_on_one_branch_and_slow(pairs: Pairs) -> None:
+    problem, robot = pairs.problem, pairs.problem.robot
+    grasp = grasp_of(problem)
+    T = robot.T_base_tcp(grasp.joints_rad)
+    goal = T.copy()
+    goal[2, 3] += 0.1
+    allowed = problem.contacts_of("grasp", "cube")
+    mover = planner.Mover(problem=problem, config=CONFIG, width_m=0.085, allowed=allowed)
+    path = mover.straight(grasp.joints_rad, goal)
+    tips = robot.Ts_base_tcp(path.joints_rad)
+    assert np.abs(tips[:, :2, 3] - T[:2, 3]).max() < 0.0005
+    assert np.abs(tips[:, :3, :3] - T[:3, :3]).max() < 0.002
+    assert tips[-1] == pytest.approx(goal, abs=1e-6)
+    assert (np.diff(tips[:, 2, 3]) > 0).all()
+    assert np.abs(np.diff(path.joints_rad, axis=0)).max() < 0.1
+    speeds = np.linalg.norm(np.diff(tips[:, :3, 3], axis=0), axis=1) / np.diff(path.times_s)
+    assert speeds.max() <= 1.01 * planner.CONTACT_M_S
+    back = planner.reversed_path(path)
+    assert np.array_equal(back.joints_rad[0], path.joints_rad[-1])
+    assert back.times_s[0] == 0.0
+    assert (np.diff(back.times_s) > 0).all()
+
+
+def test_a_straight_line_into_something_or_out_of_reach_is_refused(pairs: Pairs) -> None:
+    problem = pairs.problem
+    start = joints_at(problem, tool_down(0.42, -0.1, 0.1, 0.0), None)
+    assert start is not None
+    mover = planner.Mover(problem=problem, config=CONFIG, width_m=0.085)
+    with pytest.raises(planner.NoPathError, match=r"refused: gripper_.* and wall"):
+        mover.straight(start, tool_down(0.42, 0.1, 0.1, 0.0))
+    with pytest.raises(planner.NoPathError, match=r"unreachable .* of 1\d{3} mm"):
+        mover.straight(start, tool_down(0.42, -1.5, 0.1, 0.0))
+
+
+def test_a_cube_is_taken_into_the_box_around_what_stands_between(pairs: Pairs) -> None:
+    problem, robot = pairs.problem, pairs.problem.robot
+    grasp = grasp_of(problem)
+    release = release_of(grasp, at(0.5, 0.25, 0.027, 0.1))
+    legs = planned(problem, grasp, release)
+    assert [leg.name for leg in legs] == ["around", "approach", "lift", "carry", "lower", "leave"]
+    assert [leg.g for leg in legs] == [0, 0, 1, 1, 1, 0]
+    assert np.array_equal(legs[0].path.joints_rad[0], robot.home_rad)
+    for before, after in pairwise(legs):
+        ends = before.path.joints_rad[-1], after.path.joints_rad[0]
+        assert np.array_equal(*ends)
+    assert np.array_equal(legs[1].path.joints_rad[-1], grasp.joints_rad)
+    tool = robot.T_base_tcp(legs[4].path.joints_rad[-1])
+    assert tool == pytest.approx(release.T_base_tcp, abs=1e-6)
+
+
+def test_the_movement_that_does_not_exist_is_named(pairs: Pairs) -> None:
+    problem = pairs.problem
+    grasp = grasp_of(problem)
+    beyond = release_of(grasp, at(1.6, 0.2, 0.03))
+    with pytest.raises(planner.NoPathError, match="unreachable"):
+        planned(problem, grasp, beyond)
+    in_wall = release_of(grasp, at(0.42, 0.05, 0.03))
+    with pytest.raises(planner.NoPathError, match="for 'lower'") as caught:
+        planned(problem, grasp, in_wall)
+    assert caught.value.leg == "lower"
+
+
+def test_all_branches_come_nearest_first(pairs: Pairs) -> None:
+    robot = pairs.problem.robot
+    near = pairs.starts[0]
+    found = nearest_solutions(robot, robot.T_base_tcp(near), near)
+    assert len(found) > 2
+    assert found[0] == pytest.approx(near, abs=1e-6)
+    away = [np.abs(joints - near).sum() for joints in found]
+    assert away == sorted(away)
+    for joints in found:
+        assert robot.T_base_tcp(joints) == pytest.approx(robot.T_base_tcp(near), abs=1e-6)
+
+
+FAST = replace(CONFIG, speed_share=1.0, acceleration_share=1.0)
+
+
+def timed(pairs: Pairs, rows: np.ndarray, *, tool: float = 0.0, rounding: bool = True) -> tuple:
+    speed, acceleration, _ = limits_of(pairs.problem.robot, FAST)
+    times, joints, *_ = pairs.world.motion.time(rows, speed, acceleration, tool, 0.02, rounding)
+    return times, joints
+
+
+def knots_of(pairs: Pairs, index: int) -> np.ndarray:
+    return pairs.world.motion.find(
+        pairs.starts[index], pairs.goals[index][None], 3, 1.0, 5000, 150_000, 60
+    )[2]
+
+
+@pytest.mark.parametrize("length_rad", [0.05, 0.3, 1.4])
+def test_one_joint_takes_the_time_of_a_trapezoid(pairs: Pairs, length_rad: float) -> None:
+    speed, acceleration, _ = limits_of(pairs.problem.robot, FAST)
+    home = pairs.problem.robot.home_rad
+    goal = home + np.eye(6)[0] * length_rad
+    times, joints = timed(pairs, np.stack([home, goal]))
+    v, a = float(speed[0]), float(acceleration[0])
+    triangle = 2 * np.sqrt(length_rad / a)
+    expected = triangle if length_rad < v**2 / a else length_rad / v + v / a
+    assert times[-1] == pytest.approx(expected, rel=0.01)
+    assert np.array_equal(joints[-1], goal)
+    assert (np.diff(joints[:, 0]) > 0).all()
+
+
+def test_limits_of_speed_acceleration_and_tool_are_kept(pairs: Pairs) -> None:
+    robot = pairs.problem.robot
+    speed, acceleration, tool = limits_of(robot, CONFIG)
+    for index in range(0, len(pairs.kinds), 3):
+        path = timed_path(pairs.world, knots_of(pairs, index), CONFIG)
+        step = np.diff(path.times_s)
+        rates = np.diff(path.joints_rad, axis=0) / step[:, None]
+        assert (np.abs(rates) <= 1.01 * speed).all()
+        # At rest before and after.
+        rates = np.vstack([np.zeros(6), rates, np.zeros(6)])
+        middles = np.concatenate([[step[0]], (step[1:] + step[:-1]) / 2, [step[-1]]])
+        assert (np.abs(np.diff(rates, axis=0)) / middles[:, None] <= 1.01 * acceleration).all()
+        tips = robot.Ts_base_tcp(path.joints_rad)[:, :3, 3]
+        assert (np.linalg.norm(np.diff(tips, axis=0), axis=1) / step).max() <= 1.01 * tool
+        knots = JointPath(
+            times_ns=np.round(path.times_s * 1e9).astype(np.int64),
+            joints_rad=path.joints_rad,
+            width_times_ns=np.array([0]),
+            width_m=np.array([WIDTH_M]),
+            first_close_ns=None,
+        )
+        assert motion_failures(knots, robot) == []
+
+
+def test_rounded_corners_are_passed_without_a_stop_and_sharp_ones_with_one(pairs: Pairs) -> None:
+    home = pairs.problem.robot.home_rad
+    rows = home + np.array([[0, 0, 0, 0, 0, 0], [0.4, 0, 0, 0, 0, 0], [0.4, 0, 0, 0.4, 0, 0.0]])
+    quick, quick_rows = timed(pairs, rows)
+    slow, slow_rows = timed(pairs, rows, rounding=False)
+    assert quick[-1] < 0.8 * slow[-1]
+    speeds = np.linalg.norm(np.diff(quick_rows, axis=0), axis=1) / np.diff(quick)
+    assert speeds[3:-3].min() > 0.3
+    corner = np.abs(slow_rows - rows[1]).max(axis=1)
+    assert corner.min() == pytest.approx(0.0, abs=1e-9)  # it is passed exactly
+    assert np.abs(quick_rows - rows[1]).max(axis=1).min() > 0.01
+
+
+def test_the_tool_is_no_faster_than_asked(pairs: Pairs) -> None:
+    robot = pairs.problem.robot
+    rows = np.stack([pairs.starts[0], pairs.starts[0] + 0.2])
+    path = timed_path(pairs.world, rows, CONFIG, tool_m_s=0.05)
+    tips = robot.Ts_base_tcp(path.joints_rad)[:, :3, 3]
+    speeds = np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(path.times_s)
+    assert 0.045 < speeds.max() <= 0.0505
+
+
+def test_a_corner_beside_an_obstacle_is_rounded_less(pairs: Pairs) -> None:
+    """Whatever was rounded, the way that is followed is free."""
+    for index in range(len(pairs.kinds)):
+        path = timed_path(pairs.world, knots_of(pairs, index), CONFIG)
+        assert pairs.world.motion.blocked(path.joints_rad) < 0

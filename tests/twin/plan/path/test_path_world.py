@@ -7,12 +7,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from path_scene import EPS_M, WIDTH_M, Pairs, at, joints_at, problem_of_test, tool_down
+from small_plans import plan_of
 from twin.plan.path._motion import Motion
 
 from bridge.robots.robot import read_robot
-from bridge.task.plan import Plan
 from twin.plan.path.world import BOX, Carried, build_world
-from twin.plan.problem import Problem
 from twin.replay.clearance.bodies import SCENE
 from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.clearance.surroundings import Surroundings
@@ -185,16 +184,10 @@ def test_what_only_a_scenes_grid_shows_is_kept_away_from(pairs: Pairs) -> None:
     assert world.motion.blocked(np.stack([start, goal])) == 0
     outcome, _, knots, _ = world.motion.find(start, goal[None], 0, 1.0, 5000, 150_000, 60)
     assert outcome == 0
-    monitor = ClearanceMonitor(problem.scene, empty_plan(problem), hulls, ReplayConfig())
+    nothing = plan_of(robot=problem.robot.name, tau=())
+    monitor = ClearanceMonitor(problem.scene, nothing, hulls, ReplayConfig())
     for index, joints in enumerate(dense(knots)):
         assert monitor.measure(index, joints, WIDTH_M, {}) >= EPS_M
-
-
-def empty_plan(problem: Problem) -> Plan:
-    return Plan(
-        id="p", planner="", policy="", condition="", robot=problem.robot.name, frame="base_link",
-        instruction="", stages=(), tau=(),
-    )  # fmt: skip
 
 
 def dense(knots: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import coal
 import numpy as np
 import pytest
 from scipy import stats
+from upright import upright
 
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
@@ -33,11 +34,6 @@ def box_shape(size_m: tuple[float, float, float]) -> Shape:
     model = ObjectModel(id="box", shape="box", size_m=size_m, color_srgb=(0, 0, 0))
     vertices, triangles = shape_mesh(model)
     return Shape(vertices_m=vertices, triangles=triangles, source="test")
-
-
-def upright(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
-    q = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-    return se3.transform_from(q, np.array([x, y, z], dtype=np.float64))
 
 
 def problem_of(task: Task, poses: dict[str, np.ndarray], **scene: object) -> Problem:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_plans import plan_of, waypoint
 
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT, ROBOT_NAME
@@ -23,29 +24,8 @@ HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
 
 
 def plan_through(Ts: np.ndarray, step_s: float = 0.04) -> Plan:
-    tau = []
-    for index, T in enumerate(Ts):
-        q, p = se3.split(T)
-        tau.append(
-            Waypoint(
-                t_ns=round(index * step_s * 1e9),
-                p_m=tuple(p.tolist()),
-                q_wxyz=tuple(q.tolist()),
-                g=0,
-                width_m=0.08,
-            )
-        )
-    return Plan(
-        id="poses",
-        planner="test",
-        policy="scripted",
-        condition="without_replanning",
-        robot=ROBOT_NAME,
-        frame="base_link",
-        instruction="",
-        stages=(),
-        tau=tuple(tau),
-    )
+    tau = tuple(waypoint(index * step_s, T, 0.08) for index, T in enumerate(Ts))
+    return plan_of("poses", robot=ROBOT_NAME, tau=tau)
 
 
 def test_a_plan_for_another_robot_is_refused_with_both_names(script: SimpleNamespace) -> None:

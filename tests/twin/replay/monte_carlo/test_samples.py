@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
+from verdicts import verdict_of
 
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
@@ -43,16 +44,8 @@ def draws(
 
 
 def verdict(accepted: bool | None) -> Verdict:
-    yes = Factor(value=True)
-    return Verdict(
-        plan_id="p",
-        trajectory="planned",
-        mode="dynamic",
-        ik=yes,
-        clearance=yes,
-        terminal=Factor(value=accepted, cause="inside" if accepted is False else None),
-        engine="fake",
-        seed=0,
+    return verdict_of(
+        terminal=Factor(value=accepted, cause="inside" if accepted is False else None)
     )
 
 

@@ -21,6 +21,7 @@ from drawn_run import (
     write_recording,
     write_scene,
 )
+from verdicts import verdict_of
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -28,7 +29,6 @@ from bridge.errors import UsageError
 from bridge.exchange.lerobot.video import read_frames
 from bridge.geometry import se3
 from bridge.media.color import decode_color
-from bridge.task.verdict import Factor, Verdict
 from twin.physics.soft import SoftModel
 from twin.replay.images import RATE_HZ, render_replay
 from twin.replay.result import ReplayResult
@@ -48,12 +48,8 @@ def result_of(scene: ReplayScene, movable: str, nodes_m: np.ndarray | None = Non
     for T, s in zip(Ts, share, strict=True):
         T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, s])) @ T[:3, :3]
         T[:3, 3] += s * np.array([-0.05, 0.1, 0.08])
-    yes = Factor(value=True)
     return ReplayResult(
-        verdict=Verdict(
-            plan_id="p", trajectory="planned", mode="dynamic", ik=yes, clearance=yes,
-            terminal=yes, engine="e", seed=0,
-        ),
+        verdict=verdict_of(),
         stamps_ns=np.linspace(0, 2 * SECOND, 61).round().astype(np.int64),
         joints_rad=joints,
         width_m=np.full(61, 0.05),

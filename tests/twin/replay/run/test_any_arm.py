@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
+import small_plans
+from drawn_run import cloud
 from joint_samples import at_positions
 
 import robot_gst
@@ -26,7 +28,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.robots.robot import Robot, read_robot
-from bridge.task.plan import Plan, Waypoint
+from bridge.task.plan import Plan
 from bridge.task.verdict import Verdict
 from twin.gate.twin_process import Question, answer
 from twin.replay import runner
@@ -37,7 +39,7 @@ from twin.replay.verdict import replay_plan
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture
 from twin.robot.surface import link_surfaces
-from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
+from twin.scene.gaussians import write_ply
 from twin.scene.localise.episode import Phase
 from twin.scene.movable_scene import read_movable_scene
 from twin.scene.raster.rasteriser import Rasteriser
@@ -91,20 +93,16 @@ def line_plan(scene: ReplayScene) -> Plan:
     record = robot.record
     q, p = se3.split(robot.T_base_tcp(robot.home_rad))
     tau = tuple(
-        Waypoint(
-            t_ns=round(t * 1e9),
-            p_m=tuple((p + share * np.array([0.0, 0.08, -0.04])).tolist()),
-            q_wxyz=tuple(q.tolist()),
-            g=0,
-            width_m=record.gripper.max_width_m,
+        small_plans.waypoint(
+            t_s,
+            se3.transform_from(q, p + share * np.array([0.0, 0.08, -0.04])),
+            record.gripper.max_width_m,
         )
-        for t, share in ((0.0, 0.0), (1.5, 1.0), (3.0, 0.0))
+        for t_s, share in ((0.0, 0.0), (1.5, 1.0), (3.0, 0.0))
     )
-    return Plan(
-        id="line", planner="test", policy="scripted", condition="without_replanning",
-        robot=record.name, frame=record.base_frame, instruction="", stages=(), tau=tau,
-        task=scene.task.name,
-    )  # fmt: skip
+    return small_plans.plan_of(
+        "line", robot=record.name, frame=record.base_frame, tau=tau, task=scene.task.name
+    )
 
 
 def plan_of(case: Case, scene: ReplayScene, script: SimpleNamespace) -> Plan:
@@ -167,29 +165,18 @@ def T_base_side(scene: ReplayScene) -> np.ndarray:
 def write_scene(run: RunFolder, urdf: str) -> None:
     """A grey point far away, and the arm as its own surface has it."""
     run.scene_dir.mkdir()
-    write_ply(run.scene_dir / "background.ply", cloud(np.array([[0.0, 30.0, 0.0]]), GREY))
+    write_ply(run.scene_dir / "background.ply", cloud(np.array([[0.0, 30.0, 0.0]]), GREY, 0.008))
     parts: dict[str, list[np.ndarray]] = {}
     for item in link_surfaces(load_robot(urdf)):
         corners = item.vertices_m[item.triangles]
         parts.setdefault(item.link, []).append(corners.mean(axis=1)[:: 1 + len(corners) // 300])
-    links = {link: cloud(np.concatenate(points), BLUE) for link, points in parts.items()}
+    links = {link: cloud(np.concatenate(points), BLUE, 0.008) for link, points in parts.items()}
     record = {
         "schema_version": 1, "key": "k", "scene_hash": background_hash(run), "background": {},
         "sources": [{"id": "trial_1"}], "views": [], "objects": {},
         "robot": {"links": write_links(run, links)},
     }  # fmt: skip
     write_record(run, record)
-
-
-def cloud(points_m: np.ndarray, color: tuple[float, float, float]) -> GaussianCloud:
-    count = len(points_m)
-    return GaussianCloud(
-        means_m=as_float32(points_m),
-        quats_wxyz=as_float32(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))),
-        scales_log=as_float32(np.full((count, 3), np.log(0.008))),
-        opacities_logit=as_float32(np.full(count, 5.0)),
-        colors=as_float32(np.tile(color, (count, 1))),
-    )
 
 
 def raw_tool(robot: Robot, joints_rad: np.ndarray) -> np.ndarray:
@@ -218,11 +205,10 @@ def seen_from(scene: ReplayScene, p_base: np.ndarray) -> tuple[int, int]:
     ],
 )
 def test_an_arm_is_replayed_judged_and_drawn(
-    case: Case, tmp_path: Path, script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+    case: Case, run: RunFolder, script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = scene_of(case, script)
     plan = plan_of(case, scene, script)
-    run = RunFolder.create(tmp_path / "run")
     record_trial(run, plan, scene, tracks_of(plan, scene, script))
     write_scene(run, scene.urdf)
     start = StartState(Ts_base_object=dict(scene.Ts_base_object))
@@ -247,13 +233,12 @@ def test_an_arm_is_replayed_judged_and_drawn(
 
 
 def test_another_robot_can_be_named_than_the_recorded_description(
-    tmp_path: Path, script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder, script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A driver publishes the bare URDF under its own name: the file says the rest."""
     case = CASES["kinova"]
     scene = scene_of(case, script)
     plan = line_plan(scene)
-    run = RunFolder.create(tmp_path / "run")
     bare = read_robot(case.robot).arm_urdf()
     record_trial(run, plan, scene, tracks_of(plan, scene, script), urdf=bare)
     start = StartState(Ts_base_object=dict(scene.Ts_base_object))

@@ -2,7 +2,9 @@
 
 from typing import Any
 
-from bridge.task.verdict import Factor, Verdict
+from verdicts import verdict_of
+
+from bridge.task.verdict import Verdict
 from twin.replay.job import predicates_hold
 from twin.replay.summary import against_recorded, count_verdicts, describe_run
 
@@ -75,12 +77,8 @@ def test_every_answer_that_is_no_yes_is_listed_with_its_reason_once() -> None:
 
 def seen(*findings: tuple[str, bool | None]) -> Verdict:
     """What a recording says of each predicate."""
-    nothing = Factor(value=None)
-    return Verdict(
-        plan_id="p", trajectory="executed", mode="kinematic", ik=nothing, clearance=nothing,
-        terminal=nothing, engine="e", seed=0,
-        findings=tuple({"kind": kind, "value": value} for kind, value in findings),
-    )  # fmt: skip
+    said = tuple({"kind": kind, "value": value} for kind, value in findings)
+    return verdict_of(ik=None, clearance=None, terminal=None, mode="kinematic", findings=said)
 
 
 def test_what_nobody_found_was_not_seen_to_succeed() -> None:

@@ -1,6 +1,7 @@
-"""``robot-gst replay``: which trajectories are replayed, into which files, and what they hold."""
+"""``robot-gst replay``: which trajectories go into which files, and going on after a kill."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from joint_samples import at_positions
 from mcap.reader import make_reader
+from verdicts import verdict_of
 
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import string_to_cdr
@@ -18,25 +20,24 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.task.verdict import SAME_ENGINE, Factor, Verdict
+from bridge.task.verdict import SAME_ENGINE
 from bridge.terminal import Output
 from twin.replay import run_job as run_job_module
+from twin.replay import runner
 from twin.replay import runner as runner_module
 from twin.replay.config import ReplayConfig, ReplayRunConfig
-from twin.replay.job import ReplayJob, divergence_of, row_of_failure
+from twin.replay.job import ReplayJob, divergence_of, row_of_existing, row_of_failure
 from twin.replay.result import ReplayResult
-from twin.replay.runner import execution_of, replay_run
+from twin.replay.run_job import run_job
+from twin.replay.runner import execution_of, replay_run, there_already
 from twin.replay.scene import StartState, StartStates
-from twin.replay.summary import describe_run
+from twin.replay.summary import count_verdicts, describe_run
 from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000
 START = T0 + 2_000_000_000
 QUIET = Output(quiet=True)
-VERDICT = Verdict(
-    plan_id="round-1", trajectory="planned", mode="dynamic", ik=Factor(value=True),
-    clearance=Factor(value=True), terminal=Factor(value=True), engine="fake", seed=0,
-)  # fmt: skip
+VERDICT = verdict_of("round-1")
 
 
 @pytest.fixture
@@ -268,3 +269,64 @@ def test_a_recording_that_ends_while_the_robot_moves_says_so(
         assert row["accepted"] is None
     assert summary["counts"]["planned dynamic"]["n"] == 1
     assert summary["counts"]["planned dynamic, never executed"]["n"] == 1
+
+
+BRIEF = ReplayConfig(settle_after_s=0.3, settle_before_s=0.1)
+
+
+def test_a_half_written_replay_does_not_count(jobs: list[ReplayJob]) -> None:
+    path = jobs[0].path()
+    path.with_name(path.name + ".part").write_bytes(b"half")
+    assert row_of_existing(jobs[0]) is None
+    path.write_bytes(b"torn")
+    assert row_of_existing(jobs[0]) is None
+
+
+def test_what_is_asked_for_last_counts_also_when_it_was_made_first(
+    jobs: list[ReplayJob], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The newest replay of a trajectory is the one that an evaluation takes."""
+    monkeypatch.setattr(runner, "row_of_existing", lambda job: {} if job.path().exists() else None)
+    sampled = replace(jobs[0], config=replace(BRIEF, samples=4))
+    for age_s, job in enumerate((sampled, jobs[0], jobs[1])):
+        job.path().touch()
+        os.utime(job.path(), ns=(0, (10 - age_s) * 10**9))
+    before = {job.path(): job.path().stat().st_mtime_ns for job in (jobs[0], jobs[1], sampled)}
+
+    rows, todo = there_already(jobs, force=False)
+    assert (rows, todo) == ([{}, {}], [jobs[2]])
+    after = {path: path.stat().st_mtime_ns for path in before}
+    assert after[jobs[0].path()] > after[sampled.path()] == before[sampled.path()]
+    assert there_already(jobs, force=True) == ([], jobs)
+
+
+def test_settings_of_samples_name_another_file(jobs: list[ReplayJob]) -> None:
+    sampled = replace(jobs[0], config=replace(BRIEF, samples=4))
+    assert sampled.path() != jobs[0].path()
+    assert sampled.cost() == 5 * jobs[0].cost()
+
+
+@pytest.mark.slow
+def test_what_a_killed_replay_left_is_made_again_and_whole(jobs: list[ReplayJob]) -> None:
+    job = replace(jobs[0], config=replace(BRIEF, samples=1))
+    part = job.path().with_name(job.path().name + ".part")
+    writer = EpisodeWriter(job.path())
+    writer.describe(EpisodeInfo(id="trial_0001", kind="trial"))
+    writer.abandon()
+    assert part.is_file()
+    assert row_of_existing(job) is None
+    row = run_job(job)
+    assert row["error"] is None
+    assert not part.exists()
+    again = row_of_existing(job)
+    assert again is not None
+    assert again["skipped"]
+    assert again == {**row, "skipped": True}
+    episode = Episode.open(job.path())
+    ((_, verdict),) = streams.verdicts(episode)
+    assert verdict.p_success == row["p_success"]
+    assert verdict.p_success is not None
+    assert verdict.p_success["n"] == 1
+    assert "varied replays that succeed:" in describe_run(
+        {"rows": [row], "counts": count_verdicts([row])}
+    )

@@ -1,4 +1,4 @@
-"""``robot-gst replay`` of trials that nobody planned, and of episodes with nothing to replay."""
+"""``robot-gst replay`` of trials that nobody planned, of nothing, and without a scene to draw."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,14 +19,17 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
 from bridge.episode.writer import EpisodeWriter
+from bridge.errors import PathNotFoundError
+from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin import cli
 from twin.replay import runner as runner_module
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.result import ReplayResult
-from twin.replay.runner import replay_run
+from twin.replay.runner import describe_undrawn, replay_run
 from twin.replay.scene import StartState, StartStates
 from twin.scene.localise.episode import Phase
+from twin.scene.store.folder import write_record
 
 START = 1_700_000_000_000_000_000
 QUICK = ReplayRunConfig(replay=ReplayConfig(settle_after_s=0.5))
@@ -196,3 +199,25 @@ def test_of_objects_never_seen_only_the_robot_is_replayed_and_that_is_said(
         "only the robot is replayed; not seen before it moved: cube, box (no quiet frames)" in said
     )
     assert "executed kinematic" in said
+
+
+def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(run: RunFolder) -> None:
+    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan", kind="scan"))
+    with pytest.raises(PathNotFoundError, match=r"--render draws it.*robot-gst rebuild RUN"):
+        replay_run(run, ReplayRunConfig(render=True), Output(quiet=True))
+
+
+def test_what_was_not_scanned_and_a_missing_robot_are_named_with_the_reason(run: RunFolder) -> None:
+    run.scene_dir.mkdir()
+    record = {
+        "schema_version": 1, "key": "k", "scene_hash": "h", "background": {}, "sources": [],
+        "views": [], "objects": {"box": {}}, "objects_remark": "cube not found: hidden",
+        "robot": {"links": {}, "remark": "no joints"},
+    }  # fmt: skip
+    write_record(run, record)
+    assert describe_undrawn(run, [load_task("cube_into_box")]) == [
+        "cube was not scanned: drawn from the task's shape, with colours from before the first "
+        "motion (cube not found: hidden)",
+        "robot: not in the scene, not in pictures (no joints)",
+    ]

@@ -8,10 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scripted_plans import joints_over
+from verdicts import verdict_of
 
 from bridge.geometry import se3
 from bridge.task.plan import Plan
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Factor
 from twin.replay.audit import NEAR_M, audit
 from twin.replay.checks import limited_to_task
 from twin.replay.clearance.monitor import ClearanceMonitor
@@ -30,10 +31,6 @@ OVER_M = 0.002
 
 
 YES = Factor(value=True)
-VERDICT = Verdict(
-    plan_id="p", trajectory="planned", mode="dynamic", ik=YES, clearance=YES, terminal=YES,
-    engine="fake", seed=0,
-)  # fmt: skip
 
 
 def held(
@@ -42,7 +39,7 @@ def held(
     """A replay that goes through postures, whose clearance said the same of each."""
     count = len(postures_rad)
     return ReplayResult(
-        verdict=VERDICT,
+        verdict=verdict_of(),
         stamps_ns=10_000_000 * np.arange(count),
         joints_rad=np.stack(postures_rad),
         width_m=np.full(count, width_m),
