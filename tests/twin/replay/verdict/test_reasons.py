@@ -168,7 +168,9 @@ def test_the_gates_process_says_what_the_replay_says_and_adds_samples(
         # Beside what a replay checks, the gate knows where the arm is, and audits its yes.
         more = {name: first.checks[name].value for name in ("start", "audit")}
         assert more == {"start": True, "audit": True}
-        same = replace(first, p_success=None, reason=None, checks=good.verdict.checks)
+        assert first.samples is not None
+        assert first.samples["accepted"] == [True]
+        same = replace(first, p_success=None, samples=None, reason=None, checks=good.verdict.checks)
         assert same == good.verdict
         assert "within the cavity of box" in str(first.reason)
         assert first.checks.items() >= good.verdict.checks.items()
