@@ -55,3 +55,11 @@ def test_help_shows_at_most_fifteen_options_and_the_page_lists_the_others() -> N
         rows = [line for line in listed.splitlines() if f"`{command}`" in line]
         missing = {key for key in keys if key not in shown and f"`{key}`" not in "".join(rows)}
         assert missing == set(), command
+
+
+def test_pages_name_commands_that_are_there() -> None:
+    there = {command.name for command in robot_gst.commands()}
+    folder = ROOT / "dashboards" / "templates"
+    for page in sorted(folder.glob("*.html")):
+        for first, second in re.findall(r"robot-gst ([a-z]+)(?: ([a-z0-9]+))?", page.read_text()):
+            assert first in there or f"{first} {second}" in there, (page.name, first, second)
