@@ -9,7 +9,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bridge.errors import PathNotFoundError, UsageError
@@ -70,32 +70,35 @@ def propose(path: Path) -> tuple[Robot, list[str]]:
     """
     if not path.is_file():
         raise PathNotFoundError(path=path, what="robot description", hint="Check the path.")
-    robot = Robot(name=path.stem, urdf=path.name, joints=(), folder=path.absolute().parent)
-    robot = _with_meshes(robot, path)
+    robot = Robot(
+        name=path.stem,
+        urdf=path.name,
+        joints=(),
+        mesh_folders=_mesh_folders(path),
+        folder=path.absolute().parent,
+    )
     root = robot.parsed(robot.urdf)
     joints = _joints(root)
     if len(joints) > MOST_JOINTS:
         raise UsageError(f"{path} has {len(joints)} joints; up to {MOST_JOINTS} are looked at.")
     arm, notes = _arm(joints, path)
     below = _below(arm[-1].child, joints)
-    gripper, told = _gripper([joint for joint in below if joint.kind != "fixed"], below)
+    gripper, told = _gripper([joint for joint in below if joint.kind != "fixed"])
     driven = {joint.name for joint in arm} | {finger.joint for finger in gripper.fingers}
     tool_frame, unsure = _tool(arm[-1].child, below, gripper)
-    proposed = Robot(
+    proposed = replace(
+        robot,
         name=re.sub(r"\W+", "_", root.get("name") or path.stem),
-        urdf=path.name,
         joints=tuple(joint.name for joint in arm),
         base_frame=_root(arm[0].parent, joints),
         tool_frame=tool_frame,
         gripper=gripper,
         held=tuple(each.name for each in joints if each.moves and each.name not in driven),
-        mesh_folders=robot.mesh_folders,
-        folder=robot.folder,
     )
     return proposed, notes + told + unsure
 
 
-def _with_meshes(robot: Robot, path: Path) -> Robot:
+def _mesh_folders(path: Path) -> dict[str, str]:
     """Find the folders of packages that its meshes name, among those above it and beside them."""
     text = path.read_text(errors="replace")
     folders: dict[str, str] = {}
@@ -106,7 +109,7 @@ def _with_meshes(robot: Robot, path: Path) -> Robot:
         there = next((place for place in places if (place / mesh).is_file()), None)
         if there is not None:
             folders[package] = str(there)
-    return Robot(**{**vars(robot), "mesh_folders": folders})
+    return folders
 
 
 def _joints(root: ET.Element) -> list[Joint]:
@@ -195,7 +198,7 @@ def _root(link: str, joints: list[Joint]) -> str:
     return link
 
 
-def _gripper(moving: list[Joint], below: list[Joint]) -> tuple[Gripper, list[str]]:
+def _gripper(moving: list[Joint]) -> tuple[Gripper, list[str]]:
     """Two jaws that slide, where there are such; what turns or is more than two is held."""
     jaws = [joint for joint in moving if joint.kind == "prismatic" and joint.opens]
     span_m = sum(joint.upper - joint.lower for joint in jaws)
