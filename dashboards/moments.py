@@ -1,6 +1,7 @@
 """The moment at which recording and twin of a trial first differ, and why."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +15,7 @@ from bridge.errors import GstError
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 from evaluator.compare.attribution import SAID, attributed
+from evaluator.review_index import stamp_of
 from evaluator.trial_row import TrialRow
 from twin.replay.deciding import goes_with_success, what_decides
 
@@ -39,20 +41,14 @@ class Moment:
 
 def moment_of(run: RunFolder, row: TrialRow) -> Moment | None:
     """Find the first divergence that the replays of a trial tell, or the first failing factor."""
-    for name in (row.executed_replay, row.planned_replay):
-        path = run.derived_dir / name if name else None
-        if path is None or not path.is_file():
-            continue
-        status = path.stat()
-        moment = _moment(path, status.st_mtime_ns, status.st_size)
-        if moment is not None:
-            return moment
-    return None
+    names = filter(None, (row.executed_replay, row.planned_replay))
+    paths = (run.derived_dir / name for name in names)
+    return next(filter(None, (_moment(path, stamp_of(path)) for path in paths)), None)
 
 
 @lru_cache(maxsize=4096)
-def _moment(path: Path, _mtime_ns: int, _size: int) -> Moment | None:
-    try:
+def _moment(path: Path, _stamp: str) -> Moment | None:
+    with suppress(GstError):  # the trial's own page says what is wrong with the file
         episode = Episode.open(path)
         messages = episode.messages(episode.topics_of_type(schema.DIVERGENCE))
         for message in messages:
@@ -67,8 +63,6 @@ def _moment(path: Path, _mtime_ns: int, _size: int) -> Moment | None:
             if factor is not None and factor.first_t_ns is not None:
                 text = factor.detail or factor.cause or f"{name} fails in the twin"
                 return Moment(plan_id=verdict.plan_id, t_ns=factor.first_t_ns, text=text)
-    except GstError:
-        return None  # the trial's own page says what is wrong with the file
     return None
 
 
@@ -104,8 +98,13 @@ def cause_of(run: RunFolder, row: TrialRow) -> Cause | None:
 
 def _verdict_of(run: RunFolder, row: TrialRow) -> Verdict | None:
     path = run.derived_dir / (row.twin_replay or "")
+    return _verdict(path, stamp_of(path)) if row.twin_replay else None
+
+
+@lru_cache(maxsize=64)
+def _verdict(path: Path, _stamp: str) -> Verdict | None:
     try:
-        return streams.verdicts(Episode.open(path))[-1][1] if path.is_file() else None
+        return streams.verdicts(Episode.open(path))[-1][1]
     except (GstError, IndexError):  # the trial's own page says what is wrong with the file
         return None
 

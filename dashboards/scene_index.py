@@ -6,6 +6,7 @@ poses and intrinsics in one of a few files. What is read becomes a proposal of `
 
 import json
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from bridge.errors import UsageError
 from bridge.sources.folder.frames import read_color, read_stored_depth
 from bridge.sources.folder.scene_json import INDEX_NAME
 from bridge.terminal import Output
+from bridge.whole_file import write_whole
 
 COLOR, DEPTH = ("color", "colour", "rgb", "image", "images"), ("depth", "depths")
 POSES, PATHS = ("pose", "poses"), ("trajectory.log", "traj.txt", "traj_w_c.txt")
@@ -31,6 +33,10 @@ UNIT_M = 0.001
 def subfolder(folder: Path, names: tuple[str, ...]) -> Path | None:
     """The first folder of these names that is there."""
     return next((folder / name for name in names if (folder / name).is_dir()), None)
+
+
+def _first(files: Iterable[Path]) -> Path | None:
+    return next((path for path in files if path.is_file()), None)
 
 
 def is_paired(folder: Path) -> bool:
@@ -81,7 +87,7 @@ def propose_index(folder: Path) -> tuple[dict[str, Any], list[str]]:
 
 def _color_camera(folder: Path, shown: tuple[int, int], size: tuple[int, int]) -> dict[str, Any]:
     """Say by which camera colour is seen: that of depth, or one of its own where depth is."""
-    place = next((folder / name for name in COLOR_MATRICES if (folder / name).is_file()), None)
+    place = _first(folder / name for name in COLOR_MATRICES)
     if shown[0] * size[1] == shown[1] * size[0]:
         return {"color_registered_to_depth": True}
     if place is None:
@@ -99,7 +105,7 @@ def write_index(folder: Path, path: Path, /, *, output: Output) -> int:
     if path.resolve() != folder.resolve() / INDEX_NAME:
         raise UsageError(f"its index lies in it: robot-gst open {folder} {folder / INDEX_NAME}")
     index, notes = propose_index(folder)
-    path.write_text(json.dumps(index, indent=1))
+    write_whole(path, json.dumps(index, indent=1).encode())
     posed = "" if "no poses" not in notes else ", then rebuild RUN --poses odometry"
     output.say(f"{path} was written; look at it. next: robot-gst import rgbd {folder} RUN{posed}")
     return 0
@@ -122,10 +128,8 @@ def _poses(folder: Path, frames: list[int]) -> tuple[dict[int, Float[np.ndarray,
     if files is not None:
         texts = {int(re.findall(r"\d+", p.stem)[-1]): p for p in files.glob("*[0-9].txt")}
         return {n: _matrix(_rows(path), path, 4) for n, path in texts.items()}, files.name
-    for name in PATHS:
-        if (folder / name).is_file():
-            return _path(folder / name, frames), name
-    return {}, ""
+    path = _first(folder / name for name in PATHS)
+    return (_path(path, frames), path.name) if path else ({}, "")
 
 
 def _path(path: Path, frames: list[int]) -> dict[int, Float[np.ndarray, "4 4"]]:
@@ -162,9 +166,7 @@ def _unit_m(folder: Path) -> float:
 
 def _parameters(folder: Path) -> dict[str, Any]:
     """What Replica says of its camera, in the folder or above it."""
-    path = next(
-        (p / PARAMETERS for p in (folder, folder.parent) if (p / PARAMETERS).is_file()), None
-    )
+    path = _first(place / PARAMETERS for place in (folder, folder.parent))
     return dict(_read_json(path).get("camera", {})) if path else {}
 
 
@@ -180,7 +182,7 @@ def _intrinsics(folder: Path) -> dict[str, float]:
     known = _parameters(folder)
     if {"fx", "fy", "cx", "cy"} <= known.keys():
         return {name: float(known[name]) for name in ("fx", "fy", "cx", "cy")}
-    place = next((folder / n for n in (*OPEN3D, *MATRICES) if (folder / n).is_file()), None)
+    place = _first(folder / name for name in (*OPEN3D, *MATRICES))
     if place is None:
         names = ", ".join((*OPEN3D, *MATRICES, PARAMETERS))
         raise UsageError(

@@ -148,7 +148,22 @@ KINEMATIC_ENGINE = "pinocchio"
 SOFT_ENGINE = "xpbd"
 
 
-def command_of(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> "Commanded":
+@dataclass(frozen=True, kw_only=True)
+class Commanded:
+    """What the arm is to do, and what was found wrong with that already."""
+
+    path: JointPath
+    trajectory: str
+    failures: list[Failure] = field(default_factory=list)
+    """Of inverse kinematics and of the path itself."""
+    unreachable_ns: int | None = None
+    checks: dict[str, list[Failure]] = field(default_factory=dict)
+    """Of the checks beside I(tau)."""
+    unknown: str | None = None
+    """A limit that nobody knows."""
+
+
+def command_of(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> Commanded:
     """What a plan commands, and what is wrong with that before anything moves.
 
     Waypoints, inverse kinematics, limits and self-collision; the start is checked where the scene
@@ -180,7 +195,7 @@ def replay_plan(
     scene: ReplayScene,
     config: ReplayConfig,
     *,
-    commanded: "Commanded | None" = None,
+    commanded: Commanded | None = None,
     refuse_early: bool = False,
 ) -> ReplayResult:
     """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
@@ -204,21 +219,6 @@ def replay_joints(
     failures = check_path(path, robot, hulls_of(robot))
     commanded = Commanded(path=path, trajectory="executed", failures=failures)
     return _replay(commanded, plan, scene, config)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Commanded:
-    """What the arm is to do, and what was found wrong with that already."""
-
-    path: JointPath
-    trajectory: str
-    failures: list[Failure] = field(default_factory=list)
-    """Of inverse kinematics and of the path itself."""
-    unreachable_ns: int | None = None
-    checks: dict[str, list[Failure]] = field(default_factory=dict)
-    """Of the checks beside I(tau)."""
-    unknown: str | None = None
-    """A limit that nobody knows."""
 
 
 @dataclass(frozen=True, kw_only=True)
