@@ -3,7 +3,6 @@
 import zlib
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from bridge.episode.mcap.format import (
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
+    MessageHead,
     RecordSpan,
     attachment_of,
     message_head,
@@ -47,21 +47,6 @@ def _refuse(text: str) -> None:
 
 
 _FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
-
-
-LOOSE_BYTES = 4 << 20
-"""Messages outside chunks are read so many bytes at a time; one message may be larger."""
-
-
-@dataclass(kw_only=True, slots=True)
-class LooseMessages:
-    """Messages outside chunks that lie one behind the other."""
-
-    start: int
-    end: int
-    first_ns: int
-    last_ns: int
-    channel_ids: set[int]
 
 
 def damaged(path: Path, error: BaseException) -> EpisodeError:
@@ -88,20 +73,21 @@ class McapFile:
                 summary = rebuild_summary(stream, self.data_end)
             self.summary = summary
             self.metadata = list(self._read_metadata(stream))
-        self._loose: list[LooseMessages] | None = None
+        self._loose: list[MessageHead] | None = None
 
     def _read_metadata(self, stream: ByteStream) -> Iterator[records.Metadata]:
         for entry in self.summary.metadata_indexes:
-            place = self._indexed(stream, entry.offset, mcap_format.METADATA)
+            place = self.indexed(stream, entry.offset, mcap_format.METADATA)
             record = parse(place.opcode, read_body(stream, place))
             if isinstance(record, records.Metadata):
                 yield record
 
-    def _indexed(self, stream: ByteStream, offset: int, opcode: int) -> RecordSpan:
+    def indexed(self, stream: ByteStream, offset: int, opcode: int) -> RecordSpan:
         """Return the place of the record an index points at."""
         place = next(walk(stream, offset, self.data_end), None)
         if place is None or place.opcode != opcode:
-            raise BrokenRecordError(f"the index points at byte {offset}, where no such record lies")
+            kind = "chunk" if opcode == mcap_format.CHUNK else "such record"
+            raise BrokenRecordError(f"the index points at byte {offset}, where no {kind} lies")
         return place
 
     def attachment(self, name: str) -> bytes | None:
@@ -115,18 +101,18 @@ class McapFile:
         with self.path.open("rb") as stream:
             for entry in self.summary.attachment_indexes:
                 if name in (None, entry.name):
-                    place = self._indexed(stream, entry.offset, mcap_format.ATTACHMENT)
+                    place = self.indexed(stream, entry.offset, mcap_format.ATTACHMENT)
                     yield attachment_of(stream, place).record
 
     def schema_of(self, channel: records.Channel) -> records.Schema | None:
         """Return the schema of a channel, or None where it has none."""
         return self.summary.schemas.get(channel.schema_id)
 
-    def loose(self) -> list[LooseMessages]:
+    def loose(self) -> list[MessageHead]:
         """Return the messages outside chunks; found once, between the records that are indexed."""
         if self._loose is None:
             with self.path.open("rb") as stream:
-                self._loose = [each for gap in self._gaps() for each in _loose_in(stream, *gap)]
+                self._loose = [each for gap in self._gaps() for each in _messages_in(stream, *gap)]
         return self._loose
 
     def _gaps(self) -> Iterator[tuple[int, int]]:
@@ -145,25 +131,11 @@ class McapFile:
             yield at, self.data_end
 
 
-def _loose_in(stream: ByteStream, start: int, end: int) -> Iterator[LooseMessages]:
-    found: LooseMessages | None = None
+def _messages_in(stream: ByteStream, start: int, end: int) -> Iterator[MessageHead]:
     for place in walk(stream, start, end):
-        if place.opcode != MESSAGE:
-            continue
-        stream.seek(place.offset)
-        head = message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
-        at_ns = head.log_time_ns
-        if found is None or found.end < place.offset or place.end - found.start > LOOSE_BYTES:
-            if found is not None:
-                yield found
-            found = LooseMessages(
-                start=place.offset, end=place.end, first_ns=at_ns, last_ns=at_ns, channel_ids=set()
-            )
-        found.end = place.end
-        found.first_ns, found.last_ns = min(found.first_ns, at_ns), max(found.last_ns, at_ns)
-        found.channel_ids.add(head.channel_id)
-    if found is not None:
-        yield found
+        if place.opcode == MESSAGE:
+            stream.seek(place.offset)
+            yield message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
 
 
 def read_header(stream: ByteStream) -> records.Header:
