@@ -84,7 +84,6 @@ class ArmPublisher:
         state = schema.JOINT_STATE
         base = robot.base_frame
         targets = joint_writer(robot.joints)
-        width = joint_writer((GRIPPER_WIDTH,))
         speed = joint_writer((messages.SPEED_NAME,))
         joints = joint_writer(robot.joints, velocities=True)
         self._joints = _Topic(cell_topic(cell, JOINT_STATES), state, joints)
@@ -93,7 +92,7 @@ class ArmPublisher:
         self._wrench = _Topic(
             cell_topic(cell, TCP_WRENCH), schema.WRENCH_STAMPED, messages.wrench_writer(base)
         )
-        self._width = _Topic(cell_topic(cell, GRIPPER_STATE), state, width)
+        self._width = _Topic(cell_topic(cell, GRIPPER_STATE), state, joint_writer((GRIPPER_WIDTH,)))
         self._frame = _Topic(TF, schema.TF_MESSAGE, messages.frame_writer(base))
         self._speed = _Topic(cell_topic(cell, SPEED_SCALING), state, speed)
         self._streams: dict[str, NumberedPublisher] = {}
