@@ -3,7 +3,6 @@
 import zlib
 from collections import deque
 from collections.abc import Iterator
-from functools import lru_cache
 from pathlib import Path
 
 from mcap import records
@@ -12,13 +11,11 @@ from mcap.summary import Summary
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.data_walk import DataWalk
 from bridge.episode.mcap.format import (
-    CHANNEL,
     FOOTER_FIELDS,
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
     RECORD_HEAD,
-    SCHEMA,
 )
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
@@ -176,18 +173,9 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
         raise BrokenRecordError("its summary has another CRC than it declares")
     summary = Summary()
     for opcode, at, length in records_in(section[: footer_at - footer.summary_start]):
-        body = section[at + RECORD_HEAD.size : at + RECORD_HEAD.size + length]
-        is_shared = opcode in (SCHEMA, CHANNEL) and length <= _SHARED_BYTES
-        _add(summary, (_parse_once if is_shared else parse)(opcode, body))
+        start = at + RECORD_HEAD.size
+        _add(summary, parse(opcode, section[start : start + length]))
     return summary
-
-
-_SHARED_BYTES = 1 << 14
-"""Longer definitions are not remembered."""
-
-
-_parse_once = lru_cache(maxsize=1024)(parse)
-"""Thousands of episodes repeat the same schemas and channels; nobody changes a record."""
 
 
 def _add(summary: Summary, record: records.McapRecord | None) -> None:

@@ -4,7 +4,6 @@ Nothing but the front of the file is believed: no summary, no index. Damage is s
 a later chunk can be found. Memory is bounded by one chunk.
 """
 
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -260,8 +259,7 @@ def _index_bytes(front: bytes) -> int:
 
 def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSpan:
     place = RecordSpan(mcap.ATTACHMENT, offset, length - mcap.RECORD_HEAD.size)
-    with os.fdopen(file.descriptor, "rb", closefd=False) as stream:
-        record, data_size = attachment_of(stream, place, keep=False)
+    record, data_size = attachment_of(file.stream, place, keep=False)
     return AttachmentSpan(offset=offset, length=length, record=record, data_size=data_size)
 
 
