@@ -22,7 +22,7 @@ from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChun
 from bridge.episode.mcap.format import Buffer, crc32
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
-from bridge.episode.mcap.walk import RecordSpan, attachment_entry, chunk_entry
+from bridge.episode.mcap.walk import attachment_entry, chunk_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
 
@@ -189,8 +189,7 @@ class CopyTarget:
         offset = self.section.file.offset
         for block in self._source.blocks(found.offset, found.length):
             self.section.file.append([block])
-        span = RecordSpan.between(mcap.ATTACHMENT, offset, self.section.file.offset)
-        entry = attachment_entry(span, found.record, found.data_size)
+        entry = attachment_entry(offset, found.length, found.record, found.data_size)
         self.section.summary.add_index(entry)
 
 
@@ -237,7 +236,7 @@ def verbatim(found: Chunk) -> EncodedChunk:
     if has_wrong_times(found):
         front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
         buffers = [front, memoryview(found.raw)[len(front) :]]
-    entry = chunk_entry(RecordSpan.between(mcap.CHUNK, 0, found.length), found.head)
+    entry = chunk_entry(0, found.length, found.head)
     entry.message_start_time, entry.message_end_time = start_ns, end_ns
     return EncodedChunk(buffers=buffers, entry=entry, index=found.contents.index)
 

@@ -11,7 +11,6 @@ import zstandard
 from mcap.records import McapRecord, Schema
 
 from bridge.episode.mcap import format as mcap
-from bridge.episode.mcap.file import read_footer
 from bridge.episode.mcap.format import (
     CHANNEL,
     MESSAGE,
@@ -23,8 +22,10 @@ from bridge.episode.mcap.format import (
 from bridge.episode.mcap.walk import (
     MAX_CHUNK_BYTES,
     BrokenRecordError,
+    ByteStream,
     ChunkHead,
     parse,
+    read_footer,
     records_in,
 )
 
@@ -34,10 +35,10 @@ BLOCK_BYTES = 1 << 20
 class RecordFile:
     """Reads pieces of an open file."""
 
-    def __init__(self, descriptor: int) -> None:
-        """Use a descriptor that stays its owner's."""
-        self.stream = os.fdopen(descriptor, "rb", closefd=False)
-        self.size = self.stream.seek(0, os.SEEK_END)
+    def __init__(self, stream: ByteStream, size: int | None = None) -> None:
+        """Use a stream that stays its owner's; with ``size`` only so many of its first bytes."""
+        self.stream = stream
+        self.size = stream.seek(0, os.SEEK_END) if size is None else size
 
     def read(self, offset: int, size: int) -> bytes:
         """Return up to ``size`` bytes, fewer only at the end of the file."""

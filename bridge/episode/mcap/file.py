@@ -1,6 +1,5 @@
 """One finished MCAP file: its summary, its metadata, and where its messages lie."""
 
-import zlib
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,13 +8,12 @@ from mcap import records
 from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.damaged import RecordFile
 from bridge.episode.mcap.data_walk import DataWalk
 from bridge.episode.mcap.format import (
-    FOOTER_FIELDS,
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
-    RECORD_HEAD,
 )
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
@@ -26,7 +24,9 @@ from bridge.episode.mcap.walk import (
     message_head,
     parse,
     read_body,
-    records_in,
+    read_footer,
+    read_header,
+    read_summary,
     walk,
 )
 from bridge.errors import EpisodeError
@@ -34,16 +34,13 @@ from bridge.errors import EpisodeError
 
 def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     """Read the whole data section once; every chunk is unpacked and its CRC checked."""
-    found = DataWalk(stream, fault=_refuse, doubt=lambda text: None)
-    deque(found.messages(data_end), maxlen=0)
+    found = DataWalk(RecordFile(stream, data_end), fault=_refuse, doubt=lambda text: None)
+    deque(found.messages(), maxlen=0)
     return found.seen.to_summary()
 
 
 def _refuse(text: str) -> None:
     raise BrokenRecordError(text)
-
-
-_FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
 
 
 def damaged(path: Path, error: BaseException) -> EpisodeError:
@@ -133,64 +130,6 @@ def _messages_in(stream: ByteStream, start: int, end: int) -> Iterator[MessageHe
         if place.opcode == MESSAGE:
             stream.seek(place.offset)
             yield message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
-
-
-def read_header(stream: ByteStream) -> records.Header:
-    """Read magic and first record; raises BrokenRecordError."""
-    if stream.read(len(MAGIC)) != MAGIC:
-        raise BrokenRecordError("it does not begin as an MCAP file does")
-    place = next(walk(stream, len(MAGIC), stream.seek(0, 2)), None)
-    record = parse(place.opcode, read_body(stream, place)) if place else None
-    if not isinstance(record, records.Header):
-        raise BrokenRecordError("its first record is no header")
-    return record
-
-
-def read_footer(stream: ByteStream) -> tuple[records.Footer, int]:
-    """Read the last record and say where it begins; raises BrokenRecordError."""
-    at = stream.seek(0, 2) - _FOOTER_BYTES
-    stream.seek(max(at, 0))
-    tail = stream.read(_FOOTER_BYTES)
-    if len(tail) < _FOOTER_BYTES or not tail.endswith(MAGIC):
-        raise BrokenRecordError("it does not end as a finished MCAP file does")
-    footer = parse(tail[0], tail[RECORD_HEAD.size : -len(MAGIC)])
-    if not isinstance(footer, records.Footer):
-        raise BrokenRecordError("its last record is no footer")
-    if footer.summary_start > at:
-        message = f"its summary should begin at byte {footer.summary_start}, behind its footer"
-        raise BrokenRecordError(message)
-    return footer, at
-
-
-def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> Summary | None:
-    """Read the summary section with its CRC checked, None where there is none."""
-    if not footer.summary_start:
-        return None
-    stream.seek(footer.summary_start)
-    # The CRC covers everything up to itself, the last field of the footer.
-    section = stream.read(footer_at + RECORD_HEAD.size + 16 - footer.summary_start)
-    if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
-        raise BrokenRecordError("its summary has another CRC than it declares")
-    summary = Summary()
-    for opcode, at, length in records_in(section[: footer_at - footer.summary_start]):
-        start = at + RECORD_HEAD.size
-        _add(summary, parse(opcode, section[start : start + length]))
-    return summary
-
-
-def _add(summary: Summary, record: records.McapRecord | None) -> None:
-    if isinstance(record, records.Statistics):
-        summary.statistics = record
-    elif isinstance(record, records.Schema):
-        summary.schemas[record.id] = record
-    elif isinstance(record, records.Channel):
-        summary.channels[record.id] = record
-    elif isinstance(record, records.AttachmentIndex):
-        summary.attachment_indexes.append(record)
-    elif isinstance(record, records.ChunkIndex):
-        summary.chunk_indexes.append(record)
-    elif isinstance(record, records.MetadataIndex):
-        summary.metadata_indexes.append(record)
 
 
 def _is_complete(summary: Summary) -> bool:

@@ -61,6 +61,8 @@ class Chunk(Span):
 
     raw: bytes
     head: ChunkHead
+    records: bytes
+    """Unpacked."""
     contents: Contents
 
 
@@ -221,7 +223,9 @@ def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
     contents = walk_records(records)
     if contents.size != len(records):
         raise BrokenRecordError("a chunk is damaged: its records are torn")
-    return Chunk(offset=offset, length=len(raw), raw=raw, head=head, contents=contents)
+    return Chunk(
+        offset=offset, length=len(raw), raw=raw, head=head, records=records, contents=contents
+    )
 
 
 def _read_message(offset: int, length: int, front: bytes) -> TopMessage:

@@ -15,10 +15,13 @@ import zstandard
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
+from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.format import (
     CHUNK_FIELDS,
+    FOOTER_FIELDS,
+    MAGIC,
     MESSAGE,
     MESSAGE_FIELDS,
     MESSAGE_HEAD,
@@ -75,26 +78,14 @@ class RecordSpan(NamedTuple):
         """Where the next record begins."""
         return self.offset + RECORD_HEAD.size + self.length
 
-    @staticmethod
-    def between(opcode: int, start: int, end: int) -> "RecordSpan":
-        """Say the same of a record by its first and its last byte."""
-        return RecordSpan(opcode, start, end - start - RECORD_HEAD.size)
-
-
-def metadata_entry(place: RecordSpan, record: records.Metadata) -> records.MetadataIndex:
-    """Make the index entry of a metadata record."""
-    return records.MetadataIndex(
-        offset=place.offset, length=place.end - place.offset, name=record.name
-    )
-
 
 def attachment_entry(
-    place: RecordSpan, record: records.Attachment, data_size: int
+    offset: int, length: int, record: records.Attachment, data_size: int
 ) -> records.AttachmentIndex:
     """Make the index entry of an attachment."""
     return records.AttachmentIndex(
-        offset=place.offset,
-        length=place.end - place.offset,
+        offset=offset,
+        length=length,
         log_time=record.log_time,
         create_time=record.create_time,
         data_size=data_size,
@@ -262,11 +253,11 @@ def parse_chunk_head(front: bytes, length: int) -> ChunkHead:
     return ChunkHead(start_ns, end_ns, size, crc, compression, data_bytes, head_bytes, record_bytes)
 
 
-def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
+def chunk_entry(offset: int, length: int, chunk: ChunkHead) -> records.ChunkIndex:
     """Make the index entry of a chunk; its message indexes are yet to be added."""
     return records.ChunkIndex(
-        chunk_length=place.end - place.offset,
-        chunk_start_offset=place.offset,
+        chunk_length=length,
+        chunk_start_offset=offset,
         compression=chunk.compression,
         compressed_size=chunk.data_bytes,
         message_start_time=chunk.start_ns,
@@ -354,3 +345,64 @@ def records_in(data: Buffer, at: int = 0) -> Iterator[tuple[int, int, int]]:
             raise BrokenRecordError(message)
         yield opcode, at, length
         at = after
+
+
+_FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
+
+
+def read_header(stream: ByteStream) -> records.Header:
+    """Read magic and first record; raises BrokenRecordError."""
+    if stream.read(len(MAGIC)) != MAGIC:
+        raise BrokenRecordError("it does not begin as an MCAP file does")
+    place = next(walk(stream, len(MAGIC), stream.seek(0, 2)), None)
+    record = parse(place.opcode, read_body(stream, place)) if place else None
+    if not isinstance(record, records.Header):
+        raise BrokenRecordError("its first record is no header")
+    return record
+
+
+def read_footer(stream: ByteStream) -> tuple[records.Footer, int]:
+    """Read the last record and say where it begins; raises BrokenRecordError."""
+    at = stream.seek(0, 2) - _FOOTER_BYTES
+    stream.seek(max(at, 0))
+    tail = stream.read(_FOOTER_BYTES)
+    if len(tail) < _FOOTER_BYTES or not tail.endswith(MAGIC):
+        raise BrokenRecordError("it does not end as a finished MCAP file does")
+    footer = parse(tail[0], tail[RECORD_HEAD.size : -len(MAGIC)])
+    if not isinstance(footer, records.Footer):
+        raise BrokenRecordError("its last record is no footer")
+    if footer.summary_start > at:
+        message = f"its summary should begin at byte {footer.summary_start}, behind its footer"
+        raise BrokenRecordError(message)
+    return footer, at
+
+
+def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> Summary | None:
+    """Read the summary section with its CRC checked, None where there is none."""
+    if not footer.summary_start:
+        return None
+    stream.seek(footer.summary_start)
+    # The CRC covers everything up to itself, the last field of the footer.
+    section = stream.read(footer_at + RECORD_HEAD.size + 16 - footer.summary_start)
+    if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
+        raise BrokenRecordError("its summary has another CRC than it declares")
+    summary = Summary()
+    for opcode, at, length in records_in(section[: footer_at - footer.summary_start]):
+        start = at + RECORD_HEAD.size
+        _add(summary, parse(opcode, section[start : start + length]))
+    return summary
+
+
+def _add(summary: Summary, record: records.McapRecord | None) -> None:
+    if isinstance(record, records.Statistics):
+        summary.statistics = record
+    elif isinstance(record, records.Schema):
+        summary.schemas[record.id] = record
+    elif isinstance(record, records.Channel):
+        summary.channels[record.id] = record
+    elif isinstance(record, records.AttachmentIndex):
+        summary.attachment_indexes.append(record)
+    elif isinstance(record, records.ChunkIndex):
+        summary.chunk_indexes.append(record)
+    elif isinstance(record, records.MetadataIndex):
+        summary.metadata_indexes.append(record)
