@@ -58,7 +58,6 @@ WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 ODOMETRY = "nav_msgs/msg/Odometry"
 IMU = "sensor_msgs/msg/Imu"
-JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PLAN = "gst/Plan"
 VERDICT = "gst/Verdict"
 CONTACT = "gst/Contact"
@@ -68,7 +67,6 @@ EVENT = "gst/Event"
 DROPS = "recorder/Drops"
 CLOCKS = "recorder/Clocks"
 STATUS = "recorder/Status"
-POSES_IN_FRAME = "foxglove.PosesInFrame"
 COMPRESSED_VIDEO = "foxglove.CompressedVideo"
 
 _JSON_SCHEMAS = {
@@ -81,7 +79,6 @@ _JSON_SCHEMAS = {
     DROPS: ("bridge.episode", "schemas/drops.schema.json"),
     CLOCKS: ("bridge.episode", "schemas/clocks.schema.json"),
     STATUS: ("bridge.episode", "schemas/status.schema.json"),
-    POSES_IN_FRAME: ("bridge.episode", "schemas/poses_in_frame.schema.json"),
 }
 
 

@@ -390,22 +390,6 @@ def string_from_cdr(data: bytes) -> str:
     return str(codec.decode(schema.STRING, data)["data"])
 
 
-def joint_trajectory_to_cdr(
-    *,
-    stamp_ns: int,
-    names: tuple[str, ...],
-    times_ns: list[int],
-    positions_rad: Float[np.ndarray, "num_points num_joints"],
-) -> bytes:
-    """Serialise as trajectory_msgs/JointTrajectory, for viewers."""
-    points = []
-    for t_ns, row in zip(times_ns, positions_rad, strict=True):
-        sec, nanosec = split_ns(t_ns)
-        points.append({"positions": row, "time_from_start": {"sec": sec, "nanosec": nanosec}})
-    message = {"header": header(stamp_ns, ""), "joint_names": list(names), "points": points}
-    return codec.encode(schema.JOINT_TRAJECTORY, message)
-
-
 FLOAT32 = 7
 """PointField's number for this type."""
 POINT_STEP = 12
