@@ -1,20 +1,15 @@
-"""Read and write many messages of a topic at once: they differ in stamps and numbers only.
-
-The first is read as any other; of the rest only the bytes that may differ are looked at. What is
-not alike is left to be read one by one, with the same result.
-"""
+"""Many messages of a topic that differ in stamps and numbers only: written, and looked at."""
 
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
-from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.messages import JointSample, PoseSample, header
+from bridge.episode.cdr.messages import JointSample, header
 from bridge.errors import BridgeError
 from bridge.geometry import se3
 
@@ -73,63 +68,8 @@ def pose_messages(
 
 ORIGIN = 4
 """CDR aligns to this byte, behind those that name the encoding."""
-_STAMP = (4, 12)
-_FRAME_AT = 12
 _LITTLE_ENDIAN = 1
-_POSE_BYTES = 7 * 8
-_FAINT, _HUGE = 1e-6, 1e6
-"""A quaternion whose length is not between these is none."""
-
 Span = tuple[int, int]
-
-
-def poses_of(
-    payloads: Sequence[bytes],
-) -> tuple[Int[np.ndarray, " num_messages"], Float[np.ndarray, "num_messages 4 4"]] | None:
-    """Return stamps [ns] and ``Ts_frame_body`` of geometry_msgs/PoseStamped messages in order.
-
-    None when they are not alike: other frames, broken bytes, or no rotation.
-    """
-    rows = _rows(payloads)
-    if rows is None:
-        return None
-    try:
-        PoseSample.from_cdr(payloads[0])
-        at = _aligned(_behind_text(payloads[0], _FRAME_AT), 8)
-    except (BridgeError, struct.error):
-        return None
-    spans = (_STAMP, (at, at + _POSE_BYTES))
-    if not _differ_only_in(rows, spans):
-        return None
-    numbers = _numbers(rows, spans[1])
-    q = numbers[:, [6, 3, 4, 5]]
-    length = np.linalg.norm(q, axis=1)
-    if not ((length > _FAINT) & (length < _HUGE)).all():
-        return None
-    return _stamps_ns(rows), se3.transform_from(q, numbers[:, :3])
-
-
-def joints_of(
-    payloads: Sequence[bytes],
-) -> (
-    tuple[
-        tuple[str, ...],
-        Int[np.ndarray, " num_messages"],
-        Float[np.ndarray, "num_messages num_joints"],
-    ]
-    | None
-):
-    """Return names, stamps [ns] and positions of sensor_msgs/JointState messages in their order.
-
-    None when they are not alike: other joints, broken bytes, or no positions.
-    """
-    rows = _rows(payloads)
-    if rows is None:
-        return None
-    layout = joint_layout(payloads[0])
-    if layout is None or not _differ_only_in(rows, (_STAMP, *layout.numbers)):
-        return None
-    return layout.names, _stamps_ns(rows), _numbers(rows, layout.numbers[0])
 
 
 class JointLayout:
@@ -172,44 +112,5 @@ def joint_layout(data: bytes) -> JointLayout | None:
     return layout if layout.is_of_use else None
 
 
-def _rows(payloads: Sequence[bytes]) -> UInt8[np.ndarray, "num_messages num_bytes"] | None:
-    if not payloads:
-        return None
-    size = len(payloads[0])
-    if size < _FRAME_AT or payloads[0][1] != _LITTLE_ENDIAN:
-        return None
-    if set(map(len, payloads)) != {size}:
-        return None
-    return np.frombuffer(b"".join(payloads), dtype=np.uint8).reshape(len(payloads), size)
-
-
-def _differ_only_in(
-    rows: UInt8[np.ndarray, "num_messages num_bytes"], spans: Sequence[Span]
-) -> bool:
-    fixed = np.ones(rows.shape[1], dtype=bool)
-    for first, last in spans:
-        fixed[first:last] = False
-    return bool((rows[:, fixed] == rows[0, fixed]).all())
-
-
-def _behind_text(payload: bytes, at: int) -> int:
-    (length,) = struct.unpack_from("<I", payload, at)
-    return at + 4 + int(length)
-
-
 def _aligned(at: int, size: int) -> int:
     return at + (ORIGIN - at) % size
-
-
-def _numbers(
-    rows: UInt8[np.ndarray, "num_messages num_bytes"], span: Span
-) -> Float[np.ndarray, "num_messages num_values"]:
-    return np.ascontiguousarray(rows[:, span[0] : span[1]]).view("<f8").astype(np.float64)
-
-
-def _stamps_ns(
-    rows: UInt8[np.ndarray, "num_messages num_bytes"],
-) -> Int[np.ndarray, " num_messages"]:
-    seconds = np.ascontiguousarray(rows[:, 4:8]).view("<i4")[:, 0].astype(np.int64)
-    rest = np.ascontiguousarray(rows[:, 8:12]).view("<u4")[:, 0].astype(np.int64)
-    return seconds * NS_PER_S + rest
