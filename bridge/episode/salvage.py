@@ -22,7 +22,7 @@ from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChun
 from bridge.episode.mcap.format import Buffer, crc32
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
-from bridge.episode.mcap.walk import attachment_entry, chunk_entry
+from bridge.episode.mcap.walk import chunk_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
 
@@ -93,7 +93,7 @@ class CopyTarget:
             case TopMessage():
                 self._take_message(found)
             case AttachmentSpan():
-                self._take_attachment(found)
+                self.section.add_attachment(found.record)
 
     def _without_contradictions(self, found: CutChunk) -> tuple[bytes, Contents]:
         """Leave out definitions that no CRC proves and that others contradict."""
@@ -184,13 +184,6 @@ class CopyTarget:
     def _flush_loose(self) -> None:
         if self._loose.has_messages:
             self.section.add_chunks([self._loose.encode()])
-
-    def _take_attachment(self, found: AttachmentSpan) -> None:
-        offset = self.section.file.offset
-        for block in self._source.blocks(found.offset, found.length):
-            self.section.file.append([block])
-        entry = attachment_entry(offset, found.length, found.record, found.data_size)
-        self.section.summary.add_index(entry)
 
 
 def _definitions(source: RecordFile) -> dict[tuple[int, int], bytes]:

@@ -2,7 +2,6 @@
 
 import os
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -45,17 +44,11 @@ class RecordFile:
         self.stream.seek(offset)
         return self.stream.read(max(0, min(size, self.size - offset)))
 
-    def blocks(self, offset: int, size: int) -> Iterator[bytes]:
-        """Return a range in blocks."""
-        end = min(offset + size, self.size)
-        for start in range(offset, end, BLOCK_BYTES):
-            yield self.read(start, min(BLOCK_BYTES, end - start))
-
     def crc(self, offset: int, size: int) -> int:
         """CRC-32 of a range."""
-        crc = 0
-        for block in self.blocks(offset, size):
-            crc = crc32(block, crc)
+        crc, end = 0, min(offset + size, self.size)
+        for start in range(offset, end, BLOCK_BYTES):
+            crc = crc32(self.read(start, min(BLOCK_BYTES, end - start)), crc)
         return crc
 
 

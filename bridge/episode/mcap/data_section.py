@@ -280,9 +280,9 @@ class DataSection:
     def add_attachment(self, entry: records.Attachment) -> None:
         """Write an attachment."""
         offset = self.file.offset
-        self.file.append(mcap_format.attachment(entry))
+        self.file.append([encoded(entry)])
         length = self.file.offset - offset
-        self.summary.add_index(attachment_entry(offset, length, entry, len(entry.data)))
+        self.summary.add_index(attachment_entry(offset, length, entry))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""

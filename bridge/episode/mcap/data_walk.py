@@ -130,7 +130,7 @@ class DataWalk:
                     yield from self._message(self._file.read(found.offset, found.length), 0)
                 case AttachmentSpan():
                     self.seen.attachments.append(
-                        attachment_entry(found.offset, found.length, found.record, found.data_size)
+                        attachment_entry(found.offset, found.length, found.record)
                     )
                 case Plain(record=records.Metadata(name=name)):
                     entry = records.MetadataIndex(found.offset, found.length, name)

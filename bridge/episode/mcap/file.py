@@ -96,7 +96,7 @@ class McapFile:
             for entry in self.summary.attachment_indexes:
                 if name in (None, entry.name):
                     place = self.indexed(stream, entry.offset, mcap_format.ATTACHMENT)
-                    yield attachment_of(stream, place).record
+                    yield attachment_of(read_body(stream, place), place.offset)
 
     def schema_of(self, channel: records.Channel) -> records.Schema | None:
         """Return the schema of a channel, or None where it has none."""

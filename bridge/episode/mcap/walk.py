@@ -32,7 +32,6 @@ from bridge.episode.mcap.format import (
 
 ByteStream = BufferedReader | BytesIO
 """An open file, or bytes that act as one."""
-PIECE_BYTES = 1 << 20
 
 _CLASSES: dict[int, Any] = {
     mcap_format.HEADER: records.Header,
@@ -80,7 +79,7 @@ class RecordSpan(NamedTuple):
 
 
 def attachment_entry(
-    offset: int, length: int, record: records.Attachment, data_size: int
+    offset: int, length: int, record: records.Attachment
 ) -> records.AttachmentIndex:
     """Make the index entry of an attachment."""
     return records.AttachmentIndex(
@@ -88,7 +87,7 @@ def attachment_entry(
         length=length,
         log_time=record.log_time,
         create_time=record.create_time,
-        data_size=data_size,
+        data_size=len(record.data),
         name=record.name,
         media_type=record.media_type,
     )
@@ -148,56 +147,17 @@ def parse(opcode: int, body: bytes) -> records.McapRecord | None:
     return found
 
 
-class FoundAttachment(NamedTuple):
-    """An attachment whose CRC is right."""
-
-    record: records.Attachment
-    data_size: int
-
-
-def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -> FoundAttachment:
-    """Read an attachment record and check its CRC; without ``keep`` its data is left empty."""
-    stream.seek(place.offset + RECORD_HEAD.size)
-    fields = _Fields(BytesIO(stream.read(min(place.length, PIECE_BYTES))))
+def attachment_of(body: bytes, at: int) -> records.Attachment:
+    """Read the attachment whose record begins at byte ``at``, its CRC checked."""
+    fields = _Fields(BytesIO(body))
     try:
-        log_ns, create_ns = fields.read8(), fields.read8()
-        name, media_type = fields.read_prefixed_string(), fields.read_prefixed_string()
-        size, start = fields.read8(), fields.count
-    except (McapError, struct.error, ValueError) as error:
-        raise BrokenRecordError(f"the attachment at byte {place.offset} cannot be read") from error
-    if size > place.length - start - 4:
-        message = f"attachment {name!r} claims {size} bytes, {place.length - start - 4} are there"
-        raise BrokenRecordError(message)
-    crc, pieces = _attachment_crc(stream, place, start + size, start, keep=keep)
-    (declared,) = struct.unpack("<I", stream.read(4))
-    if declared and declared != crc:
-        raise BrokenRecordError(f"attachment {name!r} has another CRC than it declares")
-    record = records.Attachment(
-        create_time=create_ns,
-        log_time=log_ns,
-        name=name,
-        media_type=media_type,
-        data=b"".join(pieces),
-    )
-    return FoundAttachment(record, size)
-
-
-def _attachment_crc(
-    stream: ByteStream, place: RecordSpan, count: int, data_start: int, *, keep: bool
-) -> tuple[int, list[bytes]]:
-    stream.seek(place.offset + RECORD_HEAD.size)
-    crc = zlib.crc32(stream.read(data_start))
-    pieces = []
-    left = count - data_start
-    while left:
-        piece = stream.read(min(left, PIECE_BYTES))
-        if not piece:
-            raise BrokenRecordError(f"the attachment at byte {place.offset} is cut off")
-        left -= len(piece)
-        crc = zlib.crc32(piece, crc)
-        if keep:
-            pieces.append(piece)
-    return crc, pieces
+        found: records.Attachment = records.Attachment.read(fields)
+    except (McapError, struct.error, ValueError, OverflowError) as error:
+        raise BrokenRecordError(f"the attachment at byte {at} cannot be read") from error
+    end = fields.count - _U32.size
+    if body[end : fields.count] not in (bytes(4), _U32.pack(zlib.crc32(body[:end]))):
+        raise BrokenRecordError(f"attachment {found.name!r} has another CRC than it declares")
+    return found
 
 
 MAX_CHUNK_BYTES = 1 << 30
