@@ -9,14 +9,17 @@ from pathlib import Path
 from mcap import records
 from mcap.summary import Summary
 
+from bridge.episode.mcap.damaged import RecordFile
 from bridge.episode.mcap.data_walk import DataWalk, ScannedMessage, Seen
-from bridge.episode.mcap.file import read_footer, read_header, read_summary
 from bridge.episode.mcap.walk import (
     DAMAGE,
     BrokenRecordError,
     ByteStream,
     parse,
     read_body,
+    read_footer,
+    read_header,
+    read_summary,
     walk,
 )
 
@@ -50,12 +53,11 @@ def summary_faults(
 def _statistics_faults(
     seen: Seen, said: records.Statistics, num_schemas: int, num_channels: int
 ) -> Iterator[str]:
-    num_attachments = len(seen.attachments) + seen.num_broken_attachments
     pairs = {
         "messages": (said.message_count, sum(seen.counts.values())),
         "schemas": (said.schema_count, _either(said.schema_count, seen.schemas, num_schemas)),
         "channels": (said.channel_count, _either(said.channel_count, seen.channels, num_channels)),
-        "attachments": (said.attachment_count, num_attachments),
+        "attachments": (said.attachment_count, len(seen.attachments)),
         "metadata records": (said.metadata_count, len(seen.metadata)),
         "chunks": (said.chunk_count, seen.num_chunks),
     }
@@ -151,8 +153,9 @@ class FileCheck:
             with self.path.open("rb") as stream:
                 self.library = read_header(stream).library
                 footer, footer_at = read_footer(stream)
-                data = DataWalk(stream, fault=self._fault, doubt=self._fault)
-                yield from data.messages(footer.summary_start or footer_at)
+                file = RecordFile(stream, footer.summary_start or footer_at)
+                data = DataWalk(file, fault=self._fault, doubt=self._fault)
+                yield from data.messages()
                 summary = read_summary(stream, footer, footer_at)
                 for text in summary_faults(stream, data.seen, summary, footer, footer_at):
                     self._fault(text)

@@ -22,7 +22,7 @@ from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChun
 from bridge.episode.mcap.format import Buffer, crc32
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
-from bridge.episode.mcap.walk import RecordSpan, attachment_entry, chunk_entry
+from bridge.episode.mcap.walk import chunk_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
 
@@ -93,7 +93,7 @@ class CopyTarget:
             case TopMessage():
                 self._take_message(found)
             case AttachmentSpan():
-                self._take_attachment(found)
+                self.section.add_attachment(found.record)
 
     def _without_contradictions(self, found: CutChunk) -> tuple[bytes, Contents]:
         """Leave out definitions that no CRC proves and that others contradict."""
@@ -185,14 +185,6 @@ class CopyTarget:
         if self._loose.has_messages:
             self.section.add_chunks([self._loose.encode()])
 
-    def _take_attachment(self, found: AttachmentSpan) -> None:
-        offset = self.section.file.offset
-        for block in self._source.blocks(found.offset, found.length):
-            self.section.file.append([block])
-        span = RecordSpan.between(mcap.ATTACHMENT, offset, self.section.file.offset)
-        entry = attachment_entry(span, found.record, found.data_size)
-        self.section.summary.add_index(entry)
-
 
 def _definitions(source: RecordFile) -> dict[tuple[int, int], bytes]:
     """Return every schema and channel of a file by kind and id: of its summary, or of its data."""
@@ -237,7 +229,7 @@ def verbatim(found: Chunk) -> EncodedChunk:
     if has_wrong_times(found):
         front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
         buffers = [front, memoryview(found.raw)[len(front) :]]
-    entry = chunk_entry(RecordSpan.between(mcap.CHUNK, 0, found.length), found.head)
+    entry = chunk_entry(0, found.length, found.head)
     entry.message_start_time, entry.message_end_time = start_ns, end_ns
     return EncodedChunk(buffers=buffers, entry=entry, index=found.contents.index)
 

@@ -18,7 +18,7 @@ from bridge.episode.mcap.format import (
     num_bytes,
 )
 from bridge.episode.mcap.part_file import PartFile
-from bridge.episode.mcap.walk import RecordSpan, attachment_entry, metadata_entry
+from bridge.episode.mcap.walk import attachment_entry
 
 
 class Summary:
@@ -280,16 +280,15 @@ class DataSection:
     def add_attachment(self, entry: records.Attachment) -> None:
         """Write an attachment."""
         offset = self.file.offset
-        self.file.append(mcap_format.attachment(entry))
-        span = RecordSpan.between(mcap_format.ATTACHMENT, offset, self.file.offset)
-        self.summary.add_index(attachment_entry(span, entry, len(entry.data)))
+        self.file.append([encoded(entry)])
+        length = self.file.offset - offset
+        self.summary.add_index(attachment_entry(offset, length, entry))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
         offset, entry = self.file.offset, records.Metadata(name, dict(values))
         self.file.append([encoded(entry)])
-        span = RecordSpan.between(mcap_format.METADATA, offset, self.file.offset)
-        self.summary.add_index(metadata_entry(span, entry))
+        self.summary.add_index(records.MetadataIndex(offset, self.file.offset - offset, name))
 
     def seal(self) -> None:
         """Write the end of the data, the summary and the footer."""

@@ -26,7 +26,6 @@ MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 MESSAGE_FIELDS = MESSAGE_HEAD.size - RECORD_HEAD.size
 CHUNK_FIELDS = struct.Struct("<QQQI")
 """First and last log time, size and CRC of the records inside before compression."""
-ATTACHMENT_FIELDS = struct.Struct("<QQ")
 FOOTER_FIELDS = struct.Struct("<QQI")
 """Start of the summary, start of its offsets, CRC of the summary."""
 
@@ -72,15 +71,6 @@ def message_index(channel_id: int, entries: list[int]) -> bytes:
     """Encode where a channel's messages lie in a chunk: log time, offset, log time, offset ..."""
     head = struct.pack("<HI", channel_id, 8 * len(entries))
     return record(MESSAGE_INDEX, head, struct.pack(f"<{len(entries)}Q", *entries))
-
-
-def attachment(entry: records.Attachment) -> list[Buffer]:
-    """Encode an attachment as buffers to be written one after the other; its data is not copied."""
-    fields = ATTACHMENT_FIELDS.pack(entry.log_time, entry.create_time)
-    fields += text(entry.name) + text(entry.media_type) + struct.pack("<Q", len(entry.data))
-    crc = zlib.crc32(entry.data, zlib.crc32(fields))
-    head = RECORD_HEAD.pack(ATTACHMENT, len(fields) + len(entry.data) + 4) + fields
-    return [head, entry.data, struct.pack("<I", crc)]
 
 
 def summary_section(groups: Iterable[bytes], start: int) -> bytes:

@@ -4,7 +4,6 @@ Nothing but the front of the file is believed: no summary, no index. Damage is s
 a later chunk can be found. Memory is bounded by one chunk.
 """
 
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +24,6 @@ from bridge.episode.mcap.walk import (
     MAX_CHUNK_BYTES,
     BrokenRecordError,
     ChunkHead,
-    RecordSpan,
     attachment_of,
     parse_chunk,
     parse_chunk_head,
@@ -62,6 +60,8 @@ class Chunk(Span):
 
     raw: bytes
     head: ChunkHead
+    records: bytes
+    """Unpacked."""
     contents: Contents
 
 
@@ -92,8 +92,6 @@ class AttachmentSpan(Span):
     """An attachment whose CRC is right."""
 
     record: Attachment
-    """Without its data."""
-    data_size: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,7 +190,8 @@ def _read_record(file: RecordFile, offset: int) -> Found | None:
     if opcode == mcap.MESSAGE_INDEX:
         return _read_index(offset, length, front)
     if opcode == mcap.ATTACHMENT:
-        return _read_attachment(file, offset, length)
+        record = attachment_of(file.read(offset, length)[mcap.RECORD_HEAD.size :], offset)
+        return AttachmentSpan(offset=offset, length=length, record=record)
     if opcode == mcap.DATA_END:
         return DataEnd(offset=offset, length=length)
     if length > MAX_PLAIN_BYTES:
@@ -222,7 +221,9 @@ def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
     contents = walk_records(records)
     if contents.size != len(records):
         raise BrokenRecordError("a chunk is damaged: its records are torn")
-    return Chunk(offset=offset, length=len(raw), raw=raw, head=head, contents=contents)
+    return Chunk(
+        offset=offset, length=len(raw), raw=raw, head=head, records=records, contents=contents
+    )
 
 
 def _read_message(offset: int, length: int, front: bytes) -> TopMessage:
@@ -256,13 +257,6 @@ def _index_bytes(front: bytes) -> int:
     if len(front) < _INDEX_FRONT.size:
         raise BrokenRecordError("the file ends inside a message index")
     return int(_INDEX_FRONT.unpack_from(front)[3])
-
-
-def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSpan:
-    place = RecordSpan(mcap.ATTACHMENT, offset, length - mcap.RECORD_HEAD.size)
-    with os.fdopen(file.descriptor, "rb", closefd=False) as stream:
-        record, data_size = attachment_of(stream, place, keep=False)
-    return AttachmentSpan(offset=offset, length=length, record=record, data_size=data_size)
 
 
 def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:

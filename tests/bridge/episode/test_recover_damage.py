@@ -223,7 +223,7 @@ def test_a_chunk_that_stands_twice_is_kept_once(tmp_path: Path, name: str) -> No
     with (tmp_path / "w.mcap").open("rb") as stream:
         chunks = [
             found
-            for found in scan(RecordFile(stream.fileno()))
+            for found in scan(RecordFile(stream))
             if isinstance(found, Chunk) and found.contents.num_messages
         ]
     second = bytes(chunks[1].raw)

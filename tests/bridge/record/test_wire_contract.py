@@ -163,7 +163,7 @@ class Wild:
         numbers: Callable[[int], int] | None = lambda number: number,
         stamp: Callable[[int], int] = lambda number: time.time_ns(),
         raw: bytes | None = None,
-        data: bytes = b"\0\1\0\0" + struct.pack("<iI", 1_700_000_000, 0) + bytes(4 * 5),
+        data: bytes = b"\0\1\0\0" + struct.pack("<iII", 1_700_000_000, 0, 1) + bytes(4 * 5),
     ) -> None:
         publisher = self.session.declare_publisher(key, encoding=encoding)
         for number in range(count):
