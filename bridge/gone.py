@@ -15,6 +15,9 @@ _TOLD = {
     "design --width --rate-width": "Give --gain with --rate; at a given size use --starts.",
     "design --agrees-above --agreement": "Use evaluate --fail-under.",
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
+    "check --wire --seconds --rate-hz --connect --listen": (
+        "Record a few seconds, robot-gst record RUN --episode try --duration 5, and check RUN."
+    ),
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
     "export catalogue": "robot-gst ls RUN --json lists all of it.",
     "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",

@@ -126,8 +126,6 @@ class WireSample:
     source_gid: bytes | None
     """16 bytes that no other publisher has."""
     received_ns: int
-    attachment_bytes: int = 0
-    """Size of the attachment, whether it could be read or not."""
     definition: schema.Schema | None = None
     """What the publisher says its type is, where it does."""
     oversize_bytes: int = 0
@@ -152,8 +150,7 @@ def copy_sample(
     named = keys.read_key(str(sample.key_expr))
     type_name, message_encoding = keys.parse_encoding(str(sample.encoding))
     raw = sample.attachment
-    attachment = None if raw is None else raw.to_bytes()
-    note = publisher.decode(attachment)
+    note = publisher.decode(None if raw is None else raw.to_bytes())
     if note is None:
         sequence, gid = _source_of(sample.source_info)
         source_ns = None
@@ -170,7 +167,6 @@ def copy_sample(
         source_gid=gid,
         received_ns=received_ns,
         definition=definitions.get((type_name, message_encoding)) if definitions else None,
-        attachment_bytes=0 if attachment is None else len(attachment),
         oversize_bytes=size if is_oversize else 0,
     )
 
