@@ -46,13 +46,6 @@ CORE: tuple[leaves.Command, ...] = (
     ),
     *leaves.commands_of(
         leaves.RECORD,
-        "bridge.cli.publish",
-        """
-        publish episode | Play an episode back with its own timing. | FILE --rate 2
-        """,
-    ),
-    *leaves.commands_of(
-        leaves.RECORD,
         "bridge.cli.tasks",
         """
         task check | Say what is wrong with task files, or what they ask for. | my_task.toml

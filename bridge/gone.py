@@ -28,8 +28,10 @@ _TOLD = {
     "export lerobot --depth": "Depth stays in the episodes; robot-gst export tum writes it.",
     "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
     "export tum --color": "Files stay as recorded; ImageMagick decodes: mogrify -format png *.jpg.",
-    "publish folder": "robot-gst import rgbd DIR RUN; publish episode plays what that made.",
-    "publish episode --remap": "Messages keep their names; namespace in --config comes before.",
+    "publish folder": "robot-gst import rgbd DIR RUN makes an episode of it.",
+    "publish episode": (
+        "robot-gst export rosbag2 makes a bag; ros2 bag play sends it, also over rmw_zenoh_cpp."
+    ),
     "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
     "record --failover": "A failing disk ends the recording; begin anew on another disk.",
@@ -37,9 +39,6 @@ _TOLD = {
     "record --split-mb --split-s": "Stop and start another episode; mcap merge joins old parts.",
     "record --triggers|ctl snapshot": "Record with --preroll-s 5; start when it has happened.",
     "ctl pause|ctl resume": "Stop the episode, and start another one.",
-    "publish episode --loop --paused --name": (
-        "A playback begins at once and plays once; --start-s and --rate say from where, how fast."
-    ),
     "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
     "recover --in-place": "Free some space, or use another disk: a copy is made beside it.",
     "import trials": "robot-gst open TABLE RUN keeps any table of trials in a run.",

@@ -37,8 +37,6 @@ class Qos:
     """Joints and whatever else a control loop sends: small, frequent, never waits."""
     RELIABLE: ClassVar["Qos"]
     """Plans, events, labels, files: nothing may be lost and the sender can wait."""
-    PLAYBACK: ClassVar["Qos"]
-    """What was recorded: every message in one order, and the sender waits for a slow receiver."""
     PREVIEW: ClassVar["Qos"]
     """Pictures for a person; the first to go."""
 
@@ -46,5 +44,4 @@ class Qos:
 Qos.CAMERA = Qos(name="camera", block=False, priority="data_low", shared_memory=True)
 Qos.CONTROL = Qos(name="control", block=False, priority="real_time")
 Qos.RELIABLE = Qos(name="reliable", block=True, priority="data")
-Qos.PLAYBACK = Qos(name="playback", block=True, priority="data", shared_memory=True)
 Qos.PREVIEW = Qos(name="preview", block=False, priority="background", is_remote=True)

@@ -231,13 +231,10 @@ class WireSession:
         type_name: str,
         *,
         qos: Qos = Qos.RELIABLE,  # when the network is behind; loops use ``Qos.CONTROL``
-        message_encoding: str | None = None,  # cdr, json ...; None: the type's, or CDR
     ) -> WirePublisher:
         """Announce a topic."""
-        if message_encoding is None:
-            known = schema.schema_for(type_name)
-            message_encoding = known.message_encoding if known else "cdr"
-        encoding = keys.encoding_of(type_name, message_encoding)
+        known = schema.schema_for(type_name)
+        encoding = keys.encoding_of(type_name, known.message_encoding if known else "cdr")
         control = zenoh.CongestionControl
         locality = zenoh.Locality.REMOTE if qos.is_remote else zenoh.Locality.ANY
         try:
@@ -283,15 +280,6 @@ class WireSession:
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
         with _naming(WireConfigError, f"cannot subscribe to {key_expression!r}"):
             return Subscriber(self._inner.declare_subscriber(key_expression, handler))
-
-    def define(self, record: schema.Schema) -> None:
-        """Tell what a type is that nobody knows, now and to whoever asks later.
-
-        Call it before the first message, from the thread that publishes.
-        """
-        key = keys.definition_key(record.name, record.schema_encoding)
-        self.serve(key, lambda request: record.data)
-        self._inner.put(key, record.data, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def collect_definitions(self, *, timeout_s: float = 2.0) -> None:
         """Learn what publishers say of their types; samples that follow carry it.
