@@ -37,7 +37,9 @@ _TOLD = {
     "record --failover": "A failing disk ends the recording; begin anew on another disk.",
     "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
     "record --split-mb --split-s": "Stop and start another episode; mcap merge joins old parts.",
-    "record --triggers|ctl snapshot": "Record with --preroll-s 5; start when it has happened.",
+    "record --triggers --preroll-s --preroll-mb|ctl snapshot": (
+        "Record all the time; robot-gst ctl stop --discard throws a take away."
+    ),
     "ctl pause|ctl resume": "Stop the episode, and start another one.",
     "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
     "recover --in-place": "Free some space, or use another disk: a copy is made beside it.",

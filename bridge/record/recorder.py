@@ -119,7 +119,7 @@ class Recorder:
     def start(
         self, info: metadata.EpisodeInfo, task: TaskFile | None = None, *, anyway: bool = False
     ) -> Answer:
-        """Begin an episode, with the pre-roll if there is one.
+        """Begin an episode.
 
         Args:
             task: Its task file: attached to the episode, and kept in the run's ``tasks/``; looked

@@ -87,7 +87,6 @@ class Status:
             "write_lag_s": round(disk["write_lag_s"], 2),
             "stalled_s": round(stalled_s, 1) if stalled_s > STALLED_S else 0.0,
             "clock_steps": self.clock_steps,
-            "preroll_s": round(life.ring.seconds(self._now_ns()), 1),
             "recovered": self.recovered,
             "seen": self._input_queue.seen(),
             "rates_hz": self._rates_hz,
@@ -113,8 +112,7 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
         stalled += f", small messages wait {lag_s:.1f} s for the disk"
     stalled += _hearing(status)
     if status["state"] == "idle":
-        ring = f", pre-roll {s:.1f} s" if (s := status["preroll_s"]) else ""
-        return f"idle, {len(status['seen'])} topics seen{ring}, {free}{stalled}"
+        return f"idle, {len(status['seen'])} topics seen, {free}{stalled}"
     rate = "" if rate_hz is None else f" ({rate_hz:.0f}/s)"
     flags = "".join(
         f", {status[name]} {name.replace('_', ' ')}"
