@@ -19,7 +19,7 @@ class QueueConfig:
     """How much may wait in memory, and what is too much to take."""
 
     camera_queue_mb: Annotated[int, RARE] = 256
-    """Memory for images not yet written [MB]; they are thinned as it fills, then dropped."""
+    """Memory for images not yet written [MB]; when it is full they are dropped and counted."""
     small_queue_mb: Annotated[int, RARE] = 16
     """Memory for everything else [MB]; its own, so that images never evict joints."""
     max_message_mb: Annotated[float, RARE] = 64.0

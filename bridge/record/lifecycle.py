@@ -319,7 +319,6 @@ def counts(take: EpisodeRecording) -> Answer:
         "lost": total.lost,
         "undecodable": total.undecodable,
         "unknown_type": total.unknown_type,
-        "shed": total.shed,
         "unnumbered": take.ledger.unnumbered(),
         "findings": [asdict(finding) for finding in take.findings()],
     }

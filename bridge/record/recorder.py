@@ -66,9 +66,9 @@ class Recorder:
         self._now_ns = now_ns
         self.run = run
         self._task = task
-        encoder = ImageEncoder(self.config, lambda: self.input_queue.shed)
+        encoder = ImageEncoder(self.config)
         self._encoders = EncoderThreads(encoder, self._take_back, preview)
-        self.input_queue = InputQueue(self.config.queues, self._encoders.submit, encoder.kinds)
+        self.input_queue = InputQueue(self.config.queues, self._encoders.submit)
         self._merge = Merge(lambda: self._life.keeps_up)
         self._life = Lifecycle(
             run, self.config, lambda: self.input_queue.queued_bytes, self.input_queue.latched

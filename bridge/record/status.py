@@ -83,7 +83,6 @@ class Status:
             "last_episode": life.last_episode,
             "queue_bytes": self._input_queue.queued_bytes,
             "disk_free_bytes": life.free_bytes,
-            "shedding": self._input_queue.shed.name.lower(),
             "write_lag_s": round(disk["write_lag_s"], 2),
             "stalled_s": round(stalled_s, 1) if stalled_s > STALLED_S else 0.0,
             "clock_steps": self.clock_steps,
@@ -122,8 +121,6 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
     if status.get("findings"):
         found = [f"{in_words(each['name'])} on {each['about']}" for each in status["findings"]]
         flags += f", {in_short(found)}"
-    if status["shedding"] != "nothing":
-        flags += f", shedding {status['shedding'].replace('_', ' ')}"
     return (
         f"{status['state']} {status['episode']}: {status['duration_s']:.1f} s, "
         f"{status['messages']} messages{rate}, {status['bytes'] / 1e6:.1f} MB, "
