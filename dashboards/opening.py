@@ -31,7 +31,7 @@ from bridge.exchange.trials_csv import trials_path, trials_text
 from bridge.leaves import load_leaf
 from bridge.robots.robot import Robot, read_robot, robot_of
 from bridge.sources.folder.messages import find_frames, read_index
-from bridge.sources.folder.posed_index import COLMAP_FOLDERS, TRANSFORMS, read_posed_index
+from bridge.sources.folder.posed import has_poses, read_posed_index
 from bridge.sources.folder.scene_json import INDEX_NAME
 from bridge.sources.folder.tum import find_lists
 from bridge.terminal import Output
@@ -207,11 +207,6 @@ def _is_rgbd(folder: Path) -> bool:
     return bool((folder / INDEX_NAME).is_file() or find_lists(folder) or find_frames(folder))
 
 
-def _is_posed(folder: Path) -> bool:
-    models = (folder / p / f"images.{end}" for p in COLMAP_FOLDERS for end in ("txt", "bin"))
-    return (folder / TRANSFORMS).is_file() or any(path.is_file() for path in models)
-
-
 def _is_rlds(folder: Path) -> bool:
     found = (folder.glob(f"{deep}dataset_info.json") for deep in ("", "*/", "*/*/"))
     return any(any(path.parent.glob("*.tfrecord*")) for paths in found for path in paths)
@@ -223,9 +218,9 @@ FOLDERS: dict[str, Callable[[Path], bool]] = {
     "LeRobot dataset": lambda folder: (folder / "meta/info.json").is_file(),
     "RLDS dataset": _is_rlds,
     "RGB-D folder": _is_rgbd,
-    "folder of posed images": _is_posed,
+    "folder of posed images": has_poses,
     "RGB-D folder without an index": lambda folder: (
-        is_paired(folder) and not _is_rgbd(folder) and not _is_posed(folder)
+        is_paired(folder) and not _is_rgbd(folder) and not has_poses(folder)
     ),
 }
 
@@ -349,7 +344,7 @@ def _rgbd(path: Path) -> Found:
 def _posed(path: Path) -> Found:
     index = read_posed_index(path)
     return Found(
-        what=f"{len(index.images)} posed images, {index.layout}, read without depth: to look at",
+        what=f"{len(index.images)} posed images, read without depth: to look at",
         holds=tuple(f"{what}: {why}" for what, why, _ in index.unused),
         rebuild="depth images",
         replay=f"depth images, {ONLY_SEEN}",

@@ -213,30 +213,26 @@ def import_images(
     config: Annotated[PosedConfig, Parameter(name="*")] = POSED,
     output: Output = OUTPUT,
 ) -> int:
-    """Turn posed images without depth into a scan episode: COLMAP's text model, transforms.json.
+    """Turn posed images without depth into a scan episode: transforms.json.
 
     To be looked at: rebuild needs depth. Lengths are metric only with --metres-per-unit.
     Example: robot-gst import images data/garden runs/garden
 
     Args:
-        folder: Folder of one of the two layouts (docs/rgbd_folder.md).
+        folder: Folder with transforms.json (docs/rgbd_folder.md).
         run: Run folder; made where needed.
         episode: Id of the new episode.
     """
     from bridge.episode.metadata import EpisodeInfo
     from bridge.exchange.output import Unused, tell_unused
-    from bridge.sources.folder.posed_index import read_posed_index
-    from bridge.sources.folder.posed_messages import describe_posed, posed_messages
+    from bridge.sources.folder.posed import describe_posed, posed_messages, read_posed_index
 
     source = describe_posed(index := read_posed_index(folder), config)
-    output.say(f"{index.path}: {index.layout}, {len(index.images)} images")
+    output.say(f"{index.path}: {len(index.images)} images")
     for name, value in index.assumed.items():
         output.say(f"  assumed {name}: {value}")
     if not source["is_metric"]:
-        output.say(
-            "  not metric: lengths are scaled so that the cameras look at what is 1 m away; "
-            "--metres-per-unit says how long a unit of the folder is"
-        )
+        output.say("  not metric: the folder's unit is taken for 1 m; give --metres-per-unit")
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
     made = posed_messages(index, config)
     path = _import_scan(run, info, made, len(index.images), source, output)

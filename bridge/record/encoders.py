@@ -23,7 +23,7 @@ from bridge.episode.cdr.images import (
 from bridge.episode.topics import COLOR_TOPIC
 from bridge.record.config import RecorderConfig
 from bridge.record.inspection import GOOD, MessageState, inspector
-from bridge.record.queue import REDUCED_QUALITY, Item, LoadShedding
+from bridge.record.queue import Item
 from bridge.wire.session import WireSample
 
 MAX_THREADS = 32
@@ -36,10 +36,9 @@ Preview = Callable[[WireSample, str], None]
 class ImageEncoder:
     """Turns raw images into what an episode holds."""
 
-    def __init__(self, config: RecorderConfig, shed: Callable[[], LoadShedding]) -> None:
-        """Choose the profile; ``shed`` says how far shedding has gone."""
+    def __init__(self, config: RecorderConfig) -> None:
+        """Choose the profile."""
         self._config = config
-        self._shed = shed
         self.kinds: dict[str, str] = {}
         """color or depth, for each image topic seen."""
 
@@ -61,14 +60,11 @@ class ImageEncoder:
             item.finding = MessageState.UNDECODABLE
 
     def _transcode(self, item: Item, encoding: str) -> None:
-        data, reduced, topic = None, False, item.sample.topic
+        data, topic = None, item.sample.topic
         if encoding in COLOR_LAYOUTS:
             self.kinds[topic] = "color"
             if self._config.color == "jpeg":
-                quality = self._config.jpeg_quality
-                if self._shed() >= LoadShedding.COLOR_QUALITY and quality > REDUCED_QUALITY:
-                    quality, reduced = REDUCED_QUALITY, True
-                data = image_to_jpeg(item.sample.data, quality)
+                data = image_to_jpeg(item.sample.data, self._config.jpeg_quality)
         elif encoding in DEPTH_ENCODINGS and not COLOR_TOPIC.search(topic):
             self.kinds[topic] = "depth"
             if self._config.depth == "compact":
@@ -81,7 +77,6 @@ class ImageEncoder:
                 item.sample, data=data, type_name=schema.COMPRESSED_IMAGE, type_hash=""
             )
             item.type_name = schema.COMPRESSED_IMAGE
-            item.reduced = reduced
 
 
 class EncoderThreads:

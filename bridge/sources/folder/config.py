@@ -61,7 +61,7 @@ class PosedConfig:
     camera: str = "camera"
     """Name of the camera; several of them get numbers: camera1, camera2."""
     metres_per_unit: float | None = None
-    """Length of the folder's unit [m]; 1 where poses are metric. Without it nothing is metric."""
+    """Length of the folder's unit [m]; 1 where poses are metric. Without it 1, and not metric."""
     rate_hz: float = DEFAULT_RATE_HZ
     """Images per second in the episode; the folder has no times."""
 

@@ -108,19 +108,17 @@ def rlds(folder: Path) -> Path:
     return folder
 
 
-def colmap(folder: Path) -> Path:
-    """Two images and a text model."""
-    (folder / "images").mkdir(parents=True)
-    model = folder / "sparse" / "0"
-    model.mkdir(parents=True)
-    (model / "cameras.txt").write_text("1 PINHOLE 32 24 30 30 16 12\n")
-    lines = []
+def posed(folder: Path) -> Path:
+    """Two images and their poses, as NeRF programs keep them."""
+    folder.mkdir(exist_ok=True)
+    frames = []
     for number in (1, 2):
         picture = encode_jpeg(np.full((24, 32, 3), 60 * number, np.uint8))
-        (folder / "images" / f"{number}.jpg").write_bytes(picture)
-        lines += [f"{number} 1 0 0 0 {0.1 * number} 0 2 1 {number}.jpg", ""]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    (model / "points3D.txt").write_text("1 0 0 0 9 9 9 0.5 1 0\n")
+        (folder / f"{number}.jpg").write_bytes(picture)
+        frames.append({"file_path": f"{number}.jpg", "transform_matrix": np.eye(4).tolist()})
+    (folder / "transforms.json").write_text(
+        json.dumps({"w": 32, "h": 24, "fl_x": 30, "frames": frames})
+    )
     return folder
 
 

@@ -187,8 +187,8 @@ def test_a_map_names_cell_and_camera_of_a_folder(
 
 
 def test_posed_images_are_to_look_at(tmp_path: Path, say: Say) -> None:
-    text = say(strangers.colmap(tmp_path / "garden"))
-    assert "2 posed images, COLMAP, read without depth: to look at" in text
+    text = say(strangers.posed(tmp_path / "garden"))
+    assert "2 posed images, read without depth: to look at" in text
     assert "rebuild needs depth images" in text
 
 
@@ -255,12 +255,12 @@ def nothing(folder: Path) -> Path:
 
 def two_things(folder: Path) -> Path:
     (folder / "x.mcap").write_bytes(b"x")
-    strangers.colmap(folder)
+    strangers.posed(folder)
     return folder
 
 
 def things_inside(folder: Path) -> Path:
-    strangers.colmap(folder / "garden")
+    strangers.posed(folder / "garden")
     strangers.splat(folder / "s.ply")
     return folder
 

@@ -1,4 +1,4 @@
-"""Folders of posed images without depth: COLMAP's text model and transforms.json."""
+"""Folders of posed images without depth: transforms.json."""
 
 import json
 from pathlib import Path
@@ -11,11 +11,9 @@ from bridge.episode.cdr.messages import CameraInfo, CompressedColor, transforms_
 from bridge.episode.reader import Episode
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.geometry import se3
-from bridge.geometry.cameras_view import distance_to_what_is_seen
 from bridge.media.color import encode_jpeg
-from bridge.sources.folder.config import FolderError, PosedConfig
-from bridge.sources.folder.posed_index import read_posed_index
-from bridge.sources.folder.posed_messages import metres_per_unit
+from bridge.sources.folder.config import FolderError
+from bridge.sources.folder.posed import read_posed_index
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 30.0
 CENTRE = np.array([0.3, -0.2, 4.0])
@@ -53,22 +51,6 @@ def write_transforms(folder: Path, **changes: object) -> Path:
     return folder
 
 
-def write_colmap(folder: Path, camera: str = f"PINHOLE 32 24 {FOCAL} {FOCAL} 15 12.5") -> Path:
-    names = write_images(folder)
-    model = folder / "sparse" / "0"
-    model.mkdir(parents=True)
-    (model / "cameras.txt").write_text(f"# a comment\n1 {camera}\n")
-    lines = []
-    for k, (name, T) in enumerate(zip(names, poses(), strict=True), start=1):
-        q, p = se3.split(se3.invert(T))
-        numbers = " ".join(repr(float(v)) for v in (*q, *p))
-        lines += [f"{k} {numbers} 1 {Path(name).name}", "" if k % 2 else "1.0 2.0 -1"]
-    (model / "images.txt").write_text("# comments\n" + "\n".join(lines) + "\n")
-    point = " ".join(str(v) for v in CENTRE)
-    (model / "points3D.txt").write_text(f"# points\n1 {point} 9 9 9 0.5 1 0\n")
-    return folder
-
-
 def imported(folder: Path, run: Path, *words: str) -> Episode:
     assert robot_gst.run(["import", "images", str(folder), str(run), "--quiet", *words]) == 0
     return Episode.open(run / "episodes" / "scan.mcap")
@@ -79,50 +61,22 @@ def recorded_poses(episode: Episode) -> np.ndarray:
     return np.stack([item.T_parent_child for items in found for item in items])
 
 
-def test_both_layouts_give_the_poses_that_were_written(tmp_path: Path) -> None:
+@pytest.mark.parametrize("scale", [None, 1.0, 0.25])
+def test_the_poses_are_those_that_were_written(scale: float | None, tmp_path: Path) -> None:
     expected = np.stack(poses())
-    for name, write in (("nerf", write_transforms), ("colmap", write_colmap)):
-        folder = write(tmp_path / name)
-        episode = imported(folder, tmp_path / f"{name}_run", "--metres-per-unit", "1")
-        np.testing.assert_allclose(recorded_poses(episode), expected, atol=1e-9)
-        info = CameraInfo.from_cdr(
-            next(iter(episode.messages(["/scene/cam/camera/color/info"]))).data
-        )
-        assert (info.camera.fx, info.camera.cx, info.camera.cy) == (FOCAL, 15.0, 12.5)
-        stored = [
-            CompressedColor.from_cdr(m.data).data
-            for m in episode.messages(["/scene/cam/camera/color/image"])
-        ]
-        assert stored == [p.read_bytes() for p in sorted((folder / "images").iterdir())]
-        assert episode.metadata_records["source"]["is_metric"] is True
-
-
-@pytest.mark.parametrize("write", [write_transforms, write_colmap])
-def test_poses_without_a_scale_look_at_what_is_one_metre_away(
-    write: object, tmp_path: Path
-) -> None:
-    folder = write(tmp_path / "folder")  # type: ignore[operator]
-    episode = imported(folder, tmp_path / "run")
-    source = episode.metadata_records["source"]
-    assert source["is_metric"] is False
-    found = recorded_poses(episode)
-    assert distance_to_what_is_seen(found) == pytest.approx(1.0, rel=0.03)
-    scaled = np.stack(poses())[:, :3, 3] * source["metres_per_unit"]
-    np.testing.assert_allclose(found[:, :3, 3], scaled, atol=1e-9)
-
-
-def test_parallel_axes_without_points_need_a_scale(tmp_path: Path) -> None:
+    expected[:, :3, 3] *= scale or 1.0
     folder = write_transforms(tmp_path / "folder")
-    record = json.loads((folder / "transforms.json").read_text())
-    for k, frame in enumerate(record["frames"]):
-        T = np.eye(4)
-        T[0, 3] = k
-        frame["transform_matrix"] = T.tolist()
-    (folder / "transforms.json").write_text(json.dumps(record))
-    index = read_posed_index(folder)
-    with pytest.raises(FolderError, match="--metres-per-unit"):
-        metres_per_unit(index, PosedConfig())
-    assert metres_per_unit(index, PosedConfig(metres_per_unit=2.0)) == 2.0
+    words = [] if scale is None else ["--metres-per-unit", str(scale)]
+    episode = imported(folder, tmp_path / "run", *words)
+    np.testing.assert_allclose(recorded_poses(episode), expected, atol=1e-9)
+    info = CameraInfo.from_cdr(next(iter(episode.messages(["/scene/cam/camera/color/info"]))).data)
+    assert (info.camera.fx, info.camera.cx, info.camera.cy) == (FOCAL, 15.0, 12.5)
+    stored = [
+        CompressedColor.from_cdr(m.data).data
+        for m in episode.messages(["/scene/cam/camera/color/image"])
+    ]
+    assert stored == [p.read_bytes() for p in sorted((folder / "images").iterdir())]
+    assert episode.metadata_records["source"]["is_metric"] is (scale is not None)
 
 
 TURNED = np.eye(4).tolist()
@@ -161,45 +115,6 @@ def test_a_wrong_transforms_file_is_refused_by_name(
         read_posed_index(folder)
 
 
-@pytest.mark.parametrize(
-    ("camera", "found"),
-    [
-        ("OPENCV 32 24 30 30 15 12 0 0 0 0", "image_undistorter"),
-        ("PINHOLE 32 24 30 30 15", "3 numbers"),
-        ("PINHOLE 32 24 nan 30 15 12", "not finite"),
-        ("PINHOLE 32 24 -30 30 15 12", "focal lengths -30"),
-        ("PINHOLE 99999999999 24 30 30 15 12", "At most 65500"),
-    ],
-)
-def test_a_wrong_colmap_camera_is_refused(camera: str, found: str, tmp_path: Path) -> None:
-    folder = write_colmap(tmp_path / "folder", camera)
-    with pytest.raises(FolderError, match=found):
-        read_posed_index(folder)
-
-
-@pytest.mark.parametrize(
-    ("name", "old", "new", "found"),
-    [
-        ("images.txt", "1 ", "1 nan ", "not finite"),
-        ("images.txt", "000.jpg", "../../../secret.jpg", "image not found"),
-        ("points3D.txt", "1 0.3 -0.2 4.0 9 9 9 0.5 1 0", "1 2", "fewer than three"),
-    ],
-)
-def test_a_broken_colmap_line_ends_the_import_as_wrong_use(
-    name: str, old: str, new: str, found: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = write_colmap(tmp_path / "folder")
-    (tmp_path / "secret.jpg").write_bytes(encode_jpeg(np.zeros((HEIGHT, WIDTH, 3), np.uint8)))
-    path = folder / "sparse" / "0" / name
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
-    run = tmp_path / "run"
-    assert robot_gst.run(["import", "images", str(folder), str(run), "--quiet"]) == 2
-    assert found in capsys.readouterr().err
-    assert not list(run.rglob("*.mcap"))
-
-
 def test_an_index_nested_beyond_reading_is_refused(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path / "folder")
     (folder / "transforms.json").write_text("[" * 100_000)
@@ -211,10 +126,11 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(PathNotFoundError, match=r"transforms\.json"):
         read_posed_index(tmp_path)
     (tmp_path / "sparse" / "0").mkdir(parents=True)
-    (tmp_path / "sparse" / "0" / "images.bin").write_bytes(b"")
-    with pytest.raises(PathNotFoundError, match="model_converter"):
-        read_posed_index(tmp_path)
-    folder = write_colmap(tmp_path / "folder")
+    for name in ("images.bin", "images.txt"):
+        (tmp_path / "sparse" / "0" / name).write_bytes(b"")
+        with pytest.raises(PathNotFoundError, match=rf"{name} is COLMAP's: ns-process-data"):
+            read_posed_index(tmp_path)
+    folder = write_transforms(tmp_path / "folder")
     (folder / "images" / "002.jpg").unlink()
     with pytest.raises(UsageError, match=r"002\.jpg"):
         read_posed_index(folder)
