@@ -16,12 +16,11 @@ from bridge.episode.mcap.damaged import (
     RecordFile,
     read_plain,
     summary_definitions,
-    walk_records,
 )
-from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk, chunk_of
-from bridge.episode.mcap.format import Buffer, crc32
+from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
+from bridge.episode.mcap.format import Buffer
 from bridge.episode.mcap.part_file import PartFile
-from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
+from bridge.episode.mcap.scan import AttachmentSpan, Chunk, Found, Plain, TopMessage, scan
 from bridge.episode.mcap.walk import chunk_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
@@ -85,22 +84,10 @@ class CopyTarget:
             case Chunk():
                 self._define(found.contents)
                 self.section.add_chunks([verbatim(found)])
-            case CutChunk():
-                records, contents = self._without_contradictions(found)
-                self._define(contents)
-                if contents.num_messages:
-                    self.section.add_chunks([salvaged(records, contents)])
             case TopMessage():
                 self._take_message(found)
             case AttachmentSpan():
                 self.section.add_attachment(found.record)
-
-    def _without_contradictions(self, found: CutChunk) -> tuple[bytes, Contents]:
-        """Leave out definitions that no CRC proves and that others contradict."""
-        records = found.records
-        for raw in filter(self._contradicts, found.contents.definitions):
-            records = records.replace(raw, b"", 1)
-        return records, walk_records(records)
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
         """Write the rest and sync; the caller verifies, renames and closes."""
@@ -191,7 +178,7 @@ def _definitions(source: RecordFile) -> dict[tuple[int, int], bytes]:
     records = summary_definitions(source)
     if not records:
         for found in scan(source):
-            if isinstance(found, Chunk | CutChunk):
+            if isinstance(found, Chunk):
                 records += found.contents.definitions
             elif isinstance(found, Plain) and found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
                 records.append(found.raw)
@@ -232,15 +219,3 @@ def verbatim(found: Chunk) -> EncodedChunk:
     entry = chunk_entry(0, found.length, found.head)
     entry.message_start_time, entry.message_end_time = start_ns, end_ns
     return EncodedChunk(buffers=buffers, entry=entry, index=found.contents.index)
-
-
-def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
-    """Return the records saved from a cut chunk as a whole one."""
-    return chunk_of(
-        [records],
-        contents.index,
-        times_ns=contents.time_range(),
-        size=len(records),
-        crc=crc32(records, 0),
-        compression="",
-    )
