@@ -7,6 +7,7 @@ use the index see nothing else. Message indexes, summary and footer are made ane
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from mcap.records import Channel, Header, Metadata, Schema
 
@@ -112,23 +113,24 @@ class CopyTarget:
 
     def _contradicts(self, raw: bytes) -> bool:
         """Whether a definition is not the one that its id had before."""
-        summary = self.section.summary
-        known = summary.schemas if raw[0] == mcap.SCHEMA else summary.channels
-        return known.get(_id_of(raw)) not in (None, raw)
+        summary, record = self.section.summary, read_plain(raw)
+        if isinstance(record, Schema):
+            return summary.schemas.get(record.id, record) != record
+        return isinstance(record, Channel) and summary.channels.get(record.id, record) != record
 
     def _book(self, raw: bytes) -> None:
         """Tell the summary of a definition; the first one of an id counts."""
-        summary = self.section.summary
-        match read_plain(raw):
-            case Schema(id=schema_id):
-                _define_once(summary.schemas, self._made_schemas, schema_id, raw)
-            case Channel(id=channel_id, schema_id=schema_id):
-                _define_once(summary.channels, self._made_channels, channel_id, raw)
-                if schema_id and schema_id not in summary.schemas:
-                    if self._look_up(mcap.SCHEMA, schema_id):
-                        return
-                    self._make(mcap.encoded(Schema(schema_id, b"", "", "unknown")))
-                    self._made_schemas.add(schema_id)
+        summary, record = self.section.summary, read_plain(raw)
+        if isinstance(record, Schema):
+            _define_once(summary.schemas, self._made_schemas, record)
+        elif isinstance(record, Channel):
+            _define_once(summary.channels, self._made_channels, record)
+            schema_id = record.schema_id
+            if schema_id and schema_id not in summary.schemas:
+                if self._look_up(mcap.SCHEMA, schema_id):
+                    return
+                self._make(mcap.encoded(Schema(schema_id, b"", "", "unknown")))
+                self._made_schemas.add(schema_id)
 
     def _look_up(self, opcode: int, number: int) -> bool:
         """Define what was lost here and stands in the summary or in another chunk."""
@@ -194,10 +196,10 @@ def _id_of(raw: bytes) -> int:
     return record.id if isinstance(record, Schema | Channel) else 0
 
 
-def _define_once(known: dict[int, bytes], made: set[int], number: int, raw: bytes) -> None:
-    if number not in known or number in made:
-        made.discard(number)
-        known[number] = raw
+def _define_once(known: dict[int, Any], made: set[int], record: Schema | Channel) -> None:
+    if record.id not in known or record.id in made:
+        made.discard(record.id)
+        known[record.id] = record
 
 
 _TIMES = struct.Struct("<QQ")
