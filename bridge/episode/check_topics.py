@@ -48,8 +48,6 @@ class Decoder:
         """Type or encoding of topics that are kept, and that nothing here reads."""
         self.findings: list[HealthFinding] = []
         """What the recorder noticed of clocks, and of itself."""
-        self.was_paused = False
-        """By a recorder of an earlier edition, which then left messages out."""
         self._depth_sizes: dict[str, tuple[int, int]] = {}
         self._info_sizes: dict[str, tuple[int, int]] = {}
 
@@ -91,9 +89,7 @@ class Decoder:
         elif type_name == schema.DROPS:
             self._add_losses(parse_record(data, name="drops", package="bridge.episode"))
         elif type_name == schema.EVENT:
-            event = parse_record(data, name="event", package="bridge.episode")
-            self.findings += of_event(event)
-            self.was_paused |= event["type"] == "paused"
+            self.findings += of_event(parse_record(data, name="event", package="bridge.episode"))
         elif type_name in _DECODERS:
             _DECODERS[type_name](data)
         elif type_name in ROS_TYPES:

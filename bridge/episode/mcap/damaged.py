@@ -5,8 +5,6 @@ import struct
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import lz4.frame
-import zstandard
 from mcap.records import McapRecord, Schema
 
 from bridge.episode.mcap import format as mcap
@@ -19,10 +17,8 @@ from bridge.episode.mcap.format import (
     crc32,
 )
 from bridge.episode.mcap.walk import (
-    MAX_CHUNK_BYTES,
     BrokenRecordError,
     ByteStream,
-    ChunkHead,
     parse,
     read_footer,
     records_in,
@@ -140,40 +136,3 @@ def walk_records(data: Buffer) -> Contents:
     except BrokenRecordError:
         pass  # what came before is whole
     return found
-
-
-def unpack_front(head: ChunkHead, data: bytes) -> bytes:
-    """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified."""
-    if head.compression == "":
-        return data
-    limit = min(head.size or MAX_CHUNK_BYTES, MAX_CHUNK_BYTES)
-    return (_unpack_zstd if head.compression == "zstd" else _unpack_lz4)(data, limit)
-
-
-def _unpack_zstd(data: bytes, limit: int) -> bytes:
-    unpacked = bytearray()
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as reader:
-            while len(unpacked) <= limit:
-                part = reader.read(min(limit + 1 - len(unpacked), 1 << 22))
-                if not part:
-                    break
-                unpacked += part
-    except (zstandard.ZstdError, MemoryError):
-        pass  # what came before the damage is still good
-    return bytes(unpacked)
-
-
-def _unpack_lz4(data: bytes, limit: int) -> bytes:
-    unpacked = bytearray()
-    try:
-        reader = lz4.frame.LZ4FrameDecompressor()
-        unpacked += reader.decompress(data, max_length=limit + 1)
-        while not reader.eof and len(unpacked) <= limit:
-            part = reader.decompress(b"", max_length=limit + 1 - len(unpacked))
-            if not part:
-                break
-            unpacked += part
-    except (RuntimeError, EOFError, MemoryError):
-        pass
-    return bytes(unpacked)

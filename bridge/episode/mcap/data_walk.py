@@ -5,15 +5,13 @@ The walk believes no summary and no index. Memory holds one record at a time, an
 
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from mcap import records
-from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.damaged import Contents, RecordFile, read_plain
-from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, FileSummary
 from bridge.episode.mcap.scan import (
     AttachmentSpan,
     Chunk,
@@ -31,62 +29,6 @@ from bridge.episode.mcap.walk import (
     message_head,
     records_in,
 )
-
-
-@dataclass(kw_only=True)
-class Seen:
-    """What a walk through the data section found."""
-
-    schemas: dict[int, records.Schema] = field(default_factory=dict)
-    channels: dict[int, records.Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    start_ns: int | None = None
-    end_ns: int = 0
-    chunks: list[records.ChunkIndex] = field(default_factory=list)
-    """Of the chunks whose head can be read."""
-    num_chunks: int = 0
-    attachments: list[records.AttachmentIndex] = field(default_factory=list)
-    metadata: list[records.MetadataIndex] = field(default_factory=list)
-
-    def count(self, head: MessageHead) -> None:
-        """Take a message."""
-        self.counts[head.channel_id] = self.counts.get(head.channel_id, 0) + 1
-        if self.start_ns is None or head.log_time_ns < self.start_ns:
-            self.start_ns = head.log_time_ns
-        self.end_ns = max(self.end_ns, head.log_time_ns)
-
-    def define(self, record: records.McapRecord | None) -> Iterator[str]:
-        """Take a schema or channel record; yields what is wrong with it."""
-        if isinstance(record, records.Schema):
-            if record.id == 0:
-                yield "a schema has the id 0, which means none"
-            if self.schemas.setdefault(record.id, record) != record:
-                yield f"schema {record.id} is announced twice with different contents"
-        elif isinstance(record, records.Channel):
-            if record.schema_id and record.schema_id not in self.schemas:
-                yield f"channel {record.id} uses schema {record.schema_id}, not announced before"
-            if self.channels.setdefault(record.id, record) != record:
-                yield f"channel {record.id} is announced twice with different contents"
-
-    def to_summary(self) -> Summary:
-        """Make the summary that such a file should have."""
-        summary = Summary()
-        summary.schemas, summary.channels = self.schemas, self.channels
-        summary.chunk_indexes, summary.attachment_indexes = self.chunks, self.attachments
-        summary.metadata_indexes = self.metadata
-        summary.statistics = records.Statistics(
-            attachment_count=len(self.attachments),
-            channel_count=len(self.channels),
-            channel_message_counts=self.counts,
-            chunk_count=len(self.chunks),
-            message_count=sum(self.counts.values()),
-            message_start_time=self.start_ns or 0,
-            message_end_time=self.end_ns,
-            metadata_count=len(self.metadata),
-            schema_count=len(self.schemas),
-        )
-        return summary
-
 
 _INDEX_HEAD = struct.Struct("<HI")
 
@@ -107,7 +49,7 @@ class DataWalk:
         self, file: RecordFile, *, fault: Callable[[str], None], doubt: Callable[[str], None]
     ) -> None:
         """``fault`` hears of what cannot be read, ``doubt`` of what contradicts the data."""
-        self.seen = Seen()
+        self.seen = FileSummary()
         self._file, self._fault, self._doubt = file, fault, doubt
         self._chunk: records.ChunkIndex | None = None
         self._contents = Contents()
@@ -127,14 +69,16 @@ class DataWalk:
                 case IndexSpan():
                     self._check_index(found)
                 case TopMessage():
+                    log_ns = found.log_time_ns
+                    self.seen.add_messages({found.channel_id: 1}, log_ns, log_ns)
                     yield from self._message(self._file.read(found.offset, found.length), 0)
                 case AttachmentSpan():
-                    self.seen.attachments.append(
+                    self.seen.attachment_indexes.append(
                         attachment_entry(found.offset, found.length, found.record)
                     )
                 case Plain(record=records.Metadata(name=name)):
                     entry = records.MetadataIndex(found.offset, found.length, name)
-                    self.seen.metadata.append(entry)
+                    self.seen.metadata_indexes.append(entry)
                 case Plain():
                     self._define(found.record)
                 case DataEnd():
@@ -158,17 +102,24 @@ class DataWalk:
         if channel is None:
             self._fault(f"a message of channel {head.channel_id}, which was not announced")
             return
-        self.seen.count(head)
         start = at + MESSAGE_HEAD.size
         payload = data[start : start + head.length]
         yield ScannedMessage(channel, self.seen.schemas.get(channel.schema_id), head, payload)
 
     def _define(self, record: records.McapRecord | None) -> None:
-        for text in self.seen.define(record):
-            self._fault(text)
+        """Take a schema or channel record, and say what is wrong with it."""
+        schemas, channels = self.seen.schemas, self.seen.channels
+        if isinstance(record, records.Schema):
+            if schemas.setdefault(record.id, record) != record:
+                self._fault(f"schema {record.id} is announced twice with different contents")
+        elif isinstance(record, records.Channel):
+            number, schema_id = record.id, record.schema_id
+            if schema_id and schema_id not in schemas:
+                self._fault(f"channel {number} uses schema {schema_id}, not announced before")
+            if channels.setdefault(number, record) != record:
+                self._fault(f"channel {number} is announced twice with different contents")
 
     def _walk_chunk(self, found: Chunk) -> Iterator[ScannedMessage]:
-        self.seen.num_chunks += 1
         self._chunk = chunk_entry(found.offset, found.length, found.head)
         self._contents = found.contents
         data = found.records
@@ -177,6 +128,8 @@ class DataWalk:
                 yield from self._message(data, at)
             elif opcode in (mcap_format.SCHEMA, mcap_format.CHANNEL):
                 self._define(read_plain(data[at : at + RECORD_HEAD.size + length]))
+        counts = {number: len(each) // 2 for number, each in found.contents.index.items()}
+        self.seen.add_messages(counts, *found.contents.time_range())
         times, said = found.contents.time_range(), (found.head.start_ns, found.head.end_ns)
         if times != said:
             whose = f"the chunk at byte {found.offset}"
@@ -205,7 +158,7 @@ class DataWalk:
         if indexed and absent:
             at = self._chunk.chunk_start_offset
             self._doubt(f"the chunk at byte {at} has no index of channels {sorted(absent)}")
-        self.seen.chunks.append(self._chunk)
+        self.seen.chunk_indexes.append(self._chunk)
         self._chunk = None
 
 

@@ -36,7 +36,8 @@ def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     """Read the whole data section once; every chunk is unpacked and its CRC checked."""
     found = DataWalk(RecordFile(stream, data_end), fault=_refuse, doubt=lambda text: None)
     deque(found.messages(), maxlen=0)
-    return found.seen.to_summary()
+    found.seen.sum_up()
+    return found.seen
 
 
 def _refuse(text: str) -> None:

@@ -17,7 +17,6 @@ from bridge.episode.mcap.damaged import (
     Contents,
     RecordFile,
     read_plain,
-    unpack_front,
     walk_records,
 )
 from bridge.episode.mcap.walk import (
@@ -66,20 +65,6 @@ class Chunk(Span):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CutChunk(Span):
-    """The last chunk of a file that ends inside it, with the whole messages found in it.
-
-    ``length`` goes to the end of the file. Nothing verified the messages but their structure.
-    """
-
-    head: ChunkHead
-    records: bytes
-    unpacked_size: int
-    """Bytes that could be unpacked, the torn message at their end included."""
-    contents: Contents
-
-
-@dataclass(frozen=True, kw_only=True)
 class TopMessage(Span):
     """A message outside chunks."""
 
@@ -112,9 +97,7 @@ class DataEnd(Span):
     """The writer got as far as the summary."""
 
 
-Found: TypeAlias = (
-    Plain | Chunk | CutChunk | TopMessage | AttachmentSpan | IndexSpan | Damage | DataEnd
-)
+Found: TypeAlias = Plain | Chunk | TopMessage | AttachmentSpan | IndexSpan | Damage | DataEnd
 
 
 MAX_PLAIN_BYTES = 64 << 20
@@ -260,7 +243,7 @@ def _index_bytes(front: bytes) -> int:
 
 
 def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:
-    """Step over damage, or take what a cut record at the end still holds."""
+    """Step over damage; a cut message index at the end costs nothing."""
     length = _trusted_length(file, offset)
     if length:
         end = offset + length
@@ -275,7 +258,7 @@ def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:
         return None
     if front[0] == mcap.MESSAGE_INDEX:
         return IndexSpan(offset=offset, length=damage.length)
-    return _read_cut_chunk(file, offset, front) or damage
+    return damage
 
 
 def _trusted_length(file: RecordFile, offset: int) -> int:
@@ -290,27 +273,6 @@ def _trusted_length(file: RecordFile, offset: int) -> int:
     following = file.read(end, 1)
     known = not following or following[0] in _KINDS or following[0] in _SUMMARY_ONLY
     return end - offset if known else 0
-
-
-def _read_cut_chunk(file: RecordFile, offset: int, front: bytes) -> CutChunk | None:
-    try:
-        head = _chunk_head(front)
-    except BrokenRecordError:
-        return None
-    if offset + head.record_bytes <= file.size or head.size > MAX_CHUNK_BYTES:
-        return None
-    records = unpack_front(head, file.read(offset + head.head_bytes, MAX_CHUNK_BYTES))
-    contents = walk_records(records)
-    if not contents.num_messages:
-        return None
-    return CutChunk(
-        offset=offset,
-        length=file.size - offset,
-        head=head,
-        records=records[: contents.size],
-        unpacked_size=len(records),
-        contents=contents,
-    )
 
 
 def _step_over(file: RecordFile, offset: int, what: str) -> Damage:
