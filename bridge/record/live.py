@@ -78,10 +78,10 @@ class Previews:
         self._names.add(name)
         return name
 
-    def show(self, sample: WireSample, kind: str) -> None:
+    def show(self, sample: WireSample) -> None:
         """Send a small copy of an image, if somebody looks and it is time for one."""
         topic = sample.topic
-        if topic not in self._watched or kind == "depth":
+        if topic not in self._watched:
             return
         now_s = time.monotonic()
         if now_s < self._next_s.get(topic, 0.0):

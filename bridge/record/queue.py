@@ -304,22 +304,19 @@ class InputQueue:
         if second != flow.second:
             flow.second, flow.in_second = second, 0
         flow.in_second += 1
+        small = self._small_budget - (self._small_in - self._small_out)
+        free = self._bulk_budget - self._bulk_bytes if is_bulk else small
         if flow.in_second > self._limits.max_rate_hz:
             self._drop(sample, step, f"over {self._limits.max_rate_hz} messages a second")
         elif sample.oversize_bytes or cost - OVERHEAD_BYTES > self._max_bytes:
             self._drop(sample, step, f"messages over {self._limits.max_message_mb:g} MB")
         elif flow.is_ledger:
             self._drop(sample, step, "messages of anybody but the recorder")
-        elif cost > self._free_bytes(is_bulk=is_bulk):
+        elif cost > free:
             self._drop(sample, step, "")
         else:
             return True
         return False
-
-    def _free_bytes(self, *, is_bulk: bool) -> int:
-        if is_bulk:
-            return self._bulk_budget - self._bulk_bytes
-        return self._small_budget - (self._small_in - self._small_out)
 
     def _drop(self, sample: WireSample, step: Step, limit: str) -> None:
         """Count a message that is left out, for want of space where it broke no limit."""

@@ -21,7 +21,7 @@ from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import BridgeError, GstError
 from bridge.record.clocks import ClockBook
 from bridge.record.config import RecorderConfig
-from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
+from bridge.record.encoders import EncoderThreads, Preview
 from bridge.record.errors import (
     ControlError,
     DiskError,
@@ -56,7 +56,7 @@ class Recorder:
         *,
         now_ns: Callable[[], int],
         config: RecorderConfig | None = None,
-        preview: Preview = lambda sample, kind: None,
+        preview: Preview = lambda sample: None,
         task: TaskFile | None = None,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
@@ -66,8 +66,7 @@ class Recorder:
         self._now_ns = now_ns
         self.run = run
         self._task = task
-        encoder = ImageEncoder(self.config)
-        self._encoders = EncoderThreads(encoder, self._take_back, preview)
+        self._encoders = EncoderThreads(self.config, self._take_back, preview)
         self.input_queue = InputQueue(self.config.queues, self._encoders.submit)
         self._merge = Merge(lambda: self._life.keeps_up)
         self._life = Lifecycle(

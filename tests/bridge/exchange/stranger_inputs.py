@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bridge.episode.reader import Episode
 from bridge.episode.schema import ROS_TYPES, schema_text
-from bridge.media.color import encode_jpeg
+from bridge.media.color import encode_jpeg, encode_png
 
 CAMERA = ("color/image", "color/info", "depth/image", "depth/info")
 POSES = {"/tf": "/tf", "/tf_static": "/tf_static"}
@@ -109,16 +109,17 @@ def rlds(folder: Path) -> Path:
 
 
 def posed(folder: Path) -> Path:
-    """Two images and their poses, as NeRF programs keep them."""
+    """Two images with depth and their poses, as NeRF programs keep them."""
     folder.mkdir(exist_ok=True)
     frames = []
     for number in (1, 2):
         picture = encode_jpeg(np.full((24, 32, 3), 60 * number, np.uint8))
         (folder / f"{number}.jpg").write_bytes(picture)
-        frames.append({"file_path": f"{number}.jpg", "transform_matrix": np.eye(4).tolist()})
-    (folder / "transforms.json").write_text(
-        json.dumps({"w": 32, "h": 24, "fl_x": 30, "frames": frames})
-    )
+        (folder / f"{number}.png").write_bytes(encode_png(np.full((24, 32), 900, np.uint16)))
+        names = {"file_path": f"{number}.jpg", "depth_file_path": f"{number}.png"}
+        frames.append({**names, "transform_matrix": np.eye(4).tolist()})
+    about = {"w": 32, "h": 24, "fl_x": 30, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(about))
     return folder
 
 
