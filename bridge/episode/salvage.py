@@ -66,7 +66,7 @@ class CopyTarget:
         """Create ``path``; OSError when it exists or cannot be written."""
         self._source = source
         self.section = DataSection(PartFile.create(path))
-        self._loose = OpenChunk(compress=False, gather=True)
+        self._loose = OpenChunk(compress=False, is_small=True)
         self._made_schemas: set[int] = set()
         self._made_channels: set[int] = set()
         self.looked_up: list[bytes] = []
@@ -220,4 +220,4 @@ def verbatim(found: Chunk) -> EncodedChunk:
         buffers = [front, memoryview(found.raw)[len(front) :]]
     entry = chunk_entry(0, found.length, found.head)
     entry.message_start_time, entry.message_end_time = start_ns, end_ns
-    return EncodedChunk(buffers=buffers, entry=entry, index=found.contents.index)
+    return EncodedChunk(buffers, entry, found.contents.index)
