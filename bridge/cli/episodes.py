@@ -2,16 +2,14 @@
 
 import textwrap
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from bridge.episode.catalogue_query import UNLABELLED, CatalogueQuery
-from bridge.errors import refuse_outside
 from bridge.terminal import Advance, Output
-from bridge.wire.config import LOOPBACK
 
 if TYPE_CHECKING:
     from bridge.episode.catalogue_query import Entry
@@ -20,31 +18,6 @@ if TYPE_CHECKING:
     from bridge.episode.run_folder import RunFolder
 
 OUTPUT = Output()
-
-
-@dataclass(frozen=True, kw_only=True)
-class WireCheck:
-    """Listening to a publisher."""
-
-    wire: str | None = None
-    """Key expression of what to listen to, for example lab/** or lab/joint_states."""
-    seconds: float = 5.0
-    """How long to listen [s]."""
-    rate_hz: float | None = None
-    """What every topic should have [Hz]; 10 % off is wrong."""
-    connect: tuple[str, ...] = LOOPBACK
-    """Where the recorder, or another zenoh router, listens."""
-    listen: tuple[str, ...] = ()
-    """Be the router that the publisher connects to, instead."""
-    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None
-    """zenoh configuration (JSON5)."""
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that make no sense."""
-        refuse_outside(self, {"seconds": (0.01, 86_400.0), "rate_hz": (1e-3, 1e6)})
-
-
-WIRE = WireCheck()
 
 
 def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
@@ -138,15 +111,12 @@ def check(
     /,
     *,
     contract: str | None = None,
-    wire: Annotated[WireCheck, Parameter(name="*", group="A publisher")] = WIRE,
     output: Output = OUTPUT,
 ) -> int:
     """Verify episodes (CRCs, indexes, counts, decoding); list drops and silent topics.
 
     Exit code 0: clean, 3: messages were dropped or a contract was broken, 1: broken.
     Example: robot-gst check runs/demo
-    With --wire it listens to a publisher instead and says what of the contract (docs/wire.md) it
-    does not keep: robot-gst check --wire "lab/**" --seconds 5
 
     Args:
         episodes: Episode files, or folders to search for them.
@@ -157,10 +127,6 @@ def check(
     from bridge.episode.mcap.part_file import told_unfinished
     from bridge.errors import UsageError
 
-    if wire.wire is not None:
-        if episodes:
-            raise UsageError("--wire listens to a publisher; give episodes in another command.")
-        return _check_wire(wire.wire, wire, output)
     files: list[Path] = []
     unfinished: list[Path] = []
     for path in episodes:
@@ -191,29 +157,6 @@ def check(
     left = [path for path, (_, alive) in zip(unfinished, told, strict=True) if not alive]
     codes |= {1 if path in episodes else 3 for path in left}
     return 1 if 1 in codes else max(codes, default=0)
-
-
-def _check_wire(key: str, config: WireCheck, output: Output) -> int:
-    from bridge.record.wire_check import WireListener, describe_heard
-    from bridge.terminal import stop_signals
-    from bridge.wire.config import WireConfig
-    from bridge.wire.session import open_session
-
-    if config.listen:
-        wire = WireConfig(
-            mode="router", connect=(), listen=config.listen, config=config.zenoh_config
-        )
-    else:
-        wire = WireConfig(connect=config.connect, config=config.zenoh_config)
-    with stop_signals() as stop, open_session(wire) as session:
-        listener = WireListener(session, key.lstrip("/"))
-        where = ", ".join(config.listen or config.connect)
-        output.say(f"listening to {key} on {where} for {config.seconds:g} s")
-        stop.wait(config.seconds)
-        heard = listener.finish(rate_hz=config.rate_hz)
-    data = {"key": key, "topics": [each.to_json() for each in heard]}
-    output.result(data, describe_heard(key, heard))
-    return 3 if not heard or any(each.findings for each in heard) else 0
 
 
 def doctor(*, output: Output = OUTPUT) -> int:

@@ -37,7 +37,7 @@ def record(
 ) -> int:
     """Record episodes live; everything published to this recorder ends up in one.
 
-    Without --episode it waits for robot-gst ctl start, or the keys shown on a terminal.
+    Without --episode it waits for robot-gst ctl start.
     SIGINT or SIGTERM finish the open episode.
     Example: robot-gst record runs/monday --episode scan --duration 30
 
@@ -47,7 +47,7 @@ def record(
         duration_s: Stop after this long [s]; with --episode.
         anyway: Start it although topics are missing that cell.toml requires; else it waits.
         learn: Write the run's cell.toml from this good episode, and record nothing.
-        about: What is being recorded, with --episode or the key s.
+        about: What is being recorded, with --episode.
         listen: Where to listen; other processes connect here.
         connect: Other zenoh routers to join.
         zenoh_config: zenoh configuration (JSON5), for example with access control.
@@ -74,7 +74,6 @@ def record(
             output=output,
             episode=info,
             duration_s=duration_s,
-            about=about,
             anyway=anyway,
             task=task,
         )
@@ -123,7 +122,7 @@ def ctl(
     Args:
         action: start, stop, mark, label, list or status.
         text: Words of a mark or label.
-        id: Episode to start, or to label after it has been finished.
+        id: Episode to start, by default the next number, or to label when it is finished.
         about: What is being recorded (start).
         result: How it went (stop, label).
         detail: What happened, in words (stop, label).
@@ -134,7 +133,6 @@ def ctl(
         connect: Where it listens.
         zenoh_config: zenoh configuration (JSON5).
     """
-    from bridge.errors import UsageError
     from bridge.record.control import RecorderClient
     from bridge.record.status import describe_answer, describe_status
     from bridge.wire.config import WireConfig
@@ -153,8 +151,6 @@ def ctl(
         "list": {"last": last},
         "status": {},
     }
-    if action == "start" and id is None:
-        raise UsageError("start needs the new episode's id: robot-gst ctl start --id trial_0001.")
     with open_session(WireConfig(connect=connect, config=zenoh_config)) as session:
         answer = RecorderClient(session, recorder).ask(action, requests[action])
     describers: dict[str, Callable[[dict[str, Any]], str]]

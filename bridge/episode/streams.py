@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
+    FrameTransform,
     JointSample,
     PoseSample,
     RawColor,
@@ -103,12 +105,16 @@ def first_stamp_ns(episode: Episode) -> int | None:
     return min(stamps, default=None)
 
 
+@lru_cache(maxsize=1)
+def transforms(episode: Episode) -> tuple[FrameTransform, ...]:
+    """What ``/tf`` and ``/tf_static`` say; those of the last episode are kept."""
+    messages = episode.messages(episode.topics_of_type(schema.TF_MESSAGE))
+    return tuple(item for message in messages for item in transforms_from_cdr(message.data))
+
+
 def transform_tree(episode: Episode) -> TransformTree:
     """Collect ``/tf`` and ``/tf_static``."""
-    transforms = []
-    for message in episode.messages(episode.topics_of_type(schema.TF_MESSAGE)):
-        transforms.extend(transforms_from_cdr(message.data))
-    return TransformTree(transforms)
+    return TransformTree(transforms(episode))
 
 
 def camera_ids(episode: Episode) -> list[str]:

@@ -52,13 +52,6 @@ def key_from_topic(topic: str) -> str:
     return key
 
 
-def topic_pattern(expression: str) -> re.Pattern[str]:
-    """Turn a key expression (``lab/*/image``, ``lab/**``) into a pattern of whole topics."""
-    parts = expression.strip("/").split("/")
-    named = {"**": "(?:/[^/]+)*", "*": "/[^/]+"}
-    return re.compile("".join(named.get(part, "/" + re.escape(part)) for part in parts))
-
-
 @lru_cache(maxsize=4096)
 def read_key(key: str) -> NamedKey:
     """Tell the topic of a key, and type and hash when it is one of rmw_zenoh."""
@@ -86,11 +79,6 @@ _SCHEMA_ENCODINGS = {
     "jsonschema": "json",
 }
 """MCAP's schema encodings, and the message encoding that goes with each."""
-
-
-def definition_key(type_name: str, schema_encoding: str) -> str:
-    """Name the key of a type's definition: ``@schema/jsonschema/acme/Note``."""
-    return f"{DEFINITIONS}/{key_from_topic(f'/{schema_encoding}/{type_name}')}"
 
 
 def read_definition_key(key: str) -> tuple[str, str, str] | None:

@@ -59,7 +59,7 @@ def test_a_stop_comes_after_everything_sent_before_it(joined: Joined) -> None:
     [
         ("start", {"id": "../../evil"}, "not usable as a file name"),
         ("start", {"id": "a", "info": {"kind": "trial", "x": 1}}, "info does not know x"),
-        ("start", {}, "needs an episode id"),
+        ("start", {"id": 7}, "needs an episode id"),
         ("stop", {"discord": True}, "stop does not know discord. It knows: discard, outcome"),
         ("start", {"id": "a", "info": [1]}, "info must be a JSON object"),
         ("start", {"id": "a", "info": {"schema_version": 9}}, "schema_version 9 is not the 1"),

@@ -2,7 +2,6 @@
 
 import ast
 import json
-import re
 import shutil
 import struct
 import subprocess
@@ -25,7 +24,6 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.record.recorder import Recorder
-from bridge.record.wire_check import TopicHeard, WireListener
 from bridge.wire.config import WireConfig
 from bridge.wire.publisher import Attachment, encode
 from bridge.wire.session import WireSession, open_session
@@ -180,96 +178,6 @@ def wild(router: WireSession, endpoint: str) -> Iterator[Wild]:
     made = Wild(endpoint)
     yield made
     made.session.close()
-
-
-def findings(heard: list[TopicHeard]) -> dict[str, str]:
-    (topic,) = heard
-    return {f"{each.kind} {each.about}": each.text for each in topic.findings}
-
-
-def listen(router: WireSession, act: Callable[[], None], *, messages: int) -> list[TopicHeard]:
-    listener = WireListener(router, "demo/**")
-    act()
-    wait_for(listener, messages)
-    return listener.finish()
-
-
-def wait_for(listener: WireListener, messages: int) -> None:
-    wait_until(lambda: sum(each.messages for each in listener._heard.values()) >= messages)
-
-
-def test_who_keeps_the_contract_has_no_findings(router: WireSession, wild: Wild) -> None:
-    wild.alive("demo/alive")
-    (topic,) = listen(router, wild.send, messages=5)
-    assert topic.findings == []
-    assert (topic.messages, len(topic.last_numbers), topic.lost) == (5, 1, 0)
-    assert topic.lines()[1] == (
-        "  ok       encoding, payload, attachment, sequence, time, liveliness, rate"
-    )
-
-
-@pytest.mark.parametrize(
-    ("breach", "finding", "words"),
-    [
-        ({"encoding": "zenoh/bytes"}, "missing encoding", "sensor_msgs/msg/JointState is taken"),
-        ({"encoding": "application/cdr"}, "missing encoding", "names no type"),
-        ({"numbers": None}, "missing attachment", "none on 5 of 5 messages"),
-        ({"numbers": None}, "missing sequence", "their losses cannot be seen"),
-        ({"raw": b"x" * 20}, "wrong attachment", "20 bytes; it has 33"),
-        ({"numbers": lambda n: 3 * n}, "wrong sequence", "8 of 13 numbers were skipped"),
-        ({"numbers": lambda n: 4}, "wrong sequence", "4 numbers do not count on"),
-        ({"stamp": lambda n: time.time_ns() // 1000}, "wrong time", "look like microseconds"),
-        ({"stamp": lambda n: int(time.time())}, "wrong time", "look like seconds"),
-        ({"stamp": lambda n: time.time_ns() + 10**11}, "wrong time", "100 s ahead of"),
-        ({"stamp": lambda n: time.time_ns() - n * 10**8}, "wrong time", "4 messages are stamped"),
-        ({"data": b"\0\1\0\0junk"}, "wrong payload", "5 of 5 messages are not what"),
-        ({"numbers": None, "data": b"\0\1\0\0" + bytes(28)}, "missing time", "nor header.stamp"),
-    ],
-)
-def test_every_breach_is_named(
-    router: WireSession, wild: Wild, breach: dict[str, Any], finding: str, words: str
-) -> None:
-    wild.alive("demo/alive")
-    found = findings(listen(router, lambda: wild.send(**breach), messages=5))
-    assert words in found[finding], found
-
-
-def test_a_missing_token_and_a_wrong_rate_are_named(router: WireSession, wild: Wild) -> None:
-    listener = WireListener(router, "demo/**")
-    wild.send()
-    wait_for(listener, 5)
-    found = findings(listener.finish(rate_hz=1e6 * 0.9))
-    assert "no token demo/alive" in found["missing liveliness"]
-    assert "expected 900000 Hz" in found["wrong rate"]
-
-
-def test_a_token_of_a_part_of_the_cell_counts_and_that_of_another_does_not(
-    router: WireSession, wild: Wild
-) -> None:
-    wild.alive("other/alive")
-    wild.alive("dem/alive")
-    assert "missing liveliness" in findings(listen(router, wild.send, messages=5))
-    wild.alive("demo/arm/alive")
-    act = lambda: wild.send(key="demo/arm/joint_states")  # noqa: E731
-    assert findings(listen(router, act, messages=5)) == {}
-
-
-@pytest.mark.slow
-def test_the_command_ends_with_0_3_and_2(endpoint: str, spawn: Spawn) -> None:
-    command = (str(ROOT / "robot_gst.py"), "check", "--wire", "demo/**", "--listen", endpoint)
-    for left_out, code, words in (((), 0, r"ok +encoding, payload"), (("4",), 3, r"1 of \d+ num")):
-        check = spawn(*command, "--seconds", "3")
-        assert check.stderr is not None
-        assert "listening to demo/**" in check.stderr.readline()
-        spawn(str(PYTHON), endpoint, "demo", "240", "500", *left_out)
-        out, said = check.communicate(timeout=WAIT_S)
-        assert check.returncode == code, out + said
-        assert re.search(words, out), out
-    silent = spawn(*command, "--seconds", "0.1")
-    out, _ = silent.communicate(timeout=WAIT_S)
-    assert (silent.returncode, out[:24]) == (3, "nothing came on demo/**;")
-    wrong = spawn(*command, "--seconds", "-1")
-    assert wrong.wait(WAIT_S) == 2
 
 
 def test_a_publisher_may_tell_what_its_types_are(

@@ -180,7 +180,7 @@ def test_the_command_says_that_no_camera_is_there(capsys: pytest.CaptureFixture[
 @pytest.fixture(autouse=True)
 def images_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     """Busy links drop images; here each is counted."""
-    monkeypatch.setattr(Qos, "CAMERA", Qos.PLAYBACK)
+    monkeypatch.setattr(Qos, "CAMERA", Qos.RELIABLE)
 
 
 class Running:
