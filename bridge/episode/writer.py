@@ -387,13 +387,9 @@ class EpisodeWriter:
             if group.has_messages and group.opened_s <= before_s:
                 self._flush(group)
 
-    def keep_name(self) -> bool:
-        """Write the file anew where somebody removed it, and say whether that was needed."""
-        if self._file.is_there():
-            return False
-        self.wait_for_disk()
-        self._file.restore()
-        return True
+    def refuse_removed(self) -> None:
+        """Raise OSError where somebody removed or replaced the file."""
+        self._file.refuse_removed()
 
     def close(self) -> Path:
         """Finish, sync to disk and give the file its final name."""

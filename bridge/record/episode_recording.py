@@ -230,9 +230,9 @@ class EpisodeRecording:
         """The episode's file when it is finished."""
         return self._writer.path
 
-    def keep_name(self) -> bool:
-        """Write the file anew where somebody removed it; raises OSError when that fails."""
-        return self._writer.keep_name()
+    def refuse_removed(self) -> None:
+        """Raise OSError where somebody removed or replaced the file."""
+        self._writer.refuse_removed()
 
     @property
     def keeps_up(self) -> bool:
