@@ -219,42 +219,27 @@ class EpisodeWriter:
     def write(
         self,
         topic: str,
-        data: Buffer,
+        data: Buffer | Mapping[str, Any],
         *,
-        type_name: str,
-        log_time_ns: int,
-        publish_time_ns: int | None = None,
-        sequence: int | None = None,
-    ) -> None:
-        """Append one serialised message of a type this project knows.
-
-        Without a time it was sent when it was logged; without a number it counts on.
-        """
-        known = schema.schema_for(type_name)
-        if known is None:
-            raise ValueError(f"no schema for {type_name!r}; use write_foreign for other types")
-        self.write_foreign(
-            topic,
-            data,
-            schema_record=known,
-            log_time_ns=log_time_ns,
-            publish_time_ns=publish_time_ns,
-            sequence=sequence,
-        )
-
-    def write_foreign(
-        self,
-        topic: str,
-        data: Buffer,
-        *,
-        schema_record: schema.Schema | None,
+        type_name: str = "",
+        schema_record: schema.Schema | None = None,
         message_encoding: str = "",
         log_time_ns: int,
         publish_time_ns: int | None = None,
         sequence: int | None = None,
         about: About = (),
     ) -> None:
-        """Append one message with the given schema, or none; the bytes are kept as they are."""
+        """Append one serialised message, or a record as JSON, of a type this project knows.
+
+        Of other types the schema is given, or none; the bytes are kept as they are. Without a time
+        it was sent when it was logged; without a number it counts on.
+        """
+        if type_name:
+            schema_record = schema.schema_for(type_name)
+            if schema_record is None:
+                raise ValueError(f"no schema for {type_name!r}; give the schema of other types")
+        if not isinstance(data, Buffer):
+            data = json.dumps(data, separators=(",", ":")).encode()
         channel = self._channels.find(topic, schema_record, message_encoding, about)
         length = num_bytes(data)
         if self._pending or self._file.failed:
@@ -329,25 +314,6 @@ class EpisodeWriter:
         while self._pending:
             self._section.add_chunks([self._pending[0]])
             self._pending.popleft()
-
-    def write_json(
-        self,
-        topic: str,
-        record: Mapping[str, Any],
-        *,
-        type_name: str,
-        log_time_ns: int,
-        publish_time_ns: int | None = None,
-    ) -> None:
-        """Append one JSON record."""
-        data = json.dumps(record, separators=(",", ":")).encode()
-        self.write(
-            topic,
-            data,
-            type_name=type_name,
-            log_time_ns=log_time_ns,
-            publish_time_ns=publish_time_ns,
-        )
 
     def attach(self, name: str, data: bytes, *, media_type: str, log_time_ns: int) -> None:
         """Add an attachment, for example ``robot.urdf``; it is in the file at once."""

@@ -300,7 +300,7 @@ class EpisodeRecording:
         source_ns = sample.source_ns
         if source_ns is None and channel.stamp_ns is not None:
             source_ns = channel.stamp_ns(sample.data)
-        self._writer.write_foreign(
+        self._writer.write(
             sample.topic,
             sample.data,
             schema_record=channel.record,
@@ -334,7 +334,7 @@ class EpisodeRecording:
         self, topic: str, record: dict[str, Any], type_name: str, stamp_ns: int
     ) -> None:
         log_ns = self._channels.later(topic, stamp_ns)
-        self._writer.write_json(topic, record, type_name=type_name, log_time_ns=log_ns)
+        self._writer.write(topic, record, type_name=type_name, log_time_ns=log_ns)
 
     def write_clock(self, record: dict[str, Any], stamp_ns: int) -> None:
         """Append readings of a source's clock."""

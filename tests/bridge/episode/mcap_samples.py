@@ -106,7 +106,7 @@ def put_foreign(
     data: Buffer | None = None,
 ) -> None:
     """Write one message of a type that the writer need not know."""
-    writer.write_foreign(
+    writer.write(
         item.topic,
         item.data if data is None else data,
         schema_record=kind,
