@@ -85,21 +85,11 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         return Entry(**name, size_bytes=size, error=printable(str(error)))
     records = episode.metadata_records
     presence = records.get(PRESENCE_RECORD, {})
+    about = {key: value for key, value in asdict(info).items() if key in Entry.__annotations__}
     return Entry(
+        **{key: _printable(value) for key, value in about.items() if key not in name},
         **name,
         size_bytes=size,
-        kind=printable(info.kind),
-        task=printable(info.task),
-        instruction=printable(info.instruction),
-        condition=printable(info.condition),
-        policy=printable(info.policy),
-        start_id=None if info.start_id is None else printable(info.start_id),
-        trial=info.trial,
-        operator=printable(info.operator),
-        robot=printable(info.robot),
-        cell=printable(info.cell),
-        stand_in=info.stand_in,
-        tags=tuple(printable(str(tag)) for tag in info.tags),
         outcome=printable(outcome.result) if outcome else "unknown",
         cause=printable(_cause(info.kind, outcome)),
         start_ns=episode.start_ns,
@@ -109,6 +99,12 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         recovered="recovered" in records,
         presence=printable("; ".join(health_lines({**presence, **records.get(RECORD_NAME, {})}))),
     )
+
+
+def _printable(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(printable(str(item)) for item in value)
+    return printable(value) if isinstance(value, str) else value
 
 
 def _cause(kind: str, outcome: Outcome | None) -> str:

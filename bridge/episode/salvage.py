@@ -35,8 +35,8 @@ def each_chunk_once(source: RecordFile) -> Iterator[Found]:
     """Return what a file holds; a chunk that lies there twice is given once."""
     there: set[tuple[int, int]] = set()
     for found in scan(source):
-        if isinstance(found, Chunk) and found.head.crc:
-            key = found.head.crc, found.head.size
+        if isinstance(found, Chunk) and found.packed.uncompressed_crc:
+            key = found.packed.uncompressed_crc, found.packed.uncompressed_size
             if key in there:
                 continue
             there.add(key)
@@ -66,7 +66,7 @@ class CopyTarget:
         """Create ``path``; OSError when it exists or cannot be written."""
         self._source = source
         self.section = DataSection(PartFile.create(path))
-        self._loose = OpenChunk(compress=False, gather=True)
+        self._loose = OpenChunk(compress=False, is_small=True)
         self._made_schemas: set[int] = set()
         self._made_channels: set[int] = set()
         self.looked_up: list[bytes] = []
@@ -218,6 +218,6 @@ def verbatim(found: Chunk) -> EncodedChunk:
     if has_wrong_times(found):
         front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
         buffers = [front, memoryview(found.raw)[len(front) :]]
-    entry = chunk_entry(0, found.length, found.head)
+    entry = chunk_entry(0, found.length, found.packed)
     entry.message_start_time, entry.message_end_time = start_ns, end_ns
-    return EncodedChunk(buffers=buffers, entry=entry, index=found.contents.index)
+    return EncodedChunk(buffers, entry, found.contents.index)

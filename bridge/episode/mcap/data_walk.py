@@ -120,7 +120,7 @@ class DataWalk:
                 self._fault(f"channel {number} is announced twice with different contents")
 
     def _walk_chunk(self, found: Chunk) -> Iterator[ScannedMessage]:
-        self._chunk = chunk_entry(found.offset, found.length, found.head)
+        self._chunk = chunk_entry(found.offset, found.length, found.packed)
         self._contents = found.contents
         data = found.records
         for opcode, at, length in records_in(data):
@@ -130,7 +130,8 @@ class DataWalk:
                 self._define(read_plain(data[at : at + RECORD_HEAD.size + length]))
         counts = {number: len(each) // 2 for number, each in found.contents.index.items()}
         self.seen.add_messages(counts, *found.contents.time_range())
-        times, said = found.contents.time_range(), (found.head.start_ns, found.head.end_ns)
+        times = found.contents.time_range()
+        said = (found.packed.message_start_time, found.packed.message_end_time)
         if times != said:
             whose = f"the chunk at byte {found.offset}"
             self._doubt(f"{whose} says its messages are from {said}, they are from {times}")

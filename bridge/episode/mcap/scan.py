@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from mcap.records import Attachment, McapRecord
+from mcap.records import Chunk as ChunkRecord
 
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
@@ -22,10 +23,9 @@ from bridge.episode.mcap.damaged import (
 from bridge.episode.mcap.walk import (
     MAX_CHUNK_BYTES,
     BrokenRecordError,
-    ChunkHead,
     attachment_of,
+    chunk_bytes,
     parse_chunk,
-    parse_chunk_head,
     unpack_chunk,
 )
 
@@ -58,7 +58,7 @@ class Chunk(Span):
     """A chunk whose CRC and structure are right."""
 
     raw: bytes
-    head: ChunkHead
+    packed: ChunkRecord
     records: bytes
     """Unpacked."""
     contents: Contents
@@ -183,29 +183,19 @@ def _read_record(file: RecordFile, offset: int) -> Found | None:
     return Plain(offset=offset, length=length, opcode=opcode, raw=raw, record=read_plain(raw))
 
 
-def _chunk_head(front: bytes) -> ChunkHead:
-    """Read what the first bytes of a record say, where they are those of a chunk."""
-    if len(front) < mcap.RECORD_HEAD.size or front[0] != mcap.CHUNK:
-        raise BrokenRecordError("no chunk head")
-    length = mcap.RECORD_HEAD.unpack_from(front)[1]
-    head = parse_chunk_head(front[mcap.RECORD_HEAD.size :], length)
-    if head.compression not in ("", "lz4", "zstd"):
-        raise BrokenRecordError(f"its compression {head.compression!r} is not known")
-    return head
-
-
 def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
-    head = _chunk_head(front)
-    if not head.is_consistent:
-        message = "the lengths of a chunk contradict each other or are beyond all limits"
+    length = chunk_bytes(front)
+    if not length:
+        message = "a chunk is damaged: its lengths contradict each other, or are beyond all limits"
         raise BrokenRecordError(message)
-    raw = file.read(offset, head.record_bytes)
-    records = unpack_chunk(parse_chunk(raw[mcap.RECORD_HEAD.size :]))
+    raw = file.read(offset, length)
+    packed = parse_chunk(raw[mcap.RECORD_HEAD.size :])
+    records = unpack_chunk(packed)
     contents = walk_records(records)
     if contents.size != len(records):
         raise BrokenRecordError("a chunk is damaged: its records are torn")
     return Chunk(
-        offset=offset, length=len(raw), raw=raw, head=head, records=records, contents=contents
+        offset=offset, length=length, raw=raw, packed=packed, records=records, contents=contents
     )
 
 
@@ -293,16 +283,9 @@ def _next_chunk(file: RecordFile, offset: int) -> int | None:
         window = file.read(start, BLOCK_BYTES + _FRONT_BYTES)
         at = window.find(mcap.CHUNK, 0, BLOCK_BYTES)
         while at >= 0:
-            if window[at + 7 : at + 9] == b"\0\0" and _is_chunk(file, start + at, window, at):
+            length = chunk_bytes(window[at : at + _FRONT_BYTES])
+            if length and start + at + length <= file.size:
                 return start + at
             at = window.find(mcap.CHUNK, at + 1, BLOCK_BYTES)
         start += BLOCK_BYTES
     return None
-
-
-def _is_chunk(file: RecordFile, offset: int, window: bytes, at: int) -> bool:
-    try:
-        head = _chunk_head(window[at : at + _FRONT_BYTES])
-    except BrokenRecordError:
-        return False
-    return head.is_consistent and offset + head.record_bytes <= file.size

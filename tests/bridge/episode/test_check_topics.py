@@ -98,7 +98,7 @@ def test_losses_the_ledger_lists_are_declared(tmp_path: Path) -> None:
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, [0, 1, 5, 6, 9])
         record = drops(JOINTS, gaps=2, queue_drops=2, shed=1)
-        writer.write_json(DROPS, record, type_name=schema.DROPS, log_time_ns=2000)
+        writer.write(DROPS, record, type_name=schema.DROPS, log_time_ns=2000)
 
     report = check(tmp_path, fill)
     assert (report.exit_code, report.summary) == (3, "drops logged")
@@ -110,7 +110,7 @@ def test_losses_the_ledger_lists_are_declared(tmp_path: Path) -> None:
 def test_losses_the_ledger_does_not_list_are_named(tmp_path: Path) -> None:
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, [0, 1, 5])
-        writer.write_json(DROPS, drops(JOINTS, gaps=1), type_name=schema.DROPS, log_time_ns=2000)
+        writer.write(DROPS, drops(JOINTS, gaps=1), type_name=schema.DROPS, log_time_ns=2000)
 
     report = check(tmp_path, fill)
     assert (report.exit_code, report.summary) == (3, "drops not logged")
@@ -168,7 +168,7 @@ def test_the_command_prints_everything_as_json(
 ) -> None:
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, [0, 2])
-        writer.write_json(DROPS, drops(JOINTS, gaps=1), type_name=schema.DROPS, log_time_ns=2000)
+        writer.write(DROPS, drops(JOINTS, gaps=1), type_name=schema.DROPS, log_time_ns=2000)
 
     check(tmp_path, fill)
     part = tmp_path / "e2.mcap.part"

@@ -5,6 +5,7 @@ import random
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_samples import (
@@ -17,6 +18,7 @@ from mcap_samples import (
 )
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import JointSample
 from bridge.episode.check import check_episode
 from bridge.episode.mcap.damaged import RecordFile
 from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
@@ -101,6 +103,24 @@ def write_whole(path: Path, *, compress: bool) -> Path:
             put_foreign(writer, item, record)
         writer.attach("a.bin", bytes(3000), media_type="x/y", log_time_ns=5)
     return path
+
+
+def test_one_bit_of_a_derived_episode_costs_a_small_part_of_it(tmp_path: Path) -> None:
+    path, count = tmp_path / "replay.mcap", 5000
+    with EpisodeWriter(path) as writer:
+        writer.describe(EpisodeInfo(id="w", kind="imported"))
+        for stamp in range(count):
+            sample = JointSample(
+                stamp_ns=stamp,
+                names=("a",),
+                position=np.random.default_rng(stamp).random(6),
+                velocity=np.zeros(0),
+                effort=np.zeros(0),
+            )
+            writer.write("/j", sample.to_cdr(), type_name=schema.JOINT_STATE, log_time_ns=stamp)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    assert recovered(tmp_path, bytes(data)).messages >= 0.7 * count
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:

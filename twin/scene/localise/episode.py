@@ -273,7 +273,7 @@ def _write_phase(
         record = {**found.to_record(), "phase": phase.name, "plan_id": phase.plan_id}
         if object_id in in_hand:
             record["in_hand"] = in_hand[object_id]
-        writer.write_json(
+        writer.write(
             cell_topic(cell, LOCALISATION),
             record,
             type_name=schema.LOCALISATION,
