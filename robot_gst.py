@@ -181,6 +181,11 @@ def run(arguments: Sequence[str]) -> int:
     except GstError as error:
         sys.stderr.write(f"robot-gst: {error}\n")
         return error.exit_code
+    except ModuleNotFoundError as error:
+        from bridge.doctor import how_to_get  # only now
+
+        sys.stderr.write(f"robot-gst: {how_to_get(error)}\n")
+        return 1
     except BrokenPipeError:  # whoever read our output, for example head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

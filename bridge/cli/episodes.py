@@ -2,7 +2,7 @@
 
 import textwrap
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -240,38 +240,29 @@ def ls(
     query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
     output: Output = OUTPUT,
 ) -> int:
-    """List the episodes of a run, or of all runs of a folder, or those that pass the filters.
+    """List the episodes of a run, or those that pass the filters.
 
     Exit code 1 when one of them cannot be read.
-    Example: robot-gst ls runs/demo --kind trial --outcome failure --sort start --reverse
-    Search: robot-gst ls runs --text "cube slipped" --cell lab --since 2026-03-01
+    Example: robot-gst ls runs/demo --kind trial --outcome failure --text "cube slipped"
 
     Args:
-        run: Run folder, or a folder of runs.
-        query: Which, and in what order.
+        run: Run folder.
+        query: Which.
     """
-    from bridge.episode.catalogue import find_runs
     from bridge.episode.mcap.part_file import told_unfinished
+    from bridge.episode.run_folder import RunFolder
 
-    runs = find_runs(run)
-    for path in (path for each in runs for path in sorted(each.episodes_dir.glob("*.part"))):
+    opened = RunFolder.open(run)
+    for path in sorted(opened.episodes_dir.glob("*.part")):
         output.say(told_unfinished(path)[0])
-    found = _find(runs, query, output)
-    entries = [entry for _, entry in found]
-    shown = entries
-    if len(runs) > 1:
-        names = [each.path.relative_to(run).as_posix() for each, _ in found]
-        shown = [replace(e, id=f"{name}/{e.id}") for name, e in zip(names, entries, strict=True)]
-    lines = episode_table(shown) if shown else [f"no episode in {run} passes these filters"]
-    data = [{**vars(entry), "run": str(each.path)} for each, entry in found]
-    output.result({"episodes": data}, "\n".join(lines))
+    entries = _find(opened, query, output)
+    lines = episode_table(entries) if entries else [f"no episode in {run} passes these filters"]
+    output.result({"episodes": [vars(entry) for entry in entries]}, "\n".join(lines))
     return 1 if any(entry.error for entry in entries) else 0
 
 
-def _find(
-    runs: "list[RunFolder]", query: CatalogueQuery, output: Output
-) -> "list[tuple[RunFolder, Entry]]":
-    from bridge.episode.catalogue import find_in_runs
+def _find(run: "RunFolder", query: CatalogueQuery, output: Output) -> "list[Entry]":
+    from bridge.episode.catalogue import find_episodes
 
     with ExitStack() as stack:
         shown: list[Advance] = []
@@ -282,9 +273,8 @@ def _find(
             for show in shown:
                 show(done, "")
 
-        if len(runs) == 1:
-            runs[0].refuse_empty()
-        return find_in_runs(runs, query, advance=advance)
+        run.refuse_empty()
+        return find_episodes(run, query, advance=advance)
 
 
 COLUMNS = ("episode", "kind", "condition", "outcome", "seconds", "MB")

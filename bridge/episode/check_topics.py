@@ -21,7 +21,7 @@ from bridge.episode.cdr.messages import (
 from bridge.episode.contract import Presence, TopicReport
 from bridge.episode.health import ContentWatch, HealthFinding, mixed_types, of_event
 from bridge.episode.mcap.data_walk import ScannedMessage
-from bridge.episode.schema import DEFINITIONS
+from bridge.episode.schema import ROS_TYPES
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.task.plan import Plan
@@ -48,8 +48,6 @@ class Decoder:
         """Type or encoding of topics that are kept, and that nothing here reads."""
         self.findings: list[HealthFinding] = []
         """What the recorder noticed of clocks, and of itself."""
-        self.was_paused = False
-        """By a recorder of an earlier edition, which then left messages out."""
         self._depth_sizes: dict[str, tuple[int, int]] = {}
         self._info_sizes: dict[str, tuple[int, int]] = {}
 
@@ -66,7 +64,7 @@ class Decoder:
             self.unused[topic] = type_name or encoding or "no type"
             return
         is_known = type_of_topic(topic) is not None or type_name == schema.IMAGE
-        if type_name in DEFINITIONS and not is_known:
+        if type_name in ROS_TYPES and not is_known:
             codec.decode(type_name, data)
             return
         try:
@@ -91,12 +89,10 @@ class Decoder:
         elif type_name == schema.DROPS:
             self._add_losses(parse_record(data, name="drops", package="bridge.episode"))
         elif type_name == schema.EVENT:
-            event = parse_record(data, name="event", package="bridge.episode")
-            self.findings += of_event(event)
-            self.was_paused |= event["type"] == "paused"
+            self.findings += of_event(parse_record(data, name="event", package="bridge.episode"))
         elif type_name in _DECODERS:
             _DECODERS[type_name](data)
-        elif type_name in DEFINITIONS:
+        elif type_name in ROS_TYPES:
             codec.decode(type_name, data)
 
     def _add_losses(self, record: dict[str, Any]) -> None:

@@ -12,7 +12,6 @@ from bridge.episode.mcap.damaged import Contents, read_plain
 from bridge.episode.mcap.scan import (
     AttachmentSpan,
     Chunk,
-    CutChunk,
     Damage,
     DataEnd,
     Found,
@@ -76,8 +75,6 @@ class RecoveryTally:
                 return
             case IndexSpan():
                 return
-            case CutChunk():
-                self._take_cut(found)
             case Chunk():
                 self._count(found.contents)
             case TopMessage():
@@ -93,16 +90,6 @@ class RecoveryTally:
             self.define([found.raw])
         elif isinstance(found.record, Metadata) and found.record.name == RECORD_NAME:
             self.earlier = from_strings(found.record.metadata)
-
-    def _take_cut(self, found: CutChunk) -> None:
-        lost = found.unpacked_size - found.contents.size
-        kept = found.contents.num_messages
-        self._count(found.contents)
-        self.bytes_lost += lost
-        self.losses.append(
-            f"at byte {found.offset} the file ends inside a chunk; "
-            f"{kept} whole messages of it were kept, without a CRC to prove them"
-        )
 
     def _count(self, contents: Contents) -> None:
         self.define(contents.definitions)

@@ -7,6 +7,7 @@ use the index see nothing else. Message indexes, summary and footer are made ane
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from mcap.records import Channel, Header, Metadata, Schema
 
@@ -16,13 +17,12 @@ from bridge.episode.mcap.damaged import (
     RecordFile,
     read_plain,
     summary_definitions,
-    walk_records,
 )
-from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk, chunk_of
-from bridge.episode.mcap.format import Buffer, crc32
+from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
+from bridge.episode.mcap.format import Buffer
 from bridge.episode.mcap.part_file import PartFile
-from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
-from bridge.episode.mcap.walk import RecordSpan, attachment_entry, chunk_entry
+from bridge.episode.mcap.scan import AttachmentSpan, Chunk, Found, Plain, TopMessage, scan
+from bridge.episode.mcap.walk import chunk_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
 
@@ -85,22 +85,10 @@ class CopyTarget:
             case Chunk():
                 self._define(found.contents)
                 self.section.add_chunks([verbatim(found)])
-            case CutChunk():
-                records, contents = self._without_contradictions(found)
-                self._define(contents)
-                if contents.num_messages:
-                    self.section.add_chunks([salvaged(records, contents)])
             case TopMessage():
                 self._take_message(found)
             case AttachmentSpan():
-                self._take_attachment(found)
-
-    def _without_contradictions(self, found: CutChunk) -> tuple[bytes, Contents]:
-        """Leave out definitions that no CRC proves and that others contradict."""
-        records = found.records
-        for raw in filter(self._contradicts, found.contents.definitions):
-            records = records.replace(raw, b"", 1)
-        return records, walk_records(records)
+                self.section.add_attachment(found.record)
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
         """Write the rest and sync; the caller verifies, renames and closes."""
@@ -125,23 +113,24 @@ class CopyTarget:
 
     def _contradicts(self, raw: bytes) -> bool:
         """Whether a definition is not the one that its id had before."""
-        summary = self.section.summary
-        known = summary.schemas if raw[0] == mcap.SCHEMA else summary.channels
-        return known.get(_id_of(raw)) not in (None, raw)
+        summary, record = self.section.summary, read_plain(raw)
+        if isinstance(record, Schema):
+            return summary.schemas.get(record.id, record) != record
+        return isinstance(record, Channel) and summary.channels.get(record.id, record) != record
 
     def _book(self, raw: bytes) -> None:
         """Tell the summary of a definition; the first one of an id counts."""
-        summary = self.section.summary
-        match read_plain(raw):
-            case Schema(id=schema_id):
-                _define_once(summary.schemas, self._made_schemas, schema_id, raw)
-            case Channel(id=channel_id, schema_id=schema_id):
-                _define_once(summary.channels, self._made_channels, channel_id, raw)
-                if schema_id and schema_id not in summary.schemas:
-                    if self._look_up(mcap.SCHEMA, schema_id):
-                        return
-                    self._make(mcap.encoded(Schema(schema_id, b"", "", "unknown")))
-                    self._made_schemas.add(schema_id)
+        summary, record = self.section.summary, read_plain(raw)
+        if isinstance(record, Schema):
+            _define_once(summary.schemas, self._made_schemas, record)
+        elif isinstance(record, Channel):
+            _define_once(summary.channels, self._made_channels, record)
+            schema_id = record.schema_id
+            if schema_id and schema_id not in summary.schemas:
+                if self._look_up(mcap.SCHEMA, schema_id):
+                    return
+                self._make(mcap.encoded(Schema(schema_id, b"", "", "unknown")))
+                self._made_schemas.add(schema_id)
 
     def _look_up(self, opcode: int, number: int) -> bool:
         """Define what was lost here and stands in the summary or in another chunk."""
@@ -185,21 +174,13 @@ class CopyTarget:
         if self._loose.has_messages:
             self.section.add_chunks([self._loose.encode()])
 
-    def _take_attachment(self, found: AttachmentSpan) -> None:
-        offset = self.section.file.offset
-        for block in self._source.blocks(found.offset, found.length):
-            self.section.file.append([block])
-        span = RecordSpan.between(mcap.ATTACHMENT, offset, self.section.file.offset)
-        entry = attachment_entry(span, found.record, found.data_size)
-        self.section.summary.add_index(entry)
-
 
 def _definitions(source: RecordFile) -> dict[tuple[int, int], bytes]:
     """Return every schema and channel of a file by kind and id: of its summary, or of its data."""
     records = summary_definitions(source)
     if not records:
         for found in scan(source):
-            if isinstance(found, Chunk | CutChunk):
+            if isinstance(found, Chunk):
                 records += found.contents.definitions
             elif isinstance(found, Plain) and found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
                 records.append(found.raw)
@@ -215,10 +196,10 @@ def _id_of(raw: bytes) -> int:
     return record.id if isinstance(record, Schema | Channel) else 0
 
 
-def _define_once(known: dict[int, bytes], made: set[int], number: int, raw: bytes) -> None:
-    if number not in known or number in made:
-        made.discard(number)
-        known[number] = raw
+def _define_once(known: dict[int, Any], made: set[int], record: Schema | Channel) -> None:
+    if record.id not in known or record.id in made:
+        made.discard(record.id)
+        known[record.id] = record
 
 
 _TIMES = struct.Struct("<QQ")
@@ -237,18 +218,6 @@ def verbatim(found: Chunk) -> EncodedChunk:
     if has_wrong_times(found):
         front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
         buffers = [front, memoryview(found.raw)[len(front) :]]
-    entry = chunk_entry(RecordSpan.between(mcap.CHUNK, 0, found.length), found.head)
+    entry = chunk_entry(0, found.length, found.head)
     entry.message_start_time, entry.message_end_time = start_ns, end_ns
     return EncodedChunk(buffers=buffers, entry=entry, index=found.contents.index)
-
-
-def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
-    """Return the records saved from a cut chunk as a whole one."""
-    return chunk_of(
-        [records],
-        contents.index,
-        times_ns=contents.time_range(),
-        size=len(records),
-        crc=crc32(records, 0),
-        compression="",
-    )

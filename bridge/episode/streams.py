@@ -2,18 +2,19 @@
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from bridge.episode import schema
-from bridge.episode.cdr.batch import joints_of, poses_of
 from bridge.episode.cdr.codec import decode
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
+    FrameTransform,
     JointSample,
     PoseSample,
     RawColor,
@@ -104,12 +105,16 @@ def first_stamp_ns(episode: Episode) -> int | None:
     return min(stamps, default=None)
 
 
+@lru_cache(maxsize=1)
+def transforms(episode: Episode) -> tuple[FrameTransform, ...]:
+    """What ``/tf`` and ``/tf_static`` say; those of the last episode are kept."""
+    messages = episode.messages(episode.topics_of_type(schema.TF_MESSAGE))
+    return tuple(item for message in messages for item in transforms_from_cdr(message.data))
+
+
 def transform_tree(episode: Episode) -> TransformTree:
     """Collect ``/tf`` and ``/tf_static``."""
-    transforms = []
-    for message in episode.messages(episode.topics_of_type(schema.TF_MESSAGE)):
-        transforms.extend(transforms_from_cdr(message.data))
-    return TransformTree(transforms)
+    return TransformTree(transforms(episode))
 
 
 def camera_ids(episode: Episode) -> list[str]:
@@ -235,11 +240,6 @@ def joint_track_of(payloads: Sequence[bytes]) -> JointTrack | None:
 
     Those who know the most joints are taken, in the order of the first of them.
     """
-    alike = joints_of(payloads)
-    if alike is not None:
-        names, stamps_ns, position = alike
-        order = np.argsort(stamps_ns, kind="stable")
-        return JointTrack(names=names, stamps_ns=stamps_ns[order], position=position[order])
     samples = [JointSample.from_cdr(payload) for payload in payloads]
     samples = [sample for sample in samples if len(sample.position)]
     if not samples:
@@ -321,13 +321,9 @@ def pose_track_of(payloads: Sequence[bytes]) -> PoseTrajectory | None:
     """
     if not payloads:
         return None
-    alike = poses_of(payloads)
-    if alike is None:
-        samples = [PoseSample.from_cdr(payload) for payload in payloads]
-        stamps_ns = np.array([sample.stamp_ns for sample in samples], dtype=np.int64)
-        Ts = np.stack([sample.T_frame_body for sample in samples])
-    else:
-        stamps_ns, Ts = alike
+    samples = [PoseSample.from_cdr(payload) for payload in payloads]
+    stamps_ns = np.array([sample.stamp_ns for sample in samples], dtype=np.int64)
+    Ts = np.stack([sample.T_frame_body for sample in samples])
     order = np.argsort(stamps_ns, kind="stable")
     order = order[np.append(np.diff(stamps_ns[order]) != 0, True)]
     q, p = se3.split(Ts[order])

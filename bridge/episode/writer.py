@@ -19,8 +19,8 @@ from mcap import records
 from bridge.episode import metadata, provenance, schema
 from bridge.episode.chunk_queue import ChunkQueue
 from bridge.episode.mcap import format as mcap_format
-from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk, Summary
-from bridge.episode.mcap.format import Buffer, Payload, num_bytes
+from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
+from bridge.episode.mcap.format import Buffer, FileSummary, Payload, num_bytes
 from bridge.episode.mcap.part_file import BackgroundSync, cannot_write, open_part
 
 
@@ -63,7 +63,7 @@ class Channels:
     A topic whose schema changes its text, not only its name, gets a second channel.
     """
 
-    def __init__(self, summary: Summary) -> None:
+    def __init__(self, summary: FileSummary) -> None:
         """Begin without channels."""
         self._summary = summary
         self._schemas: dict[tuple[str, str, bytes], tuple[int, bytes]] = {}
@@ -91,7 +91,7 @@ class Channels:
             type_name = "" if record is None else record.name
             channel = Channel(channel_id, type_name, definition + encoded)
             self._channels[key] = channel
-            self._summary.channels[channel_id] = encoded
+            self._summary.channels[channel_id] = entry
         self._known[quick_key] = (channel, record)
         return channel
 
@@ -102,7 +102,7 @@ class Channels:
             entry = records.Schema(schema_id, record.data, record.schema_encoding, record.name)
             encoded = mcap_format.encoded(entry)
             self._schemas[key] = (schema_id, encoded)
-            self._summary.schemas[schema_id] = encoded
+            self._summary.schemas[schema_id] = entry
         return self._schemas[key]
 
 

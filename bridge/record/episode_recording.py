@@ -293,10 +293,12 @@ class EpisodeRecording:
     def _append(
         self, channel: Channel, sample: WireSample, stamp_ns: int, image_encoding: str = ""
     ) -> int | None:
-        log_ns = channel.later(stamp_ns)
         source_ns = sample.source_ns
         if source_ns is None and channel.stamp_ns is not None:
             source_ns = channel.stamp_ns(sample.data)
+        if self.info.stand_in:  # by its clock, which may run ahead of this one
+            stamp_ns = max(self.start_ns, source_ns or 0)
+        log_ns = channel.later(stamp_ns)
         self._writer.write_foreign(
             sample.topic,
             sample.data,

@@ -5,7 +5,6 @@ import os
 import re
 from typing import Any
 
-from bridge.errors import MissingDependencyError
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import WireConfigError, cause_of, public
 
@@ -18,13 +17,7 @@ recording (``docs/decisions/0005-recorder.md``)."""
 
 os.environ.setdefault("ZENOH_RUNTIME", NETWORK_THREADS)  # read when the first session opens
 
-try:
-    import zenoh as zenoh
-except ImportError as import_error:  # pragma: no cover  # needs an environment without zenoh
-    raise MissingDependencyError(
-        package="eclipse-zenoh", extra="record", purpose="talking to a cell"
-    ) from import_error
-
+import zenoh as zenoh  # noqa: E402
 
 _WRONG_VALUE = re.compile(
     r'msg: "(?P<message>.*)", location: .*?line: (?P<line>\d+)', flags=re.DOTALL

@@ -5,7 +5,6 @@ its time outside Python's lock. Bytes that are no image raise ``MalformedMessage
 nothing else; an encoding that is no business of the function gives None.
 """
 
-import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ from jaxtyping import UInt8
 
 from bridge.clock import join_ns
 from bridge.episode import schema
-from bridge.episode.cdr.codec import ENCAPSULATION_LE, Buffer, MalformedMessageError, decode
+from bridge.episode.cdr.codec import Buffer, MalformedMessageError, decode, encode
 from bridge.episode.topics import COLOR_TOPIC, DEPTH_IMAGE
 from bridge.media.color import JPEG_QUALITY, MAX_PIXELS, encode_jpeg
 from bridge.media.depth import RVL_FORMAT, pack_rvl
@@ -128,11 +127,6 @@ def depth_to_compact(data: Buffer) -> bytes | None:
 
 
 def _compressed_image(header: ImageHeader, image_format: str, data: list[bytes]) -> bytes:
-    front = bytearray(ENCAPSULATION_LE)
-    front += struct.pack("<iI", header.sec, header.nanosec)
-    for text in (header.frame_id, image_format):
-        raw = text.encode() + b"\0"
-        front += struct.pack("<I", len(raw)) + raw
-        front += b"\0" * (-len(front) % 4)
-    front += struct.pack("<I", sum(map(len, data)))
-    return b"".join([front, *data])
+    stamp = {"sec": header.sec, "nanosec": header.nanosec}
+    about = {"header": {"stamp": stamp, "frame_id": header.frame_id}, "format": image_format}
+    return encode(schema.COMPRESSED_IMAGE, {**about, "data": b"".join(data)})

@@ -12,62 +12,14 @@ from bridge.episode.mcap.format import (
     MESSAGE_FIELDS,
     MESSAGE_HEAD,
     Buffer,
+    FileSummary,
     Payload,
     crc32,
     encoded,
     num_bytes,
 )
 from bridge.episode.mcap.part_file import PartFile
-from bridge.episode.mcap.walk import RecordSpan, attachment_entry, metadata_entry
-
-
-class Summary:
-    """Schemas, channels, statistics and indexes of one file, each as it will stand in it."""
-
-    def __init__(self) -> None:
-        """Begin with an empty file."""
-        self.schemas: dict[int, bytes] = {}
-        self.channels: dict[int, bytes] = {}
-        self.message_counts: dict[int, int] = {}
-        self.start_ns: int | None = None
-        self.end_ns = 0
-        self._indexes: dict[int, list[bytes]] = {
-            mcap_format.CHUNK_INDEX: [],
-            mcap_format.ATTACHMENT_INDEX: [],
-            mcap_format.METADATA_INDEX: [],
-        }
-
-    def add_index(self, entry: records.McapRecord) -> None:
-        """Book where a chunk, attachment or metadata record lies."""
-        record = encoded(entry)
-        self._indexes[record[0]].append(record)
-
-    def add_messages(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
-        """Book the messages of a chunk by channel, the first and the last log time among them."""
-        for channel_id, count in counts.items():
-            self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
-        if counts:
-            self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
-            self.end_ns = max(self.end_ns, end_ns)
-
-    def encode(self, start: int) -> bytes:
-        """Return everything from the summary to the end of the file."""
-        chunks, attachments, metadata = self._indexes.values()
-        statistics = records.Statistics(
-            attachment_count=len(attachments),
-            channel_count=len(self.channels),
-            channel_message_counts=dict(sorted(self.message_counts.items())),
-            chunk_count=len(chunks),
-            message_count=sum(self.message_counts.values()),
-            message_start_time=self.start_ns or 0,
-            message_end_time=self.end_ns,
-            metadata_count=len(metadata),
-            schema_count=len(self.schemas),
-        )
-        definitions = (self.schemas.values(), self.channels.values())
-        groups = (*definitions, [encoded(statistics)], chunks, attachments, metadata)
-        return mcap_format.summary_section(map(b"".join, groups), start)
-
+from bridge.episode.mcap.walk import attachment_entry
 
 ZSTD_LEVEL = 1
 """Level 3 packs noisy depth 20 % tighter at twice the CPU time (the recorder study, section 2)."""
@@ -250,7 +202,7 @@ class DataSection:
     def __init__(self, file: PartFile) -> None:
         """Take over an open file."""
         self.file = file
-        self.summary = Summary()
+        self.summary = FileSummary()
 
     def add_chunks(self, chunks: Sequence[EncodedChunk]) -> None:
         """Write chunks, each with its message indexes, all or none."""
@@ -273,23 +225,24 @@ class DataSection:
         entry = chunk.entry
         entry.chunk_start_offset, entry.message_index_length = start, index_length
         entry.message_index_offsets = offsets
-        self.summary.add_index(entry)
+        self.summary.chunk_indexes.append(entry)
         counts = {channel_id: len(entries) // 2 for channel_id, entries in chunk.index.items()}
         self.summary.add_messages(counts, entry.message_start_time, entry.message_end_time)
 
     def add_attachment(self, entry: records.Attachment) -> None:
         """Write an attachment."""
         offset = self.file.offset
-        self.file.append(mcap_format.attachment(entry))
-        span = RecordSpan.between(mcap_format.ATTACHMENT, offset, self.file.offset)
-        self.summary.add_index(attachment_entry(span, entry, len(entry.data)))
+        self.file.append([encoded(entry)])
+        length = self.file.offset - offset
+        self.summary.attachment_indexes.append(attachment_entry(offset, length, entry))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
         offset, entry = self.file.offset, records.Metadata(name, dict(values))
         self.file.append([encoded(entry)])
-        span = RecordSpan.between(mcap_format.METADATA, offset, self.file.offset)
-        self.summary.add_index(metadata_entry(span, entry))
+        self.summary.metadata_indexes.append(
+            records.MetadataIndex(offset, self.file.offset - offset, name)
+        )
 
     def seal(self) -> None:
         """Write the end of the data, the summary and the footer."""

@@ -4,7 +4,6 @@ Nothing but the front of the file is believed: no summary, no index. Damage is s
 a later chunk can be found. Memory is bounded by one chunk.
 """
 
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,14 +17,12 @@ from bridge.episode.mcap.damaged import (
     Contents,
     RecordFile,
     read_plain,
-    unpack_front,
     walk_records,
 )
 from bridge.episode.mcap.walk import (
     MAX_CHUNK_BYTES,
     BrokenRecordError,
     ChunkHead,
-    RecordSpan,
     attachment_of,
     parse_chunk,
     parse_chunk_head,
@@ -62,20 +59,8 @@ class Chunk(Span):
 
     raw: bytes
     head: ChunkHead
-    contents: Contents
-
-
-@dataclass(frozen=True, kw_only=True)
-class CutChunk(Span):
-    """The last chunk of a file that ends inside it, with the whole messages found in it.
-
-    ``length`` goes to the end of the file. Nothing verified the messages but their structure.
-    """
-
-    head: ChunkHead
     records: bytes
-    unpacked_size: int
-    """Bytes that could be unpacked, the torn message at their end included."""
+    """Unpacked."""
     contents: Contents
 
 
@@ -92,8 +77,6 @@ class AttachmentSpan(Span):
     """An attachment whose CRC is right."""
 
     record: Attachment
-    """Without its data."""
-    data_size: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,9 +97,7 @@ class DataEnd(Span):
     """The writer got as far as the summary."""
 
 
-Found: TypeAlias = (
-    Plain | Chunk | CutChunk | TopMessage | AttachmentSpan | IndexSpan | Damage | DataEnd
-)
+Found: TypeAlias = Plain | Chunk | TopMessage | AttachmentSpan | IndexSpan | Damage | DataEnd
 
 
 MAX_PLAIN_BYTES = 64 << 20
@@ -192,7 +173,8 @@ def _read_record(file: RecordFile, offset: int) -> Found | None:
     if opcode == mcap.MESSAGE_INDEX:
         return _read_index(offset, length, front)
     if opcode == mcap.ATTACHMENT:
-        return _read_attachment(file, offset, length)
+        record = attachment_of(file.read(offset, length)[mcap.RECORD_HEAD.size :], offset)
+        return AttachmentSpan(offset=offset, length=length, record=record)
     if opcode == mcap.DATA_END:
         return DataEnd(offset=offset, length=length)
     if length > MAX_PLAIN_BYTES:
@@ -222,7 +204,9 @@ def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
     contents = walk_records(records)
     if contents.size != len(records):
         raise BrokenRecordError("a chunk is damaged: its records are torn")
-    return Chunk(offset=offset, length=len(raw), raw=raw, head=head, contents=contents)
+    return Chunk(
+        offset=offset, length=len(raw), raw=raw, head=head, records=records, contents=contents
+    )
 
 
 def _read_message(offset: int, length: int, front: bytes) -> TopMessage:
@@ -258,15 +242,8 @@ def _index_bytes(front: bytes) -> int:
     return int(_INDEX_FRONT.unpack_from(front)[3])
 
 
-def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSpan:
-    place = RecordSpan(mcap.ATTACHMENT, offset, length - mcap.RECORD_HEAD.size)
-    with os.fdopen(file.descriptor, "rb", closefd=False) as stream:
-        record, data_size = attachment_of(stream, place, keep=False)
-    return AttachmentSpan(offset=offset, length=length, record=record, data_size=data_size)
-
-
 def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:
-    """Step over damage, or take what a cut record at the end still holds."""
+    """Step over damage; a cut message index at the end costs nothing."""
     length = _trusted_length(file, offset)
     if length:
         end = offset + length
@@ -281,7 +258,7 @@ def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:
         return None
     if front[0] == mcap.MESSAGE_INDEX:
         return IndexSpan(offset=offset, length=damage.length)
-    return _read_cut_chunk(file, offset, front) or damage
+    return damage
 
 
 def _trusted_length(file: RecordFile, offset: int) -> int:
@@ -296,27 +273,6 @@ def _trusted_length(file: RecordFile, offset: int) -> int:
     following = file.read(end, 1)
     known = not following or following[0] in _KINDS or following[0] in _SUMMARY_ONLY
     return end - offset if known else 0
-
-
-def _read_cut_chunk(file: RecordFile, offset: int, front: bytes) -> CutChunk | None:
-    try:
-        head = _chunk_head(front)
-    except BrokenRecordError:
-        return None
-    if offset + head.record_bytes <= file.size or head.size > MAX_CHUNK_BYTES:
-        return None
-    records = unpack_front(head, file.read(offset + head.head_bytes, MAX_CHUNK_BYTES))
-    contents = walk_records(records)
-    if not contents.num_messages:
-        return None
-    return CutChunk(
-        offset=offset,
-        length=file.size - offset,
-        head=head,
-        records=records[: contents.size],
-        unpacked_size=len(records),
-        contents=contents,
-    )
 
 
 def _step_over(file: RecordFile, offset: int, what: str) -> Damage:

@@ -9,9 +9,9 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyrealsense2 as rs
 from jaxtyping import Float, UInt16
 
-from bridge.errors import MissingDependencyError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.depth import to_millimetres
@@ -19,16 +19,6 @@ from bridge.media.resample import Resampling
 from bridge.sources.device_samples import HostClock
 from bridge.sources.realsense.config import CameraStreamError, RealSenseConfig
 from bridge.sources.realsense.messages import Calibration, ColorFrame, DepthFrame, Frame
-
-try:
-    import pyrealsense2 as rs
-except ImportError as import_error:  # pragma: no cover  # needs an environment without it
-    raise MissingDependencyError(
-        package="pyrealsense2", extra="realsense", purpose="talking to a RealSense camera"
-    ) from import_error
-
-__all__ = ["rs"]
-
 
 # D415 and D435 send undistorted colour (all coefficients 0), D405 and D455 do not, and bend it by a
 # model that CameraInfo has no name for.

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, cast
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
-from bridge.episode.cdr.batch import MessageTemplate, joint_template, pose_template
+from bridge.episode.cdr.batch import Write, joint_writer, pose_writer
 from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import (
@@ -55,7 +55,7 @@ OPTIONAL = (
 class _Topic(NamedTuple):
     name: str
     type_name: str
-    template: MessageTemplate
+    write: Write
 
 
 BARE_UR5 = "ur5"
@@ -83,18 +83,17 @@ class ArmPublisher:
         self._gripper = config.make_gripper()
         state = schema.JOINT_STATE
         base = robot.base_frame
-        targets = joint_template(robot.joints)
-        width = joint_template((GRIPPER_WIDTH,))
-        speed = joint_template((messages.SPEED_NAME,))
-        joints = joint_template(robot.joints, velocities=True)
+        targets = joint_writer(robot.joints)
+        speed = joint_writer((messages.SPEED_NAME,))
+        joints = joint_writer(robot.joints, velocities=True)
         self._joints = _Topic(cell_topic(cell, JOINT_STATES), state, joints)
         self._targets = _Topic(cell_topic(cell, JOINT_TARGETS), state, targets)
-        self._pose = _Topic(cell_topic(cell, TCP_POSE), schema.POSE_STAMPED, pose_template(base))
+        self._pose = _Topic(cell_topic(cell, TCP_POSE), schema.POSE_STAMPED, pose_writer(base))
         self._wrench = _Topic(
-            cell_topic(cell, TCP_WRENCH), schema.WRENCH_STAMPED, messages.wrench_template(base)
+            cell_topic(cell, TCP_WRENCH), schema.WRENCH_STAMPED, messages.wrench_writer(base)
         )
-        self._width = _Topic(cell_topic(cell, GRIPPER_STATE), state, width)
-        self._frame = _Topic(TF, schema.TF_MESSAGE, messages.frame_template(base))
+        self._width = _Topic(cell_topic(cell, GRIPPER_STATE), state, joint_writer((GRIPPER_WIDTH,)))
+        self._frame = _Topic(TF, schema.TF_MESSAGE, messages.frame_writer(base))
         self._speed = _Topic(cell_topic(cell, SPEED_SCALING), state, speed)
         self._streams: dict[str, NumberedPublisher] = {}
         self._clock = HostClock()
@@ -183,7 +182,7 @@ class ArmPublisher:
         if stream is None:
             publisher = self._session.publisher(topic.name, topic.type_name, qos=Qos.of(topic.name))
             stream = self._streams[topic.name] = NumberedPublisher(publisher)
-        stream.put(number, topic.template.fill(stamp_ns, numbers), source_ns=stamp_ns)
+        stream.put(number, topic.write(stamp_ns, numbers), source_ns=stamp_ns)
 
 
 def _vector(value: object) -> tuple[float, ...]:

@@ -159,8 +159,7 @@ def test_what_recover_writes_passes_the_check_whatever_the_damage(
         found = check_episode(report.output)
         if found.faults:
             faults[seed] = found.faults
-        if "without a CRC to prove them" not in report.reason:
-            assert {item.data for item in read_all(report.output)} <= payloads
+        assert {item.data for item in read_all(report.output)} <= payloads
         for left in tmp_path.glob(f"m{seed}.*"):
             left.unlink()
     assert not faults
@@ -223,7 +222,7 @@ def test_a_chunk_that_stands_twice_is_kept_once(tmp_path: Path, name: str) -> No
     with (tmp_path / "w.mcap").open("rb") as stream:
         chunks = [
             found
-            for found in scan(RecordFile(stream.fileno()))
+            for found in scan(RecordFile(stream))
             if isinstance(found, Chunk) and found.contents.num_messages
         ]
     second = bytes(chunks[1].raw)

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from bridge.episode.reader import Episode
-from bridge.episode.schema import DEFINITIONS, schema_text
+from bridge.episode.schema import ROS_TYPES, schema_text
 from bridge.media.color import encode_jpeg, encode_png
 
 CAMERA = ("color/image", "color/info", "depth/image", "depth/info")
@@ -81,7 +81,7 @@ def sqlite_bag(episode: Path, folder: Path, names: Mapping[str, str]) -> Path:
     numbers = {topic: number for number, topic in enumerate(names, start=1)}
     for topic, number in numbers.items():
         type_name = opened.topics()[topic].type_name
-        assert type_name in DEFINITIONS
+        assert type_name in ROS_TYPES
         row = (number, names[topic], type_name, "cdr", "")
         database.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?)", row)
     for item in opened.messages(names):

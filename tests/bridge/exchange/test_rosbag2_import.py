@@ -17,7 +17,7 @@ from bridge.episode.check import check_episode
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.schema import DEFINITIONS
+from bridge.episode.schema import ROS_TYPES, schema_text
 from bridge.errors import BridgeError, EpisodeError, PathNotFoundError, UsageError
 from bridge.exchange.driver_names import mapped
 from bridge.exchange.rosbag2 import find_files, import_bag
@@ -185,7 +185,8 @@ def bag_of(path: Path, channels: list[tuple[str, str, str, str]]) -> Path:
     writer = Writer(stream)
     writer.start()
     for number, (topic, name, encoding, text) in enumerate(channels):
-        definition = DEFINITIONS.get(name, "") if text == "ros2msg" else "float64 data"
+        known = schema_text(name) if name in ROS_TYPES else ""
+        definition = known if text == "ros2msg" else "float64 data"
         kind = writer.register_schema(name, text, definition.encode())
         channel = writer.register_channel(topic, encoding, kind)
         writer.add_message(channel, number, b"\0\1\0\0" + bytes(8), number)
