@@ -4,13 +4,6 @@ from collections.abc import Sequence
 
 from bridge.errors import UsageError
 
-_FIXED = (
-    "--replay.start-rad start-m start-overlap-m max-contact-depth-m pre-grasp-depth-m squeeze-m "
-    "pre-grasp-soft-depth-m max-slip-m moved-m path-step-s max-joint-step-rad grip-delay-s "
-    "sample-rate-hz physics.finger-speed-m-s physics.soft-substeps physics.soft-stiffness-scale"
-).replace(" ", " --replay.")
-"""Settings of a replay that are constants now."""
-
 _TOLD = {
     "design --width --rate-width": "Give --gain with --rate; at a given size use --starts.",
     "design --agrees-above --agreement": "Use evaluate --fail-under.",
@@ -41,6 +34,7 @@ _TOLD = {
         "Record all the time; robot-gst ctl stop --discard throws a take away."
     ),
     "ctl pause|ctl resume": "Stop the episode, and start another one.",
+    "ctl list|ctl --last": "robot-gst ls RUN lists what is recorded.",
     "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
     "recover --in-place": "Free some space, or use another disk: a copy is made beside it.",
     "import trials": "robot-gst open TABLE RUN keeps any table of trials in a run.",
@@ -79,13 +73,6 @@ _TOLD = {
     "calibrate --pairs": "Record /CELL/cam/ID/target/pose, then robot-gst calibrate RUN --cameras.",
     "calibrate --samples|publish standin --probes": "calibrate RUN --posterior learns of trials.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
-    f"replay {_FIXED}|gate {_FIXED} --max-audit-distances --frames --max-frame-age-s "
-    "--max-silence-s --max-joint-age-s --other-scene-m --moved-m --moved-rad|plan --candidates "
-    "--policy|publish standin --real-time --execute-unverified --scan-id --first-probe --gate-cell"
-    "|rebuild --slab --harmonics --exposure --densify --loss --flatness --opacity --holdout-offset "
-    "--footprint-factor --depth-weight --coarse-fraction --no-densify --appearance-steps": (
-        "Nobody set it, so it is a constant of the code now."
-    ),
 }
 GONE = {
     f"{command} --{flag}" if flag else command: text

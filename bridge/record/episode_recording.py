@@ -75,15 +75,14 @@ class Channels:
         self._msg_folder = msg_folder
         self._max_topics = max_topics
         self._warn = warn
-        self._channels: dict[tuple[str, str, str, str, bool], Channel] = {}
+        self._channels: dict[tuple[str, str, str, str], Channel] = {}
         self._last_ns: dict[str, list[int]] = {}
         self._records: dict[str, schema.Schema | None] = {}
         self._hashes: dict[str, str] = {}
 
     def of(self, sample: WireSample, type_name: str) -> Channel | None:
         """Return the channel of a message, or None when there are too many."""
-        is_defined = sample.definition is not None
-        key = (sample.topic, type_name, sample.message_encoding, sample.type_hash, is_defined)
+        key = (sample.topic, type_name, sample.message_encoding, sample.type_hash)
         channel = self._channels.get(key)
         if channel is None and len(self._channels) < self._max_topics:
             channel = self._channels[key] = self._new(sample, type_name)
@@ -130,8 +129,6 @@ class Channels:
             return None, False
         encoding = sample.message_encoding
         known = schema.schema_for(type_name)
-        if known is None and sample.definition is not None:
-            return sample.definition, False
         if encoding not in ("", known.message_encoding if known else "cdr"):
             return _name_only(type_name, encoding), False
         type_hash = sample.type_hash if sample.type_hash.startswith(HASH_PREFIX) else ""

@@ -183,7 +183,6 @@ class LiveRecorder:
         core.note_recovered([_recovery_record(report) for report in reports])
         self._previews = previews
         self._ended = threading.Event()
-        session.collect_definitions()
         self._subscribers = [
             session.subscribe(key, self._take, max_bytes=config.queues.max_message_bytes)
             for key in config.topics

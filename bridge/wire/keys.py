@@ -68,29 +68,6 @@ def ros_type(dds_name: str) -> str:
     return "/".join(parts).removesuffix("_")
 
 
-DEFINITIONS = "@schema"
-"""Publishers of types that nobody knows put their definitions below this key."""
-_SCHEMA_ENCODINGS = {
-    "ros2msg": "cdr",
-    "ros2idl": "cdr",
-    "ros1msg": "ros1",
-    "protobuf": "protobuf",
-    "flatbuffer": "flatbuffer",
-    "jsonschema": "json",
-}
-"""MCAP's schema encodings, and the message encoding that goes with each."""
-
-
-def read_definition_key(key: str) -> tuple[str, str, str] | None:
-    """Return type name, schema encoding and message encoding of a definition's key, or None."""
-    _, _, rest = key.partition(f"{DEFINITIONS}/")
-    schema_encoding, _, type_name = rest.partition("/")
-    message_encoding = _SCHEMA_ENCODINGS.get(schema_encoding)
-    if message_encoding is None or not type_name:
-        return None
-    return type_name, schema_encoding, message_encoding
-
-
 def encoding_of(type_name: str, message_encoding: str) -> str:
     """Name a type in a zenoh encoding."""
     kind = f"application/{message_encoding}"

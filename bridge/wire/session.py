@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import TracebackType
@@ -126,15 +126,8 @@ class WireSample:
     source_gid: bytes | None
     """16 bytes that no other publisher has."""
     received_ns: int
-    definition: schema.Schema | None = None
-    """What the publisher says its type is, where it does."""
     oversize_bytes: int = 0
     """Size of a payload beyond the subscription's limit; then ``data`` is empty, not a copy."""
-
-
-NO_DEFINITIONS: Mapping[tuple[str, str], schema.Schema] = {}
-MAX_DEFINITIONS = 1000
-MAX_DEFINITION_BYTES = 4_000_000
 
 
 def copy_sample(
@@ -142,7 +135,6 @@ def copy_sample(
     received_ns: int,
     *,
     max_bytes: int = sys.maxsize,
-    definitions: Mapping[tuple[str, str], schema.Schema] = NO_DEFINITIONS,
 ) -> WireSample:
     """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory."""
     size = len(sample.payload)
@@ -166,7 +158,6 @@ def copy_sample(
         sequence=sequence,
         source_gid=gid,
         received_ns=received_ns,
-        definition=definitions.get((type_name, message_encoding)) if definitions else None,
         oversize_bytes=size if is_oversize else 0,
     )
 
@@ -212,7 +203,6 @@ class WireSession:
         self._services: list[Service] = []
         self._alive: list[Subscriber] = []
         self._last_words: list[tuple[Any, Callable[[bytes], bytes]]] = []
-        self._definitions: dict[tuple[str, str], schema.Schema] = {}
         self._publishers: list[tuple[str, WirePublisher]] = []
 
     @property
@@ -270,8 +260,7 @@ class WireSession:
             if sample.kind != zenoh.SampleKind.PUT:
                 return
             try:
-                now_ns, known = self._clock.now_ns(), self._definitions
-                callback(copy_sample(sample, now_ns, max_bytes=max_bytes, definitions=known))
+                callback(copy_sample(sample, self._clock.now_ns(), max_bytes=max_bytes))
             except BaseException as error:  # noqa: BLE001  # let out, it ends this link's thread
                 self.receive_errors += 1
                 self.last_receive_error = f"{type(error).__name__}: {error}"
@@ -279,30 +268,6 @@ class WireSession:
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
         with _naming(WireConfigError, f"cannot subscribe to {key_expression!r}"):
             return Subscriber(self._inner.declare_subscriber(key_expression, handler))
-
-    def collect_definitions(self, *, timeout_s: float = 2.0) -> None:
-        """Learn what publishers say of their types; samples that follow carry it.
-
-        Subscribe to their topics afterwards.
-        """
-
-        def learn(sample: WireSample) -> None:
-            named = keys.read_definition_key(sample.topic.removeprefix("/"))
-            is_full = len(self._definitions) >= MAX_DEFINITIONS
-            if named is None or sample.oversize_bytes or is_full:
-                return
-            type_name, schema_encoding, message_encoding = named
-            self._definitions[type_name, message_encoding] = schema.Schema(
-                name=type_name,
-                schema_encoding=schema_encoding,
-                message_encoding=message_encoding,
-                data=sample.data,
-            )
-
-        everything = f"{keys.DEFINITIONS}/**"
-        self.subscribe(everything, learn, max_bytes=MAX_DEFINITION_BYTES)
-        for sample in self.query_all(everything, timeout_s=timeout_s):
-            learn(sample)
 
     def open_loopback(self) -> "WireSession":
         """Open a client of the endpoint this session listens on, else of one it connects to.

@@ -1,19 +1,13 @@
 """docs/wire.md, kept by a publisher that knows nothing of us, and broken in every way there is."""
 
 import ast
-import json
 import shutil
 import struct
 import subprocess
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-import zenoh
-from mcap.reader import make_reader
 from patience import wait_until
 
 from bridge.episode import schema
@@ -24,9 +18,8 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.record.recorder import Recorder
-from bridge.wire.config import WireConfig
 from bridge.wire.publisher import Attachment, encode
-from bridge.wire.session import WireSession, open_session
+from bridge.wire.session import WireSession
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLES = ROOT / "docs" / "examples" / "zenoh"
@@ -135,96 +128,3 @@ def test_the_example_is_recorded_clean_and_its_losses_are_seen_exactly(
         sec, nanosec = struct.unpack_from("<iI", each.data, 4)
         assert each.publish_time_ns == sec * 10**9 + nanosec
         assert each.type_name == schema.JOINT_STATE
-
-
-class Wild:
-    """A plain zenoh client that keeps as much of the contract as it is told to."""
-
-    def __init__(self, endpoint: str) -> None:
-        """Connect."""
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-        config.insert_json5("scouting/multicast/enabled", "false")
-        self.session = zenoh.open(config)
-        self.tokens: list[Any] = []
-
-    def alive(self, key: str) -> None:
-        self.tokens.append(self.session.liveliness().declare_token(key))
-
-    def send(
-        self,
-        count: int = 5,
-        *,
-        key: str = "demo/joint_states",
-        encoding: str = "application/cdr;sensor_msgs/msg/JointState",
-        numbers: Callable[[int], int] | None = lambda number: number,
-        stamp: Callable[[int], int] = lambda number: time.time_ns(),
-        raw: bytes | None = None,
-        data: bytes = b"\0\1\0\0" + struct.pack("<iII", 1_700_000_000, 0, 1) + bytes(4 * 5),
-    ) -> None:
-        publisher = self.session.declare_publisher(key, encoding=encoding)
-        for number in range(count):
-            note = raw
-            if numbers is not None and raw is None:
-                note = encode(
-                    Attachment(sequence=numbers(number), source_ns=stamp(number), gid=b"wild" * 4)
-                )
-            publisher.put(data, attachment=note)
-
-
-@pytest.fixture
-def wild(router: WireSession, endpoint: str) -> Iterator[Wild]:
-    made = Wild(endpoint)
-    yield made
-    made.session.close()
-
-
-def test_a_publisher_may_tell_what_its_types_are(
-    router: WireSession, wild: Wild, run: RunFolder, endpoint: str
-) -> None:
-    """Before its first message, and to a recorder that comes later; never against a known type."""
-    text = b'{"type": "object"}'
-    query: list[str] = []
-
-    def answer(asked: Any) -> None:
-        with asked:
-            query.append(str(asked.key_expr))
-            asked.reply("@schema/jsonschema/acme/Late", text)
-
-    queryable = wild.session.declare_queryable("@schema/jsonschema/acme/Late", answer)
-    with open_session(WireConfig(connect=(endpoint,))) as session:
-        session.collect_definitions()
-        assert query == ["@schema/**"]
-        recorder = Recorder(run, now_ns=session.now_ns)
-        heard = threading.Semaphore(0)
-
-        def take(sample: Any) -> None:
-            recorder.receive(sample)
-            heard.release()
-
-        session.subscribe("demo/**", take)
-        recorder.start(EpisodeInfo(id="t1", kind="trial", cell="demo"))
-        wild.session.put("@schema/protobuf/acme.Grasp", b"descriptor")
-        wild.session.put("@schema/ros2msg/sensor_msgs/msg/JointState", b"string lie\n")
-        wild.session.put("@schema/nonsense/acme/Note", b"?")
-        sent = {
-            "demo/late": ("application/json;acme/Late", b"{}"),
-            "demo/grasp": ("application/protobuf;acme.Grasp", b"\x08\x01"),
-            "demo/note": ("application/json;acme/Note", b"{}"),
-            "demo/joint_states": ("application/cdr;sensor_msgs/msg/JointState", b"\0\1\0\0"),
-        }
-        for key, (encoding, data) in sent.items():
-            wild.send(1, key=key, encoding=encoding, data=data)
-        for _ in sent:
-            assert heard.acquire(timeout=WAIT_S)
-        recorder.stop()
-        recorder.close()
-    queryable.undeclare()
-    with (run.episodes_dir / "t1.mcap").open("rb") as stream:
-        found = {c.topic: s for s, c, _ in make_reader(stream).iter_messages() if s is not None}
-    assert (found["/demo/late"].encoding, found["/demo/late"].data) == ("jsonschema", text)
-    grasp = found["/demo/grasp"]
-    assert (grasp.name, grasp.encoding, grasp.data) == ("acme.Grasp", "protobuf", b"descriptor")
-    assert (found["/demo/note"].encoding, found["/demo/note"].data) == ("", b"")
-    assert found["/demo/joint_states"].data.startswith(b"std_msgs/Header header")
