@@ -4,16 +4,14 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mcap.records import Channel, Metadata
+from mcap.records import Attachment, Channel, DataEnd, Metadata
 
 from bridge.episode import provenance
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import Contents, read_plain
 from bridge.episode.mcap.scan import (
-    AttachmentSpan,
     Chunk,
     Damage,
-    DataEnd,
     Found,
     IndexSpan,
     Plain,
@@ -70,7 +68,7 @@ class RecoveryTally:
                 self.damaged_inside |= not found.at_end
                 self.losses.append(found.what)
                 return
-            case DataEnd():
+            case Plain(record=DataEnd()):
                 self.reached_end = found.offset
                 return
             case IndexSpan():
@@ -79,13 +77,12 @@ class RecoveryTally:
                 self._count(found.contents)
             case TopMessage():
                 self._add(found.channel_id, 1, found.log_time_ns)
-            case AttachmentSpan():
-                self.attachments += 1
             case Plain():
                 self._take_plain(found)
         self.has_data = True
 
     def _take_plain(self, found: Plain) -> None:
+        self.attachments += isinstance(found.record, Attachment)
         if found.opcode == mcap.CHANNEL:
             self.define([found.raw])
         elif isinstance(found.record, Metadata) and found.record.name == RECORD_NAME:

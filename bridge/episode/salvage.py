@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mcap.records import Channel, Header, Metadata, Schema
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
@@ -21,7 +21,7 @@ from bridge.episode.mcap.damaged import (
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
 from bridge.episode.mcap.format import Buffer
 from bridge.episode.mcap.part_file import PartFile
-from bridge.episode.mcap.scan import AttachmentSpan, Chunk, Found, Plain, TopMessage, scan
+from bridge.episode.mcap.scan import Chunk, Found, Plain, TopMessage, scan
 from bridge.episode.mcap.walk import chunk_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import unknown_topic
@@ -87,8 +87,6 @@ class CopyTarget:
                 self.section.add_chunks([verbatim(found)])
             case TopMessage():
                 self._take_message(found)
-            case AttachmentSpan():
-                self.section.add_attachment(found.record)
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
         """Write the rest and sync; the caller verifies, renames and closes."""
@@ -99,7 +97,10 @@ class CopyTarget:
         return self.section.file
 
     def _take_plain(self, found: Plain) -> None:
-        if found.opcode == mcap.HEADER:
+        if found.opcode in (mcap.HEADER, mcap.DATA_END):
+            return
+        if isinstance(found.record, Attachment):
+            self.section.add_attachment(found.record)
             return
         if isinstance(found.record, Metadata):
             name, values = found.record.name, found.record.metadata
