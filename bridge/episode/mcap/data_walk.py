@@ -52,6 +52,7 @@ class DataWalk:
         self._chunk: records.ChunkIndex | None = None
         self._contents = Contents()
         """Of that chunk."""
+        self._num_loose = 0
 
     def messages(self) -> Iterator[ScannedMessage]:
         """Yield every message that can be read, in file order."""
@@ -67,6 +68,7 @@ class DataWalk:
                 case IndexSpan():
                     self._check_index(found)
                 case TopMessage():
+                    self._num_loose += 1
                     log_ns = found.log_time_ns
                     self.seen.add_messages({found.channel_id: 1}, log_ns, log_ns)
                     yield from self._message(self._file.read(found.offset, found.length), 0)
@@ -78,6 +80,8 @@ class DataWalk:
             self._doubt("the end of its data is not marked")
         elif end.end < self._file.size:
             self._doubt(f"a record at byte {end.end}, behind the end of the data")
+        if self.seen.chunk_indexes and self._num_loose:
+            self._doubt(f"{self._num_loose} messages outside chunks, where the index shows none")
 
     def _take_plain(self, found: Plain) -> None:
         match found.record:
