@@ -118,19 +118,17 @@ def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
     temporary = path.with_name(path.name.removesuffix(PART) + TEMPORARY)
     temporary.unlink(missing_ok=True)  # of a recovery that was killed; the lock is ours
     tally = RecoveryTally()
+    for found in each_chunk_once(source):
+        tally.take(found)
+    if not tally.has_data:
+        return tally.report(path, None, finished=False)
+    tally.complete(source)
+    report = tally.report(path, None, finished=False)
     target: CopyTarget | None = None
     try:
+        target = CopyTarget(source, temporary, tally)
         for found in each_chunk_once(source):
-            tally.take(found)
-            if tally.has_data and target is None:
-                target = CopyTarget(source, temporary)
-            if target is not None:
-                target.take(found)
-        if target is not None:
-            tally.define(target.looked_up)
-        report = tally.report(path, None, finished=False)
-        if target is None:
-            return report
+            target.take(found)
         target.finish(RECORD_NAME, to_metadata(report))
         _prove(temporary)
         original = _keep_original(path) if tally.damaged_inside else None

@@ -13,10 +13,8 @@ from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.damaged import Contents, RecordFile, read_plain
 from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, FileSummary
 from bridge.episode.mcap.scan import (
-    AttachmentSpan,
     Chunk,
     Damage,
-    DataEnd,
     IndexSpan,
     Plain,
     TopMessage,
@@ -54,6 +52,7 @@ class DataWalk:
         self._chunk: records.ChunkIndex | None = None
         self._contents = Contents()
         """Of that chunk."""
+        self._num_loose = 0
 
     def messages(self) -> Iterator[ScannedMessage]:
         """Yield every message that can be read, in file order."""
@@ -69,32 +68,34 @@ class DataWalk:
                 case IndexSpan():
                     self._check_index(found)
                 case TopMessage():
+                    self._num_loose += 1
                     log_ns = found.log_time_ns
                     self.seen.add_messages({found.channel_id: 1}, log_ns, log_ns)
                     yield from self._message(self._file.read(found.offset, found.length), 0)
-                case AttachmentSpan():
-                    self.seen.attachment_indexes.append(
-                        attachment_entry(found.offset, found.length, found.record)
-                    )
-                case Plain(record=records.Metadata(name=name)):
-                    entry = records.MetadataIndex(found.offset, found.length, name)
-                    self.seen.metadata_indexes.append(entry)
                 case Plain():
-                    self._define(found.record)
-                case DataEnd():
-                    end = found
+                    self._take_plain(found)
+                    end = found if found.opcode == mcap_format.DATA_END else None
         self._end_chunk()
-        self._check_end(end)
-
-    def _check_end(self, end: DataEnd | None) -> None:
         if end is None:
             self._doubt("the end of its data is not marked")
-            return
-        if end.end < self._file.size:
+        elif end.end < self._file.size:
             self._doubt(f"a record at byte {end.end}, behind the end of the data")
-        crc = int.from_bytes(self._file.read(end.end - 4, 4), "little")
-        if crc not in (0, self._file.crc(0, end.offset)):
-            self._doubt("its data has another CRC than it declares")
+        if self.seen.chunk_indexes and self._num_loose:
+            self._doubt(f"{self._num_loose} messages outside chunks, where the index shows none")
+
+    def _take_plain(self, found: Plain) -> None:
+        match found.record:
+            case records.Attachment() as record:
+                entry = attachment_entry(found.offset, found.length, record)
+                self.seen.attachment_indexes.append(entry)
+            case records.Metadata(name=name):
+                place = records.MetadataIndex(found.offset, found.length, name)
+                self.seen.metadata_indexes.append(place)
+            case records.DataEnd(data_section_crc=crc):
+                if crc not in (0, self._file.crc(0, found.offset)):
+                    self._doubt("its data has another CRC than it declares")
+            case record:
+                self._define(record)
 
     def _message(self, data: bytes, at: int) -> Iterator[ScannedMessage]:
         head = message_head(data, at, at)

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from mcap.records import Attachment, McapRecord
 from mcap.records import Chunk as ChunkRecord
+from mcap.records import McapRecord
 
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
@@ -45,7 +45,7 @@ class Span:
 
 @dataclass(frozen=True, kw_only=True)
 class Plain(Span):
-    """A header, schema, channel, metadata or private record, whole."""
+    """A header, schema, channel, metadata, attachment, data end or private record, whole."""
 
     opcode: int
     raw: bytes
@@ -73,13 +73,6 @@ class TopMessage(Span):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AttachmentSpan(Span):
-    """An attachment whose CRC is right."""
-
-    record: Attachment
-
-
-@dataclass(frozen=True, kw_only=True)
 class IndexSpan(Span):
     """A message index, not looked into."""
 
@@ -92,12 +85,7 @@ class Damage(Span):
     at_end: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class DataEnd(Span):
-    """The writer got as far as the summary."""
-
-
-Found: TypeAlias = Plain | Chunk | TopMessage | AttachmentSpan | IndexSpan | Damage | DataEnd
+Found: TypeAlias = Plain | Chunk | TopMessage | IndexSpan | Damage
 
 
 MAX_PLAIN_BYTES = 64 << 20
@@ -147,7 +135,7 @@ def scan(file: RecordFile) -> Iterator[Found]:
         if found is None:
             return
         yield found
-        if isinstance(found, DataEnd):
+        if isinstance(found, Plain) and found.opcode == mcap.DATA_END:
             return
         before, position = found, found.end
 
@@ -173,10 +161,9 @@ def _read_record(file: RecordFile, offset: int) -> Found | None:
     if opcode == mcap.MESSAGE_INDEX:
         return _read_index(offset, length, front)
     if opcode == mcap.ATTACHMENT:
-        record = attachment_of(file.read(offset, length)[mcap.RECORD_HEAD.size :], offset)
-        return AttachmentSpan(offset=offset, length=length, record=record)
-    if opcode == mcap.DATA_END:
-        return DataEnd(offset=offset, length=length)
+        raw = file.read(offset, length)
+        record = attachment_of(raw[mcap.RECORD_HEAD.size :], offset)
+        return Plain(offset=offset, length=length, opcode=opcode, raw=raw, record=record)
     if length > MAX_PLAIN_BYTES:
         raise BrokenRecordError(f"a {kind} claims {length} bytes")
     raw = file.read(offset, length)

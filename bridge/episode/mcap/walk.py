@@ -247,7 +247,7 @@ class MessageHead(NamedTuple):
     publish_time_ns: int
 
 
-def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
+def message_head(data: Buffer, at: int, where: int) -> MessageHead:
     """Read the front of the message record at ``at``; ``where`` becomes its ``at``."""
     _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)
     if length < MESSAGE_FIELDS:
