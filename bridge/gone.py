@@ -22,6 +22,8 @@ _TOLD = {
     "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
     "export tum --color": "Files stay as recorded; ImageMagick decodes: mogrify -format png *.jpg.",
     "publish folder": "robot-gst import rgbd DIR RUN makes an episode of it.",
+    "publish ur --urdf": "Give the file with --robot.",
+    "publish realsense --align": "Depth keeps its own camera, whose pose is published too.",
     "publish episode": (
         "robot-gst export rosbag2 makes a bag; ros2 bag play sends it, also over rmw_zenoh_cpp."
     ),

@@ -59,8 +59,6 @@ class RealSenseConfig:
     """Compress colour here, or leave it to the recorder."""
     quality: int = 90
     """JPEG quality, with --color jpeg."""
-    align: bool = False
-    """Resample depth into the colour camera; otherwise it keeps its own intrinsics and frame."""
     mounts: Path | None = None
     """JSON file that says where the colour cameras are: {"NAME": {"parent": FRAME, "p_m": [x, y,
     z], "q_wxyz": [w, x, y, z]}}, the transform T_parent_color."""

@@ -3,7 +3,6 @@
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from bridge.clock import NS_PER_S
@@ -23,7 +22,7 @@ from bridge.episode.topics import (
     TF,
     cell_topic,
 )
-from bridge.errors import PathNotFoundError, UsageError
+from bridge.errors import UsageError
 from bridge.robots.robot import DEFAULT_ROBOT, GRIPPER_WIDTH, Robot, read_robot, robot_of
 from bridge.sources.device_samples import Announcer, HostClock, NumberedPublisher
 from bridge.sources.ur import messages
@@ -221,7 +220,7 @@ class UrSource:
         """
         host, config = self.host, self.config
         urdf = read_urdf(config)
-        robot = _robot(config, urdf)
+        robot = _robot(urdf)
         client: RtdeClient | None = _connect(session, host, config, output)
         announce(session, config.cell)
         announcer = Announcer(session)
@@ -253,9 +252,7 @@ def describe_counts(counts: dict[str, Any]) -> str:
 
 
 def read_urdf(config: UrConfig) -> str | None:
-    """The robot's description: a file, that of a robot file, or none."""
-    if config.urdf is not None:
-        return _read_urdf_file(config.urdf)
+    """The robot's description: that of a robot file, or none."""
     if config.robot == "none":
         return None
     if config.robot == BARE_UR5:
@@ -263,30 +260,15 @@ def read_urdf(config: UrConfig) -> str | None:
     return read_robot(config.robot).description()
 
 
-def _robot(config: UrConfig, urdf: str | None) -> Robot:
+def _robot(urdf: str | None) -> Robot:
     """The robot whose joints the controller moves."""
-    if config.urdf is not None and config.robot not in ("none", BARE_UR5):
-        robot = read_robot(config.robot)
-    else:
-        robot = robot_of(urdf or "")
+    robot = robot_of(urdf or "")
     if len(robot.joints) != NUM_JOINTS:
         raise UsageError(
             f"--robot {robot.name} has {len(robot.joints)} joints; a UR controller moves "
             f"{NUM_JOINTS}."
         )
     return robot
-
-
-def _read_urdf_file(path: Path) -> str:
-    if not path.is_file():
-        raise PathNotFoundError(path=path, what="URDF file", hint="Check --urdf.")
-    try:
-        text = path.read_text()
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{path} is not a text file ({error.reason}).") from error
-    if "<robot" not in text:
-        raise UsageError(f"{path} holds no <robot>; it must be a URDF (expand xacro files first).")
-    return text
 
 
 def _description(urdf: str, stamp_ns: int) -> StampedMessage:
