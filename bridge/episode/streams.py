@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from bridge.episode import schema
+from bridge.episode.cdr.batch import joint_layout
 from bridge.episode.cdr.codec import decode
 from bridge.episode.cdr.messages import (
     CameraInfo,
@@ -241,6 +242,11 @@ def joint_track_of(payloads: Sequence[bytes]) -> JointTrack | None:
     Those who know the most joints are taken, in the order of the first of them. Joints that only
     others know are interpolated between theirs, if these span most of the time.
     """
+    alike = joint_layout(payloads[0]) if payloads else None
+    if alike is not None and all(map(alike.is_like, payloads)):  # ten times faster
+        stamps_ns, position = alike.read(payloads)
+        order = np.argsort(stamps_ns, kind="stable")
+        return JointTrack(names=alike.names, stamps_ns=stamps_ns[order], position=position[order])
     samples = [JointSample.from_cdr(payload) for payload in payloads]
     samples = [sample for sample in samples if len(sample.position)]
     return _joined(sorted(samples, key=lambda sample: sample.stamp_ns))

@@ -27,6 +27,20 @@ def rail_at(stamp_ns: int) -> np.ndarray:
     return np.array([0.1 - 0.5 * stamp_ns * 1e-9])
 
 
+def test_messages_that_are_alike_are_read_at_once_as_one_by_one() -> None:
+    rng = np.random.default_rng(3)
+    stamps = rng.integers(0, 2**60, 40).tolist()
+    payloads = [message(stamp, ARM, rng.normal(size=3)) for stamp in stamps]
+    track = joint_track_of(payloads)
+    assert track is not None
+    samples = sorted(map(JointSample.from_cdr, payloads), key=lambda sample: sample.stamp_ns)
+    assert track.stamps_ns.tolist() == [sample.stamp_ns for sample in samples]
+    assert np.array_equal(track.position, [sample.position for sample in samples])
+    other = joint_track_of([*payloads, message(7, ARM[:2], np.zeros(2))])  # not all are alike
+    assert other is not None
+    assert np.array_equal(other.position, track.position)
+
+
 ARM_NS, RAIL_NS = range(0, 2_000_000_000, 8_000_000), range(100_000_000, 1_900_000_000, 33_000_000)
 
 
