@@ -34,15 +34,11 @@ class Channel:
     group: OpenChunk | None = None
     is_large: bool = False
     next_sequence: int = 0
-    times_defined: int = 0
-    next_definition: int = 0
-    """Number of the chunk of its group that holds its definition next."""
+    defined_in: int = -1
+    """Number of the last chunk of its group that holds its definition."""
 
 
 About = tuple[tuple[str, str], ...]
-REPEAT_CHUNKS = 16
-"""Definitions stand in a group's first two chunks that need them, and again after so many: no one
-damaged chunk leaves messages without a name."""
 
 
 class Channels:
@@ -251,8 +247,9 @@ class EpisodeWriter:
             self._flush(group)
         if self.config.flush_s is not None and not group.has_messages:
             group.opened_s = self._monotonic()
-        if group.number >= channel.next_definition:
-            self._define(channel, group)
+        if channel.defined_in != group.number:  # every chunk can be read by itself
+            group.define(channel.definition)
+            channel.defined_in = group.number
         if sequence is None:
             sequence = channel.next_sequence
         group.add(
@@ -276,16 +273,8 @@ class EpisodeWriter:
             self._groups.append(group)
             channel.is_large = True
         channel.group = group
-        channel.next_definition = channel.times_defined = 0
+        channel.defined_in = -1
         return group
-
-    @staticmethod
-    def _define(channel: Channel, group: OpenChunk) -> None:
-        group.define(channel.definition)
-        channel.times_defined += 1
-        channel.next_definition = group.number + (
-            1 if channel.times_defined == 1 else REPEAT_CHUNKS
-        )
 
     def _flush(self, group: OpenChunk) -> None:
         if self._queue is None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from mcap import records
 
 from bridge.episode.mcap import format as mcap_format
-from bridge.episode.mcap.damaged import Contents, RecordFile, read_plain
+from bridge.episode.mcap.damaged import Contents, RecordFile
 from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, FileSummary
 from bridge.episode.mcap.scan import (
     Chunk,
@@ -124,11 +124,11 @@ class DataWalk:
         self._chunk = chunk_entry(found.offset, found.length, found.packed)
         self._contents = found.contents
         data = found.records
-        for opcode, at, length in records_in(data):
+        for record in found.contents.definitions:
+            self._define(record)
+        for opcode, at, _ in records_in(data):
             if opcode == MESSAGE:
                 yield from self._message(data, at)
-            elif opcode in (mcap_format.SCHEMA, mcap_format.CHANNEL):
-                self._define(read_plain(data[at : at + RECORD_HEAD.size + length]))
         counts = {number: len(each) // 2 for number, each in found.contents.index.items()}
         self.seen.add_messages(counts, *found.contents.time_range())
         times = found.contents.time_range()
