@@ -19,6 +19,7 @@ import msgspec
 from bridge.clock import NS_PER_S, s_from_ns
 from bridge.data_files import dataset_file
 from bridge.episode.health import HealthFinding, parsed
+from bridge.episode.metadata import to_strings
 from bridge.episode.topics import EVENT, OF_RECORDER, is_latched, is_truth
 from bridge.errors import UsageError
 from bridge.whole_file import write_whole
@@ -73,8 +74,7 @@ class Contract(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def to_record(self) -> dict[str, str]:
         """The ``contract`` metadata record; every value is JSON."""
-        values = {"schema_version": SCHEMA_VERSION, **msgspec.to_builtins(self)}
-        return {name: json.dumps(value) for name, value in values.items()}
+        return to_strings({"schema_version": SCHEMA_VERSION, **msgspec.to_builtins(self)})
 
     def required(self) -> list[str]:
         """Topics without which nothing should be recorded."""

@@ -1,6 +1,5 @@
 """What was found whole, what was lost, and why: counted while a broken file is read."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from bridge.episode.mcap.scan import (
     Plain,
     TopMessage,
 )
-from bridge.episode.metadata import from_strings
+from bridge.episode.metadata import from_strings, to_strings
 
 RECORD_NAME = "recovered"
 MAX_REASONS = 8
@@ -154,13 +153,8 @@ class RecoveryTally:
 
 def to_metadata(report: RecoveryReport) -> dict[str, str]:
     """Return the ``recovered`` metadata record of an episode; every value is JSON."""
-    values = {
-        "reason": report.reason,
-        "bytes_lost": report.bytes_lost,
-        "messages": report.messages,
-        "tool": provenance.software(),
-    }
-    return {name: json.dumps(value) for name, value in values.items()}
+    values = {name: getattr(report, name) for name in ("reason", "bytes_lost", "messages")}
+    return to_strings({**values, "tool": provenance.software()})
 
 
 def unknown_topic(channel_id: int) -> str:
