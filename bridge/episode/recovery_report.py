@@ -7,7 +7,6 @@ from mcap.records import Attachment, Channel, DataEnd, Header, McapRecord, Metad
 
 from bridge.episode import provenance
 from bridge.episode.mcap.damaged import (
-    Contents,
     RecordFile,
     summary_definitions,
 )
@@ -76,7 +75,9 @@ class RecoveryTally:
             case IndexSpan():
                 return
             case Chunk():
-                self._count(found.contents)
+                self._define(found.contents.definitions)
+                for channel_id, entries in found.contents.index.items():
+                    self._add(channel_id, len(entries) // 2)
             case TopMessage():
                 self._add(found.channel_id, 1)
             case Plain():
@@ -93,11 +94,6 @@ class RecoveryTally:
                 self.attachments += 1
             case Metadata(name=name, metadata=values) if name == RECORD_NAME:
                 self.earlier = from_strings(values)
-
-    def _count(self, contents: Contents) -> None:
-        self._define(contents.definitions)
-        for channel_id, entries in contents.index.items():
-            self._add(channel_id, len(entries) // 2)
 
     def _add(self, channel_id: int, count: int) -> None:
         self.messages[channel_id] = self.messages.get(channel_id, 0) + count

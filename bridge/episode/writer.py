@@ -105,11 +105,6 @@ _HEAD_BYTES = 512
 """An encoding's name stands near the front of an image message."""
 
 
-def is_large(type_name: str, length: int) -> bool:
-    """Say whether a message of this many bytes belongs to a stream with chunks of its own."""
-    return type_name in _LARGE_TYPES or length >= LARGE_BYTES
-
-
 def is_worth_compressing(type_name: str, front: bytes) -> bool:
     """Judge a stream by its type and the front of its first message: zstd for depth and unknown.
 
@@ -264,7 +259,7 @@ class EpisodeWriter:
 
     def _assign_group(self, channel: Channel, data: Buffer, length: int) -> OpenChunk:
         group = self._small
-        if is_large(channel.type_name, length):
+        if channel.type_name in _LARGE_TYPES or length >= LARGE_BYTES:
             if channel.group is not None:  # keeps the topic's order in the file
                 self._flush(channel.group)
             head = bytes(memoryview(data).cast("B")[:_HEAD_BYTES])
@@ -326,10 +321,9 @@ class EpisodeWriter:
         """Add the ``episode`` and ``software`` records, and the others where given."""
         self.add_metadata("episode", metadata.to_strings(info))
         self.add_metadata("software", provenance.software())
-        if outcome is not None:
-            self.add_metadata("outcome", metadata.to_strings(outcome))
-        if derived is not None:
-            self.add_metadata("derived", metadata.to_strings(derived))
+        for name, record in (("outcome", outcome), ("derived", derived)):
+            if record is not None:
+                self.add_metadata(name, metadata.to_strings(record))
 
     def tick(self) -> None:
         """Write the chunks that have been waiting for ``flush_s``; call it often."""

@@ -46,15 +46,6 @@ def named(axes: str, numbers: Sequence[float]) -> dict[str, float]:
     return dict(zip(axes, numbers, strict=False))
 
 
-def joint_messages(
-    stamps_ns: Int[np.ndarray, " num_messages"],
-    names: Sequence[str],
-    position: Float[np.ndarray, "num_messages num_joints"],
-) -> Iterator[bytes]:
-    """Yield sensor_msgs/JointState messages with positions alone."""
-    return map(joint_writer(names), stamps_ns.tolist(), position.tolist())
-
-
 def pose_messages(
     stamps_ns: Int[np.ndarray, " num_messages"],
     frame_id: str,

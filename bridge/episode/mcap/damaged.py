@@ -3,7 +3,6 @@
 import os
 import struct
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from mcap.records import McapRecord, Schema
 
@@ -69,22 +68,18 @@ def summary_definitions(file: RecordFile) -> list[McapRecord | None]:
         return []
 
 
-class FinishedData(NamedTuple):
-    """Where the data of a finished file ends, and whether its CRC proves every byte of it."""
+def finished_data(file: RecordFile) -> tuple[int, bool] | None:
+    """Return where a file's data ends, and whether its CRC proves every byte of it.
 
-    end: int
-    is_proved: bool
-
-
-def finished_data(file: RecordFile) -> FinishedData | None:
-    """Look at the end of a file; None unless its closing CRCs are right."""
+    None unless the closing CRCs are right.
+    """
     places = _summary_places(file)
     head = mcap.RECORD_HEAD.pack(mcap.DATA_END, 4)
     end = places[0] - len(head) - 4 if places else -1
     if end < len(mcap.MAGIC) or file.read(end, len(head)) != head:
         return None
     crc = int.from_bytes(file.read(end + len(head), 4), "little")
-    return FinishedData(end, is_proved=crc != 0) if crc in (0, file.crc(0, end)) else None
+    return (end, crc != 0) if crc in (0, file.crc(0, end)) else None
 
 
 _INDEX_FIELDS = struct.Struct("<HxxxxQ")

@@ -98,7 +98,7 @@ class DataWalk:
                 self._define(record)
 
     def _message(self, data: bytes, at: int) -> Iterator[ScannedMessage]:
-        head = message_head(data, at, at)
+        head = message_head(data, at)
         channel = self.seen.channels.get(head.channel_id)
         if channel is None:
             self._fault(f"a message of channel {head.channel_id}, which was not announced")
@@ -139,7 +139,9 @@ class DataWalk:
 
     def _check_index(self, span: IndexSpan) -> None:
         body = self._file.read(span.offset, span.length)[RECORD_HEAD.size :]
-        channel_id, said = _index_entries(body)
+        channel_id, length = _INDEX_HEAD.unpack_from(body)
+        numbers = struct.unpack_from(f"<{length // 8}Q", body, _INDEX_HEAD.size)
+        said = sorted(zip(numbers[::2], numbers[1::2], strict=True))
         if self._chunk is None:
             self._doubt(f"the message index at byte {span.offset} follows no chunk")
             return
@@ -162,10 +164,3 @@ class DataWalk:
             self._doubt(f"the chunk at byte {at} has no index of channels {sorted(absent)}")
         self.seen.chunk_indexes.append(self._chunk)
         self._chunk = None
-
-
-def _index_entries(body: bytes) -> tuple[int, list[tuple[int, int]]]:
-    """Read a message index: its channel, and log time and offset of each message, in order."""
-    channel_id, length = _INDEX_HEAD.unpack_from(body)
-    numbers = struct.unpack_from(f"<{length // 8}Q", body, _INDEX_HEAD.size)
-    return channel_id, sorted(zip(numbers[::2], numbers[1::2], strict=True))
