@@ -42,8 +42,8 @@ PRESSED, FEWEST = 0.1, 20
 stiffness is known."""
 GRIPS_M, GOING = 0.01, (0.2, 0.8)
 """Fingers that close by so much say how they do it, on this share of their way."""
-FREE = 0.8
-"""Those of about the largest speed are stopped by nothing."""
+FREE = 0.2
+"""Those whose speed is within so much of the upper quartile's: slower ones are held up."""
 
 Rows = Float[np.ndarray, "num_times num_joints"]
 
@@ -174,12 +174,12 @@ def stiffness_of(
 
 
 def grip_of(trials: Sequence[Sent]) -> tuple[float, float]:
-    """Delay [s] and speed [m/s] of fingers that close: the fastest, for nothing stops these."""
+    """Delay [s] and speed [m/s] of fingers that close and that nothing slows down."""
     lines = np.array([line for trial in trials for line in _closings(trial)])
     if not len(lines):
         return 0.0, math.inf
     delays_s, speeds_m_s = lines.T
-    free = speeds_m_s > FREE * speeds_m_s.max()
+    free = np.abs(speeds_m_s / np.quantile(speeds_m_s, 0.75) - 1.0) < FREE
     delay_s, speed_m_s = np.median(delays_s[free]), np.median(speeds_m_s[free])
     return max(0.0, round(float(delay_s), 4)), round(float(speed_m_s), 4)
 

@@ -141,8 +141,7 @@ def stops_of_arm(
     record: Robot,
 ) -> list[Failure]:
     """Find where an arm would stop by itself: too far from its command, or pressed too hard."""
-    failures = []
-    limit_rad = record.tracking_error_rad
+    failures, limit_rad = [], record.tracking_error_rad
     over = [] if limit_rad is None else np.argwhere(~(np.abs(off_rad) <= limit_rad)).tolist()
     for index, joint in over[:1]:
         name, t_ns = record.joints[joint], int(stamps_ns[index])
@@ -150,14 +149,11 @@ def stops_of_arm(
             f"{name} is {abs(off_rad[index, joint]):.3f} rad from where it is commanded, the limit "
             f"is {limit_rad:g} rad"
         )
-        failures.append(
-            Failure(t_ns=t_ns, cause=Cause.TRACKING_ERROR, bodies=(name,), detail=detail)
-        )
+        bodies, cause = (name,), Cause.TRACKING_ERROR
+        failures.append(Failure(t_ns=t_ns, cause=cause, bodies=bodies, detail=detail))
     pressed = PressedStop(record.contact_force_N)
     lasted_ns = np.diff(stamps_ns, prepend=stamps_ns[:1])
-    for t_ns, newton, each_ns in zip(stamps_ns, force_N, lasted_ns, strict=False):
-        detail = pressed.found(float(newton), int(each_ns))
-        if detail:
-            failures.append(Failure(t_ns=int(t_ns), cause=Cause.CONTACT_FORCE, detail=detail))
-            break
+    for t_ns, newton, each_ns in zip(stamps_ns.tolist(), force_N, lasted_ns, strict=False):
+        if detail := pressed.found(float(newton), int(each_ns)):
+            return [*failures, Failure(t_ns=t_ns, cause=Cause.CONTACT_FORCE, detail=detail)]
     return failures

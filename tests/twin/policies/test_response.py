@@ -1,18 +1,28 @@
 """The twin's arm follows as the cell's did: identified from what was sent and what it did."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from drawn_run import HOME
+from drawn_run import HOME, at_positions
 from scipy.signal import lsim
 
+from bridge.episode import schema
+from bridge.episode.cdr.messages import CompressedColor, string_to_cdr
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
-from bridge.robots.default import ARM_JOINTS
+from bridge.episode.writer import EpisodeWriter
+from bridge.robots.default import ARM_JOINTS, ROBOT
+from bridge.robots.robot import GRIPPER_WIDTH
 from twin.policies.cell import TwinCell
-from twin.policies.identify import Sent, grip_of, lags_of, stiffness_of
-from twin.policies.response import Controller, Response
+from twin.policies.identify import Sent, grip_of, lags_of, response_of, stiffness_of
+from twin.policies.response import AT_ONCE, Controller, Response
+from twin.policies.shutter import ALWAYS, shutter_of
 from twin.policies.starts import Start
 from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
@@ -63,6 +73,59 @@ def test_delay_lags_stiffness_and_fingers_are_found_again(start: Start) -> None:
     assert grip_of(trials) == pytest.approx((0.09, 0.15), abs=1e-3)
     free = [each._replace(loads_Nm=0.0 * each.loads_Nm) for each in trials]
     assert set(stiffness_of(free, delay_s, lags_s, robot)) == {np.inf}
+
+
+def write_trial(run: RunFolder, trial: Sent, name: str, first_ns: int) -> Episode:
+    """Joints and fingers as they were, targets one period ahead, pictures 60 ms late."""
+    path = run.episodes_dir / f"{name}.mcap"
+    with EpisodeWriter(path) as writer:
+        writer.describe(EpisodeInfo(id=name, kind="trial", task="cube_into_box"))
+
+        def say(topic: str, kind: str, stamp_ns: int, message: Any, late_ns: int = 0) -> None:
+            data = message.to_cdr() if hasattr(message, "to_cdr") else message
+            came_ns = 10**15 + stamp_ns + late_ns  # by another clock
+            writer.write(topic, data, type_name=kind, log_time_ns=came_ns, publish_time_ns=stamp_ns)
+
+        say("/robot_description", schema.STRING, first_ns, string_to_cdr(ROBOT.urdf_text()))
+        width_m = np.where(trial.targets.stamps_ns < 2.79e9, 0.085, 0.0)[:-1]
+        ahead = np.column_stack([trial.targets.position[1:], width_m])
+        for topic, names, stamps_ns, rows in (
+            ("joint_states", ARM_JOINTS, trial.joints.stamps_ns, trial.joints.position),
+            ("policy/targets", (*ARM_JOINTS, GRIPPER_WIDTH), trial.targets.stamps_ns[:-1], ahead),
+            ("gripper/state", (GRIPPER_WIDTH,), trial.widths.stamps_ns, trial.widths.position),
+        ):
+            for stamp_ns, row in zip((first_ns + stamps_ns).tolist(), rows, strict=True):
+                sample = at_positions(stamp_ns, names, row)
+                say(f"/cell/{topic}", schema.JOINT_STATE, stamp_ns, sample)
+        for stamp_ns in range(first_ns, first_ns + 3 * 10**9, 200_000_000):
+            picture = CompressedColor(stamp_ns=stamp_ns, frame_id="side", format="jpeg", data=b"-")
+            topic = "/cell/cam/side/color/image"
+            say(topic, schema.COMPRESSED_IMAGE, stamp_ns, picture, 60_000_000)
+    return Episode.open(path)
+
+
+def test_a_trial_teaches_the_others_of_its_run(tmp_path: Path, run: RunFolder) -> None:
+    robot, folder = load_robot(ROBOT.urdf_text()), RunFolder.create(tmp_path / "taught")
+    first, _ = (
+        write_trial(folder, recorded(np.random.default_rng(n)), f"trial_{n}", n * 10**11)
+        for n in (1, 2)
+    )
+    found = response_of(folder, first, robot)
+    assert found.delay_s == pytest.approx(DELAY_S, abs=0.009)  # one reading every 8 ms
+    np.testing.assert_allclose(found.lags_s, LAGS_S, atol=0.009)
+    assert (found.grip_delay_s, found.grip_speed_m_s) == pytest.approx((0.29, 0.15), abs=2e-3)
+    assert found.stiffness_Nm_rad == ()  # nobody measured efforts
+    nothing_sent = Episode.open(run.episodes_dir / "trial_1.mcap")
+    assert response_of(run, nothing_sent, robot) == AT_ONCE
+    shutter = shutter_of(first, "side", 10**11 + 500_000_000)
+    assert shutter.period_ns == 200_000_000
+    assert shutter.first_ns == -100_000_000
+    assert shutter.late_ns == pytest.approx(60_000_000, abs=8_000_000)
+    assert [replace(shutter, late_ns=60).newest_ns(100_000_000 + k) for k in (59, 60)] == [
+        -100_000_000,
+        100_000_000,
+    ]
+    assert ALWAYS.newest_ns(12345) == 12345
 
 
 def test_a_ramp_is_followed_by_its_speed_times_delay_and_lag() -> None:
