@@ -1,6 +1,5 @@
 """Commands that record, and that control a recorder from anywhere."""
 
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 OUTPUT = Output()
 ABOUT = EpisodeAbout()
 RECORDER = RecorderConfig()
-Action = Literal["start", "stop", "mark", "label", "list", "status"]
+Action = Literal["start", "stop", "mark", "label", "status"]
 
 
 def record(
@@ -37,7 +36,7 @@ def record(
 ) -> int:
     """Record episodes live; everything published to this recorder ends up in one.
 
-    Without --episode it waits for robot-gst ctl start, or the keys shown on a terminal.
+    Without --episode it waits for robot-gst ctl start.
     SIGINT or SIGTERM finish the open episode.
     Example: robot-gst record runs/monday --episode scan --duration 30
 
@@ -47,7 +46,7 @@ def record(
         duration_s: Stop after this long [s]; with --episode.
         anyway: Start it although topics are missing that cell.toml requires; else it waits.
         learn: Write the run's cell.toml from this good episode, and record nothing.
-        about: What is being recorded, with --episode or the key s.
+        about: What is being recorded, with --episode.
         listen: Where to listen; other processes connect here.
         connect: Other zenoh routers to join.
         zenoh_config: zenoh configuration (JSON5), for example with access control.
@@ -74,7 +73,6 @@ def record(
             output=output,
             episode=info,
             duration_s=duration_s,
-            about=about,
             anyway=anyway,
             task=task,
         )
@@ -110,7 +108,6 @@ def ctl(
     detail: str | None = None,
     discard: bool = False,
     anyway: bool = False,
-    last: int = 20,
     recorder: Annotated[str, RARE] = "main",
     connect: tuple[str, ...] = LOOPBACK,
     zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
@@ -121,20 +118,18 @@ def ctl(
     Example: robot-gst ctl start --id trial_0001 --task cube_into_box --cell standin
 
     Args:
-        action: start, stop, mark, label, list or status.
+        action: start, stop, mark, label or status.
         text: Words of a mark or label.
-        id: Episode to start, or to label after it has been finished.
+        id: Episode to start, by default the next number, or to label when it is finished.
         about: What is being recorded (start).
         result: How it went (stop, label).
         detail: What happened, in words (stop, label).
         discard: Throw the open episode away (stop).
         anyway: Start although topics are missing that cell.toml requires (start).
-        last: How many episodes, by name from the end (list).
         recorder: Name of the recorder.
         connect: Where it listens.
         zenoh_config: zenoh configuration (JSON5).
     """
-    from bridge.errors import UsageError
     from bridge.record.control import RecorderClient
     from bridge.record.status import describe_answer, describe_status
     from bridge.wire.config import WireConfig
@@ -150,17 +145,12 @@ def ctl(
         "stop": {"outcome": outcome, "discard": discard},
         "mark": {"text": text},
         "label": {"text": text, "outcome": outcome, "episode": id},
-        "list": {"last": last},
         "status": {},
     }
-    if action == "start" and id is None:
-        raise UsageError("start needs the new episode's id: robot-gst ctl start --id trial_0001.")
     with open_session(WireConfig(connect=connect, config=zenoh_config)) as session:
         answer = RecorderClient(session, recorder).ask(action, requests[action])
-    describers: dict[str, Callable[[dict[str, Any]], str]]
-    describers = {"status": describe_status, "list": _describe_list}
-    describe = describers.get(action, describe_answer)
-    output.result(answer, describe(answer))
+    text = describe_status(answer) if action == "status" else describe_answer(answer)
+    output.result(answer, text)
     return 0
 
 
@@ -172,16 +162,3 @@ def _with_task_file(about: EpisodeAbout) -> "tuple[EpisodeAbout, TaskFile | None
         return about, None
     file = TaskFile.read(Path(about.task))
     return replace(about, task=file.task().name), file
-
-
-def _describe_list(answer: dict[str, Any]) -> str:
-    from bridge.cli.episodes import episode_table
-    from bridge.episode.catalogue_query import Entry
-    from bridge.episode.metadata import build
-
-    entries = [build(Entry, item) for item in answer["episodes"]]
-    if not entries:
-        return "no episode has been recorded yet"
-    left_out = answer["of"] - len(entries)
-    more = [f"({left_out} more before these)"] if left_out else []
-    return "\n".join([*more, *episode_table(entries)])

@@ -1,5 +1,7 @@
 """The frames of an episode over time: ``/tf`` and ``/tf_static`` as one tree."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -34,7 +36,7 @@ class AmbiguousFrameError(BridgeError):
 class TransformTree:
     """Answers ``T_root_frame`` at any stamp, interpolating moving frames."""
 
-    def __init__(self, transforms: list[FrameTransform]) -> None:
+    def __init__(self, transforms: Iterable[FrameTransform]) -> None:
         """Collect transforms in any order; static ones are those seen once."""
         collected: dict[str, tuple[str, dict[int, Float[np.ndarray, "4 4"]]]] = {}
         claims: dict[str, set[str]] = {}

@@ -56,7 +56,7 @@ class Start:
 def trial_episodes(run: RunFolder, task: str) -> list[Episode]:
     """The recorded trials of a task, one for each of its starts."""
     found: dict[str, Episode] = {}
-    asked = CatalogueQuery(kind=("trial",), task=(task,) if task else (), error=False)
+    asked = CatalogueQuery(kind=("trial",), task=(task,) if task else ())
     for trial in find_episodes(run, asked):
         start = f"{trial.task} {trial.start_id or trial.id}"
         if trial.task and start not in found:

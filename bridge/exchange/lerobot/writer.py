@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bridge.errors import MissingDependencyError
 from bridge.exchange.lerobot import layout
 from bridge.exchange.lerobot.layout import parquet
 from bridge.media.video_writer import VideoWriter
@@ -337,12 +336,8 @@ class DatasetWriter:
                 video.writer.close()
 
     def _write_tasks(self) -> None:
-        try:
-            import pandas as pd  # noqa: PLC0415  # LeRobot reads the words as a pandas index
-        except ImportError as error:
-            raise MissingDependencyError(
-                package="pandas", extra="report", purpose="LeRobot's table of tasks"
-            ) from error
+        import pandas as pd  # noqa: PLC0415  # LeRobot reads the words as a pandas index
+
         tasks = pd.DataFrame(
             {"task_index": list(self._tasks.values())}, index=pd.Index(self._tasks, name="task")
         )

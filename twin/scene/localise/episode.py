@@ -1,6 +1,6 @@
 """Localise the objects of a recorded episode, and keep the answer as a derived episode."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,12 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import LOCALISATION, cell_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError, GstError
+from bridge.geometry import se3
 from bridge.task.task_file import Task
 from twin.scene.align.moved_camera import MovedCamera, moved_camera
 from twin.scene.frames.camera_poses import CameraPoses, base_tree, poses_shifted
 from twin.scene.frames.selection import rgbd_camera_ids
-from twin.scene.localise.held import held_objects
+from twin.scene.localise.held import executions_ns, held_objects
 from twin.scene.localise.mesh_fit import MeshSurface, ScannedSurfaces, scanned_surfaces
 from twin.scene.localise.objects import MAX_FRAMES, MAX_VIEWS, localise_objects
 from twin.scene.localise.result import LocalisedObject
@@ -38,7 +39,7 @@ MOVED = "moved"
 """In the settings of a localisation: cameras that were found to have moved since the scan."""
 STILL_FRAMES = 3
 """Of each camera, for that."""
-LOCALISE_VERSION = 4
+LOCALISE_VERSION = 5
 """Counts changes of method that make older localisations out of date."""
 
 
@@ -164,13 +165,11 @@ def write_localised(
         about = {key: item.to_record() for key, item in moved.items()}
         derived = replace(derived, settings={**derived.settings, MOVED: about})
     poses = trial_cameras(run, episode, moved)
-    phases = _localised_phases(episode, task, scanned, poses)
-    held = held_objects(episode, task, scanned.surfaces, poses)
+    phases = [*_localised_phases(episode, task, scanned, poses)]
     path.unlink(missing_ok=True)
     with EpisodeWriter(path) as writer:
         writer.describe(episode.info, derived=derived)
-        for phase, objects in phases:
-            in_hand = held.get(phase.plan_id or "", {})
+        for phase, objects, in_hand in phases:
             _write_phase(writer, episode.info.cell or "cell", phase, objects, in_hand)
     return path
 
@@ -208,11 +207,23 @@ def trial_cameras(run: RunFolder, episode: Episode, moved: Mapping[str, MovedCam
 
 def _localised_phases(
     episode: Episode, task: Task, scanned: ScannedSurfaces, poses: Poses
-) -> list[tuple[Phase, dict[str, LocalisedObject]]]:
-    """Localise in one quiet stretch after the other; each tells the next where objects were."""
-    phases: list[tuple[Phase, dict[str, LocalisedObject]]] = []
+) -> Iterator[tuple[Phase, dict[str, LocalisedObject], dict[str, list[dict[str, Any]]]]]:
+    """Localise in one quiet stretch after the other; each tells the next where objects were.
+
+    With each what cameras saw in the hand in the execution before it, by object: ``grip_ns``, when
+    the fingers stood closed, and ``T_tcp_object``. What was held is expected where it was let go.
+    """
+    spans_ns = executions_ns(episode)
     last_seen_m: dict[str, np.ndarray] = {}
     for phase in quiet_phases(episode):
+        in_hand: dict[str, list[dict[str, Any]]] = {}
+        span_ns = spans_ns.get(phase.plan_id or "", (0, 0))
+        held = held_objects(episode, span_ns, task, scanned.surfaces, poses, last_seen_m)
+        for name, grip, T in [*held]:
+            entry = {"grip_ns": grip.start_ns, "T_tcp_object": se3.pose_record(T)}
+            in_hand.setdefault(name, []).append(entry)
+            let_go_m = (grip.T_base_tcp_end @ T)[:3, 3]
+            last_seen_m[name] = np.append(let_go_m[:2], last_seen_m.get(name, let_go_m)[2])
         found = localise_episode(
             episode,
             task,
@@ -222,13 +233,12 @@ def _localised_phases(
             surfaces=scanned.surfaces,
             poses=poses,
         )
-        phases.append((phase, found))
+        yield phase, found, in_hand
         last_seen_m |= {
             key: item.T_base_object[:3, 3]
             for key, item in found.items()
             if item.T_base_object is not None
         }
-    return phases
 
 
 def _mounts(calibration: Calibration | None, camera_ids: Collection[str]) -> dict[str, Any]:
@@ -263,7 +273,7 @@ def _write_phase(
         record = {**found.to_record(), "phase": phase.name, "plan_id": phase.plan_id}
         if object_id in in_hand:
             record["in_hand"] = in_hand[object_id]
-        writer.write_json(
+        writer.write(
             cell_topic(cell, LOCALISATION),
             record,
             type_name=schema.LOCALISATION,

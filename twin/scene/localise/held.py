@@ -7,10 +7,10 @@ stands still: frames taken on the way are views of one scene in the tool's frame
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.signal import find_peaks, peak_widths
 
 from bridge.episode import streams
 from bridge.episode.executions import EXECUTION, executed_events
@@ -34,8 +34,10 @@ PLATEAU_M = 0.003
 """Fingers that are this near to the least opening of a grasp grasp what is between them."""
 EMPTY_M = 0.002
 """Fingers that close to less have nothing between them."""
-SETTLES_NS = 200_000_000
-"""After closing and before opening the object may move in the hand."""
+CLOSES = 0.25
+"""Of the farthest way of the fingers: less is not a grip."""
+SETTLES = 0.25
+"""Share of a grip at either end in which the object may move in the hand, or is near to others."""
 FRAMES = 4
 """Of each camera."""
 MAX_SEEN_THROUGH = 0.1
@@ -74,10 +76,11 @@ def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns:
     stamps, width_m = widths.stamps_ns[inside], widths.position[inside, 0]
     if len(stamps) == 0 or np.ptp(width_m) < PLATEAU_M:
         return []
-    is_closed = width_m < (width_m.min() + width_m.max()) / 2
-    edges = np.flatnonzero(np.diff(is_closed.astype(np.int8), prepend=0, append=0))
+    closed_m = -np.pad(width_m, 1, constant_values=width_m.max())
+    deepest, _ = find_peaks(closed_m, prominence=CLOSES * np.ptp(width_m))
+    _, _, began, ended = peak_widths(closed_m, deepest)  # half way, whatever other grips hold
     grips = []
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
+    for first, last in zip(np.ceil(began).astype(int) - 1, ended.astype(int), strict=True):
         least_m = float(width_m[first:last].min())
         held = first + np.flatnonzero(width_m[first:last] <= least_m + PLATEAU_M)
         if least_m < EMPTY_M:
@@ -97,32 +100,42 @@ def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns:
 
 
 def held_objects(
-    episode: Episode, task: Task, surfaces: Mapping[str, MeshSurface], poses: Poses
-) -> dict[str, dict[str, list[dict[str, Any]]]]:
-    """What localisation records say of rigid objects in the hand, by plan and object.
+    episode: Episode,
+    span_ns: tuple[int, int],
+    task: Task,
+    surfaces: Mapping[str, MeshSurface],
+    poses: Poses,
+    last_seen_m: Mapping[str, Float[np.ndarray, "3"]],
+) -> Iterator[tuple[str, Grip, Float[np.ndarray, "4 4"]]]:
+    """What cameras saw in the hand in an execution: object, grip, and pose ``T_tcp_object``.
 
-    Each entry has ``grip_ns``, when the fingers stood closed, and ``T_tcp_object``.
+    Args:
+        last_seen_m: Before it. Of soft objects, which may look alike, only one that lay where the
+            fingers closed is looked for.
     """
     try:
         track = posture_track(episode)
         robot = load_robot(track.urdf)
     except GstError:
-        return {}
+        return
     shapes = {
         name: surfaces[name] if model.shape == SCANNED else known_surface(model)
         for name, model in task.objects.items()
-        if not model.fixed and model.soft is None and (model.shape != SCANNED or name in surfaces)
+        if not model.fixed and (model.shape != SCANNED or name in surfaces)
     }
-    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for plan_id, ends_ns in executions_ns(episode).items():
-        for grip in grips_between(track, robot, *ends_ns):
-            frames = list(_in_tool_frame(episode, grip, track, robot, poses))
-            for name, surface in shapes.items():
-                T = fitted_in_hand(frames, task, task.objects[name], surface)
+    for grip in grips_between(track, robot, *span_ns):
+        frames = list(_in_tool_frame(episode, grip, track, robot, poses))
+        for name, surface in shapes.items():
+            model = task.objects[name]
+            away_m = last_seen_m.get(name, np.inf) - grip.T_base_tcp_start[:3, 3]
+            if model.soft is None or np.linalg.norm(away_m) < _reach_m(model):
+                T = fitted_in_hand(frames, task, model, surface)
                 if T is not None:
-                    entry = {"grip_ns": grip.start_ns, "T_tcp_object": se3.pose_record(T)}
-                    found.setdefault(plan_id, {}).setdefault(name, []).append(entry)
-    return found
+                    yield name, grip, T
+
+
+def _reach_m(model: ObjectModel) -> float:
+    return BETWEEN_M + max(model.size_m) / 2
 
 
 def _in_tool_frame(
@@ -134,7 +147,8 @@ def _in_tool_frame(
         with suppress(GstError):  # others may see it
             known = poses.get(camera_id) or CameraPoses(tree=tree, source="tf")
             stamps = paired_stamps_ns(episode, camera_id)
-            held = (stamps > grip.start_ns + SETTLES_NS) & (stamps < grip.end_ns - SETTLES_NS)
+            margin_ns = SETTLES * (grip.end_ns - grip.start_ns)
+            held = (stamps > grip.start_ns + margin_ns) & (stamps < grip.end_ns - margin_ns)
             stamps = np.setdiff1d(stamps[held], [*known.unposed_ns])
             wanted = set(spread(stamps, FRAMES).tolist())
             frame_id = streams.camera_info(episode, camera_id).frame_id
@@ -155,13 +169,12 @@ def fitted_in_hand(
 ) -> Float[np.ndarray, "4 4"] | None:
     """Pose ``T_tcp_object`` of an object between the fingers; None where none is seen there."""
     views = fuse_stationary(frames, FRAMES, FRAMES, replace(task, start={}))
-    reach_m = BETWEEN_M + max(model.size_m) / 2
-    near = [
-        group
-        for group in object_points(views, model, -np.inf)
-        if len(group) >= MIN_POINTS and np.linalg.norm(group.p_base.mean(axis=0)) < reach_m
-    ]
-    if not near:
+
+    def is_far(p: Float[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
+        return np.asarray(np.linalg.norm(p, axis=1) >= BETWEEN_M + np.linalg.norm(model.size_m) / 2)
+
+    near = object_points(views, model, -np.inf, is_far)
+    if not near or len(near[0]) < MIN_POINTS:
         return None
     fit = fit_mesh(near[0], views, surface, tilt_sigma_rad=ANY_TILT_RAD, lying=True)
     is_it = fit.explained >= MIN_EXPLAINED and fit.seen_through <= MAX_SEEN_THROUGH

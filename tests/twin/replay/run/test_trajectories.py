@@ -71,7 +71,7 @@ def run(
             ("execution_ended", int(track.stamps_ns[-1])),
         ):
             event = {"schema_version": 1, "stamp_ns": stamp, "type": kind, "plan_id": "round-1"}
-            writer.write_json("/standin/event", event, type_name=schema.EVENT, log_time_ns=stamp)
+            writer.write("/standin/event", event, type_name=schema.EVENT, log_time_ns=stamp)
         for topic, recorded in (("joint_states", track), ("gripper/state", widths)):
             for stamp, position in zip(recorded.stamps_ns, recorded.position, strict=True):
                 sample = at_positions(int(stamp), recorded.names, position)
