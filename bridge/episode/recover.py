@@ -21,11 +21,10 @@ from pathlib import Path
 
 from mcap.records import Attachment, Header, Metadata
 
-from bridge.episode.check_file import Faults, FileCheck
+from bridge.episode.check_file import Faults, checked_messages
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import RecordFile, finished_data
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
-from bridge.episode.mcap.format import Buffer
 from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
 from bridge.episode.mcap.scan import Chunk, Found, Plain, TopMessage, scan
 from bridge.episode.mcap.walk import chunk_entry
@@ -114,7 +113,7 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
         return None
     faults, (end, is_proved) = Faults(), data
     if not is_proved:  # then its indexes may be wrong all the same
-        deque(FileCheck(path, faults).messages(), maxlen=0)
+        deque(checked_messages(path, faults), maxlen=0)
     if faults.count:
         return None
     tally = RecoveryTally()
@@ -286,19 +285,13 @@ class CopyTarget:
 _TIMES = struct.Struct("<QQ")
 
 
-def has_wrong_times(found: Chunk) -> bool:
-    """Whether a chunk's head states other times than its messages; no CRC covers them."""
-    return _TIMES.unpack_from(found.raw, mcap.RECORD_HEAD.size) != found.contents.time_range()
-
-
 def verbatim(found: Chunk) -> EncodedChunk:
-    """Return a chunk as it stands in the file, with the times of its messages in its head."""
-    start_ns, end_ns = found.contents.time_range()
-    at = mcap.RECORD_HEAD.size
-    buffers: list[Buffer] = [found.raw]
-    if has_wrong_times(found):
-        front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
-        buffers = [front, memoryview(found.raw)[len(front) :]]
+    """Return a chunk as it stands in the file, with the times of its messages in its head.
+
+    No CRC covers what stands there.
+    """
+    times_ns, at = found.contents.time_range(), mcap.RECORD_HEAD.size
+    front = found.raw[:at] + _TIMES.pack(*times_ns)
     entry = chunk_entry(0, found.length, found.packed)
-    entry.message_start_time, entry.message_end_time = start_ns, end_ns
-    return EncodedChunk(buffers, entry, found.contents.index)
+    entry.message_start_time, entry.message_end_time = times_ns
+    return EncodedChunk([front, memoryview(found.raw)[len(front) :]], entry, found.contents.index)
