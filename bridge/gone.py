@@ -22,6 +22,7 @@ _TOLD = {
     "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
     "export tum --color": "Files stay as recorded; ImageMagick decodes: mogrify -format png *.jpg.",
     "publish folder": "robot-gst import rgbd DIR RUN makes an episode of it.",
+    "task new --like": "Copy the file of the other task, and change its name in it.",
     "publish ur --urdf": "Give the file with --robot.",
     "publish realsense --align": "Depth keeps its own camera, whose pose is published too.",
     "publish episode": (
