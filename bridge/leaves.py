@@ -117,12 +117,14 @@ LEAVES: dict[str, Leaf] = {
             "twin.physics.soft",
             "twin.physics.soft_solver",
             "twin.physics.soft_world",
+            "dashboards.soft_nodes",
         ),
         extra="replay",
         purpose="replaying soft objects",
         entries={
             "shape": "twin.physics.soft:shape_of",
             "world": "twin.physics.soft_world:SoftWorld",
+            "bent": "dashboards.soft_nodes:bent",
         },
     ),
     "stand-in": Leaf(

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
@@ -135,7 +136,13 @@ class _Blocks:
 def pack_scene(scene: TrialScene) -> bytes:
     """Write everything that the 3D view of a trial needs into one file."""
     clouds = {} if scene.parts is None else reduced_clouds(scene.parts, scene)
+    clouds, by_node = _by_node(clouds, scene.sides)
     table, ranges, factor = _splat_table(clouds)
+    for key, followers in by_node.items():
+        first = ranges[key][0]
+        for node_key, count in followers.items():
+            ranges[node_key] = [first, count]
+            first += count
     blocks = _Blocks()
     view = first_view(scene)
     header: dict[str, Any] = {
@@ -190,6 +197,31 @@ def reduced_clouds(parts: MovableScene, scene: TrialScene) -> dict[str, Gaussian
     return {name: cloud.take(weights[name] >= least) for name, cloud in clouds.items()}
 
 
+def _by_node(
+    clouds: Mapping[str, GaussianCloud], sides: Sequence[Side]
+) -> tuple[dict[str, GaussianCloud], dict[str, dict[str, int]]]:
+    """Put the Gaussians of soft objects in the order of the nodes that they follow.
+
+    Each follows the node nearest to it, rigidly: between neighbours that is off by the strain over
+    half a cell of the lattice, about a millimetre for a toy.
+
+    Returns:
+        The clouds, and by cloud how many Gaussians follow which node, in their order.
+    """
+    ordered, counts = dict(clouds), {}
+    for name, bend in {name: bend for side in sides for name, bend in side.bends.items()}.items():
+        key = f"object {name}"
+        if key not in clouds or not len(clouds[key]):
+            continue
+        _, nodes = cKDTree(bend.rest_nodes_m).query(clouds[key].means_m)
+        ordered[key] = clouds[key].take(np.argsort(nodes, kind="stable"))
+        found, sizes = np.unique(nodes, return_counts=True)
+        size = len(bend.rest_nodes_m)
+        keys = (_node_range(name, size, node) for node in found.tolist())
+        counts[key] = dict(zip(keys, sizes.tolist(), strict=True))
+    return ordered, counts
+
+
 def _weights(cloud: GaussianCloud) -> Float[np.ndarray, " num_splats"]:
     """Opacity times the area of the two largest axes; of equal ones some, all over the surface."""
     scales = np.sort(cloud.scales_log.astype(np.float64), axis=1)
@@ -232,7 +264,9 @@ def _parts(
     found = [{"splats": "background", "side": "", "track": blocks.track(still)}]
     for side in scene.sides:
         for name, Ts in side.Ts_base_object.items():
-            if f"object {name}" in ranges:
+            bent = _bent_parts(side, name, ranges, blocks)
+            found += bent
+            if not bent and f"object {name}" in ranges:
                 track = blocks.track(Ts)
                 found.append({"splats": f"object {name}", "side": side.name, "track": track})
     for name, item in scene.parts.objects.items():
@@ -242,6 +276,25 @@ def _parts(
     for name, Ts in scene.Ts_root_link.items():
         found.append({"splats": f"link {name}", "side": "", "track": blocks.track(Ts)})
     return found
+
+
+def _bent_parts(
+    side: Side, name: str, ranges: Mapping[str, Sequence[int]], blocks: _Blocks
+) -> list[dict[str, Any]]:
+    """One part for each node that carries Gaussians; none of an object that is not bent."""
+    bend = side.bends.get(name)
+    found = []
+    for node in range(0 if bend is None else len(bend.rest_nodes_m)):
+        key = _node_range(name, len(bend.rest_nodes_m), node) if bend is not None else ""
+        if bend is not None and key in ranges:
+            track = blocks.track(bend.Ts_base_node[:, node])
+            found.append({"splats": key, "side": side.name, "track": track})
+    return found
+
+
+def _node_range(name: str, num_nodes: int, node: int) -> str:
+    """Name the Gaussians of a soft object that follow one of its nodes."""
+    return f"object {name}, node {node} of {num_nodes}"
 
 
 def _boxes(sides: Sequence[Side], scene: TrialScene, blocks: _Blocks) -> list[dict[str, Any]]:

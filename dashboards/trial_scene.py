@@ -6,7 +6,7 @@ where the replay has them, taken back to where cameras see them. Nothing is loca
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -18,9 +18,11 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.leaves import has_leaf, load_leaf
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from dashboards.library import derived_paths
+from dashboards.loading import LOADING
 from dashboards.recording import PageClock, Problems, Recording
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture, PostureTrack, posture_track
@@ -39,6 +41,17 @@ RECORDED = "recorded"
 
 
 @dataclass(frozen=True, kw_only=True)
+class Bend:
+    """How a soft object is bent: the rigid motion of each node of its lattice."""
+
+    rest_nodes_m: Float[np.ndarray, "num_nodes 3"]
+    """In the object's frame, unbent: as the replay began."""
+    Ts_base_node: Float[np.ndarray, "num_samples num_nodes 4 4"]
+    """Take what is near a node from the object's frame to where it is. Samples are evenly spaced
+    over the page's time."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Side:
     """Recording or one replay: where its objects and its arm were at each sample."""
 
@@ -49,6 +62,8 @@ class Side:
     Ts_base_object: Mapping[str, Float[np.ndarray, "num_samples 4 4"]]
     skeleton_m: Float[np.ndarray, "num_samples num_points 3"] | None
     """The arm as a line from base to tool; None where its joints are not known."""
+    bends: Mapping[str, Bend] = field(default_factory=dict)
+    """Of soft objects whose nodes the replay holds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,8 +154,6 @@ def gather_scene(
     known = postures if robot is not None else None
     tracks = problems.attempt(lambda: _localised(gathering, known), ObjectTracks())
     problems.texts.extend(tracks.notes)
-    for name in () if gathering.task is None else gathering.task.soft_objects:
-        problems.texts.append(f"{name}: drawn without being bent; replay --render bends it")
     if scene is not None:
         drawn = partial(trial_parts, run, scene, episode, gathering.task, tracks.first())
         nothing: tuple[MovableScene | None, list[str]] = (None, [])
@@ -221,7 +234,35 @@ def _replayed_side(
         span_s=(float(ends[0]), float(ends[1])),
         Ts_base_object=objects,
         skeleton_m=skeleton,
+        bends=_bends(gathering, replay, trajectory, own_ns),
     )
+
+
+def _bends(
+    gathering: _Gathering,
+    replay: Recording,
+    trajectory: str,
+    own_ns: Int[np.ndarray, " num_samples"],
+) -> dict[str, Bend]:
+    """How the replay bends soft objects, at instants of its own clock."""
+    names = () if gathering.task is None else gathering.task.soft_objects
+    if not names:
+        return {}
+    bends = {}
+    for name in names:
+        track, found = replay.objects.get(name), None
+        if track is not None and has_leaf("soft"):
+            with LOADING:
+                bent = partial(load_leaf("soft", "bent"), replay, name, track, own_ns)
+            found = gathering.problems.attempt(bent, None)
+        if found is None:
+            gathering.problems.texts.append(
+                f"{name}: as replayed ({trajectory}) drawn without being bent"
+            )
+            continue
+        rest_m, Ts = found
+        bends[name] = Bend(rest_nodes_m=rest_m, Ts_base_node=Ts)
+    return bends
 
 
 def _links(

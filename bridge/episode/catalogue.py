@@ -1,7 +1,7 @@
 """A run's episodes at a glance: listed, filtered and labelled."""
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,24 +19,13 @@ from bridge.task.find import chosen_task_file, keep_task_file
 from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
 
-Advance = Callable[[int, int], None]
-"""Called as ``advance(done, total)`` while files are read."""
 EVERYTHING = CatalogueQuery()
 
 
-def find_episodes(
-    run: RunFolder, query: CatalogueQuery = EVERYTHING, *, advance: Advance | None = None
-) -> list[Entry]:
+def find_episodes(run: RunFolder, query: CatalogueQuery = EVERYTHING) -> list[Entry]:
     """Return the episodes that pass all filters, by name; a broken one with its error."""
-    found = []
-    episodes = run.episodes()
-    for done, path in enumerate(episodes, start=1):
-        entry = read_entry(run, path)
-        if query.takes(entry):
-            found.append(entry)
-        if advance is not None:
-            advance(done, len(episodes))
-    return sorted(found, key=lambda entry: entry.file)
+    found = (read_entry(run, path) for path in run.episodes())
+    return sorted(filter(query.takes, found), key=lambda entry: entry.file)
 
 
 def sidecar_path(run: RunFolder, episode_id: str) -> Path:
@@ -85,21 +74,11 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         return Entry(**name, size_bytes=size, error=printable(str(error)))
     records = episode.metadata_records
     presence = records.get(PRESENCE_RECORD, {})
+    about = {key: value for key, value in asdict(info).items() if key in Entry.__annotations__}
     return Entry(
+        **{key: _printable(value) for key, value in about.items() if key not in name},
         **name,
         size_bytes=size,
-        kind=printable(info.kind),
-        task=printable(info.task),
-        instruction=printable(info.instruction),
-        condition=printable(info.condition),
-        policy=printable(info.policy),
-        start_id=None if info.start_id is None else printable(info.start_id),
-        trial=info.trial,
-        operator=printable(info.operator),
-        robot=printable(info.robot),
-        cell=printable(info.cell),
-        stand_in=info.stand_in,
-        tags=tuple(printable(str(tag)) for tag in info.tags),
         outcome=printable(outcome.result) if outcome else "unknown",
         cause=printable(_cause(info.kind, outcome)),
         start_ns=episode.start_ns,
@@ -109,6 +88,12 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         recovered="recovered" in records,
         presence=printable("; ".join(health_lines({**presence, **records.get(RECORD_NAME, {})}))),
     )
+
+
+def _printable(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(printable(str(item)) for item in value)
+    return printable(value) if isinstance(value, str) else value
 
 
 def _cause(kind: str, outcome: Outcome | None) -> str:

@@ -101,15 +101,15 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
     data = finished_data(source)
     if data is None:
         return None
-    faults = Faults()
-    if not data.is_proved:  # then its indexes may be wrong all the same
+    faults, (end, is_proved) = Faults(), data
+    if not is_proved:  # then its indexes may be wrong all the same
         deque(FileCheck(path, faults).messages(), maxlen=0)
     if faults.count:
         return None
     tally = RecoveryTally()
     for found in scan(source):
         tally.take(found)
-    if tally.losses or tally.reached_end != data.end:
+    if tally.losses or tally.reached_end != end:
         return None
     return tally.report(path, _publish(path) if path.name.endswith(PART) else path, finished=True)
 
@@ -118,19 +118,17 @@ def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
     temporary = path.with_name(path.name.removesuffix(PART) + TEMPORARY)
     temporary.unlink(missing_ok=True)  # of a recovery that was killed; the lock is ours
     tally = RecoveryTally()
+    for found in each_chunk_once(source):
+        tally.take(found)
+    if not tally.has_data:
+        return tally.report(path, None, finished=False)
+    tally.complete(source)
+    report = tally.report(path, None, finished=False)
     target: CopyTarget | None = None
     try:
+        target = CopyTarget(source, temporary, tally)
         for found in each_chunk_once(source):
-            tally.take(found)
-            if tally.has_data and target is None:
-                target = CopyTarget(source, temporary)
-            if target is not None:
-                target.take(found)
-        if target is not None:
-            tally.define(target.looked_up)
-        report = tally.report(path, None, finished=False)
-        if target is None:
-            return report
+            target.take(found)
         target.finish(RECORD_NAME, to_metadata(report))
         _prove(temporary)
         original = _keep_original(path) if tally.damaged_inside else None

@@ -194,7 +194,10 @@ class EpisodeRecording:
         self._writer = EpisodeWriter(
             folder / f"{info.id}{SUFFIX}",
             config=WriterConfig(
-                flush_s=disk.flush_s, sync_s=disk.sync_s, backlog_bytes=disk.backlog_bytes
+                chunk_bytes=1 << 20,
+                flush_s=disk.flush_s,
+                sync_s=disk.sync_s,
+                backlog_bytes=disk.backlog_bytes,
             ),
         )
         try:
@@ -227,9 +230,9 @@ class EpisodeRecording:
         """The episode's file when it is finished."""
         return self._writer.path
 
-    def keep_name(self) -> bool:
-        """Write the file anew where somebody removed it; raises OSError when that fails."""
-        return self._writer.keep_name()
+    def refuse_removed(self) -> None:
+        """Raise OSError where somebody removed or replaced the file."""
+        self._writer.refuse_removed()
 
     @property
     def keeps_up(self) -> bool:
@@ -299,7 +302,7 @@ class EpisodeRecording:
         if self.info.stand_in:  # by its clock, which may run ahead of this one
             stamp_ns = max(self.start_ns, source_ns or 0)
         log_ns = channel.later(stamp_ns)
-        self._writer.write_foreign(
+        self._writer.write(
             sample.topic,
             sample.data,
             schema_record=channel.record,
@@ -333,7 +336,7 @@ class EpisodeRecording:
         self, topic: str, record: dict[str, Any], type_name: str, stamp_ns: int
     ) -> None:
         log_ns = self._channels.later(topic, stamp_ns)
-        self._writer.write_json(topic, record, type_name=type_name, log_time_ns=log_ns)
+        self._writer.write(topic, record, type_name=type_name, log_time_ns=log_ns)
 
     def write_clock(self, record: dict[str, Any], stamp_ns: int) -> None:
         """Append readings of a source's clock."""

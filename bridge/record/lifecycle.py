@@ -174,12 +174,10 @@ class Lifecycle:
         news, self.take.news = self.take.news, []
         return news
 
-    def look_at_file(self) -> str:
-        """Return what happened to the open file from outside, or ""; raises OSError."""
-        take = self.take
-        if take is None or not take.keep_name():
-            return ""
-        return f"{take.part_path} was removed while it was written; it was written there anew"
+    def look_at_file(self) -> None:
+        """Raise OSError where the open file is gone from its place."""
+        if self.take is not None:
+            self.take.refuse_removed()
 
     @property
     def may_ask_disk(self) -> bool:

@@ -392,8 +392,7 @@ class Recorder:
                     self.note(news)
         if now_s >= self._next_look_s and self._life.may_ask_disk:
             self._next_look_s = now_s + LOOK_S
-            if happened := self._life.look_at_file():
-                self.note(News(text=happened, data={"kind": "file_removed"}))
+            self._life.look_at_file()
             if (cause := self._life.look_at_disk()) and not self._status.failing:
                 self._end_because(cause)
 

@@ -15,7 +15,8 @@ from PIL import Image
 from rerun_cell import write_localised
 from serving import dashboard, judged
 
-from bridge.episode import schema
+from bridge.data_files import dataset_file
+from bridge.episode import schema, streams
 from bridge.episode.cdr import messages
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
@@ -26,11 +27,14 @@ from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.robots.default import ROBOT
 from dashboards import scene_file
+from dashboards.recording import read_recording
 from dashboards.scene_file import HEAD, SPLAT
+from dashboards.soft_nodes import read_soft_nodes
 from twin.robot.posture import posture_track
 from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
 from twin.scene.movable_scene import read_movable_scene
 from twin.scene.raster.rasteriser import Rasteriser
+from twin.scene.skinning import bind, pose_cloud
 from twin.scene.standpoint import sized_camera
 from twin.scene.store.folder import read_scene
 
@@ -173,6 +177,94 @@ def test_the_file_holds_the_strongest_gaussians_and_poses_on_the_pages_clock(
     assert middle > found.poses[at, 2] + 0.01  # the replay lifts it, the localised one stays
     assert recorded["track"][1] == 1
     assert header["spans_s"]["planned"][0] == pytest.approx(1.0)  # the plan starts after a second
+
+
+def bent_nodes(T: np.ndarray, rest_m: np.ndarray, t_s: float) -> np.ndarray:
+    """Twist a body about its own vertical and lean it over, the more the higher up."""
+    turned = rest_m.copy()
+    angle = 4 * min(t_s, 3.0) * (rest_m[:, 2] + 0.05) / 3.0
+    turned[:, 0] = np.cos(angle) * rest_m[:, 0] - np.sin(angle) * rest_m[:, 1]
+    turned[:, 1] = np.sin(angle) * rest_m[:, 0] + np.cos(angle) * rest_m[:, 1]
+    turned[:, 0] += 2 * min(t_s, 3.0) * (rest_m[:, 2] + 0.05) ** 2 / 3.0
+    return se3.apply(T, turned)
+
+
+def soften(run: RunFolder, rest_m: np.ndarray) -> None:
+    """Make the cube a soft one, and write where the nodes of its lattice go in the replay."""
+    (replay,) = run.derived("*.replay.*")
+    opened = Episode.open(replay)
+    (topic,) = streams.object_pose_topics(opened).values()
+    with EpisodeWriter(run.derived_dir / replay.name.replace(".bullet.", ".soft.")) as writer:
+        writer.describe(opened.info, derived=opened.derived)
+        for message in opened.messages():
+            about = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.publish_time_ns}
+            writer.write(message.topic, message.data, type_name=message.type_name, **about)
+            if message.topic == topic:
+                pose = messages.PoseSample.from_cdr(message.data)
+                nodes_m = bent_nodes(pose.T_frame_body, rest_m, message.publish_time_ns * 1e-9)
+                cloud = messages.PointCloudSample(
+                    stamp_ns=pose.stamp_ns, frame_id="base_link", points_m=nodes_m
+                )
+                nodes = f"{topic.removesuffix('pose')}nodes"
+                writer.write(nodes, cloud.to_cdr(), type_name=schema.POINT_CLOUD, **about)
+    replay.unlink()
+    tasks = run.path / "tasks"
+    tasks.mkdir()
+    text = dataset_file("tasks", "cube_into_box").read_text()
+    box = 'shape = "box"\n'
+    soft = "soft = { young_pa = 60000.0, poisson = 0.2, damping_s = 0.01, cell_m = 0.016 }\n"
+    mesh = 'shape = "mesh"\nmesh = "sloth"\n'
+    assert box in text
+    (tasks / "cube_into_box.toml").write_text(text.replace(box, mesh + soft, 1))
+
+
+def test_a_soft_object_is_bent_as_the_twin_bends_it(run: RunFolder, synthetic: ModuleType) -> None:
+    axis = np.linspace(-0.055, 0.055, 7)
+    rest_m = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    soften(run, rest_m)
+    found = unpack(synthetic.browser_of(run).get(f"/episode/{ID}/scene").content)
+    header = found.header
+    assert not [note for note in header["notes"] if "bent" in note]
+    parts = [part for part in header["parts"] if part["side"] == "planned"]
+    assert sum(header["ranges"][part["splats"]][1] for part in parts) == 80
+    first, count = header["ranges"]["object cube"]
+    assert count == 80  # as recorded it is one part still
+
+    t_s = 4.0  # page time; the plan starts after a second
+    track = np.array([0.45, 0.0, 0.02])  # the twin dropped it
+    T = se3.transform_from(np.array([1.0, 0, 0, 0]), track)
+    whole = read_movable_scene(run, read_scene(run)).objects["cube"].cloud
+    bent = pose_cloud(whole, bind(whole.means_m, rest_m), bent_nodes(T, rest_m, t_s - 1))
+    order = [
+        int(np.abs(whole.means_m - p).sum(axis=1).argmin())
+        for p in found.splats["p_m"][first : first + count]
+    ]
+    drawn = {}
+    for part in parts:
+        at, rows = part["track"]
+        row = found.poses[at + round(t_s / header["end_s"] * (rows - 1))]
+        T_part = se3.transform_from(row[3:], row[:3])
+        begin, size = header["ranges"][part["splats"]]
+        for place in range(begin, begin + size):
+            drawn[order[place - first]] = se3.apply(T_part, found.splats["p_m"][place][None])[0]
+    means = np.array([drawn[index] for index in range(count)])
+    off_m = np.linalg.norm(means - bent.means_m, axis=1)
+    rigid_m = np.linalg.norm(se3.apply(T, whole.means_m) - bent.means_m, axis=1)
+    assert rigid_m.max() > 0.02  # it is bent by centimetres
+    assert off_m.max() < 0.004
+    assert np.median(off_m) < 0.001
+
+
+def test_nodes_of_a_soft_object_are_read_in_its_own_frame(run: RunFolder) -> None:
+    rest_m = np.random.default_rng(5).uniform(-0.05, 0.05, (30, 3))
+    soften(run, rest_m)
+    (replay,) = run.derived("*.replay.*")
+    nodes = read_soft_nodes(read_recording(replay), "cube")
+    assert nodes is not None
+    np.testing.assert_allclose(nodes.at(float(nodes.stamps_ns[0]) - 1e9), nodes.rest_m)
+    t_s = float(nodes.stamps_ns[10]) * 1e-9
+    expected = bent_nodes(np.eye(4), rest_m, t_s)
+    np.testing.assert_allclose(nodes.at(float(nodes.stamps_ns[10])), expected, atol=1e-6)
 
 
 def test_without_a_scene_the_ways_are_shown_and_why_there_is_no_more(

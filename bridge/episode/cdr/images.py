@@ -7,6 +7,7 @@ nothing else; an encoding that is no business of the function gives None.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -34,20 +35,23 @@ FLOAT_DEPTH = "32FC1"
 class ImageHeader:
     """Everything a sensor_msgs/Image says of itself, and its pixels, which are not copied."""
 
-    sec: int
-    nanosec: int
-    frame_id: str
+    header: dict[str, Any]
     height: int
     width: int
     encoding: str
-    is_bigendian: bool
+    is_bigendian: int
     step: int
-    pixels: memoryview
+    data: memoryview
 
     @property
     def stamp_ns(self) -> int:
         """Source time [ns]."""
-        return join_ns(self.sec, self.nanosec)
+        return join_ns(**self.header["stamp"])
+
+    @property
+    def frame_id(self) -> str:
+        """Where it was taken."""
+        return str(self.header["frame_id"])
 
 
 def _malformed(found: str) -> MalformedMessageError:
@@ -56,18 +60,7 @@ def _malformed(found: str) -> MalformedMessageError:
 
 def image_header(data: Buffer) -> ImageHeader:
     """Read a sensor_msgs/Image without touching its pixels."""
-    message = decode(schema.IMAGE, data)
-    return ImageHeader(
-        sec=message["header"]["stamp"]["sec"],
-        nanosec=message["header"]["stamp"]["nanosec"],
-        frame_id=message["header"]["frame_id"],
-        height=message["height"],
-        width=message["width"],
-        encoding=message["encoding"],
-        is_bigendian=bool(message["is_bigendian"]),
-        step=message["step"],
-        pixels=message["data"],
-    )
+    return ImageHeader(**decode(schema.IMAGE, data))
 
 
 def pixel_rows(header: ImageHeader) -> UInt8[np.ndarray, "rows row"]:
@@ -82,9 +75,9 @@ def pixel_rows(header: ImageHeader) -> UInt8[np.ndarray, "rows row"]:
         raise _malformed(f"{width} x {height} pixels of {encoding}, which come in pairs")
     if step < row:
         raise _malformed(f"a step of {step} bytes for rows of {width} {encoding} pixels")
-    if len(header.pixels) != step * rows:
-        raise _malformed(f"{len(header.pixels)} bytes for {rows} rows of {step}")
-    return np.frombuffer(header.pixels, np.uint8).reshape(rows, step)[:, :row]
+    if len(header.data) != step * rows:
+        raise _malformed(f"{len(header.data)} bytes for {rows} rows of {step}")
+    return np.frombuffer(header.data, np.uint8).reshape(rows, step)[:, :row]
 
 
 def check_image(topic: str, header: ImageHeader) -> None:
@@ -122,11 +115,10 @@ def depth_to_compact(data: Buffer) -> bytes | None:
     header = image_header(data)
     if header.encoding not in DEPTH_ENCODINGS:
         return None
-    rows = pixel_rows(header)
-    return _compressed_image(header, RVL_FORMAT, pack_rvl(rows, swap_bytes=header.is_bigendian))
+    packed = pack_rvl(pixel_rows(header), swap_bytes=bool(header.is_bigendian))
+    return _compressed_image(header, RVL_FORMAT, packed)
 
 
 def _compressed_image(header: ImageHeader, image_format: str, data: list[bytes]) -> bytes:
-    stamp = {"sec": header.sec, "nanosec": header.nanosec}
-    about = {"header": {"stamp": stamp, "frame_id": header.frame_id}, "format": image_format}
-    return encode(schema.COMPRESSED_IMAGE, {**about, "data": b"".join(data)})
+    message = {"header": header.header, "format": image_format, "data": b"".join(data)}
+    return encode(schema.COMPRESSED_IMAGE, message)

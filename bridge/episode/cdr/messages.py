@@ -38,8 +38,7 @@ def header(stamp_ns: int, frame_id: str) -> dict[str, object]:
 
 def stamp_of(message: Message) -> int:
     """Return ``header.stamp`` of a decoded message [ns]."""
-    stamp = message["header"]["stamp"]
-    return join_ns(stamp["sec"], stamp["nanosec"])
+    return join_ns(**message["header"]["stamp"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +146,7 @@ class RawColor:
             frame_id=header.frame_id,
             encoding=header.encoding,
             rows=pixel_rows(header),
-            swap_bytes=header.is_bigendian,
+            swap_bytes=bool(header.is_bigendian),
         )
 
     def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
@@ -203,7 +202,7 @@ class DepthImage:
         header = image_header(data)
         if header.encoding not in (*DEPTH_ENCODINGS, FLOAT_DEPTH):
             raise no_encoding(header.encoding, (*DEPTH_ENCODINGS, FLOAT_DEPTH))
-        rows, order = np.ascontiguousarray(pixel_rows(header)), "<>"[header.is_bigendian]
+        rows, order = np.ascontiguousarray(pixel_rows(header)), "<>"[bool(header.is_bigendian)]
         if header.encoding == FLOAT_DEPTH:
             depth_mm = depth.from_metres(rows.view(f"{order}f4").astype(np.float32))
         else:
@@ -405,10 +404,9 @@ class PointCloudSample:
 
     def to_cdr(self) -> bytes:
         """Serialise as sensor_msgs/PointCloud2."""
-        sec, nanosec = split_ns(self.stamp_ns)
         count = len(self.points_m)
         message = {
-            "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": self.frame_id},
+            "header": header(self.stamp_ns, self.frame_id),
             "height": 1,
             "width": count,
             "fields": [

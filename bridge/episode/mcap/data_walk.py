@@ -10,13 +10,11 @@ from typing import NamedTuple
 from mcap import records
 
 from bridge.episode.mcap import format as mcap_format
-from bridge.episode.mcap.damaged import Contents, RecordFile, read_plain
+from bridge.episode.mcap.damaged import Contents, RecordFile
 from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, FileSummary
 from bridge.episode.mcap.scan import (
-    AttachmentSpan,
     Chunk,
     Damage,
-    DataEnd,
     IndexSpan,
     Plain,
     TopMessage,
@@ -54,6 +52,7 @@ class DataWalk:
         self._chunk: records.ChunkIndex | None = None
         self._contents = Contents()
         """Of that chunk."""
+        self._num_loose = 0
 
     def messages(self) -> Iterator[ScannedMessage]:
         """Yield every message that can be read, in file order."""
@@ -69,35 +68,37 @@ class DataWalk:
                 case IndexSpan():
                     self._check_index(found)
                 case TopMessage():
+                    self._num_loose += 1
                     log_ns = found.log_time_ns
                     self.seen.add_messages({found.channel_id: 1}, log_ns, log_ns)
                     yield from self._message(self._file.read(found.offset, found.length), 0)
-                case AttachmentSpan():
-                    self.seen.attachment_indexes.append(
-                        attachment_entry(found.offset, found.length, found.record)
-                    )
-                case Plain(record=records.Metadata(name=name)):
-                    entry = records.MetadataIndex(found.offset, found.length, name)
-                    self.seen.metadata_indexes.append(entry)
                 case Plain():
-                    self._define(found.record)
-                case DataEnd():
-                    end = found
+                    self._take_plain(found)
+                    end = found if found.opcode == mcap_format.DATA_END else None
         self._end_chunk()
-        self._check_end(end)
-
-    def _check_end(self, end: DataEnd | None) -> None:
         if end is None:
             self._doubt("the end of its data is not marked")
-            return
-        if end.end < self._file.size:
+        elif end.end < self._file.size:
             self._doubt(f"a record at byte {end.end}, behind the end of the data")
-        crc = int.from_bytes(self._file.read(end.end - 4, 4), "little")
-        if crc not in (0, self._file.crc(0, end.offset)):
-            self._doubt("its data has another CRC than it declares")
+        if self.seen.chunk_indexes and self._num_loose:
+            self._doubt(f"{self._num_loose} messages outside chunks, where the index shows none")
+
+    def _take_plain(self, found: Plain) -> None:
+        match found.record:
+            case records.Attachment() as record:
+                entry = attachment_entry(found.offset, found.length, record)
+                self.seen.attachment_indexes.append(entry)
+            case records.Metadata(name=name):
+                place = records.MetadataIndex(found.offset, found.length, name)
+                self.seen.metadata_indexes.append(place)
+            case records.DataEnd(data_section_crc=crc):
+                if crc not in (0, self._file.crc(0, found.offset)):
+                    self._doubt("its data has another CRC than it declares")
+            case record:
+                self._define(record)
 
     def _message(self, data: bytes, at: int) -> Iterator[ScannedMessage]:
-        head = message_head(data, at, at)
+        head = message_head(data, at)
         channel = self.seen.channels.get(head.channel_id)
         if channel is None:
             self._fault(f"a message of channel {head.channel_id}, which was not announced")
@@ -120,24 +121,27 @@ class DataWalk:
                 self._fault(f"channel {number} is announced twice with different contents")
 
     def _walk_chunk(self, found: Chunk) -> Iterator[ScannedMessage]:
-        self._chunk = chunk_entry(found.offset, found.length, found.head)
+        self._chunk = chunk_entry(found.offset, found.length, found.packed)
         self._contents = found.contents
         data = found.records
-        for opcode, at, length in records_in(data):
+        for record in found.contents.definitions:
+            self._define(record)
+        for opcode, at, _ in records_in(data):
             if opcode == MESSAGE:
                 yield from self._message(data, at)
-            elif opcode in (mcap_format.SCHEMA, mcap_format.CHANNEL):
-                self._define(read_plain(data[at : at + RECORD_HEAD.size + length]))
         counts = {number: len(each) // 2 for number, each in found.contents.index.items()}
         self.seen.add_messages(counts, *found.contents.time_range())
-        times, said = found.contents.time_range(), (found.head.start_ns, found.head.end_ns)
+        times = found.contents.time_range()
+        said = (found.packed.message_start_time, found.packed.message_end_time)
         if times != said:
             whose = f"the chunk at byte {found.offset}"
             self._doubt(f"{whose} says its messages are from {said}, they are from {times}")
 
     def _check_index(self, span: IndexSpan) -> None:
         body = self._file.read(span.offset, span.length)[RECORD_HEAD.size :]
-        channel_id, said = _index_entries(body)
+        channel_id, length = _INDEX_HEAD.unpack_from(body)
+        numbers = struct.unpack_from(f"<{length // 8}Q", body, _INDEX_HEAD.size)
+        said = sorted(zip(numbers[::2], numbers[1::2], strict=True))
         if self._chunk is None:
             self._doubt(f"the message index at byte {span.offset} follows no chunk")
             return
@@ -160,10 +164,3 @@ class DataWalk:
             self._doubt(f"the chunk at byte {at} has no index of channels {sorted(absent)}")
         self.seen.chunk_indexes.append(self._chunk)
         self._chunk = None
-
-
-def _index_entries(body: bytes) -> tuple[int, list[tuple[int, int]]]:
-    """Read a message index: its channel, and log time and offset of each message, in order."""
-    channel_id, length = _INDEX_HEAD.unpack_from(body)
-    numbers = struct.unpack_from(f"<{length // 8}Q", body, _INDEX_HEAD.size)
-    return channel_id, sorted(zip(numbers[::2], numbers[1::2], strict=True))

@@ -10,18 +10,11 @@ from mcap.summary import Summary
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.damaged import RecordFile
 from bridge.episode.mcap.data_walk import DataWalk
-from bridge.episode.mcap.format import (
-    MAGIC,
-    MESSAGE,
-    MESSAGE_HEAD,
-)
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
-    MessageHead,
     RecordSpan,
     attachment_of,
-    message_head,
     parse,
     read_body,
     read_footer,
@@ -68,7 +61,6 @@ class McapFile:
                 summary = rebuild_summary(stream, self.data_end)
             self.summary = summary
             self.metadata = list(self._read_metadata(stream))
-        self._loose: list[MessageHead] | None = None
 
     def _read_metadata(self, stream: ByteStream) -> Iterator[records.Metadata]:
         for entry in self.summary.metadata_indexes:
@@ -85,12 +77,6 @@ class McapFile:
             raise BrokenRecordError(f"the index points at byte {offset}, where no {kind} lies")
         return place
 
-    def attachment(self, name: str) -> bytes | None:
-        """Return the bytes of the first attachment of this name, its CRC checked, or None."""
-        for found in self.attachments(name):
-            return bytes(found.data)
-        return None
-
     def attachments(self, name: str | None = None) -> Iterator[records.Attachment]:
         """Yield attachments, all or those of one name; each is held in memory."""
         with self.path.open("rb") as stream:
@@ -102,35 +88,6 @@ class McapFile:
     def schema_of(self, channel: records.Channel) -> records.Schema | None:
         """Return the schema of a channel, or None where it has none."""
         return self.summary.schemas.get(channel.schema_id)
-
-    def loose(self) -> list[MessageHead]:
-        """Return the messages outside chunks; found once, between the records that are indexed."""
-        if self._loose is None:
-            with self.path.open("rb") as stream:
-                self._loose = [each for gap in self._gaps() for each in _messages_in(stream, *gap)]
-        return self._loose
-
-    def _gaps(self) -> Iterator[tuple[int, int]]:
-        known = [
-            (chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length)
-            for chunk in self.summary.chunk_indexes
-        ]
-        known += [(entry.offset, entry.length) for entry in self.summary.attachment_indexes]
-        known += [(entry.offset, entry.length) for entry in self.summary.metadata_indexes]
-        at = len(MAGIC)
-        for offset, length in sorted(known):
-            if offset > at:
-                yield at, offset
-            at = max(at, offset + length)
-        if at < self.data_end:
-            yield at, self.data_end
-
-
-def _messages_in(stream: ByteStream, start: int, end: int) -> Iterator[MessageHead]:
-    for place in walk(stream, start, end):
-        if place.opcode == MESSAGE:
-            stream.seek(place.offset)
-            yield message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
 
 
 def _is_complete(summary: Summary) -> bool:

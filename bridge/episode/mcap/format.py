@@ -6,7 +6,7 @@ a text is its UTF-8 bytes after their number. Offsets count from the start of th
 
 import struct
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import TypeAlias
 
@@ -31,8 +31,6 @@ FOOTER_FIELDS = struct.Struct("<QQI")
 """Start of the summary, start of its offsets, CRC of the summary."""
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
-Payload: TypeAlias = Buffer | Sequence[Buffer]
-"""Bytes, whole or in pieces that follow each other."""
 
 
 def num_bytes(data: Buffer) -> int:

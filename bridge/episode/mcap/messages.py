@@ -5,13 +5,14 @@ its last message; one without a wanted topic is never read.
 """
 
 import heapq
+import mmap
 from collections.abc import Iterator, Sequence, Set
 from typing import NamedTuple
 
 from mcap import records
 
 from bridge.episode.mcap.file import McapFile, damaged
-from bridge.episode.mcap.format import CHUNK, MESSAGE, MESSAGE_HEAD
+from bridge.episode.mcap.format import CHUNK, MAGIC, MESSAGE, MESSAGE_HEAD, Buffer
 from bridge.episode.mcap.walk import (
     DAMAGE,
     BrokenRecordError,
@@ -60,9 +61,11 @@ def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
 
 
 def _messages_of(file: McapFile, select: Selection) -> Iterator[Stored]:
+    topics, channels = select.topics, file.summary.channels.values()
+    wanted = {item.id for item in channels if topics is None or item.topic in topics}
     try:
         with file.path.open("rb") as stream:
-            yield from _in_order(_Open(file, stream, select))
+            yield from _in_order(_Open(file, stream, select, wanted))
     except DAMAGE as error:
         raise damaged(file.path, error) from error
 
@@ -73,35 +76,40 @@ class _Open(NamedTuple):
     file: McapFile
     stream: ByteStream
     select: Selection
+    wanted: Set[int]
+    """Channels."""
 
-    def wanted_channels(self) -> set[int]:
-        topics, channels = self.select.topics, self.file.summary.channels.values()
-        return {item.id for item in channels if topics is None or item.topic in topics}
-
-    def is_wanted(self, channel_id: int, log_ns: int, wanted: Set[int]) -> bool:
+    def is_wanted(self, channel_id: int, log_ns: int) -> bool:
         """Whether a message is wanted; raises BrokenRecordError for one of no channel."""
         if channel_id not in self.file.summary.channels:
             message = f"a message is of channel {channel_id}, which was never announced"
             raise BrokenRecordError(message)
-        return channel_id in wanted and self.select.overlaps(log_ns, log_ns)
+        return channel_id in self.wanted and self.select.overlaps(log_ns, log_ns)
 
 
 class _Loaded(NamedTuple):
-    """The wanted messages of a chunk, or of what lies outside chunks."""
+    """The wanted messages of a chunk, or of a file without chunks."""
 
-    data: bytes | None
-    """The chunk's; None: each message is read from the file in its turn."""
+    data: Buffer
     places: list[tuple[int, int]]
     """Log time of each message and where its record begins, the last one first."""
 
 
 def _in_order(opened: _Open) -> Iterator[Stored]:
-    queue = _sources(opened)
+    queue: list[tuple[int, int, records.ChunkIndex | _Loaded]] = []
+    for index in opened.file.summary.chunk_indexes:
+        listed = index.message_index_offsets  # a chunk without an index may hold any channel
+        if (not listed or opened.wanted & listed.keys()) and opened.select.overlaps(
+            index.message_start_time, index.message_end_time
+        ):
+            queue.append((index.message_start_time, index.chunk_start_offset, index))
     heapq.heapify(queue)
+    if not opened.file.summary.chunk_indexes and opened.wanted:
+        queue.append((0, 0, _without_chunks(opened)))
     while queue:
         _, offset, source = heapq.heappop(queue)
         if isinstance(source, records.ChunkIndex):
-            source = _load(opened, source)
+            source = _unpacked(opened, source)
         else:
             limit = queue[0][:2] if queue else (NEVER, 0)
             while source.places and (source.places[-1][0], offset) < limit:
@@ -110,51 +118,37 @@ def _in_order(opened: _Open) -> Iterator[Stored]:
             heapq.heappush(queue, (source.places[-1][0], offset, source))
 
 
-def _sources(opened: _Open) -> list[tuple[int, int, records.ChunkIndex | _Loaded]]:
-    """List where wanted messages lie: when the first comes up, and at which place in the file."""
-    wanted = opened.wanted_channels()
-    found: list[tuple[int, int, records.ChunkIndex | _Loaded]] = []
-    for index in opened.file.summary.chunk_indexes:
-        listed = index.message_index_offsets  # a chunk without an index may hold any channel
-        if (not listed or wanted & listed.keys()) and opened.select.overlaps(
-            index.message_start_time, index.message_end_time
-        ):
-            found.append((index.message_start_time, index.chunk_start_offset, index))
-    loose = [
-        (item.log_time_ns, item.at)
-        for item in (opened.file.loose() if wanted else ())
-        if opened.is_wanted(item.channel_id, item.log_time_ns, wanted)
-    ]
-    if loose:
-        loose.sort(reverse=True)
-        found.append((*loose[-1], _Loaded(None, loose)))
-    return found
-
-
-def _load(opened: _Open, index: records.ChunkIndex) -> _Loaded:
+def _unpacked(opened: _Open, index: records.ChunkIndex) -> _Loaded:
     """Unpack a chunk, its CRC checked, and list what is wanted of it."""
-    offset, wanted, places = index.chunk_start_offset, opened.wanted_channels(), []
+    offset = index.chunk_start_offset
     chunk = parse_chunk(read_body(opened.stream, opened.file.indexed(opened.stream, offset, CHUNK)))
-    data = unpack_chunk(chunk, whose=f"the chunk at byte {offset}")
-    for opcode, at, _ in records_in(data):
+    return _loaded(opened, unpack_chunk(chunk, whose=f"the chunk at byte {offset}"), 0)
+
+
+def _without_chunks(opened: _Open) -> _Loaded:
+    """Look at the data of a file without chunks as at one chunk, and leave it on the disk."""
+    data = mmap.mmap(opened.stream.fileno(), opened.file.data_end, access=mmap.ACCESS_READ)
+    return _loaded(opened, memoryview(data), len(MAGIC))
+
+
+def _loaded(opened: _Open, data: Buffer, start: int) -> _Loaded:
+    places = []
+    for opcode, at, _ in records_in(data, start):
         if opcode == MESSAGE:
-            head = message_head(data, at, at)
-            if opened.is_wanted(head.channel_id, head.log_time_ns, wanted):
+            head = message_head(data, at)
+            if opened.is_wanted(head.channel_id, head.log_time_ns):
                 places.append((head.log_time_ns, at))
     places.sort(reverse=True)
     return _Loaded(data, places)
 
 
-def _stored(opened: _Open, data: bytes | None, at: int) -> Stored:
-    if data is None:
-        opened.stream.seek(at)
-        front, start = opened.stream.read(MESSAGE_HEAD.size), 0
-        head = message_head(front, 0, at)
-        payload = opened.stream.read(head.length)
-    else:
-        head, start = message_head(data, at, at), at + MESSAGE_HEAD.size
-        payload = data[start : start + head.length]
-    channel = opened.file.summary.channels[head.channel_id]
+def _stored(opened: _Open, data: Buffer, at: int) -> Stored:
+    head, start = message_head(data, at), at + MESSAGE_HEAD.size
     return Stored(
-        opened.file, channel, head.log_time_ns, head.publish_time_ns, head.sequence, payload
+        opened.file,
+        opened.file.summary.channels[head.channel_id],
+        head.log_time_ns,
+        head.publish_time_ns,
+        head.sequence,
+        bytes(data[start : start + head.length]),
     )

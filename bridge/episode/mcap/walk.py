@@ -38,6 +38,7 @@ _CLASSES: dict[int, Any] = {
     mcap_format.FOOTER: records.Footer,
     mcap_format.SCHEMA: records.Schema,
     mcap_format.CHANNEL: records.Channel,
+    mcap_format.CHUNK: records.Chunk,
     mcap_format.MESSAGE_INDEX: records.MessageIndex,
     mcap_format.CHUNK_INDEX: records.ChunkIndex,
     mcap_format.ATTACHMENT_INDEX: records.AttachmentIndex,
@@ -135,13 +136,13 @@ _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 
 
 def parse(opcode: int, body: bytes) -> records.McapRecord | None:
-    """Read a record other than messages, chunks and attachments; None for unknown opcodes."""
+    """Read a record other than messages and attachments; None for unknown opcodes."""
     kind = _CLASSES.get(opcode)
     if kind is None:
         return None
     try:
         found: records.McapRecord = kind.read(_Fields(BytesIO(body)))
-    except (McapError, struct.error, ValueError) as error:
+    except (McapError, struct.error, ValueError, OverflowError) as error:
         message = f"a {kind.__name__} record of {len(body)} bytes cannot be read"
         raise BrokenRecordError(message) from error
     return found
@@ -164,87 +165,53 @@ MAX_CHUNK_BYTES = 1 << 30
 """No chunk may unpack to more: a few bytes of zstd can claim terabytes."""
 
 
-class ChunkHead(NamedTuple):
-    """What stands before a chunk's data."""
-
-    start_ns: int
-    end_ns: int
-    size: int
-    """Bytes of the records inside when unpacked."""
-    crc: int
-    """CRC-32 of those bytes, 0 for unknown."""
-    compression: str
-    data_bytes: int
-    head_bytes: int
-    """Where the data begins, from the record's opcode."""
-    record_bytes: int
-    """Of the whole record, as claimed; a cut chunk has fewer, foxglove's tail claims 2^64."""
-
-    @property
-    def is_consistent(self) -> bool:
-        """Do the two lengths agree and the sizes stay within the limit?"""
-        return (
-            self.record_bytes == self.head_bytes + self.data_bytes
-            and self.data_bytes <= MAX_CHUNK_BYTES
-            and self.size <= MAX_CHUNK_BYTES
-        )
-
-
-class PackedChunk(NamedTuple):
-    """A chunk record, its data still packed."""
-
-    head: ChunkHead
-    data: memoryview
-
-
-def parse_chunk_head(front: bytes, length: int) -> ChunkHead:
-    """Read a chunk's head from the first bytes of its body, whose length is claimed."""
+def chunk_bytes(front: bytes) -> int:
+    """Length of the record that begins so; 0 unless it is a chunk whose lengths agree."""
+    at = RECORD_HEAD.size + CHUNK_FIELDS.size + _U32.size
     try:
-        start_ns, end_ns, size, crc = CHUNK_FIELDS.unpack_from(front, 0)
-        at = CHUNK_FIELDS.size
-        (name_bytes,) = _U32.unpack_from(front, at)
-        at += _U32.size
-        compression = str(front[at : at + name_bytes], "utf-8")
-        at += name_bytes
-        (data_bytes,) = _U64.unpack_from(front, at)
-    except (struct.error, ValueError) as error:
-        raise BrokenRecordError(f"a chunk record of {length} bytes cannot be read") from error
-    head_bytes, record_bytes = RECORD_HEAD.size + at + _U64.size, RECORD_HEAD.size + length
-    return ChunkHead(start_ns, end_ns, size, crc, compression, data_bytes, head_bytes, record_bytes)
+        opcode, length = RECORD_HEAD.unpack_from(front)
+        _, _, size, _ = CHUNK_FIELDS.unpack_from(front, RECORD_HEAD.size)
+        (name_bytes,) = _U32.unpack_from(front, at - _U32.size)
+        (data_bytes,) = _U64.unpack_from(front, at + name_bytes)
+    except struct.error:
+        return 0
+    is_known = opcode == mcap_format.CHUNK and front[at : at + name_bytes] in _COMPRESSIONS
+    agree = at + name_bytes + _U64.size + data_bytes == RECORD_HEAD.size + length
+    is_small = max(size, data_bytes) <= MAX_CHUNK_BYTES
+    return RECORD_HEAD.size + int(length) if is_known and agree and is_small else 0
 
 
-def chunk_entry(offset: int, length: int, chunk: ChunkHead) -> records.ChunkIndex:
+_COMPRESSIONS = (b"", b"lz4", b"zstd")
+
+
+def chunk_entry(offset: int, length: int, chunk: records.Chunk) -> records.ChunkIndex:
     """Make the index entry of a chunk; its message indexes are yet to be added."""
     return records.ChunkIndex(
         chunk_length=length,
         chunk_start_offset=offset,
         compression=chunk.compression,
-        compressed_size=chunk.data_bytes,
-        message_start_time=chunk.start_ns,
-        message_end_time=chunk.end_ns,
+        compressed_size=len(chunk.data),
+        message_start_time=chunk.message_start_time,
+        message_end_time=chunk.message_end_time,
         message_index_length=0,
         message_index_offsets={},
-        uncompressed_size=chunk.size,
+        uncompressed_size=chunk.uncompressed_size,
     )
 
 
-def parse_chunk(body: bytes) -> PackedChunk:
-    """Read a chunk record."""
-    head = parse_chunk_head(body, len(body))
-    data = memoryview(body)[head.head_bytes - RECORD_HEAD.size :]
-    if head.data_bytes > len(data):
-        message = f"a chunk claims {head.data_bytes} bytes of data, {len(data)} are there"
-        raise BrokenRecordError(message)
-    return PackedChunk(head, data[: head.data_bytes])
+def parse_chunk(body: bytes) -> records.Chunk:
+    """Read a chunk record; its data is left packed."""
+    chunk: records.Chunk = parse(mcap_format.CHUNK, body)  # type: ignore[assignment]
+    return chunk
 
 
-def unpack_chunk(chunk: PackedChunk, *, whose: str = "a chunk") -> bytes:
+def unpack_chunk(chunk: records.Chunk, *, whose: str = "a chunk") -> bytes:
     """Decompress a chunk and compare its size and CRC."""
-    size, crc = chunk.head.size, chunk.head.crc
+    size, crc = chunk.uncompressed_size, chunk.uncompressed_crc
     if size > MAX_CHUNK_BYTES:
         raise BrokenRecordError(f"{whose} claims {size} bytes, more than {MAX_CHUNK_BYTES}")
     try:
-        data = _decompress(chunk)
+        data = _decompress(chunk.compression, chunk.data, size)
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise BrokenRecordError(f"{whose} cannot be unpacked ({error})") from error
     if len(data) != size:
@@ -254,41 +221,36 @@ def unpack_chunk(chunk: PackedChunk, *, whose: str = "a chunk") -> bytes:
     return data
 
 
-def _decompress(chunk: PackedChunk) -> bytes:
-    if chunk.head.compression == "":
-        return bytes(chunk.data)
-    if not chunk.head.size:
-        return b""
-    if chunk.head.compression == "zstd":
-        declared = zstandard.get_frame_parameters(chunk.data).content_size
-        if declared not in (chunk.head.size, zstandard.CONTENTSIZE_UNKNOWN):
-            message = f"a zstd frame of {declared} bytes where {chunk.head.size} are declared"
+def _decompress(compression: str, data: bytes, size: int) -> bytes:
+    if compression == "" or not size:
+        return data if compression == "" else b""
+    if compression == "zstd":
+        declared = zstandard.get_frame_parameters(data).content_size
+        if declared not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            message = f"a zstd frame of {declared} bytes where {size} are declared"
             raise BrokenRecordError(message)
-        return zstandard.decompress(chunk.data, max_output_size=chunk.head.size)
-    if chunk.head.compression == "lz4":
-        unpacker = lz4.frame.LZ4FrameDecompressor()
-        return bytes(unpacker.decompress(chunk.data, max_length=chunk.head.size))
-    raise BrokenRecordError(f"compression {chunk.head.compression!r} is not known")
+        return zstandard.decompress(data, max_output_size=size)
+    if compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
+    raise BrokenRecordError(f"compression {compression!r} is not known")
 
 
 class MessageHead(NamedTuple):
     """A message inside a buffer or file, its payload left where it is."""
 
     log_time_ns: int
-    at: int
-    """Where the record begins: in a chunk's data, or in the file."""
     length: int
     channel_id: int
     sequence: int
     publish_time_ns: int
 
 
-def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
-    """Read the front of the message record at ``at``; ``where`` becomes its ``at``."""
+def message_head(data: Buffer, at: int) -> MessageHead:
+    """Read the front of the message record at ``at``."""
     _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)
     if length < MESSAGE_FIELDS:
         raise BrokenRecordError(f"a message record of {length} bytes")
-    return MessageHead(log_ns, where, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
+    return MessageHead(log_ns, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
 
 
 def records_in(data: Buffer, at: int = 0) -> Iterator[tuple[int, int, int]]:

@@ -41,7 +41,7 @@ def write(
         writer.describe(info, outcome=None if outcome is None else Outcome(result=outcome))
         for index in range(messages):
             stamp_ns = start_ns + index * 1_000_000_000
-            writer.write_foreign("/x", b"x", schema_record=None, log_time_ns=stamp_ns)
+            writer.write("/x", b"x", schema_record=None, log_time_ns=stamp_ns)
         if lost is not None:
             drops = {"gaps": str(lost), "queue_drops": "0", "shed": "0"}
             writer.add_metadata("drops", drops)
@@ -115,7 +115,7 @@ def test_what_other_programs_wrote_is_listed(run: RunFolder) -> None:
             writer.add_metadata("episode", {**info, **odd})
             if values:
                 writer.add_metadata("drops", values)
-            writer.write_foreign("/x", b"", schema_record=None, log_time_ns=2**64 - 1)
+            writer.write("/x", b"", schema_record=None, log_time_ns=2**64 - 1)
     (run.episodes_dir / os.fsdecode(b"\xff.mcap")).write_bytes(b"")
     for _ in range(2):
         broken, one, two = find_episodes(run)

@@ -148,7 +148,7 @@ def record_trial(
         say("/lab/plan", plan.to_json(), schema.PLAN, T0 + 1)
         for kind, stamp in (("execution_started", T0 + SECOND), ("execution_ended", end)):
             event = {"schema_version": 1, "stamp_ns": stamp, "type": kind, "plan_id": plan.id}
-            writer.write_json("/lab/event", event, type_name=schema.EVENT, log_time_ns=stamp)
+            writer.write("/lab/event", event, type_name=schema.EVENT, log_time_ns=stamp)
         for topic, track in zip(("joint_states", "gripper/state"), tracks, strict=False):
             for stamp, row in zip(track.stamps_ns.tolist(), track.position, strict=True):
                 sample = at_positions(stamp, track.names, row)
