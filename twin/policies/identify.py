@@ -89,8 +89,8 @@ def response_of(run: RunFolder, episode: Episode, robot: RobotModel) -> Response
 @cache
 def _starts_ns(run_path: Path) -> dict[Path, int]:
     run = RunFolder.open(run_path)
-    trials = find_episodes(run, CatalogueQuery(kind=("trial",), error=False))
-    paths = (run.episodes_dir.resolve() / trial.file for trial in trials)
+    trials = find_episodes(run, CatalogueQuery(kind=("trial",)))
+    paths = (run.episodes_dir.resolve() / each.file for each in trials if not each.error)
     return {path: Episode.open(path).start_ns for path in paths}
 
 

@@ -75,9 +75,10 @@ class JointLayout:
         starts, ends = zip(*spans, strict=True)
         self._fixed = tuple(zip((0, *ends), (*starts, len(data)), strict=True))
         self._size, self._bytes = len(data), [data[a:b] for a, b in self._fixed]
-        self._unpack = struct.Struct(f"<{len(first.position)}d").unpack_from
+        self.names, self.count = first.names, len(first.position)
+        self._unpack = struct.Struct(f"<{self.count}d").unpack_from
         self._at = starts[-1] if len(spans) == 1 else starts[1]
-        self.is_of_use = data[1] == _LITTLE_ENDIAN and len(first.position) > 0
+        self.is_of_use = data[1] == _LITTLE_ENDIAN and self.count > 0
 
     def is_like(self, data: bytes) -> bool:
         """Whether another message holds the same joints at the same places."""
@@ -91,7 +92,7 @@ class JointLayout:
     def read(self, alike: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
         """Stamps [ns] and positions of messages that are like it, at once."""
         rows = np.frombuffer(b"".join(alike), np.uint8).reshape(len(alike), -1)
-        spans = ((ORIGIN, 8), (8, 12), self.numbers[0])
+        spans = ((4, 8), (8, 12), (self._at, self._at + 8 * self.count))
         s, ns, position = (
             rows[:, start:end].copy().view(kind)
             for (start, end), kind in zip(spans, ("<i4", "<u4", "<f8"), strict=True)
