@@ -27,7 +27,7 @@ from bridge.errors import GstError
 from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.task.plan import Plan
 from twin.calibrate.weights import readings
-from twin.policies.response import AT_ONCE, Response, carrying_Nm
+from twin.policies.response import AT_ONCE, Response, carrying_Nm, largest_Nm
 from twin.replay.execution import in_order, stages_as_executed
 from twin.replay.path import path_of_plan
 from twin.robot.model import RobotModel, load_robot
@@ -89,9 +89,12 @@ def response_of(run: RunFolder, episode: Episode, robot: RobotModel) -> Response
 @cache
 def _starts_ns(run_path: Path) -> dict[Path, int]:
     run = RunFolder.open(run_path)
-    trials = find_episodes(run, CatalogueQuery(kind=("trial",), error=False))
-    paths = (run.episodes_dir.resolve() / trial.file for trial in trials)
-    return {path: Episode.open(path).start_ns for path in paths}
+    found = {}
+    for trial in find_episodes(run, CatalogueQuery(kind=("trial",))):
+        path = run.episodes_dir.resolve() / trial.file
+        with suppress(GstError):
+            found[path] = Episode.open(path).start_ns
+    return found
 
 
 @cache
@@ -164,7 +167,7 @@ def stiffness_of(
     joints, speeds = _together(told)
     off_rad = _sent_rad(told, delay_s) - joints - np.array(lags_s) * speeds
     loads_Nm = np.concatenate([trial.loads_Nm for trial in told])
-    least_Nm = PRESSED * robot.model.effortLimit[robot.arm_velocity_ids]
+    least_Nm = PRESSED * largest_Nm(robot)
     pressed = (np.abs(loads_Nm) > least_Nm) & (np.abs(speeds) < MOVES_RAD_S)
     found = []
     for load, off, which in zip(loads_Nm.T, off_rad.T, pressed.T, strict=True):

@@ -108,3 +108,8 @@ def carrying_Nm(
     """Torques that carry the arm's own weight."""
     data, q = robot.model.createData(), robot.configuration(joints_rad)
     return np.array(pin.computeGeneralizedGravity(robot.model, data, q)[robot.arm_velocity_ids])
+
+
+def largest_Nm(robot: RobotModel) -> Float[np.ndarray, " num_joints"]:
+    """The motors' largest torques."""
+    return np.array(robot.model.effortLimit[robot.arm_velocity_ids])
