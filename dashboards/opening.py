@@ -477,10 +477,10 @@ KINDS: dict[str, Callable[[Path], Found]] = {
     "LeRobot dataset": _lerobot,
     "RGB-D folder": _rgbd,
     "RGB-D folder without an index": _unindexed,
-    "COLMAP model": lambda path: Found(
-        what="a COLMAP model, not read here",
-        rebuild="depth images and transforms.json",
-        replay=f"an index, {ONLY_SEEN}",
+    "COLMAP model": partial(
+        _converted,
+        "a COLMAP model",
+        "depth images and transforms.json; ns-process-data --skip-colmap of nerfstudio",
     ),
     "splat": _splat,
     "table": _table,

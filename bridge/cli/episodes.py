@@ -1,7 +1,6 @@
 """Commands about episodes on disk, alone or all of a run, and the doctor."""
 
 import textwrap
-from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -9,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from bridge.episode.catalogue_query import UNLABELLED, CatalogueQuery
-from bridge.terminal import Advance, Output
+from bridge.terminal import Output
 
 if TYPE_CHECKING:
     from bridge.episode.catalogue_query import Entry
     from bridge.episode.metadata import Outcome
     from bridge.episode.recovery_report import RecoveryReport
-    from bridge.episode.run_folder import RunFolder
 
 OUTPUT = Output()
 
@@ -49,7 +47,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         "recovered": opened.metadata_records.get("recovered"),
         "presence": opened.metadata_records.get(PRESENCE_RECORD),
         "findings": health["findings"],
-        "clocks": [clock.to_json() for clock in clocks],
+        "clocks": [clock.sentences() for clock in clocks],
         "topics": [asdict(item) for item in topics.values()],
     }
     about = opened.info
@@ -229,8 +227,6 @@ def _describe(report: "RecoveryReport") -> str:
 
 
 EVERYTHING = CatalogueQuery()
-WORTH_A_BAR = 200
-"""New episodes to read before progress is shown."""
 
 
 def ls(
@@ -249,32 +245,18 @@ def ls(
         run: Run folder.
         query: Which.
     """
+    from bridge.episode.catalogue import find_episodes
     from bridge.episode.mcap.part_file import told_unfinished
     from bridge.episode.run_folder import RunFolder
 
     opened = RunFolder.open(run)
     for path in sorted(opened.episodes_dir.glob("*.part")):
         output.say(told_unfinished(path)[0])
-    entries = _find(opened, query, output)
+    opened.refuse_empty()
+    entries = find_episodes(opened, query)
     lines = episode_table(entries) if entries else [f"no episode in {run} passes these filters"]
     output.result({"episodes": [vars(entry) for entry in entries]}, "\n".join(lines))
     return 1 if any(entry.error for entry in entries) else 0
-
-
-def _find(run: "RunFolder", query: CatalogueQuery, output: Output) -> "list[Entry]":
-    from bridge.episode.catalogue import find_episodes
-
-    with ExitStack() as stack:
-        shown: list[Advance] = []
-
-        def advance(done: int, total: int) -> None:
-            if not shown and total > WORTH_A_BAR:
-                shown.append(stack.enter_context(output.progress("read episodes", total)))
-            for show in shown:
-                show(done, "")
-
-        run.refuse_empty()
-        return find_episodes(run, query, advance=advance)
 
 
 COLUMNS = ("episode", "kind", "condition", "outcome", "seconds", "MB")

@@ -26,7 +26,6 @@ def record(
     episode: str | None = None,
     duration_s: Annotated[float | None, Parameter(name=("--duration", "--duration-s"))] = None,
     anyway: Annotated[bool, RARE] = False,
-    learn: Annotated[Path | None, RARE] = None,
     about: Annotated[EpisodeAbout, Parameter(name="*")] = ABOUT,
     config: Annotated[RecorderConfig, Parameter(name="*")] = RECORDER,
     listen: tuple[str, ...] = LOOPBACK,
@@ -45,7 +44,6 @@ def record(
         episode: Start this episode at once.
         duration_s: Stop after this long [s]; with --episode.
         anyway: Start it although topics are missing that cell.toml requires; else it waits.
-        learn: Write the run's cell.toml from this good episode, and record nothing.
         about: What is being recorded, with --episode.
         listen: Where to listen; other processes connect here.
         connect: Other zenoh routers to join.
@@ -57,8 +55,6 @@ def record(
     from bridge.record.status import describe_answer
     from bridge.wire.config import WireConfig
 
-    if learn is not None:
-        return _learn(run, learn, output)
     if duration_s is not None and (episode is None or duration_s <= 0):
         raise UsageError("--duration needs --episode ID and a time above zero.")
     about, task = _with_task_file(about)
@@ -78,22 +74,6 @@ def record(
         )
     data = answer or {"ok": True, "episode": None}
     output.result(data, describe_answer(data) if answer else "stopped; no episode was open")
-    return 0
-
-
-def _learn(run: Path, episode: Path, output: Output) -> int:
-    from bridge.episode.check import learn_from
-    from bridge.episode.contract import CONTRACT_FILE, write_contract
-    from bridge.episode.run_folder import RunFolder
-
-    contract = learn_from(episode)
-    path = RunFolder.create(run).path / CONTRACT_FILE
-    write_contract(contract, path, source=episode.name)
-    output.result(
-        {"file": str(path), "topics": len(contract.topics), "required": contract.required()},
-        f"{path}: {len(contract.topics)} topics, {len(contract.required())} required. "
-        "Look through it; every episode recorded from now on is held to it.",
-    )
     return 0
 
 

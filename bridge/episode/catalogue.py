@@ -1,7 +1,7 @@
 """A run's episodes at a glance: listed, filtered and labelled."""
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,24 +19,13 @@ from bridge.task.find import chosen_task_file, keep_task_file
 from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
 
-Advance = Callable[[int, int], None]
-"""Called as ``advance(done, total)`` while files are read."""
 EVERYTHING = CatalogueQuery()
 
 
-def find_episodes(
-    run: RunFolder, query: CatalogueQuery = EVERYTHING, *, advance: Advance | None = None
-) -> list[Entry]:
+def find_episodes(run: RunFolder, query: CatalogueQuery = EVERYTHING) -> list[Entry]:
     """Return the episodes that pass all filters, by name; a broken one with its error."""
-    found = []
-    episodes = run.episodes()
-    for done, path in enumerate(episodes, start=1):
-        entry = read_entry(run, path)
-        if query.takes(entry):
-            found.append(entry)
-        if advance is not None:
-            advance(done, len(episodes))
-    return sorted(found, key=lambda entry: entry.file)
+    found = (read_entry(run, path) for path in run.episodes())
+    return sorted(filter(query.takes, found), key=lambda entry: entry.file)
 
 
 def sidecar_path(run: RunFolder, episode_id: str) -> Path:

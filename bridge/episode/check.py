@@ -21,7 +21,6 @@ from bridge.episode.contract import (
     contract_from,
     findings_of,
     judge,
-    learn_contract,
     unseen_losses,
 )
 from bridge.episode.health import HealthFinding, drops_logged, in_order, in_words, unreadable
@@ -29,7 +28,7 @@ from bridge.episode.metadata import BY_DISK
 from bridge.episode.reader import Episode
 from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import LIBRARY
-from bridge.errors import BridgeError, UsageError
+from bridge.errors import BridgeError
 
 
 @dataclass(kw_only=True)
@@ -107,19 +106,6 @@ def check_episode(path: Path, *, contract: Contract | None = None) -> CheckRepor
     report.faults, report.num_faults = faults.listed, faults.count
     report.findings = in_order(report.findings)
     return report
-
-
-def learn_from(path: Path) -> Contract:
-    """Learn the contract of a cell from a good episode of it.
-
-    Raises:
-        UsageError: When the episode is not clean, or no recorder of ours made it.
-    """
-    report = check_episode(path, contract=Contract(topics={}))
-    if report.exit_code or not report.presences:
-        found = "\n".join(report.lines()) if report.exit_code else "it is no recording"
-        raise UsageError(f"{path} is not an episode to learn from: {found}")
-    return learn_contract(report.presences, cell=Episode.open(path).info.cell)
 
 
 def _open(path: Path, faults: Faults, watch: "_Watch") -> Episode | None:

@@ -14,24 +14,13 @@ from bridge.episode.mcap.data_walk import DataWalk, ScannedMessage
 from bridge.episode.mcap.format import FileSummary
 from bridge.episode.mcap.walk import (
     DAMAGE,
-    BrokenRecordError,
-    ByteStream,
-    parse,
-    read_body,
     read_footer,
     read_header,
     read_summary,
-    walk,
 )
 
 
-def summary_faults(
-    stream: ByteStream,
-    seen: FileSummary,
-    summary: Summary | None,
-    footer: records.Footer,
-    footer_at: int,
-) -> Iterator[str]:
+def summary_faults(seen: FileSummary, summary: Summary | None) -> Iterator[str]:
     """Yield a sentence for every place where summary and data disagree.
 
     What a writer may leave out (statistics, repeated records, an index as a whole) is no fault.
@@ -52,8 +41,6 @@ def summary_faults(
         said, found = (getattr(each, f"{what}_indexes") for each in (summary, seen))
         key = "chunk_start_offset" if what == "chunk" else "offset"
         yield from _index_faults(what, said, found, key)
-    if footer.summary_offset_start:
-        yield from _offset_faults(stream, footer, footer_at)
 
 
 def _statistics_faults(
@@ -105,39 +92,21 @@ def _index_faults(what: str, said: list, found: list, key: str) -> Iterator[str]
         yield f"the {what} at byte {at} is not in the index"
 
 
-def _offset_faults(stream: ByteStream, footer: records.Footer, footer_at: int) -> Iterator[str]:
-    for place in walk(stream, footer.summary_offset_start, footer_at):
-        record = parse(place.opcode, read_body(stream, place))
-        if not isinstance(record, records.SummaryOffset):
-            yield f"a record of kind {place.opcode} among the summary's offsets"
-            continue
-        start, end = record.group_start, record.group_start + record.group_length
-        is_inside = footer.summary_start <= start <= end <= footer.summary_offset_start
-        if not is_inside or not _are_all(record.group_opcode, stream, start, end):
-            yield f"the summary's offset of records of kind {record.group_opcode} is wrong"
-
-
-def _are_all(opcode: int, stream: ByteStream, start: int, end: int) -> bool:
-    """Whether whole records of one kind, or none, lie between two offsets."""
-    try:
-        return all(place.opcode == opcode for place in walk(stream, start, end))
-    except BrokenRecordError:
-        return False
+LISTED = 20
 
 
 class Faults:
     """The first faults of each kind of place; a damaged file could have millions."""
 
-    def __init__(self, limit: int = 20) -> None:
-        """List at most ``limit``."""
+    def __init__(self) -> None:
+        """Begin with none."""
         self.listed: list[str] = []
         self.count = 0
-        self._limit = limit
 
     def add(self, text: str) -> None:
         """Take one more."""
         self.count += 1
-        if len(self.listed) < self._limit:
+        if len(self.listed) < LISTED:
             self.listed.append(text)
 
 
@@ -162,8 +131,7 @@ class FileCheck:
                 file = RecordFile(stream, footer.summary_start or footer_at)
                 data = DataWalk(file, fault=self._fault, doubt=self._fault)
                 yield from data.messages()
-                summary = read_summary(stream, footer, footer_at)
-                for text in summary_faults(stream, data.seen, summary, footer, footer_at):
+                for text in summary_faults(data.seen, read_summary(stream, footer, footer_at)):
                     self._fault(text)
         except DAMAGE as error:
             self._fault(f"damaged: {error}" if str(error) else f"damaged ({type(error).__name__})")

@@ -10,7 +10,7 @@ import contextlib
 import json
 import statistics
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -155,16 +155,6 @@ class SourceClock:
     def lines(self) -> list[ClockLine]:
         """A line for each time between two jumps."""
         return [fit_line(span) for span in self.spans]
-
-    def to_json(self) -> dict[str, Any]:
-        """Everything, for machines."""
-        return {
-            "source": self.source,
-            "host": self.host,
-            "topics": sorted(self.topics),
-            "lines": [asdict(line) for line in self.lines()],
-            "jumps": [jump._asdict() for jump in self.jumps],
-        }
 
     def sentences(self) -> list[str]:
         """What people are told."""

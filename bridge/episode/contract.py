@@ -7,7 +7,6 @@ that ends long before the recording does.
 """
 
 import json
-import math
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -19,9 +18,9 @@ import msgspec
 from bridge.clock import NS_PER_S, s_from_ns
 from bridge.data_files import dataset_file
 from bridge.episode.health import HealthFinding, parsed
-from bridge.episode.topics import EVENT, OF_RECORDER, is_latched, is_truth
+from bridge.episode.metadata import to_strings
+from bridge.episode.topics import EVENT, OF_RECORDER, is_latched
 from bridge.errors import UsageError
-from bridge.whole_file import write_whole
 
 SCHEMA_VERSION = 1
 CONTRACT_FILE = "cell.toml"
@@ -73,8 +72,7 @@ class Contract(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def to_record(self) -> dict[str, str]:
         """The ``contract`` metadata record; every value is JSON."""
-        values = {"schema_version": SCHEMA_VERSION, **msgspec.to_builtins(self)}
-        return {name: json.dumps(value) for name, value in values.items()}
+        return to_strings({"schema_version": SCHEMA_VERSION, **msgspec.to_builtins(self)})
 
     def required(self) -> list[str]:
         """Topics without which nothing should be recorded."""
@@ -119,24 +117,6 @@ def contract_from(values: Mapping[str, Any], *, name: str) -> Contract:
         return msgspec.convert(rest, Contract)
     except msgspec.ValidationError as error:
         raise ContractError(f"{where}: {error}.") from error
-
-
-def write_contract(contract: Contract, path: Path, *, source: str) -> None:
-    """Write a contract as a TOML file; one that is there is not replaced."""
-    if path.exists():
-        raise ContractError(f"{path} exists already. Move it away, or edit it.")
-    lines = [
-        f"# What this cell publishes, learned from {source}. Edit it freely.",
-        "# rate_hz [1/s] may differ by the part of it that tolerance says; silence_s: the longest",
-        "# time without a message [s]; no recording starts without a required topic.",
-        f"schema_version = {SCHEMA_VERSION}",
-        *([f"cell = {json.dumps(contract.cell)}"] if contract.cell else []),
-    ]
-    for topic, rule in contract.topics.items():
-        lines += ["", f"[topics.{json.dumps(topic)}]"]
-        values = msgspec.to_builtins(rule).items()
-        lines += [f"{key} = {json.dumps(value)}" for key, value in values if value is not None]
-    write_whole(path, ("\n".join(lines) + "\n").encode())
 
 
 @dataclass(kw_only=True, slots=True)
@@ -354,41 +334,3 @@ def health_lines(record: Mapping[str, Any], start_ns: int = 0) -> list[str]:
         *(found.line(start_ns) for found in parsed(record.get("findings"))),
         *unseen_losses(unnumbered if isinstance(unnumbered, dict) else {}),
     ]
-
-
-LEARNED_TOLERANCE = 0.2
-LEARNED_SILENCE_S = 0.5
-"""No learned contract allows less: machines hesitate."""
-LEARNED_HABIT = 3
-"""A learned contract allows so many times the longest silence of the good episode."""
-LEARNED_PERIODS = 5
-
-
-def learn_contract(presences: Mapping[str, Presence], *, cell: str) -> Contract:
-    """Take what a good episode shows for what the cell promises.
-
-    Regular streams get rate and silence, latched topics need only be there, and what comes when
-    something happens (events, plans) is optional. Ground truth and our own records are left out.
-    """
-    rules = {
-        topic: _learned(topic, presence)
-        for topic, presence in sorted(presences.items())
-        if topic not in OF_RECORDER and not is_truth(topic)
-    }
-    return Contract(topics=rules, cell=cell)
-
-
-def _learned(topic: str, presence: Presence) -> TopicRule:
-    if is_latched(topic):
-        return TopicRule()
-    span_s = s_from_ns(presence.last_ns - presence.first_ns)
-    longest_s = s_from_ns(presence.longest_ns)
-    if not presence.is_regular or longest_s > span_s / 4:
-        return TopicRule(required=False)
-    rate_hz = (presence.messages - 1) / span_s
-    silence_s = max(LEARNED_SILENCE_S, LEARNED_HABIT * longest_s, LEARNED_PERIODS / rate_hz)
-    return TopicRule(
-        rate_hz=float(f"{rate_hz:.3g}"),
-        tolerance=LEARNED_TOLERANCE,
-        silence_s=math.ceil(silence_s * 10) / 10,
-    )

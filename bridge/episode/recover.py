@@ -101,15 +101,15 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
     data = finished_data(source)
     if data is None:
         return None
-    faults = Faults()
-    if not data.is_proved:  # then its indexes may be wrong all the same
+    faults, (end, is_proved) = Faults(), data
+    if not is_proved:  # then its indexes may be wrong all the same
         deque(FileCheck(path, faults).messages(), maxlen=0)
     if faults.count:
         return None
     tally = RecoveryTally()
     for found in scan(source):
         tally.take(found)
-    if tally.losses or tally.reached_end != data.end:
+    if tally.losses or tally.reached_end != end:
         return None
     return tally.report(path, _publish(path) if path.name.endswith(PART) else path, finished=True)
 

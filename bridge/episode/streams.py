@@ -77,10 +77,7 @@ class JointTrack:
 
     def at(self, stamps_ns: np.ndarray) -> Float[np.ndarray, "num_queries num_joints"]:
         """Interpolate linearly; outside the range the nearest end."""
-        columns = [
-            np.interp(stamps_ns, self.stamps_ns, self.position[:, joint])
-            for joint in range(len(self.names))
-        ]
+        columns = [np.interp(stamps_ns, self.stamps_ns, each) for each in self.position.T]
         return np.stack(columns, axis=1)
 
 
@@ -295,12 +292,6 @@ def localisations(episode: Episode) -> list[dict[str, Any]]:
         parse_record(message.data, name="localisation")
         for message in episode.messages(episode.topics_of_type(schema.LOCALISATION))
     ]
-
-
-def executed_interval_ns(episode: Episode, plan_id: str) -> tuple[int, int] | None:
-    """Source times between which a plan was executed, or None if it never was."""
-    start, end = execution_ns(events(episode), plan_id)
-    return None if start is None or end is None else (start, end)
 
 
 def execution_ns(

@@ -34,15 +34,11 @@ class Channel:
     group: OpenChunk | None = None
     is_large: bool = False
     next_sequence: int = 0
-    times_defined: int = 0
-    next_definition: int = 0
-    """Number of the chunk of its group that holds its definition next."""
+    defined_in: int = -1
+    """Number of the last chunk of its group that holds its definition."""
 
 
 About = tuple[tuple[str, str], ...]
-REPEAT_CHUNKS = 16
-"""Definitions stand in a group's first two chunks that need them, and again after so many: no one
-damaged chunk leaves messages without a name."""
 
 
 class Channels:
@@ -107,11 +103,6 @@ _PACKED_TYPES = frozenset(
 _DEPTH_ENCODINGS = (b"16UC1\0", b"mono16\0", b"32FC1\0")
 _HEAD_BYTES = 512
 """An encoding's name stands near the front of an image message."""
-
-
-def is_large(type_name: str, length: int) -> bool:
-    """Say whether a message of this many bytes belongs to a stream with chunks of its own."""
-    return type_name in _LARGE_TYPES or length >= LARGE_BYTES
 
 
 def is_worth_compressing(type_name: str, front: bytes) -> bool:
@@ -251,8 +242,9 @@ class EpisodeWriter:
             self._flush(group)
         if self.config.flush_s is not None and not group.has_messages:
             group.opened_s = self._monotonic()
-        if group.number >= channel.next_definition:
-            self._define(channel, group)
+        if channel.defined_in != group.number:  # every chunk can be read by itself
+            group.define(channel.definition)
+            channel.defined_in = group.number
         if sequence is None:
             sequence = channel.next_sequence
         group.add(
@@ -267,7 +259,7 @@ class EpisodeWriter:
 
     def _assign_group(self, channel: Channel, data: Buffer, length: int) -> OpenChunk:
         group = self._small
-        if is_large(channel.type_name, length):
+        if channel.type_name in _LARGE_TYPES or length >= LARGE_BYTES:
             if channel.group is not None:  # keeps the topic's order in the file
                 self._flush(channel.group)
             head = bytes(memoryview(data).cast("B")[:_HEAD_BYTES])
@@ -276,16 +268,8 @@ class EpisodeWriter:
             self._groups.append(group)
             channel.is_large = True
         channel.group = group
-        channel.next_definition = channel.times_defined = 0
+        channel.defined_in = -1
         return group
-
-    @staticmethod
-    def _define(channel: Channel, group: OpenChunk) -> None:
-        group.define(channel.definition)
-        channel.times_defined += 1
-        channel.next_definition = group.number + (
-            1 if channel.times_defined == 1 else REPEAT_CHUNKS
-        )
 
     def _flush(self, group: OpenChunk) -> None:
         if self._queue is None:
@@ -337,10 +321,9 @@ class EpisodeWriter:
         """Add the ``episode`` and ``software`` records, and the others where given."""
         self.add_metadata("episode", metadata.to_strings(info))
         self.add_metadata("software", provenance.software())
-        if outcome is not None:
-            self.add_metadata("outcome", metadata.to_strings(outcome))
-        if derived is not None:
-            self.add_metadata("derived", metadata.to_strings(derived))
+        for name, record in (("outcome", outcome), ("derived", derived)):
+            if record is not None:
+                self.add_metadata(name, metadata.to_strings(record))
 
     def tick(self) -> None:
         """Write the chunks that have been waiting for ``flush_s``; call it often."""

@@ -64,7 +64,7 @@ def records_of(data: bytes) -> Iterator[tuple[str, Fields]]:
 
 def one_record(opcode: int, data: bytes) -> tuple[str, Fields]:
     if opcode == MESSAGE:
-        head = message_head(data, 0, 0)
+        head = message_head(data, 0)
         values = {
             "channel_id": head.channel_id,
             "data": data[MESSAGE_HEAD.size :],

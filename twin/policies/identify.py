@@ -89,12 +89,9 @@ def response_of(run: RunFolder, episode: Episode, robot: RobotModel) -> Response
 @cache
 def _starts_ns(run_path: Path) -> dict[Path, int]:
     run = RunFolder.open(run_path)
-    found = {}
-    for trial in find_episodes(run, CatalogueQuery(kind=("trial",))):
-        path = run.episodes_dir.resolve() / trial.file
-        with suppress(GstError):
-            found[path] = Episode.open(path).start_ns
-    return found
+    trials = find_episodes(run, CatalogueQuery(kind=("trial",)))
+    paths = (run.episodes_dir.resolve() / each.file for each in trials if not each.error)
+    return {path: Episode.open(path).start_ns for path in paths}
 
 
 @cache

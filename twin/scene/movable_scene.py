@@ -1,7 +1,7 @@
 """A rebuilt scene whose parts can be put anywhere: a cloud for each state of robot and objects."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -170,9 +170,15 @@ class MovableScene:
     def object_at(
         self, name: str, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]
     ) -> GaussianCloud:
-        """One object's part of that cloud; where it was scanned unless a place is given."""
+        """One object's part of that cloud; where it was scanned unless a place is given.
+
+        It has the colours that it showed there: where it is turned, it is lit anew.
+        """
         item = self.objects[name]
-        return moved_cloud(item.cloud, Ts_base_object.get(name, item.T_base_object))
+        scanned = moved_cloud(item.cloud, item.T_base_object)
+        placed = moved_cloud(item.cloud, Ts_base_object.get(name, item.T_base_object))
+        before, after = (self.lighting.on(cloud).colors for cloud in (scanned, placed))
+        return replace(placed, colors=placed.colors * after / np.maximum(before, 1e-6))
 
     def robot_at(self, posture: Posture, urdf: str) -> GaussianCloud:
         """The robot's part of that cloud; there must be links."""

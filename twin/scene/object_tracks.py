@@ -206,6 +206,11 @@ def _moved(
         spans: By the joints; the last one is where it lies then.
     """
     *before, rest = spans
+    if after is None and held and model.soft is not None:  # toys are dropped
+        T = rest.T_end.copy()
+        T[2, 3] = min(T[2, 3], before[0].T_start[2, 3])
+        note = "was not found after an execution: drawn below where it was let go"
+        return [*before, *_fallen(rest.start_ns, rest.T_end, T)], note
     if after is None:
         where = "where the hand put it" if held else "where it was"
         return [*before, rest], f"was not found after an execution: left {where}"

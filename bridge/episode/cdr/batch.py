@@ -46,15 +46,6 @@ def named(axes: str, numbers: Sequence[float]) -> dict[str, float]:
     return dict(zip(axes, numbers, strict=False))
 
 
-def joint_messages(
-    stamps_ns: Int[np.ndarray, " num_messages"],
-    names: Sequence[str],
-    position: Float[np.ndarray, "num_messages num_joints"],
-) -> Iterator[bytes]:
-    """Yield sensor_msgs/JointState messages with positions alone."""
-    return map(joint_writer(names), stamps_ns.tolist(), position.tolist())
-
-
 def pose_messages(
     stamps_ns: Int[np.ndarray, " num_messages"],
     frame_id: str,
@@ -66,32 +57,28 @@ def pose_messages(
     return map(pose_writer(frame_id), stamps_ns.tolist(), numbers.tolist())
 
 
-ORIGIN = 4
-"""CDR aligns to this byte, behind those that name the encoding."""
+_STAMP = (4, 12)
 _LITTLE_ENDIAN = 1
-Span = tuple[int, int]
 
 
 class JointLayout:
     """Where the numbers of one message of joints lie; those alike differ from it in them only."""
 
     def __init__(self, data: bytes) -> None:
-        """Read a message; raises as ``JointSample.from_cdr`` does."""
-        first = JointSample.from_cdr(data)
-        self.names, count = first.names, len(first.position)
-        start = np.frombuffer(data, np.uint8).ctypes.data
-        at = first.position.ctypes.data - start if count else len(data)
-        ends = [at + 8 * count]
-        for values in (first.velocity, first.effort):
-            ends.append(_aligned(ends[-1] + 4, 8) + values.nbytes if len(values) else ends[-1] + 4)
-        velocity, effort, end = ends
-        velocities = (effort - first.velocity.nbytes, effort)
-        efforts = (end - first.effort.nbytes, end)
-        self.numbers: tuple[Span, ...] = ((at, velocity), velocities, efforts)
-        self.is_of_use = data[1] == _LITTLE_ENDIAN and count > 0
-        self._fixed = ((0, 4), (12, at), (velocity, velocity + 4), (effort, effort + 4))
+        """Read a message that holds positions; raises as ``JointSample.from_cdr`` does."""
+        first, origin = JointSample.from_cdr(data), np.frombuffer(data, np.uint8).ctypes.data
+        spans = [_STAMP]
+        for values in (first.position, first.velocity, first.effort):
+            if len(values):
+                at = values.ctypes.data - origin
+                spans.append((at, at + values.nbytes))
+        starts, ends = zip(*spans, strict=True)
+        self._fixed = tuple(zip((0, *ends), (*starts, len(data)), strict=True))
         self._size, self._bytes = len(data), [data[a:b] for a, b in self._fixed]
-        self._unpack = struct.Struct(f"<{count}d").unpack_from
+        self.names, self.count = first.names, len(first.position)
+        self._unpack = struct.Struct(f"<{self.count}d").unpack_from
+        self._at = starts[-1] if len(spans) == 1 else starts[1]
+        self.is_of_use = data[1] == _LITTLE_ENDIAN and self.count > 0
 
     def is_like(self, data: bytes) -> bool:
         """Whether another message holds the same joints at the same places."""
@@ -99,13 +86,13 @@ class JointLayout:
 
     def has_nan(self, data: bytes) -> bool:
         """Whether a position of a message that is like it is not a number."""
-        total: float = sum(self._unpack(data, self.numbers[0][0]))
+        total: float = sum(self._unpack(data, self._at))
         return not math.isfinite(total)
 
     def read(self, alike: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
         """Stamps [ns] and positions of messages that are like it, at once."""
         rows = np.frombuffer(b"".join(alike), np.uint8).reshape(len(alike), -1)
-        spans = ((ORIGIN, 8), (8, 12), self.numbers[0])
+        spans = ((4, 8), (8, 12), (self._at, self._at + 8 * self.count))
         s, ns, position = (
             rows[:, start:end].copy().view(kind)
             for (start, end), kind in zip(spans, ("<i4", "<u4", "<f8"), strict=True)
@@ -120,7 +107,3 @@ def joint_layout(data: bytes) -> JointLayout | None:
     except BridgeError:
         return None
     return layout if layout.is_of_use else None
-
-
-def _aligned(at: int, size: int) -> int:
-    return at + (ORIGIN - at) % size

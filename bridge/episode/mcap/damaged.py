@@ -3,7 +3,6 @@
 import os
 import struct
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from mcap.records import McapRecord, Schema
 
@@ -59,28 +58,28 @@ def _summary_places(file: RecordFile) -> tuple[int, int] | None:
     return (start, at) if is_intact and start >= len(mcap.MAGIC) else None
 
 
-def summary_definitions(file: RecordFile) -> list[bytes]:
+def summary_definitions(file: RecordFile) -> list[McapRecord | None]:
     """Return the schemas and channels of a summary that is intact, none of another."""
     places = _summary_places(file)
-    return walk_records(file.read(places[0], places[1] - places[0])).definitions if places else []
+    try:
+        data = file.read(places[0], places[1] - places[0]) if places else b""
+        return walk_records(data).definitions
+    except BrokenRecordError:
+        return []
 
 
-class FinishedData(NamedTuple):
-    """Where the data of a finished file ends, and whether its CRC proves every byte of it."""
+def finished_data(file: RecordFile) -> tuple[int, bool] | None:
+    """Return where a file's data ends, and whether its CRC proves every byte of it.
 
-    end: int
-    is_proved: bool
-
-
-def finished_data(file: RecordFile) -> FinishedData | None:
-    """Look at the end of a file; None unless its closing CRCs are right."""
+    None unless the closing CRCs are right.
+    """
     places = _summary_places(file)
     head = mcap.RECORD_HEAD.pack(mcap.DATA_END, 4)
     end = places[0] - len(head) - 4 if places else -1
     if end < len(mcap.MAGIC) or file.read(end, len(head)) != head:
         return None
     crc = int.from_bytes(file.read(end + len(head), 4), "little")
-    return FinishedData(end, is_proved=crc != 0) if crc in (0, file.crc(0, end)) else None
+    return (end, crc != 0) if crc in (0, file.crc(0, end)) else None
 
 
 _INDEX_FIELDS = struct.Struct("<HxxxxQ")
@@ -97,17 +96,12 @@ def read_plain(record: bytes) -> McapRecord | None:
 
 @dataclass(kw_only=True)
 class Contents:
-    """The whole records found from the front of a chunk's data."""
+    """What lies in a chunk."""
 
-    size: int = 0
     index: dict[int, list[int]] = field(default_factory=dict)
     """By channel: log time and offset of each message, one after the other."""
-    definitions: list[bytes] = field(default_factory=list)
-
-    @property
-    def num_messages(self) -> int:
-        """Messages on all channels."""
-        return sum(map(len, self.index.values())) // 2
+    definitions: list[McapRecord | None] = field(default_factory=list)
+    """Schemas and channels."""
 
     def time_range(self) -> tuple[int, int]:
         """First and last log time, zeros without messages [ns]."""
@@ -116,23 +110,17 @@ class Contents:
 
 
 def walk_records(data: Buffer) -> Contents:
-    """Find the records at the front of a chunk's data, up to the first that is cut or wrong."""
+    """Find the records in a chunk's data, or a summary; raises where one is cut or wrong."""
     found = Contents()
     index = found.index
-    try:
-        for opcode, at, length in records_in(data):
+    for opcode, at, length in records_in(data):
+        if opcode == MESSAGE:
+            channel_id, log_time_ns = _INDEX_FIELDS.unpack_from(data, at + RECORD_HEAD.size)
+            entries = index.get(channel_id)
+            if entries is None:
+                entries = index[channel_id] = []
+            entries += (log_time_ns, at)
+        elif opcode in (SCHEMA, CHANNEL):
             end = at + RECORD_HEAD.size + length
-            if opcode == MESSAGE:
-                channel_id, log_time_ns = _INDEX_FIELDS.unpack_from(data, at + RECORD_HEAD.size)
-                entries = index.get(channel_id)
-                if entries is None:
-                    entries = index[channel_id] = []
-                entries += (log_time_ns, at)
-            elif opcode in (SCHEMA, CHANNEL):
-                record = bytes(data[at:end])
-                read_plain(record)
-                found.definitions.append(record)
-            found.size = end
-    except BrokenRecordError:
-        pass  # what came before is whole
+            found.definitions.append(read_plain(bytes(data[at:end])))
     return found

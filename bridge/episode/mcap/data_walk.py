@@ -10,7 +10,7 @@ from typing import NamedTuple
 from mcap import records
 
 from bridge.episode.mcap import format as mcap_format
-from bridge.episode.mcap.damaged import Contents, RecordFile, read_plain
+from bridge.episode.mcap.damaged import Contents, RecordFile
 from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, FileSummary
 from bridge.episode.mcap.scan import (
     Chunk,
@@ -98,7 +98,7 @@ class DataWalk:
                 self._define(record)
 
     def _message(self, data: bytes, at: int) -> Iterator[ScannedMessage]:
-        head = message_head(data, at, at)
+        head = message_head(data, at)
         channel = self.seen.channels.get(head.channel_id)
         if channel is None:
             self._fault(f"a message of channel {head.channel_id}, which was not announced")
@@ -124,11 +124,11 @@ class DataWalk:
         self._chunk = chunk_entry(found.offset, found.length, found.packed)
         self._contents = found.contents
         data = found.records
-        for opcode, at, length in records_in(data):
+        for record in found.contents.definitions:
+            self._define(record)
+        for opcode, at, _ in records_in(data):
             if opcode == MESSAGE:
                 yield from self._message(data, at)
-            elif opcode in (mcap_format.SCHEMA, mcap_format.CHANNEL):
-                self._define(read_plain(data[at : at + RECORD_HEAD.size + length]))
         counts = {number: len(each) // 2 for number, each in found.contents.index.items()}
         self.seen.add_messages(counts, *found.contents.time_range())
         times = found.contents.time_range()
@@ -139,7 +139,9 @@ class DataWalk:
 
     def _check_index(self, span: IndexSpan) -> None:
         body = self._file.read(span.offset, span.length)[RECORD_HEAD.size :]
-        channel_id, said = _index_entries(body)
+        channel_id, length = _INDEX_HEAD.unpack_from(body)
+        numbers = struct.unpack_from(f"<{length // 8}Q", body, _INDEX_HEAD.size)
+        said = sorted(zip(numbers[::2], numbers[1::2], strict=True))
         if self._chunk is None:
             self._doubt(f"the message index at byte {span.offset} follows no chunk")
             return
@@ -162,10 +164,3 @@ class DataWalk:
             self._doubt(f"the chunk at byte {at} has no index of channels {sorted(absent)}")
         self.seen.chunk_indexes.append(self._chunk)
         self._chunk = None
-
-
-def _index_entries(body: bytes) -> tuple[int, list[tuple[int, int]]]:
-    """Read a message index: its channel, and log time and offset of each message, in order."""
-    channel_id, length = _INDEX_HEAD.unpack_from(body)
-    numbers = struct.unpack_from(f"<{length // 8}Q", body, _INDEX_HEAD.size)
-    return channel_id, sorted(zip(numbers[::2], numbers[1::2], strict=True))

@@ -77,12 +77,6 @@ class McapFile:
             raise BrokenRecordError(f"the index points at byte {offset}, where no {kind} lies")
         return place
 
-    def attachment(self, name: str) -> bytes | None:
-        """Return the bytes of the first attachment of this name, its CRC checked, or None."""
-        for found in self.attachments(name):
-            return bytes(found.data)
-        return None
-
     def attachments(self, name: str | None = None) -> Iterator[records.Attachment]:
         """Yield attachments, all or those of one name; each is held in memory."""
         with self.path.open("rb") as stream:

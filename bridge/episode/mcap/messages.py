@@ -61,9 +61,11 @@ def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
 
 
 def _messages_of(file: McapFile, select: Selection) -> Iterator[Stored]:
+    topics, channels = select.topics, file.summary.channels.values()
+    wanted = {item.id for item in channels if topics is None or item.topic in topics}
     try:
         with file.path.open("rb") as stream:
-            yield from _in_order(_Open(file, stream, select))
+            yield from _in_order(_Open(file, stream, select, wanted))
     except DAMAGE as error:
         raise damaged(file.path, error) from error
 
@@ -74,17 +76,15 @@ class _Open(NamedTuple):
     file: McapFile
     stream: ByteStream
     select: Selection
+    wanted: Set[int]
+    """Channels."""
 
-    def wanted_channels(self) -> set[int]:
-        topics, channels = self.select.topics, self.file.summary.channels.values()
-        return {item.id for item in channels if topics is None or item.topic in topics}
-
-    def is_wanted(self, channel_id: int, log_ns: int, wanted: Set[int]) -> bool:
+    def is_wanted(self, channel_id: int, log_ns: int) -> bool:
         """Whether a message is wanted; raises BrokenRecordError for one of no channel."""
         if channel_id not in self.file.summary.channels:
             message = f"a message is of channel {channel_id}, which was never announced"
             raise BrokenRecordError(message)
-        return channel_id in wanted and self.select.overlaps(log_ns, log_ns)
+        return channel_id in self.wanted and self.select.overlaps(log_ns, log_ns)
 
 
 class _Loaded(NamedTuple):
@@ -97,15 +97,14 @@ class _Loaded(NamedTuple):
 
 def _in_order(opened: _Open) -> Iterator[Stored]:
     queue: list[tuple[int, int, records.ChunkIndex | _Loaded]] = []
-    wanted = opened.wanted_channels()
     for index in opened.file.summary.chunk_indexes:
         listed = index.message_index_offsets  # a chunk without an index may hold any channel
-        if (not listed or wanted & listed.keys()) and opened.select.overlaps(
+        if (not listed or opened.wanted & listed.keys()) and opened.select.overlaps(
             index.message_start_time, index.message_end_time
         ):
             queue.append((index.message_start_time, index.chunk_start_offset, index))
     heapq.heapify(queue)
-    if not opened.file.summary.chunk_indexes and wanted:
+    if not opened.file.summary.chunk_indexes and opened.wanted:
         queue.append((0, 0, _without_chunks(opened)))
     while queue:
         _, offset, source = heapq.heappop(queue)
@@ -133,18 +132,18 @@ def _without_chunks(opened: _Open) -> _Loaded:
 
 
 def _loaded(opened: _Open, data: Buffer, start: int) -> _Loaded:
-    wanted, places = opened.wanted_channels(), []
+    places = []
     for opcode, at, _ in records_in(data, start):
         if opcode == MESSAGE:
-            head = message_head(data, at, at)
-            if opened.is_wanted(head.channel_id, head.log_time_ns, wanted):
+            head = message_head(data, at)
+            if opened.is_wanted(head.channel_id, head.log_time_ns):
                 places.append((head.log_time_ns, at))
     places.sort(reverse=True)
     return _Loaded(data, places)
 
 
 def _stored(opened: _Open, data: Buffer, at: int) -> Stored:
-    head, start = message_head(data, at, at), at + MESSAGE_HEAD.size
+    head, start = message_head(data, at), at + MESSAGE_HEAD.size
     return Stored(
         opened.file,
         opened.file.summary.channels[head.channel_id],

@@ -178,11 +178,13 @@ def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
     raw = file.read(offset, length)
     packed = parse_chunk(raw[mcap.RECORD_HEAD.size :])
     records = unpack_chunk(packed)
-    contents = walk_records(records)
-    if contents.size != len(records):
-        raise BrokenRecordError("a chunk is damaged: its records are torn")
     return Chunk(
-        offset=offset, length=length, raw=raw, packed=packed, records=records, contents=contents
+        offset=offset,
+        length=length,
+        raw=raw,
+        packed=packed,
+        records=records,
+        contents=walk_records(records),
     )
 
 

@@ -239,20 +239,18 @@ class MessageHead(NamedTuple):
     """A message inside a buffer or file, its payload left where it is."""
 
     log_time_ns: int
-    at: int
-    """Where the record begins: in a chunk's data, or in the file."""
     length: int
     channel_id: int
     sequence: int
     publish_time_ns: int
 
 
-def message_head(data: Buffer, at: int, where: int) -> MessageHead:
-    """Read the front of the message record at ``at``; ``where`` becomes its ``at``."""
+def message_head(data: Buffer, at: int) -> MessageHead:
+    """Read the front of the message record at ``at``."""
     _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)
     if length < MESSAGE_FIELDS:
         raise BrokenRecordError(f"a message record of {length} bytes")
-    return MessageHead(log_ns, where, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
+    return MessageHead(log_ns, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
 
 
 def records_in(data: Buffer, at: int = 0) -> Iterator[tuple[int, int, int]]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from joint_samples import at_positions
 
-from bridge.episode.cdr.batch import joint_messages, pose_messages
+from bridge.episode.cdr.batch import joint_writer, pose_messages
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.streams import joint_track_of, pose_track_of
@@ -86,7 +86,7 @@ def test_joint_states_are_the_same_bytes(names: tuple[str, ...]) -> None:
     position[0] = 0.0
     position[1] = np.inf
     for stamp, row, data in zip(
-        STAMPS, position, joint_messages(STAMPS, names, position), strict=True
+        STAMPS, position, map(joint_writer(names), STAMPS.tolist(), position.tolist()), strict=True
     ):
         sample = at_positions(int(stamp), names, row)
         assert data == sample.to_cdr()
@@ -102,5 +102,4 @@ def test_poses_are_the_same_bytes(frame: str) -> None:
 
 def test_no_messages_are_none() -> None:
     none = np.zeros(0, dtype=np.int64)
-    assert list(joint_messages(none, ("a",), np.zeros((0, 1)))) == []
     assert list(pose_messages(none, "base", np.zeros((0, 4, 4)))) == []

@@ -279,8 +279,6 @@ STATEMENTS = [
     (mcap_format.METADATA_INDEX, True, 20, "wrong about name"),
     (mcap_format.SCHEMA, True, 6, "the summary's schema 1"),
     (mcap_format.CHANNEL, True, 8, "the summary's channel 1"),
-    (mcap_format.SUMMARY_OFFSET, True, 0, "the summary's offset"),
-    (mcap_format.SUMMARY_OFFSET, True, 1, "the summary's offset"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""Contracts of cells: what they may hold, what they are learned from, and when they are broken."""
+"""Contracts of cells: what they may hold, and when they are broken."""
 
 import itertools
 import random
@@ -22,10 +22,8 @@ from bridge.episode.contract import (
     findings_of,
     health_lines,
     judge,
-    learn_contract,
     read_contract,
     unseen_losses,
-    write_contract,
 )
 from bridge.episode.metadata import from_strings
 from bridge.errors import UsageError
@@ -164,14 +162,15 @@ def test_without_a_contract_a_rate_that_collapses_is_named(
     assert told(reports, presences, "rate_collapsed") == []
 
 
-def test_a_contract_survives_its_file_and_its_record(tmp_path: Path) -> None:
+def test_a_contract_is_read_from_its_file_and_its_record(tmp_path: Path) -> None:
     contract = Contract(topics={JOINTS: RULE, "/lab/plan": TopicRule(required=False)}, cell="lab")
-    write_contract(contract, tmp_path / "cell.toml", source="good.mcap")
+    (tmp_path / "cell.toml").write_text(
+        HEAD + f'cell = "lab"\n[topics."{JOINTS}"]\nrate_hz = 100\ntolerance = 0.2\n'
+        'silence_s = 0.5\n[topics."/lab/plan"]\nrequired = false\n'
+    )
     assert read_contract(tmp_path / "cell.toml") == contract
     assert find_contract(tmp_path, None) == contract
     assert contract_from(from_strings(contract.to_record()), name="e1") == contract
-    with pytest.raises(ContractError, match="exists already"):
-        write_contract(contract, tmp_path / "cell.toml", source="good.mcap")
     assert find_contract(tmp_path / "elsewhere", None) is None
 
 
@@ -214,28 +213,6 @@ def test_the_templates_can_be_read_and_an_unknown_one_lists_them() -> None:
         assert contract.required()
     with pytest.raises(UsageError, match=f"There are: {', '.join(names)}"):
         find_contract(Path("nowhere"), "kitchen")
-
-
-def test_what_is_learned_is_kept_by_the_episode_it_was_learned_from() -> None:
-    """Law: learn, then judge the same episode: nothing is broken."""
-    presences = {
-        JOINTS: seen(*steady(1.0, 11.0)),
-        "/lab/cam/side/color/image": seen(*steady(1.1, 10.9, 30.0)),
-        "/lab/event": seen(1.5, 3.0, 9.0),
-        "/tf_static": seen(1.0),
-        "/standin/truth/object/cube/pose": seen(*steady(1.0, 11.0)),
-        "/recorder/drops": seen(*steady(1.0, 11.0, 3.0)),
-    }
-    contract = learn_contract(presences, cell="lab")
-    assert contract.required() == ["/lab/cam/side/color/image", JOINTS, "/tf_static"]
-    assert contract.topics["/lab/event"] == TopicRule(required=False)
-    assert contract.topics[JOINTS].rate_hz == pytest.approx(100.0)
-    assert set(presences) - set(contract.topics) == {
-        "/standin/truth/object/cube/pose",
-        "/recorder/drops",
-    }
-    reports = judge(presences, contract, Span(NS_PER_S, 11 * NS_PER_S), {})
-    assert told(reports, presences) == []
 
 
 def test_records_of_other_programs_are_no_sentences() -> None:

@@ -194,6 +194,7 @@ def test_posed_images_are_rgbd_images_and_a_colmap_model_is_named(tmp_path: Path
     text = say(tmp_path / "model")
     assert "a COLMAP model, not read here" in text
     assert "rebuild needs depth images and transforms.json" in text
+    assert "evaluate: ready" not in text
 
 
 def test_a_spreadsheet_ends_in_a_rate(tmp_path: Path, say: Say, rates: Rates) -> None:

@@ -1,22 +1,27 @@
 """Recorder, control keys and sources joined by real sessions; no request leaves the run folder."""
 
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from loopback import recording
+from loopback import free_endpoint, recording
 from mcap.reader import make_reader
 
 import robot_gst
 from bridge.data_files import datasets_folder
 from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError
+from bridge.record.config import RecorderConfig
 from bridge.record.control import RecorderClient
+from bridge.record.process import run_recorder
 from bridge.record.status import describe_status
+from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
 from bridge.wire.session import WireSession, open_session
@@ -53,6 +58,28 @@ def test_a_stop_comes_after_everything_sent_before_it(joined: Joined) -> None:
     assert episode.outcome.result == "success"
     assert episode.info.tags == ("x",)
     assert client.status()["state"] == "idle"
+
+
+@pytest.mark.parametrize(("host", "is_told"), [("127.0.0.1", False), ("0.0.0.0", True)])
+def test_a_recorder_says_where_it_listens_and_when_others_may_reach_it(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], host: str, is_told: bool
+) -> None:
+    listen = free_endpoint().replace("127.0.0.1", host)
+    answer = run_recorder(
+        run.path,
+        wire=WireConfig(mode="router", connect=(), listen=(listen,)),
+        config=RecorderConfig(),
+        stop=threading.Event(),
+        output=Output(),
+        episode=EpisodeInfo(id="t1", kind="trial", cell="lab"),
+        duration_s=0.2,
+    )
+    told = capsys.readouterr().err
+    assert f"recorder 'main' listens on {listen}, writes to {run.path}" in told
+    assert ("can be reached from other machines" in told) == is_told
+    assert answer is not None
+    assert (answer["messages"], answer["lost"]) == (0, 0)
+    assert Episode.open(run.episodes_dir / "t1.mcap").info.cell == "lab"
 
 
 @pytest.mark.parametrize("is_simulated", [True, False])

@@ -57,7 +57,9 @@ class MovingVoxels:
 
     def largest_place(self) -> str:
         """Size and middle of the largest connected group of these voxels; empty for noise."""
-        cells = _cells(self.keys)
+        shifts = np.array([2 * INDEX_BITS, INDEX_BITS, 0])
+        packed = (self.keys[:, None] >> shifts) & ((1 << INDEX_BITS) - 1)
+        cells = packed - (1 << (INDEX_BITS - 1))
         if not len(cells):
             return ""
         pairs = cKDTree(cells).query_pairs(1.8, output_type="ndarray")  # corners touch, too
@@ -184,12 +186,6 @@ def _keys(p_m: np.ndarray) -> np.ndarray:
     cell = np.clip(cell, 0, (1 << INDEX_BITS) - 1)
     packed = (cell[:, 0] << (2 * INDEX_BITS)) | (cell[:, 1] << INDEX_BITS) | cell[:, 2]
     return np.asarray(packed)
-
-
-def _cells(keys: np.ndarray) -> np.ndarray:
-    shifts = (2 * INDEX_BITS, INDEX_BITS, 0)
-    packed = np.stack([(keys >> shift) & ((1 << INDEX_BITS) - 1) for shift in shifts], axis=1)
-    return np.asarray(packed - (1 << (INDEX_BITS - 1)))
 
 
 MIN_VIEWS, MAX_VIEWS = 6, 24

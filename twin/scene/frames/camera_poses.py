@@ -190,7 +190,7 @@ def find_poses(
     neither the path of the camera nor its loop closures.
 
     Raises:
-        FrameNotFoundError: When ``/tf`` is asked for and does not know the camera.
+        BridgeError: When ``/tf`` is asked for and does not know the camera.
         UnusableCameraError: When no image was taken while ``/tf`` or the joints said where the
             camera is, or ``/tf`` does not connect its colour and depth frames.
         LostError: When the odometry cannot follow the camera.

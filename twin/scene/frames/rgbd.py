@@ -269,17 +269,18 @@ def training_view(surface: FrameSurface) -> TrainingView:
     frame = surface.frame
     depth_m = surface.depth_in_color_camera()
     half = _halved_camera(frame.color_camera)
+    total = _blocks(frame.image_u8, half).sum(axis=(1, 3), dtype=np.uint16)
     return TrainingView(
         camera_id=frame.camera_id,
         stamp_ns=frame.stamp_ns,
         T_base_color=frame.T_base_color,
-        half=_target(half, _halved_image(frame.image_u8, half), _halved_depth(depth_m, half)),
+        half=_target(half, (total + 2) // 4, _halved_depth(depth_m, half)),
         full=_target(frame.color_camera, frame.image_u8, depth_m),
     )
 
 
 def _target(camera: Camera, image_u8: np.ndarray, depth_m: np.ndarray) -> Target:
-    planes = np.ascontiguousarray(np.moveaxis(image_u8, -1, 0))
+    planes = np.ascontiguousarray(np.moveaxis(image_u8, -1, 0), dtype=np.uint8)
     everywhere = np.ones(depth_m.shape, dtype=bool)
     return Target(camera=camera, planes_u8=planes, depth_m=depth_m, static_mask=everywhere)
 
@@ -304,11 +305,6 @@ def _blocks(rows: np.ndarray, camera: Camera) -> np.ndarray:
     padded = np.pad(rows, missing + ((0, 0),) * (rows.ndim - 2), mode="edge")
     shape = (camera.height, 2, camera.width, 2, *rows.shape[2:])
     return np.asarray(padded.reshape(shape))
-
-
-def _halved_image(image_u8: np.ndarray, camera: Camera) -> np.ndarray:
-    total = _blocks(image_u8, camera).sum(axis=(1, 3), dtype=np.uint16)
-    return np.asarray((total + 2) // 4, dtype=np.uint8)
 
 
 def _halved_depth(depth_m: np.ndarray, camera: Camera) -> np.ndarray:

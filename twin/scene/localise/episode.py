@@ -96,12 +96,7 @@ and robots differ, and the first millimetres are in the noise."""
 
 def first_execution_ns(episode: Episode) -> int | None:
     """Source time at which the first execution started, None without one."""
-    stamps = [
-        int(event["stamp_ns"])
-        for event in executed_events(episode)
-        if event["type"] == "execution_started"
-    ]
-    return min(stamps, default=None)
+    return quiet_phases(episode)[0].before_ns
 
 
 def quiet_phases(episode: Episode) -> list[Phase]:
@@ -165,12 +160,19 @@ def write_localised(
         about = {key: item.to_record() for key, item in moved.items()}
         derived = replace(derived, settings={**derived.settings, MOVED: about})
     poses = trial_cameras(run, episode, moved)
-    phases = [*_localised_phases(episode, task, scanned, poses)]
+    records = [*_localised_phases(episode, task, scanned, poses)]
+    topic = cell_topic(episode.info.cell or "cell", LOCALISATION)
     path.unlink(missing_ok=True)
     with EpisodeWriter(path) as writer:
         writer.describe(episode.info, derived=derived)
-        for phase, objects, in_hand in phases:
-            _write_phase(writer, episode.info.cell or "cell", phase, objects, in_hand)
+        for stamp_ns, record in records:
+            writer.write(
+                topic,
+                record,
+                type_name=schema.LOCALISATION,
+                log_time_ns=stamp_ns,
+                publish_time_ns=stamp_ns,
+            )
     return path
 
 
@@ -207,11 +209,12 @@ def trial_cameras(run: RunFolder, episode: Episode, moved: Mapping[str, MovedCam
 
 def _localised_phases(
     episode: Episode, task: Task, scanned: ScannedSurfaces, poses: Poses
-) -> Iterator[tuple[Phase, dict[str, LocalisedObject], dict[str, list[dict[str, Any]]]]]:
+) -> Iterator[tuple[int, dict[str, Any]]]:
     """Localise in one quiet stretch after the other; each tells the next where objects were.
 
-    With each what cameras saw in the hand in the execution before it, by object: ``grip_ns``, when
-    the fingers stood closed, and ``T_tcp_object``. What was held is expected where it was let go.
+    Of each object a record, and its stamp [ns]; ``in_hand`` in it is what cameras saw in the
+    execution before: ``grip_ns``, when the fingers stood closed, and ``T_tcp_object``. What was
+    held is expected where it was let go.
     """
     spans_ns = executions_ns(episode)
     last_seen_m: dict[str, np.ndarray] = {}
@@ -233,12 +236,12 @@ def _localised_phases(
             surfaces=scanned.surfaces,
             poses=poses,
         )
-        yield phase, found, in_hand
-        last_seen_m |= {
-            key: item.T_base_object[:3, 3]
-            for key, item in found.items()
-            if item.T_base_object is not None
-        }
+        for key, item in found.items():
+            record = {**item.to_record(), "phase": phase.name, "plan_id": phase.plan_id}
+            record |= {"in_hand": in_hand[key]} if key in in_hand else {}
+            yield item.stamp_ns or phase.after_ns or phase.before_ns or 0, record
+            if item.T_base_object is not None:
+                last_seen_m[key] = item.T_base_object[:3, 3]
 
 
 def _mounts(calibration: Calibration | None, camera_ids: Collection[str]) -> dict[str, Any]:
@@ -259,24 +262,3 @@ def _made_from(path: Path, derived: Derived) -> bool:
         and provenance.hash_settings({k: v for k, v in found.settings.items() if k != MOVED})
         == provenance.hash_settings(derived.settings)
     )
-
-
-def _write_phase(
-    writer: EpisodeWriter,
-    cell: str,
-    phase: Phase,
-    objects: dict[str, LocalisedObject],
-    in_hand: Mapping[str, Any],
-) -> None:
-    for object_id, found in objects.items():
-        stamp_ns = found.stamp_ns or phase.after_ns or phase.before_ns or 0
-        record = {**found.to_record(), "phase": phase.name, "plan_id": phase.plan_id}
-        if object_id in in_hand:
-            record["in_hand"] = in_hand[object_id]
-        writer.write(
-            cell_topic(cell, LOCALISATION),
-            record,
-            type_name=schema.LOCALISATION,
-            log_time_ns=stamp_ns,
-            publish_time_ns=stamp_ns,
-        )

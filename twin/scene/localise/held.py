@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.signal import find_peaks, peak_widths
 
 from bridge.episode import streams
@@ -24,7 +24,13 @@ from twin.robot.posture import PostureTrack, posture_track
 from twin.scene.frames.camera_poses import CameraPoses, base_tree
 from twin.scene.frames.pairing import paired_stamps_ns
 from twin.scene.frames.selection import rgbd_camera_ids, spread, with_true_depth
-from twin.scene.localise.mesh_fit import MIN_EXPLAINED, MeshSurface, fit_mesh, known_surface
+from twin.scene.localise.mesh_fit import (
+    MIN_EXPLAINED,
+    MeshSurface,
+    fit_mesh,
+    known_surface,
+    lengths,
+)
 from twin.scene.localise.points import MIN_POINTS, fuse_stationary, object_points
 from twin.scene.localise.stationary_frames import Poses
 
@@ -128,14 +134,12 @@ def held_objects(
         for name, surface in shapes.items():
             model = task.objects[name]
             away_m = last_seen_m.get(name, np.inf) - grip.T_base_tcp_start[:3, 3]
-            if model.soft is None or np.linalg.norm(away_m) < _reach_m(model):
+            is_near = np.linalg.norm(away_m) < BETWEEN_M + max(model.size_m) / 2
+            T = None
+            if is_near or model.soft is None:
                 T = fitted_in_hand(frames, task, model, surface)
-                if T is not None:
-                    yield name, grip, T
-
-
-def _reach_m(model: ObjectModel) -> float:
-    return BETWEEN_M + max(model.size_m) / 2
+            if T is not None:
+                yield name, grip, T
 
 
 def _in_tool_frame(
@@ -169,11 +173,8 @@ def fitted_in_hand(
 ) -> Float[np.ndarray, "4 4"] | None:
     """Pose ``T_tcp_object`` of an object between the fingers; None where none is seen there."""
     views = fuse_stationary(frames, FRAMES, FRAMES, replace(task, start={}))
-
-    def is_far(p: Float[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
-        return np.asarray(np.linalg.norm(p, axis=1) >= BETWEEN_M + np.linalg.norm(model.size_m) / 2)
-
-    near = object_points(views, model, -np.inf, is_far)
+    reach_m = BETWEEN_M + float(np.linalg.norm(model.size_m)) / 2
+    near = object_points(views, model, -np.inf, lambda p: lengths(p) >= reach_m)
     if not near or len(near[0]) < MIN_POINTS:
         return None
     fit = fit_mesh(near[0], views, surface, tilt_sigma_rad=ANY_TILT_RAD, lying=True)

@@ -225,7 +225,7 @@ def fit_toys(
             continue
         index = good[taken[row]]
         found[item.id] = SoftFit(
-            reason=_doubt(item, margins.get(row)),
+            reason=_doubt(item, margins[row]),
             num_points=len(groups[index]),
             fit=fits[index],
             shape=soft_shape(views, surface, model, fits[index]),
@@ -268,21 +268,15 @@ def _margins(
     cost: Float[np.ndarray, "num_models num_candidates"], taken: Mapping[int, int]
 ) -> dict[int, float]:
     """Per assigned toy: what the cheapest exchange with another one would cost."""
-    margins: dict[int, float] = {}
-    for row, column in taken.items():
-        others = [
-            cost[row, other_column] + cost[other, column] - cost[row, column]
-            - cost[other, other_column]
-            for other, other_column in taken.items()
-            if other != row
-        ]  # fmt: skip
-        if others:
-            margins[row] = float(min(others))
-    return margins
+    chosen = cost[np.ix_(list(taken), list(taken.values()))]
+    own = np.diag(chosen)
+    exchanged = chosen + chosen.T - own - own[:, None]
+    np.fill_diagonal(exchanged, np.inf)
+    return dict(zip(taken, exchanged.min(axis=1, initial=np.inf).tolist(), strict=True))
 
 
-def _doubt(model: ObjectModel, margin_m: float | None) -> str | None:
-    if margin_m is None or margin_m >= MIN_MARGIN_M:
+def _doubt(model: ObjectModel, margin_m: float) -> str | None:
+    if margin_m >= MIN_MARGIN_M:
         return None
     return (
         f"{model.id} is hardly told apart from an equal object: exchanging them costs "

@@ -110,11 +110,8 @@ def is_stationary(
     tree: TransformTree, frame_id: str, stamp_ns: int, until_ns: int | None = None
 ) -> bool:
     """Say whether a frame's pose is the same shortly before and after an instant."""
-    last_ns = (
-        stamp_ns + STATIONARY_WINDOW_NS
-        if until_ns is None
-        else min(stamp_ns + STATIONARY_WINDOW_NS, until_ns)
-    )
+    last_ns = stamp_ns + STATIONARY_WINDOW_NS
+    last_ns = last_ns if until_ns is None else min(last_ns, until_ns)
     before = tree.T_root_frame(frame_id, stamp_ns - STATIONARY_WINDOW_NS)
     after = tree.T_root_frame(frame_id, last_ns)
     return same_pose(
