@@ -162,9 +162,8 @@ class Arm:
         self.opening_axes: dict[str, tuple[float, ...]] = {}
         parents: dict[str, int] = {}
         fixed: set[int] = {-1}
-        client = self._client
-        for index in range(client.getNumJoints(self.id)):
-            item = client.getJointInfo(self.id, index)
+        for index in range(self._client.getNumJoints(self.id)):
+            item = self._client.getJointInfo(self.id, index)
             self._joints[item[1].decode()] = index
             self.links[item[12].decode()] = index
             self._efforts[item[1].decode()] = item[10]
