@@ -46,13 +46,6 @@ CORE: tuple[leaves.Command, ...] = (
     ),
     *leaves.commands_of(
         leaves.RECORD,
-        "bridge.cli.publish",
-        """
-        publish episode | Play an episode back with its own timing. | FILE --rate 2
-        """,
-    ),
-    *leaves.commands_of(
-        leaves.RECORD,
         "bridge.cli.tasks",
         """
         task check | Say what is wrong with task files, or what they ask for. | my_task.toml
@@ -116,7 +109,7 @@ CORE: tuple[leaves.Command, ...] = (
         "bridge.cli.exchange",
         """
         import rgbd | An RGB-D folder: scene.json, TUM, 7-Scenes. | DIR runs/x
-        import images | Posed images without depth: COLMAP, transforms.json. | DIR runs/x
+        import images | The same, as NeRF programs keep them. | DIR runs/x
         import rosbag2 | A rosbag2 recording, byte for byte. | BAG runs/x
         export tum | Cameras as folders of the TUM RGB-D layout. | EPISODE DIR
         export rosbag2 | An episode as a rosbag2 folder. | EPISODE DIR
@@ -188,6 +181,11 @@ def run(arguments: Sequence[str]) -> int:
     except GstError as error:
         sys.stderr.write(f"robot-gst: {error}\n")
         return error.exit_code
+    except ModuleNotFoundError as error:
+        from bridge.doctor import how_to_get  # only now
+
+        sys.stderr.write(f"robot-gst: {how_to_get(error)}\n")
+        return 1
     except BrokenPipeError:  # whoever read our output, for example head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

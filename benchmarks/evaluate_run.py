@@ -141,7 +141,7 @@ def _raw(writer: EpisodeWriter, topic: str, type_name: str, data: bytes, after_n
 def _json(
     writer: EpisodeWriter, topic: str, type_name: str, record: dict[str, object], after_ns: int
 ) -> None:
-    writer.write_json(topic, record, type_name=type_name, log_time_ns=START_NS + after_ns)
+    writer.write(topic, record, type_name=type_name, log_time_ns=START_NS + after_ns)
 
 
 def _event(writer: EpisodeWriter, kind: str, plan_id: str, after_ns: int) -> None:

@@ -28,6 +28,16 @@ EXTRAS = {
 """What packages that come together are for; which they are, the installed package says itself."""
 NEEDED = ("base", "record", "replay", "report", "dashboard", "standin")
 """Nothing is wrong without the others: the demo and all it shows run on one machine's CPU."""
+PACKAGES = {
+    "PIL": "pillow",
+    "fcl": "python-fcl",
+    "pinocchio": "pin",
+    "rerun": "rerun-sdk",
+    "rerun_bindings": "rerun-sdk",
+    "ruamel": "ruamel.yaml",
+    "zenoh": "eclipse-zenoh",
+}
+"""What brings a module of another name."""
 NATIVE = (
     ("splat rasteriser", "twin.scene._splat", "no scene can be rebuilt"),
     ("depth codec", "bridge.media._depth", "no compact depth is written or read"),
@@ -57,6 +67,17 @@ def examine() -> list[InstallCheck]:
     findings.append(InstallCheck(what="chromium", found=found, ok=True, advice=advice))
     findings.extend(_system_libraries())
     return findings
+
+
+def how_to_get(missing: ModuleNotFoundError) -> str:
+    """Name the package that brings a missing module, and its extra; raise where none does."""
+    module = str(missing.name).partition(".")[0]
+    package = PACKAGES.get(module, module)
+    for extra in EXTRAS:
+        if package in packages_of(extra):
+            how = f"pip install 'robot-gst[{extra}]'"
+            return f"{package} is not installed, and this needs it. Install the extra: {how}."
+    raise missing
 
 
 def packages_of(extra: str) -> list[str]:

@@ -4,17 +4,13 @@ from collections.abc import Sequence
 
 from bridge.errors import UsageError
 
-_FIXED = (
-    "--replay.start-rad start-m start-overlap-m max-contact-depth-m pre-grasp-depth-m squeeze-m "
-    "pre-grasp-soft-depth-m max-slip-m moved-m path-step-s max-joint-step-rad grip-delay-s "
-    "sample-rate-hz physics.finger-speed-m-s physics.soft-substeps physics.soft-stiffness-scale"
-).replace(" ", " --replay.")
-"""Settings of a replay that are constants now."""
-
 _TOLD = {
     "design --width --rate-width": "Give --gain with --rate; at a given size use --starts.",
     "design --agrees-above --agreement": "Use evaluate --fail-under.",
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
+    "check --wire --seconds --rate-hz --connect --listen": (
+        "Record a few seconds, robot-gst record RUN --episode try --duration 5, and check RUN."
+    ),
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
     "export catalogue": "robot-gst ls RUN --json lists all of it.",
     "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
@@ -25,18 +21,22 @@ _TOLD = {
     "export lerobot --depth": "Depth stays in the episodes; robot-gst export tum writes it.",
     "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
     "export tum --color": "Files stay as recorded; ImageMagick decodes: mogrify -format png *.jpg.",
-    "publish folder": "robot-gst import rgbd DIR RUN; publish episode plays what that made.",
-    "publish episode --remap": "Messages keep their names; namespace in --config comes before.",
+    "publish folder": "robot-gst import rgbd DIR RUN makes an episode of it.",
+    "publish ur --urdf": "Give the file with --robot.",
+    "publish realsense --align": "Depth keeps its own camera, whose pose is published too.",
+    "publish episode": (
+        "robot-gst export rosbag2 makes a bag; ros2 bag play sends it, also over rmw_zenoh_cpp."
+    ),
     "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
     "record --failover": "A failing disk ends the recording; begin anew on another disk.",
     "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
     "record --split-mb --split-s": "Stop and start another episode; mcap merge joins old parts.",
-    "record --triggers|ctl snapshot": "Record with --preroll-s 5; start when it has happened.",
-    "ctl pause|ctl resume": "Stop the episode, and start another one.",
-    "publish episode --loop --paused --name": (
-        "A playback begins at once and plays once; --start-s and --rate say from where, how fast."
+    "record --triggers --preroll-s --preroll-mb|ctl snapshot": (
+        "Record all the time; robot-gst ctl stop --discard throws a take away."
     ),
+    "ctl pause|ctl resume": "Stop the episode, and start another one.",
+    "ctl list|ctl --last": "robot-gst ls RUN lists what is recorded.",
     "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
     "recover --in-place": "Free some space, or use another disk: a copy is made beside it.",
     "import trials": "robot-gst open TABLE RUN keeps any table of trials in a run.",
@@ -75,13 +75,6 @@ _TOLD = {
     "calibrate --pairs": "Record /CELL/cam/ID/target/pose, then robot-gst calibrate RUN --cameras.",
     "calibrate --samples|publish standin --probes": "calibrate RUN --posterior learns of trials.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
-    f"replay {_FIXED}|gate {_FIXED} --max-audit-distances --frames --max-frame-age-s "
-    "--max-silence-s --max-joint-age-s --other-scene-m --moved-m --moved-rad|plan --candidates "
-    "--policy|publish standin --real-time --execute-unverified --scan-id --first-probe --gate-cell"
-    "|rebuild --slab --harmonics --exposure --densify --loss --flatness --opacity --holdout-offset "
-    "--footprint-factor --depth-weight --coarse-fraction --no-densify --appearance-steps": (
-        "Nobody set it, so it is a constant of the code now."
-    ),
 }
 GONE = {
     f"{command} --{flag}" if flag else command: text

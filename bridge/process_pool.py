@@ -7,30 +7,28 @@ killed, and with Python 3.11 waits for ever when that happens while another one 
 ``multiprocessing.Pool`` waits for what a dead process had.
 
 A process is a new interpreter, for threads and simulators' memory must not be forked, and the
-program's own main module stays unloaded there. It talks over its own standard streams alone, so it
-ends with the object that stands for it and with the program that holds that object, however that
-ends: the stream it listens to closes.
+program's own main module stays unloaded there. It talks over a pipe of its own alone, so it ends
+with the object that stands for it and with the program that holds that object, however that ends:
+the pipe it listens to closes.
 """
 
 import errno
 import os
 import pickle
 import queue
-import selectors
 import signal
 import subprocess
 import sys
 import threading
-import time
 import traceback
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import wait
-from typing import Any, BinaryIO, Protocol, TypeVar, runtime_checkable
+from multiprocessing.connection import Connection, Pipe, wait
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from bridge.errors import BridgeError, GstError
 
@@ -43,10 +41,8 @@ ONE_THREAD: Mapping[str, str] = {
 """Side by side, libraries that start a thread for each core only get in each other's way."""
 REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
 """What a disk says that is full, or may not be written; everything else is a bug here."""
-LENGTH_BYTES = 8
-"""Before each message: how long it is."""
 PATIENCE_S = 60.0
-"""Without a byte of a message that has begun, or with work that should take a tenth of a second."""
+"""For a message that has begun, or with work that should take a tenth of a second."""
 JOIN_S = 5.0
 
 Item = TypeVar("Item")
@@ -126,19 +122,20 @@ class Worker:
     def __init__(self, *, quiet: bool = False) -> None:
         """Start it; what it imports, it imports with the first piece of work."""
         places = os.pathsep.join(place or os.getcwd() for place in sys.path)  # noqa: PTH109
-        self.process = subprocess.Popen(
-            [sys.executable, "-P", "-c", f"from {__name__} import _serve; _serve()"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL if quiet else None,
-            bufsize=0,
-            env={**os.environ, **ONE_THREAD, "PYTHONPATH": places},
-        )
-        assert self.process.stdin is not None  # noqa: S101  # for the type checker
-        self.outlet: Any = self.process.stdout
+        ours, theirs = Pipe()
+        self.outlet: Any = ours
         """Becomes readable with an answer, and when the process ends."""
-        os.set_blocking(self.process.stdin.fileno(), False)
-        self._close = weakref.finalize(self, _end, self.process)
+        with theirs:
+            code = f"from {__name__} import _serve; _serve({theirs.fileno()})"
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", code],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL if quiet else None,
+                pass_fds=[theirs.fileno()],
+                env={**os.environ, **ONE_THREAD, "PYTHONPATH": places},
+            )
+        self._close = weakref.finalize(self, _end, self.process, self.outlet)
         self._num_begun = 0
 
     @property
@@ -155,43 +152,35 @@ class Worker:
         """Give it a piece of work; the function is one of a module that can be imported.
 
         Args:
-            timeout_s: For handing it over; ``PATIENCE_S`` for each part of it without a number.
+            timeout_s: For handing it over; ``PATIENCE_S`` without a number.
         """
-        assert self.process.stdin is not None  # noqa: S101  # for the type checker
-        left = memoryview(_packed((function, item)))
-        ends_s = None if timeout_s is None else time.monotonic() + timeout_s
-        with selectors.DefaultSelector() as selector:
-            try:
-                inlet = self.process.stdin.fileno()
-                selector.register(inlet, selectors.EVENT_WRITE)
-                while left:
-                    patience_s = PATIENCE_S if ends_s is None else ends_s - time.monotonic()
-                    if not selector.select(max(0.0, patience_s)):
-                        self.process.kill()
-                        limit_s = PATIENCE_S if timeout_s is None else timeout_s
-                        raise TimeIsUpError(f"it took no more for {limit_s:g} s")
-                    left = left[os.write(inlet, left) :]
-            except (OSError, ValueError) as error:  # it ended, or was closed meanwhile
-                raise WorkerDiedError(status=self._status()) from error
+        with self._within(PATIENCE_S if timeout_s is None else timeout_s, "it took no more"):
+            self.outlet.send((function, item))
         self._num_begun += 1
 
     def finish(self, timeout_s: float | None = None) -> Answer | Failed:
         """Wait for the next answer."""
-        try:
-            if not wait([self.outlet], timeout_s):
-                raise TimeIsUpError(f"no answer within {timeout_s:g} s")
-            data = _receive(self._read)
-        except (EOFError, OSError, ValueError) as error:
-            raise WorkerDiedError(status=self._status()) from error
+        if not wait([self.outlet], timeout_s):
+            raise TimeIsUpError(f"no answer within {timeout_s:g} s")
+        with self._within(PATIENCE_S, "it said no more"):
+            answer = self.outlet.recv()
         self._num_begun -= 1
-        return pickle.loads(data)
+        return answer
 
-    def _read(self, size: int) -> bytes | None:
-        if not wait([self.outlet], PATIENCE_S):
-            self.process.kill()
-            raise TimeIsUpError(f"it said no more for {PATIENCE_S:g} s")
-        found: bytes | None = self.outlet.read(size)
-        return found
+    @contextmanager
+    def _within(self, limit_s: float, told: str) -> Iterator[None]:
+        """End the process where a message to it or from it takes too long."""
+        killer = threading.Timer(limit_s, self.process.kill)
+        killer.daemon = True
+        killer.start()
+        try:
+            yield
+        except (EOFError, OSError, ValueError) as error:  # it ended, or was closed meanwhile
+            if killer.finished.is_set():
+                raise TimeIsUpError(f"{told} for {limit_s:g} s") from error
+            raise WorkerDiedError(status=self._status()) from error
+        finally:
+            killer.cancel()
 
     def _status(self) -> int | None:
         with suppress(subprocess.TimeoutExpired):
@@ -203,54 +192,29 @@ class Worker:
         self._close()
 
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
+def _end(process: "subprocess.Popen[bytes]", outlet: "Connection[Any, Any]") -> None:
     process.kill()
     with suppress(OSError):
-        process.wait()  # before the pipes close: another thread may still listen
-    with suppress(OSError), process:
-        pass
+        process.wait()  # before the pipe closes: another thread may still listen
+    outlet.close()
 
 
-def _packed(message: object) -> bytes:
-    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
-    return len(data).to_bytes(LENGTH_BYTES, "big") + data
-
-
-def _receive(read: Callable[[int], bytes | None]) -> bytes:
-    """Read one message, and not a byte beyond it."""
-    return _exactly(read, int.from_bytes(_exactly(read, LENGTH_BYTES), "big"))
-
-
-def _exactly(read: Callable[[int], bytes | None], size: int) -> bytes:
-    found = bytearray()
-    while len(found) < size:
-        more = read(size - len(found))
-        if not more:  # nobody is left to speak
-            raise EOFError
-        found += more
-    return bytes(found)
-
-
-def _serve() -> None:
+def _serve(descriptor: int) -> None:
     """Work in a process of its own, until its owner is gone."""
     # The owner decides when to stop; Ctrl-C reaches every process of the terminal.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    to_owner = os.dup(1)
-    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
-        os.dup2(nowhere.fileno(), 1)  # a library that prints must not speak to the owner
+    owner: Connection[Any, Any] = Connection(descriptor)
     arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    with open(0, "rb", closefd=False) as inbox, open(to_owner, "wb") as outbox:  # noqa: PTH123
-        threading.Thread(target=_listen, args=(inbox, arrived), daemon=True).start()
-        while True:
-            function, item = pickle.loads(arrived.get())
-            outbox.write(_packed(do(function, item)))
-            outbox.flush()
+    threading.Thread(target=_listen, args=(owner, arrived), daemon=True).start()
+    while True:
+        function, item = pickle.loads(arrived.get())
+        owner.send(do(function, item))
 
 
-def _listen(inbox: BinaryIO, arrived: "queue.SimpleQueue[bytes]") -> None:
+def _listen(owner: "Connection[Any, Any]", arrived: "queue.SimpleQueue[bytes]") -> None:
     with suppress(EOFError, OSError):
         while True:
-            arrived.put(_receive(inbox.read))
+            arrived.put(owner.recv_bytes())
     os._exit(0)  # in the middle of anything: nobody waits for it
 
 

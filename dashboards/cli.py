@@ -1,7 +1,5 @@
 """Commands of the package ``dashboards``; imports stay late so that --help is quick."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -34,8 +32,8 @@ def dashboard(
 
     if not runs:
         raise UsageError("which run? For example: robot-gst dashboard runs/demo.")
-    with _needing("starlette", "uvicorn", "jinja2", purpose="the dashboard"):
-        from dashboards.server import serve
+    from dashboards.server import serve
+
     return serve(runs, config, output)
 
 
@@ -49,10 +47,9 @@ def share(run: Path, /, *, config: ShareConfig = SHARE, output: Output = OUTPUT)
         config: Which trials, and how large the file may be.
     """
     from bridge.episode.run_folder import RunFolder
+    from dashboards.share_file import MB
+    from dashboards.share_file import share as write
 
-    with _needing("jinja2", "markupsafe", purpose="a file to share"):
-        from dashboards.share_file import MB
-        from dashboards.share_file import share as write
     path, made = write(RunFolder.open(run), config)
     for note in made.notes:
         output.say(f"Without a clip: {note}")
@@ -92,9 +89,9 @@ def view(target: Path, /, *, out: Path | None = None, output: Output = OUTPUT) -
 
 
 def _export(episode: Path, out: Path, output: Output) -> Path:
-    with _needing("rerun", "rerun_bindings", package="rerun-sdk", purpose="the Rerun view"):
-        from dashboards.rerun_view import export_rrd as export
-        from dashboards.rerun_view import run_of
+    from dashboards.rerun_view import export_rrd as export
+    from dashboards.rerun_view import run_of
+
     done = export(episode, out, run_of(episode))
     for note in done.notes:
         output.say(f"Note: {note}")
@@ -109,18 +106,3 @@ def _export(episode: Path, out: Path, output: Output) -> Path:
     }
     output.result(data, text)
     return done.path
-
-
-@contextmanager
-def _needing(*modules: str, purpose: str, package: str = "") -> Iterator[None]:
-    """Name the extra where one of these modules is not there."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name not in modules:
-            raise
-        from bridge.errors import MissingDependencyError
-
-        raise MissingDependencyError(
-            package=package or error.name, extra="dashboard", purpose=purpose
-        ) from error

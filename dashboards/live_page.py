@@ -337,4 +337,4 @@ def _lost(status: Mapping[str, Any], topic: str) -> int | None:
     if not isinstance(tallies, dict):
         return None
     counts = _numbers(tallies.get(topic))
-    return int(sum(counts.get(name, 0) for name in ("gaps", "queue_drops", "shed")))
+    return int(sum(counts.get(name, 0) for name in ("gaps", "queue_drops")))

@@ -15,7 +15,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, NamedTuple
 
-from bridge.cli.exchange import import_images, import_rgbd, import_rosbag2
+from bridge.cli.exchange import import_rgbd, import_rosbag2
 from bridge.clock import NS_PER_S
 from bridge.data_files import datasets_folder
 from bridge.episode import schema
@@ -31,8 +31,8 @@ from bridge.exchange.trials_csv import trials_path, trials_text
 from bridge.leaves import load_leaf
 from bridge.robots.robot import Robot, read_robot, robot_of
 from bridge.sources.folder.messages import find_frames, read_index
-from bridge.sources.folder.posed_index import COLMAP_FOLDERS, TRANSFORMS, read_posed_index
 from bridge.sources.folder.scene_json import INDEX_NAME
+from bridge.sources.folder.transforms import TRANSFORMS
 from bridge.sources.folder.tum import find_lists
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
@@ -115,7 +115,7 @@ def open(
 ) -> int:
     """Say what a file or folder of yours holds, what it lacks and what comes next; or import it.
 
-    Bags, LeRobot datasets, RGB-D and posed images, splats, tables of trials, runs, URDFs.
+    Bags, LeRobot datasets, RGB-D images, splats, tables of trials, runs, URDFs.
     Example: robot-gst open bags/monday runs/monday
 
     Args:
@@ -204,12 +204,8 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _is_rgbd(folder: Path) -> bool:
-    return bool((folder / INDEX_NAME).is_file() or find_lists(folder) or find_frames(folder))
-
-
-def _is_posed(folder: Path) -> bool:
-    models = (folder / p / f"images.{end}" for p in COLMAP_FOLDERS for end in ("txt", "bin"))
-    return (folder / TRANSFORMS).is_file() or any(path.is_file() for path in models)
+    is_indexed = any((folder / name).is_file() for name in (INDEX_NAME, TRANSFORMS))
+    return bool(is_indexed or find_lists(folder) or find_frames(folder))
 
 
 def _is_rlds(folder: Path) -> bool:
@@ -223,10 +219,10 @@ FOLDERS: dict[str, Callable[[Path], bool]] = {
     "LeRobot dataset": lambda folder: (folder / "meta/info.json").is_file(),
     "RLDS dataset": _is_rlds,
     "RGB-D folder": _is_rgbd,
-    "folder of posed images": _is_posed,
-    "RGB-D folder without an index": lambda folder: (
-        is_paired(folder) and not _is_rgbd(folder) and not _is_posed(folder)
+    "COLMAP model": lambda folder: any(
+        any(folder.glob(f"{deep}points3D.*")) for deep in ("", "sparse/", "sparse/0/")
     ),
+    "RGB-D folder without an index": lambda folder: is_paired(folder) and not _is_rgbd(folder),
 }
 
 
@@ -343,18 +339,6 @@ def _rgbd(path: Path) -> Found:
         holds=tuple(f"assumed {name}: {value}" for name, value in index.assumed.items()),
         replay=ONLY_SEEN,
         bring=import_rgbd,
-    )
-
-
-def _posed(path: Path) -> Found:
-    index = read_posed_index(path)
-    return Found(
-        what=f"{len(index.images)} posed images, {index.layout}, read without depth: to look at",
-        holds=tuple(f"{what}: {why}" for what, why, _ in index.unused),
-        rebuild="depth images",
-        replay=f"depth images, {ONLY_SEEN}",
-        evaluate="depth images, or trials",
-        bring=import_images,
     )
 
 
@@ -493,7 +477,11 @@ KINDS: dict[str, Callable[[Path], Found]] = {
     "LeRobot dataset": _lerobot,
     "RGB-D folder": _rgbd,
     "RGB-D folder without an index": _unindexed,
-    "folder of posed images": _posed,
+    "COLMAP model": partial(
+        _converted,
+        "a COLMAP model",
+        "depth images and transforms.json; ns-process-data --skip-colmap of nerfstudio",
+    ),
     "splat": _splat,
     "table": _table,
     "robot description": _description,

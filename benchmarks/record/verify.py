@@ -147,7 +147,7 @@ def _declared(files: Sequence[Path]) -> dict[str, int] | None:
                 if record.name == "drops":
                     total = {} if total is None else total
                     for topic, counts in json.loads(record.metadata["topics"]).items():
-                        names = ("gaps", "queue_drops", "shed")
+                        names = ("gaps", "queue_drops")
                         lost = sum(counts.get(name, 0) for name in names)
                         total[topic] = total.get(topic, 0) + lost
     return total

@@ -1,50 +1,21 @@
 """Commands about episodes on disk, alone or all of a run, and the doctor."""
 
 import textwrap
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from bridge.episode.catalogue_query import UNLABELLED, CatalogueQuery
-from bridge.errors import refuse_outside
-from bridge.terminal import Advance, Output
-from bridge.wire.config import LOOPBACK
+from bridge.terminal import Output
 
 if TYPE_CHECKING:
     from bridge.episode.catalogue_query import Entry
     from bridge.episode.metadata import Outcome
     from bridge.episode.recovery_report import RecoveryReport
-    from bridge.episode.run_folder import RunFolder
 
 OUTPUT = Output()
-
-
-@dataclass(frozen=True, kw_only=True)
-class WireCheck:
-    """Listening to a publisher."""
-
-    wire: str | None = None
-    """Key expression of what to listen to, for example lab/** or lab/joint_states."""
-    seconds: float = 5.0
-    """How long to listen [s]."""
-    rate_hz: float | None = None
-    """What every topic should have [Hz]; 10 % off is wrong."""
-    connect: tuple[str, ...] = LOOPBACK
-    """Where the recorder, or another zenoh router, listens."""
-    listen: tuple[str, ...] = ()
-    """Be the router that the publisher connects to, instead."""
-    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None
-    """zenoh configuration (JSON5)."""
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that make no sense."""
-        refuse_outside(self, {"seconds": (0.01, 86_400.0), "rate_hz": (1e-3, 1e6)})
-
-
-WIRE = WireCheck()
 
 
 def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
@@ -76,7 +47,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         "recovered": opened.metadata_records.get("recovered"),
         "presence": opened.metadata_records.get(PRESENCE_RECORD),
         "findings": health["findings"],
-        "clocks": [clock.to_json() for clock in clocks],
+        "clocks": [clock.sentences() for clock in clocks],
         "topics": [asdict(item) for item in topics.values()],
     }
     about = opened.info
@@ -138,15 +109,12 @@ def check(
     /,
     *,
     contract: str | None = None,
-    wire: Annotated[WireCheck, Parameter(name="*", group="A publisher")] = WIRE,
     output: Output = OUTPUT,
 ) -> int:
     """Verify episodes (CRCs, indexes, counts, decoding); list drops and silent topics.
 
     Exit code 0: clean, 3: messages were dropped or a contract was broken, 1: broken.
     Example: robot-gst check runs/demo
-    With --wire it listens to a publisher instead and says what of the contract (docs/wire.md) it
-    does not keep: robot-gst check --wire "lab/**" --seconds 5
 
     Args:
         episodes: Episode files, or folders to search for them.
@@ -157,10 +125,6 @@ def check(
     from bridge.episode.mcap.part_file import told_unfinished
     from bridge.errors import UsageError
 
-    if wire.wire is not None:
-        if episodes:
-            raise UsageError("--wire listens to a publisher; give episodes in another command.")
-        return _check_wire(wire.wire, wire, output)
     files: list[Path] = []
     unfinished: list[Path] = []
     for path in episodes:
@@ -191,29 +155,6 @@ def check(
     left = [path for path, (_, alive) in zip(unfinished, told, strict=True) if not alive]
     codes |= {1 if path in episodes else 3 for path in left}
     return 1 if 1 in codes else max(codes, default=0)
-
-
-def _check_wire(key: str, config: WireCheck, output: Output) -> int:
-    from bridge.record.wire_check import WireListener, describe_heard
-    from bridge.terminal import stop_signals
-    from bridge.wire.config import WireConfig
-    from bridge.wire.session import open_session
-
-    if config.listen:
-        wire = WireConfig(
-            mode="router", connect=(), listen=config.listen, config=config.zenoh_config
-        )
-    else:
-        wire = WireConfig(connect=config.connect, config=config.zenoh_config)
-    with stop_signals() as stop, open_session(wire) as session:
-        listener = WireListener(session, key.lstrip("/"))
-        where = ", ".join(config.listen or config.connect)
-        output.say(f"listening to {key} on {where} for {config.seconds:g} s")
-        stop.wait(config.seconds)
-        heard = listener.finish(rate_hz=config.rate_hz)
-    data = {"key": key, "topics": [each.to_json() for each in heard]}
-    output.result(data, describe_heard(key, heard))
-    return 3 if not heard or any(each.findings for each in heard) else 0
 
 
 def doctor(*, output: Output = OUTPUT) -> int:
@@ -286,8 +227,6 @@ def _describe(report: "RecoveryReport") -> str:
 
 
 EVERYTHING = CatalogueQuery()
-WORTH_A_BAR = 200
-"""New episodes to read before progress is shown."""
 
 
 def ls(
@@ -297,51 +236,27 @@ def ls(
     query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
     output: Output = OUTPUT,
 ) -> int:
-    """List the episodes of a run, or of all runs of a folder, or those that pass the filters.
+    """List the episodes of a run, or those that pass the filters.
 
     Exit code 1 when one of them cannot be read.
-    Example: robot-gst ls runs/demo --kind trial --outcome failure --sort start --reverse
-    Search: robot-gst ls runs --text "cube slipped" --cell lab --since 2026-03-01
+    Example: robot-gst ls runs/demo --kind trial --outcome failure --text "cube slipped"
 
     Args:
-        run: Run folder, or a folder of runs.
-        query: Which, and in what order.
+        run: Run folder.
+        query: Which.
     """
-    from bridge.episode.catalogue import find_runs
+    from bridge.episode.catalogue import find_episodes
     from bridge.episode.mcap.part_file import told_unfinished
+    from bridge.episode.run_folder import RunFolder
 
-    runs = find_runs(run)
-    for path in (path for each in runs for path in sorted(each.episodes_dir.glob("*.part"))):
+    opened = RunFolder.open(run)
+    for path in sorted(opened.episodes_dir.glob("*.part")):
         output.say(told_unfinished(path)[0])
-    found = _find(runs, query, output)
-    entries = [entry for _, entry in found]
-    shown = entries
-    if len(runs) > 1:
-        names = [each.path.relative_to(run).as_posix() for each, _ in found]
-        shown = [replace(e, id=f"{name}/{e.id}") for name, e in zip(names, entries, strict=True)]
-    lines = episode_table(shown) if shown else [f"no episode in {run} passes these filters"]
-    data = [{**vars(entry), "run": str(each.path)} for each, entry in found]
-    output.result({"episodes": data}, "\n".join(lines))
+    opened.refuse_empty()
+    entries = find_episodes(opened, query)
+    lines = episode_table(entries) if entries else [f"no episode in {run} passes these filters"]
+    output.result({"episodes": [vars(entry) for entry in entries]}, "\n".join(lines))
     return 1 if any(entry.error for entry in entries) else 0
-
-
-def _find(
-    runs: "list[RunFolder]", query: CatalogueQuery, output: Output
-) -> "list[tuple[RunFolder, Entry]]":
-    from bridge.episode.catalogue import find_in_runs
-
-    with ExitStack() as stack:
-        shown: list[Advance] = []
-
-        def advance(done: int, total: int) -> None:
-            if not shown and total > WORTH_A_BAR:
-                shown.append(stack.enter_context(output.progress("read episodes", total)))
-            for show in shown:
-                show(done, "")
-
-        if len(runs) == 1:
-            runs[0].refuse_empty()
-        return find_in_runs(runs, query, advance=advance)
 
 
 COLUMNS = ("episode", "kind", "condition", "outcome", "seconds", "MB")

@@ -2,17 +2,14 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from bridge.clock import ClockChoice
 from bridge.episode.schema import StampedMessage
-from bridge.sources.folder.config import FolderConfig, PosedConfig
+from bridge.sources.folder.config import FolderConfig
 from bridge.terminal import Output
-
-if TYPE_CHECKING:
-    from bridge.episode.metadata import EpisodeInfo
 
 OUTPUT = Output()
 
@@ -139,18 +136,20 @@ def import_rgbd(
     config: Annotated[FolderConfig, Parameter(name="*")] = FOLDER,
     output: Output = OUTPUT,
 ) -> int:
-    """Turn an RGB-D folder into a scan episode: scene.json, TUM or 7-Scenes layout.
+    """Turn an RGB-D folder into a scan episode: scene.json, transforms.json, TUM, 7-Scenes.
 
     The layout is found by the files. TUM folders keep their real times and all their poses.
     Example: robot-gst import rgbd data/kitchen runs/kitchen --cell kitchen --camera kinect
 
     Args:
-        folder: Folder of one of the three layouts (docs/rgbd_folder.md).
+        folder: Folder of one of the four layouts (docs/rgbd_folder.md).
         run: Run folder; made where needed.
         episode: Id of the new episode.
     """
     from bridge.episode.metadata import EpisodeInfo
+    from bridge.episode.run_folder import RunFolder
     from bridge.exchange.output import Unused, tell_unused
+    from bridge.exchange.rgbd import write_scan
     from bridge.sources.folder.messages import (
         describe_folder,
         folder_messages,
@@ -163,9 +162,16 @@ def import_rgbd(
     for name, value in index.assumed.items():
         output.say(f"  assumed {name.replace('_', ' ')}: {value}")
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
-    source = describe_folder(index, config)
     total = num_frames(index, config)
-    path = _import_scan(run, info, folder_messages(index, config), total, source, output)
+    with output.progress("import", total) as advance:
+
+        def messages() -> Iterator[StampedMessage]:
+            for done, frame in enumerate(folder_messages(index, config), start=1):
+                yield from frame
+                advance(done, "")
+
+        source = describe_folder(index, config)
+        path = write_scan(RunFolder.create(run), info, messages(), source=source)
     unused = [Unused(*item) for item in index.unused]
     data = {
         "file": str(path),
@@ -179,72 +185,7 @@ def import_rgbd(
     return tell_unused(output, unused)
 
 
-def _import_scan(
-    run: Path,
-    info: "EpisodeInfo",
-    frames: Iterator[list[StampedMessage]],
-    total: int,
-    source: dict[str, Any],
-    output: Output,
-) -> Path:
-    """Write one scan episode, frame by frame; the run folder is made where needed."""
-    from bridge.episode.run_folder import RunFolder
-    from bridge.exchange.rgbd import write_scan
-
-    with output.progress("import", total) as advance:
-
-        def messages() -> Iterator[StampedMessage]:
-            for done, frame in enumerate(frames, start=1):
-                yield from frame
-                advance(done, "")
-
-        return write_scan(RunFolder.create(run), info, messages(), source=source)
-
-
-POSED = PosedConfig()
-
-
-def import_images(
-    folder: Path,
-    run: Path,
-    /,
-    *,
-    episode: str = "scan",
-    config: Annotated[PosedConfig, Parameter(name="*")] = POSED,
-    output: Output = OUTPUT,
-) -> int:
-    """Turn posed images without depth into a scan episode: COLMAP's text model, transforms.json.
-
-    To be looked at: rebuild needs depth. Lengths are metric only with --metres-per-unit.
-    Example: robot-gst import images data/garden runs/garden
-
-    Args:
-        folder: Folder of one of the two layouts (docs/rgbd_folder.md).
-        run: Run folder; made where needed.
-        episode: Id of the new episode.
-    """
-    from bridge.episode.metadata import EpisodeInfo
-    from bridge.exchange.output import Unused, tell_unused
-    from bridge.sources.folder.posed_index import read_posed_index
-    from bridge.sources.folder.posed_messages import describe_posed, posed_messages
-
-    source = describe_posed(index := read_posed_index(folder), config)
-    output.say(f"{index.path}: {index.layout}, {len(index.images)} images")
-    for name, value in index.assumed.items():
-        output.say(f"  assumed {name}: {value}")
-    if not source["is_metric"]:
-        output.say(
-            "  not metric: lengths are scaled so that the cameras look at what is 1 m away; "
-            "--metres-per-unit says how long a unit of the folder is"
-        )
-    info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
-    made = posed_messages(index, config)
-    path = _import_scan(run, info, made, len(index.images), source, output)
-    unused = [Unused(*item) for item in index.unused]
-    data = {"file": str(path), "images": len(index.images), **source}
-    data["unused"] = [item._asdict() for item in unused]
-    output.result(data, f"{path}: {len(index.images)} posed images without depth")
-    return tell_unused(output, unused)
+import_images = import_rgbd
 
 
 def import_rosbag2(

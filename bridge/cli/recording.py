@@ -1,6 +1,5 @@
 """Commands that record, and that control a recorder from anywhere."""
 
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 OUTPUT = Output()
 ABOUT = EpisodeAbout()
 RECORDER = RecorderConfig()
-Action = Literal["start", "stop", "mark", "label", "list", "status"]
+Action = Literal["start", "stop", "mark", "label", "status"]
 
 
 def record(
@@ -27,7 +26,6 @@ def record(
     episode: str | None = None,
     duration_s: Annotated[float | None, Parameter(name=("--duration", "--duration-s"))] = None,
     anyway: Annotated[bool, RARE] = False,
-    learn: Annotated[Path | None, RARE] = None,
     about: Annotated[EpisodeAbout, Parameter(name="*")] = ABOUT,
     config: Annotated[RecorderConfig, Parameter(name="*")] = RECORDER,
     listen: tuple[str, ...] = LOOPBACK,
@@ -37,7 +35,7 @@ def record(
 ) -> int:
     """Record episodes live; everything published to this recorder ends up in one.
 
-    Without --episode it waits for robot-gst ctl start, or the keys shown on a terminal.
+    Without --episode it waits for robot-gst ctl start.
     SIGINT or SIGTERM finish the open episode.
     Example: robot-gst record runs/monday --episode scan --duration 30
 
@@ -46,8 +44,7 @@ def record(
         episode: Start this episode at once.
         duration_s: Stop after this long [s]; with --episode.
         anyway: Start it although topics are missing that cell.toml requires; else it waits.
-        learn: Write the run's cell.toml from this good episode, and record nothing.
-        about: What is being recorded, with --episode or the key s.
+        about: What is being recorded, with --episode.
         listen: Where to listen; other processes connect here.
         connect: Other zenoh routers to join.
         zenoh_config: zenoh configuration (JSON5), for example with access control.
@@ -58,8 +55,6 @@ def record(
     from bridge.record.status import describe_answer
     from bridge.wire.config import WireConfig
 
-    if learn is not None:
-        return _learn(run, learn, output)
     if duration_s is not None and (episode is None or duration_s <= 0):
         raise UsageError("--duration needs --episode ID and a time above zero.")
     about, task = _with_task_file(about)
@@ -74,28 +69,11 @@ def record(
             output=output,
             episode=info,
             duration_s=duration_s,
-            about=about,
             anyway=anyway,
             task=task,
         )
     data = answer or {"ok": True, "episode": None}
     output.result(data, describe_answer(data) if answer else "stopped; no episode was open")
-    return 0
-
-
-def _learn(run: Path, episode: Path, output: Output) -> int:
-    from bridge.episode.check import learn_from
-    from bridge.episode.contract import CONTRACT_FILE, write_contract
-    from bridge.episode.run_folder import RunFolder
-
-    contract = learn_from(episode)
-    path = RunFolder.create(run).path / CONTRACT_FILE
-    write_contract(contract, path, source=episode.name)
-    output.result(
-        {"file": str(path), "topics": len(contract.topics), "required": contract.required()},
-        f"{path}: {len(contract.topics)} topics, {len(contract.required())} required. "
-        "Look through it; every episode recorded from now on is held to it.",
-    )
     return 0
 
 
@@ -110,7 +88,6 @@ def ctl(
     detail: str | None = None,
     discard: bool = False,
     anyway: bool = False,
-    last: int = 20,
     recorder: Annotated[str, RARE] = "main",
     connect: tuple[str, ...] = LOOPBACK,
     zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
@@ -121,20 +98,18 @@ def ctl(
     Example: robot-gst ctl start --id trial_0001 --task cube_into_box --cell standin
 
     Args:
-        action: start, stop, mark, label, list or status.
+        action: start, stop, mark, label or status.
         text: Words of a mark or label.
-        id: Episode to start, or to label after it has been finished.
+        id: Episode to start, by default the next number, or to label when it is finished.
         about: What is being recorded (start).
         result: How it went (stop, label).
         detail: What happened, in words (stop, label).
         discard: Throw the open episode away (stop).
         anyway: Start although topics are missing that cell.toml requires (start).
-        last: How many episodes, by name from the end (list).
         recorder: Name of the recorder.
         connect: Where it listens.
         zenoh_config: zenoh configuration (JSON5).
     """
-    from bridge.errors import UsageError
     from bridge.record.control import RecorderClient
     from bridge.record.status import describe_answer, describe_status
     from bridge.wire.config import WireConfig
@@ -150,17 +125,12 @@ def ctl(
         "stop": {"outcome": outcome, "discard": discard},
         "mark": {"text": text},
         "label": {"text": text, "outcome": outcome, "episode": id},
-        "list": {"last": last},
         "status": {},
     }
-    if action == "start" and id is None:
-        raise UsageError("start needs the new episode's id: robot-gst ctl start --id trial_0001.")
     with open_session(WireConfig(connect=connect, config=zenoh_config)) as session:
         answer = RecorderClient(session, recorder).ask(action, requests[action])
-    describers: dict[str, Callable[[dict[str, Any]], str]]
-    describers = {"status": describe_status, "list": _describe_list}
-    describe = describers.get(action, describe_answer)
-    output.result(answer, describe(answer))
+    text = describe_status(answer) if action == "status" else describe_answer(answer)
+    output.result(answer, text)
     return 0
 
 
@@ -172,16 +142,3 @@ def _with_task_file(about: EpisodeAbout) -> "tuple[EpisodeAbout, TaskFile | None
         return about, None
     file = TaskFile.read(Path(about.task))
     return replace(about, task=file.task().name), file
-
-
-def _describe_list(answer: dict[str, Any]) -> str:
-    from bridge.cli.episodes import episode_table
-    from bridge.episode.catalogue_query import Entry
-    from bridge.episode.metadata import build
-
-    entries = [build(Entry, item) for item in answer["episodes"]]
-    if not entries:
-        return "no episode has been recorded yet"
-    left_out = answer["of"] - len(entries)
-    more = [f"({left_out} more before these)"] if left_out else []
-    return "\n".join([*more, *episode_table(entries)])

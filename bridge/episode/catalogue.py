@@ -1,8 +1,8 @@
 """A run's episodes at a glance: listed, filtered and labelled."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,25 +19,13 @@ from bridge.task.find import chosen_task_file, keep_task_file
 from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
 
-Advance = Callable[[int, int], None]
-"""Called as ``advance(done, total)`` while files are read."""
 EVERYTHING = CatalogueQuery()
 
 
-def find_episodes(
-    run: RunFolder, query: CatalogueQuery = EVERYTHING, *, advance: Advance | None = None
-) -> list[Entry]:
-    """Return the episodes that pass all filters; a broken one is listed with its error."""
-    found = []
-    episodes = run.episodes()
-    for done, path in enumerate(episodes, start=1):
-        entry = read_entry(run, path)
-        if query.takes(entry):
-            found.append(entry)
-        if advance is not None:
-            advance(done, len(episodes))
-    found.sort(key=query.sort_key, reverse=query.reverse)
-    return found[: query.limit]
+def find_episodes(run: RunFolder, query: CatalogueQuery = EVERYTHING) -> list[Entry]:
+    """Return the episodes that pass all filters, by name; a broken one with its error."""
+    found = (read_entry(run, path) for path in run.episodes())
+    return sorted(filter(query.takes, found), key=lambda entry: entry.file)
 
 
 def sidecar_path(run: RunFolder, episode_id: str) -> Path:
@@ -86,21 +74,11 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         return Entry(**name, size_bytes=size, error=printable(str(error)))
     records = episode.metadata_records
     presence = records.get(PRESENCE_RECORD, {})
+    about = {key: value for key, value in asdict(info).items() if key in Entry.__annotations__}
     return Entry(
+        **{key: _printable(value) for key, value in about.items() if key not in name},
         **name,
         size_bytes=size,
-        kind=printable(info.kind),
-        task=printable(info.task),
-        instruction=printable(info.instruction),
-        condition=printable(info.condition),
-        policy=printable(info.policy),
-        start_id=None if info.start_id is None else printable(info.start_id),
-        trial=info.trial,
-        operator=printable(info.operator),
-        robot=printable(info.robot),
-        cell=printable(info.cell),
-        stand_in=info.stand_in,
-        tags=tuple(printable(str(tag)) for tag in info.tags),
         outcome=printable(outcome.result) if outcome else "unknown",
         cause=printable(_cause(info.kind, outcome)),
         start_ns=episode.start_ns,
@@ -110,6 +88,12 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         recovered="recovered" in records,
         presence=printable("; ".join(health_lines({**presence, **records.get(RECORD_NAME, {})}))),
     )
+
+
+def _printable(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(printable(str(item)) for item in value)
+    return printable(value) if isinstance(value, str) else value
 
 
 def _cause(kind: str, outcome: Outcome | None) -> str:
@@ -125,38 +109,6 @@ def _declared_lost(drops: dict[str, Any] | None) -> int | None:
     counts: Iterable[Any] = (drops.get(name, 0) for name in ("gaps", "queue_drops", "shed"))
     found = [count for count in counts if isinstance(count, int)]
     return sum(found) if len(found) == 3 else None
-
-
-RUNS_DEEP = 3
-"""How far below a folder its runs are looked for."""
-
-
-def find_runs(folder: Path) -> list[RunFolder]:
-    """Return a run, or all runs of a folder of runs, by name."""
-    run = RunFolder.open(folder)
-    if run.episodes_dir.is_dir():
-        return [run]
-    patterns = ("/".join(["*"] * depth + ["episodes"]) for depth in range(1, RUNS_DEEP + 1))
-    found = {each.parent for pattern in patterns for each in folder.glob(pattern) if each.is_dir()}
-    runs = [RunFolder(path) for path in sorted(found) if not path.name.startswith(".")]
-    if not runs:
-        run.refuse_empty()
-    return runs
-
-
-def find_in_runs(
-    runs: Sequence[RunFolder], query: CatalogueQuery, *, advance: Advance | None = None
-) -> list[tuple[RunFolder, Entry]]:
-    """Return the episodes of several runs that pass all filters, in one order."""
-    found = [
-        (run, entry)
-        for run in runs
-        for entry in find_episodes(run, replace(query, limit=None), advance=advance)
-    ]
-    if len(runs) > 1:
-        key = query.sort_key
-        found.sort(key=lambda pair: (*key(pair[1]), str(pair[0].path)), reverse=query.reverse)
-    return found[: query.limit]
 
 
 def assign_trial(

@@ -3,13 +3,7 @@
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import datetime
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from bridge.errors import UsageError, refuse_outside
-from bridge.terminal import RARE
 
 UNLABELLED = "nobody labelled it"
 """Why the outcome of a trial is unknown that has no label."""
@@ -75,17 +69,10 @@ def printable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode()
 
 
-Order = Literal["name", "start", "duration", "size", "messages", "lost", "task", "outcome"]
-_COLUMNS: dict[str, str] = {
-    "name": "file",
-    "start": "start_ns",
-    "duration": "duration_s",
-    "size": "size_bytes",
-}
-
-
-_EXACT = ("kind", "task", "condition", "policy", "operator", "cell", "robot", "outcome")
-_SEARCHED = (*_EXACT, "id", "instruction", "tags", "cause", "presence", "error")
+_SEARCHED = (
+    *("id", "kind", "task", "condition", "policy", "operator", "cell", "robot", "outcome"),
+    *("instruction", "tags", "cause", "presence", "error"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,83 +83,17 @@ class CatalogueQuery:
     """scan, trial, retry, probe or imported."""
     task: tuple[str, ...] = ()
     """Id of the task file."""
-    condition: tuple[str, ...] = ()
-    """without_replanning or with_replanning."""
-    policy: tuple[str, ...] = ()
-    """Name of the planner or policy."""
-    operator: Annotated[tuple[str, ...], RARE] = ()
-    """Who was there."""
-    cell: tuple[str, ...] = ()
-    """Name of the cell."""
-    robot: Annotated[tuple[str, ...], RARE] = ()
-    """Which robot."""
     outcome: tuple[str, ...] = ()
     """success, failure or unknown."""
-    tag: tuple[str, ...] = ()
-    """A tag; of several, all must be there."""
-    text: str | None = None
-    """These words, in whatever case, in name, task, instruction, tags, cause ..."""
-    since: str | None = None
-    """Begun at or after this time, for example 2026-03-01 or 2026-03-01T14:30 (local)."""
-    until: str | None = None
-    """Begun before this time."""
-    lost: bool | None = None
-    """Only with dropped messages, or recovered after a crash; --no-lost only those without."""
-    error: bool | None = None
-    """Only those that cannot be read; --no-error only the others."""
-    sort: Order = "name"
-    """Order of the list."""
-    reverse: Annotated[bool, RARE] = False
-    """Largest or latest first."""
-    limit: int | None = None
-    """At most this many."""
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be asked."""
-        refuse_outside(self, {"limit": (0, float("inf"))})
-        _ = self._begun_ns
-
-    @cached_property
-    def _begun_ns(self) -> tuple[int | None, int | None]:
-        """Not before the first, and before the second."""
-        return _instant_ns("since", self.since), _instant_ns("until", self.until)
+    text: str = ""
+    """These words, in whatever case, in name, task, cell, operator, tags, cause ..."""
 
     def takes(self, entry: Entry) -> bool:
         """Whether an entry passes all filters."""
-        since_ns, until_ns = self._begun_ns
-        is_lossy = bool(entry.lost) or entry.recovered
+        folded = "\n".join(str(getattr(entry, name)) for name in _SEARCHED).casefold()
         return (
-            all(
-                getattr(entry, name) in (getattr(self, name) or [getattr(entry, name)])
-                for name in _EXACT
-            )
-            and set(self.tag) <= set(entry.tags)
-            and (since_ns is None or entry.start_ns >= since_ns)
-            and (until_ns is None or entry.start_ns < until_ns)
-            and (self.text is None or _holds(entry, self.text))
-            and self.lost in (None, is_lossy)
-            and self.error in (None, bool(entry.error))
+            (not self.kind or entry.kind in self.kind)
+            and (not self.task or entry.task in self.task)
+            and (not self.outcome or entry.outcome in self.outcome)
+            and all(word in folded for word in self.text.casefold().split())
         )
-
-    def sort_key(self, entry: Entry) -> tuple[bool, Any, str]:
-        """What an entry is ordered by, where the answers of several runs are put together."""
-        value = getattr(entry, _COLUMNS.get(self.sort, self.sort))
-        return value is not None, value, entry.file
-
-
-def _instant_ns(name: str, text: str | None) -> int | None:
-    if text is None:
-        return None
-    try:
-        return round(datetime.fromisoformat(text).timestamp() * 1e6) * 1000
-    except (ValueError, OverflowError, OSError) as error:
-        raise UsageError(
-            f"--{name} {text!r} is no date or time. "
-            "Write it like 2026-03-01 or 2026-03-01T14:30, with +01:00 behind it if not local."
-        ) from error
-
-
-def _holds(entry: Entry, words: str) -> bool:
-    """Whether all words are there, in any order and case."""
-    folded = "\n".join(map(str, (getattr(entry, name) for name in _SEARCHED))).casefold()
-    return all(word in folded for word in words.casefold().split())

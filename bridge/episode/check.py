@@ -21,7 +21,6 @@ from bridge.episode.contract import (
     contract_from,
     findings_of,
     judge,
-    learn_contract,
     unseen_losses,
 )
 from bridge.episode.health import HealthFinding, drops_logged, in_order, in_words, unreadable
@@ -29,7 +28,7 @@ from bridge.episode.metadata import BY_DISK
 from bridge.episode.reader import Episode
 from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import LIBRARY
-from bridge.errors import BridgeError, UsageError
+from bridge.errors import BridgeError
 
 
 @dataclass(kw_only=True)
@@ -102,26 +101,11 @@ def check_episode(path: Path, *, contract: Contract | None = None) -> CheckRepor
     if episode is not None:
         report.start_ns, records = episode.start_ns, episode.metadata_records
         is_judged = "recorder" in records or ("recovered" in records and RECORD_NAME in records)
-        if watch.decoder.was_paused:
-            report.notes.append("it was paused: what was missing or silent then is not judged")
-        elif is_judged:
+        if is_judged:
             _judge_presence(report, episode, watch, faults, contract)
     report.faults, report.num_faults = faults.listed, faults.count
     report.findings = in_order(report.findings)
     return report
-
-
-def learn_from(path: Path) -> Contract:
-    """Learn the contract of a cell from a good episode of it.
-
-    Raises:
-        UsageError: When the episode is not clean, or no recorder of ours made it.
-    """
-    report = check_episode(path, contract=Contract(topics={}))
-    if report.exit_code or not report.presences:
-        found = "\n".join(report.lines()) if report.exit_code else "it is no recording"
-        raise UsageError(f"{path} is not an episode to learn from: {found}")
-    return learn_contract(report.presences, cell=Episode.open(path).info.cell)
 
 
 def _open(path: Path, faults: Faults, watch: "_Watch") -> Episode | None:
@@ -163,10 +147,6 @@ def _find_ends(report: CheckReport, episode: Episode) -> None:
     stopped_by = str(episode.record("recorder").get("stopped_by", ""))
     if stopped_by.startswith(BY_DISK):
         report.find("cut_short", name, f"ended by the {stopped_by}")
-    split = episode.record("split")
-    if split and (split.get("index") != 1 or split.get("last") is not True):
-        text = "one part of several of an earlier edition; mcap merge makes one file of them"
-        report.find("cut_short", name, text)
     if recovered := episode.record("recovered"):
         lost = recovered.get("bytes_lost", "an unknown number of")
         text = f"{recovered.get('reason', 'its recorder died')}; {lost} bytes were lost"
@@ -217,7 +197,7 @@ def _judge_topics(
         if result.time_steps_back:
             text = f"{topic}: its log time steps back {result.time_steps_back} times"
             (say if is_recording else report.notes.append)(text)
-        if decoder.has_drop_log and topic not in shared and not decoder.was_paused:
+        if decoder.has_drop_log and topic not in shared:
             missing = max(0, result.sequence_gaps - result.declared_losses)
             report.undeclared_losses += missing
             if missing:

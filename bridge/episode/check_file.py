@@ -9,21 +9,18 @@ from pathlib import Path
 from mcap import records
 from mcap.summary import Summary
 
-from bridge.episode.mcap.data_walk import DataWalk, ScannedMessage, Seen
-from bridge.episode.mcap.file import read_footer, read_header, read_summary
+from bridge.episode.mcap.damaged import RecordFile
+from bridge.episode.mcap.data_walk import DataWalk, ScannedMessage
+from bridge.episode.mcap.format import FileSummary
 from bridge.episode.mcap.walk import (
     DAMAGE,
-    BrokenRecordError,
-    ByteStream,
-    parse,
-    read_body,
-    walk,
+    read_footer,
+    read_header,
+    read_summary,
 )
 
 
-def summary_faults(
-    stream: ByteStream, seen: Seen, summary: Summary | None, footer: records.Footer, footer_at: int
-) -> Iterator[str]:
+def summary_faults(seen: FileSummary, summary: Summary | None) -> Iterator[str]:
     """Yield a sentence for every place where summary and data disagree.
 
     What a writer may leave out (statistics, repeated records, an index as a whole) is no fault.
@@ -40,24 +37,22 @@ def summary_faults(
             yield f"the summary's channel {channel.id} ({channel.topic}) is not that of the data"
     if summary.statistics is not None:
         yield from _statistics_faults(seen, summary.statistics, *in_data)
-    yield from _index_faults("chunk", summary.chunk_indexes, seen.chunks, "chunk_start_offset")
-    yield from _index_faults("attachment", summary.attachment_indexes, seen.attachments, "offset")
-    yield from _index_faults("metadata", summary.metadata_indexes, seen.metadata, "offset")
-    if footer.summary_offset_start:
-        yield from _offset_faults(stream, footer, footer_at)
+    for what in ("chunk", "attachment", "metadata"):
+        said, found = (getattr(each, f"{what}_indexes") for each in (summary, seen))
+        key = "chunk_start_offset" if what == "chunk" else "offset"
+        yield from _index_faults(what, said, found, key)
 
 
 def _statistics_faults(
-    seen: Seen, said: records.Statistics, num_schemas: int, num_channels: int
+    seen: FileSummary, said: records.Statistics, num_schemas: int, num_channels: int
 ) -> Iterator[str]:
-    num_attachments = len(seen.attachments) + seen.num_broken_attachments
     pairs = {
-        "messages": (said.message_count, sum(seen.counts.values())),
+        "messages": (said.message_count, sum(seen.message_counts.values())),
         "schemas": (said.schema_count, _either(said.schema_count, seen.schemas, num_schemas)),
         "channels": (said.channel_count, _either(said.channel_count, seen.channels, num_channels)),
-        "attachments": (said.attachment_count, num_attachments),
-        "metadata records": (said.metadata_count, len(seen.metadata)),
-        "chunks": (said.chunk_count, seen.num_chunks),
+        "attachments": (said.attachment_count, len(seen.attachment_indexes)),
+        "metadata records": (said.metadata_count, len(seen.metadata_indexes)),
+        "chunks": (said.chunk_count, len(seen.chunk_indexes)),
     }
     for what, (count, found) in pairs.items():
         if count != found:
@@ -65,11 +60,11 @@ def _statistics_faults(
     times = (said.message_start_time, said.message_end_time)
     # Log time 0 means "none yet" to the Go writer, which then states the next one.
     start_ns = said.message_start_time if seen.start_ns == 0 else seen.start_ns
-    if seen.counts and times != (start_ns, seen.end_ns):
+    if seen.message_counts and times != (start_ns, seen.end_ns):
         yield f"the summary says messages from {times}, they are from {(start_ns, seen.end_ns)}"
-    for channel_id in sorted(said.channel_message_counts.keys() | seen.counts.keys()):
+    for channel_id in sorted(said.channel_message_counts.keys() | seen.message_counts.keys()):
         count = said.channel_message_counts.get(channel_id, 0)
-        found = seen.counts.get(channel_id, 0)
+        found = seen.message_counts.get(channel_id, 0)
         if count != found and said.channel_message_counts:
             channel = seen.channels.get(channel_id)
             name = channel.topic if channel else f"channel {channel_id}"
@@ -97,39 +92,21 @@ def _index_faults(what: str, said: list, found: list, key: str) -> Iterator[str]
         yield f"the {what} at byte {at} is not in the index"
 
 
-def _offset_faults(stream: ByteStream, footer: records.Footer, footer_at: int) -> Iterator[str]:
-    for place in walk(stream, footer.summary_offset_start, footer_at):
-        record = parse(place.opcode, read_body(stream, place))
-        if not isinstance(record, records.SummaryOffset):
-            yield f"a record of kind {place.opcode} among the summary's offsets"
-            continue
-        start, end = record.group_start, record.group_start + record.group_length
-        is_inside = footer.summary_start <= start <= end <= footer.summary_offset_start
-        if not is_inside or not _are_all(record.group_opcode, stream, start, end):
-            yield f"the summary's offset of records of kind {record.group_opcode} is wrong"
-
-
-def _are_all(opcode: int, stream: ByteStream, start: int, end: int) -> bool:
-    """Whether whole records of one kind, or none, lie between two offsets."""
-    try:
-        return all(place.opcode == opcode for place in walk(stream, start, end))
-    except BrokenRecordError:
-        return False
+LISTED = 20
 
 
 class Faults:
     """The first faults of each kind of place; a damaged file could have millions."""
 
-    def __init__(self, limit: int = 20) -> None:
-        """List at most ``limit``."""
+    def __init__(self) -> None:
+        """Begin with none."""
         self.listed: list[str] = []
         self.count = 0
-        self._limit = limit
 
     def add(self, text: str) -> None:
         """Take one more."""
         self.count += 1
-        if len(self.listed) < self._limit:
+        if len(self.listed) < LISTED:
             self.listed.append(text)
 
 
@@ -151,10 +128,10 @@ class FileCheck:
             with self.path.open("rb") as stream:
                 self.library = read_header(stream).library
                 footer, footer_at = read_footer(stream)
-                data = DataWalk(stream, fault=self._fault, doubt=self._fault)
-                yield from data.messages(footer.summary_start or footer_at)
-                summary = read_summary(stream, footer, footer_at)
-                for text in summary_faults(stream, data.seen, summary, footer, footer_at):
+                file = RecordFile(stream, footer.summary_start or footer_at)
+                data = DataWalk(file, fault=self._fault, doubt=self._fault)
+                yield from data.messages()
+                for text in summary_faults(data.seen, read_summary(stream, footer, footer_at)):
                     self._fault(text)
         except DAMAGE as error:
             self._fault(f"damaged: {error}" if str(error) else f"damaged ({type(error).__name__})")

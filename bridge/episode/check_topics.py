@@ -1,9 +1,11 @@
 """What one topic shows over a whole episode: numbers, times, rate, and whether it decodes."""
 
-from collections import deque
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
@@ -21,7 +23,7 @@ from bridge.episode.cdr.messages import (
 from bridge.episode.contract import Presence, TopicReport
 from bridge.episode.health import ContentWatch, HealthFinding, mixed_types, of_event
 from bridge.episode.mcap.data_walk import ScannedMessage
-from bridge.episode.schema import DEFINITIONS
+from bridge.episode.schema import ROS_TYPES
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.task.plan import Plan
@@ -48,8 +50,6 @@ class Decoder:
         """Type or encoding of topics that are kept, and that nothing here reads."""
         self.findings: list[HealthFinding] = []
         """What the recorder noticed of clocks, and of itself."""
-        self.was_paused = False
-        """By a recorder of an earlier edition, which then left messages out."""
         self._depth_sizes: dict[str, tuple[int, int]] = {}
         self._info_sizes: dict[str, tuple[int, int]] = {}
 
@@ -66,7 +66,7 @@ class Decoder:
             self.unused[topic] = type_name or encoding or "no type"
             return
         is_known = type_of_topic(topic) is not None or type_name == schema.IMAGE
-        if type_name in DEFINITIONS and not is_known:
+        if type_name in ROS_TYPES and not is_known:
             codec.decode(type_name, data)
             return
         try:
@@ -91,12 +91,10 @@ class Decoder:
         elif type_name == schema.DROPS:
             self._add_losses(parse_record(data, name="drops", package="bridge.episode"))
         elif type_name == schema.EVENT:
-            event = parse_record(data, name="event", package="bridge.episode")
-            self.findings += of_event(event)
-            self.was_paused |= event["type"] == "paused"
+            self.findings += of_event(parse_record(data, name="event", package="bridge.episode"))
         elif type_name in _DECODERS:
             _DECODERS[type_name](data)
-        elif type_name in DEFINITIONS:
+        elif type_name in ROS_TYPES:
             codec.decode(type_name, data)
 
     def _add_losses(self, record: dict[str, Any]) -> None:
@@ -140,54 +138,17 @@ YEAR_NS = 31_556_952 * NS_PER_S
 LATEST_NS, MOST_YEARS = 230 * YEAR_NS, 10
 """No recorder of today says later, or records for so long."""
 _WRAP = 1 << 32
-_MAX_OPEN_GAPS = 64
+_FAR_BACK = 32
+"""A number so far behind the one before it is none that came late: its publisher began anew."""
 
 
-class SequenceWatch:
-    """Counts missing sequence numbers; late ones are taken off again, a restart is no gap."""
-
-    def __init__(self) -> None:
-        """Start before the first number."""
-        self.gaps = 0
-        self.backward = 0
-        """Numbers seen before, late ones and restarts."""
-        self._next: int | None = None
-        self._open: deque[tuple[int, int]] = deque(maxlen=_MAX_OPEN_GAPS)
-        self._last_backward: int | None = None
-
-    def see(self, sequence: int) -> None:
-        """Take the next number in the order of the file."""
-        if self._next is None:
-            self._next = (sequence + 1) % _WRAP
-            return
-        ahead = (sequence - self._next) % _WRAP
-        if ahead < _WRAP // 2:
-            if ahead:
-                self.gaps += ahead
-                self._open.append((self._next, ahead))
-            self._next = (sequence + 1) % _WRAP
-            self._last_backward = None
-            return
-        self.backward += 1
-        if self._fill(sequence):
-            return
-        # Two in a row that count on: the publisher has begun anew.
-        if self._last_backward is not None and sequence == (self._last_backward + 1) % _WRAP:
-            self._next = (sequence + 1) % _WRAP
-            self._open.clear()
-        self._last_backward = sequence
-
-    def _fill(self, sequence: int) -> bool:
-        for index, (start, length) in enumerate(self._open):
-            at = (sequence - start) % _WRAP
-            if at < length:
-                del self._open[index]
-                for rest in ((start, at), ((sequence + 1) % _WRAP, length - at - 1)):
-                    if rest[1]:
-                        self._open.append(rest)
-                self.gaps -= 1
-                return True
-        return False
+def missing_numbers(sequences: array) -> int:  # type: ignore[type-arg]
+    """Count missing sequence numbers; a late one is not missing, and a restart is no gap."""
+    numbers = np.array(sequences, dtype=np.int64)
+    steps = (np.diff(numbers) + _WRAP // 2) % _WRAP - _WRAP // 2
+    places = np.cumsum(np.concatenate([numbers[:1], steps]))
+    runs = np.split(places, np.flatnonzero(steps < -_FAR_BACK) + 1)
+    return sum(int(np.ptp(run)) + 1 - len(np.unique(run)) for run in runs if len(run))
 
 
 @dataclass(kw_only=True)
@@ -200,8 +161,6 @@ class TopicCheck:
     """Mean over the topic's own time, 0 for fewer than two messages."""
     sequence_gaps: int = 0
     """Numbers missing between those that are there."""
-    sequences_backward: int = 0
-    """Numbers repeated, late, or of a publisher that began anew."""
     declared_losses: int = 0
     """Gaps, queue drops and shed messages the drop log lists."""
     time_steps_back: int = 0
@@ -224,7 +183,9 @@ class TopicWatch:
     """By type."""
     odd: list[int] = field(default_factory=list)
     """When messages came whose times cannot be."""
-    sequences: SequenceWatch = field(default_factory=SequenceWatch)
+    sequences: array = field(  # type: ignore[type-arg]
+        default_factory=lambda: array("L")
+    )
     presence: Presence = field(default_factory=Presence)
     last_ns: dict[int, int] = field(default_factory=dict)
     """By channel: two definitions of a topic may lie in different chunks, in another order."""
@@ -241,7 +202,7 @@ class TopicWatch:
             content.see(message.data, head.log_time_ns)
         if max(head.log_time_ns, head.publish_time_ns) > LATEST_NS:
             self.odd.append(head.log_time_ns)
-        self.sequences.see(head.sequence)
+        self.sequences.append(head.sequence)
         if head.log_time_ns < self.last_ns.get(head.channel_id, 0):
             result.time_steps_back += 1
         self.last_ns[head.channel_id] = head.log_time_ns
@@ -267,8 +228,7 @@ class TopicWatch:
     def finish(self) -> TopicCheck:
         """Work out what needs all messages."""
         result = self.result
-        result.sequence_gaps = self.sequences.gaps
-        result.sequences_backward = self.sequences.backward
+        result.sequence_gaps = missing_numbers(self.sequences)
         span_s = (self.presence.last_ns - self.presence.first_ns) * 1e-9
         if result.messages > 1 and span_s > 0:
             result.rate_hz = (result.messages - 1) / span_s

@@ -13,8 +13,6 @@ from bridge.episode.mcap.data_section import DataSection, EncodedChunk
 
 _INDEX_BYTES = 15
 """Of a message index without entries, which have 16 bytes each."""
-BATCH_BYTES = 4 << 20
-"""Large chunks written with one call: a disk that is slow by the call keeps up."""
 
 
 class _Small(NamedTuple):
@@ -24,7 +22,8 @@ class _Small(NamedTuple):
 
 def _size(chunk: EncodedChunk) -> int:
     """Bytes of a chunk and of its message indexes."""
-    return chunk.length + sum(_INDEX_BYTES + 8 * len(entries) for entries in chunk.index.values())
+    entries = sum(map(len, chunk.index.values()))
+    return chunk.entry.chunk_length + _INDEX_BYTES * len(chunk.index) + 8 * entries
 
 
 class ChunkQueue:
@@ -39,7 +38,6 @@ class ChunkQueue:
         self._error: OSError | None = None
         self._is_held = False
         """Nothing is written after an error, until its owner knows and calls again."""
-        self._batch_bytes = BATCH_BYTES
         self._busy_since_s: float | None = None
         self._is_ending = False
         self._changed = threading.Condition()
@@ -129,7 +127,7 @@ class ChunkQueue:
                     break
                 small = [] if turn_of_bulk and self._bulk else [each.chunk for each in self._small]
                 turn_of_bulk = bool(small)
-                chunks = small or self._batch()
+                chunks = small or [self._bulk[0]]
                 self._busy_since_s = self._monotonic()
             error = None
             try:
@@ -141,20 +139,7 @@ class ChunkQueue:
                 self._error, self._is_held = error, error is not None
                 if error is None:
                     self._forget(len(chunks), is_small=bool(small))
-                    self._batch_bytes = BATCH_BYTES
-                else:
-                    self._batch_bytes = 0  # what does not fit together may fit alone
                 self._changed.notify_all()
-
-    def _batch(self) -> list[EncodedChunk]:
-        chunks: list[EncodedChunk] = []
-        size = 0
-        for chunk in self._bulk:
-            size += chunk.length
-            if chunks and size > self._batch_bytes:
-                break
-            chunks.append(chunk)
-        return chunks
 
     def _forget(self, count: int, *, is_small: bool) -> None:
         for _ in range(count):

@@ -10,10 +10,11 @@ import contextlib
 import json
 import statistics
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from mcap import records
 
@@ -155,16 +156,6 @@ class SourceClock:
         """A line for each time between two jumps."""
         return [fit_line(span) for span in self.spans]
 
-    def to_json(self) -> dict[str, Any]:
-        """Everything, for machines."""
-        return {
-            "source": self.source,
-            "host": self.host,
-            "topics": sorted(self.topics),
-            "lines": [asdict(line) for line in self.lines()],
-            "jumps": [jump._asdict() for jump in self.jumps],
-        }
-
     def sentences(self) -> list[str]:
         """What people are told."""
         line = self.lines()[-1]
@@ -216,45 +207,26 @@ class StampWatch:
 # In the episode
 
 
+class ClockRecord(msgspec.Struct, kw_only=True):
+    """One message of ``/recorder/clocks``."""
+
+    source: str
+    id: str
+    topics: list[str]
+    readings: list[Reading]
+    host: str = ""
+
+
 def to_record(clock: SourceClock, identity: str, readings: Iterable[Reading]) -> dict[str, Any]:
     """Make the record of ``/recorder/clocks``."""
-    return {
-        "schema_version": 1,
-        "source": clock.source,
-        "id": identity,
-        "host": clock.host,
-        "topics": sorted(clock.topics),
-        "readings": [list(reading) for reading in readings],
-    }
-
-
-def source_clocks(records: Iterable[dict[str, Any]]) -> list[SourceClock]:
-    """Put together what an episode says of clocks, by source."""
-    found: dict[tuple[str, str], SourceClock] = {}
-    for record in records:
-        try:
-            key = (str(record["source"]), str(record["id"]))
-            readings = [Reading(*map(int, values)) for values in record["readings"]]
-            topics = frozenset(map(str, record["topics"]))
-        except (KeyError, TypeError, ValueError):
-            continue
-        clock = found.get(key)
-        if clock is None:
-            host = str(record.get("host", ""))
-            clock = found[key] = SourceClock(source=key[0], host=host)
-        clock.topics |= topics
-        for reading in readings:
-            clock.add(reading)
-    return [clock for clock in found.values() if clock.spans]
-
-
-def parse_clock_record(data: bytes) -> dict[str, Any]:
-    """Read one message of ``/recorder/clocks``; empty where it is damaged."""
-    try:
-        record = json.loads(data)
-    except (ValueError, RecursionError):
-        return {}
-    return record if isinstance(record, dict) else {}
+    record = ClockRecord(
+        source=clock.source,
+        id=identity,
+        topics=sorted(clock.topics),
+        readings=list(readings),
+        host=clock.host,
+    )
+    return {"schema_version": 1, **msgspec.to_builtins(record)}
 
 
 class StampCorrection:
@@ -304,7 +276,7 @@ def restamped(message: RawMessage, definition: records.Schema | None, shift_ns: 
     """Move the time of a message, and the time it holds itself, where its type has one."""
     publish_ns = max(0, message.publish_time_ns + shift_ns)
     data = message.data
-    with contextlib.suppress(codec.MalformedMessageError):
+    with contextlib.suppress(codec.MalformedMessageError, ValueError, AttributeError):
         data = _restamped_data(message.type_name, definition, data, shift_ns)
     return message._replace(publish_time_ns=publish_ns, data=data)
 
@@ -334,7 +306,7 @@ def _moved(sec: int, nanosec: int, shift_ns: int) -> tuple[int, int]:
 
 
 def _restamped_json(data: bytes, shift_ns: int) -> bytes:
-    record = parse_clock_record(data)
+    record = json.loads(data)
     stamp_ns = record.get("stamp_ns")
     if not isinstance(stamp_ns, int) or isinstance(stamp_ns, bool) or stamp_ns <= 0:
         return data
@@ -343,8 +315,18 @@ def _restamped_json(data: bytes, shift_ns: int) -> bytes:
 
 def clocks_of(episode: Episode) -> list[SourceClock]:
     """What an episode says of the clocks of its sources; empty where nobody measured them."""
-    messages = episode.messages([CLOCKS]) if CLOCKS in episode.topics() else ()
-    return source_clocks(parse_clock_record(message.data) for message in messages)
+    found: dict[tuple[str, str], SourceClock] = {}
+    for message in episode.messages([CLOCKS]):
+        try:
+            record = msgspec.json.decode(message.data, type=ClockRecord)
+        except msgspec.DecodeError:
+            continue
+        clock = SourceClock(source=record.source, host=record.host)
+        clock = found.setdefault((record.source, record.id), clock)
+        clock.topics |= {*record.topics}
+        for reading in record.readings:
+            clock.add(reading)
+    return [clock for clock in found.values() if clock.spans]
 
 
 class CorrectedEpisode(Episode):

@@ -6,12 +6,10 @@ was promised when it was recorded. Without a contract only one thing is judged: 
 that ends long before the recording does.
 """
 
-import difflib
 import json
-import math
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -20,9 +18,9 @@ import msgspec
 from bridge.clock import NS_PER_S, s_from_ns
 from bridge.data_files import dataset_file
 from bridge.episode.health import HealthFinding, parsed
-from bridge.episode.topics import EVENT, OF_RECORDER, is_latched, is_truth
+from bridge.episode.metadata import to_strings
+from bridge.episode.topics import EVENT, OF_RECORDER, is_latched
 from bridge.errors import UsageError
-from bridge.whole_file import write_whole
 
 SCHEMA_VERSION = 1
 CONTRACT_FILE = "cell.toml"
@@ -53,8 +51,7 @@ class ContractError(UsageError):
     """A contract cannot be used."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TopicRule:
+class TopicRule(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What one topic promises."""
 
     rate_hz: Above0 | None = None
@@ -67,18 +64,15 @@ class TopicRule:
     """Whether a recording without the topic is broken; else it may be absent."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Contract:
+class Contract(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a cell's topics promise."""
 
-    topics: Mapping[str, TopicRule]
+    topics: dict[str, TopicRule]
     cell: str = ""
 
     def to_record(self) -> dict[str, str]:
         """The ``contract`` metadata record; every value is JSON."""
-        rules = {topic: asdict(rule) for topic, rule in self.topics.items()}
-        values = {"schema_version": SCHEMA_VERSION, "cell": self.cell, "topics": rules}
-        return {name: json.dumps(value) for name, value in values.items()}
+        return to_strings({"schema_version": SCHEMA_VERSION, **msgspec.to_builtins(self)})
 
     def required(self) -> list[str]:
         """Topics without which nothing should be recorded."""
@@ -108,55 +102,21 @@ def find_contract(run: Path, name: str | None) -> Contract | None:
 
 def contract_from(values: Mapping[str, Any], *, name: str) -> Contract:
     """Build a contract from parsed values."""
-    version, whose, rules = values.get("schema_version"), "topics", {}
+    version, where, rest = values.get("schema_version"), name, dict(values)
     if version != SCHEMA_VERSION:
         found = "is missing" if version is None else f"is {version!r:.40}"
         raise ContractError(f"{name}: schema_version {found}; it must be {SCHEMA_VERSION}.")
-    _refuse_unknown(values, ("schema_version", "cell", "topics"), where=name, prefix="")
-    known = [item.name for item in fields(TopicRule)]
+    del rest["schema_version"]
     try:
-        for topic, rule in msgspec.convert(values.get("topics"), dict[str, Any]).items():
-            whose = f"topics.{json.dumps(topic)}"
+        for topic, rule in msgspec.convert(rest.get("topics"), dict[str, Any]).items():
+            where = f"{name}: topics.{json.dumps(topic)}"
             if not topic.startswith("/"):
-                raise ContractError(f"{name}: {whose}: a topic starts with a slash: /{topic}.")
-            _refuse_unknown(rule if isinstance(rule, dict) else (), known, where=name, prefix=whose)
-            rules[topic] = msgspec.convert(rule, TopicRule)
-        whose = "cell"
-        return Contract(topics=rules, cell=msgspec.convert(values.get("cell", ""), str))
+                raise ContractError(f"{where}: a topic starts with a slash: /{topic}.")
+            msgspec.convert(rule, TopicRule)
+        where = name
+        return msgspec.convert(rest, Contract)
     except msgspec.ValidationError as error:
-        raise ContractError(f"{name}: {whose}: {error}.") from error
-
-
-def _refuse_unknown(
-    values: Iterable[str], allowed: Sequence[str], *, where: str, prefix: str
-) -> None:
-    for key in values:
-        if key in allowed:
-            continue
-        nearest = difflib.get_close_matches(key, allowed, n=1, cutoff=0.5)
-        meant = f" Did you mean {nearest[0]}?" if nearest else ""
-        whole = f"{prefix}.{key}" if prefix else key
-        raise ContractError(
-            f"{where}: the key {whole} is not known. Allowed: {', '.join(allowed)}.{meant}"
-        )
-
-
-def write_contract(contract: Contract, path: Path, *, source: str) -> None:
-    """Write a contract as a TOML file; one that is there is not replaced."""
-    if path.exists():
-        raise ContractError(f"{path} exists already. Move it away, or edit it.")
-    lines = [
-        f"# What this cell publishes, learned from {source}. Edit it freely.",
-        "# rate_hz [1/s] may differ by the part of it that tolerance says; silence_s: the longest",
-        "# time without a message [s]; no recording starts without a required topic.",
-        f"schema_version = {SCHEMA_VERSION}",
-        *([f"cell = {json.dumps(contract.cell)}"] if contract.cell else []),
-    ]
-    for topic, rule in contract.topics.items():
-        lines += ["", f"[topics.{json.dumps(topic)}]"]
-        values = {key: value for key, value in asdict(rule).items() if value is not None}
-        lines += [f"{key} = {json.dumps(value)}" for key, value in values.items()]
-    write_whole(path, ("\n".join(lines) + "\n").encode())
+        raise ContractError(f"{where}: {error}.") from error
 
 
 @dataclass(kw_only=True, slots=True)
@@ -369,48 +329,8 @@ def unseen_losses(unnumbered: Mapping[str, int]) -> list[str]:
 
 def health_lines(record: Mapping[str, Any], start_ns: int = 0) -> list[str]:
     """Sentences on what the records ``health`` and ``presence``, or the answer to a stop, say."""
-    old = [record.get("breaches"), record.get("unknown_tails")]  # of earlier editions
     unnumbered = record.get("unnumbered")
     return [
         *(found.line(start_ns) for found in parsed(record.get("findings"))),
-        *(str(text) for texts in old if isinstance(texts, list) for text in texts),
         *unseen_losses(unnumbered if isinstance(unnumbered, dict) else {}),
     ]
-
-
-LEARNED_TOLERANCE = 0.2
-LEARNED_SILENCE_S = 0.5
-"""No learned contract allows less: machines hesitate."""
-LEARNED_HABIT = 3
-"""A learned contract allows so many times the longest silence of the good episode."""
-LEARNED_PERIODS = 5
-
-
-def learn_contract(presences: Mapping[str, Presence], *, cell: str) -> Contract:
-    """Take what a good episode shows for what the cell promises.
-
-    Regular streams get rate and silence, latched topics need only be there, and what comes when
-    something happens (events, plans) is optional. Ground truth and our own records are left out.
-    """
-    rules = {
-        topic: _learned(topic, presence)
-        for topic, presence in sorted(presences.items())
-        if topic not in OF_RECORDER and not is_truth(topic)
-    }
-    return Contract(topics=rules, cell=cell)
-
-
-def _learned(topic: str, presence: Presence) -> TopicRule:
-    if is_latched(topic):
-        return TopicRule()
-    span_s = s_from_ns(presence.last_ns - presence.first_ns)
-    longest_s = s_from_ns(presence.longest_ns)
-    if not presence.is_regular or longest_s > span_s / 4:
-        return TopicRule(required=False)
-    rate_hz = (presence.messages - 1) / span_s
-    silence_s = max(LEARNED_SILENCE_S, LEARNED_HABIT * longest_s, LEARNED_PERIODS / rate_hz)
-    return TopicRule(
-        rate_hz=float(f"{rate_hz:.3g}"),
-        tolerance=LEARNED_TOLERANCE,
-        silence_s=math.ceil(silence_s * 10) / 10,
-    )

@@ -6,7 +6,7 @@ survive the round trip.
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import msgspec
@@ -156,9 +156,9 @@ Record = TypeVar("Record")
 
 
 def to_strings(record: object) -> dict[str, str]:
-    """Turn one of the records above into an MCAP metadata map."""
-    values = asdict(record)  # type: ignore[call-overload]
-    return {name: json.dumps(value) for name, value in values.items()}
+    """Turn one of the records above, or a map of values, into an MCAP metadata map."""
+    values = msgspec.to_builtins(record).items()
+    return {name: json.dumps(value) for name, value in values}
 
 
 def build(of_type: type[Record], record: Mapping[str, Any]) -> Record:

@@ -208,6 +208,6 @@ class Episode:
     def attachment(self, name: str) -> bytes | None:
         """Return the bytes of the first attachment of this name with its CRC checked, or None."""
         try:
-            return self.file.attachment(name)
+            return next((bytes(each.data) for each in self.file.attachments(name)), None)
         except DAMAGE as error:
             raise damaged(self.path, error) from error

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from io import BufferedReader
 from pathlib import Path
 
 from bridge.episode.check_file import Faults, FileCheck
@@ -45,8 +46,8 @@ def recover(path: Path) -> RecoveryReport:
         hint = "robot-gst recover takes files, or folders to search for *.mcap.part."
         raise PathNotFoundError(path=path, what="file", hint=hint)
     is_part = path.name.endswith(PART)
-    with _locked(path, write=is_part) as descriptor:
-        source = RecordFile(descriptor)
+    with _locked(path, write=is_part) as stream:
+        source = RecordFile(stream)
         finished = _report_finished(path, source)
         if finished is not None:
             return finished
@@ -87,14 +88,12 @@ def _set_aside(path: Path) -> None:
 
 
 @contextmanager
-def _locked(path: Path, *, write: bool) -> Iterator[int]:
+def _locked(path: Path, *, write: bool) -> Iterator[BufferedReader]:
     descriptor = lock_dead(path, write=write)
     if descriptor is None:
         raise StillWrittenError(f"{path} is still being written. Stop its recorder first.")
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
+    with os.fdopen(descriptor, "rb") as stream:
+        yield stream
 
 
 def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
@@ -102,15 +101,15 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
     data = finished_data(source)
     if data is None:
         return None
-    faults = Faults()
-    if not data.is_proved:  # then its indexes may be wrong all the same
+    faults, (end, is_proved) = Faults(), data
+    if not is_proved:  # then its indexes may be wrong all the same
         deque(FileCheck(path, faults).messages(), maxlen=0)
     if faults.count:
         return None
     tally = RecoveryTally()
     for found in scan(source):
         tally.take(found)
-    if tally.losses or tally.reached_end != data.end:
+    if tally.losses or tally.reached_end != end:
         return None
     return tally.report(path, _publish(path) if path.name.endswith(PART) else path, finished=True)
 
@@ -119,19 +118,17 @@ def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
     temporary = path.with_name(path.name.removesuffix(PART) + TEMPORARY)
     temporary.unlink(missing_ok=True)  # of a recovery that was killed; the lock is ours
     tally = RecoveryTally()
+    for found in each_chunk_once(source):
+        tally.take(found)
+    if not tally.has_data:
+        return tally.report(path, None, finished=False)
+    tally.complete(source)
+    report = tally.report(path, None, finished=False)
     target: CopyTarget | None = None
     try:
+        target = CopyTarget(source, temporary, tally)
         for found in each_chunk_once(source):
-            tally.take(found)
-            if tally.has_data and target is None:
-                target = CopyTarget(source, temporary)
-            if target is not None:
-                target.take(found)
-        if target is not None:
-            tally.define(target.looked_up)
-        report = tally.report(path, None, finished=False)
-        if target is None:
-            return report
+            target.take(found)
         target.finish(RECORD_NAME, to_metadata(report))
         _prove(temporary)
         original = _keep_original(path) if tally.damaged_inside else None
@@ -148,7 +145,7 @@ def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
 def _prove(path: Path) -> None:
     """Read the copy back; its CRC covers every byte that was found whole before."""
     with path.open("rb") as stream:
-        if finished_data(RecordFile(stream.fileno())) is None:
+        if finished_data(RecordFile(stream)) is None:
             raise RecoveryError(f"{path} does not hold what was written to it. Check the disk.")
 
 

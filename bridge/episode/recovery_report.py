@@ -1,26 +1,24 @@
 """What was found whole, what was lost, and why: counted while a broken file is read."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mcap.records import Channel, Metadata
+from mcap.records import Attachment, Channel, DataEnd, Header, McapRecord, Metadata, Schema
 
 from bridge.episode import provenance
-from bridge.episode.mcap import format as mcap
-from bridge.episode.mcap.damaged import Contents, read_plain
+from bridge.episode.mcap.damaged import (
+    RecordFile,
+    summary_definitions,
+)
 from bridge.episode.mcap.scan import (
-    AttachmentSpan,
     Chunk,
-    CutChunk,
     Damage,
-    DataEnd,
     Found,
     IndexSpan,
     Plain,
     TopMessage,
 )
-from bridge.episode.metadata import from_strings
+from bridge.episode.metadata import from_strings, to_strings
 
 RECORD_NAME = "recovered"
 MAX_REASONS = 8
@@ -40,8 +38,6 @@ class RecoveryReport:
     reason: str = ""
     finished: bool = False
     attachments: int = 0
-    last_log_time_ns: dict[str, int] = field(default_factory=dict)
-    """By topic: nothing after it was found."""
     original: Path | None = None
     """Where a part that is damaged inside was kept, for someone who can read more of it."""
 
@@ -51,8 +47,10 @@ class RecoveryTally:
     """Counts while a file is being read."""
 
     messages: dict[int, int] = field(default_factory=dict)
-    last_ns: dict[int, int] = field(default_factory=dict)
-    topics: dict[int, str] = field(default_factory=dict)
+    header: Header | None = None
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    """The first definition of each id."""
     attachments: int = 0
     bytes_lost: int = 0
     losses: list[str] = field(default_factory=list)
@@ -71,54 +69,49 @@ class RecoveryTally:
                 self.damaged_inside |= not found.at_end
                 self.losses.append(found.what)
                 return
-            case DataEnd():
+            case Plain(record=DataEnd()):
                 self.reached_end = found.offset
                 return
             case IndexSpan():
                 return
-            case CutChunk():
-                self._take_cut(found)
             case Chunk():
-                self._count(found.contents)
+                self._define(found.contents.definitions)
+                for channel_id, entries in found.contents.index.items():
+                    self._add(channel_id, len(entries) // 2)
             case TopMessage():
-                self._add(found.channel_id, 1, found.log_time_ns)
-            case AttachmentSpan():
-                self.attachments += 1
+                self._add(found.channel_id, 1)
             case Plain():
                 self._take_plain(found)
         self.has_data = True
 
     def _take_plain(self, found: Plain) -> None:
-        if found.opcode == mcap.CHANNEL:
-            self.define([found.raw])
-        elif isinstance(found.record, Metadata) and found.record.name == RECORD_NAME:
-            self.earlier = from_strings(found.record.metadata)
+        match found.record:
+            case Header() as header:
+                self.header = self.header or header
+            case Schema() | Channel():
+                self._define([found.record])
+            case Attachment():
+                self.attachments += 1
+            case Metadata(name=name, metadata=values) if name == RECORD_NAME:
+                self.earlier = from_strings(values)
 
-    def _take_cut(self, found: CutChunk) -> None:
-        lost = found.unpacked_size - found.contents.size
-        kept = found.contents.num_messages
-        self._count(found.contents)
-        self.bytes_lost += lost
-        self.losses.append(
-            f"at byte {found.offset} the file ends inside a chunk; "
-            f"{kept} whole messages of it were kept, without a CRC to prove them"
-        )
-
-    def _count(self, contents: Contents) -> None:
-        self.define(contents.definitions)
-        for channel_id, entries in contents.index.items():
-            self._add(channel_id, len(entries) // 2, max(entries[::2]))
-
-    def _add(self, channel_id: int, count: int, last_ns: int) -> None:
+    def _add(self, channel_id: int, count: int) -> None:
         self.messages[channel_id] = self.messages.get(channel_id, 0) + count
-        self.last_ns[channel_id] = max(self.last_ns.get(channel_id, 0), last_ns)
 
-    def define(self, definitions: list[bytes]) -> None:
-        """Learn the names of channels."""
-        for raw in definitions:
-            channel = read_plain(raw)
-            if isinstance(channel, Channel):
-                self.topics.setdefault(channel.id, channel.topic)
+    def _define(self, definitions: list[McapRecord | None]) -> None:
+        for record in definitions:
+            if isinstance(record, Schema):
+                self.schemas.setdefault(record.id, record)
+            elif isinstance(record, Channel):
+                self.channels.setdefault(record.id, record)
+
+    def complete(self, source: RecordFile) -> None:
+        """Find what was lost of the definitions in the summary, or make it: readers need them."""
+        self._define(summary_definitions(source))
+        for number in self.messages:
+            self.channels.setdefault(number, Channel(number, unknown_topic(number), "", {}, 0))
+        for number in {channel.schema_id for channel in self.channels.values()} - {0}:
+            self.schemas.setdefault(number, Schema(number, b"", "", "unknown"))
 
     @property
     def reason(self) -> str:
@@ -137,11 +130,10 @@ class RecoveryTally:
     def report(self, path: Path, output: Path | None, *, finished: bool) -> RecoveryReport:
         """Say what was done with a file."""
         counts: dict[str, int] = {}
-        last: dict[str, int] = {}
         for channel_id, count in self.messages.items():
-            topic = self.topics.get(channel_id, unknown_topic(channel_id))
+            channel = self.channels.get(channel_id)
+            topic = channel.topic if channel else unknown_topic(channel_id)
             counts[topic] = counts.get(topic, 0) + count
-            last[topic] = max(last.get(topic, 0), self.last_ns[channel_id])
         before = self.earlier.get("bytes_lost")
         return RecoveryReport(
             path=path,
@@ -152,20 +144,13 @@ class RecoveryTally:
             reason=str(self.earlier.get("reason", "")) if finished else self.reason,
             finished=finished,
             attachments=self.attachments,
-            last_log_time_ns=dict(sorted(last.items())),
         )
 
 
 def to_metadata(report: RecoveryReport) -> dict[str, str]:
     """Return the ``recovered`` metadata record of an episode; every value is JSON."""
-    values = {
-        "reason": report.reason,
-        "bytes_lost": report.bytes_lost,
-        "messages": report.messages,
-        "last_log_time_ns": report.last_log_time_ns,
-        "tool": provenance.software(),
-    }
-    return {name: json.dumps(value) for name, value in values.items()}
+    values = {name: getattr(report, name) for name in ("reason", "bytes_lost", "messages")}
+    return to_strings({**values, "tool": provenance.software()})
 
 
 def unknown_topic(channel_id: int) -> str:

@@ -1,30 +1,25 @@
 """Carry everything whole from a broken MCAP file into a new one.
 
-Chunks are copied byte for byte. Messages outside chunks are put into chunks, because readers that
-use the index see nothing else. Message indexes, summary and footer are made anew.
+Chunks are copied byte for byte, behind the definitions of all of them. Messages outside chunks are
+put into chunks, because readers that use the index see nothing else. Message indexes, summary and
+footer are made anew.
 """
 
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from mcap.records import Channel, Header, Metadata, Schema
+from mcap.records import Attachment, Header, Metadata
 
 from bridge.episode.mcap import format as mcap
-from bridge.episode.mcap.damaged import (
-    Contents,
-    RecordFile,
-    read_plain,
-    summary_definitions,
-    walk_records,
-)
-from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk, chunk_of
-from bridge.episode.mcap.format import Buffer, crc32
+from bridge.episode.mcap.damaged import RecordFile
+from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
+from bridge.episode.mcap.format import Buffer
 from bridge.episode.mcap.part_file import PartFile
-from bridge.episode.mcap.scan import AttachmentSpan, Chunk, CutChunk, Found, Plain, TopMessage, scan
-from bridge.episode.mcap.walk import RecordSpan, attachment_entry, chunk_entry
+from bridge.episode.mcap.scan import Chunk, Found, Plain, TopMessage, scan
+from bridge.episode.mcap.walk import chunk_entry
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
-from bridge.episode.recovery_report import unknown_topic
+from bridge.episode.recovery_report import RecoveryTally
 
 CHUNK_BYTES = 1 << 20
 UNKNOWN_LIBRARY = "unknown; recovered by robot-gst"
@@ -35,8 +30,8 @@ def each_chunk_once(source: RecordFile) -> Iterator[Found]:
     """Return what a file holds; a chunk that lies there twice is given once."""
     there: set[tuple[int, int]] = set()
     for found in scan(source):
-        if isinstance(found, Chunk) and found.head.crc:
-            key = found.head.crc, found.head.size
+        if isinstance(found, Chunk) and found.packed.uncompressed_crc:
+            key = found.packed.uncompressed_crc, found.packed.uncompressed_size
             if key in there:
                 continue
             there.add(key)
@@ -62,118 +57,39 @@ def is_readable(name: str, values: dict[str, str]) -> bool:
 class CopyTarget:
     """The new file."""
 
-    def __init__(self, source: RecordFile, path: Path) -> None:
-        """Create ``path``; OSError when it exists or cannot be written."""
+    def __init__(self, source: RecordFile, path: Path, tally: RecoveryTally) -> None:
+        """Create ``path``, with all definitions; OSError when it exists or cannot be written."""
         self._source = source
         self.section = DataSection(PartFile.create(path))
-        self._loose = OpenChunk(compress=False, gather=True)
-        self._made_schemas: set[int] = set()
-        self._made_channels: set[int] = set()
-        self.looked_up: list[bytes] = []
-        """Definitions that were lost where they were needed, and found elsewhere."""
-        self._elsewhere: dict[tuple[int, int], bytes] | None = None
+        self._loose = OpenChunk(compress=False, is_small=True)
+        self.section.summary.schemas, self.section.summary.channels = tally.schemas, tally.channels
+        header = tally.header or Header("", UNKNOWN_LIBRARY)
+        front = [header, *tally.schemas.values(), *tally.channels.values()]
+        self.section.file.append([mcap.MAGIC, *map(mcap.encoded, front)])
 
     def take(self, found: Found) -> None:
-        """Copy one thing; index spans, damage and the old end are left behind."""
-        if self.section.file.offset == 0:
-            is_header = isinstance(found, Plain) and found.opcode == mcap.HEADER
-            header = found.raw if is_header else mcap.encoded(Header("", UNKNOWN_LIBRARY))  # type: ignore[union-attr]
-            self.section.file.append([mcap.MAGIC + header])
+        """Copy one thing; definitions, index spans, damage and the old end are left behind."""
         match found:
-            case Plain():
-                self._take_plain(found)
+            case Plain(record=Attachment() as attachment):
+                self.section.add_attachment(attachment)
+            case Plain(record=Metadata(name=name, metadata=values)):
+                kept_as = name if is_readable(name, values) else name + DAMAGED
+                self.section.add_metadata(kept_as, values)
+            case Plain(record=None):
+                self.section.file.append([found.raw])
             case Chunk():
-                self._define(found.contents)
                 self.section.add_chunks([verbatim(found)])
-            case CutChunk():
-                records, contents = self._without_contradictions(found)
-                self._define(contents)
-                if contents.num_messages:
-                    self.section.add_chunks([salvaged(records, contents)])
             case TopMessage():
                 self._take_message(found)
-            case AttachmentSpan():
-                self._take_attachment(found)
 
-    def _without_contradictions(self, found: CutChunk) -> tuple[bytes, Contents]:
-        """Leave out definitions that no CRC proves and that others contradict."""
-        records = found.records
-        for raw in filter(self._contradicts, found.contents.definitions):
-            records = records.replace(raw, b"", 1)
-        return records, walk_records(records)
-
-    def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
+    def finish(self, metadata_name: str, values: dict[str, str]) -> None:
         """Write the rest and sync; the caller verifies, renames and closes."""
         self._flush_loose()
         self.section.add_metadata(metadata_name, values)
         self.section.seal()
         self.section.file.sync_data()
-        return self.section.file
-
-    def _take_plain(self, found: Plain) -> None:
-        if found.opcode == mcap.HEADER:
-            return
-        if isinstance(found.record, Metadata):
-            name, values = found.record.name, found.record.metadata
-            self.section.add_metadata(name if is_readable(name, values) else name + DAMAGED, values)
-            return
-        if found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
-            if self._contradicts(found.raw):
-                return
-            self._book(found.raw)
-        self.section.file.append([found.raw])
-
-    def _contradicts(self, raw: bytes) -> bool:
-        """Whether a definition is not the one that its id had before."""
-        summary = self.section.summary
-        known = summary.schemas if raw[0] == mcap.SCHEMA else summary.channels
-        return known.get(_id_of(raw)) not in (None, raw)
-
-    def _book(self, raw: bytes) -> None:
-        """Tell the summary of a definition; the first one of an id counts."""
-        summary = self.section.summary
-        match read_plain(raw):
-            case Schema(id=schema_id):
-                _define_once(summary.schemas, self._made_schemas, schema_id, raw)
-            case Channel(id=channel_id, schema_id=schema_id):
-                _define_once(summary.channels, self._made_channels, channel_id, raw)
-                if schema_id and schema_id not in summary.schemas:
-                    if self._look_up(mcap.SCHEMA, schema_id):
-                        return
-                    self._make(mcap.encoded(Schema(schema_id, b"", "", "unknown")))
-                    self._made_schemas.add(schema_id)
-
-    def _look_up(self, opcode: int, number: int) -> bool:
-        """Define what was lost here and stands in the summary or in another chunk."""
-        if self._elsewhere is None:
-            self._elsewhere = _definitions(self._source)
-        raw = self._elsewhere.get((opcode, number))
-        if raw is None:
-            return False
-        self.looked_up.append(raw)
-        self._make(raw)
-        return True
-
-    def _make(self, raw: bytes) -> None:
-        """Define a schema or channel whose own definition was lost; readers refuse without."""
-        self._book(raw)
-        self.section.file.append([raw])
-
-    def _define(self, contents: Contents) -> None:
-        for raw in contents.definitions:
-            self._book(raw)
-        for channel_id in contents.index:
-            self._require_channel(channel_id)
-
-    def _require_channel(self, channel_id: int) -> None:
-        if channel_id in self.section.summary.channels:
-            return
-        if not self._look_up(mcap.CHANNEL, channel_id):
-            self._make(mcap.encoded(Channel(channel_id, unknown_topic(channel_id), "", {}, 0)))
-            self._made_channels.add(channel_id)
 
     def _take_message(self, found: TopMessage) -> None:
-        self._require_channel(found.channel_id)
         if self._loose.size + found.length > CHUNK_BYTES:
             self._flush_loose()
         raw = self._source.read(found.offset, found.length)
@@ -184,41 +100,6 @@ class CopyTarget:
     def _flush_loose(self) -> None:
         if self._loose.has_messages:
             self.section.add_chunks([self._loose.encode()])
-
-    def _take_attachment(self, found: AttachmentSpan) -> None:
-        offset = self.section.file.offset
-        for block in self._source.blocks(found.offset, found.length):
-            self.section.file.append([block])
-        span = RecordSpan.between(mcap.ATTACHMENT, offset, self.section.file.offset)
-        entry = attachment_entry(span, found.record, found.data_size)
-        self.section.summary.add_index(entry)
-
-
-def _definitions(source: RecordFile) -> dict[tuple[int, int], bytes]:
-    """Return every schema and channel of a file by kind and id: of its summary, or of its data."""
-    records = summary_definitions(source)
-    if not records:
-        for found in scan(source):
-            if isinstance(found, Chunk | CutChunk):
-                records += found.contents.definitions
-            elif isinstance(found, Plain) and found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
-                records.append(found.raw)
-    definitions: dict[tuple[int, int], bytes] = {}
-    for raw in records:
-        definitions.setdefault((raw[0], _id_of(raw)), raw)
-    return definitions
-
-
-def _id_of(raw: bytes) -> int:
-    """Return the number of a schema or channel."""
-    record = read_plain(raw)
-    return record.id if isinstance(record, Schema | Channel) else 0
-
-
-def _define_once(known: dict[int, bytes], made: set[int], number: int, raw: bytes) -> None:
-    if number not in known or number in made:
-        made.discard(number)
-        known[number] = raw
 
 
 _TIMES = struct.Struct("<QQ")
@@ -237,18 +118,6 @@ def verbatim(found: Chunk) -> EncodedChunk:
     if has_wrong_times(found):
         front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
         buffers = [front, memoryview(found.raw)[len(front) :]]
-    entry = chunk_entry(RecordSpan.between(mcap.CHUNK, 0, found.length), found.head)
+    entry = chunk_entry(0, found.length, found.packed)
     entry.message_start_time, entry.message_end_time = start_ns, end_ns
-    return EncodedChunk(buffers=buffers, entry=entry, index=found.contents.index)
-
-
-def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
-    """Return the records saved from a cut chunk as a whole one."""
-    return chunk_of(
-        [records],
-        contents.index,
-        times_ns=contents.time_range(),
-        size=len(records),
-        crc=crc32(records, 0),
-        compression="",
-    )
+    return EncodedChunk(buffers, entry, found.contents.index)

@@ -35,8 +35,6 @@ IMU = "/imu"
 ODOMETRY = "/odometry"
 POINTS = "/points"
 PLAN = "/plan"
-PLAN_TRAJECTORY = "/plan/trajectory"
-PLAN_PATH = "/plan/path"
 EVENT = "/event"
 VERDICT = "/verdict"
 GATE = "/gate/verdict"
@@ -81,8 +79,6 @@ _TYPES: tuple[tuple[str, str], ...] = (
     (f"^({TF}|{TF_STATIC})$", schema.TF_MESSAGE),
     (f"^{ROBOT_DESCRIPTION}$", schema.STRING),
     (f"{PLAN}$", schema.PLAN),
-    (f"{PLAN_TRAJECTORY}$", schema.JOINT_TRAJECTORY),
-    (f"{PLAN_PATH}$", schema.POSES_IN_FRAME),
     (f"{EVENT}$", schema.EVENT),
     (f"{VERDICT}$", schema.VERDICT),
     (f"{CONTACT}$", schema.CONTACT),

@@ -1,5 +1,7 @@
 """The frames of an episode over time: ``/tf`` and ``/tf_static`` as one tree."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -9,32 +11,18 @@ from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 
 
-class FrameNotFoundError(BridgeError):
-    """No transform leads to a frame."""
-
-    def __init__(self, *, frame: str, known: list[str]) -> None:
-        """Remember the frame and list those that exist."""
-        self.frame = frame
-        listed = ", ".join(known) or "none"
-        super().__init__(f"no transform for frame {frame!r}. Frames in this episode: {listed}.")
-
-
-class AmbiguousFrameError(BridgeError):
-    """A frame has several parents, or is its own ancestor."""
-
-    def __init__(self, *, frame: str, parents: list[str]) -> None:
-        """Remember the frame and who claims it."""
-        self.frame = frame
-        super().__init__(
-            f"frame {frame!r} hangs on {' and '.join(map(repr, parents))}; where it is cannot be "
-            "said. Two publishers of /tf disagree: record again with one of them."
-        )
+def _ambiguous(frame: str, parents: list[str]) -> BridgeError:
+    """Say of a frame that it has several parents, or is its own ancestor."""
+    return BridgeError(
+        f"frame {frame!r} hangs on {' and '.join(map(repr, parents))}; where it is cannot be "
+        "said. Two publishers of /tf disagree: record again with one of them."
+    )
 
 
 class TransformTree:
     """Answers ``T_root_frame`` at any stamp, interpolating moving frames."""
 
-    def __init__(self, transforms: list[FrameTransform]) -> None:
+    def __init__(self, transforms: Iterable[FrameTransform]) -> None:
         """Collect transforms in any order; static ones are those seen once."""
         collected: dict[str, tuple[str, dict[int, Float[np.ndarray, "4 4"]]]] = {}
         claims: dict[str, set[str]] = {}
@@ -59,13 +47,14 @@ class TransformTree:
     def root_of(self, frame: str) -> str:
         """Follow parents up to the frame that has none."""
         if frame not in self._parents and frame not in self._parents.values():
-            raise FrameNotFoundError(frame=frame, known=self.frames())
+            known = f"Frames in this episode: {', '.join(self.frames()) or 'none'}."
+            raise BridgeError(f"no transform for frame {frame!r}. {known}")
         seen: list[str] = []
         while frame in self._parents:
             if frame in self._disputed:
-                raise AmbiguousFrameError(frame=frame, parents=self._disputed[frame])
+                raise _ambiguous(frame, self._disputed[frame])
             if frame in seen:
-                raise AmbiguousFrameError(frame=frame, parents=["itself", *seen])
+                raise _ambiguous(frame, ["itself", *seen])
             seen.append(frame)
             frame = self._parents[frame]
         return frame

@@ -19,42 +19,26 @@ from mcap import records
 from bridge.episode import metadata, provenance, schema
 from bridge.episode.chunk_queue import ChunkQueue
 from bridge.episode.mcap import format as mcap_format
-from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk, Summary
-from bridge.episode.mcap.format import Buffer, Payload, num_bytes
+from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
+from bridge.episode.mcap.format import Buffer, FileSummary, num_bytes
 from bridge.episode.mcap.part_file import BackgroundSync, cannot_write, open_part
 
 
+@dataclass(slots=True)
 class Channel:
     """One topic with one schema, and the chunk its messages go to."""
 
-    __slots__ = (
-        "definition",
-        "group",
-        "id",
-        "is_large",
-        "next_definition",
-        "next_sequence",
-        "times_defined",
-        "type_name",
-    )
-
-    def __init__(self, channel_id: int, type_name: str, definition: bytes) -> None:
-        """Begin without a group."""
-        self.id = channel_id
-        self.type_name = type_name
-        self.definition = definition
-        self.next_definition = 0
-        """Number of the chunk of its group that holds them next."""
-        self.times_defined = 0
-        self.next_sequence = 0
-        self.is_large = False
-        self.group: OpenChunk | None = None
+    id: int
+    type_name: str
+    definition: bytes
+    group: OpenChunk | None = None
+    is_large: bool = False
+    next_sequence: int = 0
+    defined_in: int = -1
+    """Number of the last chunk of its group that holds its definition."""
 
 
 About = tuple[tuple[str, str], ...]
-REPEAT_CHUNKS = 16
-"""Definitions stand in a group's first two chunks that need them, and again after so many: no one
-damaged chunk leaves messages without a name."""
 
 
 class Channels:
@@ -63,36 +47,27 @@ class Channels:
     A topic whose schema changes its text, not only its name, gets a second channel.
     """
 
-    def __init__(self, summary: Summary) -> None:
+    def __init__(self, summary: FileSummary) -> None:
         """Begin without channels."""
         self._summary = summary
         self._schemas: dict[tuple[str, str, bytes], tuple[int, bytes]] = {}
-        self._channels: dict[tuple[str, str, int, About], Channel] = {}
-        self._known: dict[tuple[str, int, str, About], tuple[Channel, schema.Schema | None]] = {}
+        self._channels: dict[tuple[str, schema.Schema | None, str, About], Channel] = {}
 
     def find(
         self, topic: str, record: schema.Schema | None, message_encoding: str, about: About = ()
     ) -> Channel:
         """Return the channel of a topic."""
-        # Comparing schemas by identity spares hashing their text for every message; the value
-        # keeps the schema alive, so that its identity is not given to another.
-        quick_key = (topic, id(record), message_encoding, about)
-        found = self._known.get(quick_key)
-        if found is not None:
-            return found[0]
         encoding = message_encoding if record is None else record.message_encoding
-        schema_id, definition = (0, b"") if record is None else self._schema(record)
-        key = (topic, encoding, schema_id, about)
+        key = (topic, record, encoding, about)
         channel = self._channels.get(key)
         if channel is None:
             channel_id = len(self._channels) + 1
+            schema_id, definition = (0, b"") if record is None else self._schema(record)
             entry = records.Channel(channel_id, topic, encoding, dict(about), schema_id)
-            encoded = mcap_format.encoded(entry)
-            type_name = "" if record is None else record.name
-            channel = Channel(channel_id, type_name, definition + encoded)
+            self._summary.channels[channel_id] = entry
+            definition += mcap_format.encoded(entry)
+            channel = Channel(channel_id, "" if record is None else record.name, definition)
             self._channels[key] = channel
-            self._summary.channels[channel_id] = encoded
-        self._known[quick_key] = (channel, record)
         return channel
 
     def _schema(self, record: schema.Schema) -> tuple[int, bytes]:
@@ -102,7 +77,7 @@ class Channels:
             entry = records.Schema(schema_id, record.data, record.schema_encoding, record.name)
             encoded = mcap_format.encoded(entry)
             self._schemas[key] = (schema_id, encoded)
-            self._summary.schemas[schema_id] = encoded
+            self._summary.schemas[schema_id] = entry
         return self._schemas[key]
 
 
@@ -130,18 +105,6 @@ _HEAD_BYTES = 512
 """An encoding's name stands near the front of an image message."""
 
 
-def is_large(type_name: str, length: int) -> bool:
-    """Say whether a message of this many bytes belongs to a stream with chunks of its own."""
-    return type_name in _LARGE_TYPES or length >= LARGE_BYTES
-
-
-def first_bytes(data: Payload) -> bytes:
-    """Return the front of a message, enough to see its encoding."""
-    if isinstance(data, Buffer):
-        return bytes(memoryview(data).cast("B")[:_HEAD_BYTES])
-    return b"".join(first_bytes(piece) for piece in data[:4])[:_HEAD_BYTES]
-
-
 def is_worth_compressing(type_name: str, front: bytes) -> bool:
     """Judge a stream by its type and the front of its first message: zstd for depth and unknown.
 
@@ -162,8 +125,8 @@ LIBRARY = "robot-gst"
 class WriterConfig:
     """How an episode reaches the disk."""
 
-    chunk_bytes: int = 1 << 20
-    """A chunk is written before it grows beyond this many bytes."""
+    chunk_bytes: int = 1 << 17
+    """A chunk is written before it grows beyond this many bytes; one damaged bit costs a chunk."""
     flush_s: float | None = None
     """A live writer's ``tick`` writes messages older than this [s]; None fills chunks first."""
     sync_s: float | None = None
@@ -178,8 +141,7 @@ class EpisodeWriter:
     """Append messages to a new episode file. For one thread.
 
     Topics start with a slash. ``log_time_ns`` is when the message was received,
-    ``publish_time_ns`` when its source made it. A payload is bytes, or pieces that are written one
-    after the other; the caller must not change its buffers afterwards.
+    ``publish_time_ns`` when its source made it. The caller must not change a payload afterwards.
 
     Every call may raise OSError for a disk that is full or broken, also on behalf of an earlier
     call; a live writer says it with ``tick``, and takes messages while it has room. The message of
@@ -218,7 +180,7 @@ class EpisodeWriter:
             self._file.close()
             raise cannot_write(self.part_path, error) from error
         self._channels = Channels(self._section.summary)
-        self._small = OpenChunk(compress=config.compress, gather=True)
+        self._small = OpenChunk(compress=config.compress, is_small=True)
         self._groups = [self._small]
         self._pending: deque[EncodedChunk] = deque()
         self._queue: ChunkQueue | None = None
@@ -248,44 +210,29 @@ class EpisodeWriter:
     def write(
         self,
         topic: str,
-        data: Payload,
+        data: Buffer | Mapping[str, Any],
         *,
-        type_name: str,
-        log_time_ns: int,
-        publish_time_ns: int | None = None,
-        sequence: int | None = None,
-    ) -> None:
-        """Append one serialised message of a type this project knows.
-
-        Without a time it was sent when it was logged; without a number it counts on.
-        """
-        known = schema.schema_for(type_name)
-        if known is None:
-            raise ValueError(f"no schema for {type_name!r}; use write_foreign for other types")
-        self.write_foreign(
-            topic,
-            data,
-            schema_record=known,
-            log_time_ns=log_time_ns,
-            publish_time_ns=publish_time_ns,
-            sequence=sequence,
-        )
-
-    def write_foreign(
-        self,
-        topic: str,
-        data: Payload,
-        *,
-        schema_record: schema.Schema | None,
+        type_name: str = "",
+        schema_record: schema.Schema | None = None,
         message_encoding: str = "",
         log_time_ns: int,
         publish_time_ns: int | None = None,
         sequence: int | None = None,
         about: About = (),
     ) -> None:
-        """Append one message with the given schema, or none; the bytes are kept as they are."""
+        """Append one serialised message, or a record as JSON, of a type this project knows.
+
+        Of other types the schema is given, or none; the bytes are kept as they are. Without a time
+        it was sent when it was logged; without a number it counts on.
+        """
+        if type_name:
+            schema_record = schema.schema_for(type_name)
+            if schema_record is None:
+                raise ValueError(f"no schema for {type_name!r}; give the schema of other types")
+        if not isinstance(data, Buffer):
+            data = json.dumps(data, separators=(",", ":")).encode()
         channel = self._channels.find(topic, schema_record, message_encoding, about)
-        length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
+        length = num_bytes(data)
         if self._pending or self._file.failed:
             self.wait_for_disk()
         group = channel.group
@@ -295,8 +242,9 @@ class EpisodeWriter:
             self._flush(group)
         if self.config.flush_s is not None and not group.has_messages:
             group.opened_s = self._monotonic()
-        if group.number >= channel.next_definition:
-            self._define(channel, group)
+        if channel.defined_in != group.number:  # every chunk can be read by itself
+            group.define(channel.definition)
+            channel.defined_in = group.number
         if sequence is None:
             sequence = channel.next_sequence
         group.add(
@@ -309,27 +257,19 @@ class EpisodeWriter:
         )
         channel.next_sequence = sequence + 1
 
-    def _assign_group(self, channel: Channel, data: Payload, length: int) -> OpenChunk:
+    def _assign_group(self, channel: Channel, data: Buffer, length: int) -> OpenChunk:
         group = self._small
-        if is_large(channel.type_name, length):
+        if channel.type_name in _LARGE_TYPES or length >= LARGE_BYTES:
             if channel.group is not None:  # keeps the topic's order in the file
                 self._flush(channel.group)
-            head = first_bytes(data)
+            head = bytes(memoryview(data).cast("B")[:_HEAD_BYTES])
             compress = self.config.compress and is_worth_compressing(channel.type_name, head)
-            group = OpenChunk(compress=compress, gather=False)
+            group = OpenChunk(compress=compress, is_small=False)
             self._groups.append(group)
             channel.is_large = True
         channel.group = group
-        channel.next_definition = channel.times_defined = 0
+        channel.defined_in = -1
         return group
-
-    @staticmethod
-    def _define(channel: Channel, group: OpenChunk) -> None:
-        group.define(channel.definition)
-        channel.times_defined += 1
-        channel.next_definition = group.number + (
-            1 if channel.times_defined == 1 else REPEAT_CHUNKS
-        )
 
     def _flush(self, group: OpenChunk) -> None:
         if self._queue is None:
@@ -359,25 +299,6 @@ class EpisodeWriter:
             self._section.add_chunks([self._pending[0]])
             self._pending.popleft()
 
-    def write_json(
-        self,
-        topic: str,
-        record: Mapping[str, Any],
-        *,
-        type_name: str,
-        log_time_ns: int,
-        publish_time_ns: int | None = None,
-    ) -> None:
-        """Append one JSON record."""
-        data = json.dumps(record, separators=(",", ":")).encode()
-        self.write(
-            topic,
-            data,
-            type_name=type_name,
-            log_time_ns=log_time_ns,
-            publish_time_ns=publish_time_ns,
-        )
-
     def attach(self, name: str, data: bytes, *, media_type: str, log_time_ns: int) -> None:
         """Add an attachment, for example ``robot.urdf``; it is in the file at once."""
         self.wait_for_disk()
@@ -400,10 +321,9 @@ class EpisodeWriter:
         """Add the ``episode`` and ``software`` records, and the others where given."""
         self.add_metadata("episode", metadata.to_strings(info))
         self.add_metadata("software", provenance.software())
-        if outcome is not None:
-            self.add_metadata("outcome", metadata.to_strings(outcome))
-        if derived is not None:
-            self.add_metadata("derived", metadata.to_strings(derived))
+        for name, record in (("outcome", outcome), ("derived", derived)):
+            if record is not None:
+                self.add_metadata(name, metadata.to_strings(record))
 
     def tick(self) -> None:
         """Write the chunks that have been waiting for ``flush_s``; call it often."""
@@ -416,13 +336,9 @@ class EpisodeWriter:
             if group.has_messages and group.opened_s <= before_s:
                 self._flush(group)
 
-    def keep_name(self) -> bool:
-        """Write the file anew where somebody removed it, and say whether that was needed."""
-        if self._file.is_there():
-            return False
-        self.wait_for_disk()
-        self._file.restore()
-        return True
+    def refuse_removed(self) -> None:
+        """Raise OSError where somebody removed or replaced the file."""
+        self._file.refuse_removed()
 
     def close(self) -> Path:
         """Finish, sync to disk and give the file its final name."""

@@ -181,7 +181,7 @@ def _import(
         bag.copy_attachments(writer)
         for done, item in enumerate(bag.messages(), start=1):
             topic = names.get(item.topic, item.topic)
-            writer.write_foreign(
+            writer.write(
                 topic,
                 item.data,
                 schema_record=item.record,

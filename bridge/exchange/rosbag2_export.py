@@ -104,7 +104,7 @@ def _copy_messages(
         channel = channels.get(item.channel.id)
         if channel is None:  # of a topic that also has messages that can go
             continue
-        writer.write_foreign(
+        writer.write(
             channel.topic,
             item.data,
             schema_record=channel.record,

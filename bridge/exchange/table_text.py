@@ -14,7 +14,7 @@ from datetime import date, datetime, time
 from pathlib import Path
 from typing import Annotated, Any
 
-from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, UsageError
+from bridge.errors import BridgeError, PathNotFoundError, UsageError
 from bridge.terminal import RARE
 
 YES = (
@@ -309,12 +309,8 @@ def load_grid(path: Path, known: Sequence[str]) -> tuple[str, list[tuple[int, li
 
 def _workbook_cells(path: Path) -> list[tuple[int, list[str]]]:
     """Return the rows of the only sheet that holds any; merged cells all hold what one holds."""
-    try:
-        import openpyxl  # noqa: PLC0415  # only a workbook needs it
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            package="openpyxl", extra="report", purpose="a workbook"
-        ) from error
+    import openpyxl  # noqa: PLC0415  # only a workbook needs it
+
     try:
         book = openpyxl.load_workbook(path, data_only=True)
     except Exception as error:  # whatever a damaged archive raises

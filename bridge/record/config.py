@@ -19,7 +19,7 @@ class QueueConfig:
     """How much may wait in memory, and what is too much to take."""
 
     camera_queue_mb: Annotated[int, RARE] = 256
-    """Memory for images not yet written [MB]; they are thinned as it fills, then dropped."""
+    """Memory for images not yet written [MB]; when it is full they are dropped and counted."""
     small_queue_mb: Annotated[int, RARE] = 16
     """Memory for everything else [MB]; its own, so that images never evict joints."""
     max_message_mb: Annotated[float, RARE] = 64.0
@@ -96,10 +96,6 @@ class RecorderConfig:
     """Where the .msg files of your own ROS 2 types lie, as PACKAGE/msg/NAME.msg at any depth."""
     preview_hz: Annotated[float, RARE] = 5.0
     """At most this many small pictures a second for whoever watches; 0 makes none [1/s]."""
-    preroll_s: float = 0.0
-    """Begin each episode this long before its start [s]; 0 begins at the start."""
-    preroll_mb: Annotated[int, RARE] = 512
-    """Memory for those seconds [MB]; with less, an episode begins later."""
     command_timeout_s: Annotated[float, RARE] = 60.0
     """A start or stop that the disk has not carried out after this long is reported [s]."""
     queues: Annotated[QueueConfig, Parameter(name="*")] = QueueConfig()
@@ -110,8 +106,7 @@ class RecorderConfig:
     def __post_init__(self) -> None:
         """Refuse numbers with which nothing could be recorded."""
         refuse_outside(self, {"jpeg_quality": (1, 100), "command_timeout_s": (0.1, UNBOUNDED)})
-        refuse_outside(self, {"preview_hz": (0, 1000), "preroll_s": (0, 3600)})
-        refuse_outside(self, {"preroll_mb": (1, UNBOUNDED)})
+        refuse_outside(self, {"preview_hz": (0, 1000)})
 
 
 @dataclass(frozen=True, kw_only=True)

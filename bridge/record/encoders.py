@@ -14,7 +14,6 @@ from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.images import (
     COLOR_LAYOUTS,
     DEPTH_ENCODINGS,
-    FLOAT_DEPTH,
     check_image,
     depth_to_compact,
     image_header,
@@ -23,75 +22,52 @@ from bridge.episode.cdr.images import (
 from bridge.episode.topics import COLOR_TOPIC
 from bridge.record.config import RecorderConfig
 from bridge.record.inspection import GOOD, MessageState, inspector
-from bridge.record.queue import REDUCED_QUALITY, Item, LoadShedding
+from bridge.record.queue import Item
 from bridge.wire.session import WireSample
 
 MAX_THREADS = 32
 """Streams beyond this many share the threads of others."""
 
-Preview = Callable[[WireSample, str], None]
-"""Called with the image as it came and its kind, on the stream's thread."""
+Preview = Callable[[WireSample], None]
+"""Called with the image as it came, on the stream's thread."""
 
 
-class ImageEncoder:
-    """Turns raw images into what an episode holds."""
+def encode(item: Item, config: RecorderConfig) -> None:
+    """Replace an item's message where the profile asks for it; flag what is broken."""
+    sample = item.sample
+    if item.type_name != schema.IMAGE or sample.message_encoding not in ("", "cdr"):
+        item.finding = inspector(item.type_name, sample.message_encoding)(sample.data)
+        return
+    try:
+        header = image_header(sample.data)
+        check_image(sample.topic, header)
+        item.finding, item.image_encoding = GOOD, header.encoding
+        _transcode(item, header.encoding, config)
+    except MalformedMessageError:
+        item.finding = MessageState.UNDECODABLE
 
-    def __init__(self, config: RecorderConfig, shed: Callable[[], LoadShedding]) -> None:
-        """Choose the profile; ``shed`` says how far shedding has gone."""
-        self._config = config
-        self._shed = shed
-        self.kinds: dict[str, str] = {}
-        """color or depth, for each image topic seen."""
 
-    def encode(self, item: Item) -> None:
-        """Replace the item's message where the profile asks for it; flag what is broken."""
-        sample = item.sample
-        if item.type_name != schema.IMAGE or sample.message_encoding not in ("", "cdr"):
-            item.finding = inspector(item.type_name, sample.message_encoding)(sample.data)
-            if sample.topic not in self.kinds:
-                is_depth = b"compressedDepth" in sample.data[:256]
-                self.kinds[sample.topic] = "depth" if is_depth else "color"
-            return
-        try:
-            header = image_header(sample.data)
-            check_image(sample.topic, header)
-            item.finding, item.image_encoding = GOOD, header.encoding
-            self._transcode(item, header.encoding)
-        except MalformedMessageError:
-            item.finding = MessageState.UNDECODABLE
-
-    def _transcode(self, item: Item, encoding: str) -> None:
-        data, reduced, topic = None, False, item.sample.topic
-        if encoding in COLOR_LAYOUTS:
-            self.kinds[topic] = "color"
-            if self._config.color == "jpeg":
-                quality = self._config.jpeg_quality
-                if self._shed() >= LoadShedding.COLOR_QUALITY and quality > REDUCED_QUALITY:
-                    quality, reduced = REDUCED_QUALITY, True
-                data = image_to_jpeg(item.sample.data, quality)
-        elif encoding in DEPTH_ENCODINGS and not COLOR_TOPIC.search(topic):
-            self.kinds[topic] = "depth"
-            if self._config.depth == "compact":
-                data = depth_to_compact(item.sample.data)
-        elif encoding == FLOAT_DEPTH:  # recorded as it came: RVL holds whole millimetres only
-            self.kinds[topic] = "depth"
-        if data is not None:
-            item.image_encoding = ""
-            item.sample = replace(
-                item.sample, data=data, type_name=schema.COMPRESSED_IMAGE, type_hash=""
-            )
-            item.type_name = schema.COMPRESSED_IMAGE
-            item.reduced = reduced
+def _transcode(item: Item, encoding: str, config: RecorderConfig) -> None:
+    """Compress; depth in metres stays as it came, for RVL holds whole millimetres only."""
+    sample, data = item.sample, None
+    is_depth = encoding in DEPTH_ENCODINGS and not COLOR_TOPIC.search(sample.topic)
+    if encoding in COLOR_LAYOUTS and config.color == "jpeg":
+        data = image_to_jpeg(sample.data, config.jpeg_quality)
+    elif is_depth and config.depth == "compact":
+        data = depth_to_compact(sample.data)
+    if data is not None:
+        item.image_encoding, item.type_name = "", schema.COMPRESSED_IMAGE
+        item.sample = replace(sample, data=data, type_name=item.type_name, type_hash="")
 
 
 class EncoderThreads:
     """Hands each image to the thread of its stream."""
 
     def __init__(
-        self, encoder: ImageEncoder, done: Callable[[Item, int], None], preview: Preview
+        self, config: RecorderConfig, done: Callable[[Item, int], None], preview: Preview
     ) -> None:
         """Start without threads."""
-        self._encoder = encoder
+        self._config = config
         self._done = done
         self._preview = preview
         self._threads: dict[str, ThreadPoolExecutor] = {}
@@ -125,8 +101,8 @@ class EncoderThreads:
     def _treat(self, item: Item) -> None:
         original = item.sample
         if not item.for_preview:
-            self._encoder.encode(item)
-        self._preview(original, self._encoder.kinds.get(original.topic, ""))
+            encode(item, self._config)
+        self._preview(original)
 
     def close(self) -> None:
         """End the threads after what they hold."""

@@ -75,15 +75,14 @@ class Channels:
         self._msg_folder = msg_folder
         self._max_topics = max_topics
         self._warn = warn
-        self._channels: dict[tuple[str, str, str, str, bool], Channel] = {}
+        self._channels: dict[tuple[str, str, str, str], Channel] = {}
         self._last_ns: dict[str, list[int]] = {}
         self._records: dict[str, schema.Schema | None] = {}
         self._hashes: dict[str, str] = {}
 
     def of(self, sample: WireSample, type_name: str) -> Channel | None:
         """Return the channel of a message, or None when there are too many."""
-        is_defined = sample.definition is not None
-        key = (sample.topic, type_name, sample.message_encoding, sample.type_hash, is_defined)
+        key = (sample.topic, type_name, sample.message_encoding, sample.type_hash)
         channel = self._channels.get(key)
         if channel is None and len(self._channels) < self._max_topics:
             channel = self._channels[key] = self._new(sample, type_name)
@@ -130,8 +129,6 @@ class Channels:
             return None, False
         encoding = sample.message_encoding
         known = schema.schema_for(type_name)
-        if known is None and sample.definition is not None:
-            return sample.definition, False
         if encoding not in ("", known.message_encoding if known else "cdr"):
             return _name_only(type_name, encoding), False
         type_hash = sample.type_hash if sample.type_hash.startswith(HASH_PREFIX) else ""
@@ -197,7 +194,10 @@ class EpisodeRecording:
         self._writer = EpisodeWriter(
             folder / f"{info.id}{SUFFIX}",
             config=WriterConfig(
-                flush_s=disk.flush_s, sync_s=disk.sync_s, backlog_bytes=disk.backlog_bytes
+                chunk_bytes=1 << 20,
+                flush_s=disk.flush_s,
+                sync_s=disk.sync_s,
+                backlog_bytes=disk.backlog_bytes,
             ),
         )
         try:
@@ -230,9 +230,9 @@ class EpisodeRecording:
         """The episode's file when it is finished."""
         return self._writer.path
 
-    def keep_name(self) -> bool:
-        """Write the file anew where somebody removed it; raises OSError when that fails."""
-        return self._writer.keep_name()
+    def refuse_removed(self) -> None:
+        """Raise OSError where somebody removed or replaced the file."""
+        self._writer.refuse_removed()
 
     @property
     def keeps_up(self) -> bool:
@@ -296,11 +296,13 @@ class EpisodeRecording:
     def _append(
         self, channel: Channel, sample: WireSample, stamp_ns: int, image_encoding: str = ""
     ) -> int | None:
-        log_ns = channel.later(stamp_ns)
         source_ns = sample.source_ns
         if source_ns is None and channel.stamp_ns is not None:
             source_ns = channel.stamp_ns(sample.data)
-        self._writer.write_foreign(
+        if self.info.stand_in:  # by its clock, which may run ahead of this one
+            stamp_ns = max(self.start_ns, source_ns or 0)
+        log_ns = channel.later(stamp_ns)
+        self._writer.write(
             sample.topic,
             sample.data,
             schema_record=channel.record,
@@ -334,7 +336,7 @@ class EpisodeRecording:
         self, topic: str, record: dict[str, Any], type_name: str, stamp_ns: int
     ) -> None:
         log_ns = self._channels.later(topic, stamp_ns)
-        self._writer.write_json(topic, record, type_name=type_name, log_time_ns=log_ns)
+        self._writer.write(topic, record, type_name=type_name, log_time_ns=log_ns)
 
     def write_clock(self, record: dict[str, Any], stamp_ns: int) -> None:
         """Append readings of a source's clock."""

@@ -95,7 +95,7 @@ def _inspect_cdr(topic: str, type_name: str, data: bytes) -> MessageState:
 def why_unreadable(topic: str, type_name: str, data: bytes) -> str:
     """Say what is wrong with a message that was found undecodable."""
     try:
-        if type_name in schema.DEFINITIONS:
+        if type_name in schema.ROS_TYPES:
             _read(topic, type_name, data)
     except codec.MalformedMessageError as error:
         return str(error)

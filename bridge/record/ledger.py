@@ -1,7 +1,7 @@
 """What was received and what was lost: per topic and second, and in total.
 
 Of every topic, as long as its messages are numbered:
-sent = received - repeated + gaps + queue_drops + shed.
+sent = received - repeated + gaps + queue_drops.
 """
 
 import json
@@ -30,10 +30,6 @@ class Tally:
     which more of them arrived late than went missing."""
     queue_drops: int = 0
     """Reached the recorder, which could not keep them."""
-    shed: int = 0
-    """Reached the recorder, which left them out so that it could keep the others."""
-    reduced: int = 0
-    """Images written at less than the wanted quality, for the same reason."""
     undecodable: int = 0
     """Written as they are, but not what their type says."""
     newer_version: int = 0
@@ -64,7 +60,7 @@ class Tally:
     @property
     def lost(self) -> int:
         """Everything that was sent and is not in the episode."""
-        return self.gaps + self.queue_drops + self.shed
+        return self.gaps + self.queue_drops
 
     def to_record(self) -> dict[str, Any]:
         """Counts by name."""
@@ -123,7 +119,6 @@ class Ledger:
         self._book(tally, item)
         tally.repeated += item.step.repeated
         tally.unnumbered += sample.sequence is None
-        tally.reduced += item.reduced
         gid = sample.source_gid
         if gid is not None and len(self._streams) < MAX_STREAMS:
             self._streams.add((sample.topic, gid))
@@ -149,7 +144,6 @@ class Ledger:
         for (topic, second), count in dropped.counts.items():
             tally = self._tally(topic, second)
             tally.queue_drops += count.messages
-            tally.shed += count.shed
             tally.gaps += count.gaps - sum(ticket >= self._first for ticket in count.fills)
         self._told |= dropped.told
         for text in dropped.warnings:

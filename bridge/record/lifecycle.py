@@ -5,13 +5,12 @@ import errno
 import os
 import tempfile
 import traceback
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bridge.clock import ns_from_s, s_from_ns
+from bridge.clock import s_from_ns
 from bridge.episode import metadata
 from bridge.episode.contract import Contract
 from bridge.episode.run_folder import RunFolder
@@ -21,7 +20,6 @@ from bridge.record.episode_recording import EpisodeRecording
 from bridge.record.errors import DiskError, LifecycleError, NoSpaceError
 from bridge.record.presence import News
 from bridge.record.queue import (
-    OVERHEAD_BYTES,
     Command,
     Dropped,
     Item,
@@ -86,64 +84,6 @@ def free_bytes(folder: Path) -> int:
     return found.f_bavail * found.f_frsize
 
 
-class PreRoll:
-    """Holds messages as they would be written; what falls out at the old end is passed on."""
-
-    def __init__(self, *, seconds: float, max_bytes: int, passed: Callable[[Item], None]) -> None:
-        """Set the bounds."""
-        self._span_ns = ns_from_s(seconds)
-        self._max_bytes = max_bytes
-        self._passed = passed
-        self._entries: deque[Item | Dropped] = deque()
-        self.bytes = 0
-
-    @property
-    def is_on(self) -> bool:
-        """Say whether anything is held at all."""
-        return self._span_ns > 0
-
-    def add(self, entry: Item | Dropped) -> None:
-        """Hold a message, or the count of messages that were left out."""
-        if not self.is_on:
-            if isinstance(entry, Item):
-                self._passed(entry)
-            return
-        self._entries.append(entry)
-        self.bytes += _size(entry)
-        while self.bytes > self._max_bytes:
-            self._let_go()
-
-    def trim(self, now_ns: int) -> None:
-        """Let go of what is too old."""
-        while self._entries and self._entries[0].received_ns < now_ns - self._span_ns:
-            self._let_go()
-
-    def _let_go(self) -> None:
-        entry = self._entries.popleft()
-        self.bytes -= _size(entry)
-        if isinstance(entry, Item):
-            self._passed(entry)
-
-    def held(self, now_ns: int) -> list[Item | Dropped]:
-        """Return what lies within the span, in order of arrival."""
-        self.trim(now_ns)
-        return sorted(self._entries, key=lambda entry: entry.ticket)
-
-    def empty(self) -> None:
-        """Let go of everything: it is in an episode now."""
-        while self._entries:
-            self._let_go()
-
-    def seconds(self, now_ns: int) -> float:
-        """How far back it reaches now [s]."""
-        first = self._entries[0].received_ns if self._entries else now_ns
-        return max(0, now_ns - first) / 1e9
-
-
-def _size(entry: Item | Dropped) -> int:
-    return OVERHEAD_BYTES + (len(entry.sample.data) if isinstance(entry, Item) else 0)
-
-
 Answer = dict[str, Any]
 UNANSWERED_S = 1.0
 """A disk that has been at one write for so long is not asked for anything else [s]."""
@@ -172,11 +112,6 @@ class Lifecycle:
         """What the topics of the next episode promise."""
         self.earlier_clocks: Callable[[], list[Answer]] = list
         """Readings of the sources' clocks made before an episode."""
-        self.ring = PreRoll(
-            seconds=config.preroll_s,
-            max_bytes=config.preroll_mb * BYTES_PER_MB,
-            passed=lambda item: self.latched.remember(item.sample),
-        )
         self._reserve = DiskReserve(run.episodes_dir, config.disk.reserve_mb)
         self.free_bytes = free_bytes(run.path)
         self._run = run
@@ -187,7 +122,7 @@ class Lifecycle:
     @property
     def is_quiet(self) -> bool:
         """Say whether messages are of no use now, but for what is latched."""
-        return self.take is None and not self.ring.is_on
+        return self.take is None
 
     @property
     def keeps_up(self) -> bool:
@@ -207,15 +142,13 @@ class Lifecycle:
         return {"queue_bytes": self._queued_bytes(), "disk_free_bytes": self.free_bytes}
 
     def receive(self, entry: Item | Dropped) -> None:
-        """Write, keep for the pre-roll, or leave out."""
-        take = self.take
-        if take is None:
-            self.ring.add(entry)
-        elif isinstance(entry, Item):
+        """Write, keep where it is latched, or leave out."""
+        if isinstance(entry, Item):
             self.latched.remember(entry.sample)
-            self._write(take, entry)
-        else:
-            take.ledger.count_dropped(entry)
+            if self.take is not None:
+                self._write(self.take, entry)
+        elif self.take is not None:
+            self.take.ledger.count_dropped(entry)
 
     def _write(self, take: EpisodeRecording, item: Item) -> None:
         """One message that cannot be written is counted as lost; recording goes on."""
@@ -231,7 +164,6 @@ class Lifecycle:
 
     def tick(self, now_ns: int) -> None:
         """Do what time asks for: flush, close seconds. Raises OSError for the disk."""
-        self.ring.trim(now_ns)
         if self.take is not None:
             self.take.tick(now_ns, self._health())
 
@@ -242,12 +174,10 @@ class Lifecycle:
         news, self.take.news = self.take.news, []
         return news
 
-    def look_at_file(self) -> str:
-        """Return what happened to the open file from outside, or ""; raises OSError."""
-        take = self.take
-        if take is None or not take.keep_name():
-            return ""
-        return f"{take.part_path} was removed while it was written; it was written there anew"
+    def look_at_file(self) -> None:
+        """Raise OSError where the open file is gone from its place."""
+        if self.take is not None:
+            self.take.refuse_removed()
 
     @property
     def may_ask_disk(self) -> bool:
@@ -277,17 +207,22 @@ class Lifecycle:
     def start(
         self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
     ) -> Answer:
-        """Begin an episode, with the pre-roll if there is one."""
+        """Begin an episode."""
         self._refuse_start(info.id)
-        held = self.ring.held(command.received_ns)
-        self.take = self._open(info, held, command, task)
-        self._write_held(self.take, held)
-        self.ring.empty()
-        answer: Answer = {"ok": True, "episode": info.id}
-        if self.ring.is_on:
-            first_ns = min([entry.received_ns for entry in held], default=command.received_ns)
-            answer["preroll_s"] = s_from_ns(command.received_ns - first_ns)
-        return answer
+        self._reserve.hold()
+        self.take = EpisodeRecording(
+            self._run.episodes_dir,
+            info,
+            self._config,
+            start_ns=command.received_ns,
+            latched=self.latched.all,
+            others=self.others,
+            contract=self.contract,
+            task=task,
+            clocks=self.earlier_clocks(),
+        )
+        self.take.ledger.begin(command.ticket)
+        return {"ok": True, "episode": info.id}
 
     def _refuse_start(self, episode_id: str) -> None:
         if self.is_closing:
@@ -305,36 +240,6 @@ class Lifecycle:
         lacks, free_mb, min_mb = self._space()
         if lacks:
             raise NoSpaceError(folder=self._run.path, free_mb=free_mb, wanted_mb=min_mb)
-
-    def _open(
-        self,
-        info: metadata.EpisodeInfo,
-        held: list[Item | Dropped],
-        command: Command,
-        task: TaskFile | None,
-    ) -> EpisodeRecording:
-        self._reserve.hold()
-        first_ns = [entry.received_ns for entry in held]
-        take = EpisodeRecording(
-            self._run.episodes_dir,
-            info,
-            self._config,
-            start_ns=min([*first_ns, command.received_ns]),
-            latched=self.latched.all,
-            others=self.others,
-            contract=self.contract,
-            task=task,
-            clocks=self.earlier_clocks(),
-        )
-        take.ledger.begin(held[0].ticket if held else command.ticket)
-        return take
-
-    def _write_held(self, take: EpisodeRecording, held: list[Item | Dropped]) -> None:
-        for entry in held:
-            if isinstance(entry, Item):
-                self._write(take, entry)
-            else:
-                take.ledger.count_dropped(entry)
 
     def _open_take(self) -> EpisodeRecording:
         if self.take is None:
@@ -412,7 +317,6 @@ def counts(take: EpisodeRecording) -> Answer:
         "lost": total.lost,
         "undecodable": total.undecodable,
         "unknown_type": total.unknown_type,
-        "shed": total.shed,
         "unnumbered": take.ledger.unnumbered(),
         "findings": [asdict(finding) for finding in take.findings()],
     }

@@ -23,7 +23,6 @@ from bridge.record.config import RecorderConfig
 from bridge.record.control import serve_control
 from bridge.record.errors import FolderTakenError
 from bridge.record.presence import Heartbeat
-from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import Ros2Graph
 from bridge.task.task_file import TaskFile
@@ -42,14 +41,11 @@ MAX_PREVIEWS = 64
 class Previews:
     """Makes previews on the encoders' threads; every image of every stream passes here."""
 
-    def __init__(
-        self, session: WireSession, recorder: str, rate_hz: float, shed: Callable[[], LoadShedding]
-    ) -> None:
+    def __init__(self, session: WireSession, recorder: str, rate_hz: float) -> None:
         """Publish nothing yet."""
         self._session = session
         self._recorder = recorder
         self._period_s = 1 / rate_hz if rate_hz else None
-        self._shed = shed
         self._publishers: dict[str, WirePublisher] = {}
         self._names: set[str] = set()
         self._watched: frozenset[str] = frozenset()
@@ -82,10 +78,10 @@ class Previews:
         self._names.add(name)
         return name
 
-    def show(self, sample: WireSample, kind: str) -> None:
+    def show(self, sample: WireSample) -> None:
         """Send a small copy of an image, if somebody looks and it is time for one."""
         topic = sample.topic
-        if topic not in self._watched or kind == "depth" or self._shed() >= LoadShedding.PREVIEWS:
+        if topic not in self._watched:
             return
         now_s = time.monotonic()
         if now_s < self._next_s.get(topic, 0.0):
@@ -180,16 +176,13 @@ class LiveRecorder:
         reports = recover_parts(run)
         for report in reports:
             say(_describe_recovery(report))
-        previews = Previews(
-            session, config.recorder, config.preview_hz, lambda: core.input_queue.shed
-        )
+        previews = Previews(session, config.recorder, config.preview_hz)
         core = self.core = Recorder(
             run, now_ns=session.now_ns, config=config, preview=previews.show, task=task
         )
         core.note_recovered([_recovery_record(report) for report in reports])
         self._previews = previews
         self._ended = threading.Event()
-        session.collect_definitions()
         self._subscribers = [
             session.subscribe(key, self._take, max_bytes=config.queues.max_message_bytes)
             for key in config.topics

@@ -272,7 +272,6 @@ class PresenceMonitor:
             "missing": self.missing(self.contract),
             "deaf_s": round(deaf_s, 1),
             "starved_s": round(self.starved_s, 1),
-            "hears_itself": self._was_heard,
         }
 
 

@@ -8,9 +8,8 @@ their place among the messages.
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from enum import IntEnum
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
@@ -99,46 +98,6 @@ def _children(sample: WireSample) -> frozenset[str]:
         return frozenset()
 
 
-# What is left out first when images come faster than they can be written: previews, then the
-# quality of colour, then every other colour image, then every other depth image. Joints, plans and
-# all other small messages are never shed.
-
-
-class LoadShedding(IntEnum):
-    """How far shedding has gone; each level includes those before it."""
-
-    NOTHING = 0
-    PREVIEWS = 1
-    COLOR_QUALITY = 2
-    COLOR_RATE = 3
-    DEPTH_RATE = 4
-
-
-BEGINS_AT = (0.0, 0.25, 0.5, 0.7, 0.85)
-"""Fill of the camera queue at which each level begins."""
-ENDS_BELOW = 0.75
-"""A level ends when the fill is below this part of where it began."""
-REDUCED_QUALITY = 60
-"""JPEG quality from ``COLOR_QUALITY`` on."""
-
-
-def next_level(level: LoadShedding, fill: float) -> LoadShedding:
-    """Return the level that belongs to a fill of 0 to 1, given the level so far."""
-    wanted = max(item for item in LoadShedding if fill >= BEGINS_AT[item])
-    if wanted < level and fill >= BEGINS_AT[level] * ENDS_BELOW:
-        return level
-    return wanted
-
-
-def keep_every(level: LoadShedding, kind: str) -> int:
-    """Return n when only every n-th image of a kind (color, depth or "") is to be kept."""
-    if kind == "color":
-        return {LoadShedding.COLOR_RATE: 2, LoadShedding.DEPTH_RATE: 4}.get(level, 1)
-    if kind == "depth":
-        return 2 if level >= LoadShedding.DEPTH_RATE else 1
-    return 1
-
-
 MAX_WARNINGS = 1000
 
 
@@ -157,8 +116,6 @@ class Item:
     """Takes space from the budget of images, not from that of small messages."""
     finding: MessageState | None = None
     """None when nobody has looked yet."""
-    reduced: bool = False
-    """Of less than the wanted quality."""
     for_preview: bool = False
     """Nobody records; only a preview is made of it."""
     image_encoding: str = ""
@@ -175,7 +132,6 @@ class DropCount:
     """What was not taken in of one topic in one second."""
 
     messages: int = 0
-    shed: int = 0
     gaps: int = 0
     fills: list[int] = field(default_factory=list)
     """Tickets at which messages that then came late had been booked as missing."""
@@ -247,23 +203,18 @@ class Flow:
     seen: int = 0
     second: int = 0
     in_second: int = 0
-    waiting: int = 0
-    """Images since the last one that was kept while shedding."""
 
 
 class InputQueue:
     """Filled by network threads, emptied by the writer thread."""
 
-    def __init__(
-        self, limits: QueueConfig, hand_over: Callable[[Item], None], kinds: Mapping[str, str]
-    ) -> None:
+    def __init__(self, limits: QueueConfig, hand_over: Callable[[Item], None]) -> None:
         """Set the budgets."""
         self._limits = limits
         self._bulk_budget = limits.camera_queue_mb * BYTES_PER_MB
         self._small_budget = limits.small_queue_mb * BYTES_PER_MB
         self._max_bytes = limits.max_message_bytes
         self._hand_over = hand_over
-        self._kinds = kinds
         self._tracker = SequenceTracker()
         self.latched = LatchedTopics()
         """Queued even while nothing is recorded."""
@@ -281,7 +232,6 @@ class InputQueue:
         self._small_in = 0
         self._small_out = 0
         self._is_quiet = False
-        self.shed = LoadShedding.NOTHING
         self.watched: frozenset[str] = frozenset()
         """Image topics of which somebody wants a preview."""
 
@@ -354,40 +304,22 @@ class InputQueue:
         if second != flow.second:
             flow.second, flow.in_second = second, 0
         flow.in_second += 1
+        small = self._small_budget - (self._small_in - self._small_out)
+        free = self._bulk_budget - self._bulk_bytes if is_bulk else small
         if flow.in_second > self._limits.max_rate_hz:
             self._drop(sample, step, f"over {self._limits.max_rate_hz} messages a second")
         elif sample.oversize_bytes or cost - OVERHEAD_BYTES > self._max_bytes:
             self._drop(sample, step, f"messages over {self._limits.max_message_mb:g} MB")
         elif flow.is_ledger:
             self._drop(sample, step, "messages of anybody but the recorder")
-        elif is_bulk and self._is_shed(flow):
-            self._drop(sample, step, None)
-        elif cost > self._free_bytes(is_bulk=is_bulk):
+        elif cost > free:
             self._drop(sample, step, "")
         else:
             return True
         return False
 
-    def _free_bytes(self, *, is_bulk: bool) -> int:
-        if is_bulk:
-            return self._bulk_budget - self._bulk_bytes
-        return self._small_budget - (self._small_in - self._small_out)
-
-    def _is_shed(self, flow: Flow) -> bool:
-        self.shed = next_level(self.shed, self._bulk_bytes / self._bulk_budget)
-        every = keep_every(self.shed, self._kinds.get(flow.topic, ""))
-        flow.waiting += 1
-        if flow.waiting < every:
-            return True
-        flow.waiting = 0
-        return False
-
-    def _drop(self, sample: WireSample, step: Step, limit: str | None) -> None:
-        """Count a message that is left out.
-
-        Args:
-            limit: The limit it broke, "" for want of space, None for shedding.
-        """
+    def _drop(self, sample: WireSample, step: Step, limit: str) -> None:
+        """Count a message that is left out, for want of space where it broke no limit."""
         dropped = self._open_drops(sample.received_ns)
         count = dropped.count(sample.topic, sample.received_ns)
         count.gaps += step.gap
@@ -395,10 +327,7 @@ class InputQueue:
             count.fills.append(step.fills)
         if step.repeated:
             return
-        if limit is None:
-            count.shed += 1
-        else:
-            count.messages += 1
+        count.messages += 1
         if limit:
             dropped.warn(f"{sample.topic}: {limit} are dropped")
 

@@ -21,7 +21,7 @@ from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import BridgeError, GstError
 from bridge.record.clocks import ClockBook
 from bridge.record.config import RecorderConfig
-from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
+from bridge.record.encoders import EncoderThreads, Preview
 from bridge.record.errors import (
     ControlError,
     DiskError,
@@ -56,7 +56,7 @@ class Recorder:
         *,
         now_ns: Callable[[], int],
         config: RecorderConfig | None = None,
-        preview: Preview = lambda sample, kind: None,
+        preview: Preview = lambda sample: None,
         task: TaskFile | None = None,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
@@ -64,11 +64,10 @@ class Recorder:
         self.config = config or RecorderConfig()
         self.failed = threading.Event()
         self._now_ns = now_ns
-        self._run = run
+        self.run = run
         self._task = task
-        encoder = ImageEncoder(self.config, lambda: self.input_queue.shed)
-        self._encoders = EncoderThreads(encoder, self._take_back, preview)
-        self.input_queue = InputQueue(self.config.queues, self._encoders.submit, encoder.kinds)
+        self._encoders = EncoderThreads(self.config, self._take_back, preview)
+        self.input_queue = InputQueue(self.config.queues, self._encoders.submit)
         self._merge = Merge(lambda: self._life.keeps_up)
         self._life = Lifecycle(
             run, self.config, lambda: self.input_queue.queued_bytes, self.input_queue.latched
@@ -113,13 +112,13 @@ class Recorder:
 
     def read_contract(self) -> None:
         """Read the contract of the cell anew; it may have been learned or edited."""
-        contract = find_contract(self._run.path, self.config.contract)
+        contract = find_contract(self.run.path, self.config.contract)
         self._life.contract = self.presence.contract = contract
 
     def start(
         self, info: metadata.EpisodeInfo, task: TaskFile | None = None, *, anyway: bool = False
     ) -> Answer:
-        """Begin an episode, with the pre-roll if there is one.
+        """Begin an episode.
 
         Args:
             task: Its task file: attached to the episode, and kept in the run's ``tasks/``; looked
@@ -155,7 +154,7 @@ class Recorder:
         if not info.task:
             return None
         try:
-            return find_task_file(info.task, tasks_dir=self._run.tasks_dir)
+            return find_task_file(info.task, tasks_dir=self.run.tasks_dir)
         except MissingTaskError:
             return None
 
@@ -165,7 +164,7 @@ class Recorder:
             return {}
         name = task.task().name
         try:
-            path = keep_task_file(self._run.tasks_dir, name, task.data)
+            path = keep_task_file(self.run.tasks_dir, name, task.data)
         except OSError as error:  # the episode carries it all the same
             return {"task_file": None, "task_remark": f"tasks/ cannot be written: {error.strerror}"}
         answer = {"task_file": str(path)}
@@ -264,13 +263,13 @@ class Recorder:
             )
         if text and not outcome.detail:
             outcome = replace(outcome, detail=text)
-        note = label_episode(self._run, name, outcome)
+        note = label_episode(self.run, name, outcome)
         return {"ok": True, "episode": name, "note": str(note)}
 
     def episodes(self, last: int) -> Answer:
         """The last episodes of the run folder, by name."""
-        paths = self._run.episodes()
-        episodes = [asdict(read_entry(self._run, path)) for path in paths[-last:]]
+        paths = self.run.episodes()
+        episodes = [asdict(read_entry(self.run, path)) for path in paths[-last:]]
         return {"ok": True, "of": len(paths), "episodes": episodes}
 
     def declare_latched(self, topic: str) -> None:
@@ -393,8 +392,7 @@ class Recorder:
                     self.note(news)
         if now_s >= self._next_look_s and self._life.may_ask_disk:
             self._next_look_s = now_s + LOOK_S
-            if happened := self._life.look_at_file():
-                self.note(News(text=happened, data={"kind": "file_removed"}))
+            self._life.look_at_file()
             if (cause := self._life.look_at_disk()) and not self._status.failing:
                 self._end_because(cause)
 

@@ -83,11 +83,9 @@ class Status:
             "last_episode": life.last_episode,
             "queue_bytes": self._input_queue.queued_bytes,
             "disk_free_bytes": life.free_bytes,
-            "shedding": self._input_queue.shed.name.lower(),
             "write_lag_s": round(disk["write_lag_s"], 2),
             "stalled_s": round(stalled_s, 1) if stalled_s > STALLED_S else 0.0,
             "clock_steps": self.clock_steps,
-            "preroll_s": round(life.ring.seconds(self._now_ns()), 1),
             "recovered": self.recovered,
             "seen": self._input_queue.seen(),
             "rates_hz": self._rates_hz,
@@ -113,8 +111,7 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
         stalled += f", small messages wait {lag_s:.1f} s for the disk"
     stalled += _hearing(status)
     if status["state"] == "idle":
-        ring = f", pre-roll {s:.1f} s" if (s := status["preroll_s"]) else ""
-        return f"idle, {len(status['seen'])} topics seen{ring}, {free}{stalled}"
+        return f"idle, {len(status['seen'])} topics seen, {free}{stalled}"
     rate = "" if rate_hz is None else f" ({rate_hz:.0f}/s)"
     flags = "".join(
         f", {status[name]} {name.replace('_', ' ')}"
@@ -124,8 +121,6 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
     if status.get("findings"):
         found = [f"{in_words(each['name'])} on {each['about']}" for each in status["findings"]]
         flags += f", {in_short(found)}"
-    if status["shedding"] != "nothing":
-        flags += f", shedding {status['shedding'].replace('_', ' ')}"
     return (
         f"{status['state']} {status['episode']}: {status['duration_s']:.1f} s, "
         f"{status['messages']} messages{rate}, {status['bytes'] / 1e6:.1f} MB, "

@@ -126,8 +126,6 @@ class Robot:
     own whose parent is a link of the arm; a link of the arm gets the shapes it has there."""
     flange: str = ""
     """Link of the arm that attached files are mounted on; "": the one that they name."""
-    prefix: str = ""
-    """Put before every joint, link and frame: of this file, and of the URDF where it lacks it."""
     joints: tuple[str, ...]
     """The arm's, base to flange: the order of every array of joint values."""
     base_frame: str = "base_link"
@@ -195,8 +193,6 @@ class Robot:
             for item in part:
                 known = there.get(item.get("name")) if item.tag == "link" else None
                 arm.append(item) if known is None else known.extend(list(item))
-        if self.prefix:
-            _put_before(self.prefix, arm)
         for joint in arm.findall("joint"):
             mimics = [m for m in joint.findall("mimic") if not number_of(m.get("offset", "0"))]
             if {joint.get("name"), *(m.get("joint") for m in mimics)} & set(self.held):
@@ -260,9 +256,9 @@ class Robot:
             if parent.get("link") in own:
                 continue
             if self.flange:
-                parent.set("link", self.flange.removeprefix(self.prefix))
+                parent.set("link", self.flange)
             mount = parent.get("link", "")
-            if not {mount, self.prefix + mount} & links:
+            if mount not in links:
                 raise UsageError(
                     f"{name} hangs on {mount!r}, which the arm of {self.name!r} lacks. Set flange "
                     f"to one of: {', '.join(str(link) for link in sorted(links, key=str))}."
@@ -274,19 +270,8 @@ class Robot:
 
 _UNREAD = re.compile(rb"<!--.*?-->|<gazebo\b[^>]*/>|<gazebo\b.*?</gazebo>", re.DOTALL)
 """Simulators read these, with prefixes that nothing declares."""
-_OF_FILES = ("attached", "flange", "prefix", "held", "mesh_folders", "folder")
+_OF_FILES = ("attached", "flange", "held", "mesh_folders", "folder")
 """Fields that say how the URDF is put together: a description is put together already."""
-
-
-def _put_before(prefix: str, root: ET.Element) -> None:
-    """Rename links and joints, and what refers to them."""
-    elements = [(item, "name") for item in [*root.findall("link"), *root.findall("joint")]]
-    elements += [(item, "link") for tag in ("parent", "child") for item in root.iter(tag)]
-    elements += [(item, "joint") for item in root.iter("mimic")]
-    for item, key in elements:
-        name = item.get(key, "")
-        if name and not name.startswith(prefix):
-            item.set(key, prefix + name)
 
 
 _ODD = (msgspec.ValidationError, AttributeError, TypeError, ValueError)
@@ -372,7 +357,7 @@ def robot_name(urdf: str) -> str:
 
 
 def _robot_from(table: Mapping[str, Any]) -> Robot:
-    """Make the record of a table, names with their prefix."""
+    """Make the record of a table."""
     gripper = table.get("gripper", {})
     parts = [(Robot, "robot", table), (Gripper, "gripper", gripper)]
     parts += [(Finger, "gripper.fingers", item) for item in gripper.get("fingers", ())]
@@ -383,36 +368,10 @@ def _robot_from(table: Mapping[str, Any]) -> Robot:
             guess = f"; did you mean {near[0]!r}?" if near else "."
             raise ValueError(f"{where} has no {key}{guess} It may have: {', '.join(allowed)}")
     json.dumps(table, default=str, allow_nan=False)  # refuses numbers that are none
-    robot = _prefixed(msgspec.convert(table, Robot))
+    robot = msgspec.convert(table, Robot)
     _check_names(robot)
     _check_numbers(robot)
     return robot
-
-
-def _prefixed(robot: Robot) -> Robot:
-    """Put the prefix before all names that the file gives without it."""
-    before = robot.prefix
-    if not before:
-        return robot
-
-    def named(name: str) -> str:
-        return name if name.startswith(before) else before + name
-
-    gripper = robot.gripper
-    return replace(
-        robot,
-        joints=tuple(map(named, robot.joints)),
-        base_frame=named(robot.base_frame),
-        tool_frame=named(robot.tool_frame),
-        held=tuple(map(named, robot.held)),
-        may_overlap=tuple((named(one), named(other)) for one, other in robot.may_overlap),
-        gripper=replace(
-            gripper,
-            links=tuple(map(named, gripper.links)),
-            finger_links=tuple(map(named, gripper.finger_links)),
-            fingers=tuple(replace(item, joint=named(item.joint)) for item in gripper.fingers),
-        ),
-    )
 
 
 def _check_names(robot: Robot) -> None:

@@ -52,13 +52,6 @@ def key_from_topic(topic: str) -> str:
     return key
 
 
-def topic_pattern(expression: str) -> re.Pattern[str]:
-    """Turn a key expression (``lab/*/image``, ``lab/**``) into a pattern of whole topics."""
-    parts = expression.strip("/").split("/")
-    named = {"**": "(?:/[^/]+)*", "*": "/[^/]+"}
-    return re.compile("".join(named.get(part, "/" + re.escape(part)) for part in parts))
-
-
 @lru_cache(maxsize=4096)
 def read_key(key: str) -> NamedKey:
     """Tell the topic of a key, and type and hash when it is one of rmw_zenoh."""
@@ -73,34 +66,6 @@ def ros_type(dds_name: str) -> str:
     """Turn ``std_msgs::msg::dds_::String_`` into ``std_msgs/msg/String``."""
     parts = [part for part in dds_name.split("::") if part != "dds_"]
     return "/".join(parts).removesuffix("_")
-
-
-DEFINITIONS = "@schema"
-"""Publishers of types that nobody knows put their definitions below this key."""
-_SCHEMA_ENCODINGS = {
-    "ros2msg": "cdr",
-    "ros2idl": "cdr",
-    "ros1msg": "ros1",
-    "protobuf": "protobuf",
-    "flatbuffer": "flatbuffer",
-    "jsonschema": "json",
-}
-"""MCAP's schema encodings, and the message encoding that goes with each."""
-
-
-def definition_key(type_name: str, schema_encoding: str) -> str:
-    """Name the key of a type's definition: ``@schema/jsonschema/acme/Note``."""
-    return f"{DEFINITIONS}/{key_from_topic(f'/{schema_encoding}/{type_name}')}"
-
-
-def read_definition_key(key: str) -> tuple[str, str, str] | None:
-    """Return type name, schema encoding and message encoding of a definition's key, or None."""
-    _, _, rest = key.partition(f"{DEFINITIONS}/")
-    schema_encoding, _, type_name = rest.partition("/")
-    message_encoding = _SCHEMA_ENCODINGS.get(schema_encoding)
-    if message_encoding is None or not type_name:
-        return None
-    return type_name, schema_encoding, message_encoding
 
 
 def encoding_of(type_name: str, message_encoding: str) -> str:

@@ -20,8 +20,6 @@ class Qos:
     sees a gap in the numbers."""
     priority: str
     """Which of zenoh's queues carries it, by its name there; a full queue delays no other one."""
-    shared_memory: bool = False
-    """Large messages go through shared memory when the session has some."""
     is_remote: bool = False
     """Subscribers of the same session get none, and do not count as somebody who looks."""
 
@@ -37,14 +35,11 @@ class Qos:
     """Joints and whatever else a control loop sends: small, frequent, never waits."""
     RELIABLE: ClassVar["Qos"]
     """Plans, events, labels, files: nothing may be lost and the sender can wait."""
-    PLAYBACK: ClassVar["Qos"]
-    """What was recorded: every message in one order, and the sender waits for a slow receiver."""
     PREVIEW: ClassVar["Qos"]
     """Pictures for a person; the first to go."""
 
 
-Qos.CAMERA = Qos(name="camera", block=False, priority="data_low", shared_memory=True)
+Qos.CAMERA = Qos(name="camera", block=False, priority="data_low")
 Qos.CONTROL = Qos(name="control", block=False, priority="real_time")
 Qos.RELIABLE = Qos(name="reliable", block=True, priority="data")
-Qos.PLAYBACK = Qos(name="playback", block=True, priority="data", shared_memory=True)
 Qos.PREVIEW = Qos(name="preview", block=False, priority="background", is_remote=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.episode.schema import Schema
-from bridge.errors import MissingDependencyError, UsageError
+from bridge.errors import UsageError
 
 NAME_PARTS = 3
 
@@ -101,12 +101,8 @@ def _read_folder(folder: Path) -> dict[str, Any]:
 
 @cache
 def _typesys() -> Any:
-    try:
-        from rosbags import typesys  # noqa: PLC0415  # only where ROS 2 types are met
-    except ImportError as error:
-        raise MissingDependencyError(
-            package="rosbags", extra="record", purpose="knowing ROS 2 message types"
-        ) from error
+    from rosbags import typesys  # noqa: PLC0415  # only where ROS 2 types are met
+
     return typesys
 
 

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import TracebackType
@@ -34,7 +34,7 @@ from bridge.wire.errors import (
     cause_of,
     public,
 )
-from bridge.wire.publisher import BYTES_PER_MB, SharedPool
+from bridge.wire.publisher import BYTES_PER_MB
 from bridge.wire.publisher import WirePublisher as WirePublisher
 from bridge.wire.qos import Qos
 from bridge.wire.zenoh_config import zenoh, zenoh_config
@@ -126,17 +126,8 @@ class WireSample:
     source_gid: bytes | None
     """16 bytes that no other publisher has."""
     received_ns: int
-    attachment_bytes: int = 0
-    """Size of the attachment, whether it could be read or not."""
-    definition: schema.Schema | None = None
-    """What the publisher says its type is, where it does."""
     oversize_bytes: int = 0
     """Size of a payload beyond the subscription's limit; then ``data`` is empty, not a copy."""
-
-
-NO_DEFINITIONS: Mapping[tuple[str, str], schema.Schema] = {}
-MAX_DEFINITIONS = 1000
-MAX_DEFINITION_BYTES = 4_000_000
 
 
 def copy_sample(
@@ -144,7 +135,6 @@ def copy_sample(
     received_ns: int,
     *,
     max_bytes: int = sys.maxsize,
-    definitions: Mapping[tuple[str, str], schema.Schema] = NO_DEFINITIONS,
 ) -> WireSample:
     """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory."""
     size = len(sample.payload)
@@ -152,8 +142,7 @@ def copy_sample(
     named = keys.read_key(str(sample.key_expr))
     type_name, message_encoding = keys.parse_encoding(str(sample.encoding))
     raw = sample.attachment
-    attachment = None if raw is None else raw.to_bytes()
-    note = publisher.decode(attachment)
+    note = publisher.decode(None if raw is None else raw.to_bytes())
     if note is None:
         sequence, gid = _source_of(sample.source_info)
         source_ns = None
@@ -169,8 +158,6 @@ def copy_sample(
         sequence=sequence,
         source_gid=gid,
         received_ns=received_ns,
-        definition=definitions.get((type_name, message_encoding)) if definitions else None,
-        attachment_bytes=0 if attachment is None else len(attachment),
         oversize_bytes=size if is_oversize else 0,
     )
 
@@ -205,7 +192,7 @@ class Subscriber:
 class WireSession:
     """A live connection; use as a context manager."""
 
-    def __init__(self, inner: Any, *, shared_memory_mb: int = 0, config: WireConfig) -> None:
+    def __init__(self, inner: Any, config: WireConfig) -> None:
         """Use ``open_session``."""
         self._inner = inner
         self._config = config
@@ -216,9 +203,7 @@ class WireSession:
         self._services: list[Service] = []
         self._alive: list[Subscriber] = []
         self._last_words: list[tuple[Any, Callable[[bytes], bytes]]] = []
-        self._definitions: dict[tuple[str, str], schema.Schema] = {}
         self._publishers: list[tuple[str, WirePublisher]] = []
-        self._pool = SharedPool(shared_memory_mb * BYTES_PER_MB) if shared_memory_mb else None
 
     @property
     def identity(self) -> str:
@@ -235,13 +220,10 @@ class WireSession:
         type_name: str,
         *,
         qos: Qos = Qos.RELIABLE,  # when the network is behind; loops use ``Qos.CONTROL``
-        message_encoding: str | None = None,  # cdr, json ...; None: the type's, or CDR
     ) -> WirePublisher:
         """Announce a topic."""
-        if message_encoding is None:
-            known = schema.schema_for(type_name)
-            message_encoding = known.message_encoding if known else "cdr"
-        encoding = keys.encoding_of(type_name, message_encoding)
+        known = schema.schema_for(type_name)
+        encoding = keys.encoding_of(type_name, known.message_encoding if known else "cdr")
         control = zenoh.CongestionControl
         locality = zenoh.Locality.REMOTE if qos.is_remote else zenoh.Locality.ANY
         try:
@@ -254,7 +236,7 @@ class WireSession:
             )
         except zenoh.ZError as error:
             raise BadTopicError(topic=topic, found=cause_of(error)) from error
-        made = WirePublisher(inner, self._pool if qos.shared_memory else None)
+        made = WirePublisher(inner)
         self._publishers.append((topic, made))
         return made
 
@@ -278,8 +260,7 @@ class WireSession:
             if sample.kind != zenoh.SampleKind.PUT:
                 return
             try:
-                now_ns, known = self._clock.now_ns(), self._definitions
-                callback(copy_sample(sample, now_ns, max_bytes=max_bytes, definitions=known))
+                callback(copy_sample(sample, self._clock.now_ns(), max_bytes=max_bytes))
             except BaseException as error:  # noqa: BLE001  # let out, it ends this link's thread
                 self.receive_errors += 1
                 self.last_receive_error = f"{type(error).__name__}: {error}"
@@ -288,48 +269,13 @@ class WireSession:
         with _naming(WireConfigError, f"cannot subscribe to {key_expression!r}"):
             return Subscriber(self._inner.declare_subscriber(key_expression, handler))
 
-    def define(self, record: schema.Schema) -> None:
-        """Tell what a type is that nobody knows, now and to whoever asks later.
-
-        Call it before the first message, from the thread that publishes.
-        """
-        key = keys.definition_key(record.name, record.schema_encoding)
-        self.serve(key, lambda request: record.data)
-        self._inner.put(key, record.data, congestion_control=zenoh.CongestionControl.BLOCK)
-
-    def collect_definitions(self, *, timeout_s: float = 2.0) -> None:
-        """Learn what publishers say of their types; samples that follow carry it.
-
-        Subscribe to their topics afterwards.
-        """
-
-        def learn(sample: WireSample) -> None:
-            named = keys.read_definition_key(sample.topic.removeprefix("/"))
-            is_full = len(self._definitions) >= MAX_DEFINITIONS
-            if named is None or sample.oversize_bytes or is_full:
-                return
-            type_name, schema_encoding, message_encoding = named
-            self._definitions[type_name, message_encoding] = schema.Schema(
-                name=type_name,
-                schema_encoding=schema_encoding,
-                message_encoding=message_encoding,
-                data=sample.data,
-            )
-
-        everything = f"{keys.DEFINITIONS}/**"
-        self.subscribe(everything, learn, max_bytes=MAX_DEFINITION_BYTES)
-        for sample in self.query_all(everything, timeout_s=timeout_s):
-            learn(sample)
-
     def open_loopback(self) -> "WireSession":
         """Open a client of the endpoint this session listens on, else of one it connects to.
 
         What it publishes reaches this session through the network, as everybody else's does.
         """
         endpoints = self._config.listen or self._config.connect
-        own = replace(
-            self._config, mode="client", connect=endpoints[:1], listen=(), shared_memory_mb=0
-        )
+        own = replace(self._config, mode="client", connect=endpoints[:1], listen=())
         return open_session(own)
 
     def serve(
@@ -485,8 +431,4 @@ def open_session(config: WireConfig) -> WireSession:
             f"cannot open a zenoh session on {where}: {cause}. "
             "An endpoint looks like tcp/127.0.0.1:7447."
         ) from error
-    try:
-        return WireSession(inner, shared_memory_mb=config.shared_memory_mb, config=config)
-    except WireConfigError:
-        inner.close()
-        raise
+    return WireSession(inner, config)

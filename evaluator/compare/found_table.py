@@ -30,6 +30,8 @@ def read_found(path: Path, grid: Sequence[Line], options: TableOptions) -> Found
         TableError: For a cell or a row that fits no reading.
         UsageError: When there is nothing that could be read.
     """
+    if len(grid) == 1:
+        raise UsageError(f"{path} has a header and no row below it.")
     sheet = _sheet(path, grid, options)
     found = sheet.found
     if options.mapped:

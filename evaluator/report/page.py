@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from bridge.errors import MissingDependencyError
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
 from bridge.whole_file import write_whole
 from evaluator.report import sections, wording
 from evaluator.report.figures import DARK, LIGHT, Drawing
@@ -22,14 +24,6 @@ from evaluator.report.sections import OTHER, SECTIONS, TRIALS, Section
 from evaluator.report.views import Figures, Shown, is_number, used_columns, view
 from evaluator.report.wording import minus
 from evaluator.result import Measurement, Results, Table
-
-try:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup, escape
-except ModuleNotFoundError as error:
-    raise MissingDependencyError(
-        package=str(error.name), extra="report", purpose="the page of the report"
-    ) from error
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """The page forbids itself to load anything."""

@@ -6,8 +6,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from own_process import printed
 
 from bridge import doctor
+from bridge.episode.run_folder import RunFolder
 
 PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
@@ -57,3 +59,46 @@ def test_extras_that_nothing_depends_on_are_named_but_not_held_against_a_machine
         assert "pip install" in found[what].advice
     assert not found["open3d [replay]"].ok
     assert found["open3d [replay]"].purpose == "rebuild, render, replay, gate, calibrate"
+
+
+WITHOUT = """
+import sys
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == sys.argv[1]:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Finder())
+import robot_gst
+
+sys.stderr = sys.stdout
+print(robot_gst.run(sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "command", "package", "extra"),
+    [
+        ("zenoh", "record new", "eclipse-zenoh", "record"),
+        ("scipy", "replay run", "scipy", "replay"),
+        ("jinja2", "evaluate run", "jinja2", "report"),
+        ("starlette", "dashboard run", "starlette", "dashboard"),
+        ("pyrealsense2", "publish realsense", "pyrealsense2", "realsense"),
+        ("pinocchio", "robot check panda", "pin", "replay"),
+    ],
+)
+def test_a_command_without_a_package_names_the_extra_that_brings_it(
+    tmp_path: Path, module: str, command: str, package: str, extra: str
+) -> None:
+    RunFolder.create(tmp_path / "run")
+    words = [str(tmp_path / word) if word in ("run", "new") else word for word in command.split()]
+    told = printed(WITHOUT, module, *words)
+    assert f"{package} is not installed" in told
+    assert f"pip install 'robot-gst[{extra}]'" in told
+    assert told.endswith("1")
+
+
+def test_a_missing_module_that_no_extra_brings_is_a_defect_and_stays_one() -> None:
+    with pytest.raises(ModuleNotFoundError, match="lost"):
+        doctor.how_to_get(ModuleNotFoundError("No module named 'bridge.lost'", name="bridge.lost"))

@@ -175,7 +175,7 @@ class _Log:
 
     def event(self, kind: str, stamp_ns: int, **fields: object) -> None:
         record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, **fields}
-        self._writer.write_json(
+        self._writer.write(
             "/standin/event",
             record,
             type_name=schema.EVENT,
@@ -350,7 +350,7 @@ def write_divergence(
         "not_compared": [],
     }
     topic = "/standin/replay/divergence"
-    writer.write_json(topic, record, type_name=schema.DIVERGENCE, log_time_ns=1)
+    writer.write(topic, record, type_name=schema.DIVERGENCE, log_time_ns=1)
 
 
 def write_views(run: RunFolder, source: str = "scan") -> Path:

@@ -121,6 +121,6 @@ def write_localised(
                 "method": "test",
                 "reason": None if T else "hidden",
             }
-            writer.write_json(
+            writer.write(
                 "/standin/localisation", record, type_name=schema.LOCALISATION, log_time_ns=start
             )

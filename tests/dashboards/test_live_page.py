@@ -111,7 +111,7 @@ def test_what_is_silent_stands_first_and_what_is_no_record_is_counted(
         "state": "recording", "episode": "e", "rates_hz": {"/a": 1e300, "/b": 2.0, "/z": 3.0},
         "seen": {"/a": 1, "/b": 5, "/z": 6}, "missing": ["/gone has not been seen", 7],
         "silent": [{"topic": "/z", "silent_s": 2.25}, "nonsense", {"silent_s": "x"}],
-        "topics": {"/b": {"gaps": 2, "queue_drops": 1, "shed": 0}}, "clocks": "none",
+        "topics": {"/b": {"gaps": 2, "queue_drops": 1}}, "clocks": "none",
     }  # fmt: skip
     say(router, "/rec/main/status", schema.STATUS, status)
     state = state_when(feed, lambda s: s.is_heard)

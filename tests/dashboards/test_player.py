@@ -125,7 +125,7 @@ def write_touches(planned: Path, synthetic: ModuleType) -> None:
                 "min_distance_m": 0.0,
                 "source": "distance",
             }
-            writer.write_json(
+            writer.write(
                 "/standin/replay/contact", record, type_name=schema.CONTACT, log_time_ns=start_ns
             )
         plan_id = synthetic.make_plan(synthetic.TRIALS[1]).id

@@ -212,7 +212,7 @@ def test_a_robot_that_cannot_be_drawn_is_a_note(
     assert "the robot is not drawn" in note
 
 
-@pytest.mark.parametrize("name", ["panda", "left_ur5_parallel_gripper", "kinova_j2s6s200"])
+@pytest.mark.parametrize("name", ["panda", "kinova_j2s6s200"])
 def test_any_robot_is_drawn_with_its_base_as_root(name: str, tmp_path: Path) -> None:
     pytest.importorskip("pinocchio")
     robot = read_robot(name)

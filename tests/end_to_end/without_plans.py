@@ -8,7 +8,6 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 GONE = ("gst/Plan", "gst/Verdict", "gst/Event")
-VIEWERS = ("/plan/trajectory", "/plan/path")
 
 
 def without_plans(run: Path, out: Path) -> int:
@@ -26,7 +25,7 @@ def _strip(path: Path) -> int:
         schemas: dict[int, int] = {0: 0}
         channels: dict[int, int] = {}
         for schema, channel, message in reader.iter_messages(log_time_order=False):
-            if channel.topic.endswith(VIEWERS) or (schema and schema.name.startswith(GONE)):
+            if schema and schema.name.startswith(GONE):
                 left_out += 1
                 continue
             if schema and schema.id not in schemas:

@@ -196,7 +196,7 @@ class _Log:
         self.writer.write(topic, data, type_name=type_name, log_time_ns=stamp_ns)
 
     def json(self, topic: str, type_name: str, record: dict[str, object], stamp_ns: int) -> None:
-        self.writer.write_json(topic, record, type_name=type_name, log_time_ns=stamp_ns)
+        self.writer.write(topic, record, type_name=type_name, log_time_ns=stamp_ns)
 
     def event(self, kind: str, plan_id: str, stamp_ns: int) -> None:
         record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": plan_id}

@@ -47,8 +47,8 @@ def replayed(path: Path, plan_id: str, first: dict[str, Any] | None) -> Path:
             stamp_ns = START_NS + t_ns
             event = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": plan_id}
             event |= {} if stage is None else {"stage_id": stage}
-            writer.write_json("/cell/event", event, type_name=schema.EVENT, log_time_ns=stamp_ns)
-        writer.write_json(
+            writer.write("/cell/event", event, type_name=schema.EVENT, log_time_ns=stamp_ns)
+        writer.write(
             "/cell/replay/divergence",
             record,
             type_name=schema.DIVERGENCE,

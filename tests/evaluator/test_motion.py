@@ -152,7 +152,7 @@ def write(path: Path, source: Tracks, *, kind: str = "trial", plan_id: str = "p1
                     "type": kind_of,
                     "plan_id": plan_id,
                 }
-                writer.write_json("/cell/event", record, type_name=schema.EVENT, log_time_ns=stamp)
+                writer.write("/cell/event", record, type_name=schema.EVENT, log_time_ns=stamp)
         poses = pose_messages(stamps, "base_link", source.tool.transforms())
         for stamp, pose in zip(stamps.tolist(), poses, strict=True):
             writer.write("/cell/tcp/pose", pose, type_name=schema.POSE_STAMPED, log_time_ns=stamp)

@@ -28,13 +28,13 @@ with atheris.instrument_imports(include=["bridge"]):
     from bridge.episode.mcap.format import crc32
     from bridge.episode.reader import Episode
     from bridge.episode.recover import recover
-    from bridge.episode.schema import DEFINITIONS
+    from bridge.episode.schema import ROS_TYPES
     from bridge.errors import GstError
     from bridge.media.depth import decode_rvl, encode_rvl
     from bridge.wire import publisher
 
 LIMIT_BYTES = 3 << 30
-TYPES = sorted(DEFINITIONS)
+TYPES = sorted(ROS_TYPES)
 FOLDER = Path(tempfile.gettempdir()) / f"gst-fuzz-{os.getpid()}"
 """Left behind, for libFuzzer ends the process where it stands; set TMPDIR to choose its place."""
 

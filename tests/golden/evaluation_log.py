@@ -69,7 +69,7 @@ class Log:
     def json(self, topic: str, type_name: str, stamp_ns: int, **record: object) -> None:
         """Write one JSON record."""
         record = {"schema_version": 1, "stamp_ns": stamp_ns, **record}
-        self.writer.write_json(f"{CELL}/{topic}", record, type_name=type_name, log_time_ns=stamp_ns)
+        self.writer.write(f"{CELL}/{topic}", record, type_name=type_name, log_time_ns=stamp_ns)
 
     def execution(self, plan: Plan) -> None:
         """Write when the execution and its stages began and ended."""

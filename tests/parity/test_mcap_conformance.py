@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from mcap.records import Attachment, McapRecord
+from mcap.records import McapRecord
 
 from bridge.episode.check import check_episode
 from bridge.episode.mcap import format as mcap_format
@@ -56,7 +56,7 @@ def records_of(data: bytes) -> Iterator[tuple[str, Fields]]:
             for opcode, at, length in records_in(inner):
                 yield one_record(opcode, inner[at : at + RECORD_HEAD.size + length])
         elif place.opcode == mcap_format.ATTACHMENT:
-            found: Attachment = attachment_of(stream, place).record
+            found = attachment_of(read_body(stream, place), place.offset)
             yield "Attachment", fields_of(found)
         elif place.opcode != mcap_format.MESSAGE_INDEX:
             yield one_record(place.opcode, data[place.offset : place.end])
@@ -64,7 +64,7 @@ def records_of(data: bytes) -> Iterator[tuple[str, Fields]]:
 
 def one_record(opcode: int, data: bytes) -> tuple[str, Fields]:
     if opcode == MESSAGE:
-        head = message_head(data, 0, 0)
+        head = message_head(data, 0)
         values = {
             "channel_id": head.channel_id,
             "data": data[MESSAGE_HEAD.size :],

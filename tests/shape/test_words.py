@@ -100,9 +100,9 @@ WORDS = {
         under=("twin", "evaluator"),
     ),
     "take": Word(
-        use="episode recording, input queue, load shedding, publisher liveliness, disk reserve",
-        files="take|intake|shedding|departures|reserve",
-        names="Take|intake|shedding|departures?",
+        use="episode recording, input queue, publisher liveliness, disk reserve",
+        files="take|intake|departures|reserve",
+        names="Take|intake|departures?",
         under=("bridge/record",),
     ),
     "said": Word(

@@ -163,10 +163,11 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     outcome = outcome_of(run, episode)
     if outcome is None or outcome.result == "unknown":
         raise UsageError("nobody said how it ended")
+    events = streams.events(episode)
     executed = [
         (stamp_ns, plan)
         for stamp_ns, plan in streams.plans(episode)
-        if streams.executed_interval_ns(episode, plan.id) is not None
+        if None not in streams.execution_ns(events, plan.id)
     ]
     if not executed:
         raise UsageError("no plan was executed from beginning to end")

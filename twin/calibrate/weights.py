@@ -211,7 +211,7 @@ def weighed(episode: Episode, task: Task) -> list[dict[str, Any]]:
     if urdf is None:
         raise NoWeightError("no robot description was recorded")
     robot, rows, reasons = load_robot(urdf), list[dict[str, Any]](), list[str]()
-    stamps_ns, joints, efforts = _readings(episode, robot.joints)
+    stamps_ns, joints, efforts = readings(episode, robot.joints)
     begun_ns = streams.first_stamp_ns(episode) or 0
     moved = smoothed((stamps_ns - begun_ns) * 1e-9, joints, efforts)
     times_s, widths = moved[:, 0], width_track(episode, robot.record)
@@ -239,7 +239,7 @@ def weighed(episode: Episode, task: Task) -> list[dict[str, Any]]:
     return rows
 
 
-def _readings(episode: Episode, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def readings(episode: Episode, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stamps, joints and efforts of the readings that have them for every joint of an arm."""
     topics = [t for t in episode.topics_of_type(schema.JOINT_STATE) if t.endswith(JOINT_STATES)]
     rows: dict[int, np.ndarray] = {}

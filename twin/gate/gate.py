@@ -75,7 +75,8 @@ def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task) -> str:
         p_m = entity.get("p_m") if isinstance(entity, Mapping) else None
         if name not in found or not isinstance(p_m, list | tuple) or len(p_m) != 3:
             continue
-        like = [key for key in found if _looks(task.objects[key]) == _looks(task.objects[name])]
+        looks = {k: (m.shape, m.mesh, m.size_m, m.color_srgb) for k, m in task.objects.items()}
+        like = [key for key in found if looks[key] == looks[name]]
         places = np.stack([found[key].T_base_object[:3, 3] for key in like])
         away_m = float(np.linalg.norm(places - np.array(p_m, dtype=np.float64), axis=1).min())
         if not away_m <= OTHER_SCENE_M:
@@ -84,10 +85,6 @@ def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task) -> str:
                 f"{OTHER_SCENE_M * 1e3:.0f} mm are a planner's error"
             )
     return ""
-
-
-def _looks(model: ObjectModel) -> tuple[object, ...]:
-    return model.shape, model.mesh, model.size_m, model.color_srgb
 
 
 def turn_between(

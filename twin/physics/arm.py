@@ -136,7 +136,7 @@ class Arm:
         self._index_joints(mimics_of(urdf))
         self._couple_fingers()
         self._target_m = self._max_width_m
-        self._arm_order: tuple[list[float], list[float]] | None = None
+        self._arm_order: tuple[list[float], ...] | None = None
         self._finger_order: tuple[float, float, float] | None = None
         self._press_m_s: float | None = None
         self.closing = False
@@ -181,7 +181,8 @@ class Arm:
         self.finger_links = [self.links[name] for name in gripper.finger_links]
         carriers = [parents[name] for name, index in self.links.items() if index in self._fingers]
         self._finger_parent = carriers[0] if carriers else self.links[record.tool_frame]
-        self._arm_forces = [self._efforts[name] for name in record.joints]
+        self._arm_limits = [self._efforts[name] for name in record.joints]
+        self._arm_forces = self._arm_limits
         for name, index in self.links.items():
             if index in self._fingers:
                 self.opening_axes[name] = self._opening(index)
@@ -234,7 +235,7 @@ class Arm:
 
         Motors keep their orders: one that is already followed is not given again.
         """
-        order = (_numbers(joints_rad), _numbers(velocity_rad_s))
+        order = (_numbers(joints_rad), _numbers(velocity_rad_s), self._arm_forces)
         if order != self._arm_order:
             self._client.setJointMotorControlArray(
                 self.id,
@@ -254,6 +255,13 @@ class Arm:
             self.closing = True
         self._target_m = target_m
         self._close_fingers()
+
+    def soften(self, most_Nm: Joints, carrying_Nm: Joints) -> None:
+        """Let the arm's motors be no stronger than so much, beside what carries it for a step."""
+        self._arm_forces = np.minimum(most_Nm, self._arm_limits).tolist()
+        self._client.setJointMotorControlArray(
+            self.id, self._arm, pybullet.TORQUE_CONTROL, forces=_numbers(carrying_Nm)
+        )
 
     def _close_fingers(self) -> None:
         if self._press_m_s is None:

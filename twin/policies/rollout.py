@@ -3,7 +3,7 @@
 import re
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.result import ReplayResult
 from twin.replay.run_job import cell_of
 
-ROLLOUT_VERSION = 2
+ROLLOUT_VERSION = 3
 """Raise it when the same inputs give another rollout, so that old files are redone."""
 LOOK_S = 0.5
 """How often it is asked whether the task is done."""
@@ -144,6 +144,8 @@ def _roll_out(
         row = _row(job, info, start.id, acted, result)
         row["varied"] = {q.name: round(q.amount(drawn[q.name]), 6) for q in job.vary}
         row["gains"] = dict(gains)
+        row["response"] = start.response.to_record()
+        row["shutters"] = {name: asdict(each) for name, each in cameras.shutters.items()}
         row["checkpoint"] = who_acts(job.policy, job.mapping, policy.metadata)
         _write(job, episode, start, (result, plan), acted, row, policy.metadata)
         return row

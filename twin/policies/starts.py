@@ -16,6 +16,8 @@ from bridge.errors import GstError
 from bridge.robots.robot import robot_of
 from bridge.task.task_file import Task
 from twin.policies.errors import PolicyError
+from twin.policies.identify import response_of
+from twin.policies.response import AT_ONCE, Response
 from twin.replay.config import ReplayConfig
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.replay.run_job import recorded_start
@@ -42,6 +44,8 @@ class Start:
     """Source time at which it was seen."""
     config: ReplayConfig
     """With the calibrated physics of the task."""
+    response: Response = AT_ONCE
+    """How the cell's controller follows targets."""
 
     @property
     def task(self) -> Task:
@@ -52,7 +56,7 @@ class Start:
 def trial_episodes(run: RunFolder, task: str) -> list[Episode]:
     """The recorded trials of a task, one for each of its starts."""
     found: dict[str, Episode] = {}
-    asked = CatalogueQuery(kind=("trial",), task=(task,) if task else (), error=False)
+    asked = CatalogueQuery(kind=("trial",), task=(task,) if task else ())
     for trial in find_episodes(run, asked):
         start = f"{trial.task} {trial.start_id or trial.id}"
         if trial.task and start not in found:
@@ -95,6 +99,7 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
         width_m=_width_m(episode, urdf, stamp_ns),
         stamp_ns=stamp_ns,
         config=for_task(ReplayConfig(), read_calibration(run), task),
+        response=response_of(run, episode, robot),
     )
 
 

@@ -11,13 +11,14 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.policies.cell import TwinCell
+from twin.policies.cell import Sight, TwinCell
 from twin.policies.errors import PolicyError
 from twin.policies.mapping import fitting
+from twin.policies.shutter import shutter_of
 from twin.policies.starts import Start
 from twin.policies.variation import ANGLE, POSITION, Drawn
 from twin.replay.images import Drawable, mounting, set_up
-from twin.robot.model import load_robot
+from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture
 from twin.scene.backdrop import Backdrop
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
@@ -144,26 +145,42 @@ class TwinCameras:
             for name in cameras or known
         }
         self._gains = _varied(gains or {}, self._drawn, self.viewpoints)
+        self.shutters = {
+            name: shutter_of(episode, name, start.stamp_ns) for name in self.viewpoints
+        }
+        self._newest: dict[str, UInt8[np.ndarray, "height width 3"]] = {}
+        self._drawn_of: dict[str, Sight] = {}
         backdrop = self._drawable.parts.backdrop
         self._canvases = {name: Canvas(at, backdrop) for name, at in self.viewpoints.items()}
 
     def draw(self, cell: TwinCell) -> Pictures:
-        """One picture for each camera."""
-        joints_rad, width_m = cell.posture()
-        places, nodes = cell.places(), cell.nodes_m()
+        """The newest picture of each camera that is there."""
+        sights = {
+            name: cell.sight(shutter.newest_ns(cell.t_ns))
+            for name, shutter in self.shutters.items()
+        }
+        old = {name for name, sight in sights.items() if self._drawn_of.get(name) is not sight}
+        for sight in {id(sights[name]): sights[name] for name in sights if name in old}.values():
+            names = [name for name in sights if name in old and sights[name] is sight]
+            self._newest |= self._taken(sight, names, cell.robot)
+        self._drawn_of = sights
+        return {name: self._newest[name].copy() for name in self.viewpoints}
+
+    def _taken(self, sight: Sight, names: Sequence[str], robot: RobotModel) -> Pictures:
+        places, nodes = sight.places, sight.nodes_m
         rest, parts = self._what_rests(places, nodes), self._drawable.parts
         moving = [name for name in parts.objects if name not in rest.objects]
         over = [self._object_at(name, places, nodes) for name in moving]
         if parts.links:
-            posture = Posture(joints_rad=joints_rad, width_m=width_m)
+            posture = Posture(joints_rad=sight.joints_rad, width_m=sight.width_m)
             over.append(parts.robot_at(posture, self._drawable.urdf))
         hidden = self._covered(moving, places, nodes) & ~rest.covered
         padded = np.zeros(len(rest.cloud), dtype=bool)
         padded[: len(hidden)] = hidden
-        T_base_tcp = cell.robot.T_base_tcp(joints_rad)
+        covered, T_base_tcp = padded if hidden.any() else None, robot.T_base_tcp(sight.joints_rad)
         pictures = {
-            name: canvas.picture(rest.cloud, over, padded if hidden.any() else None, T_base_tcp)
-            for name, canvas in self._canvases.items()
+            name: self._canvases[name].picture(rest.cloud, over, covered, T_base_tcp)
+            for name in names
         }
         return lit(pictures, self._gains)
 

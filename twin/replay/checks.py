@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.robots.robot import Robot
+from bridge.robots.stop import PressedStop
 from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import Task
@@ -140,8 +141,7 @@ def stops_of_arm(
     record: Robot,
 ) -> list[Failure]:
     """Find where an arm would stop by itself: too far from its command, or pressed too hard."""
-    failures = []
-    limit_rad, limit_N = record.tracking_error_rad, record.contact_force_N
+    failures, limit_rad = [], record.tracking_error_rad
     over = [] if limit_rad is None else np.argwhere(~(np.abs(off_rad) <= limit_rad)).tolist()
     for index, joint in over[:1]:
         name, t_ns = record.joints[joint], int(stamps_ns[index])
@@ -149,12 +149,11 @@ def stops_of_arm(
             f"{name} is {abs(off_rad[index, joint]):.3f} rad from where it is commanded, the limit "
             f"is {limit_rad:g} rad"
         )
-        failures.append(
-            Failure(t_ns=t_ns, cause=Cause.TRACKING_ERROR, bodies=(name,), detail=detail)
-        )
-    pressed = [] if limit_N is None else np.flatnonzero(~(force_N <= limit_N)).tolist()
-    for index in pressed[:1]:
-        detail = f"the arm is pressed with {force_N[index]:.0f} N, the limit is {limit_N:g} N"
-        t_ns = int(stamps_ns[index])
-        failures.append(Failure(t_ns=t_ns, cause=Cause.CONTACT_FORCE, detail=detail))
+        bodies, cause = (name,), Cause.TRACKING_ERROR
+        failures.append(Failure(t_ns=t_ns, cause=cause, bodies=bodies, detail=detail))
+    pressed = PressedStop(record.contact_force_N)
+    lasted_ns = np.diff(stamps_ns, prepend=stamps_ns[:1])
+    for t_ns, newton, each_ns in zip(stamps_ns.tolist(), force_N, lasted_ns, strict=False):
+        if detail := pressed.found(float(newton), int(each_ns)):
+            return [*failures, Failure(t_ns=t_ns, cause=Cause.CONTACT_FORCE, detail=detail)]
     return failures

@@ -12,7 +12,7 @@ from jaxtyping import Int
 
 from bridge.episode import schema
 from bridge.episode import topics as named
-from bridge.episode.cdr.batch import joint_messages, pose_messages
+from bridge.episode.cdr.batch import joint_writer, pose_messages
 from bridge.episode.cdr.messages import CompressedColor, PointCloudSample, string_to_cdr
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import Derived, EpisodeInfo
@@ -82,7 +82,7 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
         (named.GRIPPER_STATE, (GRIPPER_WIDTH,), result.width_m[:, None]),
         (named.CLEARANCE, (MIN_CLEARANCE,), result.clearance_m[:, None]),
     ):
-        rows = joint_messages(stamps, names, values)
+        rows: Iterator[bytes] = map(joint_writer(names), stamps.tolist(), values.tolist())
         yield from _stamped(stamps, f"{prefix}{topic}", schema.JOINT_STATE, rows)
     poses = {f"{prefix}{named.TCP_POSE}": result.Ts_base_tcp} | {
         named.object_topic(origin.cell, name, "pose"): Ts

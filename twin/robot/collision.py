@@ -144,7 +144,7 @@ _ALWAYS = 0.95
 _WIDTH_M = 0.04
 """Opening in those postures, where the gripper is as wide."""
 
-_MOST_LEFT_OUT = 0.2
+_MOST_LEFT_OUT, _LONGEST_M = 0.2, 30.0
 
 _SIGNED = coal.DistanceRequest()
 _SIGNED.enable_signed_distance = True
@@ -279,9 +279,11 @@ class RobotHulls:
         self.share_left_out += len(found) / (len(pairs) + len(found) or 1)
 
     def oversized(self) -> str | None:
-        """Name a shape that moves and is longer than the arm, with what may be wrong with it."""
+        """Name what is too long for an arm, or for this one, with what may be wrong with it."""
         model = self.robot.model
         reach_m = sum(float(np.linalg.norm(T.translation)) for T in model.jointPlacements)
+        if reach_m > _LONGEST_M:
+            return f"the joints lie {reach_m:.0f} m apart; are their origins in millimetres?"
         for hull in self.hulls:
             body = model.getFrameId(hull.link, pin.FrameType.BODY)
             length_m = float(np.ptp(hull.points_m, axis=0).max())

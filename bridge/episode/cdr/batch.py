@@ -1,114 +1,49 @@
-"""Read and write many messages of a topic at once: they differ in stamps and numbers only.
-
-The first is read as any other; of the rest only the bytes that may differ are looked at. What is
-not alike is left to be read one by one, with the same result. A ``MessageTemplate`` writes such
-messages, byte for byte as one by one (tests compare both).
-"""
+"""Many messages of a topic that differ in stamps and numbers only: written, and looked at."""
 
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
-from bridge.clock import NS_PER_S, split_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.messages import JointSample, PoseSample
+from bridge.episode.cdr.messages import JointSample, header
 from bridge.errors import BridgeError
 from bridge.geometry import se3
 
-Stamp = dict[str, int]
-_STAMP_MARK = {"sec": 0x13579BDF, "nanosec": 0x2468ACE0}
-_STAMP_FIELDS = struct.Struct("<iI")
+Write = Callable[[int, Sequence[float]], bytes]
+"""Makes a message of a stamp [ns] and the numbers that differ from one to the next."""
 
 
-class MessageTemplate:
-    """A message of which one header stamp and a run of doubles are filled in later.
-
-    It is serialised once: at 500 samples a second and six topics a general serialiser would cost a
-    quarter of a core.
-    """
-
-    def __init__(
-        self, type_name: str, build: Callable[[Stamp, list[float]], dict[str, Any]], count: int
-    ) -> None:
-        """Serialise once and remember where the numbers went."""
-        marks = [2.0**-30 * (3 * number + 1) for number in range(count)]
-        self._bytes = codec.encode(type_name, build(_STAMP_MARK, marks))
-        self._stamp_at = self._place(_STAMP_FIELDS.pack(*_STAMP_MARK.values()))
-        runs: list[list[int]] = []
-        for mark in marks:
-            at = self._place(struct.pack("<d", mark))
-            if runs and at == runs[-1][0] + 8 * runs[-1][1]:
-                runs[-1][1] += 1
-            else:
-                runs.append([at, 1])
-        self._runs = [(at, struct.Struct(f"<{length}d")) for at, length in runs]
-
-    def _place(self, mark: bytes) -> int:
-        at = self._bytes.find(mark)
-        if at < 0 or self._bytes.find(mark, at + 1) >= 0:
-            raise ValueError(f"{mark!r} is not once in the message")
-        return at
-
-    def fill(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
-        """Return the message with this stamp and these numbers."""
-        data = bytearray(self._bytes)
-        _STAMP_FIELDS.pack_into(data, self._stamp_at, *split_ns(stamp_ns))
-        start = 0
-        for at, layout in self._runs:
-            count = layout.size // 8
-            layout.pack_into(data, at, *numbers[start : start + count])
-            start += count
-        return bytes(data)
-
-    def fill_all(
-        self,
-        stamps_ns: Int[np.ndarray, " num_messages"],
-        numbers: Float[np.ndarray, "num_messages num_values"],
-    ) -> Iterator[bytes]:
-        """Yield a message for each stamp and row of numbers, as ``fill`` makes them."""
-        for stamp_ns, row in zip(stamps_ns.tolist(), numbers.tolist(), strict=True):
-            yield self.fill(stamp_ns, row)
-
-
-def joint_template(names: Sequence[str], *, velocities: bool = False) -> MessageTemplate:
+def joint_writer(names: Sequence[str], *, velocities: bool = False) -> Write:
     """sensor_msgs/JointState: positions [rad or m], then velocities [per s] where wanted."""
     count = len(names)
 
-    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
-        header = {"stamp": stamp, "frame_id": ""}
-        first, rest = numbers[:count], numbers[count:]
-        return {"header": header, "name": list(names), "position": first, "velocity": rest}
+    def write(stamp_ns: int, numbers: Sequence[float]) -> bytes:
+        values = {"position": numbers[:count], "velocity": numbers[count:] if velocities else ()}
+        message = {"header": header(stamp_ns, ""), "name": list(names), **values}
+        return codec.encode(schema.JOINT_STATE, message)
 
-    return MessageTemplate(schema.JOINT_STATE, build, count * (2 if velocities else 1))
+    return write
 
 
-def pose_template(frame_id: str) -> MessageTemplate:
+def pose_writer(frame_id: str) -> Write:
     """geometry_msgs/PoseStamped: x, y, z [m], then the quaternion in ROS order: x, y, z, w."""
 
-    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
+    def write(stamp_ns: int, numbers: Sequence[float]) -> bytes:
         pose = {"position": named("xyz", numbers), "orientation": named("xyzw", numbers[3:])}
-        return {"header": {"stamp": stamp, "frame_id": frame_id}, "pose": pose}
+        return codec.encode(
+            schema.POSE_STAMPED, {"header": header(stamp_ns, frame_id), "pose": pose}
+        )
 
-    return MessageTemplate(schema.POSE_STAMPED, build, 7)
+    return write
 
 
 def named(axes: str, numbers: Sequence[float]) -> dict[str, float]:
     """Return the first numbers by the names of their axes."""
     return dict(zip(axes, numbers, strict=False))
-
-
-def joint_messages(
-    stamps_ns: Int[np.ndarray, " num_messages"],
-    names: Sequence[str],
-    position: Float[np.ndarray, "num_messages num_joints"],
-) -> Iterator[bytes]:
-    """Yield sensor_msgs/JointState messages with positions alone."""
-    return joint_template(names).fill_all(stamps_ns, position)
 
 
 def pose_messages(
@@ -119,90 +54,31 @@ def pose_messages(
     """Yield geometry_msgs/PoseStamped messages."""
     q, p = se3.split(Ts_frame_body)
     numbers = np.concatenate([p, q[:, 1:], q[:, :1]], axis=1)
-    return pose_template(frame_id).fill_all(stamps_ns, numbers)
+    return map(pose_writer(frame_id), stamps_ns.tolist(), numbers.tolist())
 
 
-ORIGIN = 4
-"""CDR aligns to this byte, behind those that name the encoding."""
 _STAMP = (4, 12)
-_FRAME_AT = 12
 _LITTLE_ENDIAN = 1
-_POSE_BYTES = 7 * 8
-_FAINT, _HUGE = 1e-6, 1e6
-"""A quaternion whose length is not between these is none."""
-
-Span = tuple[int, int]
-
-
-def poses_of(
-    payloads: Sequence[bytes],
-) -> tuple[Int[np.ndarray, " num_messages"], Float[np.ndarray, "num_messages 4 4"]] | None:
-    """Return stamps [ns] and ``Ts_frame_body`` of geometry_msgs/PoseStamped messages in order.
-
-    None when they are not alike: other frames, broken bytes, or no rotation.
-    """
-    rows = _rows(payloads)
-    if rows is None:
-        return None
-    try:
-        PoseSample.from_cdr(payloads[0])
-        at = _aligned(_behind_text(payloads[0], _FRAME_AT), 8)
-    except (BridgeError, struct.error):
-        return None
-    spans = (_STAMP, (at, at + _POSE_BYTES))
-    if not _differ_only_in(rows, spans):
-        return None
-    numbers = _numbers(rows, spans[1])
-    q = numbers[:, [6, 3, 4, 5]]
-    length = np.linalg.norm(q, axis=1)
-    if not ((length > _FAINT) & (length < _HUGE)).all():
-        return None
-    return _stamps_ns(rows), se3.transform_from(q, numbers[:, :3])
-
-
-def joints_of(
-    payloads: Sequence[bytes],
-) -> (
-    tuple[
-        tuple[str, ...],
-        Int[np.ndarray, " num_messages"],
-        Float[np.ndarray, "num_messages num_joints"],
-    ]
-    | None
-):
-    """Return names, stamps [ns] and positions of sensor_msgs/JointState messages in their order.
-
-    None when they are not alike: other joints, broken bytes, or no positions.
-    """
-    rows = _rows(payloads)
-    if rows is None:
-        return None
-    layout = joint_layout(payloads[0])
-    if layout is None or not _differ_only_in(rows, (_STAMP, *layout.numbers)):
-        return None
-    return layout.names, _stamps_ns(rows), _numbers(rows, layout.numbers[0])
 
 
 class JointLayout:
     """Where the numbers of one message of joints lie; those alike differ from it in them only."""
 
     def __init__(self, data: bytes) -> None:
-        """Read a message; raises as ``JointSample.from_cdr`` does."""
-        first = JointSample.from_cdr(data)
-        self.names, count = first.names, len(first.position)
-        start = np.frombuffer(data, np.uint8).ctypes.data
-        at = first.position.ctypes.data - start if count else len(data)
-        ends = [at + 8 * count]
-        for values in (first.velocity, first.effort):
-            ends.append(_aligned(ends[-1] + 4, 8) + values.nbytes if len(values) else ends[-1] + 4)
-        velocity, effort, end = ends
-        velocities = (effort - first.velocity.nbytes, effort)
-        efforts = (end - first.effort.nbytes, end)
-        self.numbers: tuple[Span, ...] = ((at, velocity), velocities, efforts)
-        self.is_of_use = data[1] == _LITTLE_ENDIAN and count > 0
-        self._fixed = ((0, 4), (12, at), (velocity, velocity + 4), (effort, effort + 4))
+        """Read a message that holds positions; raises as ``JointSample.from_cdr`` does."""
+        first, origin = JointSample.from_cdr(data), np.frombuffer(data, np.uint8).ctypes.data
+        spans = [_STAMP]
+        for values in (first.position, first.velocity, first.effort):
+            if len(values):
+                at = values.ctypes.data - origin
+                spans.append((at, at + values.nbytes))
+        starts, ends = zip(*spans, strict=True)
+        self._fixed = tuple(zip((0, *ends), (*starts, len(data)), strict=True))
         self._size, self._bytes = len(data), [data[a:b] for a, b in self._fixed]
-        self._unpack = struct.Struct(f"<{count}d").unpack_from
+        self.names, self.count = first.names, len(first.position)
+        self._unpack = struct.Struct(f"<{self.count}d").unpack_from
+        self._at = starts[-1] if len(spans) == 1 else starts[1]
+        self.is_of_use = data[1] == _LITTLE_ENDIAN and self.count > 0
 
     def is_like(self, data: bytes) -> bool:
         """Whether another message holds the same joints at the same places."""
@@ -210,8 +86,18 @@ class JointLayout:
 
     def has_nan(self, data: bytes) -> bool:
         """Whether a position of a message that is like it is not a number."""
-        total: float = sum(self._unpack(data, self.numbers[0][0]))
+        total: float = sum(self._unpack(data, self._at))
         return not math.isfinite(total)
+
+    def read(self, alike: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps [ns] and positions of messages that are like it, at once."""
+        rows = np.frombuffer(b"".join(alike), np.uint8).reshape(len(alike), -1)
+        spans = ((4, 8), (8, 12), (self._at, self._at + 8 * self.count))
+        s, ns, position = (
+            rows[:, start:end].copy().view(kind)
+            for (start, end), kind in zip(spans, ("<i4", "<u4", "<f8"), strict=True)
+        )
+        return s[:, 0].astype(np.int64) * 1_000_000_000 + ns[:, 0], position
 
 
 def joint_layout(data: bytes) -> JointLayout | None:
@@ -221,46 +107,3 @@ def joint_layout(data: bytes) -> JointLayout | None:
     except BridgeError:
         return None
     return layout if layout.is_of_use else None
-
-
-def _rows(payloads: Sequence[bytes]) -> UInt8[np.ndarray, "num_messages num_bytes"] | None:
-    if not payloads:
-        return None
-    size = len(payloads[0])
-    if size < _FRAME_AT or payloads[0][1] != _LITTLE_ENDIAN:
-        return None
-    if set(map(len, payloads)) != {size}:
-        return None
-    return np.frombuffer(b"".join(payloads), dtype=np.uint8).reshape(len(payloads), size)
-
-
-def _differ_only_in(
-    rows: UInt8[np.ndarray, "num_messages num_bytes"], spans: Sequence[Span]
-) -> bool:
-    fixed = np.ones(rows.shape[1], dtype=bool)
-    for first, last in spans:
-        fixed[first:last] = False
-    return bool((rows[:, fixed] == rows[0, fixed]).all())
-
-
-def _behind_text(payload: bytes, at: int) -> int:
-    (length,) = struct.unpack_from("<I", payload, at)
-    return at + 4 + int(length)
-
-
-def _aligned(at: int, size: int) -> int:
-    return at + (ORIGIN - at) % size
-
-
-def _numbers(
-    rows: UInt8[np.ndarray, "num_messages num_bytes"], span: Span
-) -> Float[np.ndarray, "num_messages num_values"]:
-    return np.ascontiguousarray(rows[:, span[0] : span[1]]).view("<f8").astype(np.float64)
-
-
-def _stamps_ns(
-    rows: UInt8[np.ndarray, "num_messages num_bytes"],
-) -> Int[np.ndarray, " num_messages"]:
-    seconds = np.ascontiguousarray(rows[:, 4:8]).view("<i4")[:, 0].astype(np.int64)
-    rest = np.ascontiguousarray(rows[:, 8:12]).view("<u4")[:, 0].astype(np.int64)
-    return seconds * NS_PER_S + rest

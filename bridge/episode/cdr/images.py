@@ -5,16 +5,16 @@ its time outside Python's lock. Bytes that are no image raise ``MalformedMessage
 nothing else; an encoding that is no business of the function gives None.
 """
 
-import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from bridge.clock import join_ns
 from bridge.episode import schema
-from bridge.episode.cdr.codec import ENCAPSULATION_LE, Buffer, MalformedMessageError, decode
+from bridge.episode.cdr.codec import Buffer, MalformedMessageError, decode, encode
 from bridge.episode.topics import COLOR_TOPIC, DEPTH_IMAGE
 from bridge.media.color import JPEG_QUALITY, MAX_PIXELS, encode_jpeg
 from bridge.media.depth import RVL_FORMAT, pack_rvl
@@ -35,20 +35,23 @@ FLOAT_DEPTH = "32FC1"
 class ImageHeader:
     """Everything a sensor_msgs/Image says of itself, and its pixels, which are not copied."""
 
-    sec: int
-    nanosec: int
-    frame_id: str
+    header: dict[str, Any]
     height: int
     width: int
     encoding: str
-    is_bigendian: bool
+    is_bigendian: int
     step: int
-    pixels: memoryview
+    data: memoryview
 
     @property
     def stamp_ns(self) -> int:
         """Source time [ns]."""
-        return join_ns(self.sec, self.nanosec)
+        return join_ns(**self.header["stamp"])
+
+    @property
+    def frame_id(self) -> str:
+        """Where it was taken."""
+        return str(self.header["frame_id"])
 
 
 def _malformed(found: str) -> MalformedMessageError:
@@ -57,18 +60,7 @@ def _malformed(found: str) -> MalformedMessageError:
 
 def image_header(data: Buffer) -> ImageHeader:
     """Read a sensor_msgs/Image without touching its pixels."""
-    message = decode(schema.IMAGE, data)
-    return ImageHeader(
-        sec=message["header"]["stamp"]["sec"],
-        nanosec=message["header"]["stamp"]["nanosec"],
-        frame_id=message["header"]["frame_id"],
-        height=message["height"],
-        width=message["width"],
-        encoding=message["encoding"],
-        is_bigendian=bool(message["is_bigendian"]),
-        step=message["step"],
-        pixels=message["data"],
-    )
+    return ImageHeader(**decode(schema.IMAGE, data))
 
 
 def pixel_rows(header: ImageHeader) -> UInt8[np.ndarray, "rows row"]:
@@ -83,9 +75,9 @@ def pixel_rows(header: ImageHeader) -> UInt8[np.ndarray, "rows row"]:
         raise _malformed(f"{width} x {height} pixels of {encoding}, which come in pairs")
     if step < row:
         raise _malformed(f"a step of {step} bytes for rows of {width} {encoding} pixels")
-    if len(header.pixels) != step * rows:
-        raise _malformed(f"{len(header.pixels)} bytes for {rows} rows of {step}")
-    return np.frombuffer(header.pixels, np.uint8).reshape(rows, step)[:, :row]
+    if len(header.data) != step * rows:
+        raise _malformed(f"{len(header.data)} bytes for {rows} rows of {step}")
+    return np.frombuffer(header.data, np.uint8).reshape(rows, step)[:, :row]
 
 
 def check_image(topic: str, header: ImageHeader) -> None:
@@ -123,16 +115,10 @@ def depth_to_compact(data: Buffer) -> bytes | None:
     header = image_header(data)
     if header.encoding not in DEPTH_ENCODINGS:
         return None
-    rows = pixel_rows(header)
-    return _compressed_image(header, RVL_FORMAT, pack_rvl(rows, swap_bytes=header.is_bigendian))
+    packed = pack_rvl(pixel_rows(header), swap_bytes=bool(header.is_bigendian))
+    return _compressed_image(header, RVL_FORMAT, packed)
 
 
 def _compressed_image(header: ImageHeader, image_format: str, data: list[bytes]) -> bytes:
-    front = bytearray(ENCAPSULATION_LE)
-    front += struct.pack("<iI", header.sec, header.nanosec)
-    for text in (header.frame_id, image_format):
-        raw = text.encode() + b"\0"
-        front += struct.pack("<I", len(raw)) + raw
-        front += b"\0" * (-len(front) % 4)
-    front += struct.pack("<I", sum(map(len, data)))
-    return b"".join([front, *data])
+    message = {"header": header.header, "format": image_format, "data": b"".join(data)}
+    return encode(schema.COMPRESSED_IMAGE, message)

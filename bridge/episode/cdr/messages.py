@@ -30,15 +30,15 @@ from bridge.media.color import decode_color, encode_jpeg
 from bridge.media.pixels import COLORS, rgb_from
 
 
-def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
+def header(stamp_ns: int, frame_id: str) -> dict[str, object]:
+    """Make a std_msgs/Header."""
     sec, nanosec = split_ns(stamp_ns)
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
 
 
 def stamp_of(message: Message) -> int:
     """Return ``header.stamp`` of a decoded message [ns]."""
-    stamp = message["header"]["stamp"]
-    return join_ns(stamp["sec"], stamp["nanosec"])
+    return join_ns(**message["header"]["stamp"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class JointSample:
     def to_cdr(self) -> bytes:
         """Serialise as sensor_msgs/JointState."""
         message = {
-            "header": _header(self.stamp_ns, ""),
+            "header": header(self.stamp_ns, ""),
             "name": list(self.names),
             "position": self.position,
             "velocity": self.velocity,
@@ -91,7 +91,7 @@ class CompressedColor:
     def to_cdr(self) -> bytes:
         """Serialise as sensor_msgs/CompressedImage."""
         message = {
-            "header": _header(self.stamp_ns, self.frame_id),
+            "header": header(self.stamp_ns, self.frame_id),
             "format": self.format,
             "data": self.data,
         }
@@ -146,7 +146,7 @@ class RawColor:
             frame_id=header.frame_id,
             encoding=header.encoding,
             rows=pixel_rows(header),
-            swap_bytes=header.is_bigendian,
+            swap_bytes=bool(header.is_bigendian),
         )
 
     def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
@@ -183,7 +183,7 @@ class DepthImage:
         """Serialise as sensor_msgs/Image with encoding 16UC1."""
         height, width = self.depth_mm.shape
         message = {
-            "header": _header(self.stamp_ns, self.frame_id),
+            "header": header(self.stamp_ns, self.frame_id),
             "height": height,
             "width": width,
             "encoding": "16UC1",
@@ -202,7 +202,7 @@ class DepthImage:
         header = image_header(data)
         if header.encoding not in (*DEPTH_ENCODINGS, FLOAT_DEPTH):
             raise no_encoding(header.encoding, (*DEPTH_ENCODINGS, FLOAT_DEPTH))
-        rows, order = np.ascontiguousarray(pixel_rows(header)), "<>"[header.is_bigendian]
+        rows, order = np.ascontiguousarray(pixel_rows(header)), "<>"[bool(header.is_bigendian)]
         if header.encoding == FLOAT_DEPTH:
             depth_mm = depth.from_metres(rows.view(f"{order}f4").astype(np.float32))
         else:
@@ -246,7 +246,7 @@ class CameraInfo:
         """Serialise as sensor_msgs/CameraInfo, of images without distortion."""
         fx, fy, cx, cy = self.camera.to_ros()
         message = {
-            "header": _header(self.stamp_ns, self.frame_id),
+            "header": header(self.stamp_ns, self.frame_id),
             "height": self.camera.height,
             "width": self.camera.width,
             "distortion_model": "plumb_bob",
@@ -323,7 +323,7 @@ def transforms_to_cdr(transforms: list[FrameTransform]) -> bytes:
     """Serialise as tf2_msgs/TFMessage."""
     items = [
         {
-            "header": _header(item.stamp_ns, item.parent),
+            "header": header(item.stamp_ns, item.parent),
             "child_frame_id": item.child,
             "transform": _pose_fields(item.T_parent_child, "translation", "rotation"),
         }
@@ -360,7 +360,7 @@ class PoseSample:
     def to_cdr(self) -> bytes:
         """Serialise as geometry_msgs/PoseStamped."""
         message = {
-            "header": _header(self.stamp_ns, self.frame_id),
+            "header": header(self.stamp_ns, self.frame_id),
             "pose": _pose_fields(self.T_frame_body, "position", "orientation"),
         }
         return codec.encode(schema.POSE_STAMPED, message)
@@ -389,22 +389,6 @@ def string_from_cdr(data: bytes) -> str:
     return str(codec.decode(schema.STRING, data)["data"])
 
 
-def joint_trajectory_to_cdr(
-    *,
-    stamp_ns: int,
-    names: tuple[str, ...],
-    times_ns: list[int],
-    positions_rad: Float[np.ndarray, "num_points num_joints"],
-) -> bytes:
-    """Serialise as trajectory_msgs/JointTrajectory, for viewers."""
-    points = []
-    for t_ns, row in zip(times_ns, positions_rad, strict=True):
-        sec, nanosec = split_ns(t_ns)
-        points.append({"positions": row, "time_from_start": {"sec": sec, "nanosec": nanosec}})
-    message = {"header": _header(stamp_ns, ""), "joint_names": list(names), "points": points}
-    return codec.encode(schema.JOINT_TRAJECTORY, message)
-
-
 FLOAT32 = 7
 """PointField's number for this type."""
 POINT_STEP = 12
@@ -420,10 +404,9 @@ class PointCloudSample:
 
     def to_cdr(self) -> bytes:
         """Serialise as sensor_msgs/PointCloud2."""
-        sec, nanosec = split_ns(self.stamp_ns)
         count = len(self.points_m)
         message = {
-            "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": self.frame_id},
+            "header": header(self.stamp_ns, self.frame_id),
             "height": 1,
             "width": count,
             "fields": [

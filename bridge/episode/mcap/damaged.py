@@ -2,12 +2,8 @@
 
 import os
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
-import lz4.frame
-import zstandard
 from mcap.records import McapRecord, Schema
 
 from bridge.episode.mcap import format as mcap
@@ -20,10 +16,10 @@ from bridge.episode.mcap.format import (
     crc32,
 )
 from bridge.episode.mcap.walk import (
-    MAX_CHUNK_BYTES,
     BrokenRecordError,
-    ChunkHead,
+    ByteStream,
     parse,
+    read_footer,
     records_in,
 )
 
@@ -33,85 +29,57 @@ BLOCK_BYTES = 1 << 20
 class RecordFile:
     """Reads pieces of an open file."""
 
-    def __init__(self, descriptor: int) -> None:
-        """Use a descriptor that stays its owner's."""
-        self.descriptor = descriptor
-        self.size = os.fstat(descriptor).st_size
+    def __init__(self, stream: ByteStream, size: int | None = None) -> None:
+        """Use a stream that stays its owner's; with ``size`` only so many of its first bytes."""
+        self.stream = stream
+        self.size = stream.seek(0, os.SEEK_END) if size is None else size
 
     def read(self, offset: int, size: int) -> bytes:
         """Return up to ``size`` bytes, fewer only at the end of the file."""
-        size = min(size, self.size - offset)
-        data = os.pread(self.descriptor, size, offset) if size > 0 else b""
-        while len(data) < size:  # one call returns at most 2 GiB
-            more = os.pread(self.descriptor, size - len(data), offset + len(data))
-            if not more:
-                break
-            data += more
-        return data
-
-    def blocks(self, offset: int, size: int) -> Iterator[bytes]:
-        """Return a range in blocks."""
-        end = min(offset + size, self.size)
-        while offset < end:
-            block = self.read(offset, min(BLOCK_BYTES, end - offset))
-            if not block:
-                return
-            yield block
-            offset += len(block)
+        self.stream.seek(offset)
+        return self.stream.read(max(0, min(size, self.size - offset)))
 
     def crc(self, offset: int, size: int) -> int:
         """CRC-32 of a range."""
-        crc = 0
-        for block in self.blocks(offset, size):
-            crc = crc32(block, crc)
+        crc, end = 0, min(offset + size, self.size)
+        for start in range(offset, end, BLOCK_BYTES):
+            crc = crc32(self.read(start, min(BLOCK_BYTES, end - start)), crc)
         return crc
 
 
-_FOOTER_BYTES = mcap.RECORD_HEAD.size + mcap.FOOTER_FIELDS.size + len(mcap.MAGIC)
-
-
-def _summary_start(file: RecordFile) -> int | None:
-    """Return where the summary of a file begins, None unless its CRC is right."""
-    if file.size < 2 * _FOOTER_BYTES:
+def _summary_places(file: RecordFile) -> tuple[int, int] | None:
+    """Return where summary and footer of a file begin, None unless the summary's CRC is right."""
+    try:
+        footer, at = read_footer(file.stream)
+    except BrokenRecordError:
         return None
-    footer = file.read(file.size - _FOOTER_BYTES, _FOOTER_BYTES)
-    expected = mcap.RECORD_HEAD.pack(mcap.FOOTER, mcap.FOOTER_FIELDS.size)
-    if not (footer.startswith(expected) and footer.endswith(mcap.MAGIC)):
-        return None
-    start, _, crc = mcap.FOOTER_FIELDS.unpack_from(footer, mcap.RECORD_HEAD.size)
-    if not len(mcap.MAGIC) <= start <= file.size - _FOOTER_BYTES:
-        return None
-    return int(start) if crc == file.crc(start, file.size - start - len(mcap.MAGIC) - 4) else None
+    start, behind_crc = footer.summary_start, len(mcap.MAGIC) + 4
+    is_intact = footer.summary_crc == file.crc(start, file.size - start - behind_crc)
+    return (start, at) if is_intact and start >= len(mcap.MAGIC) else None
 
 
-def summary_definitions(file: RecordFile) -> list[bytes]:
+def summary_definitions(file: RecordFile) -> list[McapRecord | None]:
     """Return the schemas and channels of a summary that is intact, none of another."""
-    start = _summary_start(file)
-    if start is None:
+    places = _summary_places(file)
+    try:
+        data = file.read(places[0], places[1] - places[0]) if places else b""
+        return walk_records(data).definitions
+    except BrokenRecordError:
         return []
-    return walk_records(file.read(start, file.size - _FOOTER_BYTES - start)).definitions
 
 
-class FinishedData(NamedTuple):
-    """Where the data of a finished file ends, and whether its CRC proves every byte of it."""
+def finished_data(file: RecordFile) -> tuple[int, bool] | None:
+    """Return where a file's data ends, and whether its CRC proves every byte of it.
 
-    end: int
-    is_proved: bool
-
-
-def finished_data(file: RecordFile) -> FinishedData | None:
-    """Look at the end of a file; None unless its closing CRCs are right."""
-    start = _summary_start(file)
-    end = -1 if start is None else start - mcap.RECORD_HEAD.size - 4
-    if start is None or end < len(mcap.MAGIC):
+    None unless the closing CRCs are right.
+    """
+    places = _summary_places(file)
+    head = mcap.RECORD_HEAD.pack(mcap.DATA_END, 4)
+    end = places[0] - len(head) - 4 if places else -1
+    if end < len(mcap.MAGIC) or file.read(end, len(head)) != head:
         return None
-    data_end = file.read(end, start - end)
-    crc = int.from_bytes(data_end[-4:], "little")
-    if not data_end.startswith(mcap.RECORD_HEAD.pack(mcap.DATA_END, 4)):
-        return None
-    if crc not in (0, file.crc(0, end)):
-        return None
-    return FinishedData(end, is_proved=crc != 0)
+    crc = int.from_bytes(file.read(end + len(head), 4), "little")
+    return (end, crc != 0) if crc in (0, file.crc(0, end)) else None
 
 
 _INDEX_FIELDS = struct.Struct("<HxxxxQ")
@@ -128,17 +96,12 @@ def read_plain(record: bytes) -> McapRecord | None:
 
 @dataclass(kw_only=True)
 class Contents:
-    """The whole records found from the front of a chunk's data."""
+    """What lies in a chunk."""
 
-    size: int = 0
     index: dict[int, list[int]] = field(default_factory=dict)
     """By channel: log time and offset of each message, one after the other."""
-    definitions: list[bytes] = field(default_factory=list)
-
-    @property
-    def num_messages(self) -> int:
-        """Messages on all channels."""
-        return sum(map(len, self.index.values())) // 2
+    definitions: list[McapRecord | None] = field(default_factory=list)
+    """Schemas and channels."""
 
     def time_range(self) -> tuple[int, int]:
         """First and last log time, zeros without messages [ns]."""
@@ -147,60 +110,17 @@ class Contents:
 
 
 def walk_records(data: Buffer) -> Contents:
-    """Find the records at the front of a chunk's data, up to the first that is cut or wrong."""
+    """Find the records in a chunk's data, or a summary; raises where one is cut or wrong."""
     found = Contents()
     index = found.index
-    try:
-        for opcode, at, length in records_in(data):
+    for opcode, at, length in records_in(data):
+        if opcode == MESSAGE:
+            channel_id, log_time_ns = _INDEX_FIELDS.unpack_from(data, at + RECORD_HEAD.size)
+            entries = index.get(channel_id)
+            if entries is None:
+                entries = index[channel_id] = []
+            entries += (log_time_ns, at)
+        elif opcode in (SCHEMA, CHANNEL):
             end = at + RECORD_HEAD.size + length
-            if opcode == MESSAGE:
-                channel_id, log_time_ns = _INDEX_FIELDS.unpack_from(data, at + RECORD_HEAD.size)
-                entries = index.get(channel_id)
-                if entries is None:
-                    entries = index[channel_id] = []
-                entries += (log_time_ns, at)
-            elif opcode in (SCHEMA, CHANNEL):
-                record = bytes(data[at:end])
-                read_plain(record)
-                found.definitions.append(record)
-            found.size = end
-    except BrokenRecordError:
-        pass  # what came before is whole
+            found.definitions.append(read_plain(bytes(data[at:end])))
     return found
-
-
-def unpack_front(head: ChunkHead, data: bytes) -> bytes:
-    """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified."""
-    if head.compression == "":
-        return data
-    limit = min(head.size or MAX_CHUNK_BYTES, MAX_CHUNK_BYTES)
-    return (_unpack_zstd if head.compression == "zstd" else _unpack_lz4)(data, limit)
-
-
-def _unpack_zstd(data: bytes, limit: int) -> bytes:
-    unpacked = bytearray()
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as reader:
-            while len(unpacked) <= limit:
-                part = reader.read(min(limit + 1 - len(unpacked), 1 << 22))
-                if not part:
-                    break
-                unpacked += part
-    except (zstandard.ZstdError, MemoryError):
-        pass  # what came before the damage is still good
-    return bytes(unpacked)
-
-
-def _unpack_lz4(data: bytes, limit: int) -> bytes:
-    unpacked = bytearray()
-    try:
-        reader = lz4.frame.LZ4FrameDecompressor()
-        unpacked += reader.decompress(data, max_length=limit + 1)
-        while not reader.eof and len(unpacked) <= limit:
-            part = reader.decompress(b"", max_length=limit + 1 - len(unpacked))
-            if not part:
-                break
-            unpacked += part
-    except (RuntimeError, EOFError, MemoryError):
-        pass
-    return bytes(unpacked)

@@ -12,62 +12,13 @@ from bridge.episode.mcap.format import (
     MESSAGE_FIELDS,
     MESSAGE_HEAD,
     Buffer,
-    Payload,
+    FileSummary,
     crc32,
     encoded,
     num_bytes,
 )
 from bridge.episode.mcap.part_file import PartFile
-from bridge.episode.mcap.walk import RecordSpan, attachment_entry, metadata_entry
-
-
-class Summary:
-    """Schemas, channels, statistics and indexes of one file, each as it will stand in it."""
-
-    def __init__(self) -> None:
-        """Begin with an empty file."""
-        self.schemas: dict[int, bytes] = {}
-        self.channels: dict[int, bytes] = {}
-        self.message_counts: dict[int, int] = {}
-        self.start_ns: int | None = None
-        self.end_ns = 0
-        self._indexes: dict[int, list[bytes]] = {
-            mcap_format.CHUNK_INDEX: [],
-            mcap_format.ATTACHMENT_INDEX: [],
-            mcap_format.METADATA_INDEX: [],
-        }
-
-    def add_index(self, entry: records.McapRecord) -> None:
-        """Book where a chunk, attachment or metadata record lies."""
-        record = encoded(entry)
-        self._indexes[record[0]].append(record)
-
-    def add_messages(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
-        """Book the messages of a chunk by channel, the first and the last log time among them."""
-        for channel_id, count in counts.items():
-            self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
-        if counts:
-            self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
-            self.end_ns = max(self.end_ns, end_ns)
-
-    def encode(self, start: int) -> bytes:
-        """Return everything from the summary to the end of the file."""
-        chunks, attachments, metadata = self._indexes.values()
-        statistics = records.Statistics(
-            attachment_count=len(attachments),
-            channel_count=len(self.channels),
-            channel_message_counts=dict(sorted(self.message_counts.items())),
-            chunk_count=len(chunks),
-            message_count=sum(self.message_counts.values()),
-            message_start_time=self.start_ns or 0,
-            message_end_time=self.end_ns,
-            metadata_count=len(metadata),
-            schema_count=len(self.schemas),
-        )
-        definitions = (self.schemas.values(), self.channels.values())
-        groups = (*definitions, [encoded(statistics)], chunks, attachments, metadata)
-        return mcap_format.summary_section(map(b"".join, groups), start)
-
+from bridge.episode.mcap.walk import attachment_entry
 
 ZSTD_LEVEL = 1
 """Level 3 packs noisy depth 20 % tighter at twice the CPU time (the recorder study, section 2)."""
@@ -89,7 +40,7 @@ Index = dict[int, list[int]]
 """By channel: log time and offset of each message, one after the other."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class EncodedChunk:
     """A chunk record ready to be written."""
 
@@ -98,64 +49,31 @@ class EncodedChunk:
     """What the summary will say of it; where it lies is known when it is written."""
     index: Index
 
-    @property
-    def length(self) -> int:
-        """Bytes of the record."""
-        return self.entry.chunk_length
-
-
-def chunk_of(
-    data: list[Buffer],
-    index: Index,
-    *,
-    times_ns: tuple[int, int],
-    size: int,
-    crc: int,
-    compression: str,
-) -> EncodedChunk:
-    """Make a chunk of records, packed or not; ``size`` and ``crc`` are of the records."""
-    data_size = sum(map(num_bytes, data))
-    entry = records.ChunkIndex(
-        chunk_length=0,
-        chunk_start_offset=0,
-        compression=compression,
-        compressed_size=data_size,
-        message_end_time=times_ns[1],
-        message_index_length=0,
-        message_index_offsets={},
-        message_start_time=times_ns[0],
-        uncompressed_size=size,
-    )
-    head = mcap_format.chunk_head(entry, crc)
-    entry.chunk_length = len(head) + data_size
-    return EncodedChunk(buffers=[head, *data], entry=entry, index=index)
-
 
 class OpenChunk:
     """One group's messages in memory. ``size`` counts the bytes, 0 when there are none.
 
-    Groups of small messages are gathered in one buffer, because thousands of pieces cost more than
-    the copy. Large payloads stay where they are: their owner must not change them before they are
-    written.
+    Payloads stay where they are: their owner must not change them before they are written.
     """
 
-    def __init__(self, *, compress: bool, gather: bool) -> None:
-        """Begin empty. ``gather`` is for small messages."""
+    def __init__(self, *, compress: bool, is_small: bool) -> None:
+        """Begin empty; the small messages of many topics share a group."""
         self.size = 0
         self.opened_s = 0.0
         """When the first message came, for the owner to set and read."""
         self.number = 0
         """Of this chunk among those of its group."""
-        self.is_small = gather
-        self._compressor = _compressor(gather=gather) if compress else None
-        self._gather = gather
+        self.is_small = is_small
+        self._compressor: zstandard.ZstdCompressor | None = None
+        if compress:
+            about = {"level": ZSTD_LEVEL} if is_small else {"compression_params": LARGE_PACKING}
+            self._compressor = zstandard.ZstdCompressor(**about)
         self._clear()
 
     def _clear(self) -> None:
         self.size = 0
-        self._buffer = bytearray()
         self._pieces: list[Buffer] = []
-        self._index: dict[int, list[int]] = {}
+        self._index: Index = {}
         self._start_ns = 0
         self._end_ns = 0
 
@@ -167,10 +85,7 @@ class OpenChunk:
     def define(self, records: bytes) -> None:
         """Append schema and channel records, before the first message that needs them."""
         self.size += len(records)
-        if self._gather:
-            self._buffer += records
-        else:
-            self._pieces.append(records)
+        self._pieces.append(records)
 
     def add(
         self,
@@ -178,7 +93,7 @@ class OpenChunk:
         sequence: int,
         log_time_ns: int,
         publish_time_ns: int,
-        data: Payload,
+        data: Buffer,
         length: int,
     ) -> None:
         """Append one message whose payload has ``length`` bytes.
@@ -200,48 +115,36 @@ class OpenChunk:
         elif log_time_ns < self._start_ns:
             self._start_ns = log_time_ns
         self.size += len(head) + length
-        if self._gather:
-            self._buffer += head
-            if isinstance(data, Buffer):
-                self._buffer += data
-            else:
-                for piece in data:
-                    self._buffer += piece
-        else:
-            self._pieces.append(head)
-            if isinstance(data, Buffer):
-                self._pieces.append(data)
-            else:
-                self._pieces.extend(data)
+        self._pieces += (head, data)
 
     def encode(self) -> EncodedChunk:
         """Return the messages as a chunk record and begin anew."""
-        pieces: list[Buffer] = [self._buffer] if self._gather else self._pieces
-        crc = 0
-        for piece in pieces:
+        data, compression, crc = self._pieces, "", 0
+        if self.is_small or self._compressor is not None:  # many pieces cost more than a copy
+            data = [b"".join(data)]
+        for piece in data:
             crc = crc32(piece, crc)
-        data, compression = pieces, ""
         if self._compressor is not None:
-            packed = self._compressor.compress(pieces[0] if self._gather else b"".join(pieces))
+            packed = self._compressor.compress(data[0])
             if len(packed) < self.size:
                 data, compression = [packed], "zstd"
-        made = chunk_of(
-            data,
-            self._index,
-            times_ns=(self._start_ns, self._end_ns),
-            size=self.size,
-            crc=crc,
+        entry = records.ChunkIndex(
+            chunk_length=0,
+            chunk_start_offset=0,
             compression=compression,
+            compressed_size=sum(map(num_bytes, data)),
+            message_end_time=self._end_ns,
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=self._start_ns,
+            uncompressed_size=self.size,
         )
+        head = mcap_format.chunk_head(entry, crc)
+        entry.chunk_length = len(head) + entry.compressed_size
+        made = EncodedChunk([head, *data], entry, self._index)
         self._clear()
         self.number += 1
         return made
-
-
-def _compressor(*, gather: bool) -> zstandard.ZstdCompressor:
-    if gather:
-        return zstandard.ZstdCompressor(level=ZSTD_LEVEL, write_content_size=True)
-    return zstandard.ZstdCompressor(compression_params=LARGE_PACKING)
 
 
 class DataSection:
@@ -250,58 +153,45 @@ class DataSection:
     def __init__(self, file: PartFile) -> None:
         """Take over an open file."""
         self.file = file
-        self.summary = Summary()
+        self.summary = FileSummary()
 
     def add_chunks(self, chunks: Sequence[EncodedChunk]) -> None:
         """Write chunks, each with its message indexes, all or none."""
         start = self.file.offset
         buffers: list[Buffer] = []
-        places = []
         for chunk in chunks:
-            indexes, offsets = index_records(chunk.index, start + chunk.length)
+            entry = chunk.entry
+            entry.chunk_start_offset, indexes = start, b""
+            start += entry.chunk_length
+            for channel_id, entries in chunk.index.items():
+                entry.message_index_offsets[channel_id] = start + len(indexes)
+                indexes += mcap_format.message_index(channel_id, entries)
+            entry.message_index_length = len(indexes)
+            start += len(indexes)
             buffers += [*chunk.buffers, indexes]
-            places.append((chunk, start, offsets, len(indexes)))
-            start += chunk.length + len(indexes)
         self.file.append(buffers)
-        for place in places:
-            self.book(*place)
-
-    def book(
-        self, chunk: EncodedChunk, start: int, offsets: dict[int, int], index_length: int
-    ) -> None:
-        """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``."""
-        entry = chunk.entry
-        entry.chunk_start_offset, entry.message_index_length = start, index_length
-        entry.message_index_offsets = offsets
-        self.summary.add_index(entry)
-        counts = {channel_id: len(entries) // 2 for channel_id, entries in chunk.index.items()}
-        self.summary.add_messages(counts, entry.message_start_time, entry.message_end_time)
+        for chunk in chunks:
+            entry = chunk.entry
+            counts = {number: len(entries) // 2 for number, entries in chunk.index.items()}
+            self.summary.chunk_indexes.append(entry)
+            self.summary.add_messages(counts, entry.message_start_time, entry.message_end_time)
 
     def add_attachment(self, entry: records.Attachment) -> None:
         """Write an attachment."""
         offset = self.file.offset
-        self.file.append(mcap_format.attachment(entry))
-        span = RecordSpan.between(mcap_format.ATTACHMENT, offset, self.file.offset)
-        self.summary.add_index(attachment_entry(span, entry, len(entry.data)))
+        self.file.append([encoded(entry)])
+        length = self.file.offset - offset
+        self.summary.attachment_indexes.append(attachment_entry(offset, length, entry))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
         offset, entry = self.file.offset, records.Metadata(name, dict(values))
         self.file.append([encoded(entry)])
-        span = RecordSpan.between(mcap_format.METADATA, offset, self.file.offset)
-        self.summary.add_index(metadata_entry(span, entry))
+        self.summary.metadata_indexes.append(
+            records.MetadataIndex(offset, self.file.offset - offset, name)
+        )
 
     def seal(self) -> None:
         """Write the end of the data, the summary and the footer."""
         data_end = encoded(records.DataEnd(self.file.crc))
         self.file.append([data_end, self.summary.encode(self.file.offset + len(data_end))])
-
-
-def index_records(index: dict[int, list[int]], start: int) -> tuple[bytes, dict[int, int]]:
-    """Return a chunk's message index records and where each lies, the first at ``start``."""
-    found = [mcap_format.message_index(*item) for item in index.items()]
-    offsets = {}
-    for channel_id, record in zip(index, found, strict=True):
-        offsets[channel_id] = start
-        start += len(record)
-    return b"".join(found), offsets

@@ -4,99 +4,31 @@ The walk believes no summary and no index. Memory holds one record at a time, an
 """
 
 import struct
-import zlib
-from array import array
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numpy as np
-from jaxtyping import UInt64
 from mcap import records
-from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
-from bridge.episode.mcap.format import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.damaged import Contents, RecordFile
+from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, FileSummary
+from bridge.episode.mcap.scan import (
+    Chunk,
+    Damage,
+    IndexSpan,
+    Plain,
+    TopMessage,
+    scan,
+)
 from bridge.episode.mcap.walk import (
-    PIECE_BYTES,
-    BrokenRecordError,
-    ByteStream,
     MessageHead,
-    RecordSpan,
     attachment_entry,
-    attachment_of,
     chunk_entry,
     message_head,
-    metadata_entry,
-    parse,
-    parse_chunk,
-    read_body,
     records_in,
-    unpack_chunk,
-    walk,
 )
 
-
-@dataclass(kw_only=True)
-class Seen:
-    """What a walk through the data section found."""
-
-    schemas: dict[int, records.Schema] = field(default_factory=dict)
-    channels: dict[int, records.Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    start_ns: int | None = None
-    end_ns: int = 0
-    chunks: list[records.ChunkIndex] = field(default_factory=list)
-    """Of the chunks whose head can be read."""
-    num_chunks: int = 0
-    attachments: list[records.AttachmentIndex] = field(default_factory=list)
-    num_broken_attachments: int = 0
-    metadata: list[records.MetadataIndex] = field(default_factory=list)
-
-    def count(self, head: MessageHead) -> None:
-        """Take a message."""
-        self.counts[head.channel_id] = self.counts.get(head.channel_id, 0) + 1
-        if self.start_ns is None or head.log_time_ns < self.start_ns:
-            self.start_ns = head.log_time_ns
-        self.end_ns = max(self.end_ns, head.log_time_ns)
-
-    def define(self, place: RecordSpan, record: records.McapRecord | None) -> Iterator[str]:
-        """Take a schema, channel or metadata record; yields what is wrong with it."""
-        if isinstance(record, records.Metadata):
-            self.metadata.append(metadata_entry(place, record))
-        elif isinstance(record, records.Schema):
-            if record.id == 0:
-                yield "a schema has the id 0, which means none"
-            if self.schemas.setdefault(record.id, record) != record:
-                yield f"schema {record.id} is announced twice with different contents"
-        elif isinstance(record, records.Channel):
-            if record.schema_id and record.schema_id not in self.schemas:
-                yield f"channel {record.id} uses schema {record.schema_id}, not announced before"
-            if self.channels.setdefault(record.id, record) != record:
-                yield f"channel {record.id} is announced twice with different contents"
-
-    def to_summary(self) -> Summary:
-        """Make the summary that such a file should have."""
-        summary = Summary()
-        summary.schemas, summary.channels = self.schemas, self.channels
-        summary.chunk_indexes, summary.attachment_indexes = self.chunks, self.attachments
-        summary.metadata_indexes = self.metadata
-        summary.statistics = records.Statistics(
-            attachment_count=len(self.attachments),
-            channel_count=len(self.channels),
-            channel_message_counts=self.counts,
-            chunk_count=len(self.chunks),
-            message_count=sum(self.counts.values()),
-            message_start_time=self.start_ns or 0,
-            message_end_time=self.end_ns,
-            metadata_count=len(self.metadata),
-            schema_count=len(self.schemas),
-        )
-        return summary
-
-
 _INDEX_HEAD = struct.Struct("<HI")
-NEVER = 1 << 64
 
 
 class ScannedMessage(NamedTuple):
@@ -112,164 +44,123 @@ class DataWalk:
     """The walk through one data section. Use ``messages`` to the end, then read ``seen``."""
 
     def __init__(
-        self, stream: ByteStream, *, fault: Callable[[str], None], doubt: Callable[[str], None]
+        self, file: RecordFile, *, fault: Callable[[str], None], doubt: Callable[[str], None]
     ) -> None:
         """``fault`` hears of what cannot be read, ``doubt`` of what contradicts the data."""
-        self.seen = Seen()
-        self._stream, self._fault, self._doubt = stream, fault, doubt
-        self._crc = 0
+        self.seen = FileSummary()
+        self._file, self._fault, self._doubt = file, fault, doubt
         self._chunk: records.ChunkIndex | None = None
-        self._entries: dict[int, array[int]] = {}
-        """By channel: log time and offset of its messages in the chunk, one after the other."""
-        self._indexed: set[int] = set()
+        self._contents = Contents()
+        """Of that chunk."""
+        self._num_loose = 0
 
-    def messages(self, data_end: int) -> Iterator[ScannedMessage]:
+    def messages(self) -> Iterator[ScannedMessage]:
         """Yield every message that can be read, in file order."""
-        stream = self._stream
-        stream.seek(0)
-        self._crc = zlib.crc32(stream.read(len(MAGIC)))
-        ended = False
-        for place in walk(stream, len(MAGIC), data_end):
-            if ended:
-                self._doubt(f"a record at byte {place.offset}, behind the end of the data")
-                break
-            if place.opcode not in (mcap_format.MESSAGE_INDEX, mcap_format.CHUNK):
+        end = None
+        for found in scan(self._file):
+            if not isinstance(found, IndexSpan):
                 self._end_chunk()
-            if place.opcode == mcap_format.DATA_END:
-                self._end_chunk()
-                self._check_data_end(stream, place)
-                ended = True
-            elif place.opcode == mcap_format.ATTACHMENT:
-                self._add_attachment(stream, place)
-            else:
-                body = read_body(stream, place)
-                head = RECORD_HEAD.pack(place.opcode, place.length)
-                self._crc = zlib.crc32(body, zlib.crc32(head, self._crc))
-                try:
-                    yield from self._take(place, body)
-                except BrokenRecordError as error:
-                    self._fault(str(error))
+            match found:
+                case Damage():
+                    self._fault(found.what)
+                case Chunk():
+                    yield from self._walk_chunk(found)
+                case IndexSpan():
+                    self._check_index(found)
+                case TopMessage():
+                    self._num_loose += 1
+                    log_ns = found.log_time_ns
+                    self.seen.add_messages({found.channel_id: 1}, log_ns, log_ns)
+                    yield from self._message(self._file.read(found.offset, found.length), 0)
+                case Plain():
+                    self._take_plain(found)
+                    end = found if found.opcode == mcap_format.DATA_END else None
         self._end_chunk()
-        if not ended:
+        if end is None:
             self._doubt("the end of its data is not marked")
+        elif end.end < self._file.size:
+            self._doubt(f"a record at byte {end.end}, behind the end of the data")
+        if self.seen.chunk_indexes and self._num_loose:
+            self._doubt(f"{self._num_loose} messages outside chunks, where the index shows none")
 
-    def _take(self, place: RecordSpan, body: bytes) -> Iterator[ScannedMessage]:
-        if place.opcode == MESSAGE:
-            front = RECORD_HEAD.pack(place.opcode, place.length) + body[: MESSAGE_HEAD.size]
-            head = message_head(front, 0, place.offset)
-            yield from self._message(head, body[MESSAGE_HEAD.size - RECORD_HEAD.size :])
-        elif place.opcode == mcap_format.CHUNK:
-            yield from self._walk_chunk(place, body)
-        elif place.opcode == mcap_format.MESSAGE_INDEX:
-            self._check_index(place, body)
-        else:
-            self._define(place, parse(place.opcode, body))
+    def _take_plain(self, found: Plain) -> None:
+        match found.record:
+            case records.Attachment() as record:
+                entry = attachment_entry(found.offset, found.length, record)
+                self.seen.attachment_indexes.append(entry)
+            case records.Metadata(name=name):
+                place = records.MetadataIndex(found.offset, found.length, name)
+                self.seen.metadata_indexes.append(place)
+            case records.DataEnd(data_section_crc=crc):
+                if crc not in (0, self._file.crc(0, found.offset)):
+                    self._doubt("its data has another CRC than it declares")
+            case record:
+                self._define(record)
 
-    def _message(self, head: MessageHead, data: bytes) -> Iterator[ScannedMessage]:
+    def _message(self, data: bytes, at: int) -> Iterator[ScannedMessage]:
+        head = message_head(data, at)
         channel = self.seen.channels.get(head.channel_id)
         if channel is None:
             self._fault(f"a message of channel {head.channel_id}, which was not announced")
             return
-        self.seen.count(head)
-        yield ScannedMessage(channel, self.seen.schemas.get(channel.schema_id), head, data)
+        start = at + MESSAGE_HEAD.size
+        payload = data[start : start + head.length]
+        yield ScannedMessage(channel, self.seen.schemas.get(channel.schema_id), head, payload)
 
-    def _define(self, place: RecordSpan, record: records.McapRecord | None) -> None:
-        for text in self.seen.define(place, record):
-            self._fault(text)
+    def _define(self, record: records.McapRecord | None) -> None:
+        """Take a schema or channel record, and say what is wrong with it."""
+        schemas, channels = self.seen.schemas, self.seen.channels
+        if isinstance(record, records.Schema):
+            if schemas.setdefault(record.id, record) != record:
+                self._fault(f"schema {record.id} is announced twice with different contents")
+        elif isinstance(record, records.Channel):
+            number, schema_id = record.id, record.schema_id
+            if schema_id and schema_id not in schemas:
+                self._fault(f"channel {number} uses schema {schema_id}, not announced before")
+            if channels.setdefault(number, record) != record:
+                self._fault(f"channel {number} is announced twice with different contents")
 
-    def _walk_chunk(self, place: RecordSpan, body: bytes) -> Iterator[ScannedMessage]:
-        self._end_chunk()
-        whose = f"the chunk at byte {place.offset}"
-        self.seen.num_chunks += 1
-        chunk = parse_chunk(body)
-        self._chunk = chunk_entry(place, chunk.head)
-        data = unpack_chunk(chunk, whose=whose)
-        first_ns, last_ns = NEVER, 0
-        for opcode, at, length in records_in(data):
-            start = at + RECORD_HEAD.size
+    def _walk_chunk(self, found: Chunk) -> Iterator[ScannedMessage]:
+        self._chunk = chunk_entry(found.offset, found.length, found.packed)
+        self._contents = found.contents
+        data = found.records
+        for record in found.contents.definitions:
+            self._define(record)
+        for opcode, at, _ in records_in(data):
             if opcode == MESSAGE:
-                head = message_head(data, at, at)
-                first_ns = min(first_ns, head.log_time_ns)
-                last_ns = max(last_ns, head.log_time_ns)
-                self._note(head)
-                payload = at + MESSAGE_HEAD.size
-                yield from self._message(head, data[payload : start + length])
-            else:
-                self._define(
-                    RecordSpan(opcode, at, length), parse(opcode, data[start : start + length])
-                )
-        found = (first_ns, last_ns) if self._entries else (0, 0)
-        if found != (chunk.head.start_ns, chunk.head.end_ns):
-            said = (chunk.head.start_ns, chunk.head.end_ns)
-            self._doubt(f"{whose} says its messages are from {said}, they are from {found}")
+                yield from self._message(data, at)
+        counts = {number: len(each) // 2 for number, each in found.contents.index.items()}
+        self.seen.add_messages(counts, *found.contents.time_range())
+        times = found.contents.time_range()
+        said = (found.packed.message_start_time, found.packed.message_end_time)
+        if times != said:
+            whose = f"the chunk at byte {found.offset}"
+            self._doubt(f"{whose} says its messages are from {said}, they are from {times}")
 
-    def _note(self, head: MessageHead) -> None:
-        entries = self._entries.get(head.channel_id)
-        if entries is None:
-            entries = self._entries[head.channel_id] = array("Q")
-        entries.append(head.log_time_ns)
-        entries.append(head.at)
-
-    def _check_index(self, place: RecordSpan, body: bytes) -> None:
-        channel_id, said = _index_entries(body)
+    def _check_index(self, span: IndexSpan) -> None:
+        body = self._file.read(span.offset, span.length)[RECORD_HEAD.size :]
+        channel_id, length = _INDEX_HEAD.unpack_from(body)
+        numbers = struct.unpack_from(f"<{length // 8}Q", body, _INDEX_HEAD.size)
+        said = sorted(zip(numbers[::2], numbers[1::2], strict=True))
         if self._chunk is None:
-            self._doubt(f"the message index at byte {place.offset} follows no chunk")
+            self._doubt(f"the message index at byte {span.offset} follows no chunk")
             return
-        self._chunk.message_index_offsets[channel_id] = place.offset
-        self._chunk.message_index_length += place.end - place.offset
-        self._indexed.add(channel_id)
-        found = np.array(self._entries.get(channel_id, ()), dtype=np.uint64).reshape(-1, 2)
-        if not np.array_equal(_in_order(said), _in_order(found)):
+        self._chunk.message_index_offsets[channel_id] = span.offset
+        self._chunk.message_index_length += span.length
+        entries = self._contents.index.get(channel_id, [])
+        if said != sorted(zip(entries[::2], entries[1::2], strict=True)):
             self._doubt(
-                f"the message index at byte {place.offset} does not point at the messages of "
+                f"the message index at byte {span.offset} does not point at the messages of "
                 f"channel {channel_id} in its chunk"
             )
 
     def _end_chunk(self) -> None:
         if self._chunk is None:
             return
-        absent = self._entries.keys() - self._indexed
-        if self._indexed and absent:
+        indexed = self._chunk.message_index_offsets
+        absent = self._contents.index.keys() - indexed
+        if indexed and absent:
             at = self._chunk.chunk_start_offset
             self._doubt(f"the chunk at byte {at} has no index of channels {sorted(absent)}")
-        self.seen.chunks.append(self._chunk)
+        self.seen.chunk_indexes.append(self._chunk)
         self._chunk = None
-        self._entries = {}
-        self._indexed = set()
-
-    def _add_attachment(self, stream: ByteStream, place: RecordSpan) -> None:
-        try:
-            found, data_size = attachment_of(stream, place, keep=False)
-            self.seen.attachments.append(attachment_entry(place, found, data_size))
-        except BrokenRecordError as error:
-            self.seen.num_broken_attachments += 1
-            self._fault(str(error))
-        stream.seek(place.offset)
-        left = place.end - place.offset
-        while left:
-            piece = stream.read(min(left, PIECE_BYTES))
-            if not piece:
-                break
-            left -= len(piece)
-            self._crc = zlib.crc32(piece, self._crc)
-
-    def _check_data_end(self, stream: ByteStream, place: RecordSpan) -> None:
-        record = parse(place.opcode, read_body(stream, place))
-        if isinstance(record, records.DataEnd) and record.data_section_crc not in (0, self._crc):
-            self._doubt("its data has another CRC than it declares")
-
-
-def _index_entries(body: bytes) -> tuple[int, UInt64[np.ndarray, "entries 2"]]:
-    """Read a message index: its channel, and log time and offset of each message."""
-    if len(body) < _INDEX_HEAD.size:
-        raise BrokenRecordError(f"a message index of {len(body)} bytes")
-    channel_id, length = _INDEX_HEAD.unpack_from(body)
-    if length % 16 or length > len(body) - _INDEX_HEAD.size:
-        message = f"a message index of {len(body)} bytes claims {length} bytes of entries"
-        raise BrokenRecordError(message)
-    entries = np.frombuffer(body, dtype="<u8", count=length // 8, offset=_INDEX_HEAD.size)
-    return channel_id, entries.astype(np.uint64).reshape(-1, 2)
-
-
-def _in_order(entries: UInt64[np.ndarray, "entries 2"]) -> UInt64[np.ndarray, "entries 2"]:
-    return entries[np.lexsort((entries[:, 1], entries[:, 0]))]

@@ -1,35 +1,25 @@
 """One finished MCAP file: its summary, its metadata, and where its messages lie."""
 
-import zlib
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 from mcap import records
 from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.damaged import RecordFile
 from bridge.episode.mcap.data_walk import DataWalk
-from bridge.episode.mcap.format import (
-    CHANNEL,
-    FOOTER_FIELDS,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_HEAD,
-    RECORD_HEAD,
-    SCHEMA,
-)
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
     RecordSpan,
     attachment_of,
-    message_head,
     parse,
     read_body,
-    records_in,
+    read_footer,
+    read_header,
+    read_summary,
     walk,
 )
 from bridge.errors import EpisodeError
@@ -37,31 +27,14 @@ from bridge.errors import EpisodeError
 
 def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     """Read the whole data section once; every chunk is unpacked and its CRC checked."""
-    found = DataWalk(stream, fault=_refuse, doubt=lambda text: None)
-    deque(found.messages(data_end), maxlen=0)
-    return found.seen.to_summary()
+    found = DataWalk(RecordFile(stream, data_end), fault=_refuse, doubt=lambda text: None)
+    deque(found.messages(), maxlen=0)
+    found.seen.sum_up()
+    return found.seen
 
 
 def _refuse(text: str) -> None:
     raise BrokenRecordError(text)
-
-
-_FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
-
-
-LOOSE_BYTES = 4 << 20
-"""Messages outside chunks are read so many bytes at a time; one message may be larger."""
-
-
-@dataclass(kw_only=True, slots=True)
-class LooseMessages:
-    """Messages outside chunks that lie one behind the other."""
-
-    start: int
-    end: int
-    first_ns: int
-    last_ns: int
-    channel_ids: set[int]
 
 
 def damaged(path: Path, error: BaseException) -> EpisodeError:
@@ -88,149 +61,33 @@ class McapFile:
                 summary = rebuild_summary(stream, self.data_end)
             self.summary = summary
             self.metadata = list(self._read_metadata(stream))
-        self._loose: list[LooseMessages] | None = None
 
     def _read_metadata(self, stream: ByteStream) -> Iterator[records.Metadata]:
         for entry in self.summary.metadata_indexes:
-            place = self._indexed(stream, entry.offset, mcap_format.METADATA)
+            place = self.indexed(stream, entry.offset, mcap_format.METADATA)
             record = parse(place.opcode, read_body(stream, place))
             if isinstance(record, records.Metadata):
                 yield record
 
-    def _indexed(self, stream: ByteStream, offset: int, opcode: int) -> RecordSpan:
+    def indexed(self, stream: ByteStream, offset: int, opcode: int) -> RecordSpan:
         """Return the place of the record an index points at."""
         place = next(walk(stream, offset, self.data_end), None)
         if place is None or place.opcode != opcode:
-            raise BrokenRecordError(f"the index points at byte {offset}, where no such record lies")
+            kind = "chunk" if opcode == mcap_format.CHUNK else "such record"
+            raise BrokenRecordError(f"the index points at byte {offset}, where no {kind} lies")
         return place
-
-    def attachment(self, name: str) -> bytes | None:
-        """Return the bytes of the first attachment of this name, its CRC checked, or None."""
-        for found in self.attachments(name):
-            return bytes(found.data)
-        return None
 
     def attachments(self, name: str | None = None) -> Iterator[records.Attachment]:
         """Yield attachments, all or those of one name; each is held in memory."""
         with self.path.open("rb") as stream:
             for entry in self.summary.attachment_indexes:
                 if name in (None, entry.name):
-                    place = self._indexed(stream, entry.offset, mcap_format.ATTACHMENT)
-                    yield attachment_of(stream, place).record
+                    place = self.indexed(stream, entry.offset, mcap_format.ATTACHMENT)
+                    yield attachment_of(read_body(stream, place), place.offset)
 
     def schema_of(self, channel: records.Channel) -> records.Schema | None:
         """Return the schema of a channel, or None where it has none."""
         return self.summary.schemas.get(channel.schema_id)
-
-    def loose(self) -> list[LooseMessages]:
-        """Return the messages outside chunks; found once, between the records that are indexed."""
-        if self._loose is None:
-            with self.path.open("rb") as stream:
-                self._loose = [each for gap in self._gaps() for each in _loose_in(stream, *gap)]
-        return self._loose
-
-    def _gaps(self) -> Iterator[tuple[int, int]]:
-        known = [
-            (chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length)
-            for chunk in self.summary.chunk_indexes
-        ]
-        known += [(entry.offset, entry.length) for entry in self.summary.attachment_indexes]
-        known += [(entry.offset, entry.length) for entry in self.summary.metadata_indexes]
-        at = len(MAGIC)
-        for offset, length in sorted(known):
-            if offset > at:
-                yield at, offset
-            at = max(at, offset + length)
-        if at < self.data_end:
-            yield at, self.data_end
-
-
-def _loose_in(stream: ByteStream, start: int, end: int) -> Iterator[LooseMessages]:
-    found: LooseMessages | None = None
-    for place in walk(stream, start, end):
-        if place.opcode != MESSAGE:
-            continue
-        stream.seek(place.offset)
-        head = message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
-        at_ns = head.log_time_ns
-        if found is None or found.end < place.offset or place.end - found.start > LOOSE_BYTES:
-            if found is not None:
-                yield found
-            found = LooseMessages(
-                start=place.offset, end=place.end, first_ns=at_ns, last_ns=at_ns, channel_ids=set()
-            )
-        found.end = place.end
-        found.first_ns, found.last_ns = min(found.first_ns, at_ns), max(found.last_ns, at_ns)
-        found.channel_ids.add(head.channel_id)
-    if found is not None:
-        yield found
-
-
-def read_header(stream: ByteStream) -> records.Header:
-    """Read magic and first record; raises BrokenRecordError."""
-    if stream.read(len(MAGIC)) != MAGIC:
-        raise BrokenRecordError("it does not begin as an MCAP file does")
-    place = next(walk(stream, len(MAGIC), stream.seek(0, 2)), None)
-    record = parse(place.opcode, read_body(stream, place)) if place else None
-    if not isinstance(record, records.Header):
-        raise BrokenRecordError("its first record is no header")
-    return record
-
-
-def read_footer(stream: ByteStream) -> tuple[records.Footer, int]:
-    """Read the last record and say where it begins; raises BrokenRecordError."""
-    at = stream.seek(0, 2) - _FOOTER_BYTES
-    stream.seek(max(at, 0))
-    tail = stream.read(_FOOTER_BYTES)
-    if len(tail) < _FOOTER_BYTES or not tail.endswith(MAGIC):
-        raise BrokenRecordError("it does not end as a finished MCAP file does")
-    footer = parse(tail[0], tail[RECORD_HEAD.size : -len(MAGIC)])
-    if not isinstance(footer, records.Footer):
-        raise BrokenRecordError("its last record is no footer")
-    if footer.summary_start > at:
-        message = f"its summary should begin at byte {footer.summary_start}, behind its footer"
-        raise BrokenRecordError(message)
-    return footer, at
-
-
-def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> Summary | None:
-    """Read the summary section with its CRC checked, None where there is none."""
-    if not footer.summary_start:
-        return None
-    stream.seek(footer.summary_start)
-    # The CRC covers everything up to itself, the last field of the footer.
-    section = stream.read(footer_at + RECORD_HEAD.size + 16 - footer.summary_start)
-    if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
-        raise BrokenRecordError("its summary has another CRC than it declares")
-    summary = Summary()
-    for opcode, at, length in records_in(section[: footer_at - footer.summary_start]):
-        body = section[at + RECORD_HEAD.size : at + RECORD_HEAD.size + length]
-        is_shared = opcode in (SCHEMA, CHANNEL) and length <= _SHARED_BYTES
-        _add(summary, (_parse_once if is_shared else parse)(opcode, body))
-    return summary
-
-
-_SHARED_BYTES = 1 << 14
-"""Longer definitions are not remembered."""
-
-
-_parse_once = lru_cache(maxsize=1024)(parse)
-"""Thousands of episodes repeat the same schemas and channels; nobody changes a record."""
-
-
-def _add(summary: Summary, record: records.McapRecord | None) -> None:
-    if isinstance(record, records.Statistics):
-        summary.statistics = record
-    elif isinstance(record, records.Schema):
-        summary.schemas[record.id] = record
-    elif isinstance(record, records.Channel):
-        summary.channels[record.id] = record
-    elif isinstance(record, records.AttachmentIndex):
-        summary.attachment_indexes.append(record)
-    elif isinstance(record, records.ChunkIndex):
-        summary.chunk_indexes.append(record)
-    elif isinstance(record, records.MetadataIndex):
-        summary.metadata_indexes.append(record)
 
 
 def _is_complete(summary: Summary) -> bool:

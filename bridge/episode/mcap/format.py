@@ -6,12 +6,13 @@ a text is its UTF-8 bytes after their number. Offsets count from the start of th
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import TypeAlias
 
 from mcap import records
 from mcap.data_stream import RecordBuilder
+from mcap.summary import Summary
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -26,13 +27,10 @@ MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 MESSAGE_FIELDS = MESSAGE_HEAD.size - RECORD_HEAD.size
 CHUNK_FIELDS = struct.Struct("<QQQI")
 """First and last log time, size and CRC of the records inside before compression."""
-ATTACHMENT_FIELDS = struct.Struct("<QQ")
 FOOTER_FIELDS = struct.Struct("<QQI")
 """Start of the summary, start of its offsets, CRC of the summary."""
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
-Payload: TypeAlias = Buffer | Sequence[Buffer]
-"""Bytes, whole or in pieces that follow each other."""
 
 
 def num_bytes(data: Buffer) -> int:
@@ -74,28 +72,52 @@ def message_index(channel_id: int, entries: list[int]) -> bytes:
     return record(MESSAGE_INDEX, head, struct.pack(f"<{len(entries)}Q", *entries))
 
 
-def attachment(entry: records.Attachment) -> list[Buffer]:
-    """Encode an attachment as buffers to be written one after the other; its data is not copied."""
-    fields = ATTACHMENT_FIELDS.pack(entry.log_time, entry.create_time)
-    fields += text(entry.name) + text(entry.media_type) + struct.pack("<Q", len(entry.data))
-    crc = zlib.crc32(entry.data, zlib.crc32(fields))
-    head = RECORD_HEAD.pack(ATTACHMENT, len(fields) + len(entry.data) + 4) + fields
-    return [head, entry.data, struct.pack("<I", crc)]
+class FileSummary(Summary):
+    """The summary of a file whose data is being written, or read from front to back."""
 
+    def __init__(self) -> None:
+        """Begin with an empty file."""
+        super().__init__()
+        self.message_counts: dict[int, int] = {}
+        self.start_ns: int | None = None
+        self.end_ns = 0
 
-def summary_section(groups: Iterable[bytes], start: int) -> bytes:
-    """Encode summary, offsets, footer and magic; each group holds the records of one kind."""
-    body, offsets = b"", b""
-    for group in filter(None, groups):
-        offsets += encoded(records.SummaryOffset(group[0], start + len(body), len(group)))
-        body += group
-    if not body:
-        start = 0
-    offsets_start = start + len(body) if offsets else 0
-    body += offsets
-    head = RECORD_HEAD.pack(FOOTER, FOOTER_FIELDS.size) + struct.pack("<QQ", start, offsets_start)
-    crc = zlib.crc32(head, zlib.crc32(body))
-    return body + head + struct.pack("<I", crc) + MAGIC
+    def add_messages(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
+        """Book messages by channel, the first and the last log time among them."""
+        for channel_id, count in counts.items():
+            self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
+        if counts:
+            self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
+            self.end_ns = max(self.end_ns, end_ns)
+
+    def sum_up(self) -> records.Statistics:
+        """Make the statistics."""
+        self.statistics = records.Statistics(
+            attachment_count=len(self.attachment_indexes),
+            channel_count=len(self.channels),
+            channel_message_counts=dict(sorted(self.message_counts.items())),
+            chunk_count=len(self.chunk_indexes),
+            message_count=sum(self.message_counts.values()),
+            message_start_time=self.start_ns or 0,
+            message_end_time=self.end_ns,
+            metadata_count=len(self.metadata_indexes),
+            schema_count=len(self.schemas),
+        )
+        return self.statistics
+
+    def encode(self, start: int) -> bytes:
+        """Return everything from the summary to the end of the file."""
+        definitions = (self.schemas.values(), self.channels.values(), [self.sum_up()])
+        indexes = (self.chunk_indexes, self.attachment_indexes, self.metadata_indexes)
+        body, offsets = b"", b""
+        for group in filter(None, (*definitions, *indexes)):
+            data = b"".join(map(encoded, group))
+            offsets += encoded(records.SummaryOffset(data[0], start + len(body), len(data)))
+            body += data
+        head = RECORD_HEAD.pack(FOOTER, FOOTER_FIELDS.size)
+        head += struct.pack("<QQ", start, start + len(body))
+        crc = zlib.crc32(head, zlib.crc32(offsets, zlib.crc32(body)))
+        return body + offsets + head + struct.pack("<I", crc) + MAGIC
 
 
 def _fastest() -> Callable[[Buffer, int], int]:

@@ -88,9 +88,10 @@ class PartFile:
         """Sync the file and give it its final name; it stays open and locked until ``close``.
 
         Raises:
-            OSError: When the disk refused; the file keeps its name.
+            OSError: When the disk refused, or another file has its name; nothing is renamed.
         """
         self.sync_data()
+        self.refuse_removed()
         self.path.rename(final_path)
         sync_folder(final_path.parent)
 
@@ -99,37 +100,14 @@ class PartFile:
         os.ftruncate(self._descriptor, offset)
         self.offset, self.crc = offset, crc
 
-    def is_there(self) -> bool:
-        """Whether the file still has its name: somebody may have removed or replaced it."""
+    def refuse_removed(self) -> None:
+        """Raise OSError where the file lost its name: somebody removed or replaced it."""
         try:
-            return os.path.samestat(os.fstat(self._descriptor), self.path.stat())
+            is_there = os.path.samestat(os.fstat(self._descriptor), self.path.stat())
         except (FileNotFoundError, NotADirectoryError):
-            return False
-
-    def restore(self) -> None:
-        """Write the file anew under its name, from what the system still holds of it.
-
-        Raises:
-            OSError: When it cannot be written there; the file stays open, without a name.
-        """
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        copy = PartFile.create(self.path)
-        try:
-            offset = 0
-            while offset < self.offset:
-                count = os.sendfile(
-                    copy._descriptor, self._descriptor, offset, self.offset - offset
-                )
-                if not count:
-                    raise OSError(errno.EIO, "the removed file could not be read to its end")
-                offset += count
-        except OSError:
-            copy.close()
-            self.path.unlink(missing_ok=True)
-            raise
-        # The same number is kept: another thread may be syncing it.
-        os.dup2(copy._descriptor, self._descriptor, inheritable=False)
-        copy.close()
+            is_there = False
+        if not is_there:
+            raise OSError(errno.ENOENT, f"{self.path} was removed or replaced while it was written")
 
     def close(self) -> None:
         """Close and unlock; safe to repeat."""

@@ -4,13 +4,13 @@ Nothing but the front of the file is believed: no summary, no index. Damage is s
 a later chunk can be found. Memory is bounded by one chunk.
 """
 
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from mcap.records import Attachment, McapRecord
+from mcap.records import Chunk as ChunkRecord
+from mcap.records import McapRecord
 
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
@@ -18,17 +18,14 @@ from bridge.episode.mcap.damaged import (
     Contents,
     RecordFile,
     read_plain,
-    unpack_front,
     walk_records,
 )
 from bridge.episode.mcap.walk import (
     MAX_CHUNK_BYTES,
     BrokenRecordError,
-    ChunkHead,
-    RecordSpan,
     attachment_of,
+    chunk_bytes,
     parse_chunk,
-    parse_chunk_head,
     unpack_chunk,
 )
 
@@ -48,7 +45,7 @@ class Span:
 
 @dataclass(frozen=True, kw_only=True)
 class Plain(Span):
-    """A header, schema, channel, metadata or private record, whole."""
+    """A header, schema, channel, metadata, attachment, data end or private record, whole."""
 
     opcode: int
     raw: bytes
@@ -61,21 +58,9 @@ class Chunk(Span):
     """A chunk whose CRC and structure are right."""
 
     raw: bytes
-    head: ChunkHead
-    contents: Contents
-
-
-@dataclass(frozen=True, kw_only=True)
-class CutChunk(Span):
-    """The last chunk of a file that ends inside it, with the whole messages found in it.
-
-    ``length`` goes to the end of the file. Nothing verified the messages but their structure.
-    """
-
-    head: ChunkHead
+    packed: ChunkRecord
     records: bytes
-    unpacked_size: int
-    """Bytes that could be unpacked, the torn message at their end included."""
+    """Unpacked."""
     contents: Contents
 
 
@@ -85,15 +70,6 @@ class TopMessage(Span):
 
     channel_id: int
     log_time_ns: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class AttachmentSpan(Span):
-    """An attachment whose CRC is right."""
-
-    record: Attachment
-    """Without its data."""
-    data_size: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,14 +85,7 @@ class Damage(Span):
     at_end: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class DataEnd(Span):
-    """The writer got as far as the summary."""
-
-
-Found: TypeAlias = (
-    Plain | Chunk | CutChunk | TopMessage | AttachmentSpan | IndexSpan | Damage | DataEnd
-)
+Found: TypeAlias = Plain | Chunk | TopMessage | IndexSpan | Damage
 
 
 MAX_PLAIN_BYTES = 64 << 20
@@ -166,7 +135,7 @@ def scan(file: RecordFile) -> Iterator[Found]:
         if found is None:
             return
         yield found
-        if isinstance(found, DataEnd):
+        if isinstance(found, Plain) and found.opcode == mcap.DATA_END:
             return
         before, position = found, found.end
 
@@ -192,37 +161,31 @@ def _read_record(file: RecordFile, offset: int) -> Found | None:
     if opcode == mcap.MESSAGE_INDEX:
         return _read_index(offset, length, front)
     if opcode == mcap.ATTACHMENT:
-        return _read_attachment(file, offset, length)
-    if opcode == mcap.DATA_END:
-        return DataEnd(offset=offset, length=length)
+        raw = file.read(offset, length)
+        record = attachment_of(raw[mcap.RECORD_HEAD.size :], offset)
+        return Plain(offset=offset, length=length, opcode=opcode, raw=raw, record=record)
     if length > MAX_PLAIN_BYTES:
         raise BrokenRecordError(f"a {kind} claims {length} bytes")
     raw = file.read(offset, length)
     return Plain(offset=offset, length=length, opcode=opcode, raw=raw, record=read_plain(raw))
 
 
-def _chunk_head(front: bytes) -> ChunkHead:
-    """Read what the first bytes of a record say, where they are those of a chunk."""
-    if len(front) < mcap.RECORD_HEAD.size or front[0] != mcap.CHUNK:
-        raise BrokenRecordError("no chunk head")
-    length = mcap.RECORD_HEAD.unpack_from(front)[1]
-    head = parse_chunk_head(front[mcap.RECORD_HEAD.size :], length)
-    if head.compression not in ("", "lz4", "zstd"):
-        raise BrokenRecordError(f"its compression {head.compression!r} is not known")
-    return head
-
-
 def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
-    head = _chunk_head(front)
-    if not head.is_consistent:
-        message = "the lengths of a chunk contradict each other or are beyond all limits"
+    length = chunk_bytes(front)
+    if not length:
+        message = "a chunk is damaged: its lengths contradict each other, or are beyond all limits"
         raise BrokenRecordError(message)
-    raw = file.read(offset, head.record_bytes)
-    records = unpack_chunk(parse_chunk(raw[mcap.RECORD_HEAD.size :]))
-    contents = walk_records(records)
-    if contents.size != len(records):
-        raise BrokenRecordError("a chunk is damaged: its records are torn")
-    return Chunk(offset=offset, length=len(raw), raw=raw, head=head, contents=contents)
+    raw = file.read(offset, length)
+    packed = parse_chunk(raw[mcap.RECORD_HEAD.size :])
+    records = unpack_chunk(packed)
+    return Chunk(
+        offset=offset,
+        length=length,
+        raw=raw,
+        packed=packed,
+        records=records,
+        contents=walk_records(records),
+    )
 
 
 def _read_message(offset: int, length: int, front: bytes) -> TopMessage:
@@ -258,15 +221,8 @@ def _index_bytes(front: bytes) -> int:
     return int(_INDEX_FRONT.unpack_from(front)[3])
 
 
-def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSpan:
-    place = RecordSpan(mcap.ATTACHMENT, offset, length - mcap.RECORD_HEAD.size)
-    with os.fdopen(file.descriptor, "rb", closefd=False) as stream:
-        record, data_size = attachment_of(stream, place, keep=False)
-    return AttachmentSpan(offset=offset, length=length, record=record, data_size=data_size)
-
-
 def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:
-    """Step over damage, or take what a cut record at the end still holds."""
+    """Step over damage; a cut message index at the end costs nothing."""
     length = _trusted_length(file, offset)
     if length:
         end = offset + length
@@ -281,7 +237,7 @@ def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:
         return None
     if front[0] == mcap.MESSAGE_INDEX:
         return IndexSpan(offset=offset, length=damage.length)
-    return _read_cut_chunk(file, offset, front) or damage
+    return damage
 
 
 def _trusted_length(file: RecordFile, offset: int) -> int:
@@ -296,27 +252,6 @@ def _trusted_length(file: RecordFile, offset: int) -> int:
     following = file.read(end, 1)
     known = not following or following[0] in _KINDS or following[0] in _SUMMARY_ONLY
     return end - offset if known else 0
-
-
-def _read_cut_chunk(file: RecordFile, offset: int, front: bytes) -> CutChunk | None:
-    try:
-        head = _chunk_head(front)
-    except BrokenRecordError:
-        return None
-    if offset + head.record_bytes <= file.size or head.size > MAX_CHUNK_BYTES:
-        return None
-    records = unpack_front(head, file.read(offset + head.head_bytes, MAX_CHUNK_BYTES))
-    contents = walk_records(records)
-    if not contents.num_messages:
-        return None
-    return CutChunk(
-        offset=offset,
-        length=file.size - offset,
-        head=head,
-        records=records[: contents.size],
-        unpacked_size=len(records),
-        contents=contents,
-    )
 
 
 def _step_over(file: RecordFile, offset: int, what: str) -> Damage:
@@ -337,16 +272,9 @@ def _next_chunk(file: RecordFile, offset: int) -> int | None:
         window = file.read(start, BLOCK_BYTES + _FRONT_BYTES)
         at = window.find(mcap.CHUNK, 0, BLOCK_BYTES)
         while at >= 0:
-            if window[at + 7 : at + 9] == b"\0\0" and _is_chunk(file, start + at, window, at):
+            length = chunk_bytes(window[at : at + _FRONT_BYTES])
+            if length and start + at + length <= file.size:
                 return start + at
             at = window.find(mcap.CHUNK, at + 1, BLOCK_BYTES)
         start += BLOCK_BYTES
     return None
-
-
-def _is_chunk(file: RecordFile, offset: int, window: bytes, at: int) -> bool:
-    try:
-        head = _chunk_head(window[at : at + _FRONT_BYTES])
-    except BrokenRecordError:
-        return False
-    return head.is_consistent and offset + head.record_bytes <= file.size

@@ -15,10 +15,13 @@ import zstandard
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
+from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.format import (
     CHUNK_FIELDS,
+    FOOTER_FIELDS,
+    MAGIC,
     MESSAGE,
     MESSAGE_FIELDS,
     MESSAGE_HEAD,
@@ -29,13 +32,13 @@ from bridge.episode.mcap.format import (
 
 ByteStream = BufferedReader | BytesIO
 """An open file, or bytes that act as one."""
-PIECE_BYTES = 1 << 20
 
 _CLASSES: dict[int, Any] = {
     mcap_format.HEADER: records.Header,
     mcap_format.FOOTER: records.Footer,
     mcap_format.SCHEMA: records.Schema,
     mcap_format.CHANNEL: records.Channel,
+    mcap_format.CHUNK: records.Chunk,
     mcap_format.MESSAGE_INDEX: records.MessageIndex,
     mcap_format.CHUNK_INDEX: records.ChunkIndex,
     mcap_format.ATTACHMENT_INDEX: records.AttachmentIndex,
@@ -75,29 +78,17 @@ class RecordSpan(NamedTuple):
         """Where the next record begins."""
         return self.offset + RECORD_HEAD.size + self.length
 
-    @staticmethod
-    def between(opcode: int, start: int, end: int) -> "RecordSpan":
-        """Say the same of a record by its first and its last byte."""
-        return RecordSpan(opcode, start, end - start - RECORD_HEAD.size)
-
-
-def metadata_entry(place: RecordSpan, record: records.Metadata) -> records.MetadataIndex:
-    """Make the index entry of a metadata record."""
-    return records.MetadataIndex(
-        offset=place.offset, length=place.end - place.offset, name=record.name
-    )
-
 
 def attachment_entry(
-    place: RecordSpan, record: records.Attachment, data_size: int
+    offset: int, length: int, record: records.Attachment
 ) -> records.AttachmentIndex:
     """Make the index entry of an attachment."""
     return records.AttachmentIndex(
-        offset=place.offset,
-        length=place.end - place.offset,
+        offset=offset,
+        length=length,
         log_time=record.log_time,
         create_time=record.create_time,
-        data_size=data_size,
+        data_size=len(record.data),
         name=record.name,
         media_type=record.media_type,
     )
@@ -132,204 +123,95 @@ def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
 
 
 class _Fields(ReadDataStream):
-    """Takes the fields of one record off its bytes; what runs past their end is an error.
-
-    The ``mcap`` package's own stream takes fewer bytes than asked for without a word, and needs a
-    microsecond and a half for a number.
-    """
-
-    def __init__(self, data: bytes) -> None:
-        super().__init__(BytesIO())
-        self._data = data
+    """Takes the fields of one record off its bytes; what runs past their end is an error."""
 
     def read(self, length: int) -> bytes:
-        at = self._count
-        self._count = at + length
-        data = self._data[at : at + length]
+        data = super().read(length)
         if len(data) != length:
             raise EndOfFile
         return data
 
-    def read1(self) -> int:
-        return self._number(_U8)
 
-    def read2(self) -> int:
-        return self._number(_U16)
-
-    def read4(self) -> int:
-        return self._number(_U32)
-
-    def read8(self) -> int:
-        return self._number(_U64)
-
-    def _number(self, kind: struct.Struct) -> int:
-        (value,) = kind.unpack_from(self._data, self._count)
-        self._count += kind.size
-        return int(value)
-
-    def read_prefixed_string(self) -> str:
-        (length,) = _U32.unpack_from(self._data, self._count)
-        at = self._count + _U32.size
-        self._count = at + length
-        data = self._data[at : at + length]
-        if len(data) != length:
-            raise EndOfFile
-        return data.decode()
-
-
-_U8, _U16, _U32, _U64 = map(struct.Struct, ("<B", "<H", "<I", "<Q"))
+_U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 
 
 def parse(opcode: int, body: bytes) -> records.McapRecord | None:
-    """Read a record other than messages, chunks and attachments; None for unknown opcodes."""
+    """Read a record other than messages and attachments; None for unknown opcodes."""
     kind = _CLASSES.get(opcode)
     if kind is None:
         return None
     try:
-        found: records.McapRecord = kind.read(_Fields(body))
-    except (McapError, struct.error, ValueError) as error:
+        found: records.McapRecord = kind.read(_Fields(BytesIO(body)))
+    except (McapError, struct.error, ValueError, OverflowError) as error:
         message = f"a {kind.__name__} record of {len(body)} bytes cannot be read"
         raise BrokenRecordError(message) from error
     return found
 
 
-class FoundAttachment(NamedTuple):
-    """An attachment whose CRC is right."""
-
-    record: records.Attachment
-    data_size: int
-
-
-def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -> FoundAttachment:
-    """Read an attachment record and check its CRC; without ``keep`` its data is left empty."""
-    stream.seek(place.offset + RECORD_HEAD.size)
-    fields = _Fields(stream.read(min(place.length, PIECE_BYTES)))
+def attachment_of(body: bytes, at: int) -> records.Attachment:
+    """Read the attachment whose record begins at byte ``at``, its CRC checked."""
+    fields = _Fields(BytesIO(body))
     try:
-        log_ns, create_ns = fields.read8(), fields.read8()
-        name, media_type = fields.read_prefixed_string(), fields.read_prefixed_string()
-        size, start = fields.read8(), fields.count
-    except (McapError, struct.error, ValueError) as error:
-        raise BrokenRecordError(f"the attachment at byte {place.offset} cannot be read") from error
-    if size > place.length - start - 4:
-        message = f"attachment {name!r} claims {size} bytes, {place.length - start - 4} are there"
-        raise BrokenRecordError(message)
-    crc, pieces = _attachment_crc(stream, place, start + size, start, keep=keep)
-    (declared,) = struct.unpack("<I", stream.read(4))
-    if declared and declared != crc:
-        raise BrokenRecordError(f"attachment {name!r} has another CRC than it declares")
-    record = records.Attachment(
-        create_time=create_ns,
-        log_time=log_ns,
-        name=name,
-        media_type=media_type,
-        data=b"".join(pieces),
-    )
-    return FoundAttachment(record, size)
-
-
-def _attachment_crc(
-    stream: ByteStream, place: RecordSpan, count: int, data_start: int, *, keep: bool
-) -> tuple[int, list[bytes]]:
-    stream.seek(place.offset + RECORD_HEAD.size)
-    crc = zlib.crc32(stream.read(data_start))
-    pieces = []
-    left = count - data_start
-    while left:
-        piece = stream.read(min(left, PIECE_BYTES))
-        if not piece:
-            raise BrokenRecordError(f"the attachment at byte {place.offset} is cut off")
-        left -= len(piece)
-        crc = zlib.crc32(piece, crc)
-        if keep:
-            pieces.append(piece)
-    return crc, pieces
+        found: records.Attachment = records.Attachment.read(fields)
+    except (McapError, struct.error, ValueError, OverflowError) as error:
+        raise BrokenRecordError(f"the attachment at byte {at} cannot be read") from error
+    end = fields.count - _U32.size
+    if body[end : fields.count] not in (bytes(4), _U32.pack(zlib.crc32(body[:end]))):
+        raise BrokenRecordError(f"attachment {found.name!r} has another CRC than it declares")
+    return found
 
 
 MAX_CHUNK_BYTES = 1 << 30
 """No chunk may unpack to more: a few bytes of zstd can claim terabytes."""
 
 
-class ChunkHead(NamedTuple):
-    """What stands before a chunk's data."""
-
-    start_ns: int
-    end_ns: int
-    size: int
-    """Bytes of the records inside when unpacked."""
-    crc: int
-    """CRC-32 of those bytes, 0 for unknown."""
-    compression: str
-    data_bytes: int
-    head_bytes: int
-    """Where the data begins, from the record's opcode."""
-    record_bytes: int
-    """Of the whole record, as claimed; a cut chunk has fewer, foxglove's tail claims 2^64."""
-
-    @property
-    def is_consistent(self) -> bool:
-        """Do the two lengths agree and the sizes stay within the limit?"""
-        return (
-            self.record_bytes == self.head_bytes + self.data_bytes
-            and self.data_bytes <= MAX_CHUNK_BYTES
-            and self.size <= MAX_CHUNK_BYTES
-        )
-
-
-class PackedChunk(NamedTuple):
-    """A chunk record, its data still packed."""
-
-    head: ChunkHead
-    data: memoryview
-
-
-def parse_chunk_head(front: bytes, length: int) -> ChunkHead:
-    """Read a chunk's head from the first bytes of its body, whose length is claimed."""
+def chunk_bytes(front: bytes) -> int:
+    """Length of the record that begins so; 0 unless it is a chunk whose lengths agree."""
+    at = RECORD_HEAD.size + CHUNK_FIELDS.size + _U32.size
     try:
-        start_ns, end_ns, size, crc = CHUNK_FIELDS.unpack_from(front, 0)
-        at = CHUNK_FIELDS.size
-        (name_bytes,) = _U32.unpack_from(front, at)
-        at += _U32.size
-        compression = str(front[at : at + name_bytes], "utf-8")
-        at += name_bytes
-        (data_bytes,) = _U64.unpack_from(front, at)
-    except (struct.error, ValueError) as error:
-        raise BrokenRecordError(f"a chunk record of {length} bytes cannot be read") from error
-    head_bytes, record_bytes = RECORD_HEAD.size + at + _U64.size, RECORD_HEAD.size + length
-    return ChunkHead(start_ns, end_ns, size, crc, compression, data_bytes, head_bytes, record_bytes)
+        opcode, length = RECORD_HEAD.unpack_from(front)
+        _, _, size, _ = CHUNK_FIELDS.unpack_from(front, RECORD_HEAD.size)
+        (name_bytes,) = _U32.unpack_from(front, at - _U32.size)
+        (data_bytes,) = _U64.unpack_from(front, at + name_bytes)
+    except struct.error:
+        return 0
+    is_known = opcode == mcap_format.CHUNK and front[at : at + name_bytes] in _COMPRESSIONS
+    agree = at + name_bytes + _U64.size + data_bytes == RECORD_HEAD.size + length
+    is_small = max(size, data_bytes) <= MAX_CHUNK_BYTES
+    return RECORD_HEAD.size + int(length) if is_known and agree and is_small else 0
 
 
-def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
+_COMPRESSIONS = (b"", b"lz4", b"zstd")
+
+
+def chunk_entry(offset: int, length: int, chunk: records.Chunk) -> records.ChunkIndex:
     """Make the index entry of a chunk; its message indexes are yet to be added."""
     return records.ChunkIndex(
-        chunk_length=place.end - place.offset,
-        chunk_start_offset=place.offset,
+        chunk_length=length,
+        chunk_start_offset=offset,
         compression=chunk.compression,
-        compressed_size=chunk.data_bytes,
-        message_start_time=chunk.start_ns,
-        message_end_time=chunk.end_ns,
+        compressed_size=len(chunk.data),
+        message_start_time=chunk.message_start_time,
+        message_end_time=chunk.message_end_time,
         message_index_length=0,
         message_index_offsets={},
-        uncompressed_size=chunk.size,
+        uncompressed_size=chunk.uncompressed_size,
     )
 
 
-def parse_chunk(body: bytes) -> PackedChunk:
-    """Read a chunk record."""
-    head = parse_chunk_head(body, len(body))
-    data = memoryview(body)[head.head_bytes - RECORD_HEAD.size :]
-    if head.data_bytes > len(data):
-        message = f"a chunk claims {head.data_bytes} bytes of data, {len(data)} are there"
-        raise BrokenRecordError(message)
-    return PackedChunk(head, data[: head.data_bytes])
+def parse_chunk(body: bytes) -> records.Chunk:
+    """Read a chunk record; its data is left packed."""
+    chunk: records.Chunk = parse(mcap_format.CHUNK, body)  # type: ignore[assignment]
+    return chunk
 
 
-def unpack_chunk(chunk: PackedChunk, *, whose: str = "a chunk") -> bytes:
+def unpack_chunk(chunk: records.Chunk, *, whose: str = "a chunk") -> bytes:
     """Decompress a chunk and compare its size and CRC."""
-    size, crc = chunk.head.size, chunk.head.crc
+    size, crc = chunk.uncompressed_size, chunk.uncompressed_crc
     if size > MAX_CHUNK_BYTES:
         raise BrokenRecordError(f"{whose} claims {size} bytes, more than {MAX_CHUNK_BYTES}")
     try:
-        data = _decompress(chunk)
+        data = _decompress(chunk.compression, chunk.data, size)
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise BrokenRecordError(f"{whose} cannot be unpacked ({error})") from error
     if len(data) != size:
@@ -339,41 +221,36 @@ def unpack_chunk(chunk: PackedChunk, *, whose: str = "a chunk") -> bytes:
     return data
 
 
-def _decompress(chunk: PackedChunk) -> bytes:
-    if chunk.head.compression == "":
-        return bytes(chunk.data)
-    if not chunk.head.size:
-        return b""
-    if chunk.head.compression == "zstd":
-        declared = zstandard.get_frame_parameters(chunk.data).content_size
-        if declared not in (chunk.head.size, zstandard.CONTENTSIZE_UNKNOWN):
-            message = f"a zstd frame of {declared} bytes where {chunk.head.size} are declared"
+def _decompress(compression: str, data: bytes, size: int) -> bytes:
+    if compression == "" or not size:
+        return data if compression == "" else b""
+    if compression == "zstd":
+        declared = zstandard.get_frame_parameters(data).content_size
+        if declared not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            message = f"a zstd frame of {declared} bytes where {size} are declared"
             raise BrokenRecordError(message)
-        return zstandard.decompress(chunk.data, max_output_size=chunk.head.size)
-    if chunk.head.compression == "lz4":
-        unpacker = lz4.frame.LZ4FrameDecompressor()
-        return bytes(unpacker.decompress(chunk.data, max_length=chunk.head.size))
-    raise BrokenRecordError(f"compression {chunk.head.compression!r} is not known")
+        return zstandard.decompress(data, max_output_size=size)
+    if compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
+    raise BrokenRecordError(f"compression {compression!r} is not known")
 
 
 class MessageHead(NamedTuple):
     """A message inside a buffer or file, its payload left where it is."""
 
     log_time_ns: int
-    at: int
-    """Where the record begins: in a chunk's data, or in the file."""
     length: int
     channel_id: int
     sequence: int
     publish_time_ns: int
 
 
-def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
-    """Read the front of the message record at ``at``; ``where`` becomes its ``at``."""
+def message_head(data: Buffer, at: int) -> MessageHead:
+    """Read the front of the message record at ``at``."""
     _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)
     if length < MESSAGE_FIELDS:
         raise BrokenRecordError(f"a message record of {length} bytes")
-    return MessageHead(log_ns, where, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
+    return MessageHead(log_ns, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
 
 
 def records_in(data: Buffer, at: int = 0) -> Iterator[tuple[int, int, int]]:
@@ -390,3 +267,64 @@ def records_in(data: Buffer, at: int = 0) -> Iterator[tuple[int, int, int]]:
             raise BrokenRecordError(message)
         yield opcode, at, length
         at = after
+
+
+_FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
+
+
+def read_header(stream: ByteStream) -> records.Header:
+    """Read magic and first record; raises BrokenRecordError."""
+    if stream.read(len(MAGIC)) != MAGIC:
+        raise BrokenRecordError("it does not begin as an MCAP file does")
+    place = next(walk(stream, len(MAGIC), stream.seek(0, 2)), None)
+    record = parse(place.opcode, read_body(stream, place)) if place else None
+    if not isinstance(record, records.Header):
+        raise BrokenRecordError("its first record is no header")
+    return record
+
+
+def read_footer(stream: ByteStream) -> tuple[records.Footer, int]:
+    """Read the last record and say where it begins; raises BrokenRecordError."""
+    at = stream.seek(0, 2) - _FOOTER_BYTES
+    stream.seek(max(at, 0))
+    tail = stream.read(_FOOTER_BYTES)
+    if len(tail) < _FOOTER_BYTES or not tail.endswith(MAGIC):
+        raise BrokenRecordError("it does not end as a finished MCAP file does")
+    footer = parse(tail[0], tail[RECORD_HEAD.size : -len(MAGIC)])
+    if not isinstance(footer, records.Footer):
+        raise BrokenRecordError("its last record is no footer")
+    if footer.summary_start > at:
+        message = f"its summary should begin at byte {footer.summary_start}, behind its footer"
+        raise BrokenRecordError(message)
+    return footer, at
+
+
+def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> Summary | None:
+    """Read the summary section with its CRC checked, None where there is none."""
+    if not footer.summary_start:
+        return None
+    stream.seek(footer.summary_start)
+    # The CRC covers everything up to itself, the last field of the footer.
+    section = stream.read(footer_at + RECORD_HEAD.size + 16 - footer.summary_start)
+    if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
+        raise BrokenRecordError("its summary has another CRC than it declares")
+    summary = Summary()
+    for opcode, at, length in records_in(section[: footer_at - footer.summary_start]):
+        start = at + RECORD_HEAD.size
+        _add(summary, parse(opcode, section[start : start + length]))
+    return summary
+
+
+def _add(summary: Summary, record: records.McapRecord | None) -> None:
+    if isinstance(record, records.Statistics):
+        summary.statistics = record
+    elif isinstance(record, records.Schema):
+        summary.schemas[record.id] = record
+    elif isinstance(record, records.Channel):
+        summary.channels[record.id] = record
+    elif isinstance(record, records.AttachmentIndex):
+        summary.attachment_indexes.append(record)
+    elif isinstance(record, records.ChunkIndex):
+        summary.chunk_indexes.append(record)
+    elif isinstance(record, records.MetadataIndex):
+        summary.metadata_indexes.append(record)

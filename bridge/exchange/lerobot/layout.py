@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bridge.clock import ClockChoice
-from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, refuse_outside
+from bridge.errors import BridgeError, PathNotFoundError, refuse_outside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,11 +216,7 @@ def _flat_names(names: object) -> list[str]:
 
 def parquet() -> tuple[Any, Any]:
     """Return ``pyarrow`` and ``pyarrow.parquet``; an extra brings them."""
-    try:
-        import pyarrow as pa  # noqa: PLC0415
-        import pyarrow.parquet as pq  # noqa: PLC0415
-    except ImportError as error:
-        raise MissingDependencyError(
-            package="pyarrow", extra="report", purpose="LeRobot's Parquet files"
-        ) from error
+    import pyarrow as pa  # noqa: PLC0415
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
     return pa, pq

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bridge.errors import MissingDependencyError
 from bridge.exchange.lerobot import layout
 from bridge.exchange.lerobot.layout import parquet
 from bridge.media.video_writer import VideoWriter
@@ -21,82 +20,46 @@ PIXEL_STRIDE = 4
 
 @dataclass(kw_only=True)
 class RunningStats:
-    """Moments of rows of numbers; ``merge`` adds another's."""
+    """Moments of rows of numbers: of columns, or of the pixels of images scaled to 0..1."""
 
-    count: int = 0
-    low: np.ndarray | None = None
-    high: np.ndarray | None = None
-    mean: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    squares: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    num_rows: int = 0
+    num_images: int = 0
+    low: Any = np.inf
+    high: Any = -np.inf
+    mean: Any = 0.0
+    squares: Any = 0.0
     """Sum of squared distances from the mean (Welford; Chan et al. 1983 for merging)."""
 
     def add(self, rows: Float[np.ndarray, "num_rows num_values"]) -> None:
         """Add rows."""
         if not len(rows):
             return
-        mean = rows.mean(axis=0)
-        self.merge(
-            RunningStats(
-                count=len(rows),
-                low=rows.min(axis=0),
-                high=rows.max(axis=0),
-                mean=mean,
-                squares=((rows - mean) ** 2).sum(axis=0),
-            )
-        )
+        mean, low, high = rows.mean(axis=0), rows.min(axis=0), rows.max(axis=0)
+        squares = ((rows - mean) ** 2).sum(axis=0)
+        self.merge(RunningStats(num_rows=len(rows), low=low, high=high, mean=mean, squares=squares))
+
+    def add_image(self, pixels: np.ndarray) -> None:
+        """Add one image: height x width x 3 of uint8."""
+        thinned = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE]
+        self.add(thinned.reshape(-1, 3).astype(np.float64) / 255.0)
+        self.num_images += 1
 
     def merge(self, other: "RunningStats") -> None:
         """Add everything another has seen."""
-        if other.low is None or other.high is None:
-            return
-        if self.low is None or self.high is None:
-            self.low, self.high = other.low.copy(), other.high.copy()
-            self.mean, self.squares = other.mean.copy(), other.squares.copy()
-            self.count = other.count
-            return
-        total = self.count + other.count
-        gap = other.mean - self.mean
-        self.squares = self.squares + other.squares + gap**2 * (self.count * other.count / total)
-        self.mean = self.mean + gap * (other.count / total)
+        num_rows, gap = self.num_rows + other.num_rows, other.mean - self.mean
+        share = other.num_rows / max(num_rows, 1)
+        self.squares = self.squares + other.squares + gap**2 * (self.num_rows * share)
+        self.mean = self.mean + gap * share
         self.low, self.high = np.minimum(self.low, other.low), np.maximum(self.high, other.high)
-        self.count = total
+        self.num_rows, self.num_images = num_rows, self.num_images + other.num_images
 
     def record(self) -> dict[str, Any]:
-        """Return what ``meta/stats.json`` holds for a vector."""
-        return {
-            "min": [] if self.low is None else self.low.tolist(),
-            "max": [] if self.high is None else self.high.tolist(),
-            "mean": self.mean.tolist(),
-            "std": np.sqrt(self.squares / max(self.count, 1)).tolist(),
-            "count": [self.count],
-        }
-
-
-@dataclass(kw_only=True)
-class ImageStats:
-    """The same over the pixels of images, scaled to 0..1, per channel; counts images."""
-
-    pixels: RunningStats = field(default_factory=RunningStats)
-    images: int = 0
-
-    def add(self, pixels: np.ndarray) -> None:
-        """Add one image: height x width x 3 of uint8."""
-        thinned = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE]
-        self.pixels.add(thinned.reshape(-1, 3).astype(np.float64) / 255.0)
-        self.images += 1
-
-    def merge(self, other: "ImageStats") -> None:
-        """Add everything another has seen."""
-        self.pixels.merge(other.pixels)
-        self.images += other.images
-
-    def record(self) -> dict[str, Any]:
-        """Return what ``meta/stats.json`` holds for a camera: channels first, 3 x 1 x 1."""
-        record = self.pixels.record()
-        shaped = {
-            name: [[[value]] for value in record[name]] for name in ("min", "max", "mean", "std")
-        }
-        return {**shaped, "count": [self.images]}
+        """Return what ``meta/stats.json`` holds: of a vector, or of a camera, channels first."""
+        std = np.sqrt(self.squares / max(self.num_rows, 1))
+        found = {"min": self.low, "max": self.high, "mean": self.mean, "std": std}
+        shape = (3, 1, 1) if self.num_images else (-1,)
+        shaped = {name: np.reshape(value, shape).tolist() for name, value in found.items()}
+        return {**shaped, "count": [self.num_images or self.num_rows]}
 
 
 MB = 1024 * 1024
@@ -173,7 +136,7 @@ class DatasetWriter:
         self._episodes: Any = None
         self._rows: list[dict[str, Any]] = []
         self._videos = {camera: _Video() for camera in shape.cameras}
-        self._stats: dict[str, RunningStats | ImageStats] = {}
+        self._stats: dict[str, RunningStats] = {}
 
     def add(
         self,
@@ -191,7 +154,7 @@ class DatasetWriter:
         """
         length = len(state)
         columns = self._columns(task, state, action, success)
-        stats: dict[str, RunningStats | ImageStats] = {}
+        stats: dict[str, RunningStats] = {}
         for key, values in columns.items():
             stats[key] = RunningStats()
             stats[key].add(values.astype(np.float64).reshape(length, -1))
@@ -208,19 +171,12 @@ class DatasetWriter:
         row.update({"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
         for key, found in stats.items():
             row.update({f"stats/{key}/{name}": v for name, v in found.record().items()})
-            self._merge(key, found)
+            self._stats.setdefault(key, RunningStats()).merge(found)
         self._rows.append(row)
         self._num_episodes += 1
         self._num_frames += length
         if len(self._rows) == FLUSH_EPISODES:
             self._flush_episodes()
-
-    def _merge(self, key: str, found: RunningStats | ImageStats) -> None:
-        if isinstance(found, ImageStats):
-            before = self._stats.setdefault(key, ImageStats())
-        else:
-            before = self._stats.setdefault(key, RunningStats())
-        before.merge(found)  # type: ignore[arg-type]
 
     def _columns(
         self,
@@ -276,7 +232,7 @@ class DatasetWriter:
         self,
         camera: str,
         frames: Iterable[np.ndarray],
-        stats: dict[str, RunningStats | ImageStats],
+        stats: dict[str, RunningStats],
     ) -> dict[str, int | float]:
         video, key = self._videos[camera], layout.IMAGES + camera
         if video.writer is None:
@@ -286,10 +242,10 @@ class DatasetWriter:
             video.writer = VideoWriter(path, fps=self._shape.fps, **shape)
             video.pix_fmt = video.writer.pix_fmt
         first = video.writer.num_frames
-        found = ImageStats()
+        found = RunningStats()
         for pixels in frames:
-            video.writer.write(pixels, first=found.images == 0)
-            found.add(pixels)
+            video.writer.write(pixels, first=found.num_images == 0)
+            found.add_image(pixels)
         stats[key] = found
         used: dict[str, int | float] = {
             f"videos/{key}/chunk_index": video.place.chunk_index,
@@ -337,12 +293,8 @@ class DatasetWriter:
                 video.writer.close()
 
     def _write_tasks(self) -> None:
-        try:
-            import pandas as pd  # noqa: PLC0415  # LeRobot reads the words as a pandas index
-        except ImportError as error:
-            raise MissingDependencyError(
-                package="pandas", extra="report", purpose="LeRobot's table of tasks"
-            ) from error
+        import pandas as pd  # noqa: PLC0415  # LeRobot reads the words as a pandas index
+
         tasks = pd.DataFrame(
             {"task_index": list(self._tasks.values())}, index=pd.Index(self._tasks, name="task")
         )

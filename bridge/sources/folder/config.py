@@ -50,23 +50,3 @@ class FolderConfig:
             if values is not None and not min(values[:2]) > 0:
                 name = option.replace("_", "-")
                 raise UsageError(f"--{name} {values}: focal lengths FX and FY are above zero.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PosedConfig:
-    """How a folder of posed images is turned into messages."""
-
-    cell: str = "scene"
-    """Name of the cell in topics: /CELL/cam/CAMERA/color/image."""
-    camera: str = "camera"
-    """Name of the camera; several of them get numbers: camera1, camera2."""
-    metres_per_unit: float | None = None
-    """Length of the folder's unit [m]; 1 where poses are metric. Without it nothing is metric."""
-    rate_hz: float = DEFAULT_RATE_HZ
-    """Images per second in the episode; the folder has no times."""
-
-    def __post_init__(self) -> None:
-        """Refuse names that cannot be part of a topic, and numbers that make no sense."""
-        for what, name in (("cell", self.cell), ("camera", self.camera)):
-            refuse_bad_name(what, name)
-        refuse_outside(self, {"rate_hz": (0.001, 1000), "metres_per_unit": (1e-6, 1e6)})

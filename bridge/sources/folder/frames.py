@@ -87,7 +87,7 @@ _BENDING = (
 """Keys under which a lens is described."""
 STRAIGHT = ("SIMPLE_PINHOLE", "PINHOLE", "OPENCV", "PLUMB_BOB", "NONE", "")
 """Models that keep straight lines straight where all their numbers are 0."""
-STRAIGHTEN = "Straighten the images: colmap image_undistorter writes PINHOLE."
+_STRAIGHTEN = "Straighten the images: colmap image_undistorter writes PINHOLE."
 
 
 def refuse_bent(path: Path, what: str, record: Mapping[str, Any]) -> None:
@@ -95,10 +95,10 @@ def refuse_bent(path: Path, what: str, record: Mapping[str, Any]) -> None:
     for key in (*_MODELS, *_BENDING):
         value = record.get(key) or ""
         if key in _MODELS and str(value).upper() not in STRAIGHT:
-            raise FolderError(path=path, found=f"{what} has the model {value!r}", hint=STRAIGHTEN)
+            raise FolderError(path=path, found=f"{what} has the model {value!r}", hint=_STRAIGHTEN)
         numbers = value.values() if isinstance(value, dict) else value
         if key in _BENDING and any(numbers if isinstance(value, list | dict) else [value]):
-            raise FolderError(path=path, found=f"{what} has {key}", hint=STRAIGHTEN)
+            raise FolderError(path=path, found=f"{what} has {key}", hint=_STRAIGHTEN)
 
 
 def unread(

@@ -42,6 +42,7 @@ from bridge.sources.folder.frames import (
     require_image,
 )
 from bridge.sources.folder.scene_json import INDEX_NAME, read_scene
+from bridge.sources.folder.transforms import TRANSFORMS, read_transforms
 from bridge.sources.folder.tum import find_lists, read_tum
 
 DEFAULTS = FolderConfig()
@@ -55,6 +56,8 @@ def read_index(folder: Path, config: FolderConfig = DEFAULTS) -> FolderIndex:
         )
     if (folder / INDEX_NAME).is_file():
         return read_scene(folder, config)
+    if (folder / TRANSFORMS).is_file():
+        return read_transforms(folder, config)
     if find_lists(folder):
         return read_tum(folder, config)
     if find_frames(folder):

@@ -159,8 +159,7 @@ def _frame(path: Path, entry: Any, where: str) -> FolderFrame | None:
         raise FolderError(
             path=path,
             found="a frame has no depth image",
-            hint="Images without depth: robot-gst import images, with transforms.json or COLMAP's "
-            "poses (docs/rgbd_folder.md).",
+            hint="A scene is rebuilt from depth images.",
         )
     files = {name: path.parent / str(_value(path, entry, name)) for name in ("color", "depth")}
     for name, file in files.items():

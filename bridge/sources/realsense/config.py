@@ -59,13 +59,11 @@ class RealSenseConfig:
     """Compress colour here, or leave it to the recorder."""
     quality: int = 90
     """JPEG quality, with --color jpeg."""
-    align: bool = False
-    """Resample depth into the colour camera; otherwise it keeps its own intrinsics and frame."""
     mounts: Path | None = None
     """JSON file that says where the colour cameras are: {"NAME": {"parent": FRAME, "p_m": [x, y,
     z], "q_wxyz": [w, x, y, z]}}, the transform T_parent_color."""
     shared_memory_mb: int = 0
-    """Shared memory for images to a recorder on this machine [MB]; 0: over the network."""
+    """Shared memory for images to a recorder on this machine [MB]; 0: zenoh's own 16."""
 
     def __post_init__(self) -> None:
         """Refuse names that cannot be part of a topic, and one camera twice."""

@@ -1,6 +1,6 @@
 """One RealSense camera through its sensors: calibration once, then every frame in order.
 
-No syncer stands between (unless depth is aligned): it would pair frames and drop the odd ones.
+No syncer stands between: it would pair frames and drop the odd ones.
 Colour and depth of one camera can come from two sensors (D435) or from one (D405).
 """
 
@@ -9,9 +9,9 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyrealsense2 as rs
 from jaxtyping import Float, UInt16
 
-from bridge.errors import MissingDependencyError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.depth import to_millimetres
@@ -19,16 +19,6 @@ from bridge.media.resample import Resampling
 from bridge.sources.device_samples import HostClock
 from bridge.sources.realsense.config import CameraStreamError, RealSenseConfig
 from bridge.sources.realsense.messages import Calibration, ColorFrame, DepthFrame, Frame
-
-try:
-    import pyrealsense2 as rs
-except ImportError as import_error:  # pragma: no cover  # needs an environment without it
-    raise MissingDependencyError(
-        package="pyrealsense2", extra="realsense", purpose="talking to a RealSense camera"
-    ) from import_error
-
-__all__ = ["rs"]
-
 
 # D415 and D435 send undistorted colour (all coefficients 0), D405 and D455 do not, and bend it by a
 # model that CameraInfo has no name for.
@@ -123,11 +113,8 @@ class CameraDevice:
         intrinsics = color.profile.as_video_stream_profile().get_intrinsics()
         self._rectifier = rectifier(intrinsics) if is_distorted(intrinsics) else None
         self._set_unit(depth.sensor)
-        self.calibration = self._calibration(color.profile, depth.profile, aligned=config.align)
-        self._align = rs.align(rs.stream.color) if config.align else None
-        self._queue = (
-            rs.syncer(QUEUE_FRAMES) if config.align else rs.frame_queue(QUEUE_FRAMES, True)
-        )
+        self.calibration = self._calibration(color.profile, depth.profile)
+        self._queue = rs.frame_queue(QUEUE_FRAMES, True)
         self._started: list[Any] = []
         self._start(color, depth)
 
@@ -165,8 +152,7 @@ class CameraDevice:
         except RuntimeError:  # outside what this model allows
             return
 
-    def _calibration(self, color: Any, depth: Any, *, aligned: bool) -> Calibration:
-        color_camera = _camera_of(color)
+    def _calibration(self, color: Any, depth: Any) -> Calibration:
         intrinsics = depth.as_video_stream_profile().get_intrinsics()
         if is_distorted(intrinsics):
             raise CameraStreamError(
@@ -174,12 +160,8 @@ class CameraDevice:
                 found="its depth images have lens distortion, which episodes do not hold",
                 hint="Reset the calibration with the vendor's viewer.",
             )
-        if aligned:
-            return Calibration(
-                color_camera=color_camera, depth_camera=color_camera, T_color_depth=np.eye(4)
-            )
         return Calibration(
-            color_camera=color_camera,
+            color_camera=_camera_of(color),
             depth_camera=_camera_of(depth),
             T_color_depth=_transform_of(depth.get_extrinsics_to(color)),
         )
@@ -205,32 +187,15 @@ class CameraDevice:
             ) from error
 
     def read(self, timeout_s: float) -> list[Frame] | None:
-        """Return the next frames, or None when nothing came in time.
+        """Return the next frame, or None when nothing came in time.
 
-        An empty list means that a frame came that is not yet of use: the offset between the
-        clocks is still being found, or depth has no colour image to be aligned to.
+        An empty list means that one came while the offset between the clocks is being found.
         """
-        milliseconds = round(timeout_s * 1e3)
-        if self._align is None:
-            came, frame = self._queue.try_wait_for_frame(milliseconds)
-            items = [frame] if came else []
-        else:
-            came, frame = self._queue.try_wait_for_frames(milliseconds)
-            items = self._aligned(frame.as_frameset()) if came else []
+        came, item = self._queue.try_wait_for_frame(round(timeout_s * 1e3))
         if not came:
             return None
-        received_ns = self._now_ns()
-        frames = [self._frame_of(item, received_ns) for item in items]
-        return [item for item in frames if item is not None]
-
-    def _aligned(self, frames: Any) -> list[Any]:
-        color = frames.get_color_frame()
-        if not color:
-            return []
-        if not frames.get_depth_frame():
-            return [color]
-        assert self._align is not None  # noqa: S101  # only called when aligning
-        return [color, self._align.process(frames).get_depth_frame()]
+        frame = self._frame_of(item, self._now_ns())
+        return [] if frame is None else [frame]
 
     def _frame_of(self, frame: Any, received_ns: int) -> Frame | None:
         depth = frame.is_depth_frame()

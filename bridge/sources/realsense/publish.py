@@ -4,6 +4,8 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+import pyrealsense2 as rs
+
 from bridge.episode.topics import (
     COLOR_IMAGE,
     COLOR_INFO,
@@ -20,7 +22,7 @@ from bridge.sources.realsense.config import (
     CameraStreamError,
     RealSenseConfig,
 )
-from bridge.sources.realsense.device import CameraDevice, describe_device, rs, serial_of
+from bridge.sources.realsense.device import CameraDevice, describe_device, serial_of
 from bridge.sources.realsense.messages import CameraMessages, ColorFrame, Frame, Mount, read_mounts
 from bridge.terminal import Output
 from bridge.wire.clocks import announce

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from bridge.clock import ns_from_s
 from bridge.errors import BridgeError
 from bridge.robots.default import MAX_WIDTH_M, ROBOT
+from bridge.robots.stop import PressedStop
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.render import Layer, Renderer, measure_color, measure_depth
@@ -31,8 +32,6 @@ GRIPPER_NS = ns_from_s(1 / 50)
 FRAMES_NS = ns_from_s(1 / 60)
 """Of ``/tf``; the wrist camera moves less than a millimetre off a straight line in between."""
 TRUTH_NS = ns_from_s(1 / 30)
-PRESSED_NS, FORCE_N = ns_from_s(0.04), ROBOT.contact_force_N or np.inf
-"""Pressed harder for so long the arm stops by itself."""
 FINGER_SPEED_M_S = 0.15
 """How fast the gripper's controller closes the opening."""
 HOME_SEED_RAD = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
@@ -119,7 +118,7 @@ class StandinCell:
         self._should_stop = should_stop
         self.target_rad, self._width_m = self.home_rad, MAX_WIDTH_M
         self._width_target_m = MAX_WIDTH_M
-        self.stopped, self._pressed_ns = "", 0
+        self.stopped, self._pressed = "", PressedStop(ROBOT.contact_force_N)
         self._due = dict.fromkeys(("gripper", "truth", "camera", "frames"), start_ns)
         self.cameras_running = False
 
@@ -141,7 +140,7 @@ class StandinCell:
             Ts_base_object = self.hidden.deviations.put_down(self.world.task, Ts_base_object)
         self.target_rad = self.home_rad
         self._width_m = self._width_target_m = MAX_WIDTH_M
-        self.stopped, self._pressed_ns = "", 0
+        self.stopped, self._pressed = "", PressedStop(ROBOT.contact_force_N)
         self.world.reset(self.home_rad - self.hidden.joint_offset_rad, Ts_base_object)
         self.truth = TruthLog()
 
@@ -209,13 +208,13 @@ class StandinCell:
 
     def _stop_where_pressed(self, force_N: float) -> None:
         """The protective stop: the arm holds where it is until the next reset, and says so."""
-        self._pressed_ns = self._pressed_ns + TICK_NS if force_N > FORCE_N else 0
-        if self.stopped or self._pressed_ns < PRESSED_NS:
+        detail = self._pressed.found(force_N, TICK_NS)
+        if self.stopped or not detail:
             return
         self.target_rad = self.encoders_rad
-        detail = f"the arm is pressed with {force_N:.0f} N, the limit is {FORCE_N:g} N"
         self.stopped = f"{Cause.CONTACT_FORCE}: {detail}"
-        data = {"cause": Cause.CONTACT_FORCE, "force_N": round(force_N, 1), "limit_N": FORCE_N}
+        about = {"force_N": round(force_N, 1), "limit_N": ROBOT.contact_force_N}
+        data = {"cause": Cause.CONTACT_FORCE, **about}
         self.streams.event("mark", self.now_ns, text=f"protective stop: {detail}", data=data)
 
     @property

@@ -81,8 +81,6 @@ class StandinSource:
             topics.GRIPPER_STATE,
             topics.TCP_POSE,
             topics.PLAN,
-            topics.PLAN_TRAJECTORY,
-            topics.PLAN_PATH,
             topics.EVENT,
         )
         return (

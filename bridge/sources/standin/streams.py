@@ -7,7 +7,6 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
-from bridge.clock import split_ns
 from bridge.episode import schema, topics
 from bridge.episode.cdr.messages import (
     CameraInfo,
@@ -17,7 +16,6 @@ from bridge.episode.cdr.messages import (
     JointSample,
     PointCloudSample,
     PoseSample,
-    joint_trajectory_to_cdr,
     string_to_cdr,
     transforms_to_cdr,
 )
@@ -193,17 +191,8 @@ class Streams:
         self._put(TRUTH_PARAMETERS, string_to_cdr(json.dumps(record)), stamp_ns, schema.STRING)
 
     def plan(self, plan: Plan, stamp_ns: int) -> None:
-        """Publish a plan: the authority, and two forms of it for viewers."""
+        """Publish a plan."""
         self._put(topics.cell_topic(self._cell, topics.PLAN), plan.to_json(), stamp_ns)
-        times = [waypoint.t_ns for waypoint in plan.tau]
-        joints = np.array([waypoint.joints_rad for waypoint in plan.tau], dtype=np.float64)
-        trajectory = joint_trajectory_to_cdr(
-            stamp_ns=stamp_ns, names=plan.joint_names, times_ns=times, positions_rad=joints
-        )
-        self._put(topics.cell_topic(self._cell, topics.PLAN_TRAJECTORY), trajectory, stamp_ns)
-        self._put(
-            topics.cell_topic(self._cell, topics.PLAN_PATH), _path_json(plan, stamp_ns), stamp_ns
-        )
 
     def event(self, kind: str, stamp_ns: int, **fields: Any) -> None:
         """Publish one event; the schema lists the kinds and the fields."""
@@ -212,15 +201,3 @@ class Streams:
         self._put(
             topics.cell_topic(self._cell, topics.EVENT), json.dumps(record).encode(), stamp_ns
         )
-
-
-def _path_json(plan: Plan, stamp_ns: int) -> bytes:
-    sec, nsec = split_ns(stamp_ns)
-    poses = []
-    for waypoint in plan.tau:
-        position = dict(zip("xyz", waypoint.p_m, strict=True))
-        orientation = dict(zip("wxyz", waypoint.q_wxyz, strict=True))
-        poses.append({"position": position, "orientation": orientation})
-    record = {"timestamp": {"sec": sec, "nsec": nsec}, "frame_id": plan.frame, "poses": poses}
-    check_record(record, name="poses_in_frame", package="bridge.episode")
-    return json.dumps(record, separators=(",", ":")).encode()

@@ -7,7 +7,6 @@ registers that the robot program writes. ``docs/recording.md`` says which suits 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from bridge.episode.topics import refuse_bad_name
 from bridge.errors import BridgeError, UsageError, refuse_outside
@@ -119,8 +118,6 @@ class UrConfig:
     robot: str = DEFAULT_ROBOT
     """Robot file, by name or path (docs/robots.md): its description is published and its joint
     names are used; ur5 publishes the bare arm, none publishes no description."""
-    urdf: Path | None = None
-    """URDF file of your arm, instead of that of --robot."""
 
     def __post_init__(self) -> None:
         """Refuse what no controller can send."""

@@ -8,10 +8,11 @@ URDF.
 import json
 import math
 from collections.abc import Sequence
-from typing import Any
 
 from bridge.episode import schema
-from bridge.episode.cdr.batch import MessageTemplate, Stamp, named
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.batch import Write, named
+from bridge.episode.cdr.messages import header
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import EVENT, cell_topic
 
@@ -82,26 +83,26 @@ def tool_wrench(wrench: Sequence[float]) -> tuple[float, ...]:
     return -fx, -fy, fz, -tx, -ty, tz
 
 
-def frame_template(base_frame: str) -> MessageTemplate:
+def frame_writer(base_frame: str) -> Write:
     """tf2_msgs/TFMessage with the tool's frame, so that a camera at the wrist has a place."""
 
-    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
+    def write(stamp_ns: int, numbers: Sequence[float]) -> bytes:
         transform = {"translation": named("xyz", numbers), "rotation": named("xyzw", numbers[3:])}
-        header = {"stamp": stamp, "frame_id": base_frame}
-        item = {"header": header, "child_frame_id": CONTROLLER_TCP_FRAME, "transform": transform}
-        return {"transforms": [item]}
+        about = {"header": header(stamp_ns, base_frame), "child_frame_id": CONTROLLER_TCP_FRAME}
+        return codec.encode(schema.TF_MESSAGE, {"transforms": [{**about, "transform": transform}]})
 
-    return MessageTemplate(schema.TF_MESSAGE, build, 7)
+    return write
 
 
-def wrench_template(base_frame: str) -> MessageTemplate:
-    """geometry_msgs/WrenchStamped along base_link, filled with ``tool_wrench``."""
+def wrench_writer(base_frame: str) -> Write:
+    """geometry_msgs/WrenchStamped along base_link, of ``tool_wrench``."""
 
-    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
+    def write(stamp_ns: int, numbers: Sequence[float]) -> bytes:
         wrench = {"force": named("xyz", numbers), "torque": named("xyz", numbers[3:])}
-        return {"header": {"stamp": stamp, "frame_id": base_frame}, "wrench": wrench}
+        message = {"header": header(stamp_ns, base_frame), "wrench": wrench}
+        return codec.encode(schema.WRENCH_STAMPED, message)
 
-    return MessageTemplate(schema.WRENCH_STAMPED, build, 6)
+    return write
 
 
 def mode_event(

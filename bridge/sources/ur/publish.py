@@ -3,12 +3,11 @@
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
-from bridge.episode.cdr.batch import MessageTemplate, joint_template, pose_template
+from bridge.episode.cdr.batch import Write, joint_writer, pose_writer
 from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import (
@@ -23,7 +22,7 @@ from bridge.episode.topics import (
     TF,
     cell_topic,
 )
-from bridge.errors import PathNotFoundError, UsageError
+from bridge.errors import UsageError
 from bridge.robots.robot import DEFAULT_ROBOT, GRIPPER_WIDTH, Robot, read_robot, robot_of
 from bridge.sources.device_samples import Announcer, HostClock, NumberedPublisher
 from bridge.sources.ur import messages
@@ -55,7 +54,7 @@ OPTIONAL = (
 class _Topic(NamedTuple):
     name: str
     type_name: str
-    template: MessageTemplate
+    write: Write
 
 
 BARE_UR5 = "ur5"
@@ -83,18 +82,17 @@ class ArmPublisher:
         self._gripper = config.make_gripper()
         state = schema.JOINT_STATE
         base = robot.base_frame
-        targets = joint_template(robot.joints)
-        width = joint_template((GRIPPER_WIDTH,))
-        speed = joint_template((messages.SPEED_NAME,))
-        joints = joint_template(robot.joints, velocities=True)
+        targets = joint_writer(robot.joints)
+        speed = joint_writer((messages.SPEED_NAME,))
+        joints = joint_writer(robot.joints, velocities=True)
         self._joints = _Topic(cell_topic(cell, JOINT_STATES), state, joints)
         self._targets = _Topic(cell_topic(cell, JOINT_TARGETS), state, targets)
-        self._pose = _Topic(cell_topic(cell, TCP_POSE), schema.POSE_STAMPED, pose_template(base))
+        self._pose = _Topic(cell_topic(cell, TCP_POSE), schema.POSE_STAMPED, pose_writer(base))
         self._wrench = _Topic(
-            cell_topic(cell, TCP_WRENCH), schema.WRENCH_STAMPED, messages.wrench_template(base)
+            cell_topic(cell, TCP_WRENCH), schema.WRENCH_STAMPED, messages.wrench_writer(base)
         )
-        self._width = _Topic(cell_topic(cell, GRIPPER_STATE), state, width)
-        self._frame = _Topic(TF, schema.TF_MESSAGE, messages.frame_template(base))
+        self._width = _Topic(cell_topic(cell, GRIPPER_STATE), state, joint_writer((GRIPPER_WIDTH,)))
+        self._frame = _Topic(TF, schema.TF_MESSAGE, messages.frame_writer(base))
         self._speed = _Topic(cell_topic(cell, SPEED_SCALING), state, speed)
         self._streams: dict[str, NumberedPublisher] = {}
         self._clock = HostClock()
@@ -183,7 +181,7 @@ class ArmPublisher:
         if stream is None:
             publisher = self._session.publisher(topic.name, topic.type_name, qos=Qos.of(topic.name))
             stream = self._streams[topic.name] = NumberedPublisher(publisher)
-        stream.put(number, topic.template.fill(stamp_ns, numbers), source_ns=stamp_ns)
+        stream.put(number, topic.write(stamp_ns, numbers), source_ns=stamp_ns)
 
 
 def _vector(value: object) -> tuple[float, ...]:
@@ -222,7 +220,7 @@ class UrSource:
         """
         host, config = self.host, self.config
         urdf = read_urdf(config)
-        robot = _robot(config, urdf)
+        robot = _robot(urdf)
         client: RtdeClient | None = _connect(session, host, config, output)
         announce(session, config.cell)
         announcer = Announcer(session)
@@ -254,9 +252,7 @@ def describe_counts(counts: dict[str, Any]) -> str:
 
 
 def read_urdf(config: UrConfig) -> str | None:
-    """The robot's description: a file, that of a robot file, or none."""
-    if config.urdf is not None:
-        return _read_urdf_file(config.urdf)
+    """The robot's description: that of a robot file, or none."""
     if config.robot == "none":
         return None
     if config.robot == BARE_UR5:
@@ -264,30 +260,15 @@ def read_urdf(config: UrConfig) -> str | None:
     return read_robot(config.robot).description()
 
 
-def _robot(config: UrConfig, urdf: str | None) -> Robot:
+def _robot(urdf: str | None) -> Robot:
     """The robot whose joints the controller moves."""
-    if config.urdf is not None and config.robot not in ("none", BARE_UR5):
-        robot = read_robot(config.robot)
-    else:
-        robot = robot_of(urdf or "")
+    robot = robot_of(urdf or "")
     if len(robot.joints) != NUM_JOINTS:
         raise UsageError(
             f"--robot {robot.name} has {len(robot.joints)} joints; a UR controller moves "
             f"{NUM_JOINTS}."
         )
     return robot
-
-
-def _read_urdf_file(path: Path) -> str:
-    if not path.is_file():
-        raise PathNotFoundError(path=path, what="URDF file", hint="Check --urdf.")
-    try:
-        text = path.read_text()
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{path} is not a text file ({error.reason}).") from error
-    if "<robot" not in text:
-        raise UsageError(f"{path} holds no <robot>; it must be a URDF (expand xacro files first).")
-    return text
 
 
 def _description(urdf: str, stamp_ns: int) -> StampedMessage:

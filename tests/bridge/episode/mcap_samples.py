@@ -11,7 +11,7 @@ from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from bridge.episode import metadata, schema
-from bridge.episode.mcap.format import Payload
+from bridge.episode.mcap.format import Buffer
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 
 
@@ -103,10 +103,10 @@ def put_foreign(
     writer: EpisodeWriter,
     item: Stored,
     kind: schema.Schema | None = None,
-    data: Payload | None = None,
+    data: Buffer | None = None,
 ) -> None:
     """Write one message of a type that the writer need not know."""
-    writer.write_foreign(
+    writer.write(
         item.topic,
         item.data if data is None else data,
         schema_record=kind,

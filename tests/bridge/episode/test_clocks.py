@@ -134,7 +134,7 @@ def _write(path: Path, host: Host, *, seconds: int = 30, jump_at: int | None = N
                 jumped_ns = now_ns
             source_ns = now_ns + round(host.offset_ns(now_ns))
             for topic in (JOINTS, "/other/x"):
-                writer.write_foreign(
+                writer.write(
                     topic,
                     _joints(source_ns),
                     schema_record=schema.schema_for(schema.JOINT_STATE),
@@ -146,7 +146,7 @@ def _write(path: Path, host: Host, *, seconds: int = 30, jump_at: int | None = N
             if k % 10 == 0:
                 record = to_record(clock, "1", [host.reading(now_ns)])
                 log_ns = now_ns + 300_000
-                writer.write_json(CLOCKS, record, type_name=schema.CLOCKS, log_time_ns=log_ns)
+                writer.write(CLOCKS, record, type_name=schema.CLOCKS, log_time_ns=log_ns)
     assert (jump_at is None) == (jumped_ns == 0)
 
 
@@ -207,11 +207,11 @@ def test_every_kind_of_stamp_is_moved_and_unset_ones_stay(tmp_path: Path) -> Non
         writer.describe(EpisodeInfo(id="t", kind="trial"))
         readings = [host.reading(START_NS + k * NS_PER_S) for k in range(3)]
         record = to_record(clock, "1", readings)
-        writer.write_json(CLOCKS, record, type_name=schema.CLOCKS, log_time_ns=START_NS)
+        writer.write(CLOCKS, record, type_name=schema.CLOCKS, log_time_ns=START_NS)
         for topic, (type_name, data) in kinds.items():
             known = schema.schema_for(type_name)
             assert known is not None
-            writer.write_foreign(
+            writer.write(
                 topic,
                 data,
                 schema_record=known,

@@ -94,7 +94,7 @@ def write(
             )
         for kind, stamp_ns, plan_id in events:
             event = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": plan_id}
-            writer.write_json("/c/event", event, type_name=schema.EVENT, log_time_ns=stamp_ns)
+            writer.write("/c/event", event, type_name=schema.EVENT, log_time_ns=stamp_ns)
     return Episode.open(path)
 
 
@@ -133,5 +133,5 @@ def test_plans_that_were_never_executed_make_no_execution_of_a_motion(tmp_path: 
     path = tmp_path / "t.mcap"
     with EpisodeWriter(path) as writer:
         writer.describe(TRIAL)
-        writer.write_json("/c/plan", {}, type_name=schema.PLAN, log_time_ns=10**18)
+        writer.write("/c/plan", {}, type_name=schema.PLAN, log_time_ns=10**18)
     assert not executions(Episode.open(path))

@@ -1,8 +1,6 @@
 """Messages in log order, compared with the official reader; chunks that are never read."""
 
 import io
-import random
-import tracemalloc
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -137,21 +135,3 @@ def test_damage_elsewhere_does_not_keep_a_topic_from_being_read(tmp_path: Path) 
     assert len(list(episode.messages(["/a"]))) == 1
     with pytest.raises(EpisodeError, match=r"x\.mcap: damaged .*another CRC"):
         list(episode.messages())
-
-
-def test_chunks_that_all_overlap_are_read_in_order_with_bounded_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "x.mcap"
-    times = list(range(200))
-    random.Random(5).shuffle(times)
-    messages = [("/a", n, random.Random(n).randbytes(20_000)) for n in times]
-    path.write_bytes(mcap_bytes(messages, chunk_size=200_000))
-    monkeypatch.setattr(messages_module, "MEMORY_BYTES", 800_000)
-    episode = Episode.open(path)
-    tracemalloc.start()
-    found = [message.log_time_ns for message in episode.messages()]
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert found == sorted(times)
-    assert peak < 3_000_000

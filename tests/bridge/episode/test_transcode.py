@@ -42,7 +42,7 @@ def test_a_header_says_where_the_pixels_are() -> None:
     header = image_header(image(depth, "16UC1"))
     assert (header.stamp_ns, header.frame_id) == (STAMP_NS, "camera")
     assert (header.height, header.width, header.encoding, header.step) == (3, 4, "16UC1", 8)
-    assert header.pixels == depth.tobytes()
+    assert header.data == depth.tobytes()
 
 
 def test_a_big_endian_message_is_read() -> None:

@@ -1,6 +1,5 @@
 """Write and read back, also with the official reader; break files on purpose."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ from joint_samples import at_positions
 
 from bridge.episode import metadata, schema, streams
 from bridge.episode.cdr import messages
-from bridge.episode.check import check_episode
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, EpisodeError, SchemaVersionError
@@ -144,18 +142,3 @@ def test_a_missing_frame_is_answered_with_those_that_exist(episode_path: Path) -
     tree = streams.transform_tree(Episode.open(episode_path))
     with pytest.raises(BridgeError, match="base_link"):
         tree.T_root_frame("nowhere", 0)
-
-
-@pytest.mark.parametrize(
-    ("index", "last", "is_whole"), [(1, True, True), (1, False, False), (2, True, False)]
-)
-def test_a_part_of_an_episode_that_an_earlier_edition_split_is_said(
-    tmp_path: Path, index: int, last: bool, is_whole: bool
-) -> None:
-    with EpisodeWriter(tmp_path / "t1.2.mcap") as writer:
-        writer.describe(INFO)
-        writer.add_metadata("split", {"index": str(index), "last": json.dumps(last)})
-    report = check_episode(tmp_path / "t1.2.mcap")
-    assert [finding.name for finding in report.findings] == ([] if is_whole else ["cut_short"])
-    assert report.exit_code == (0 if is_whole else 3)
-    assert all("mcap merge" in finding.text for finding in report.findings)

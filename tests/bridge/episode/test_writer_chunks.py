@@ -46,9 +46,8 @@ def test_every_message_comes_back_with_its_times_and_sequence(
     image = schema.schema_for(schema.IMAGE)
     with EpisodeWriter(path, config=WriterConfig(chunk_bytes=chunk_bytes)) as writer:
         for item in messages:
-            middle = len(item.data) // 2
             kind = image if item.topic.endswith("image") else None
-            put_foreign(writer, item, kind, [item.data[:middle], memoryview(item.data)[middle:]])
+            put_foreign(writer, item, kind, memoryview(item.data))
     assert sorted(read_all(path)) == sorted(messages)
 
 
@@ -57,7 +56,7 @@ def test_one_topic_keeps_its_order_when_it_grows_large(tmp_path: Path) -> None:
     with EpisodeWriter(path) as writer:
         for index in range(20):
             data = bytes([index]) * (10 if index < 10 else 100_000)
-            writer.write_foreign("/cloud", data, schema_record=None, log_time_ns=7)
+            writer.write("/cloud", data, schema_record=None, log_time_ns=7)
     assert [item.data[0] for item in read_all(path)] == list(range(20))
     assert len(summary_of(path).chunk_indexes) > 1
 
@@ -81,7 +80,7 @@ def test_small_topics_share_their_chunks(tmp_path: Path) -> None:
     with EpisodeWriter(path) as writer:
         for index in range(50):
             for topic in ("/a", "/b", "/c"):
-                writer.write_foreign(topic, b"0" * 50, schema_record=None, log_time_ns=index)
+                writer.write(topic, b"0" * 50, schema_record=None, log_time_ns=index)
     (chunk,) = summary_of(path).chunk_indexes
     assert len(chunk.message_index_offsets) == 3
     assert chunk.compression == "zstd"
@@ -98,7 +97,7 @@ def test_one_topic_with_two_schemas_of_one_name_has_two_channels(tmp_path: Path)
                 message_encoding="cdr",
                 data=texts[index % 2],
             )
-            writer.write_foreign("/t", bytes([index]), schema_record=record, log_time_ns=index)
+            writer.write("/t", bytes([index]), schema_record=record, log_time_ns=index)
     summary = summary_of(path)
     assert [item.data for item in summary.schemas.values()] == list(texts)
     assert {item.topic for item in summary.channels.values()} == {"/t"}
@@ -123,7 +122,7 @@ def test_a_number_that_does_not_fit_is_refused_and_costs_nothing(tmp_path: Path)
     path = tmp_path / "e.mcap"
     with EpisodeWriter(path) as writer:
         with pytest.raises(struct.error):
-            writer.write_foreign("/t", b"x", schema_record=None, log_time_ns=-1)
+            writer.write("/t", b"x", schema_record=None, log_time_ns=-1)
         put(writer, MESSAGES[0])
     assert len(read_all(path)) == 1
 

@@ -30,7 +30,7 @@ def test_no_message_waits_longer_than_the_flush_time(
         is_due = oldest is not None and now - oldest >= flush
         assert (writer.part_path.stat().st_size > before) is is_due
         oldest = None if is_due else oldest
-        writer.write_foreign("/a", b"x", schema_record=None, log_time_ns=now)
+        writer.write("/a", b"x", schema_record=None, log_time_ns=now)
         oldest = now if oldest is None else oldest
     writer.discard()
 
@@ -43,7 +43,7 @@ def test_a_chunk_of_several_messages_is_as_large_as_asked_at_most(
     path = tmp_path_factory.mktemp("run") / "e.mcap"
     with EpisodeWriter(path, config=WriterConfig(chunk_bytes=chunk_bytes)) as writer:
         for number, length in enumerate(lengths):
-            writer.write_foreign("/a", bytes(length), schema_record=None, log_time_ns=number)
+            writer.write("/a", bytes(length), schema_record=None, log_time_ns=number)
     head = 31  # of the message that is added last
     sizes = [chunk.uncompressed_size for chunk in summary_of(path).chunk_indexes]
     assert max(sizes) <= chunk_bytes + head
@@ -58,7 +58,7 @@ def test_a_chunk_says_its_first_and_last_time_in_whatever_order_messages_come(
     path = tmp_path_factory.mktemp("run") / "e.mcap"
     with EpisodeWriter(path, config=WriterConfig(chunk_bytes=300)) as writer:
         for stamp in times:
-            writer.write_foreign("/a", bytes(20), schema_record=None, log_time_ns=stamp)
+            writer.write("/a", bytes(20), schema_record=None, log_time_ns=stamp)
     summary = summary_of(path)
     for chunk in summary.chunk_indexes:
         assert chunk.message_start_time <= chunk.message_end_time

@@ -13,8 +13,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from bridge.episode.reader import Episode
-from bridge.episode.schema import DEFINITIONS, schema_text
-from bridge.media.color import encode_jpeg
+from bridge.episode.schema import ROS_TYPES, schema_text
+from bridge.media.color import encode_jpeg, encode_png
 
 CAMERA = ("color/image", "color/info", "depth/image", "depth/info")
 POSES = {"/tf": "/tf", "/tf_static": "/tf_static"}
@@ -81,7 +81,7 @@ def sqlite_bag(episode: Path, folder: Path, names: Mapping[str, str]) -> Path:
     numbers = {topic: number for number, topic in enumerate(names, start=1)}
     for topic, number in numbers.items():
         type_name = opened.topics()[topic].type_name
-        assert type_name in DEFINITIONS
+        assert type_name in ROS_TYPES
         row = (number, names[topic], type_name, "cdr", "")
         database.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?)", row)
     for item in opened.messages(names):
@@ -108,19 +108,18 @@ def rlds(folder: Path) -> Path:
     return folder
 
 
-def colmap(folder: Path) -> Path:
-    """Two images and a text model."""
-    (folder / "images").mkdir(parents=True)
-    model = folder / "sparse" / "0"
-    model.mkdir(parents=True)
-    (model / "cameras.txt").write_text("1 PINHOLE 32 24 30 30 16 12\n")
-    lines = []
+def posed(folder: Path) -> Path:
+    """Two images with depth and their poses, as NeRF programs keep them."""
+    folder.mkdir(exist_ok=True)
+    frames = []
     for number in (1, 2):
         picture = encode_jpeg(np.full((24, 32, 3), 60 * number, np.uint8))
-        (folder / "images" / f"{number}.jpg").write_bytes(picture)
-        lines += [f"{number} 1 0 0 0 {0.1 * number} 0 2 1 {number}.jpg", ""]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    (model / "points3D.txt").write_text("1 0 0 0 9 9 9 0.5 1 0\n")
+        (folder / f"{number}.jpg").write_bytes(picture)
+        (folder / f"{number}.png").write_bytes(encode_png(np.full((24, 32), 900, np.uint16)))
+        names = {"file_path": f"{number}.jpg", "depth_file_path": f"{number}.png"}
+        frames.append({**names, "transform_matrix": np.eye(4).tolist()})
+    about = {"w": 32, "h": 24, "fl_x": 30, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(about))
     return folder
 
 

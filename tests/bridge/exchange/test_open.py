@@ -186,10 +186,15 @@ def test_a_map_names_cell_and_camera_of_a_folder(
     assert "/lab/cam/overhead/color/image" in Episode.open(path).topics()
 
 
-def test_posed_images_are_to_look_at(tmp_path: Path, say: Say) -> None:
-    text = say(strangers.colmap(tmp_path / "garden"))
-    assert "2 posed images, COLMAP, read without depth: to look at" in text
-    assert "rebuild needs depth images" in text
+def test_posed_images_are_rgbd_images_and_a_colmap_model_is_named(tmp_path: Path, say: Say) -> None:
+    text = say(strangers.posed(tmp_path / "garden"))
+    assert "RGB-D images, transforms.json layout without times: 2 frames" in text
+    (tmp_path / "model" / "sparse").mkdir(parents=True)
+    (tmp_path / "model" / "sparse" / "points3D.bin").touch()
+    text = say(tmp_path / "model")
+    assert "a COLMAP model, not read here" in text
+    assert "rebuild needs depth images and transforms.json" in text
+    assert "evaluate: ready" not in text
 
 
 def test_a_spreadsheet_ends_in_a_rate(tmp_path: Path, say: Say, rates: Rates) -> None:
@@ -255,12 +260,12 @@ def nothing(folder: Path) -> Path:
 
 def two_things(folder: Path) -> Path:
     (folder / "x.mcap").write_bytes(b"x")
-    strangers.colmap(folder)
+    strangers.posed(folder)
     return folder
 
 
 def things_inside(folder: Path) -> Path:
-    strangers.colmap(folder / "garden")
+    strangers.posed(folder / "garden")
     strangers.splat(folder / "s.ply")
     return folder
 
@@ -284,8 +289,8 @@ def huge(path: Path) -> Path:
         (lambda folder: folder, 2, "is empty. Known are: run, bag"),
         (nothing, 2, "is empty. Known are"),
         (unfinished, 1, "robot-gst recover makes a finished copy"),
-        (two_things, 2, "is a bag and a folder of posed images at once"),
-        (things_inside, 2, "holds garden (folder of posed images), s.ply (splat). Open one"),
+        (two_things, 2, "is a bag and a RGB-D folder at once"),
+        (things_inside, 2, "holds garden (RGB-D folder), s.ply (splat). Open one"),
         (pickled, 2, "is nothing known here"),
         (lambda folder: huge(folder / "huge.bin"), 2, "is nothing known here"),
         (lambda folder: huge(folder / "huge.csv"), 2, "is larger than any table of trials"),

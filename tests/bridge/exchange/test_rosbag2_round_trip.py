@@ -175,16 +175,14 @@ def write_episode(path: Path) -> list[Message]:
                 )
                 kept.append((topic, kind, at_ns, data))
             event = {"schema_version": 1, "stamp_ns": at_ns, "type": "mark", "text": "größer"}
-            writer.write_json("/lab/event", event, type_name=schema.EVENT, log_time_ns=at_ns)
+            writer.write("/lab/event", event, type_name=schema.EVENT, log_time_ns=at_ns)
             truth = "/standin/truth/object/x/pose"
-            writer.write_foreign(truth, b"\0\1\0\0", schema_record=None, log_time_ns=at_ns)
-            writer.write_foreign("/lab/raw", b"raw", schema_record=None, log_time_ns=at_ns)
+            writer.write(truth, b"\0\1\0\0", schema_record=None, log_time_ns=at_ns)
+            writer.write("/lab/raw", b"raw", schema_record=None, log_time_ns=at_ns)
             nameless = Schema(
                 name="my_msgs/msg/Grip", schema_encoding="", message_encoding="cdr", data=b""
             )
-            writer.write_foreign(
-                "/lab/grip", b"\0\1\0\0", schema_record=nameless, log_time_ns=at_ns
-            )
+            writer.write("/lab/grip", b"\0\1\0\0", schema_record=nameless, log_time_ns=at_ns)
     return kept
 
 
@@ -235,7 +233,7 @@ def test_an_export_lists_what_it_leaves_out_and_replaces_only_when_told(
 
 def test_an_episode_without_ros_messages_is_no_bag(tmp_path: Path) -> None:
     with EpisodeWriter(tmp_path / "t1.mcap") as writer:
-        writer.write_foreign("/raw", b"x", schema_record=None, log_time_ns=1)
+        writer.write("/raw", b"x", schema_record=None, log_time_ns=1)
     with pytest.raises(UsageError, match="holds no ROS 2 messages"):
         export_bag(Episode.open(tmp_path / "t1.mcap"), tmp_path / "bag")
     assert not (tmp_path / "bag").exists()

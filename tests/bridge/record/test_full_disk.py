@@ -14,7 +14,6 @@ import pytest
 from patience import wait_until
 
 from bridge.clock import StepWatch
-from bridge.episode import schema
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -160,55 +159,6 @@ def data_of(episode: Episode, topic: str = JOINTS) -> list[bytes]:
 
 def info(name: str = "t1") -> EpisodeInfo:
     return EpisodeInfo(id=name, kind="trial", cell="cell")
-
-
-def test_the_preroll_opens_the_episode_and_its_losses_are_counted(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    recorder = make_recorder(preroll_s=30.0)
-    before = [make_sample(sequence=number) for number in (0, 1, 4, 2)]
-    for sample in before:
-        recorder.receive(sample)
-    answer = recorder.start(info())
-    assert 0 < answer["preroll_s"] < 30
-    after = make_sample(sequence=6)
-    recorder.receive(after)
-    stopped = recorder.stop()
-    assert (stopped["messages"], stopped["lost"]) == (5, 2)  # 3 and 5; 2 only came late
-    episode = episode_of(run)
-    assert data_of(episode) == [sample.data for sample in (*before, after)]
-    assert episode.start_ns <= before[0].received_ns
-
-
-def test_the_preroll_reaches_back_as_far_as_asked_and_no_further(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    recorder = make_recorder(preroll_s=5.0)
-    now_ns = make_sample().received_ns
-    old = make_sample(received_ns=now_ns - 6 * 10**9)
-    urdf = make_sample(
-        topic="/robot_description",
-        type_name=schema.STRING,
-        data=b"urdf",
-        received_ns=now_ns - 9 * 10**9,
-    )
-    young = make_sample(received_ns=now_ns - 4 * 10**9)
-    for sample in (urdf, old, young):
-        recorder.receive(sample)
-    recorder.start(info())
-    recorder.stop()
-    assert data_of(episode_of(run)) == [young.data]
-    assert data_of(episode_of(run), "/robot_description") == [b"urdf"]  # kept apart
-
-
-def test_the_preroll_is_bounded_in_bytes(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    recorder = make_recorder(preroll_s=60.0, preroll_mb=1)
-    for number in range(40):
-        recorder.receive(make_sample(data=bytes([number]) * 100_000, type_name="x"))
-    recorder.start(info())
-    assert recorder.stop()["messages"] == 1_000_000 // 100_512
 
 
 def test_a_step_of_the_system_clock_is_written_down_and_reorders_nothing(

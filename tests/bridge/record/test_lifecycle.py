@@ -16,10 +16,9 @@ from bridge.episode.recover import recover_parts
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
 from bridge.errors import UsageError
-from bridge.record.config import EpisodeAbout, QueueConfig, RecorderConfig
-from bridge.record.control import parse_task_file
+from bridge.record.config import QueueConfig, RecorderConfig
+from bridge.record.control import numbered, parse_task_file
 from bridge.record.errors import ControlError, LifecycleError
-from bridge.record.process import Keys
 from bridge.record.recorder import Recorder
 from bridge.task.check import TaskFileError
 from bridge.task.find import ATTACHMENT, MissingTaskError
@@ -162,25 +161,10 @@ def test_an_ending_recorder_starts_nothing_and_forgives_a_stop_at_the_same_momen
     assert [path.name for path in run.episodes_dir.iterdir()] == ["t1.mcap"]
 
 
-def test_keys_start_stop_mark_and_label(recorder: Recorder, run: RunFolder) -> None:
-    keys = Keys(recorder, run, EpisodeAbout(kind="probe", task="x"))
-    said = [keys.act(key) for key in "xsmyxsxn?"]
-    assert said == [
-        "nothing is being recorded. Start an episode first.",
-        "started probe_0001",
-        "marked probe_0001",
-        "probe_0001: success",
-        "probe_0001: 0 messages, 0 lost",
-        "started probe_0002",
-        "probe_0002: 0 messages, 0 lost",
-        "probe_0002: failure",
-        "",
-    ]
-    first = Episode.open(path_of(run, "probe_0001"))
-    assert (first.info.kind, first.info.task) == ("probe", "x")
-    assert first.outcome is not None
-    assert first.outcome.result == "success"
-    assert first.metadata_records["recorder"]["stopped_by"] == "keyboard"
+def test_an_episode_without_an_id_gets_the_next_number_of_its_kind(run: RunFolder) -> None:
+    for name in ("trial_0001.mcap", "trial_0002.mcap.part", "scan_0003.mcap"):
+        (run.episodes_dir / name).touch()
+    assert [numbered(run, kind) for kind in ("trial", "scan")] == ["trial_0003", "scan_0001"]
 
 
 TEXT = (datasets_folder() / "tasks" / "cube_into_box.toml").read_text()

@@ -43,7 +43,7 @@ def wire(endpoint: str) -> WireConfig:
 
 @pytest.fixture
 def live(tmp_path: Path, wire: WireConfig) -> Iterator[LiveRecorder]:
-    with open_recorder(tmp_path / "run", wire=wire, config=RecorderConfig(preroll_s=9.0)) as made:
+    with open_recorder(tmp_path / "run", wire=wire) as made:
         yield made
 
 
@@ -82,9 +82,9 @@ def test_the_recorder_is_seen_while_it_lives(
 
 def test_every_command_is_answered_over_the_wire(live: LiveRecorder, client: WireSession) -> None:
     ask = RecorderClient(client, timeout_s=WAIT_S).ask
+    ask("start", {"id": "s1"})
     client.publisher("/lab/x", "odd/Type").put(b"1", source_ns=1)
     wait_until(lambda: "/lab/x" in live.status()["seen"])
-    ask("start", {"id": "s1"})
     assert ask("mark", {})["ok"]
     assert ask("stop", {})["messages"] == 1
     ask("start", {"id": "t1", "info": {"task": "cube"}})

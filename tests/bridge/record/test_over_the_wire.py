@@ -1,21 +1,27 @@
 """Recorder, control keys and sources joined by real sessions; no request leaves the run folder."""
 
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from loopback import recording
+from loopback import free_endpoint, recording
+from mcap.reader import make_reader
 
 import robot_gst
 from bridge.data_files import datasets_folder
 from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError
+from bridge.record.config import RecorderConfig
 from bridge.record.control import RecorderClient
+from bridge.record.process import run_recorder
 from bridge.record.status import describe_status
+from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
 from bridge.wire.session import WireSession, open_session
@@ -54,12 +60,57 @@ def test_a_stop_comes_after_everything_sent_before_it(joined: Joined) -> None:
     assert client.status()["state"] == "idle"
 
 
+@pytest.mark.parametrize(("host", "is_told"), [("127.0.0.1", False), ("0.0.0.0", True)])
+def test_a_recorder_says_where_it_listens_and_when_others_may_reach_it(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], host: str, is_told: bool
+) -> None:
+    listen = free_endpoint().replace("127.0.0.1", host)
+    answer = run_recorder(
+        run.path,
+        wire=WireConfig(mode="router", connect=(), listen=(listen,)),
+        config=RecorderConfig(),
+        stop=threading.Event(),
+        output=Output(),
+        episode=EpisodeInfo(id="t1", kind="trial", cell="lab"),
+        duration_s=0.2,
+    )
+    told = capsys.readouterr().err
+    assert f"recorder 'main' listens on {listen}, writes to {run.path}" in told
+    assert ("can be reached from other machines" in told) == is_told
+    assert answer is not None
+    assert (answer["messages"], answer["lost"]) == (0, 0)
+    assert Episode.open(run.episodes_dir / "t1.mcap").info.cell == "lab"
+
+
+@pytest.mark.parametrize("is_simulated", [True, False])
+def test_a_clock_that_runs_ahead_is_that_of_the_log_in_a_simulated_cell_alone(
+    joined: Joined, is_simulated: bool
+) -> None:
+    client, ahead_ns = RecorderClient(joined.client, timeout_s=10.0), 60_000_000_000
+    client.start("t1", {"cell": "lab", "stand_in": is_simulated})
+    publisher, now_ns = joined.client.publisher("/lab/event", schema.EVENT), joined.client.now_ns()
+    data = json.dumps({"schema_version": 1, "stamp_ns": 1, "type": "note", "text": ""}).encode()
+    publisher.put(data, source_ns=1)  # long before the episode
+    for step in range(100):
+        publisher.put(data, source_ns=now_ns + ahead_ns + 20_000_000 * step)
+    client.stop()
+    with (joined.run.episodes_dir / "t1.mcap").open("rb") as file:
+        times = [
+            (message.log_time, message.publish_time)
+            for _, _, message in make_reader(file).iter_messages("/lab/event")
+        ]
+    assert len(times) == 101
+    assert 0 <= times[0][0] - now_ns + 1e9 < 20e9
+    late_ns = {log_ns - publish_ns for log_ns, publish_ns in times[1:]}
+    assert late_ns == {0} if is_simulated else max(late_ns) < -ahead_ns / 2
+
+
 @pytest.mark.parametrize(
     ("verb", "request_", "match"),
     [
         ("start", {"id": "../../evil"}, "not usable as a file name"),
         ("start", {"id": "a", "info": {"kind": "trial", "x": 1}}, "info does not know x"),
-        ("start", {}, "needs an episode id"),
+        ("start", {"id": 7}, "needs an episode id"),
         ("stop", {"discord": True}, "stop does not know discord. It knows: discard, outcome"),
         ("start", {"id": "a", "info": [1]}, "info must be a JSON object"),
         ("start", {"id": "a", "info": {"schema_version": 9}}, "schema_version 9 is not the 1"),

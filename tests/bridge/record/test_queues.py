@@ -25,8 +25,7 @@ class Queues:
     def __init__(self, **limits: object) -> None:
         """Open the queues."""
         self.images: deque[queue.Item] = deque()
-        self.kinds: dict[str, str] = {}
-        self.input_queue = queue.InputQueue(QueueConfig(**limits), self.images.append, self.kinds)  # type: ignore[arg-type]
+        self.input_queue = queue.InputQueue(QueueConfig(**limits), self.images.append)  # type: ignore[arg-type]
 
     def encode(self, count: int | None = None) -> None:
         for _ in range(len(self.images) if count is None else count):
@@ -69,9 +68,8 @@ def command() -> queue.Command:
 def test_every_message_is_kept_or_counted(
     messages: list[tuple[int, bool, int]], encoded: int
 ) -> None:
-    """Law: received + queue drops + shed + gaps = sent, whatever the sizes and whatever fits."""
+    """Law: received + queue drops + gaps = sent, whatever the sizes and whatever fits."""
     queues = Queues(camera_queue_mb=1, small_queue_mb=1, max_message_mb=0.3, max_rate_hz=30)
-    queues.kinds["/cell/cam/a/depth/image"] = "depth"
     ledger, sent = Ledger(), {True: 0, False: 0}
     for number, (size, is_image, missing) in enumerate(messages):
         sequence = sent[is_image]
@@ -89,11 +87,11 @@ def test_every_message_is_kept_or_counted(
         elif isinstance(entry, queue.Dropped):
             ledger.count_dropped(entry)
     total = ledger.total()
-    assert total.received + total.queue_drops + total.shed == len(messages)
+    assert total.received + total.queue_drops == len(messages)
     assert total.received + total.lost == sum(sent.values())
     assert queues.input_queue.queued_bytes == 0
     by_second = list(ledger.close_seconds())
-    for name in ("received", "queue_drops", "shed", "gaps"):
+    for name in ("received", "queue_drops", "gaps"):
         assert sum(record[name] for record in by_second) == getattr(total, name)
 
 

@@ -151,18 +151,16 @@ def test_small_messages_do_not_wait_for_an_encoder(
     assert recorder.stop()["messages"] == 11
 
 
-def test_overload_is_shed_in_order_and_every_image_accounted_for(
+def test_under_overload_every_image_is_accounted_for(
     started: MakeRecorder,
     monkeypatch: pytest.MonkeyPatch,
     make_sample: Callable[..., WireSample],
 ) -> None:
-    """Law: sent = written + shed + dropped, of each stream; joints lose nothing."""
+    """Law: sent = written + dropped, of each stream; joints lose nothing."""
 
     def slow(data: bytes, quality: int) -> None:
-        qualities.append(quality)
         time.sleep(0.004)
 
-    qualities: list[int] = []
     monkeypatch.setattr("bridge.record.encoders.image_to_jpeg", slow)
     monkeypatch.setattr("bridge.record.encoders.depth_to_compact", lambda data: slow(data, 0))
     recorder = started(depth="compact", queues=QueueConfig(camera_queue_mb=4))
@@ -185,10 +183,9 @@ def test_overload_is_shed_in_order_and_every_image_accounted_for(
     for topic in (COLOR, DEPTH):
         tally = topics[topic]
         assert tally["gaps"] == 0
-        assert tally["received"] + tally["shed"] + tally["queue_drops"] == 301
-    assert topics[COLOR]["shed"] > 0
+        assert tally["received"] + tally["queue_drops"] == 301
+    assert topics[COLOR]["queue_drops"] > 0
     assert topics["/cell/joint_states"]["received"] == 300
-    assert {90, 60} <= set(qualities)
     assert answer["messages"] + answer["lost"] == 2 * 301 + 300
 
 

@@ -1,20 +1,13 @@
 """docs/wire.md, kept by a publisher that knows nothing of us, and broken in every way there is."""
 
 import ast
-import json
-import re
 import shutil
 import struct
 import subprocess
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-import zenoh
-from mcap.reader import make_reader
 from patience import wait_until
 
 from bridge.episode import schema
@@ -25,10 +18,8 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.record.recorder import Recorder
-from bridge.record.wire_check import TopicHeard, WireListener
-from bridge.wire.config import WireConfig
 from bridge.wire.publisher import Attachment, encode
-from bridge.wire.session import WireSession, open_session
+from bridge.wire.session import WireSession
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLES = ROOT / "docs" / "examples" / "zenoh"
@@ -137,186 +128,3 @@ def test_the_example_is_recorded_clean_and_its_losses_are_seen_exactly(
         sec, nanosec = struct.unpack_from("<iI", each.data, 4)
         assert each.publish_time_ns == sec * 10**9 + nanosec
         assert each.type_name == schema.JOINT_STATE
-
-
-class Wild:
-    """A plain zenoh client that keeps as much of the contract as it is told to."""
-
-    def __init__(self, endpoint: str) -> None:
-        """Connect."""
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-        config.insert_json5("scouting/multicast/enabled", "false")
-        self.session = zenoh.open(config)
-        self.tokens: list[Any] = []
-
-    def alive(self, key: str) -> None:
-        self.tokens.append(self.session.liveliness().declare_token(key))
-
-    def send(
-        self,
-        count: int = 5,
-        *,
-        key: str = "demo/joint_states",
-        encoding: str = "application/cdr;sensor_msgs/msg/JointState",
-        numbers: Callable[[int], int] | None = lambda number: number,
-        stamp: Callable[[int], int] = lambda number: time.time_ns(),
-        raw: bytes | None = None,
-        data: bytes = b"\0\1\0\0" + struct.pack("<iI", 1_700_000_000, 0) + bytes(4 * 5),
-    ) -> None:
-        publisher = self.session.declare_publisher(key, encoding=encoding)
-        for number in range(count):
-            note = raw
-            if numbers is not None and raw is None:
-                note = encode(
-                    Attachment(sequence=numbers(number), source_ns=stamp(number), gid=b"wild" * 4)
-                )
-            publisher.put(data, attachment=note)
-
-
-@pytest.fixture
-def wild(router: WireSession, endpoint: str) -> Iterator[Wild]:
-    made = Wild(endpoint)
-    yield made
-    made.session.close()
-
-
-def findings(heard: list[TopicHeard]) -> dict[str, str]:
-    (topic,) = heard
-    return {f"{each.kind} {each.about}": each.text for each in topic.findings}
-
-
-def listen(router: WireSession, act: Callable[[], None], *, messages: int) -> list[TopicHeard]:
-    listener = WireListener(router, "demo/**")
-    act()
-    wait_for(listener, messages)
-    return listener.finish()
-
-
-def wait_for(listener: WireListener, messages: int) -> None:
-    wait_until(lambda: sum(each.messages for each in listener._heard.values()) >= messages)
-
-
-def test_who_keeps_the_contract_has_no_findings(router: WireSession, wild: Wild) -> None:
-    wild.alive("demo/alive")
-    (topic,) = listen(router, wild.send, messages=5)
-    assert topic.findings == []
-    assert (topic.messages, len(topic.last_numbers), topic.lost) == (5, 1, 0)
-    assert topic.lines()[1] == (
-        "  ok       encoding, payload, attachment, sequence, time, liveliness, rate"
-    )
-
-
-@pytest.mark.parametrize(
-    ("breach", "finding", "words"),
-    [
-        ({"encoding": "zenoh/bytes"}, "missing encoding", "sensor_msgs/msg/JointState is taken"),
-        ({"encoding": "application/cdr"}, "missing encoding", "names no type"),
-        ({"numbers": None}, "missing attachment", "none on 5 of 5 messages"),
-        ({"numbers": None}, "missing sequence", "their losses cannot be seen"),
-        ({"raw": b"x" * 20}, "wrong attachment", "20 bytes; it has 33"),
-        ({"numbers": lambda n: 3 * n}, "wrong sequence", "8 of 13 numbers were skipped"),
-        ({"numbers": lambda n: 4}, "wrong sequence", "4 numbers do not count on"),
-        ({"stamp": lambda n: time.time_ns() // 1000}, "wrong time", "look like microseconds"),
-        ({"stamp": lambda n: int(time.time())}, "wrong time", "look like seconds"),
-        ({"stamp": lambda n: time.time_ns() + 10**11}, "wrong time", "100 s ahead of"),
-        ({"stamp": lambda n: time.time_ns() - n * 10**8}, "wrong time", "4 messages are stamped"),
-        ({"data": b"\0\1\0\0junk"}, "wrong payload", "5 of 5 messages are not what"),
-        ({"numbers": None, "data": b"\0\1\0\0" + bytes(28)}, "missing time", "nor header.stamp"),
-    ],
-)
-def test_every_breach_is_named(
-    router: WireSession, wild: Wild, breach: dict[str, Any], finding: str, words: str
-) -> None:
-    wild.alive("demo/alive")
-    found = findings(listen(router, lambda: wild.send(**breach), messages=5))
-    assert words in found[finding], found
-
-
-def test_a_missing_token_and_a_wrong_rate_are_named(router: WireSession, wild: Wild) -> None:
-    listener = WireListener(router, "demo/**")
-    wild.send()
-    wait_for(listener, 5)
-    found = findings(listener.finish(rate_hz=1e6 * 0.9))
-    assert "no token demo/alive" in found["missing liveliness"]
-    assert "expected 900000 Hz" in found["wrong rate"]
-
-
-def test_a_token_of_a_part_of_the_cell_counts_and_that_of_another_does_not(
-    router: WireSession, wild: Wild
-) -> None:
-    wild.alive("other/alive")
-    wild.alive("dem/alive")
-    assert "missing liveliness" in findings(listen(router, wild.send, messages=5))
-    wild.alive("demo/arm/alive")
-    act = lambda: wild.send(key="demo/arm/joint_states")  # noqa: E731
-    assert findings(listen(router, act, messages=5)) == {}
-
-
-@pytest.mark.slow
-def test_the_command_ends_with_0_3_and_2(endpoint: str, spawn: Spawn) -> None:
-    command = (str(ROOT / "robot_gst.py"), "check", "--wire", "demo/**", "--listen", endpoint)
-    for left_out, code, words in (((), 0, r"ok +encoding, payload"), (("4",), 3, r"1 of \d+ num")):
-        check = spawn(*command, "--seconds", "3")
-        assert check.stderr is not None
-        assert "listening to demo/**" in check.stderr.readline()
-        spawn(str(PYTHON), endpoint, "demo", "240", "500", *left_out)
-        out, said = check.communicate(timeout=WAIT_S)
-        assert check.returncode == code, out + said
-        assert re.search(words, out), out
-    silent = spawn(*command, "--seconds", "0.1")
-    out, _ = silent.communicate(timeout=WAIT_S)
-    assert (silent.returncode, out[:24]) == (3, "nothing came on demo/**;")
-    wrong = spawn(*command, "--seconds", "-1")
-    assert wrong.wait(WAIT_S) == 2
-
-
-def test_a_publisher_may_tell_what_its_types_are(
-    router: WireSession, wild: Wild, run: RunFolder, endpoint: str
-) -> None:
-    """Before its first message, and to a recorder that comes later; never against a known type."""
-    text = b'{"type": "object"}'
-    query: list[str] = []
-
-    def answer(asked: Any) -> None:
-        with asked:
-            query.append(str(asked.key_expr))
-            asked.reply("@schema/jsonschema/acme/Late", text)
-
-    queryable = wild.session.declare_queryable("@schema/jsonschema/acme/Late", answer)
-    with open_session(WireConfig(connect=(endpoint,))) as session:
-        session.collect_definitions()
-        assert query == ["@schema/**"]
-        recorder = Recorder(run, now_ns=session.now_ns)
-        heard = threading.Semaphore(0)
-
-        def take(sample: Any) -> None:
-            recorder.receive(sample)
-            heard.release()
-
-        session.subscribe("demo/**", take)
-        recorder.start(EpisodeInfo(id="t1", kind="trial", cell="demo"))
-        wild.session.put("@schema/protobuf/acme.Grasp", b"descriptor")
-        wild.session.put("@schema/ros2msg/sensor_msgs/msg/JointState", b"string lie\n")
-        wild.session.put("@schema/nonsense/acme/Note", b"?")
-        sent = {
-            "demo/late": ("application/json;acme/Late", b"{}"),
-            "demo/grasp": ("application/protobuf;acme.Grasp", b"\x08\x01"),
-            "demo/note": ("application/json;acme/Note", b"{}"),
-            "demo/joint_states": ("application/cdr;sensor_msgs/msg/JointState", b"\0\1\0\0"),
-        }
-        for key, (encoding, data) in sent.items():
-            wild.send(1, key=key, encoding=encoding, data=data)
-        for _ in sent:
-            assert heard.acquire(timeout=WAIT_S)
-        recorder.stop()
-        recorder.close()
-    queryable.undeclare()
-    with (run.episodes_dir / "t1.mcap").open("rb") as stream:
-        found = {c.topic: s for s, c, _ in make_reader(stream).iter_messages() if s is not None}
-    assert (found["/demo/late"].encoding, found["/demo/late"].data) == ("jsonschema", text)
-    grasp = found["/demo/grasp"]
-    assert (grasp.name, grasp.encoding, grasp.data) == ("acme.Grasp", "protobuf", b"descriptor")
-    assert (found["/demo/note"].encoding, found["/demo/note"].data) == ("", b"")
-    assert found["/demo/joint_states"].data.startswith(b"std_msgs/Header header")

@@ -101,18 +101,6 @@ def test_a_damaged_record_is_refused(record: str) -> None:
         robot_of(f'<robot name="a"><robot_gst>{record}</robot_gst></robot>')
 
 
-def test_a_prefix_renames_what_lacks_it(tmp_path: Path) -> None:
-    urdf = URDF.replace('"flange"', '"left_flange"').replace("package://mine/", "")
-    (tmp_path / "flange.stl").write_bytes(b"solid")
-    robot = read(tmp_path, ARM.replace("name =", 'prefix = "left_"\nname =', 1), urdf)
-    assert robot.joints[0] == "left_j1"
-    text = robot.urdf_text()
-    assert text.count('"left_flange"') == 2
-    assert text.count('"left_base"') == 2
-    assert 'name="left_j1"' in text
-    assert "left_left" not in text
-
-
 def test_meshes_are_found_beside_the_urdf_and_in_named_folders(tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "flange.stl").write_bytes(b"solid")

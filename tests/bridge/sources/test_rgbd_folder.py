@@ -140,12 +140,10 @@ def test_an_image_in_which_nothing_was_measured_is_no_wrong_unit(folder: Path) -
     assert not depth_of(messages_of(folder)[0]).any()
 
 
-def test_frames_without_depth_are_sent_to_the_import_of_images(
-    folder: Path, index_record: dict[str, Any]
-) -> None:
+def test_frames_without_depth_are_refused(folder: Path, index_record: dict[str, Any]) -> None:
     frames = [{k: v for k, v in f.items() if k != "depth"} for f in index_record["frames"]]
     rewrite(folder, {**index_record, "frames": frames})
-    with pytest.raises(FolderError, match=r"no depth image.*import images"):
+    with pytest.raises(FolderError, match=r"no depth image. A scene is rebuilt from depth"):
         read_index(folder)
 
 

@@ -1,7 +1,5 @@
 """Topics, keys, encodings, and the attachment's bytes against zenoh's own serialiser."""
 
-import struct
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -73,23 +71,10 @@ def test_the_bytes_are_those_of_the_zenoh_serialiser() -> None:
     assert len(reference) == 33
 
 
-@given(INT64, INT64, GIDS)
-def test_the_form_with_field_names_is_read(sequence: int, source_ns: int, gid: bytes) -> None:
-    data = b"".join(
-        (
-            bytes([15]) + b"sequence_number" + struct.pack("<q", sequence),
-            bytes([16]) + b"source_timestamp" + struct.pack("<q", source_ns),
-            bytes([10]) + b"source_gid" + bytes([16]) + gid,
-        )
-    )
-    assert len(data) == 77
-    assert decode(data) == Attachment(sequence=sequence, source_ns=source_ns, gid=gid)
-
-
 @given(st.one_of(st.none(), st.binary(max_size=100)))
 def test_anything_else_is_no_attachment_and_no_error(data: bytes | None) -> None:
     found = decode(data)
-    assert found is None or len(data or b"") in (33, 77)
+    assert found is None or len(data or b"") == 33
 
 
 def test_a_wrong_length_field_is_no_attachment() -> None:

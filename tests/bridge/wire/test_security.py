@@ -20,7 +20,6 @@ from bridge.episode import schema
 from bridge.record.control import RecorderClient
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import NoPeerError, NoReplyError
-from bridge.wire.qos import Qos
 from bridge.wire.session import WireSample, WireSession, open_session
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -195,8 +194,7 @@ def test_a_huge_message_is_stopped_at_the_door(
         connect=(tls,), config=pki / "cell.json5", shared_memory_mb=shared_memory_mb
     )
     with open_session(config) as session:
-        qos = Qos.CAMERA if shared_memory_mb else Qos.RELIABLE
-        image = session.publisher("/lab/cam/a/depth/image", schema.IMAGE, qos=qos)
+        image = session.publisher("/lab/cam/a/depth/image", schema.IMAGE)
         wait_until(image.has_subscribers)
         image.put(bytes(3_000_000), source_ns=1)
         image.put(bytes(1_500_000), source_ns=2)

@@ -134,11 +134,11 @@ def replay_episode(path: Path, plan: Plan, moved: dict[str, list[np.ndarray]]) -
 
 def _event(writer: EpisodeWriter, kind: str, stamp_ns: int, **fields: str) -> None:
     record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": PLAN_ID, **fields}
-    writer.write_json("/cell/event", record, type_name=schema.EVENT, log_time_ns=stamp_ns)
+    writer.write("/cell/event", record, type_name=schema.EVENT, log_time_ns=stamp_ns)
 
 
 def _localisation(writer: EpisodeWriter, record: dict[str, Any]) -> None:
-    writer.write_json(
+    writer.write(
         "/cell/localisation",
         record,
         type_name=schema.LOCALISATION,

@@ -94,6 +94,28 @@ def test_the_arm_stops_by_itself_at_the_force_of_its_robot_file(
         cell.close()
 
 
+@pytest.mark.parametrize(("knock_s", "stops"), [(0.03, False), (0.05, True)])
+def test_a_knock_does_not_stop_the_arm(
+    start: Start, monkeypatch: pytest.MonkeyPatch, knock_s: float, stops: bool
+) -> None:
+    """As in the stand-in cell, in the middle of a period of the policy."""
+    robot = load_robot(start.scene.urdf)
+    monkeypatch.setattr(robot, "record", replace(robot.record, contact_force_N=150.0))
+    cell = TwinCell(start)
+    forces = iter([0.0] * 6 + [200.0] * round(knock_s * 240) + [0.0] * 30)
+    monkeypatch.setattr(cell._world, "arm_force_N", lambda: next(forces))
+    monkeypatch.setattr(cell._samples, "take", lambda *_: True)
+    try:
+        if stops:
+            with pytest.raises(StoppedError, match="pressed with 200 N"):
+                cell.hold(0.1)
+            np.testing.assert_allclose(cell.target_rad, cell.posture()[0], atol=1e-12)
+        else:
+            cell.hold(0.1)
+    finally:
+        cell.close()
+
+
 def press(cell: TwinCell) -> None:
     for _ in range(60):
         cell.go(cell.target_rad + np.array([0, 0.03, 0, 0, 0, 0]), 0.0, 0.1)

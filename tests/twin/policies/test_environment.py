@@ -12,6 +12,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from twin.policies.environment import ID, TwinEnv
+from twin.policies.shutter import ALWAYS
 from twin.replay.images import Drawable
 from twin.robot.posture import Posture
 from twin.scene.gaussians import as_float32
@@ -126,7 +127,8 @@ def test_pictures_are_those_of_drawing_everything_anew(run: RunFolder) -> None:
     env = TwinEnv(run.path)
     start = env.reset()[0]["agent_pos"].astype(float)
     cell, cameras, rasteriser = env._opened(), env._cameras, open_rasteriser()
-    begun = cell.places()
+    begun = cell.sight(0).places
+    cameras.shutters = dict.fromkeys(cameras.shutters, ALWAYS)
     drawable = with_a_table(cameras._drawable, begun["cube"])
     cameras._drawable, cameras._resting = drawable, None
     # The cube rests, moves, rests again; the arm moves all the time.
@@ -135,7 +137,8 @@ def test_pictures_are_those_of_drawing_everything_anew(run: RunFolder) -> None:
         at = np.array([shift_m, shift_m, 0.0])
         places = begun | {"cube": se3.transform_from(np.eye(4)[0], at) @ begun["cube"]}
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(cell, "places", lambda found=places: found)
+            seen = cell.sight(cell.t_ns)._replace(places=places)
+            patch.setattr(cell, "sight", lambda _, seen=seen: seen)
             pictures = cameras.draw(cell)
         joints_rad, width_m = cell.posture()
         everything = drawable.at(places, {}, Posture(joints_rad=joints_rad, width_m=width_m))

@@ -62,9 +62,9 @@ def localised(run: RunFolder) -> None:
     with pytest.MonkeyPatch.context() as patch:
         about = {"confidence": 1.0, "method": "measured", "reason": None, "stamp_ns": 1}
         places = scene_of_test().Ts_base_object.items()
-        found = {key: LocalisedObject(object_id=key, T_base_object=T, **about) for key, T in places}
-        phase = localising.Phase(name="start", plan_id=None, after_ns=None, before_ns=None)
-        patch.setattr(localising, "_localised_phases", lambda *_: [(phase, found)])
+        found = [LocalisedObject(object_id=key, T_base_object=T, **about) for key, T in places]
+        records = [(1, {**each.to_record(), "phase": "start", "plan_id": None}) for each in found]
+        patch.setattr(localising, "_localised_phases", lambda *_: records)
         for path in run.episodes():
             episode = Episode.open(path)
             task, scene = streams.task_file(episode).task(), scene_hash_of(run)

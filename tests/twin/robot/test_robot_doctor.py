@@ -68,6 +68,11 @@ def of_link(index: int, old: str, new: str) -> str:
             "the link 'l2' is not watched: 0 of its 2",
         ),
         (of_link(4, SHAPE, '<box size="200 10 10"/>'), "gate", "'l4' is 200 m long; is it in mill"),
+        (
+            URDF.replace('xyz="0 0 0.2"', 'xyz="0 0 200"'),
+            "gate",
+            "1200 m apart; are their origins in mill",
+        ),
         (of_link(2, 'ixx="0.01"', 'ixx="0.03"'), "dynamic", "the inertia of the link 'l2' is no"),
         (of_link(6, 'value="1"', 'value="0"'), "dynamic", "no inertia to what 'j6' moves: l6"),
         (URDF.replace('effort="50"', 'effort="0"', 1), "dynamic", "the joint 'j1' no effort"),

@@ -5,6 +5,7 @@ laid onto that picture by depth and brightness together, as consecutive frames a
 What differs by more than a bump explains, such as robot and objects, has no say.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,8 +21,10 @@ from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser
 
-MOVED_M, MOVED_RAD = 0.005, np.radians(0.5)
+MOVED_M, MOVED_RAD = 0.005, math.radians(0.5)
 """From here on a camera was moved; less is the scatter of poses and of this comparison."""
+STANDS = 0.5
+"""The first frame says enough where it differs by less than this share of that."""
 BEYOND_M = (0.06, 0.02)
 """Depths that differ by more, in the first and in the second round, show another thing."""
 LIMITS = DepthLimits(max_depth_m=5.0)
@@ -66,11 +69,7 @@ class MovedCamera:
 
 
 def moved_camera(frames: Sequence[RgbdFrame], background: GaussianCloud) -> MovedCamera | None:
-    """Compare frames of one camera with the scene; None where it is as its poses say.
-
-    Args:
-        frames: Taken while camera, robot and objects stood still.
-    """
+    """Compare a camera's still frames with the scene; None where it is as its poses say."""
     rasteriser, aligner = Rasteriser(), Aligner(LIMITS.max_depth_m)
     vectors, is_lost = [], False
     for frame in frames:
@@ -86,13 +85,18 @@ def moved_camera(frames: Sequence[RgbdFrame], background: GaussianCloud) -> Move
             T, found = T @ step.T_target_source, True
         if found:
             vectors.append(np.concatenate([se3.vector_from_rotation(T[:3, :3]), T[:3, 3]]))
+            if _size(vectors[0]) < STANDS:
+                return None
     if not vectors:
         return MovedCamera(T_posed_true=None) if is_lost else None
     middle = np.median(vectors, axis=0)
-    turn_rad, shift_m = (float(np.linalg.norm(part)) for part in (middle[:3], middle[3:]))
-    if shift_m < MOVED_M and turn_rad < MOVED_RAD:
-        return None
-    return MovedCamera(T_posed_true=se3.small_motion(middle))
+    return MovedCamera(T_posed_true=se3.small_motion(middle)) if _size(middle) >= 1.0 else None
+
+
+def _size(motion: Float[np.ndarray, "6"]) -> float:
+    """Of a turn and a shift; from 1 on the camera was moved."""
+    turn_rad, shift_m = (float(np.linalg.norm(part)) for part in (motion[:3], motion[3:]))
+    return max(turn_rad / MOVED_RAD, shift_m / MOVED_M)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -77,10 +77,6 @@ class MovingVoxels:
         """Say which points (root frame, metres) belong to something that moved."""
         return np.isin(_keys(p_m), self.keys)
 
-    def drop_from(self, points: PointSet) -> PointSet:
-        """Return the static points only."""
-        return points.take(~self.contains(points.p_m))
-
     def mask_in(self, view: TrainingView) -> TrainingView:
         """Mark the pixels that show something moving, so that the fit passes them over."""
         if not len(self.keys):

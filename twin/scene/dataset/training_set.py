@@ -110,7 +110,8 @@ def read_training_set(
     pairs = ((bare_points, bare_views), (points, views))
     for seen, shown in pairs:  # one by one, so that memory holds the frames once
         for place in range(len(shown)):
-            seen[place], shown[place] = moving.drop_from(seen[place]), moving.mask_in(shown[place])
+            seen[place] = seen[place].take(~moving.contains(seen[place].p_m))
+            shown[place] = moving.mask_in(shown[place])
     gone = (num_points - sum(len(item.p_m) for item in bare_points)) / max(num_points, 1)
     report = replace(
         report,

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import FrameTransform, transforms_from_cdr
+from bridge.episode import streams
+from bridge.episode.cdr.messages import FrameTransform
 from bridge.episode.reader import Episode
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
@@ -108,10 +108,8 @@ SAME = 1e-6
 
 def base_tree(episode: Episode) -> TransformTree:
     """Collect ``/tf`` and ``/tf_static``; see ``rooted_in_base``."""
-    transforms: list[FrameTransform] = []
-    for message in episode.messages(episode.topics_of_type(schema.TF_MESSAGE)):
-        transforms.extend(transforms_from_cdr(message.data))
-    return TransformTree(rooted_in_base(transforms, streams.recorded_robot(episode).base_frame))
+    base_frame = streams.recorded_robot(episode).base_frame
+    return TransformTree(rooted_in_base(streams.transforms(episode), base_frame))
 
 
 def rooted_in_base(transforms: Sequence[FrameTransform], base_frame: str) -> list[FrameTransform]:
@@ -192,7 +190,7 @@ def find_poses(
     neither the path of the camera nor its loop closures.
 
     Raises:
-        FrameNotFoundError: When ``/tf`` is asked for and does not know the camera.
+        BridgeError: When ``/tf`` is asked for and does not know the camera.
         UnusableCameraError: When no image was taken while ``/tf`` or the joints said where the
             camera is, or ``/tf`` does not connect its colour and depth frames.
         LostError: When the odometry cannot follow the camera.

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.streams import RgbdFrame
-from bridge.errors import MissingDependencyError
 from bridge.geometry import se3
 from bridge.terminal import Advance
 from twin.scene.frames.downscaled import DownscaledDepth, colors_in_depth, downscaled_depth, meet
@@ -64,12 +63,8 @@ class Aligner:
 
     def __init__(self, max_depth_m: float) -> None:
         """Load Open3D."""
-        try:
-            import open3d  # noqa: PLC0415  # heavy, and only scans without poses need it
-        except ImportError as error:
-            raise MissingDependencyError(
-                package="open3d", extra="replay", purpose="following a camera without poses"
-            ) from error
+        import open3d  # noqa: PLC0415  # heavy, and only scans without poses need it
+
         self.max_depth_m = max_depth_m
         self.open3d: Any = open3d
         self._term = open3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm()

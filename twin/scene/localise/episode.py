@@ -166,8 +166,13 @@ def write_localised(
     with EpisodeWriter(path) as writer:
         writer.describe(episode.info, derived=derived)
         for stamp_ns, record in records:
-            times_ns = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
-            writer.write_json(topic, record, type_name=schema.LOCALISATION, **times_ns)
+            writer.write(
+                topic,
+                record,
+                type_name=schema.LOCALISATION,
+                log_time_ns=stamp_ns,
+                publish_time_ns=stamp_ns,
+            )
     return path
 
 

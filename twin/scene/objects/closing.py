@@ -134,7 +134,7 @@ class _Look:
         row, column = np.where(inside, row, 0), np.where(inside, column, 0)
         inside &= self.shown[row, column] & (seen_m[:, 2] < self.expected_m[row, column] + SAME_M)
         weight = self.trust[row, column] * cosine**2
-        between = self.camera.project(seen_m)[0][:, ::-1].T - 0.5 - np.array(self.corner)[:, None]
+        between = self.camera.project(seen_m)[0][:, ::-1].T - 0.5 - np.reshape(self.corner, (2, 1))
         colors = [
             ndimage.map_coordinates(plane, between, order=1, mode="nearest")
             for plane in np.moveaxis(self.colors, -1, 0)

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 import robot_gst
 from bridge.episode.topics import CLOCKS, DROPS
 
-LOSSES = ("gaps", "queue_drops", "shed")
+LOSSES = ("gaps", "queue_drops")
 
 
 class Found(NamedTuple):

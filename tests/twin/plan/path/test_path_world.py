@@ -23,7 +23,6 @@ from twin.scene.shape.static import StaticSdf
 ROBOTS = (
     "ur5_parallel_gripper",
     pytest.param("panda", marks=pytest.mark.slow),
-    pytest.param("left_ur5_parallel_gripper", marks=pytest.mark.slow),
     pytest.param("kinova_j2s6s200", marks=pytest.mark.slow),
 )
 

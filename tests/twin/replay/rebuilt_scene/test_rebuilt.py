@@ -200,7 +200,7 @@ def test_an_episode_without_cameras_starts_from_nothing_and_says_why(tmp_path: P
     run = RunFolder.create(tmp_path)
     with EpisodeWriter(run.episodes_dir / "trial_0001.mcap") as writer:
         writer.describe(EpisodeInfo(id="trial_0001", kind="trial", cell="standin"))
-        writer.write_json(
+        writer.write(
             "/standin/event",
             {"schema_version": 1, "stamp_ns": 5, "type": "mark"},
             type_name="gst/Event",

@@ -66,7 +66,6 @@ QUICK = ("panda", "kinova")
 """Seven joints with a gripper, six with a fixed tool; the others are slow."""
 CASES = {
     "ur3": Case("ur3_parallel_gripper", (0.3, -0.15), (0.3, 0.19), 1.5),
-    "ur5_with_prefix": Case("left_ur5_parallel_gripper"),
     "ur10": Case("ur10_parallel_gripper"),
     "ur10e": Case("ur10e_parallel_gripper"),
     "panda": Case("panda", pace=1.5),
@@ -149,7 +148,7 @@ def record_trial(
         say("/lab/plan", plan.to_json(), schema.PLAN, T0 + 1)
         for kind, stamp in (("execution_started", T0 + SECOND), ("execution_ended", end)):
             event = {"schema_version": 1, "stamp_ns": stamp, "type": kind, "plan_id": plan.id}
-            writer.write_json("/lab/event", event, type_name=schema.EVENT, log_time_ns=stamp)
+            writer.write("/lab/event", event, type_name=schema.EVENT, log_time_ns=stamp)
         for topic, track in zip(("joint_states", "gripper/state"), tracks, strict=False):
             for stamp, row in zip(track.stamps_ns.tolist(), track.position, strict=True):
                 sample = at_positions(stamp, track.names, row)
@@ -273,7 +272,7 @@ def check_replay(episode: Episode, robot: Robot, plan: Plan, *, picks: bool) -> 
     track = streams.joint_track(episode)
     assert track.names == robot.joints
     assert streams.recorded_robot(episode) == replace(
-        robot, attached=(), flange="", prefix="", held=(), mesh_folders={}, folder=Path()
+        robot, attached=(), flange="", held=(), mesh_folders={}, folder=Path()
     )
     for row in (0, -1):
         T = raw_tool(robot, track.position[row])

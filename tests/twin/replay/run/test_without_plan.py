@@ -132,7 +132,7 @@ def test_what_was_executed_is_replayed_and_nothing_is_said_to_be_planned(
     episode = Episode.open(path)
     assert not streams.plans(episode), "no plan is made up for viewers"
     assert (episode.info.kind, episode.info.policy) == ("trial", "act")
-    started, _ = streams.executed_interval_ns(episode, NO_PLAN) or (0, 0)
+    started = streams.execution_ns(streams.events(episode), NO_PLAN)[0] or 0
     assert abs(started - START) < 50_000_000
     cube = streams.pose_track(episode, streams.object_pose_topics(episode)["cube"])
     assert np.linalg.norm(cube.p_m[-1] - cube.p_m[0]) > 0.2

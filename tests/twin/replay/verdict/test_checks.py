@@ -233,6 +233,8 @@ def test_a_robot_that_would_stop_by_itself_is_not_told_to_go_on() -> None:
     assert force.cause == "contact_force"
     assert "151 N, the limit is 150 N" in force.detail
     assert stops_of_arm(states.stamps_ns, 0 * off_rad, force_N, record) == [force]
+    knocked = states.stamps_ns // 50  # it lasts 20 ms
+    assert stops_of_arm(knocked, 0 * off_rad, force_N, record) == []
 
 
 def test_early_refusal_and_whole_replay_agree_on_plans_that_physics_need_not_see(

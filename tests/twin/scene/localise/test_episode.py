@@ -33,7 +33,7 @@ END = {**START, "cube": START["box"] @ pose_of(np.array([0.0, 0.01, 0.026, 0.2])
 
 def put_event(writer: EpisodeWriter, kind: str, stamp_ns: int) -> None:
     record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": "plan_1"}
-    writer.write_json("/standin/event", record, type_name=schema.EVENT, log_time_ns=stamp_ns)
+    writer.write("/standin/event", record, type_name=schema.EVENT, log_time_ns=stamp_ns)
 
 
 @pytest.fixture(scope="module")

@@ -1,1 +1,0 @@
-"""Plays an episode back onto zenoh, with its own timing."""
