@@ -188,6 +188,7 @@ def test_starts_are_drawn_as_the_task_says(run: RunFolder) -> None:
 def test_a_check_explains_one_answer_and_rolls_nothing_out(run: RunFolder) -> None:
     found = check_policy(run, config("Scripted"))
     text = describe_check(found)
+    assert "the arm follows at once" in text
     assert "pixels.side: 120 x 160 x 3 uint8" in text
     assert "answered: 10 x 7 float64" in text
     assert "followed for 10 rows, 1.00 s" in text
