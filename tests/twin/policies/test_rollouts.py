@@ -68,6 +68,7 @@ def test_a_policy_that_does_the_task_is_judged_kept_and_compared(run: RunFolder)
     assert made.derived is not None
     assert made.derived.kind == "rollout"
     assert made.info.policy == "Scripted"
+    assert found["rows"][0]["shutters"]["side"]["period_ns"] == 200_000_000  # the recording's
     pictures = [topic for topic in made.topics() if "rendered" in topic]
     assert len(pictures) == 2
     before = {path: path.stat().st_mtime_ns for path in run.derived("*.rollout.*")}
