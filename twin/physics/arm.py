@@ -162,9 +162,8 @@ class Arm:
         self.opening_axes: dict[str, tuple[float, ...]] = {}
         parents: dict[str, int] = {}
         fixed: set[int] = {-1}
-        client = self._client
-        for index in range(client.getNumJoints(self.id)):
-            item = client.getJointInfo(self.id, index)
+        for index in range(self._client.getNumJoints(self.id)):
+            item = self._client.getJointInfo(self.id, index)
             self._joints[item[1].decode()] = index
             self.links[item[12].decode()] = index
             self._efforts[item[1].decode()] = item[10]
@@ -181,11 +180,10 @@ class Arm:
         self.finger_links = [self.links[name] for name in gripper.finger_links]
         carriers = [parents[name] for name, index in self.links.items() if index in self._fingers]
         self._finger_parent = carriers[0] if carriers else self.links[record.tool_frame]
-        self._arm_limits = [self._efforts[name] for name in record.joints]
-        self._arm_forces = self._arm_limits
+        self._arm_forces = [self._efforts[name] for name in record.joints]
         for name, index in self.links.items():
             if index in self._fingers:
-                self.opening_axes[name] = self._opening(index)
+                self.opening_axes[name] = self._opening(name, index)
 
     def _driven(self, mimics: Sequence[Mimic]) -> list[_Drive]:
         """The joints that open the gripper, leaders and followers."""
@@ -197,15 +195,14 @@ class Arm:
             if item.leader in leaders and item.joint not in leaders
         ]
 
-    def _opening(self, index: int) -> tuple[float, ...]:
+    def _opening(self, name: str, index: int) -> tuple[float, ...]:
         """Direction in which a finger's pad goes when the gripper opens, in the finger's frame."""
         item = self._client.getJointInfo(self.id, index)
         drive = next(drive for drive in self._drives if drive.index == index)
         opens = 1.0 if drive.slope(self._max_width_m / 2) > 0 else -1.0
         axis = np.array(item[13]) * opens
         if item[2] == pybullet.JOINT_REVOLUTE:
-            p, (x, y, z, w) = self.link_poses([index])[0]
-            T_finger_base = se3.invert(se3.transform_from(np.array([w, x, y, z]), np.array(p)))
+            T_finger_base = se3.invert(self.T_base_link(name))
             pad = se3.apply(T_finger_base, self.T_base_link(self.record.tool_frame)[:3, 3])
             axis = np.cross(axis, pad)
             axis /= np.linalg.norm(axis)
@@ -246,8 +243,6 @@ class Arm:
                 forces=self._arm_forces,
             )
             self._arm_order = order
-        if not self._drives:
-            return
         target_m = min(max(width_m, 0.0), self._max_width_m)
         if target_m > self._target_m:
             self.closing, self._press_m_s = False, None
@@ -258,16 +253,14 @@ class Arm:
 
     def soften(self, most_Nm: Joints, carrying_Nm: Joints) -> None:
         """Let the arm's motors be no stronger than so much, beside what carries it for a step."""
-        self._arm_forces = np.minimum(most_Nm, self._arm_limits).tolist()
-        self._client.setJointMotorControlArray(
-            self.id, self._arm, pybullet.TORQUE_CONTROL, forces=_numbers(carrying_Nm)
-        )
+        self._arm_forces, carried = _numbers(most_Nm), _numbers(carrying_Nm)
+        mode = pybullet.TORQUE_CONTROL
+        self._client.setJointMotorControlArray(self.id, self._arm, mode, forces=carried)
 
     def _close_fingers(self) -> None:
-        if self._press_m_s is None:
-            self._drive_fingers(self._target_m, FINGER_SPEED_M_S)
-        else:
-            self._drive_fingers(self._target_m, self._press_m_s, _PRESS_GAIN)
+        press = self._press_m_s
+        speed_m_s, gain = (FINGER_SPEED_M_S, _GAIN) if press is None else (press, _PRESS_GAIN)
+        self._drive_fingers(self._target_m, speed_m_s, gain)
 
     def press(self, speed_m_s: float | None) -> None:
         """Drive the fingers to their target with another speed; None: with the usual one."""
@@ -281,8 +274,8 @@ class Arm:
         share, found = 1.0 / len(self._drives), []
         for drive, state in zip(self._drives, states, strict=True):
             width_m = drive.width_m(state[0])
-            short_m = share * (width_m - self._target_m)
-            found.append((short_m, share * state[1] / drive.slope(width_m)))
+            speed_m_s = state[1] / drive.slope(width_m)
+            found.append((share * (width_m - self._target_m), share * speed_m_s))
         return found
 
     def _drive_fingers(self, target_m: float, speed_m_s: float, gain: float = _GAIN) -> None:
@@ -326,10 +319,9 @@ class Arm:
         """Where the arm is, and the distance between the finger pads; one question for both."""
         states = self._client.getJointStates(self.id, [*self._arm, *self._fingers])
         places = [state[0] for state in states]
-        count = len(self._arm)
-        pairs = zip(self._drives, places[count:], strict=True)
-        widths = [drive.width_m(value) for drive, value in pairs]
-        return np.array(places[:count]), float(sum(widths)) / len(widths) if widths else 0.0
+        arm, fingers = np.array(places[: len(self._arm)]), places[len(self._arm) :]
+        widths = [drive.width_m(at) for drive, at in zip(self._drives, fingers, strict=True)]
+        return arm, float(sum(widths)) / len(widths) if widths else 0.0
 
     def link_poses(self, links: Sequence[int]) -> list[LinkPose]:
         """Position [m] and quaternion xyzw of the frames of links, base frame."""

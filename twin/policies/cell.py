@@ -19,7 +19,7 @@ from twin.physics.arm import Arm
 from twin.physics.engines import PhysicsWorld, open_world
 from twin.policies.errors import RefusedError, StoppedError
 from twin.policies.limits import refuse_target
-from twin.policies.response import Controller, carrying_Nm
+from twin.policies.response import Controller, carrying_Nm, largest_Nm
 from twin.policies.starts import Start
 from twin.replay.checks import stops_of_arm
 from twin.replay.config import STATE_EVERY
@@ -142,7 +142,8 @@ class TwinCell:
         told, arm = self._controller, self._world.robot
         if told.is_soft and isinstance(arm, Arm):
             joints_rad = arm.posture()[0]
-            arm.soften(told.strength_Nm(joints_rad), carrying_Nm(self.robot, joints_rad))
+            most_Nm = np.minimum(told.strength_Nm(joints_rad), largest_Nm(self.robot))
+            arm.soften(most_Nm, carrying_Nm(self.robot, joints_rad))
         arm.command(told.joints_rad.tolist(), told.velocity_rad_s.tolist(), told.width_m)
 
     def _follow(

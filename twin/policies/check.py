@@ -43,6 +43,7 @@ def check_policy(run: RunFolder, config: RolloutConfig) -> dict[str, Any]:
             "answered": _described(rows),
             "kind": mapping.actions.kind,
             "rate_hz": mapping.rate_hz,
+            "response": start.response.describe(),
         }
         found |= _first(speak, cell, rows)
         gains = gains_of(run, episode, list(cameras.viewpoints))
@@ -102,4 +103,5 @@ def describe_check(found: Mapping[str, Any]) -> str:
     )
     if found["refused"]:
         lines.append(f"then refused: {found['refused']}")
+    lines.append(found["response"])
     return "\n".join([*lines, *describe_gap(found["gap"])])

@@ -27,7 +27,7 @@ from bridge.errors import GstError
 from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.task.plan import Plan
 from twin.calibrate.weights import readings
-from twin.policies.response import AT_ONCE, Response, carrying_Nm
+from twin.policies.response import AT_ONCE, Response, carrying_Nm, largest_Nm
 from twin.replay.execution import in_order, stages_as_executed
 from twin.replay.path import path_of_plan
 from twin.robot.model import RobotModel, load_robot
@@ -164,7 +164,7 @@ def stiffness_of(
     joints, speeds = _together(told)
     off_rad = _sent_rad(told, delay_s) - joints - np.array(lags_s) * speeds
     loads_Nm = np.concatenate([trial.loads_Nm for trial in told])
-    least_Nm = PRESSED * robot.model.effortLimit[robot.arm_velocity_ids]
+    least_Nm = PRESSED * largest_Nm(robot)
     pressed = (np.abs(loads_Nm) > least_Nm) & (np.abs(speeds) < MOVES_RAD_S)
     found = []
     for load, off, which in zip(loads_Nm.T, off_rad.T, pressed.T, strict=True):

@@ -43,6 +43,19 @@ class Response:
             "grip_speed_m_s": speed_m_s,
         }
 
+    def describe(self) -> str:
+        """In a line."""
+        if not self.lags_s:
+            return "the arm follows at once: no trial says what the controller was sent"
+        soft = [k for k in self.stiffness_Nm_rad if math.isfinite(k)]
+        gives = f", {len(soft)} joints give way" if soft else ""
+        return (
+            f"the arm follows after {1e3 * self.delay_s:.0f} ms with lags of "
+            f"{1e3 * min(self.lags_s):.0f} to {1e3 * max(self.lags_s):.0f} ms{gives}; the "
+            f"fingers after {1e3 * self.grip_delay_s:.0f} ms at {self.grip_speed_m_s:.2g} m/s, as "
+            "the cell's"
+        )
+
 
 AT_ONCE = Response()
 
@@ -108,3 +121,8 @@ def carrying_Nm(
     """Torques that carry the arm's own weight."""
     data, q = robot.model.createData(), robot.configuration(joints_rad)
     return np.array(pin.computeGeneralizedGravity(robot.model, data, q)[robot.arm_velocity_ids])
+
+
+def largest_Nm(robot: RobotModel) -> Float[np.ndarray, " num_joints"]:
+    """The motors' largest torques."""
+    return np.array(robot.model.effortLimit[robot.arm_velocity_ids])

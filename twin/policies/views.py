@@ -14,7 +14,7 @@ from bridge.geometry.camera import Camera
 from twin.policies.cell import Sight, TwinCell
 from twin.policies.errors import PolicyError
 from twin.policies.mapping import fitting
-from twin.policies.shutter import shutter_of
+from twin.policies.shutter import ALWAYS, shutter_of
 from twin.policies.starts import Start
 from twin.policies.variation import ANGLE, POSITION, Drawn
 from twin.replay.images import Drawable, mounting, set_up
@@ -116,6 +116,8 @@ class TwinCameras:
         sizes: Mapping[str, tuple[int, int]] | None = None,
         drawn: Drawn | None = None,
         gains: Gains | None = None,
+        *,
+        live: bool = False,
     ) -> None:
         """Read the scene.
 
@@ -125,6 +127,7 @@ class TwinCameras:
                 as they were recorded.
             drawn: Conditions that differ from the recorded ones.
             gains: Of the light, where it is another than when the scene was scanned.
+            live: A person looks: pictures are of now, not as old as the cell's.
         """
         self._drawn = drawn or {}
         episode = Episode.open(start.episode_path)
@@ -146,7 +149,8 @@ class TwinCameras:
         }
         self._gains = _varied(gains or {}, self._drawn, self.viewpoints)
         self.shutters = {
-            name: shutter_of(episode, name, start.stamp_ns) for name in self.viewpoints
+            name: ALWAYS if live else shutter_of(episode, name, start.stamp_ns)
+            for name in self.viewpoints
         }
         self._newest: dict[str, UInt8[np.ndarray, "height width 3"]] = {}
         self._drawn_of: dict[str, Sight] = {}

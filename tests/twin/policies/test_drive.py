@@ -101,6 +101,7 @@ def test_a_rollout_by_keys_is_an_episode_that_lerobot_takes(run: RunFolder, tmp_
     (row,) = roll_out_run(run, start, QUIET)["rows"]
     assert (row["start_id"], row["success"], row["problem"]) == ("start 2", False, "")
     assert row["asked"] == round(1.8 * RATE_HZ)
+    assert row["shutters"]["side"]["period_ns"] == 1  # who drives sees now
     made = Episode.open(run.derived_dir / row["file"])
     path.write_text("r 0.4\n")  # other keys in the same place are another rollout
     (other,) = roll_out_run(run, start, QUIET)["rows"]

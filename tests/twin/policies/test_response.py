@@ -115,6 +115,7 @@ def test_a_trial_teaches_the_others_of_its_run(tmp_path: Path, run: RunFolder) -
     np.testing.assert_allclose(found.lags_s, LAGS_S, atol=0.009)
     assert (found.grip_delay_s, found.grip_speed_m_s) == pytest.approx((0.29, 0.15), abs=2e-3)
     assert found.stiffness_Nm_rad == ()  # nobody measured efforts
+    assert "at 0.15 m/s, as the cell's" in found.describe()
     nothing_sent = Episode.open(run.episodes_dir / "trial_1.mcap")
     assert response_of(run, nothing_sent, robot) == AT_ONCE
     shutter = shutter_of(first, "side", 10**11 + 500_000_000)

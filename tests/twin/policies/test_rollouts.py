@@ -68,6 +68,7 @@ def test_a_policy_that_does_the_task_is_judged_kept_and_compared(run: RunFolder)
     assert made.derived is not None
     assert made.derived.kind == "rollout"
     assert made.info.policy == "Scripted"
+    assert found["rows"][0]["shutters"]["side"]["period_ns"] == 200_000_000  # the recording's
     pictures = [topic for topic in made.topics() if "rendered" in topic]
     assert len(pictures) == 2
     before = {path: path.stat().st_mtime_ns for path in run.derived("*.rollout.*")}
@@ -188,6 +189,7 @@ def test_starts_are_drawn_as_the_task_says(run: RunFolder) -> None:
 def test_a_check_explains_one_answer_and_rolls_nothing_out(run: RunFolder) -> None:
     found = check_policy(run, config("Scripted"))
     text = describe_check(found)
+    assert "the arm follows at once" in text
     assert "pixels.side: 120 x 160 x 3 uint8" in text
     assert "answered: 10 x 7 float64" in text
     assert "followed for 10 rows, 1.00 s" in text
