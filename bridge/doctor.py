@@ -1,7 +1,6 @@
 """What is installed, what is missing, and how to get it."""
 
 import re
-import shutil
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -58,13 +57,9 @@ class InstallCheck:
 
 
 def examine() -> list[InstallCheck]:
-    """Look at packages, the native extensions, system libraries and programs; import nothing."""
+    """Look at packages, the native extensions and system libraries; import nothing."""
     findings = [_package(name, extra) for extra in EXTRAS for name in packages_of(extra)]
     findings.extend(_native(*each) for each in NATIVE)
-    has = shutil.which("chromium") is not None
-    advice = "" if has else "needed only to test the dashboard: apt install chromium"
-    found = "present" if has else "missing"
-    findings.append(InstallCheck(what="chromium", found=found, ok=True, advice=advice))
     findings.extend(_system_libraries())
     return findings
 

@@ -26,7 +26,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from multiprocessing.connection import Connection, Pipe, wait
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -270,29 +270,15 @@ class ProcessPool:
         """Start nothing yet."""
         self._size, self._prepare, self._quiet = size, prepare, quiet
         self.workers: list[Worker] = []
-        self._preparing: set[Worker] = set()
 
     def _start(self) -> Worker:
         worker = Worker(quiet=self._quiet)
         self.workers.append(worker)
-        if self._prepare is not None:
-            self._preparing.add(worker)
-            with suppress(WorkerLostError):  # found out when it should answer
-                worker.begin(self._prepare, None)
         return worker
 
     def _lose(self, worker: Worker) -> None:
         worker.close()
         self.workers.remove(worker)
-        self._preparing.discard(worker)
-
-    def _has_prepared(self, worker: Worker) -> bool:
-        """Take the answer to ``prepare``, which is the first one; say whether it was that."""
-        if worker not in self._preparing:
-            return False
-        worker.finish()
-        self._preparing.remove(worker)
-        return True
 
     def run(
         self,
@@ -319,8 +305,6 @@ class ProcessPool:
                 for outlet in spoke:
                     worker = outlets[outlet]
                     try:
-                        if self._has_prepared(worker):
-                            continue
                         answer = worker.finish()
                         item, _ = at_work.pop(worker)
                     except WorkerLostError as error:
@@ -375,7 +359,7 @@ class ProcessPool:
         found: dict[int, Answer | Failed] = {}
         at = 0
         with suppress(NoProcessError):
-            numbered, job = list(enumerate(chunks)), partial(_do_chunk, work)
+            numbered, job = list(enumerate(chunks)), partial(_do_chunk, work, self._prepare)
             for (number, _), answer in self.run(job, numbered, lambda c: -c[0], PATIENCE_S):
                 found[number] = answer
                 while at in found:
@@ -400,8 +384,17 @@ ALONE = ProcessPool(0)
 """Maps in this process."""
 
 
-def _do_chunk(work: Callable[[Item], Result], chunk: tuple[int, Sequence[Item]]) -> list[Result]:
+def _do_chunk(
+    work: Callable[[Item], Result], prepare: Function | None, chunk: tuple[int, Sequence[Item]]
+) -> list[Result]:
+    if prepare is not None:
+        _once(prepare)
     return [work(item) for item in chunk[1]]
+
+
+@cache
+def _once(prepare: Function) -> None:
+    prepare(None)
 
 
 def _results(

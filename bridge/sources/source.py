@@ -25,14 +25,6 @@ Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s")
 class Source(Protocol):
     """Publishes what one device or simulation has to say."""
 
-    @property
-    def name(self) -> str:
-        """What people call it."""
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """The topics it publishes, or some of them where the device lacks a signal."""
-
     def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
         """Publish until ``stop`` is set or there is nothing left, and count what was sent."""
 
@@ -43,7 +35,6 @@ def run_source(
     """Run a source until it ends, SIGINT or SIGTERM arrives, or the time is over."""
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
 
-    output.detail(f"{source.name} publishes {', '.join(source.topics)}")
     with stopping(duration_s) as stop, open_session(wire) as session:
         return source.run(session, stop, output)
 

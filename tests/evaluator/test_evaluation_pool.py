@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +19,9 @@ from evaluator.run_reader.contents import READ_S
 
 
 def begun(pool: ProcessPool, number: int) -> ProcessPool:
-    """Start processes, and wait until they can work."""
+    """Start processes."""
     while len(pool.workers) < number:
         pool._start()
-    for worker in pool.workers:
-        assert worker not in pool._preparing or wait([worker.outlet], 30)
     return pool
 
 

@@ -7,11 +7,6 @@ from typing import Any
 import pyrealsense2 as rs
 
 from bridge.episode.topics import (
-    COLOR_IMAGE,
-    COLOR_INFO,
-    DEPTH_IMAGE,
-    DEPTH_INFO,
-    TF_STATIC,
     camera_topic,
 )
 from bridge.errors import GstError
@@ -166,19 +161,6 @@ class RealSenseSource:
         """Look for every camera asked for."""
         self._config, self._list_devices = config, list_devices
         self._wanted = choose_cameras(config, list_devices)
-
-    @property
-    def name(self) -> str:
-        """The cameras by name."""
-        return f"RealSense {', '.join(self._wanted)}"
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """Images and intrinsics of each camera, and where they are."""
-        endings = (COLOR_IMAGE, COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
-        cell = self._config.cell
-        images = (camera_topic(cell, name, each) for name in self._wanted for each in endings)
-        return (*images, TF_STATIC)
 
     def run(
         self, session: WireSession, stop: threading.Event, output: Output

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from bridge.clock import AnchoredClock
-from bridge.episode import topics
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.errors import BridgeError
 from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import Operator
 from bridge.sources.standin.settings import SessionConfig
-from bridge.sources.standin.streams import TRUTH_PARAMETERS, Session, Streams
+from bridge.sources.standin.streams import Session, Streams
 from bridge.task.find import chosen_task_file
 from bridge.terminal import Output
 
@@ -64,39 +63,6 @@ class StandinSource:
     """The stand-in cell as a ``bridge.sources.source.Source``."""
 
     config: SessionConfig
-
-    @property
-    def name(self) -> str:
-        """The cell's."""
-        return f"stand-in cell {self.config.cell}"
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """Those of a real cell, and the truth that only tests and perception metrics read."""
-        task = chosen_task_file(self.config.task).task()
-        cell, cameras = self.config.cell, load_cell(self.config.cell_file or task.cell).cameras
-        endings = (topics.COLOR_IMAGE, topics.COLOR_INFO, topics.DEPTH_IMAGE, topics.DEPTH_INFO)
-        of_cell = (
-            topics.JOINT_STATES,
-            topics.GRIPPER_STATE,
-            topics.TCP_POSE,
-            topics.PLAN,
-            topics.EVENT,
-        )
-        return (
-            *(topics.cell_topic(cell, ending) for ending in of_cell),
-            *(
-                topics.camera_topic(cell, camera, ending)
-                for camera in cameras
-                for ending in endings
-            ),
-            *(topics.object_topic(topics.TRUTH, key, "pose") for key in task.objects),
-            *(topics.object_topic(topics.TRUTH, key, "nodes") for key in task.soft_objects),
-            TRUTH_PARAMETERS,
-            topics.TF,
-            topics.TF_STATIC,
-            topics.ROBOT_DESCRIPTION,
-        )
 
     def run(self, session: Any, stop: threading.Event, output: Output) -> dict[str, Any]:
         """Record as the configuration says, or until stopped; see ``run_session``."""

@@ -11,7 +11,6 @@ from bridge.episode.cdr.batch import Write, joint_writer, pose_writer
 from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import (
-    EVENT,
     GRIPPER_STATE,
     JOINT_STATES,
     JOINT_TARGETS,
@@ -199,18 +198,6 @@ class UrSource:
     """Name or address of the controller."""
     config: UrConfig
     """What is read, and how it is named."""
-
-    @property
-    def name(self) -> str:
-        """The controller's address."""
-        return f"UR arm at {self.host}"
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """Without those of signals that the controller does not know."""
-        named = (JOINT_STATES, JOINT_TARGETS, TCP_POSE, TCP_WRENCH, GRIPPER_STATE, SPEED_SCALING)
-        of_cell = (cell_topic(self.config.cell, ending) for ending in (*named, EVENT))
-        return (*of_cell, TF, ROBOT_DESCRIPTION)
 
     def run(self, session: WireSession, stop: threading.Event, output: Output) -> dict[str, Any]:
         """Publish until stopped.

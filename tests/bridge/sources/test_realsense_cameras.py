@@ -198,7 +198,6 @@ class Running:
         try:
             source = RealSenseSource(config, list_devices)
             self.result = source.run(joined.client, self.stop, output)
-            assert {topic for topic in self.heard if "/cam/" in topic} <= set(source.topics)
         except Exception as error:  # noqa: BLE001  # told to the test
             self.error = error
 
