@@ -22,6 +22,7 @@ _TOLD = {
     "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
     "export tum --color": "Files stay as recorded; ImageMagick decodes: mogrify -format png *.jpg.",
     "publish folder": "robot-gst import rgbd DIR RUN makes an episode of it.",
+    "task new --like": "Copy the file of the other task, and change its name in it.",
     "publish ur --urdf": "Give the file with --robot.",
     "publish realsense --align": "Depth keeps its own camera, whose pose is published too.",
     "publish episode": (
@@ -29,8 +30,6 @@ _TOLD = {
     ),
     "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
-    "record --failover": "A failing disk ends the recording; begin anew on another disk.",
-    "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
     "record --split-mb --split-s": "Stop and start another episode; mcap merge joins old parts.",
     "record --triggers --preroll-s --preroll-mb|ctl snapshot": (
         "Record all the time; robot-gst ctl stop --discard throws a take away."
@@ -46,35 +45,20 @@ _TOLD = {
         "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them."
     ),
     "rebuild --correct-geometry": "Import again: import rgbd --depth-unit-m, --depth-intrinsics.",
-    "rebuild --features --feature-channels --feature-stride": "Nothing read them; see --clip.",
-    "rebuild --depth-model": "rebuild needs depth images: it finds no depth of its own.",
-    "rebuild --generator --generator-timeout-s": "Shapes are carved from what the cameras saw.",
     "evaluate --live --recorder --connect --goal": (
         "evaluate says how many more trials would likely decide a comparison."
     ),
-    "evaluate --interval|design --interval": "Intervals are Wilson's; results.json has k and n.",
     "evaluate --axes": "Evaluate the rows of each setting as a table of their own.",
-    "evaluate --names": "Spell names alike that are one, and others further apart.",
-    "design --past": "Say what is expected: --rate, --gain.",
-    "design --per-task": "A study asks for its gain over all tasks together.",
     "evaluate --force": "Delete RUN/results/cache; nothing else remembers a file.",
     "evaluate --lpips-alex": "--lpips-vgg makes LPIPS as papers on splatting compute it.",
     "evaluate --against": "Evaluate each run; trials.csv has the same trials in both.",
-    "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
-    "trials --rate-hz --image-scale": "Pictures of a study are those of the cell file, 5 a second.",
-    "share --before-s --after-s": "A clip shows 3 s before the moment of divergence and 2 s after.",
-    "render --rate-hz": "One frame is drawn for each recorded image.",
-    "replay --grasp|gate --grasp": "A grasp holds by friction, as in life.",
     "replay --engines-must-agree|gate --engines-must-agree": (
         "--engine mujoco replays in MuJoCo, after or before pybullet."
     ),
     "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
-    "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",
-    "plan --send-images": "A model gets the marked picture of the start; leave the flag out.",
     "calibrate --pairs": "Record /CELL/cam/ID/target/pose, then robot-gst calibrate RUN --cameras.",
     "calibrate --samples|publish standin --probes": "calibrate RUN --posterior learns of trials.",
-    "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
 }
 GONE = {
     f"{command} --{flag}" if flag else command: text

@@ -255,21 +255,12 @@ class Serial:
         for item in items:
             yield item, do(function, item)
 
-    def map(
-        self, work: Callable[[Item], Result], items: Sequence[Item], *, each_s: float
-    ) -> Iterator[Result]:
-        """See ``ProcessPool``."""
-        return map(work, items)
-
     def __enter__(self) -> "Serial":
         """Nothing was started."""
         return self
 
     def __exit__(self, *_: object) -> None:
         """Nothing to end."""
-
-
-SERIAL = Serial()
 
 
 class ProcessPool:
@@ -403,6 +394,10 @@ class ProcessPool:
             worker.process.kill()
         for worker in list(self.workers):
             self._lose(worker)
+
+
+ALONE = ProcessPool(0)
+"""Maps in this process."""
 
 
 def _do_chunk(work: Callable[[Item], Result], chunk: tuple[int, Sequence[Item]]) -> list[Result]:

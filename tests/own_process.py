@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+PLAYED = ROOT / "tests/played.py"
 PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
 DEADLINE_S = 200.0
 """Below the time after which pytest ends itself, which would leave the process behind."""

@@ -1,6 +1,5 @@
 """Commands about task files: check them, and write one to start from."""
 
-import re
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
@@ -46,31 +45,20 @@ def task_check(*files: str, output: Output = OUTPUT) -> int:
     return 0 if all(item["ok"] for item in found) else 2
 
 
-def task_new(
-    name: str, /, *, like: str = "", folder: Path = Path(), output: Output = OUTPUT
-) -> int:
+def task_new(name: str, /, *, folder: Path = Path(), output: Output = OUTPUT) -> int:
     """Write a complete task file with comments, to start from; never overwrites one.
 
     Example: robot-gst task new cube_onto_block
 
     Args:
         name: Of the task and of its file, NAME.toml: letters, digits, '_' and '-'.
-        like: Start from this task, a name or a file, rather than from a cube and a block.
         folder: Where the file goes; here when not given.
     """
     from bridge.errors import UsageError
-    from bridge.task.find import chosen_task_file
     from bridge.task.task_file import TaskFile
 
     text = resources.files("bridge.task").joinpath("template.toml").read_text()
-    if like:
-        file = chosen_task_file(like)
-        text, before = file.data.decode(), file.task().name
-        text = re.sub(
-            rf'^name *= *(["\']){re.escape(before)}\1', f'name = "{name}"', text, flags=re.MULTILINE
-        )
-    else:
-        text = text.replace("NAME", name)
+    text = text.replace("NAME", name)
     path = folder / f"{name}.toml"
     task = TaskFile(text.encode(), str(path)).task()
     try:

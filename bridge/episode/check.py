@@ -5,12 +5,13 @@ that are not what they promise. ``health`` names what is wrong with a whole
 file (``exit_code`` 3). Files of other programs are held to the format only.
 """
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bridge.episode import schema
-from bridge.episode.check_file import Faults, FileCheck
+from bridge.episode.check_file import Faults, checked_messages
 from bridge.episode.check_topics import Decoder, TopicCheck, TopicWatch
 from bridge.episode.contract import (
     RECORD_NAME,
@@ -24,6 +25,7 @@ from bridge.episode.contract import (
     unseen_losses,
 )
 from bridge.episode.health import HealthFinding, drops_logged, in_order, in_words, unreadable
+from bridge.episode.mcap.data_walk import ScannedMessage
 from bridge.episode.metadata import BY_DISK
 from bridge.episode.reader import Episode
 from bridge.episode.topics import type_of_topic
@@ -94,7 +96,7 @@ def check_episode(path: Path, *, contract: Contract | None = None) -> CheckRepor
     watch = _Watch()
     episode = _open(path, faults, watch)
     if episode is not None:
-        watch.read(FileCheck(path, faults))
+        watch.read(checked_messages(path, faults))
         _find_ends(report, episode)
         _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
@@ -116,7 +118,7 @@ def _open(path: Path, faults: Faults, watch: "_Watch") -> Episode | None:
         said = str(error)
     faults.add(said)
     found = Faults()
-    watch.read(FileCheck(path, found))
+    watch.read(checked_messages(path, found))
     for text in found.listed:
         if text.rpartition("damaged: ")[2] not in said:
             faults.add(text)
@@ -129,16 +131,14 @@ class _Watch:
     def __init__(self) -> None:
         self.decoder = Decoder()
         self.topics: dict[str, TopicWatch] = {}
-        self.is_ours = False
 
-    def read(self, file: FileCheck) -> None:
-        """Walk through one file."""
-        for message in file.messages():
+    def read(self, messages: Iterable[ScannedMessage]) -> None:
+        """Take the messages of one file."""
+        for message in messages:
             topic = message.channel.topic
             if topic not in self.topics:
                 self.topics[topic] = TopicWatch(topic=topic)
             self.topics[topic].see(message, self.decoder)
-        self.is_ours = self.is_ours or file.library.startswith(LIBRARY)
 
 
 def _find_ends(report: CheckReport, episode: Episode) -> None:
@@ -177,7 +177,8 @@ def _judge_topics(
 ) -> None:
     decoder = watch.decoder
     records = {} if episode is None else episode.metadata_records
-    ours = watch.is_ours and records.get("episode", {}).get("kind") != "imported"
+    is_ours = episode is not None and episode.file.header.library.startswith(LIBRARY)
+    ours = is_ours and records.get("episode", {}).get("kind") != "imported"
     is_recording = "recorder" in records
     say = faults.add if ours else report.notes.append
     report.notes += sorted(decoder.missing)

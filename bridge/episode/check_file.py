@@ -4,6 +4,7 @@ Summary and index are not believed; they are compared with what a walk finds.
 """
 
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mcap import records
@@ -95,13 +96,12 @@ def _index_faults(what: str, said: list, found: list, key: str) -> Iterator[str]
 LISTED = 20
 
 
+@dataclass
 class Faults:
-    """The first faults of each kind of place; a damaged file could have millions."""
+    """The first faults of a file; a damaged one could have millions."""
 
-    def __init__(self) -> None:
-        """Begin with none."""
-        self.listed: list[str] = []
-        self.count = 0
+    listed: list[str] = field(default_factory=list)
+    count: int = 0
 
     def add(self, text: str) -> None:
         """Take one more."""
@@ -110,28 +110,20 @@ class Faults:
             self.listed.append(text)
 
 
-class FileCheck:
-    """The walk through one file. Use ``messages`` to the end, then read ``faults``."""
+def checked_messages(path: Path, faults: Faults) -> Iterator[ScannedMessage]:
+    """Yield every message that can be read, in file order; damage is listed, not raised."""
 
-    def __init__(self, path: Path, faults: Faults) -> None:
-        """Faults are added to those given."""
-        self.path = path
-        self.faults = faults
-        self.library = ""
+    def fault(text: str) -> None:
+        faults.add(f"{path.name}: {text}")
 
-    def _fault(self, text: str) -> None:
-        self.faults.add(f"{self.path.name}: {text}")
-
-    def messages(self) -> Iterator[ScannedMessage]:
-        """Yield every message that can be read, in file order; damage is listed, not raised."""
-        try:
-            with self.path.open("rb") as stream:
-                self.library = read_header(stream).library
-                footer, footer_at = read_footer(stream)
-                file = RecordFile(stream, footer.summary_start or footer_at)
-                data = DataWalk(file, fault=self._fault, doubt=self._fault)
-                yield from data.messages()
-                for text in summary_faults(data.seen, read_summary(stream, footer, footer_at)):
-                    self._fault(text)
-        except DAMAGE as error:
-            self._fault(f"damaged: {error}" if str(error) else f"damaged ({type(error).__name__})")
+    try:
+        with path.open("rb") as stream:
+            read_header(stream)
+            footer, footer_at = read_footer(stream)
+            file = RecordFile(stream, footer.summary_start or footer_at)
+            data = DataWalk(file, fault=fault, doubt=fault)
+            yield from data.messages()
+            for text in summary_faults(data.seen, read_summary(stream, footer, footer_at)):
+                fault(text)
+    except DAMAGE as error:
+        fault(f"damaged: {error}" if str(error) else f"damaged ({type(error).__name__})")

@@ -4,7 +4,8 @@ A learned policy, a person at a teach pendant and an imported log publish no pla
 Then everything from the joints' first motion to their last is one execution, of ``NO_PLAN``.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -94,7 +95,11 @@ def with_execution(episode: Episode, events: Iterable[Mapping[str, Any]]) -> lis
         return found
     if not is_without_plan(episode):
         return found
-    moved = motion_ns(*_tracks(episode))
+    tracks = []
+    for ending in (JOINT_STATES, GRIPPER_STATE):
+        with suppress(GstError):  # not recorded, or damaged: whoever needs it says so
+            tracks.append(streams.joint_track(episode, ending))
+    moved = motion_ns(*tracks)
     if moved is None:
         return found
     return found + [
@@ -116,13 +121,3 @@ def is_without_plan(episode: Episode) -> bool:
         return False
     topics = episode.topics()
     return not any(topics[name].count for name in episode.topics_of_type(schema.PLAN))
-
-
-def _tracks(episode: Episode) -> Sequence[JointTrack]:
-    found = []
-    for ending in (JOINT_STATES, GRIPPER_STATE):
-        try:
-            found.append(streams.joint_track(episode, ending))
-        except GstError:  # not recorded, or damaged: whoever needs it says so
-            continue
-    return found

@@ -50,7 +50,7 @@ class Channels:
     def __init__(self, summary: FileSummary) -> None:
         """Begin without channels."""
         self._summary = summary
-        self._schemas: dict[tuple[str, str, bytes], tuple[int, bytes]] = {}
+        self._schemas: dict[schema.Schema, tuple[int, bytes]] = {}
         self._channels: dict[tuple[str, schema.Schema | None, str, About], Channel] = {}
 
     def find(
@@ -71,14 +71,13 @@ class Channels:
         return channel
 
     def _schema(self, record: schema.Schema) -> tuple[int, bytes]:
-        key = (record.name, record.schema_encoding, record.data)
-        if key not in self._schemas:
+        if record not in self._schemas:
             schema_id = len(self._schemas) + 1
             entry = records.Schema(schema_id, record.data, record.schema_encoding, record.name)
             encoded = mcap_format.encoded(entry)
-            self._schemas[key] = (schema_id, encoded)
+            self._schemas[record] = (schema_id, encoded)
             self._summary.schemas[schema_id] = entry
-        return self._schemas[key]
+        return self._schemas[record]
 
 
 # A reader of one small topic must not unpack images, and bytes that are packed already (JPEG,

@@ -27,15 +27,9 @@ class PoseTrajectory:
             return PoseTrajectory(stamps_ns, self.p_m[index], self.q_wxyz[index])
         before, fraction = self._between(stamps_ns)
         q = se3.interpolate_quaternion(self.q_wxyz[before], self.q_wxyz[before + 1], fraction)
-        return PoseTrajectory(stamps_ns, self._positions(before, fraction), q)
-
-    def positions_at(
-        self, stamps_ns: Int[np.ndarray, " num_queries"]
-    ) -> Float[np.ndarray, "num_queries 3"]:
-        """Return the positions of ``at``, to the bit, without turning anything."""
-        if len(self) == 1:
-            return self.p_m[np.zeros(len(stamps_ns), dtype=np.int64)]
-        return self._positions(*self._between(stamps_ns))
+        first = self.p_m[before]
+        p_m = first + fraction[:, None] * (self.p_m[before + 1] - first)
+        return PoseTrajectory(stamps_ns, np.asarray(p_m), q)
 
     def _between(
         self, stamps_ns: Int[np.ndarray, " num_queries"]
@@ -46,14 +40,6 @@ class PoseTrajectory:
         span = (self.stamps_ns[after] - self.stamps_ns[before]).astype(np.float64)
         offset = (stamps_ns - self.stamps_ns[before]).astype(np.float64)
         return before, np.clip(offset / np.maximum(span, 1.0), 0.0, 1.0)
-
-    def _positions(
-        self,
-        before: Int[np.ndarray, " num_queries"],
-        fraction: Float[np.ndarray, " num_queries"],
-    ) -> Float[np.ndarray, "num_queries 3"]:
-        first = self.p_m[before]
-        return np.asarray(first + fraction[:, None] * (self.p_m[before + 1] - first))
 
     def shifted(self, shift_ns: int) -> "PoseTrajectory":
         """Return the same poses so much later."""

@@ -46,8 +46,8 @@ NUM_JOINTS = range(5, 8)
 class Finger:
     """A joint that opens the gripper, and how its value follows from the width.
 
-    Of the three laws one holds: the line ``closed + per_m * width``; with ``link_m`` the lever
-    ``width = offset_m + link_m * sin(value - zero_rad)``; or the lines between rows of ``table``.
+    One of two laws holds: the line ``closed + per_m * width``, or with ``link_m`` the lever
+    ``width = offset_m + link_m * sin(value - zero_rad)``.
     """
 
     joint: str
@@ -63,14 +63,9 @@ class Finger:
     offset_m: float = 0.0
     """Width at which the lever is parallel to the closing pads' face [m]."""
     zero_rad: float = 0.0
-    table: tuple[tuple[float, float], ...] = ()
-    """Rows of width [m] and value [m or rad], widths rising."""
 
     def value(self, width_m: Width) -> Width:
         """Where the joint is at a distance between the pads, or at several [m or rad]."""
-        if self.table:
-            widths, values = zip(*self.table, strict=True)
-            return typing.cast(Width, np.interp(width_m, widths, values))
         if self.link_m:
             sine = np.clip((width_m - self.offset_m) / self.link_m, -1.0, 1.0)
             return typing.cast(Width, self.zero_rad + np.arcsin(sine))
@@ -78,10 +73,6 @@ class Finger:
 
     def width(self, value: Width) -> Width:
         """The distance between the pads at a value of the joint, or at several [m]."""
-        if self.table:
-            rows = sorted((value, width) for width, value in self.table)
-            values, widths = zip(*rows, strict=True)
-            return typing.cast(Width, np.interp(value, values, widths))
         if self.link_m:
             sine = np.sin(value - self.zero_rad)
             return typing.cast(Width, self.offset_m + self.link_m * sine)
@@ -89,11 +80,6 @@ class Finger:
 
     def slope(self, width_m: float) -> float:
         """Change of the value with the width, there [m/m or rad/m]."""
-        if self.table:
-            widths, values = (np.array(column) for column in zip(*self.table, strict=True))
-            row = int(np.clip(np.searchsorted(widths, width_m, "right"), 1, len(widths) - 1))
-            rise = values[row] - values[row - 1]
-            return float(rise / (widths[row] - widths[row - 1]))
         if self.link_m:
             return 1.0 / (self.link_m * math.cos(float(self.value(width_m)) - self.zero_rad))
         return self.per_m
@@ -424,15 +410,7 @@ def _check_numbers(robot: Robot) -> None:
 
 
 def _check_finger(finger: Finger, max_width_m: float) -> None:
-    if finger.table:
-        widths, values = zip(*finger.table, strict=True)
-        steps = np.sign(np.diff(values))
-        if len(widths) < 2 or np.any(np.diff(widths) <= 0) or abs(steps.sum()) != len(steps):
-            raise ValueError(
-                f"the table of {finger.joint} needs rows of [width, value], widths rising and "
-                "values all rising or all falling"
-            )
-    elif finger.link_m:
+    if finger.link_m:
         if not finger.turns:
             raise ValueError(f"link_m of {finger.joint} is the lever of a joint that turns = true")
         ends = np.array([-finger.offset_m, max_width_m - finger.offset_m]) / finger.link_m

@@ -87,7 +87,7 @@ def compare_tracks(mine: Tracks, other: Tracks) -> MotionErrors:
         raise _no_tool()
     errors = pose_errors(mine.tool, other.tool)
     lag_s, path_m = None, errors.position_m
-    same_m = mine.tool.positions_at(errors.stamps_ns)
+    same_m = mine.tool.at(errors.stamps_ns).p_m
     try:
         lag_s = find_lag_s(errors.stamps_ns, same_m, other.tool)
         later = other.tool.shifted(round(lag_s * NS_PER_S))

@@ -15,7 +15,7 @@ from typing import Any
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.process_pool import SERIAL, ProcessPool, Serial, cores
+from bridge.process_pool import ALONE, ProcessPool, cores
 from bridge.task.find import MissingTaskError, find_task_file
 from bridge.task.task_file import Task
 from bridge.terminal import Output
@@ -112,7 +112,7 @@ def sum_up(
     trials: Sequence[Trial],
     cache: SummaryCache,
     output: Output,
-    pool: ProcessPool | Serial = SERIAL,
+    pool: ProcessPool = ALONE,
 ) -> Summaries:
     """Summarise motions and final states of every trial with a plan sent."""
     found: dict[type[Any], list[Any]] = {part.kind: [] for part in PARTS}

@@ -117,7 +117,7 @@ def position_errors(
 ) -> Float[np.ndarray, " num_common"]:
     """Return the distances [m] of ``pose_errors``, to the bit, where no angle is asked for."""
     common = _common(stamps_ns, replayed.stamps_ns)
-    other_m = replayed.positions_at(stamps_ns[common])
+    other_m = replayed.at(stamps_ns[common]).p_m
     return np.asarray(np.linalg.norm(p_recorded_m[common] - other_m, axis=1))
 
 

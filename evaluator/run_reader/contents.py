@@ -19,7 +19,7 @@ from bridge.episode.catalogue_query import LABEL_SUFFIX, stamp_of
 from bridge.episode.provenance import hash_file
 from bridge.episode.run_folder import RunFolder, file_names
 from bridge.errors import GstError
-from bridge.process_pool import SERIAL, ProcessPool, Serial
+from bridge.process_pool import ALONE, ProcessPool
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.result import Exclusion
@@ -62,7 +62,7 @@ class RunContents:
 
 
 def read_contents(
-    run: RunFolder, cache: SummaryCache, output: Output, pool: ProcessPool | Serial = SERIAL
+    run: RunFolder, cache: SummaryCache, output: Output, pool: ProcessPool = ALONE
 ) -> RunContents:
     """Read what is new or has changed in a run; a broken file is left out and named."""
     recorded, derived, left_out = _take_inventory(run, cache, output)

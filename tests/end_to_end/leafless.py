@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from loopback import free_endpoint
-from own_process import PACKAGES, ROOT, imports_from
+from own_process import PACKAGES, PLAYED, ROOT, imports_from
 from tracked_files import tracked
 
 from bridge.leaves import LEAVES
@@ -109,8 +109,8 @@ def record_again(env: dict[str, str], run: Path, into: Path) -> int:
             status = [*start, "ctl", "status", "--connect", at, "--quiet"]
             if subprocess.run(status, env=env, capture_output=True, check=False).returncode == 0:
                 break
-        play = [*start, "publish", "episode", str(run / "episodes" / "trial_0001.mcap")]
-        play += ["--rate", "20", "--episode", "again", "--connect", at, "--quiet"]
+        trial = str(run / "episodes" / "trial_0001.mcap")
+        play = [sys.executable, str(PLAYED), trial, at, "again", "20"]
         subprocess.run(play, env=env, capture_output=True, check=True, timeout=120)
     finally:
         recorder.terminate()

@@ -60,14 +60,10 @@ class McapFile:
             if summary is None or not _is_complete(summary):
                 summary = rebuild_summary(stream, self.data_end)
             self.summary = summary
-            self.metadata = list(self._read_metadata(stream))
-
-    def _read_metadata(self, stream: ByteStream) -> Iterator[records.Metadata]:
-        for entry in self.summary.metadata_indexes:
-            place = self.indexed(stream, entry.offset, mcap_format.METADATA)
-            record = parse(place.opcode, read_body(stream, place))
-            if isinstance(record, records.Metadata):
-                yield record
+            self.metadata: list[records.Metadata] = []
+            for entry in summary.metadata_indexes:
+                place = self.indexed(stream, entry.offset, mcap_format.METADATA)
+                self.metadata.append(parse(place.opcode, read_body(stream, place)))  # type: ignore[arg-type]
 
     def indexed(self, stream: ByteStream, offset: int, opcode: int) -> RecordSpan:
         """Return the place of the record an index points at."""

@@ -134,17 +134,6 @@ def test_one_pose_answers_every_stamp() -> None:
     np.testing.assert_allclose(single.at(np.array([0, 10])).p_m, track.p_m[[0, 0]])
 
 
-@pytest.mark.parametrize("count", [1, 2, 40])
-def test_positions_alone_are_those_with_rotations_to_the_bit(count: int) -> None:
-    rng = np.random.default_rng(count)
-    stamps_ns = np.cumsum(rng.integers(1, 9_000_000, count))
-    poses = PoseTrajectory(
-        stamps_ns, rng.normal(size=(count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
-    )
-    asked = np.concatenate([stamps_ns, rng.integers(-9_000_000, 400_000_000, 100)])
-    assert poses.positions_at(asked).tobytes() == poses.at(asked).p_m.tobytes()
-
-
 CAMERA = Camera(width=64, height=48, fx=60.0, fy=58.0, cx=31.0, cy=25.0)
 
 

@@ -57,10 +57,6 @@ def read(folder: Path, text: str, urdf: str = URDF) -> Robot:
             ARM + GRIPPER + "fingers = [{ joint = 'a', turns = true, link_m = 0.05 }]\n",
             "link_m of a is too short",
         ),
-        (
-            ARM + GRIPPER + "fingers = [{ joint = 'a', table = [[0.0, 0.1], [0.1, 0.1]] }]\n",
-            "the table of a needs rows",
-        ),
         (ARM + GRIPPER + "fingers = [{ jiont = 'a' }]\n", "did you mean 'joint'"),
         (ARM + GRIPPER + "fingers = [{ turns = true }]\n", "missing required field .joint"),
     ],
@@ -131,7 +127,6 @@ def test_a_tool_that_hangs_on_nothing_is_refused_with_the_links_there_are(tmp_pa
         Finger(joint="a"),
         Finger(joint="a", turns=True, closed=0.8, per_m=-8.0),
         Finger(joint="a", turns=True, link_m=-0.12, offset_m=0.01, zero_rad=0.2),
-        Finger(joint="a", turns=True, table=((0.0, 0.7), (0.03, 0.4), (0.1, -0.3))),
     ],
 )
 def test_the_width_gives_the_joint_and_the_joint_the_width(finger: Finger) -> None:
@@ -141,9 +136,8 @@ def test_the_width_gives_the_joint_and_the_joint_the_width(finger: Finger) -> No
     for width, value in zip(widths, values, strict=True):
         assert finger.value(float(width)) == pytest.approx(value, abs=1e-12)
         step = 1e-7
-        if all(abs(width - row[0]) > 2 * step for row in finger.table):
-            rise = (finger.value(width + step) - finger.value(width - step)) / (2 * step)
-            assert finger.slope(float(width)) == pytest.approx(rise, rel=1e-5)
+        rise = (finger.value(width + step) - finger.value(width - step)) / (2 * step)
+        assert finger.slope(float(width)) == pytest.approx(rise, rel=1e-5)
 
 
 def test_a_lever_is_two_mirrored_jaws_or_one() -> None:

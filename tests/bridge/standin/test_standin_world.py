@@ -14,7 +14,8 @@ import standin_plans
 from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import Outcome
 from bridge.errors import UsageError
-from bridge.sources.standin.cell import FORCE_N, StandinCell
+from bridge.robots.default import ROBOT
+from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.kinematics import tool_down
 from bridge.sources.standin.operator import execute_plan, label_trial
@@ -105,7 +106,7 @@ def test_the_arm_bears_what_it_carries_and_no_grasp_comes_near_its_limit(
     ratio = (force_N / (mass_kg * np.linalg.norm(faster, axis=1)))[place_m[:, 2] > 0.2]
     assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
     assert np.median(np.abs(ratio - 1.0)) < 0.05
-    assert 0 < force_N.max() < FORCE_N / 4
+    assert 0 < force_N.max() < ROBOT.contact_force_N / 4
     assert cell.stopped == ""
 
 
@@ -119,7 +120,7 @@ def test_a_press_beyond_the_robots_limit_stops_the_arm_and_fails_the_trial(
     cell.follow(np.array([0, 2_000_000_000, 4_000_000_000]), np.stack(way))
     (event,) = cell.streams._session.events()  # type: ignore[attr-defined]
     assert (event["type"], event["data"]["cause"]) == ("mark", "contact_force")
-    assert FORCE_N < event["data"]["force_N"] < 2 * FORCE_N
+    assert ROBOT.contact_force_N < event["data"]["force_N"] < 2 * ROBOT.contact_force_N
     words = r"contact_force: the arm is pressed with \d+ N, the limit is 150 N"
     assert re.fullmatch(words, cell.stopped)
     held, stopped_ns = cell.target_rad, cell.now_ns
@@ -138,7 +139,10 @@ def test_a_press_beyond_the_robots_limit_stops_the_arm_and_fails_the_trial(
 def test_a_blow_shorter_than_40_ms_stops_nothing(
     cell: StandinCell, ticks: int, stops: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hard, steps = np.array([0.0, 0.6, 0.8]) * (FORCE_N + 1), ticks * cell._steps_per_tick
+    hard, steps = (
+        np.array([0.0, 0.6, 0.8]) * (ROBOT.contact_force_N + 1),
+        ticks * cell._steps_per_tick,
+    )
     forces = iter([hard] * steps + [0 * hard] * 4 + [hard] * steps + [0 * hard] * 99)
     monkeypatch.setattr(cell.world, "arm_force_N", lambda: next(forces))
     cell.wait(0.1)

@@ -171,16 +171,6 @@ def test_a_new_file_is_right_and_is_never_overwritten(capsys: pytest.CaptureFixt
     assert "1. grasp: grasps cube; may touch: cube and table, gripper and cube" in said
 
 
-@pytest.mark.parametrize("name", [path.stem for path in SHIPPED])
-def test_a_copy_differs_from_its_model_in_the_name_only(name: str) -> None:
-    assert tasks.task_new("mine", like=name) == 0
-    model = (datasets_folder() / "tasks" / f"{name}.toml").read_text()
-    copy = Path("mine.toml").read_text()
-    assert copy == model.replace(f'name = "{name}"', 'name = "mine"')
-    assert tasks.task_new("again", like="mine.toml") == 0
-    assert load_task("again.toml").objects == load_task(name).objects
-
-
 @pytest.mark.parametrize("name", ["../evil", "a b", "", "x" * 81])
 def test_a_name_that_is_no_file_name_is_refused(name: str) -> None:
     assert robot_gst.run(["task", "new", name]) == 2

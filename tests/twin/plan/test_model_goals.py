@@ -398,7 +398,7 @@ def test_instructions_in_labels_are_data_and_do_nothing(
     ("options", "said"),
     [
         (["--model", "http://127.0.0.1:9/v1"], "--model-name"),
-        (["--policy", "model"], "plan --policy is gone"),
+        (["--policy", "model"], "Unknown option: --policy"),
         (["--model", "nowhere", "--model-name", "m"], "must begin with http"),
     ],
 )

@@ -35,7 +35,7 @@ REFINEMENTS = 8
 """Halvings of the step around the best."""
 GAPS = (1, 2, 4, 8, 16, 32)
 """Pairs are this many frames apart: far ones say most of scale, near ones of time."""
-MAX_PAIRS = 24
+MAX_PAIRS = 48
 MAX_COLUMNS = 48
 SIGMA = 0.01
 """Depths that differ by this share of the distance count exp(-1/2)."""
@@ -43,7 +43,7 @@ LEAST_OVERLAP = 0.15
 """Of what one image measured, on measurements of the other; readings with less do not count."""
 ENOUGH = 0.9
 """With this agreement nothing is looked for."""
-LEAST_GAIN = 0.02
+LEAST_GAIN = 0.01
 """A number is wrong when this much more of the depth agrees with another."""
 LEAST_AGREEMENT = 0.35
 """With less agreement even at the best, one number does not explain it."""

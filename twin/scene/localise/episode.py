@@ -166,13 +166,7 @@ def write_localised(
     with EpisodeWriter(path) as writer:
         writer.describe(episode.info, derived=derived)
         for stamp_ns, record in records:
-            writer.write(
-                topic,
-                record,
-                type_name=schema.LOCALISATION,
-                log_time_ns=stamp_ns,
-                publish_time_ns=stamp_ns,
-            )
+            writer.write(topic, record, type_name=schema.LOCALISATION, log_time_ns=stamp_ns)
     return path
 
 

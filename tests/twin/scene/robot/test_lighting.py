@@ -8,6 +8,8 @@ from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.fit.lighting import EVEN, Lighting, fit_lighting, read_lighting
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import as_float32
+from twin.scene.movable_scene import MovableScene
+from twin.scene.objects.decompose import ObjectSplats
 from twin.scene.robot.extraction import SeenLink, link_lighting, on_surface, own_colors
 
 HALF_M = np.array([0.05, 0.04, 0.12])
@@ -88,3 +90,18 @@ def test_one_posture_says_nothing_of_light(count: int) -> None:
     directions = Rotation.random(100, random_state=3).apply([0.0, 0.0, 1.0])
     np.testing.assert_allclose(found.brightness(directions), 1.0, atol=0.02)
     assert fit_lighting([]) == EVEN
+
+
+def test_an_object_that_lies_turned_is_lit_as_it_lies() -> None:
+    normals, paint = (
+        Rotation.random(60, random_state=1).as_matrix()[:, :, 0],
+        np.tile(PAINT, (10, 1)),
+    )
+    seen_as = paint * TRUE.brightness(normals)[:, None]
+    cloud = flat_gaussians(HALF_M * normals, normals, seen_as, np.full(60, 0.01))
+    toy = ObjectSplats(cloud=cloud, T_base_object=np.eye(4))
+    scene = MovableScene(background=cloud, objects={"toy": toy}, links={}, lighting=TRUE)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([2.0, 0.5, 0.1]).as_matrix()
+    lit = paint * TRUE.brightness(normals @ T[:3, :3].T)[:, None]
+    np.testing.assert_allclose(scene.object_at("toy", {"toy": T}).colors, lit, atol=1e-4)
