@@ -111,7 +111,7 @@ def test_a_topic_is_recorded_so_that_others_can_decode_it(cell: Cell, form: str)
     store.register(get_types_from_msg(schema.data.decode(), schema.name))
     texts = [store.deserialize_cdr(each.data, schema.name).data for _, _, each in found]
     assert texts == [f"hello {number}" for number in range(20)]
-    if form != "0":
+    if form == "33":  # what Jazzy sent at first (77) is kept by its arrival
         assert [each.sequence for _, _, each in found] == list(range(20))
         assert [each.publish_time for _, _, each in found] == [1_000 + n for n in range(20)]
     robot.leave()

@@ -261,9 +261,9 @@ def test_a_camera_that_moves_asks_for_target_poses(
         ((), "say what to calibrate"),
         (("--physics", "--cameras"), "say what to calibrate"),
         (("--physics", "--workers", "0"), "--workers 0"),
-        (("--cameras", "--pairs", "x.json"), "Record /CELL/cam/ID/target/pose"),
+        (("--cameras", "--pairs", "x.json"), "Unknown option: --pairs"),
         (("--cameras", "--camera", "front"), "camera front has neither"),
-        (("--physics", "--evaluations", "9"), "trials teach through --posterior"),
+        (("--physics", "--evaluations", "9"), "Unknown option: --evaluations"),
     ],
 )
 def test_wrong_use_is_exit_code_two(

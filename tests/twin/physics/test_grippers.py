@@ -74,15 +74,7 @@ def test_the_grip_force_does_not_depend_on_how_the_fingers_are_driven() -> None:
     wanted = PhysicsConfig().grip_force_N
     pair = tuple(Finger(joint=f"panda_finger_joint{k}") for k in (1, 2))
     both = replace(PANDA, name="mine", gripper=replace(PANDA.gripper, fingers=pair))
-    table = replace(
-        PANDA,
-        name="mine",
-        gripper=replace(
-            PANDA.gripper,
-            fingers=(Finger(joint="panda_finger_joint1", table=((0.0, 0.0), (0.08, 0.04))),),
-        ),
-    )
-    for robot in (PANDA, both, table):
+    for robot in (PANDA, both):
         assert squeezed_N(robot) == pytest.approx(wanted, rel=0.15)
 
 
