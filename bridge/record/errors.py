@@ -37,7 +37,7 @@ class MissingTopicsError(LifecycleError):
 _WORDS = {
     errno.EIO: "the disk, or the connection to it, is failing",
     errno.EROFS: "the system has stopped writing to this disk, often after an error of it",
-    errno.ENOENT: "the file or its folder was removed while it was written",
+    errno.ENOENT: "somebody changed the file or its folder",
     errno.ESTALE: "the folder on the network was removed or replaced",
 }
 

@@ -46,8 +46,10 @@ class PartFile:
         """Write one record or several, all or nothing.
 
         Raises:
-            OSError: When the disk refused; the file ends where it ended before.
+            OSError: When the disk refused, or somebody cut the file; it ends where it ended before.
         """
+        if os.fstat(self._descriptor).st_size < self.offset:
+            raise OSError(errno.ENOENT, f"{self.path} was cut while it was written")
         offset = self.offset
         try:
             for first in range(0, len(buffers), MAX_PIECES):

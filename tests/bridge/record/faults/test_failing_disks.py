@@ -98,7 +98,7 @@ def test_a_slow_disk_drops_no_joints(cell: FaultCell) -> None:
     assert check_code(cell.path("t1")) == 0
 
 
-@pytest.mark.parametrize("what", ["file", "folder", "replaced"])
+@pytest.mark.parametrize("what", ["file", "folder", "replaced", "cut"])
 def test_a_file_that_is_removed_while_it_is_written_ends_the_recorder(
     cell: FaultCell, what: str
 ) -> None:
@@ -109,12 +109,15 @@ def test_a_file_that_is_removed_while_it_is_written_ends_the_recorder(
     part = cell.path("t1").with_suffix(".mcap.part")
     if what == "folder":
         shutil.rmtree(cell.run)
+    elif what == "cut":
+        os.truncate(part, part.stat().st_size // 2)
     else:
         part.unlink()
     if what == "replaced":
         part.write_bytes(b"not ours")
     assert recorder.process.wait(timeout=WAIT_S) == 1
-    assert "t1.mcap.part was removed or replaced while it was written" in recorder.said()
+    done = "cut" if what == "cut" else "removed or replaced"
+    assert f"t1.mcap.part was {done} while it was written" in recorder.said()
     assert not cell.path("t1").exists()
     assert what != "replaced" or part.read_bytes() == b"not ours"
 
