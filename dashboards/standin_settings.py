@@ -146,7 +146,7 @@ class DemoConfig:
     @property
     def iterations(self) -> int:
         """Images that the scene is fitted to: 15, 40 and 90 s on two idle cores."""
-        return 7000 if self.full else 1000 if self.quick else 2400
+        return 7000 if self.full else 1000 if self.quick else 1800
 
     @property
     def limit(self) -> str:

@@ -141,7 +141,7 @@ class ContentWatch:
                 now.append("nan_joints")
         elif self._is_image:
             key = data[_FRONT :: len(data) // _SAMPLES + 1]
-            is_suspect = self._is_depth and (len(data) < _SMALL or not any(key))
+            is_suspect = self._is_depth and (len(data) < _SMALL or len(set(key)) <= 4)
             if is_suspect and _is_empty(self._type, data):
                 now.append("empty_depth")
             elif key == self._key and data[12:] == self._data[12:]:

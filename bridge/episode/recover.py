@@ -28,7 +28,7 @@ from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChun
 from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
 from bridge.episode.mcap.scan import Chunk, Found, Plain, TopMessage, scan
 from bridge.episode.mcap.walk import chunk_entry
-from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
+from bridge.episode.metadata import KINDS, Derived, EpisodeInfo, Outcome, build, from_strings
 from bridge.episode.recovery_report import RECORD_NAME, RecoveryReport, RecoveryTally, to_metadata
 from bridge.episode.run_folder import PART, SUFFIX, RunFolder
 from bridge.errors import BridgeError, GstError, PathNotFoundError
@@ -228,10 +228,10 @@ def is_readable(name: str, values: dict[str, str]) -> bool:
     if name not in _RECORDS:
         return True
     try:
-        build(_RECORDS[name], from_strings(values))
+        built: object = build(_RECORDS[name], from_strings(values))
     except ValueError:
         return False
-    return True
+    return not isinstance(built, EpisodeInfo) or built.kind in KINDS
 
 
 class CopyTarget:

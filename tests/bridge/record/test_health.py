@@ -21,6 +21,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_jpeg
+from bridge.record.clocks import StampJumps
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
 
@@ -67,6 +68,7 @@ def lens(number: int) -> bytes:
 STILL, FLAT = noise(), noise(1, np.uint16)
 STILL_JPEG = encode_jpeg(STILL)
 EMPTY = np.zeros((48, 64), np.uint16)
+HOLES = np.full((48, 64), np.nan, np.float32)
 GOOD: dict[str, tuple[str, Make]] = {
     COLOR: (schema.IMAGE, lambda n: image(n, noise(), "rgb8")),
     DEPTH: (schema.IMAGE, lambda n: image(n, noise(1, np.uint16)[..., 0], "16UC1")),
@@ -83,6 +85,12 @@ FAULTS: dict[str, tuple[str, str, str, Make]] = {
         DEPTH,
         schema.IMAGE,
         lambda n: image(n, EMPTY if n < 30 else noise(1, np.uint16), "16UC1"),
+    ),
+    "empty of no numbers": (
+        "empty_depth",
+        DEPTH,
+        schema.IMAGE,
+        lambda n: image(n, HOLES if n < 30 else noise(1, np.uint16).astype(np.float32), "32FC1"),
     ),
     "empty rvl": (
         "empty_depth",
@@ -203,6 +211,23 @@ def test_a_fault_of_a_moment_is_none_and_one_that_comes_back_is_one(tmp_path: Pa
     (found,) = check_episode(tmp_path / "a.mcap").findings
     assert (found.name, found.count) == ("frozen_image", 29 + 39)
     assert (found.first_ns, found.last_ns) == (41 * 10**8, 119 * 10**8)
+
+
+@pytest.mark.parametrize(
+    ("received", "back_ms", "is_told"), [(1, 58, False), (1, 3_600_000, True), (30, 58, True)]
+)
+def test_a_slow_topic_is_late_by_chance_and_no_clock_was_set(
+    received: int, back_ms: int, is_told: bool
+) -> None:
+    jumps = StampJumps()
+    delays_ms = (70 + back_ms, 72 + back_ms, 14, 12)
+    told = [
+        jumps.look(
+            [{"topic": "/tf", "second": k, "received": received, "clock_offset_ns": ms * 1_000_000}]
+        )
+        for k, ms in enumerate(delays_ms)
+    ]
+    assert any(told) == is_told
 
 
 @pytest.mark.parametrize(("blind_s", "found"), [(2.5, []), (4.0, ["empty_depth"])])
