@@ -9,6 +9,7 @@ import pytest
 from fault_account import lost, metadata, read
 from live_recorder import LiveRecorder, open_recorder
 from loopback import free_endpoint
+from patience import wait_until
 
 from bridge.episode.check import check_episode
 from bridge.record import clocks as record_clocks
@@ -56,6 +57,7 @@ def test_what_is_lost_before_a_stop_is_counted(live: tuple[LiveRecorder, WireCon
     with open_session(wire) as source:
         announce(source, "lab", has_clock=False)
         publisher = publish(source)
+        wait_until(lambda: recorder.status()["messages"] > 0, "the source")  # who is heard is asked
         assert stopped(recorder, sent=57, tails=[]) == 7
         recorder.start("t2", cell="lab")
         publisher.put(b"x", source_ns=1)  # it goes on, and nothing is counted twice
