@@ -146,7 +146,7 @@ def _sides(file: RerunFile, recording: Recording, run: RunFolder | None) -> Iter
             yield _replay_side(replay, trajectory, clock.stamp_ns(float(moved[0])) - first)
     if len(replays) > len(shown):
         count = len(replays) - len(shown)
-        file.note(f"not shown: {count} replays of other plans, or made again since")
+        file.note(f"not shown: {count} more of the same plans, kinematic or older, or of others")
 
 
 def _replay_side(replay: Recording, trajectory: str | None, shift_ns: int) -> Side:
