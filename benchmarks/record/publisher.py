@@ -126,7 +126,10 @@ def main() -> None:
         columns[f"put_ns:{topic}"] = np.array(sender.put_ns, dtype=np.int64)
         columns[f"skipped:{topic}"] = np.array(sender.skipped)
     np.savez(options.account, **columns)
-    summary = {"cpu_s": time.process_time()}
+    summary = {
+        "cpu_s": time.process_time(),
+        "not_shared": sum(sender.publisher.not_shared for sender in senders),
+    }
     sys.stdout.write(json.dumps(summary) + "\n")
 
 

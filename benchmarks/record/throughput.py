@@ -25,6 +25,8 @@ class Recording:
     """Of the recorder, from the first message to the finished file [s]."""
     seconds: float
     publisher_cpu_s: float
+    not_shared: int
+    """Messages that found the shared memory full and went over the network."""
     peak_rss_mb: float
     file_mb: float
     load_1min: float
@@ -57,7 +59,7 @@ class Recording:
             counts = {**asdict(verdict), "lost": verdict.lost}
             put_ns = counts.pop("put_ns")
             topics[topic] = {**counts, "put_max_ms": float(put_ns.max(initial=0)) / 1e6}
-        names = ("cpu_s", "seconds", "core", "publisher_cpu_s", "peak_rss_mb")
+        names = ("cpu_s", "seconds", "core", "publisher_cpu_s", "not_shared", "peak_rss_mb")
         names += ("file_mb", "load_1min", "ledger_is_exact")
         return {**{name: getattr(self, name) for name in names}, "topics": topics}
 
@@ -118,6 +120,7 @@ def _meter(
         "cpu_s": recorder.cpu_s() - before_s,
         "seconds": seconds,
         "publisher_cpu_s": summary["cpu_s"],
+        "not_shared": summary["not_shared"],
         "peak_rss_mb": recorder.peak_rss_mb(),
         "load_1min": os.getloadavg()[0],
     }

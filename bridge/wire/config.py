@@ -20,6 +20,6 @@ class WireConfig:
     config: Path | None = None
     """A zenoh configuration file (JSON5) to start from, for example with access control."""
     shared_memory_mb: int = 0
-    """Shared memory for large messages to receivers on this machine [MB]; 0: zenoh's own choice."""
+    """Shared memory for the images this session publishes [MB]; 0 sends them over the network."""
     connect_timeout_s: float = 3.0
     """Give up when no endpoint has answered after this long [s]."""

@@ -20,6 +20,8 @@ class Qos:
     sees a gap in the numbers."""
     priority: str
     """Which of zenoh's queues carries it, by its name there; a full queue delays no other one."""
+    shared_memory: bool = False
+    """Large messages go through shared memory when the session has some."""
     is_remote: bool = False
     """Subscribers of the same session get none, and do not count as somebody who looks."""
 
@@ -39,7 +41,7 @@ class Qos:
     """Pictures for a person; the first to go."""
 
 
-Qos.CAMERA = Qos(name="camera", block=False, priority="data_low")
+Qos.CAMERA = Qos(name="camera", block=False, priority="data_low", shared_memory=True)
 Qos.CONTROL = Qos(name="control", block=False, priority="real_time")
 Qos.RELIABLE = Qos(name="reliable", block=True, priority="data")
 Qos.PREVIEW = Qos(name="preview", block=False, priority="background", is_remote=True)

@@ -34,7 +34,7 @@ from bridge.wire.errors import (
     cause_of,
     public,
 )
-from bridge.wire.publisher import BYTES_PER_MB
+from bridge.wire.publisher import BYTES_PER_MB, SharedPool
 from bridge.wire.publisher import WirePublisher as WirePublisher
 from bridge.wire.qos import Qos
 from bridge.wire.zenoh_config import zenoh, zenoh_config
@@ -192,7 +192,7 @@ class Subscriber:
 class WireSession:
     """A live connection; use as a context manager."""
 
-    def __init__(self, inner: Any, config: WireConfig) -> None:
+    def __init__(self, inner: Any, *, shared_memory_mb: int = 0, config: WireConfig) -> None:
         """Use ``open_session``."""
         self._inner = inner
         self._config = config
@@ -204,6 +204,7 @@ class WireSession:
         self._alive: list[Subscriber] = []
         self._last_words: list[tuple[Any, Callable[[bytes], bytes]]] = []
         self._publishers: list[tuple[str, WirePublisher]] = []
+        self._pool = SharedPool(shared_memory_mb * BYTES_PER_MB) if shared_memory_mb else None
 
     @property
     def identity(self) -> str:
@@ -236,7 +237,7 @@ class WireSession:
             )
         except zenoh.ZError as error:
             raise BadTopicError(topic=topic, found=cause_of(error)) from error
-        made = WirePublisher(inner)
+        made = WirePublisher(inner, self._pool if qos.shared_memory else None)
         self._publishers.append((topic, made))
         return made
 
@@ -275,7 +276,9 @@ class WireSession:
         What it publishes reaches this session through the network, as everybody else's does.
         """
         endpoints = self._config.listen or self._config.connect
-        own = replace(self._config, mode="client", connect=endpoints[:1], listen=())
+        own = replace(
+            self._config, mode="client", connect=endpoints[:1], listen=(), shared_memory_mb=0
+        )
         return open_session(own)
 
     def serve(
@@ -431,4 +434,8 @@ def open_session(config: WireConfig) -> WireSession:
             f"cannot open a zenoh session on {where}: {cause}. "
             "An endpoint looks like tcp/127.0.0.1:7447."
         ) from error
-    return WireSession(inner, config)
+    try:
+        return WireSession(inner, shared_memory_mb=config.shared_memory_mb, config=config)
+    except WireConfigError:
+        inner.close()
+        raise

@@ -18,6 +18,10 @@ recording (``docs/decisions/0005-recorder.md``)."""
 os.environ.setdefault("ZENOH_RUNTIME", NETWORK_THREADS)  # read when the first session opens
 
 import zenoh as zenoh  # noqa: E402
+from zenoh import shm as zenoh_shm  # noqa: E402
+
+__all__ = ["zenoh", "zenoh_shm"]
+
 
 _WRONG_VALUE = re.compile(
     r'msg: "(?P<message>.*)", location: .*?line: (?P<line>\d+)', flags=re.DOTALL
@@ -44,9 +48,6 @@ def zenoh_config(config: WireConfig) -> Any:
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,  # there is nobody to wait for without scouting
     }
-    if config.shared_memory_mb:  # of what zenoh does by itself; a full pool costs a copy
-        pool = "transport/shared_memory/transport_optimization/pool_size"
-        settings[pool] = config.shared_memory_mb * 1_000_000
     made = zenoh.Config() if config.config is None else _config_from_file(config)
     plain = zenoh.Config()
     for key, value in _OURS_WHERE_THE_FILE_IS_SILENT.items():

@@ -63,7 +63,7 @@ class RealSenseConfig:
     """JSON file that says where the colour cameras are: {"NAME": {"parent": FRAME, "p_m": [x, y,
     z], "q_wxyz": [w, x, y, z]}}, the transform T_parent_color."""
     shared_memory_mb: int = 0
-    """Shared memory for images to a recorder on this machine [MB]; 0: zenoh's own 16."""
+    """Shared memory for images to a recorder on this machine [MB]; 0: over the network."""
 
     def __post_init__(self) -> None:
         """Refuse names that cannot be part of a topic, and one camera twice."""

@@ -3,7 +3,6 @@
 import queue
 import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 from patience import wait_until
@@ -11,8 +10,10 @@ from patience import wait_until
 from bridge.episode import schema
 from bridge.errors import GstError, UsageError
 from bridge.wire import errors
+from bridge.wire import publisher as publishing
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import NoPeerError, PortTakenError, WireConfigError
+from bridge.wire.publisher import SharedPool
 from bridge.wire.qos import Qos
 from bridge.wire.session import WireSample, WireSession, open_session
 
@@ -280,15 +281,15 @@ def test_images_travel_through_shared_memory_and_arrive_as_plain_bytes(
     frames = [sample for sample in got if sample.topic == "/cell/image"]
     assert [sample.data for sample in frames] == [bytes([n]) * 300_000 for n in range(20)]
     assert [type(sample.data) for sample in frames] == [bytes] * 20
-    # the memory is made with the first large message, which goes over the network
-    assert sum(shared) >= 19
+    assert sum(shared) == 20
+    assert image.not_shared == 0
 
 
 def test_a_full_pool_falls_back_to_the_network_and_never_waits(
     router: WireSession, endpoint: str
 ) -> None:
     """A receiver that keeps the sender's memory must cost a copy, not the frame, not the loop."""
-    kept: list[Any] = []
+    kept: list[object] = []
     got: list[WireSample] = []
     router._inner.declare_subscriber("cell/image", lambda sample: kept.append(sample.payload))
     router.subscribe("cell/image", got.append)
@@ -298,12 +299,28 @@ def test_a_full_pool_falls_back_to_the_network_and_never_waits(
         for number in range(10):
             image.put(bytes([number]) * 300_000, source_ns=number)
             wait_until(lambda: len(got) == number + 1, "the message")  # noqa: B023
+        assert image.not_shared >= 7  # three of them fill the megabyte
         image.put(b"y" * 2_000_000, source_ns=10)  # larger than the pool
         wait_until(lambda: len(got) == 11, "the large message")
     assert [sample.data[0] for sample in got] == [*range(10), ord("y")]
     assert [sample.sequence for sample in got] == list(range(11))
-    shared = [payload.as_shm() is not None for payload in kept]
-    assert 1 <= sum(shared) <= 3  # three of them fill the megabyte
+
+
+def test_only_cameras_use_the_pool(router: WireSession, endpoint: str) -> None:
+    with open_session(WireConfig(connect=(endpoint,), shared_memory_mb=1)) as session:
+        for qos in PRESETS:
+            made = session.publisher(f"/a/{qos.name}", schema.IMAGE, qos=qos)
+            assert (made._pool is not None) is (qos is Qos.CAMERA)
+
+
+def test_more_shared_memory_than_there_is_is_wrong_use(
+    endpoint: str, router: WireSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(WireConfigError, match=r"100000000 MB of shared memory are not to be had"):
+        open_session(WireConfig(connect=(endpoint,), shared_memory_mb=100_000_000))
+    monkeypatch.setattr(publishing, "_free_bytes", lambda: 1_000_000)
+    with pytest.raises(WireConfigError, match=r"2 MB .* not to be had: /dev/shm has 1 MB left"):
+        SharedPool(2_000_000)
 
 
 def test_who_comes_and_goes_is_seen(router: WireSession, client: WireSession) -> None:
