@@ -161,7 +161,7 @@ class MujocoArm:
 
 
 def _refuse_gripper(record: Robot, urdf: str) -> None:
-    """Refuse (PhysicsError) fingers that turn, follow a lever or a table, or mimic another one."""
+    """Refuse (PhysicsError) fingers that turn, follow a lever, or mimic another one."""
     fingers = record.gripper.fingers
     followers = [item.joint for item in mimics_of(urdf) if item.leader in record.finger_joints]
     others = [item.joint for item in fingers if item.turns or item.link_m]

@@ -72,6 +72,7 @@ class TwinCell:
         )
         spawn(self._world, self.scene, self._soft)
         self._world.reset_robot(start.joints_rad, start.width_m)
+        self._largest_Nm = largest_Nm(self.robot)
         self.target_rad = np.array(start.joints_rad, dtype=np.float64)
         self.target_width_m = float(start.width_m)
         self._controller = Controller(
@@ -142,7 +143,7 @@ class TwinCell:
         told, arm = self._controller, self._world.robot
         if told.is_soft and isinstance(arm, Arm):
             joints_rad = arm.posture()[0]
-            most_Nm = np.minimum(told.strength_Nm(joints_rad), largest_Nm(self.robot))
+            most_Nm = np.minimum(told.strength_Nm(joints_rad), self._largest_Nm)
             arm.soften(most_Nm, carrying_Nm(self.robot, joints_rad))
         arm.command(told.joints_rad.tolist(), told.velocity_rad_s.tolist(), told.width_m)
 
