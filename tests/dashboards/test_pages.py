@@ -21,6 +21,7 @@ from dashboards.moments import Moment
 from dashboards.overview_page import first_numbers
 from dashboards.twin_page import build_twin
 from evaluator.report.front import front
+from evaluator.report.page import breakable
 from evaluator.result import Interval, load_results
 from robot_gst import run as type_here
 
@@ -37,6 +38,19 @@ def test_the_overview_shows_the_numbers_of_results_json(
     assert "PSNR of held-out views, raw" in text
     assert "95 % Wilson" in text
     assert "Stand-in cell" in text
+
+
+def test_numbers_are_found_by_words_of_their_ids_and_definitions(
+    browser: Any, shared_run: RunFolder
+) -> None:
+    known = load_results(shared_run.path).measurements
+    wanted = [m.id for m in known if "psnr" in f"{m.id} {m.definition}".lower()]
+    assert 0 < len(wanted) < len(known)
+    text = browser.get("/numbers", params={"q": "PSNR"}).text
+    shown = [m.id for m in known if f"<code>{breakable(m.id)}</code>" in text]
+    assert shown == wanted
+    assert "<details open>" in text
+    assert "No number is called" in browser.get("/numbers?q=psnr+nonsense").text
 
 
 @pytest.mark.parametrize(
