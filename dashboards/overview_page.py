@@ -3,6 +3,7 @@
 Measurements are chosen by id; nothing is computed.
 """
 
+import re
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -157,7 +158,8 @@ def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
         recorded = [each for name, each in by_id.items() if name.startswith("rate.recorded.")]
         rates = [each for each in recorded if each.value is not None][: len(NUMBERS)]
         for each in rates:
-            parts = [part.replace("_", " ") for part in each.id.split(".")[2:] if part != "-"]
+            told = re.sub(r"\+([0-9a-f]{4})", lambda found: chr(int(found[1], 16)), each.id)
+            parts = [part.replace("_", " ") for part in told.split(".")[2:] if part != "-"]
             yield f"Recorded success, {' · '.join(parts)}", each
     for name, title in NUMBERS.items():
         found = by_id.get(name.replace(SIM_SIDE, side))

@@ -67,6 +67,15 @@ def test_a_correlation_that_may_be_none_is_no_first_number(
     assert titles == ["Success rates, correlation r"] * is_first
 
 
+def test_a_task_is_called_as_its_makers_call_it(copy: RunFolder) -> None:
+    old = next(m for m in judged(copy).measurements if m.id.startswith("rate.recorded."))
+    rate = replace(old, id="rate.recorded.W+00fcrfel_auf_Block.-.act")
+    found: Any = SimpleNamespace(measurements=(rate,))
+    assert [name for name, _ in first_numbers(found)] == [
+        "Recorded success, Würfel auf Block · act"
+    ]
+
+
 def test_the_first_page_begins_with_the_answer_and_the_worst(
     synthetic: ModuleType, copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
