@@ -122,7 +122,7 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         "stop": ({"outcome", "discard"}, stop),
         "mark": ({"text"}, lambda request: recorder.mark(_text(request))),
         "label": ({"text", "outcome", "episode"}, label),
-        "list": ({"last"}, lambda request: recorder.episodes(_whole_number(request, "last"))),
+        "list": (None, lambda request: recorder.episodes(MAX_LISTED)),
         "status": (None, lambda request: recorder.status()),
     }
     return [
@@ -178,15 +178,6 @@ def _only(request: dict[str, Any], verb: str, known: set[str]) -> None:
         raise ControlError(
             f"{verb} does not know {', '.join(unknown)}. It knows: {', '.join(sorted(known))}."
         )
-
-
-def _whole_number(request: dict[str, Any], name: str) -> int:
-    number = request.get(name, MAX_LISTED)
-    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= MAX_LISTED:
-        raise ControlError(
-            f"{name} must be a whole number from 1 to {MAX_LISTED}, got {number!r:.80}."
-        )
-    return number
 
 
 def _text(request: dict[str, Any]) -> str:
