@@ -177,7 +177,7 @@ class Lifecycle:
     def look_at_file(self) -> None:
         """Raise OSError where the open file is gone from its place."""
         if self.take is not None:
-            self.take.refuse_removed()
+            self.take.writer.refuse_removed()
 
     @property
     def may_ask_disk(self) -> bool:
@@ -282,7 +282,7 @@ class Lifecycle:
     ) -> DiskError:
         """End a recording the disk has refused, and finish its file if there is any way."""
         take = self.take
-        path = take.part_path if take else self._run.episodes_dir
+        path = take.writer.part_path if take else self._run.episodes_dir
         error = DiskError(path=path, cause=cause, is_finished=False)
         reason = f"{metadata.IN_RESERVE if in_reserve else metadata.BY_DISK}{cause}"
         if take is None:
@@ -293,7 +293,7 @@ class Lifecycle:
         self._reserve.release()
         try:
             take.close(end_ns=now_ns, reason=reason, outcome=None, health=self._health())
-            error = DiskError(path=take.path, cause=cause, is_finished=True)
+            error = DiskError(path=take.writer.path, cause=cause, is_finished=True)
             self.last_episode = take.info.id
         except OSError:
             take.abandon()

@@ -272,10 +272,6 @@ class Recorder:
         episodes = [asdict(read_entry(self.run, path)) for path in paths[-last:]]
         return {"ok": True, "of": len(paths), "episodes": episodes}
 
-    def declare_latched(self, topic: str) -> None:
-        """Begin later episodes with the last message of a topic; its publisher says so."""
-        self.input_queue.latched.declare(topic)
-
     def forget(self, prefix: str, but: tuple[str, ...] = ()) -> None:
         """Repeat no latched message of topics that begin so: their publisher has gone."""
         self._aside(lambda command: self._life.latched.forget(prefix, but))
