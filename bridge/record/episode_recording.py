@@ -408,7 +408,8 @@ class EpisodeRecording:
             self.ledger.presences, self._contract, span, lost, by_habit=not self.info.stand_in
         )
         presences = self.ledger.presences
-        self._of_presence = tuple(findings_of(self.presence, presences, span.end_ns))
+        untold = self.ledger.untold_tails()
+        self._of_presence = tuple(findings_of(self.presence, presences, span.end_ns, untold))
         record = {
             "topics": {topic: asdict(report) for topic, report in self.presence.items()},
             "unnumbered": self.ledger.unnumbered(),
