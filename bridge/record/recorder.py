@@ -75,7 +75,7 @@ class Recorder:
         self.presence = PresenceMonitor(self.input_queue.seen, tell=self.note)
         self.clocks = ClockBook(tell=self.note, write=self._write_clock)
         self._life.earlier_clocks = self.clocks.earlier
-        self._life.answering = lambda: self.clocks.topics_of_others([])
+        self._life.answering = self.clocks.answering
         self.settle: Callable[[], None] = lambda: None
         """Asks publishers how many messages they have sent; what has not come is counted."""
         self.news: deque[str] = deque(maxlen=MAX_NEWS)
