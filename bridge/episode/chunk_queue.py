@@ -78,16 +78,13 @@ class ChunkQueue:
         """Wait until a chunk may be added."""
         if not self._waiting() or self._waiting() + num_bytes <= limit:
             return
+        self._wait_until(lambda: not self._waiting() or self._waiting() + num_bytes <= limit)
+
+    def _wait_until(self, is_so: Callable[[], bool]) -> None:
         self.raise_error()
         with self._changed:
             self._changed.notify_all()
-            self._changed.wait_for(
-                lambda: (
-                    self._error is not None
-                    or not self._waiting()
-                    or self._waiting() + num_bytes <= limit
-                )
-            )
+            self._changed.wait_for(lambda: self._error is not None or is_so())
         self.raise_error()
 
     def drain(self) -> None:
@@ -96,16 +93,7 @@ class ChunkQueue:
         Raises:
             OSError: When the disk refuses; what waits is kept, and tried again with the next call.
         """
-        self.raise_error()
-        with self._changed:
-            self._changed.notify_all()
-            self._changed.wait_for(
-                lambda: (
-                    self._error is not None
-                    or not (self._small or self._bulk or self._busy_since_s is not None)
-                )
-            )
-        self.raise_error()
+        self._wait_until(lambda: not (self._small or self._bulk or self._busy_since_s is not None))
 
     def oldest_s(self) -> float | None:
         """When the oldest small message came that is not on the disk yet, None without one."""

@@ -38,18 +38,12 @@ def write(path: Path) -> None:
         for index in range(COUNT):
             stamp_ns = START_NS + index * 33_333_333
             raw = DepthImage(stamp_ns=stamp_ns, frame_id="camera", depth_mm=depth(index)).to_cdr()
+            compact = depth_to_compact(image_header(raw))
+            jpeg = image_to_jpeg(image_header(color(index)))
             for topic, data, name in (
                 ("/c/cam/raw/depth/image", raw, schema.IMAGE),
-                (
-                    "/c/cam/compact/depth/image",
-                    depth_to_compact(image_header(raw)),
-                    schema.COMPRESSED_IMAGE,
-                ),
-                (
-                    "/c/cam/raw/color/image",
-                    image_to_jpeg(image_header(color(index))),
-                    schema.COMPRESSED_IMAGE,
-                ),
+                ("/c/cam/compact/depth/image", compact, schema.COMPRESSED_IMAGE),
+                ("/c/cam/raw/color/image", jpeg, schema.COMPRESSED_IMAGE),
             ):
                 assert data is not None
                 writer.write(topic, data, type_name=name, log_time_ns=stamp_ns)

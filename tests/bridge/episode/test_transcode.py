@@ -102,13 +102,10 @@ def test_depth_is_the_same_in_every_form(
 
 
 def test_encodings_of_others_are_left_to_others() -> None:
-    assert image_to_jpeg(image_header(image(np.zeros((2, 2), dtype=np.uint16), "16UC1"))) is None
-    assert (
-        depth_to_compact(image_header(image(np.zeros((2, 2, 3), dtype=np.uint8), "rgb8"))) is None
-    )
-    assert (
-        depth_to_compact(image_header(image(np.zeros((2, 2), dtype=np.float32), "32FC1"))) is None
-    )
+    depth = image_header(image(np.zeros((2, 2), dtype=np.uint16), "16UC1"))
+    color = image_header(image(np.zeros((2, 2, 3), dtype=np.uint8), "rgb8"))
+    metres = image_header(image(np.zeros((2, 2), dtype=np.float32), "32FC1"))
+    assert [image_to_jpeg(depth), *map(depth_to_compact, (color, metres))] == [None] * 3
     with pytest.raises(
         MalformedMessageError, match=r"'32SC1' cannot be read.*16UC1, mono16, 32FC1"
     ):

@@ -45,6 +45,10 @@ def noise(channels: int = 3, kind: type = np.uint8) -> np.ndarray:
     return RNG.integers(1, 255, (48, 64, channels)).astype(kind)
 
 
+def compact(number: int, depth: np.ndarray) -> bytes:
+    return depth_to_compact(image_header(image(number, depth, "16UC1"))) or b""
+
+
 def joints(number: int, position: float = 0.5, **fields: object) -> bytes:
     message = {"header": header(number), "name": ["a", "b"], "position": [0.1 * number, position]}
     return codec.encode(schema.JOINT_STATE, {**message, **fields})
@@ -96,12 +100,7 @@ FAULTS: dict[str, tuple[str, str, str, Make]] = {
         "empty_depth",
         DEPTH,
         schema.COMPRESSED_IMAGE,
-        lambda n: (
-            depth_to_compact(
-                image_header(image(n, EMPTY if n < 30 else noise(1, np.uint16), "16UC1"))
-            )
-            or b""
-        ),
+        lambda n: compact(n, EMPTY if n < 30 else noise(1, np.uint16)),
     ),
     "nan": ("nan_joints", JOINTS, schema.JOINT_STATE, lambda n: joints(n, np.nan)),
     "infinity": ("nan_joints", JOINTS, schema.JOINT_STATE, lambda n: joints(n, -np.inf)),
