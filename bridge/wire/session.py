@@ -269,10 +269,7 @@ class WireSession:
             return Subscriber(self._inner.declare_subscriber(key_expression, handler))
 
     def follow(self, topic: str, callback: Callable[[WireSample], None]) -> None:
-        """Receive a topic, or all below ``/**``, of our wire and of rmw_zenoh.
-
-        What ROS 2 nodes offer as transient local comes first, as they sent it before.
-        """
+        """Receive a topic, or all below ``/**``, ROS 2 nodes' too: what they keep comes first."""
         ros = f"*{topic}" if topic.endswith("**") else f"*{topic}/*/*"
         for key in (topic[1:], ros):
             self.subscribe(key, callback)

@@ -39,8 +39,7 @@ class FolderConfig:
         """Refuse names that cannot be part of a topic, and numbers that make no sense."""
         for what, name in (("cell", self.cell), ("camera", self.camera)):
             refuse_bad_name(what, name)
-        allowed = {"rate_hz": (0.001, 1000), "depth_unit_m": (1e-6, 1)}
-        refuse_outside(self, allowed)
+        refuse_outside(self, {"rate_hz": (0.001, 1000), "depth_unit_m": (1e-6, 1)})
         for option in ("depth_intrinsics", "color_intrinsics"):
             values = getattr(self, option)
             if values is not None and not min(values[:2]) > 0:
