@@ -231,7 +231,7 @@ def import_rosbag2(
         output.say(f"  {old} is called {new} in the episode")
     output.result(
         data,
-        f"{report.path}: {report.messages} messages on {len(report.topics)} topics "
-        f"of {len(report.files)} files",
+        f"{report.path}: messages: {report.messages}, topics: {len(report.topics)}, "
+        f"files: {len(report.files)}",
     )
     return tell_unused(output, report.unused)

@@ -288,8 +288,8 @@ def read_robot(name: str) -> Robot:
 def robot_of(urdf: str) -> Robot:
     """Return the robot that a description is of.
 
-    That is the record the description carries; else the robot file that has the name of the URDF;
-    else the default robot, with which old episodes were recorded.
+    That is the record the description carries; else the robot file that has the name of the URDF,
+    or alone has its joints; else the default robot, with which old episodes were recorded.
     """
     carried = re.search(rf"<{RECORD_TAG}\b[^>]*>(.*?)</{RECORD_TAG}>", urdf, re.DOTALL)
     if carried is not None:
@@ -301,8 +301,12 @@ def robot_of(urdf: str) -> Robot:
                 "Name the robot's file: --robot FILE.toml."
             ) from error
     name = robot_name(urdf)
-    files = {path.stem for path in (datasets_folder() / "robots").glob("*.toml")}
-    return read_robot(name if name in files else DEFAULT_ROBOT)
+    files = sorted(path.stem for path in (datasets_folder() / "robots").glob("*.toml"))
+    if name in files:
+        return read_robot(name)
+    joints = set(re.findall(r'<joint\b[^>]*\bname="([^"]+)"', urdf))
+    fits = [robot for robot in map(read_robot, files) if joints.issuperset(robot.joints)]
+    return fits[0] if len(fits) == 1 else read_robot(DEFAULT_ROBOT)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -268,6 +268,17 @@ class WireSession:
         with _naming(WireConfigError, f"cannot subscribe to {key_expression!r}"):
             return Subscriber(self._inner.declare_subscriber(key_expression, handler))
 
+    def follow(self, topic: str, callback: Callable[[WireSample], None]) -> None:
+        """Receive a topic, or all below ``/**``, of our wire and of rmw_zenoh.
+
+        What ROS 2 nodes offer as transient local comes first, as they sent it before.
+        """
+        ros = f"*{topic}" if topic.endswith("**") else f"*{topic}/*/*"
+        for key in (topic[1:], ros):
+            self.subscribe(key, callback)
+        for sample in self.query_all(f"{ros}/@adv/**", timeout_s=2.0):
+            callback(sample)
+
     def open_loopback(self) -> "WireSession":
         """Open a client of the endpoint this session listens on, else of one it connects to.
 

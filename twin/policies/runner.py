@@ -133,8 +133,8 @@ class CellRunner:
         self.policy = open_policy(config.policy, config.timeout_s)
         self.view = View()
         for ending in (JOINT_STATES, GRIPPER_STATE, f"{CAMERAS}*{COLOR_IMAGE}"):
-            session.subscribe(cell_topic(self.cell, ending)[1:], self.view.take)
-        session.subscribe(ROBOT_DESCRIPTION[1:], self.view.take)
+            session.follow(cell_topic(self.cell, ending), self.view.take)
+        session.follow(ROBOT_DESCRIPTION, self.view.take)
         self.targets = self._publisher(POLICY_TARGETS, Qos.CONTROL)
         self.events = self._publisher(EVENT, Qos.RELIABLE)
         session.serve(policy_key(self.cell, self.name), self._answer)

@@ -359,6 +359,39 @@ def test_a_cache_is_asked_for_what_it_kept(router: WireSession, client: WireSess
     assert client.query_all("large/**", timeout_s=5.0, max_mb=1) == []
 
 
+def test_a_topic_is_followed_whoever_publishes_it(router: WireSession, endpoint: str) -> None:
+    import zenoh
+    from zenoh.ext import CacheConfig, declare_advanced_publisher
+
+    config = zenoh.Config.from_json5(
+        f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}},'
+        " timestamping: {enabled: true}, scouting: {multicast: {enabled: false}}}"
+    )
+    kind = "sensor_msgs::msg::dds_::{}_/" + TYPE_HASH
+    got: list[WireSample] = []
+    with zenoh.open(config) as node:
+        key = f"0/tf_static/tf2_msgs::msg::dds_::TFMessage_/{TYPE_HASH}"
+        latched = declare_advanced_publisher(node, key, cache=CacheConfig())
+        latched.put(b"before")
+        wait_until(lambda: router.query_all(f"{key}/@adv/**", timeout_s=5.0), "its cache")
+        for topic in ("/tf_static", "/lab/joint_states", "/lab/cam/**"):
+            router.follow(topic, got.append)
+        node.put("0/lab/joint_states/" + kind.format("JointState"), b"ros")
+        node.put("0/lab/cam/a/color/image/" + kind.format("Image"), b"ros")
+        node.put("0/other/joint_states/" + kind.format("JointState"), b"no")
+        node.put("lab/joint_states", b"ours")
+        latched.put(b"after")
+        wait_until(lambda: len(got) >= 5, "all five")
+    assert [(each.topic, each.data) for each in got] == [
+        ("/tf_static", b"before"),
+        ("/lab/joint_states", b"ros"),
+        ("/lab/cam/a/color/image", b"ros"),
+        ("/lab/joint_states", b"ours"),
+        ("/tf_static", b"after"),
+    ]
+    assert got[1].type_name == schema.JOINT_STATE
+
+
 def test_numbers_of_zenoh_itself_are_read(router: WireSession, client: WireSession) -> None:
     """An AdvancedPublisher numbers its samples without any attachment of ours."""
     from zenoh.ext import MissDetectionConfig, declare_advanced_publisher
