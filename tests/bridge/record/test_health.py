@@ -45,7 +45,11 @@ def noise(channels: int = 3, kind: type = np.uint8) -> np.ndarray:
     return RNG.integers(1, 255, (48, 64, channels)).astype(kind)
 
 
-def compact(number: int, depth: np.ndarray) -> bytes:
+def late(number: int, empty: np.ndarray) -> np.ndarray:
+    return empty if number < 30 else noise(1, np.uint16).astype(empty.dtype)
+
+
+def rvl(number: int, depth: np.ndarray) -> bytes:
     return depth_to_compact(image_header(image(number, depth, "16UC1"))) or b""
 
 
@@ -84,24 +88,9 @@ FAULTS: dict[str, tuple[str, str, str, Make]] = {
     "frozen raw": ("frozen_image", COLOR, schema.IMAGE, lambda n: image(n, STILL, "rgb8")),
     "frozen jpeg": ("frozen_image", COLOR, schema.COMPRESSED_IMAGE, lambda n: jpeg(n, STILL_JPEG)),
     "frozen depth": ("frozen_image", DEPTH, schema.IMAGE, lambda n: image(n, FLAT, "16UC1")),
-    "empty": (
-        "empty_depth",
-        DEPTH,
-        schema.IMAGE,
-        lambda n: image(n, EMPTY if n < 30 else noise(1, np.uint16), "16UC1"),
-    ),
-    "empty of no numbers": (
-        "empty_depth",
-        DEPTH,
-        schema.IMAGE,
-        lambda n: image(n, HOLES if n < 30 else noise(1, np.uint16).astype(np.float32), "32FC1"),
-    ),
-    "empty rvl": (
-        "empty_depth",
-        DEPTH,
-        schema.COMPRESSED_IMAGE,
-        lambda n: compact(n, EMPTY if n < 30 else noise(1, np.uint16)),
-    ),
+    "empty": ("empty_depth", DEPTH, schema.IMAGE, lambda n: image(n, late(n, EMPTY), "16UC1")),
+    "holes": ("empty_depth", DEPTH, schema.IMAGE, lambda n: image(n, late(n, HOLES), "32FC1")),
+    "empty rvl": ("empty_depth", DEPTH, schema.COMPRESSED_IMAGE, lambda n: rvl(n, late(n, EMPTY))),
     "nan": ("nan_joints", JOINTS, schema.JOINT_STATE, lambda n: joints(n, np.nan)),
     "infinity": ("nan_joints", JOINTS, schema.JOINT_STATE, lambda n: joints(n, -np.inf)),
     "no stamps": ("stamp_zero", JOINTS, schema.JOINT_STATE, lambda n: joints(n, **UNSET)),
