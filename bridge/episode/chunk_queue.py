@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk
 
+LOOK_S = 0.05
+"""The thread looks for chunks this often, rather than being woken by each."""
 _INDEX_BYTES = 15
 """Of a message index without entries, which have 16 bytes each."""
 
@@ -56,7 +58,6 @@ class ChunkQueue:
             else:
                 self._bulk.append(chunk)
                 self.bulk_bytes += _size(chunk)
-            self._changed.notify_all()
 
     def raise_error(self) -> None:
         """Raise what the disk said since the last call; with the call after, it is tried again."""
@@ -79,6 +80,7 @@ class ChunkQueue:
             return
         self.raise_error()
         with self._changed:
+            self._changed.notify_all()
             self._changed.wait_for(
                 lambda: (
                     self._error is not None
@@ -96,6 +98,7 @@ class ChunkQueue:
         """
         self.raise_error()
         with self._changed:
+            self._changed.notify_all()
             self._changed.wait_for(
                 lambda: (
                     self._error is not None
@@ -118,11 +121,8 @@ class ChunkQueue:
         turn_of_bulk = False
         while True:
             with self._changed:
-                self._changed.wait_for(
-                    lambda: (
-                        self._is_ending or (not self._is_held and bool(self._small or self._bulk))
-                    )
-                )
+                while not self._is_ending and (self._is_held or not (self._small or self._bulk)):
+                    self._changed.wait(LOOK_S)
                 if self._is_ending:
                     break
                 small = [] if turn_of_bulk and self._bulk else [each.chunk for each in self._small]

@@ -299,6 +299,8 @@ def findings_of(
     reports: Mapping[str, TopicReport], presences: Mapping[str, Presence], end_ns: int
 ) -> Iterator[HealthFinding]:
     """Say where a contract was broken, what fell silent, and whose rate fell."""
+    if not any(presence.messages for presence in presences.values()):
+        yield HealthFinding(name="nothing_recorded", about="all topics", text="no message came")
     for topic, report in reports.items():
         presence = presences.get(topic, Presence())
         span = {"first_ns": presence.first_ns, "last_ns": presence.last_ns}

@@ -25,6 +25,7 @@ from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.record.clocks import StampJumps
 from bridge.record.config import RecorderConfig
+from bridge.record.encoders import encode
 from bridge.record.inspection import (
     GOOD,
     MessageState,
@@ -258,6 +259,8 @@ class EpisodeRecording:
         if channel is None:
             self.ledger.count_refused(item)
             return
+        if item.is_bulk and item.finding is None:
+            encode(item, self._config)
         is_known = channel.content.knows(item.sample.data)
         finding = GOOD if is_known else item.finding or channel.inspect(item.sample.data)
         self._look(channel, item, finding, is_known=is_known)

@@ -280,10 +280,6 @@ class Recorder:
         """Repeat no latched message of topics that begin so: their publisher has gone."""
         self._aside(lambda command: self._life.latched.forget(prefix, but))
 
-    def note_recovered(self, reports: list[Answer]) -> None:
-        """Show in the status what was found cut off when the recorder began."""
-        self._status.recovered = reports
-
     def also_tell(self, name: str, ask: Callable[[], object]) -> None:
         """Add something to every status and episode; ``ask`` must answer at once."""
         self._status.others[name] = ask

@@ -52,13 +52,11 @@ class Service:
         self,
         key: str,
         handler: Callable[[bytes], bytes],
-        max_waiting: int,
-        side_by_side: int = 1,
+        side_by_side: int,
     ) -> None:
         """Use ``WireSession.serve``."""
         self._key = key
         self._handler = handler
-        self._max_waiting = max_waiting
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._inner: Any = None
         self._threads = [
@@ -74,12 +72,12 @@ class Service:
 
     def take(self, query: Any) -> None:
         """Queue a request, on the network thread; one too many is refused at once."""
-        if self._requests.qsize() < self._max_waiting:
+        if self._requests.qsize() < MAX_WAITING:
             self._requests.put(query)
             return
         with query, contextlib.suppress(zenoh.ZError):
             query.reply_err(
-                f"busy: {self._max_waiting} requests on {self._key} wait already. "
+                f"busy: {MAX_WAITING} requests on {self._key} wait already. "
                 "Ask again later, or start another one under its own name."
             )
 
@@ -286,11 +284,10 @@ class WireSession:
         key: str,
         handler: Callable[[bytes], bytes],
         *,
-        max_waiting: int = MAX_WAITING,
         side_by_side: int = 1,
     ) -> Service:
         """Answer requests on a key; a ``GstError`` of the handler goes back as the answer."""
-        service = Service(key, handler, max_waiting, side_by_side)
+        service = Service(key, handler, side_by_side)
         callback = zenoh.handlers.Callback(service.take, indirect=False)
         try:
             service.start(self._inner.declare_queryable(key, callback))

@@ -96,7 +96,7 @@ def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
 def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     """What the twin said against what happened, counted over trials."""
     ends = ("success", "failure")
-    kinds = [f"predicted {said}, {word} {end}" for said in ends for end in ends]
+    kinds = [f"predicted {foretold}, {word} {end}" for foretold in ends for end in ends]
     sides: tuple[tuple[str, Answer], ...] = (
         ("sim planned", lambda row: row.sim_planned),
         ("verdict before motion", lambda row: row.verdict),

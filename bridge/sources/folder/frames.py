@@ -1,10 +1,10 @@
 """What every layout of an RGB-D folder is read into, and the checks they share."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -21,6 +21,7 @@ ROTATION_TOLERANCE = 0.01
 """Poses written with five digits are off by 5e-4; more than this is not a rotation."""
 VGA = (640, 480)
 """Size of the images that nominal intrinsics are given for."""
+Image = TypeVar("Image")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,13 +140,7 @@ class StoredColor:
 
 def read_color(path: Path) -> StoredColor:
     """Read a colour image."""
-    try:
-        stored = path.read_bytes()
-        return StoredColor(stored=stored, image_u8=decode_color(stored))
-    except (UnreadableImageError, OSError) as error:
-        raise FolderError(
-            path=path, found=str(error).rstrip("."), hint="Restore the file or remove the frame."
-        ) from error
+    return _decoded(path, lambda stored: StoredColor(stored=stored, image_u8=decode_color(stored)))
 
 
 def check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
@@ -160,8 +155,12 @@ def check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
 
 def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
     """Read the numbers of a 16-bit depth image."""
+    return _decoded(path, decode_depth_png)
+
+
+def _decoded(path: Path, decode: Callable[[bytes], Image]) -> Image:
     try:
-        return decode_depth_png(path.read_bytes())
+        return decode(path.read_bytes())
     except (UnreadableImageError, OSError) as error:
         raise FolderError(
             path=path, found=str(error).rstrip("."), hint="Restore the file or remove the frame."

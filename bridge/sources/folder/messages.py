@@ -71,29 +71,21 @@ INFO_PERIOD_S = 1.0
 """Calibration and static transforms are repeated this often [s]."""
 
 
-def num_frames(index: FolderIndex, config: FolderConfig) -> int:
-    """How many frames will be sent."""
-    return min(len(index.frames), config.max_frames or len(index.frames))
-
-
 def frame_times_ns(index: FolderIndex, config: FolderConfig) -> list[tuple[int, int]]:
     """Stamps of colour and depth of every frame [ns]: real times, or the rate asked for, from 0.
 
     Raises:
         UsageError: When a rate is asked of a folder that has real times.
     """
-    count = num_frames(index, config)
     if not index.has_times:
         period_ns = ns_from_s(1.0 / (config.rate_hz or DEFAULT_RATE_HZ))
-        return [(number * period_ns, number * period_ns) for number in range(count)]
+        return [(number * period_ns, number * period_ns) for number in range(len(index.frames))]
     if config.rate_hz is not None:
         raise UsageError(
             f"--rate-hz {config.rate_hz:g} was given, but {index.path} says when each frame was "
             "taken. Leave the option out."
         )
-    return [
-        (frame.color_stamp_ns or 0, frame.depth_stamp_ns or 0) for frame in index.frames[:count]
-    ]
+    return [(frame.color_stamp_ns or 0, frame.depth_stamp_ns or 0) for frame in index.frames]
 
 
 def describe_folder(index: FolderIndex, config: FolderConfig) -> dict[str, Any]:
@@ -120,7 +112,7 @@ def folder_messages(index: FolderIndex, config: FolderConfig) -> Iterator[list[S
     pose = next(poses, None)
     color_camera: Camera | None = None
     next_info_ns = min(times[0])
-    for number, (frame, stamps) in enumerate(zip(index.frames, times, strict=False), start=1):
+    for number, (frame, stamps) in enumerate(zip(index.frames, times, strict=True), start=1):
         color = read_color(frame.color_path)
         if color_camera is None:
             shown = color.image_u8.shape[1] / index.depth_camera.width
@@ -143,7 +135,7 @@ def _pose_messages(
     """One pose per frame, or all that the folder has from before the first to after the last."""
     if index.poses is None:
         stamps = [color_ns for color_ns, _ in times]
-        transforms = [frame.T_world_depth for frame in index.frames[: len(times)]]
+        transforms = [frame.T_world_depth for frame in index.frames]
     else:
         inside = index.poses.stamps_ns
         ends = [at for pair in times for at in pair]

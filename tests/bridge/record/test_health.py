@@ -14,7 +14,7 @@ import robot_gst
 from bridge.clock import NS_PER_S, AnchoredClock
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.images import depth_to_compact
+from bridge.episode.cdr.images import depth_to_compact, image_header
 from bridge.episode.check import check_episode
 from bridge.episode.health import ContentWatch
 from bridge.episode.metadata import EpisodeInfo
@@ -97,7 +97,10 @@ FAULTS: dict[str, tuple[str, str, str, Make]] = {
         DEPTH,
         schema.COMPRESSED_IMAGE,
         lambda n: (
-            depth_to_compact(image(n, EMPTY if n < 30 else noise(1, np.uint16), "16UC1")) or b""
+            depth_to_compact(
+                image_header(image(n, EMPTY if n < 30 else noise(1, np.uint16), "16UC1"))
+            )
+            or b""
         ),
     ),
     "nan": ("nan_joints", JOINTS, schema.JOINT_STATE, lambda n: joints(n, np.nan)),
