@@ -363,9 +363,8 @@ class Trial:
                 waited_s = min(time.monotonic() - began_s, READY_S)
                 if self._over() or waited_s == READY_S:
                     there = ", ".join(sorted(self._view.seen)) or "nothing"
-                    raise PolicyError(
-                        f"nothing came on {topic} in {waited_s:.0f} s; the cell shows {there}"
-                    )
+                    what = f"nothing came on {topic} in {waited_s:.0f} s"
+                    raise PolicyError(f"{what}; the cell shows {there}")
                 self._view.news.wait(HOLD_S)
             return self._view.seen[topic]
 
