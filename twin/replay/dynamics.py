@@ -26,7 +26,7 @@ from twin.replay.failure import NotEvaluatedError
 from twin.replay.path import JointPath
 from twin.replay.result import Burst, ReplayResult, States
 from twin.replay.scene import ReplayScene
-from twin.replay.varied import STRIDE, hand_near
+from twin.replay.varied import hand_near
 from twin.robot.collision import RobotHulls, convex_hull, signed_distance
 from twin.robot.model import check_dynamics
 
@@ -146,7 +146,7 @@ def simulate(
                 continue
             if not samples.take(world, stamps[step + 1]):
                 break
-            if known is not None and state % STRIDE == 0 and samples.lie():
+            if known is not None and state % STATE_EVERY == 0 and samples.lie():
                 places = {name: world.object_pose(name)[:3] for name in movable}
                 if not hand_near(known, places, scene, hulls)[state:].any():
                     samples.fill(known, slice(state + 1, None))

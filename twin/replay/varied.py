@@ -24,9 +24,6 @@ its fingers may have been told to move a tenth of a second later."""
 HASTE = 1.5
 """Bodies keep so many of the tool's or an object's steps more: ``LATE_S`` asks for 0.6 of their
 own, and half of one may be lost between two states."""
-STRIDE = 4
-"""Clearances are measured in each fourth state, and between them where that is too coarse."""
-
 Places = Mapping[str, Sequence[float] | Float[np.ndarray, "*num_steps 3"]]
 
 
@@ -62,8 +59,7 @@ def to_measure(
     known: ReplayResult, states: States, scene: ReplayScene, monitor: ClearanceMonitor
 ) -> Bool[np.ndarray, " num_steps"]:
     """The states of a varied replay in which a clearance may be too small."""
-    known_m, movable = known.clearance_m, scene.movable()
-    found = np.zeros(len(known_m), dtype=bool)
+    known_m, found = known.clearance_m, np.zeros(len(known.stamps_ns), dtype=bool)
     joints, widths = states.joints_rad - known.joints_rad, states.width_m - known.width_m
     moved = monitor.reach.travel_m(joints, widths).max(axis=1)
     step = np.linalg.norm(np.diff(known.Ts_base_tcp[:, :3, 3], axis=0), axis=1)
@@ -75,9 +71,11 @@ def to_measure(
         step = np.maximum(step, np.linalg.norm(np.diff(Ts[:, :3, 3], axis=0), axis=1))
         left = [np.linalg.norm(T[:, :3, 3] - T[0, :3, 3], axis=1) > MOVED_M for T in (Ts, before)]
         found |= left[0] != left[1]
-        if name not in movable:  # the hand may touch it, and then be deeper in it than before
-            near = hand_near(known, {name: Ts[:, :3, 3]}, scene, monitor.hulls)
-            found |= near & (shift > MAX_CONTACT_DEPTH_M / 2)
+        # What the hand may touch may be deeper in it than before.
+        touched = states.finger_contact.get(name)
+        if touched is None:
+            touched = hand_near(known, {name: Ts[:, :3, 3]}, scene, monitor.hulls)
+        found |= touched & (shift > MAX_CONTACT_DEPTH_M / 2)
     clear_m = np.minimum(known_m, np.append(np.inf, known_m[:-1])) - moved
     least_m = monitor.config.eps_col_m + max(monitor.sigma_m.values(), default=0.0)
     return np.asarray(found | (clear_m < least_m + HASTE * np.append(0.0, step)))

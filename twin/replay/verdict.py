@@ -34,7 +34,7 @@ from twin.replay.motion import held_of, motion_failures, payload_unknown
 from twin.replay.path import JointPath, check_path, path_of_plan
 from twin.replay.result import ReplayResult, States
 from twin.replay.scene import ReplayScene
-from twin.replay.varied import STRIDE, to_measure
+from twin.replay.varied import to_measure
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 
@@ -353,14 +353,9 @@ def _clearance_m(
 ) -> Float[np.ndarray, " num_steps"]:
     moving = {n: Ts for n, Ts in states.Ts_base_object.items() if n in monitor.scene.movable()}
     found = np.full(len(states.stamps_ns), np.nan)
-    steps = list(range(len(found)))
-    runs = [steps]
-    if where is not None:
-        ends = runs_of_true(where)
-        runs = [[*steps[max(first - 1, 0) : end - 1 : STRIDE], end - 1] for first, end in ends]
-    for run in runs:
+    for first, end in [(0, len(found))] if where is None else runs_of_true(where):
         monitor.leap()
-        for index in run:
+        for index in range(max(first - 1, 0), end):
             found[index] = monitor.measure(
                 int(states.stamps_ns[index]),
                 states.joints_rad[index],
