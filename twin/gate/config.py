@@ -53,16 +53,15 @@ class GateConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers with which no gate can work."""
-        day_s = 86_400
         refuse_outside(
             self,
             {
                 "max_steps": (1, 10**9),
-                "deadline_s": (0, day_s),
+                "deadline_s": (0, 86_400),
                 "waiting": (0, 1000),
                 "samples": (0, 100_000),
                 "min_p_success": (0, 1),
-                "frame_wait_s": (0, day_s),
+                "frame_wait_s": (0, 86_400),
             },
         )
         if self.min_p_success > 0 and self.samples == 0:

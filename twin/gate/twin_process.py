@@ -5,6 +5,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +91,10 @@ def answer(question: Question) -> Verdict:
         verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
     verdict = replace(verdict, warnings=(*verdict.warnings, *scene.notes))
     early = verdict.terminal.value is None  # else samples are replayed as all other replays are
+    again = partial(replay_plan, plan, commanded=commanded, refuse_early=early, known=nominal)
     return with_samples(
         replace(verdict, reason=reason_of(verdict)),
-        lambda *drawn: replay_plan(plan, *drawn, commanded=commanded, refuse_early=early).verdict,
+        lambda *drawn: again(*drawn).verdict,
         scene,
         replace(config, samples=min(config.samples, most_samples)),
         identity=plan.start_id or plan.id,

@@ -220,10 +220,11 @@ class Arm:
             gear, gearRatio=-first / second, erp=0.2, maxForce=10 * self._config.grip_force_N
         )
 
-    def reset(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Put the robot into a posture at rest, without simulating."""
-        for index, value in zip(self._arm, joints_rad, strict=True):
-            self._client.resetJointState(self.id, index, float(value), 0.0)
+    def reset(self, joints_rad: Joints, width_m: float, rad_s: Joints | None = None) -> None:
+        """Put the robot into a posture, at rest or at a speed, without simulating."""
+        speeds = np.zeros(len(self._arm)) if rad_s is None else rad_s
+        for index, value, speed in zip(self._arm, joints_rad, speeds, strict=True):
+            self._client.resetJointState(self.id, index, float(value), float(speed))
         for drive in self._drives:
             self._client.resetJointState(self.id, drive.index, drive.value(float(width_m)), 0.0)
 

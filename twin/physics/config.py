@@ -52,16 +52,14 @@ class PhysicsConfig:
     def __post_init__(self) -> None:
         """Refuse what is no physics; samples draw from wide priors, so the limits are wide too."""
         least, most = 1e-6, 1e6
+        frictions = ("object_friction", "finger_friction", "surface_friction")
         refuse_outside(
             self,
             {
-                "rate_hz": (1, 100_000),
-                "solver_iterations": (1, 100_000),
+                **dict.fromkeys(("rate_hz", "solver_iterations"), (1, 100_000)),
+                **dict.fromkeys(frictions, (0, most)),
                 "solver_residual": (0, 1),
                 "grip_force_N": (least, most),
-                "object_friction": (0, most),
-                "finger_friction": (0, most),
-                "surface_friction": (0, most),
                 "gravity_m_s2": (0, 1000),
             },
         )

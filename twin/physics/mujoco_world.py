@@ -116,14 +116,15 @@ class MujocoArm:
         self._finger_dofs = np.array([int(joint.dofadr[0]) for joint in fingers], dtype=int)
         self._wanted, self._torques = np.zeros(model.nv), np.zeros(model.nv)
 
-    def reset(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Put the robot into a posture at rest, without simulating."""
-        data = self._data
-        data.qpos[self._arm], data.qvel[self._arm_dofs] = joints_rad, 0.0
+    def reset(self, joints_rad: Joints, width_m: float, rad_s: Joints | None = None) -> None:
+        """Put the robot into a posture, at rest or at a speed, without simulating."""
+        data, rest = self._data, np.zeros(len(self._arm))
+        data.qpos[self._arm] = joints_rad
+        data.qvel[self._arm_dofs] = rest if rad_s is None else rad_s
         data.qpos[self._fingers] = [finger.value(width_m) for finger in self._drives]
         data.qvel[self._finger_dofs] = 0.0
         self._ramp_m = width_m
-        self.command(joints_rad, np.zeros(len(self._arm)), width_m)
+        self.command(joints_rad, rest, width_m)
         mujoco.mj_forward(self._model, data)
 
     def command(self, joints_rad: Joints, velocity_rad_s: Joints, width_m: float) -> None:
@@ -330,11 +331,11 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         }
         mujoco.mj_forward(self._model, self._data)
 
-    def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Put the robot into a posture at rest, without simulating."""
+    def reset_robot(self, joints_rad: Joints, width_m: float, rad_s: Joints | None = None) -> None:
+        """Put the robot into a posture, at rest or at a speed, without simulating."""
         if self._changed:
             self._compile()
-        self.robot.reset(joints_rad, width_m)
+        self.robot.reset(joints_rad, width_m, rad_s)
 
     def step(self) -> None:
         """Advance by one control period."""

@@ -25,9 +25,7 @@ class Unseen:
         if self.edge_m <= 0.0:
             return [size]
         least = 0.1 * size
-        return [
-            np.maximum(size - 2 * self.edge_m * (np.arange(3) != axis), least) for axis in range(3)
-        ]
+        return [np.maximum(size - 2 * self.edge_m * (np.arange(3) != k), least) for k in range(3)]
 
 
 EVEN = Unseen()

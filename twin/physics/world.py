@@ -8,7 +8,7 @@ same bits on every run.
 """
 
 from collections.abc import Callable, Sequence
-from math import cos
+from math import cos, hypot
 from operator import methodcaller
 from typing import TypeVar
 
@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.leaves import load_leaf
-from twin.physics.arm import Arm, Hulls, PhysicsError, Press
+from twin.physics.arm import Arm, Hulls, Joints, PhysicsError, Press
 from twin.physics.bending import SoftBodies
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import Client, give_client_back, open_client, pybullet
@@ -215,9 +215,9 @@ class World(Bodies):
         self.client.changeDynamics(body, -1, localInertiaDiagonal=inertia)
         return body
 
-    def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Put the robot into a posture at rest, without simulating."""
-        self.robot.reset(joints_rad, width_m)
+    def reset_robot(self, joints_rad: Joints, width_m: float, rad_s: Joints | None = None) -> None:
+        """Put the robot into a posture, at rest or at a speed, without simulating."""
+        self.robot.reset(joints_rad, width_m, rad_s)
         if self._soft is not None:
             self._soft.place_links()
 
@@ -263,12 +263,13 @@ class World(Bodies):
 
     def arm_force_N(self) -> float:
         """Size of the force that rigid bodies exert on the arm in all; a grasp's cancel out."""
-        total = np.zeros(3)
+        x = y = z = 0.0  # numpy is slower for three numbers
         for point in self.client.getContactPoints(self.robot.id):
             if point[1] != point[2]:  # not the arm against itself
-                total += point[9] * np.array(point[7])
-                total += point[10] * np.array(point[11]) + point[12] * np.array(point[13])
-        return float(np.linalg.norm(total))
+                for size, axis in ((9, 7), (10, 11), (12, 13)):
+                    newton, (along_x, along_y, along_z) = point[size], point[axis]
+                    x, y, z = x + newton * along_x, y + newton * along_y, z + newton * along_z
+        return hypot(x, y, z)
 
     def soft_bodies(self) -> SoftBodies:
         """What is soft in this world; asking the first time begins it."""

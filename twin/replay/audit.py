@@ -150,7 +150,10 @@ class _Audit:
             _Placed(self._objects[name], Ts[:, :3, :3], Ts[:, :3, 3])
             for name, Ts in states.Ts_base_object.items()
         ]
-        moved = {name: self._moved(Ts) for name, Ts in states.Ts_base_object.items()}
+        moved = {  # belongs to somebody's motion; a millimetre later than for the monitor
+            name: np.linalg.norm(Ts[:, :3, 3] - Ts[0, :3, 3], axis=1) > MOVED_M + 0.001
+            for name, Ts in states.Ts_base_object.items()
+        }
         found: list[_Excess] = []
         fixed = self._fixed()
         always = np.ones(len(states.stamps_ns), dtype=bool)
@@ -214,11 +217,6 @@ class _Audit:
         answer = self._fcl.DistanceResult()
         found = self._fcl.distance(first.body.shape, second.body.shape, self._request, answer)
         return max(0.0, float(found))
-
-    def _moved(self, Ts: Float[np.ndarray, "num_states 4 4"]) -> Bool[np.ndarray, " num_states"]:
-        """Whether an object belongs to somebody's motion; a millimetre later than the monitor."""
-        away = np.linalg.norm(Ts[:, :3, 3] - Ts[0, :3, 3], axis=1)
-        return np.asarray(away > MOVED_M + 0.001)
 
     def _placed_links(self, states: _States) -> list[_Placed]:
         robot = self._robot

@@ -150,16 +150,8 @@ class ReplayConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers beyond which no comparison fails, and engines that are not there."""
-        second = (0, 60)
-        refuse_outside(
-            self,
-            {
-                "eps_col_m": (0, 1),
-                "settle_before_s": second,
-                "settle_after_s": second,
-                "grip_delay_s": second,
-            },
-        )
+        durations = ("settle_before_s", "settle_after_s", "grip_delay_s")
+        refuse_outside(self, {"eps_col_m": (0, 1), **dict.fromkeys(durations, (0, 60))})
         require_engine(self.engine)
 
     @property

@@ -30,7 +30,7 @@ from jaxtyping import Bool, Float, Int
 from bridge.geometry import se3
 from bridge.geometry.signals import LAGS_S, lag_of_least_cost
 from bridge.task.record import check_record
-from twin.replay.trace import Touch, Trace
+from twin.replay.trace import Trace
 
 TOOL_M, TOOL_RAD = 0.01, 0.05
 """Limits beyond which planned, executed and recorded are apart: tool position [m] and rotation
@@ -219,7 +219,11 @@ def _touches(first: Trace, second: Trace) -> Iterator[DivergedQuantity]:
         if one is None and two is None:
             continue
         if one is None or two is None:
-            yield _only_one(pair, name, one or two or (0, 0), pair[one is None], whose)
+            touch = one or two or (0, 0)
+            lasted_s = (touch[1] - touch[0]) * 1e-9
+            alone = _quantity(pair, "contact", touch[0], lasted_s, CONTACT_S, whose)
+            detail = f"only {_where(pair[one is None])} do the fingers touch {name}"
+            yield replace(alone, body=name, detail=detail)
             continue
         for end, cause, word in ((0, whose, "touched"), (1, "contact", "let go of")):
             gap_s = abs(one[end] - two[end]) * 1e-9
@@ -231,14 +235,6 @@ def _touches(first: Trace, second: Trace) -> Iterator[DivergedQuantity]:
                     detail=f"{name} is {word} {gap_s:.2f} s earlier {_where(earlier)}",
                 )
                 break
-
-
-def _only_one(
-    pair: tuple[str, str], name: str, touch: Touch, side: str, cause: str
-) -> DivergedQuantity:
-    lasted_s = (touch[1] - touch[0]) * 1e-9
-    found = _quantity(pair, "contact", touch[0], lasted_s, CONTACT_S, cause)
-    return replace(found, body=name, detail=f"only {_where(side)} do the fingers touch {name}")
 
 
 def _objects(first: Trace, second: Trace) -> Iterator[DivergedQuantity]:

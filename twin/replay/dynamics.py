@@ -24,8 +24,9 @@ from twin.replay.clearance.bodies import placed_panels, placement_of
 from twin.replay.config import STATE_EVERY, ReplayConfig
 from twin.replay.failure import NotEvaluatedError
 from twin.replay.path import JointPath
-from twin.replay.result import Burst, States
+from twin.replay.result import Burst, ReplayResult, States
 from twin.replay.scene import ReplayScene
+from twin.replay.varied import hand_near
 from twin.robot.collision import RobotHulls, convex_hull, signed_distance
 from twin.robot.model import check_dynamics
 
@@ -95,12 +96,18 @@ def _steps_kept(end_ns: int, config: ReplayConfig) -> int:
 
 
 def simulate(
-    path: JointPath, scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig
+    path: JointPath,
+    scene: ReplayScene,
+    hulls: RobotHulls,
+    config: ReplayConfig,
+    *,
+    known: ReplayResult | None = None,  # of the same path
 ) -> States:
     """Follow a path with position-controlled motors and free objects.
 
     Every run of the same inputs gives the same bits: one fresh world, fixed steps. A soft body
-    that bursts ends it: what comes after would be noise.
+    that bursts ends it: what comes after would be noise. Nothing is simulated where the hand is
+    known to be away from all objects, and they lie still.
     """
     check_dynamics(hulls.robot)
     rate = config.physics.rate_hz
@@ -113,18 +120,39 @@ def simulate(
     stamps = times_ns.tolist()
     soft = soft_models(scene)
     samples = Samples(scene, soft)
+    settling = round(config.settle_before_s * rate)
+    first, movable = 0, scene.movable()
+    if known is not None:
+        starts = {name: T[:3, 3] for name, T in movable.items()}
+        first = int(hand_near(known, starts, scene, hulls).argmax())
+    at = first - settling // STATE_EVERY
     with open_world(config.engine, hulls.robot.urdf, mesh_hulls(hulls), config.physics) as world:
         spawn(world, scene, soft)
-        world.reset_robot(postures[0], widths[0])
-        world.robot.command(targets[0], [0.0] * len(targets[0]), widths[0])
-        for _ in range(round(config.settle_before_s * rate)):
-            world.step()
-        samples.take(world, 0)
-        for step in range(total):
+        if known is not None and at > 0:  # objects come to rest while the arm is on its way
+            speeds = velocities[at * STATE_EVERY]
+            world.reset_robot(known.joints_rad[at], float(known.width_m[at]), speeds)
+        else:
+            at = first = 0
+            world.reset_robot(postures[0], widths[0])
+            world.robot.command(targets[0], [0.0] * len(targets[0]), widths[0])
+            for _ in range(settling):
+                world.step()
+            samples.take(world, 0)
+        for step in range(at * STATE_EVERY, total):
             world.robot.command(targets[step + 1], velocities[step], widths[step])
             world.step()
-            if (step + 1) % STATE_EVERY == 0 and not samples.take(world, stamps[step + 1]):
+            state, between = divmod(step + 1, STATE_EVERY)
+            if between or state < first:
+                continue
+            if not samples.take(world, stamps[step + 1]):
                 break
+            if known is not None and state % STATE_EVERY == 0 and samples.lie():
+                places = {name: world.object_pose(name)[:3] for name in movable}
+                if not hand_near(known, places, scene, hulls)[state:].any():
+                    samples.fill(known, slice(state + 1, None))
+                    break
+        if known is not None:
+            samples.fill(known, slice(0, first))
         return samples.states(world)
 
 
@@ -136,6 +164,10 @@ def mesh_hulls(hulls: RobotHulls) -> dict[str, list[Float[np.ndarray, "num_point
         if hull.from_mesh:
             found.setdefault(hull.link, []).append(hull.points_m)
     return found
+
+
+LIE_STATES, LIE = 15, 1e-4
+"""What moves [m] and turns by less in so many states lies still."""
 
 
 class Samples:
@@ -170,6 +202,21 @@ class Samples:
             else:
                 rows.append((world.object_pose(name), touch))
         return True
+
+    def lie(self) -> bool:
+        """Whether no rigid object has moved in the last ``LIE_STATES``."""
+        recent = [[row[0] for row in rows[-LIE_STATES - 1 :]] for rows in self._seen.values()]
+        still = all(np.ptp(poses, axis=0).max() < LIE for poses in recent)
+        return still and len(self._rows) > LIE_STATES
+
+    def fill(self, known: States, steps: slice) -> None:
+        """Put in known states of the arm before or after all others; objects lie as there."""
+        at = len(self._rows) if steps.start else 0
+        arm = (known.stamps_ns, known.joints_rad, known.width_m, known.arm_force_N)
+        filled = list(zip(*(column[steps] for column in arm), strict=True))
+        self._rows[at:at] = filled
+        for rows in self._seen.values():
+            rows[at:at] = [rows[max(at - 1, 0)]] * len(filled)
 
     def states(self, world: PhysicsWorld) -> States:
         """All that was kept."""

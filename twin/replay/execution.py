@@ -58,10 +58,8 @@ def check_track(track: JointTrack, what: str, plan_id: str) -> None:
 def gripper_widths(widths: JointTrack, plan: Plan, robot: Robot) -> JointTrack:
     """The recorded distances between the finger pads [m] alone, if that is what they are.
 
-    Raises:
-        UnusablePlanError: For several joints of which none has the name, for what ``check_track``
-            refuses, and for numbers that no distance between these pads can be: radians,
-            millimetres, percent.
+    UnusablePlanError: several joints of which none has the name, what ``check_track`` refuses, and
+    numbers that no distance between these pads can be: radians, millimetres, percent.
     """
     names = widths.names
     if len(names) > 1 and GRIPPER_WIDTH not in names:
@@ -103,7 +101,11 @@ _LATENESS_NS = 2_000_000_000
 
 
 def path_of_execution(
-    track: JointTrack, widths: JointTrack, plan: Plan, config: ReplayConfig, robot: Robot
+    track: JointTrack,  # its first sample is time 0 of the path
+    widths: JointTrack,  # on the same clock
+    plan: Plan,  # what was executed: says when the gripper was to be closed
+    config: ReplayConfig,
+    robot: Robot,
 ) -> JointPath:
     """Turn recorded tracks into a path that starts at time 0.
 
@@ -112,14 +114,8 @@ def path_of_execution(
     is ``SQUEEZE_M`` narrower and the force limit holds the object. A kinematic replay shows the
     recorded width.
 
-    Args:
-        track: Recorded joints; the first sample is time 0 of the path.
-        widths: Recorded widths of the gripper, on the same clock.
-        plan: What was executed: says when the gripper was to be closed.
-
-    Raises:
-        UnusablePlanError: When a track is empty, has gaps, names other joints, or holds what is no
-            posture or no width.
+    UnusablePlanError: a track is empty, has gaps, names other joints, or holds what is no posture
+    or no width.
     """
     if len(track.stamps_ns) == 0 or len(widths.stamps_ns) == 0:
         raise UnusablePlanError(
@@ -197,7 +193,9 @@ def closed_mask(
 ) -> Bool[np.ndarray, " num_samples"]:
     """Say when the fingers were closed on something, from the plan's wish and their own motion."""
     closed = np.zeros(len(times_ns), dtype=bool)
-    for start_ns, end_ns in _closed_intervals(plan):
+    stamps = [*(waypoint.t_ns for waypoint in plan.tau), plan.tau[-1].t_ns + 1]
+    for first, end in runs_of_true(np.array([waypoint.g == 1 for waypoint in plan.tau])):
+        start_ns, end_ns = stamps[first], stamps[end]  # without an end, just past the plan's own
         window = np.flatnonzero((times_ns >= start_ns) & (times_ns <= end_ns + _LATENESS_NS))
         wide = np.maximum.accumulate(width_m[window])
         begun = width_m[window] < wide - PLATEAU_M
@@ -211,10 +209,3 @@ def closed_mask(
             last = stopped[0] + left[0] if len(left) else window[-1] + 1
             closed[stopped[0] : last] = True
     return closed
-
-
-def _closed_intervals(plan: Plan) -> list[tuple[int, int]]:
-    """From when to when a plan wants the gripper closed; without an end, just past its own."""
-    stamps = [*(waypoint.t_ns for waypoint in plan.tau), plan.tau[-1].t_ns + 1]
-    wanted = np.array([waypoint.g == 1 for waypoint in plan.tau])
-    return [(stamps[first], stamps[end]) for first, end in runs_of_true(wanted)]

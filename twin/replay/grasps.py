@@ -1,7 +1,7 @@
 """What became of each grasp of a plan: whether the object was carried along."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from bridge.geometry import se3
 from bridge.geometry.signals import runs_of_true
@@ -17,8 +17,10 @@ def grasps_seen(
     plan: Plan, path: JointPath, states: States, Ts_base_tcp: Float[np.ndarray, "num_steps 4 4"]
 ) -> tuple[dict[str, object], ...]:
     """What became of each grasp of a plan, for whoever plans again; as verdicts keep it."""
-    stretches = []
-    for first, end in _closed(plan, path, states.stamps_ns):
+    stretches, told = [], np.array([waypoint.g == 1 for waypoint in plan.tau])
+    newest = np.searchsorted(path.width_times_ns, states.stamps_ns, side="right") - 1
+    closed = (newest >= 0) & told[np.clip(newest, 0, len(told) - 1)]
+    for first, end in runs_of_true(closed):
         name = grasped(plan, int(states.stamps_ns[first]))
         if name is not None and name in states.finger_contact:
             stretches.append((name, first, end))
@@ -43,15 +45,6 @@ def _carries(
     """Whether a finger touches the object as the hand leaves; a grasp that misses carries none."""
     left = np.linalg.norm(tool_m - tool_m[0], axis=1) > LEAVES_M
     return bool(left.any() and contact[int(left.argmax())])
-
-
-def _closed(
-    plan: Plan, path: JointPath, stamps: Int[np.ndarray, " num_steps"]
-) -> list[tuple[int, int]]:
-    """First step and the one after the last of each stretch with the gripper told to be closed."""
-    told: Bool[np.ndarray, " num_waypoints"] = np.array([w.g == 1 for w in plan.tau])
-    index = np.searchsorted(path.width_times_ns, stamps, side="right") - 1
-    return runs_of_true((index >= 0) & told[np.clip(index, 0, len(told) - 1)])
 
 
 def grasped(plan: Plan, t_ns: int) -> str | None:

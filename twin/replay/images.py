@@ -101,7 +101,10 @@ def render_replay(
                 T = seen.T_root_frame(info.frame_id, stamp_ns)
             else:
                 T = result.Ts_base_tcp[index] @ T_tcp_camera
-            cloud = stage.at(*_state(result, scene, index))
+            at = {n: Ts[index] for n, Ts in result.Ts_base_object.items()}
+            nodes = {name: rows[index] for name, rows in result.nodes_m.items()}
+            posture = Posture(joints_rad=result.joints_rad[index], width_m=result.width_m[index])
+            cloud = stage.at(scene.Ts_base_object | at, nodes, posture)
             drawn = stage.parts.draw(rasteriser, cloud, info.camera, T)
             jpeg, name = encode_jpeg(drawn.marked_u8()), info.frame_id
             yield (
@@ -120,16 +123,6 @@ def set_up(run: RunFolder, episode: Episode, scene: ReplayScene) -> Drawable:
         if len(parts.objects[name].cloud)
     }
     return Drawable(parts=parts, bindings=bindings, urdf=scene.urdf)
-
-
-def _state(
-    result: ReplayResult, scene: ReplayScene, index: int
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Posture]:
-    """Places, nodes and posture at one of a replay's states."""
-    places = scene.Ts_base_object | {n: Ts[index] for n, Ts in result.Ts_base_object.items()}
-    nodes = {name: rows[index] for name, rows in result.nodes_m.items()}
-    posture = Posture(joints_rad=result.joints_rad[index], width_m=float(result.width_m[index]))
-    return places, nodes, posture
 
 
 def _stamps(

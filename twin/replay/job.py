@@ -91,18 +91,10 @@ class ReplayJob:
     def path(self) -> Path:
         """Where the derived episode goes."""
         plan = re.sub(r"[^A-Za-z0-9_-]", "-", self.plan_id)[:60] or "plan"
-        kinematic = self.config.mode == "kinematic"
-        parts = (
-            self.episode_path.stem,
-            "replay",
-            self.trajectory,
-            self.config.mode,
-            plan,
-            KINEMATIC_ENGINE if kinematic else self.config.engine,
-            hash_settings(self.settings()),
-            "mcap",
-        )
-        return self.folder / ".".join(parts)
+        mode = self.config.mode
+        engine = KINEMATIC_ENGINE if mode == "kinematic" else self.config.engine
+        named = (self.episode_path.stem, "replay", self.trajectory, mode, plan, engine)
+        return self.folder / ".".join((*named, hash_settings(self.settings()), "mcap"))
 
     def length_ns(self) -> int:
         """How long the recorded execution took; 0 for a plan that was never executed."""
@@ -174,12 +166,8 @@ def _row(job: ReplayJob) -> dict[str, Any]:
         "executed": job.was_executed,
         "file": job.path().name,
         "skipped": False,
-        "accepted": None,
-        "reason": None,
-        "error": None,
         "warnings": [],
-        "predicates": None,
-        "divergence": None,
+        **dict.fromkeys(("accepted", "reason", "error", "predicates", "divergence")),
     }
 
 

@@ -21,7 +21,6 @@ from twin.physics.unseen import Unseen
 from twin.replay.config import (
     UNKNOWN_POSE_M,
     UNKNOWN_POSE_RAD,
-    BoxDraw,
     PosteriorDraw,
     ReplayConfig,
 )
@@ -73,15 +72,14 @@ def with_draw(
         poses[name] = T.copy()
         poses[name][:2, 3] += draw.bias_m
     task = replace(scene.task, objects=objects)
-    unseen = {box.name: _unseen(box, objects[box.name]) for box in draw.boxes}
+    unseen = {}
+    for box in draw.boxes:
+        half = np.array(objects[box.name].size_m) / 2
+        x, y, z = (half * box.centre_of_mass).tolist()
+        edge_m = float(box.edge_share * half.min())
+        unseen[box.name] = Unseen(edge_m=edge_m, centre_of_mass_m=(x, y, z))
     moved = replace(scene, task=task, Ts_base_object=poses, unseen=unseen)
     return moved, replace(config, physics=physics)
-
-
-def _unseen(box: BoxDraw, model: ObjectModel) -> Unseen:
-    half = np.array(model.size_m) / 2
-    x, y, z = (half * box.centre_of_mass).tolist()
-    return Unseen(edge_m=float(box.edge_share * half.min()), centre_of_mass_m=(x, y, z))
 
 
 def halving(index: int) -> float:
@@ -197,7 +195,7 @@ def with_samples(
     config: ReplayConfig,
     *,
     identity: str,
-    until: float | None = None,
+    until: float | None = None,  # stop once it is decided whether more or fewer succeed
 ) -> Verdict:
     """Add the share of ``config.samples`` varied replays that succeed, with its Wilson interval.
 
@@ -205,9 +203,6 @@ def with_samples(
     there is a posterior, each sample counts with the chance that its answer is right in this
     session. A yes also gets what decides it as its reason. UsageError for kinematic replays, which
     move no objects.
-
-    Args:
-        until: Stop once it is decided whether more or fewer than this share succeed.
     """
     if not config.samples:
         return verdict
@@ -224,7 +219,9 @@ def with_samples(
             samples.append(replay(*varied))
         except GstError:  # this variation cannot be replayed; the others can
             samples.append(replace(verdict, terminal=Factor(value=None), findings=()))
-        total += _probability(samples[n].accepted is True, config, n)
+        likely, good = config.variation.draw_at(halving(n)), samples[n].accepted is True
+        # Of success in the real cell, now that a sample has said so.
+        total += good if likely is None else 1.0 - likely.wrong_yes if good else likely.wrong_no
     k, value = sum(sample.accepted is True for sample in samples), total / n
     low, high = wilson(value, n)
     verdict = replace(
@@ -304,11 +301,3 @@ def decided(total: float, n: int, share: float) -> bool:
     likely = xlogy(total, share) + xlog1py(n - total, -share)
     average = betaln(total + 0.5, n - total + 0.5) - betaln(0.5, 0.5)
     return bool(average - likely >= np.log(1 / (1 - LEVEL)))
-
-
-def _probability(accepted: bool, config: ReplayConfig, index: int) -> float:
-    """Of success in the real cell now that a sample has said so."""
-    drawn = config.variation.draw_at(halving(index))
-    if drawn is None:
-        return float(accepted)
-    return 1.0 - drawn.wrong_yes if accepted else drawn.wrong_no

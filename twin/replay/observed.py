@@ -79,6 +79,11 @@ def find_grips(
     """
     found: list[Grip] = []
     widest, first, narrowest = -np.inf, None, np.inf
+
+    def grip(first: int, last: int) -> Grip:
+        held = first + int(np.argmax(width_m[first : last + 1] <= narrowest + PLATEAU_M))
+        return int(times_ns[first]), int(times_ns[held]), int(times_ns[last])
+
     for index, width in enumerate(width_m.tolist()):
         if first is None:
             widest = max(widest, width)
@@ -87,22 +92,11 @@ def find_grips(
             continue
         narrowest = min(narrowest, width)
         if width > narrowest + PLATEAU_M:
-            found.append(_grip(times_ns, width_m, first, index, narrowest))
+            found.append(grip(first, index))
             widest, first, narrowest = width, None, np.inf
     if first is not None:
-        found.append(_grip(times_ns, width_m, first, len(times_ns) - 1, narrowest))
+        found.append(grip(first, len(times_ns) - 1))
     return found
-
-
-def _grip(
-    times_ns: Int[np.ndarray, " num_samples"],
-    width_m: Float[np.ndarray, " num_samples"],
-    first: int,
-    last: int,
-    narrowest_m: float,
-) -> Grip:
-    held = first + int(np.argmax(width_m[first : last + 1] <= narrowest_m + PLATEAU_M))
-    return int(times_ns[first]), int(times_ns[held]), int(times_ns[last])
 
 
 def observed_stages(

@@ -4,7 +4,6 @@ The IK indicator is 1 when joints exist within their limits that reach every pos
 tolerance, when no joint jumps along the interpolated path, and when no links meet.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby, pairwise
@@ -137,8 +136,8 @@ def _about_times(plan: Plan) -> _Wrong | None:
 def _about_numbers(plan: Plan, robot: Robot) -> _Wrong | None:
     try:
         p, q = np.abs(plan.positions_m()), np.abs(plan.quaternions_wxyz()).max(axis=1)
-        widths = _floats(w.width_m for w in plan.tau if w.width_m is not None)
-        joints = _floats(value for w in plan.tau for value in w.joints_rad or ())
+        widths = np.array([w.width_m for w in plan.tau if w.width_m is not None], dtype=np.float64)
+        joints = np.array([v for w in plan.tau for v in w.joints_rad or ()], dtype=np.float64)
     except OverflowError:  # an integer of hundreds of digits
         return "has numbers that are too large", "Send metres, radians and unit quaternions."
     # Comparisons that what is no number fails.
@@ -174,10 +173,6 @@ def _about_grasps(plan: Plan, robot: Robot) -> _Wrong | None:
         found = f"closes a gripper, and the tool of {robot.name!r} has no fingers"
         return found, "Send plans without grasps, g = 0 throughout, or describe its gripper."
     return None
-
-
-def _floats(values: Iterable[float]) -> Float[np.ndarray, " num_values"]:
-    return np.array(list(values), dtype=np.float64)
 
 
 def _about_whose(plan: Plan, robot: RobotModel) -> _Wrong | None:
@@ -267,26 +262,29 @@ def path_of_plan(
     robot: RobotModel,
     *,
     clearance: Clearance | None = None,
-    start_rad: Float[np.ndarray, " num_joints"] | None = None,
+    start_rad: Float[np.ndarray, " num_joints"] | None = None,  # a plan without joints begins here
 ) -> tuple[JointPath, list[Failure], int | None]:
     """Solve a plan's waypoints.
 
     Joints given by the plan are the warm start and count only where their own forward kinematics
     reaches the waypoint. Waypoints without joints are joined by straight tool motion.
 
-    Args:
-        start_rad: Where the robot stands: a plan that begins without joints goes on from there.
-
-    Returns:
-        The path up to the last pose that could be reached, what failed, and the time of the first
-        unreachable pose (None when all were reached).
+    Returns the path up to the last pose that could be reached, what failed, and the time of the
+    first unreachable pose (None when all were reached).
     """
     check_usable(plan, robot)
     knots = _Knots()
     for is_open, group in groupby(_targets(plan, robot), key=lambda target: target.given is None):
         run = list(group)
         if is_open:
-            _follow(knots, run, robot, clearance, start_rad)
+            begin_rad = knots.joints[-1] if knots.joints else start_rad
+            Ts = np.stack([target.T for target in run])
+            ways = follow_poses(robot, Ts, start_rad=begin_rad, config=IK, clearance=clearance)
+            for target, joints, reached in zip(run, ways.joints_rad, ways.reached, strict=True):
+                if not reached:
+                    knots.stop(robot, target, joints)
+                    break
+                knots.add(target.t_ns, joints)
         else:
             _take_given(knots, run, robot)
         if knots.unreachable_ns is not None:
@@ -330,32 +328,13 @@ class _Knots:
     ) -> None:
         """Note a pose that cannot be reached; a path needs at least one knot."""
         self.unreachable_ns = target.t_ns
-        error_m, _ = pose_error(robot, nearest, target.T)
-        self.failures.append(_unreachable(target.t_ns, target.T, error_m))
+        (error_m, _), (x, y, z) = pose_error(robot, nearest, target.T), target.T[:3, 3]
+        detail = f"no joints reach ({x:.3f}, {y:.3f}, {z:.3f}) m; the nearest miss it by "
+        detail += f"{error_m * 1e3:.1f} mm"
+        failure = Failure(t_ns=target.t_ns, cause=Cause.UNREACHABLE, detail=detail)
+        self.failures.append(failure)
         if not self.joints:
             self.add(target.t_ns, nearest)
-
-
-def _follow(
-    knots: _Knots,
-    run: list[_Target],
-    robot: RobotModel,
-    clearance: Clearance | None,
-    start_rad: Float[np.ndarray, " num_joints"] | None,
-) -> None:
-    """Solve poses whose joints the plan leaves open."""
-    followed = follow_poses(
-        robot,
-        np.stack([target.T for target in run]),
-        start_rad=knots.joints[-1] if knots.joints else start_rad,
-        config=IK,
-        clearance=clearance,
-    )
-    for target, joints, reached in zip(run, followed.joints_rad, followed.reached, strict=True):
-        if not reached:
-            knots.stop(robot, target, joints)
-            return
-        knots.add(target.t_ns, joints)
 
 
 def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel) -> None:
@@ -419,16 +398,6 @@ def _width(waypoint: Waypoint, robot: Robot) -> float:
     if waypoint.width_m is not None:
         return float(waypoint.width_m)
     return 0.0 if waypoint.g == 1 else robot.gripper.max_width_m
-
-
-def _unreachable(t_ns: int, T: Float[np.ndarray, "4 4"], error_m: float) -> Failure:
-    x, y, z = T[:3, 3]
-    return Failure(
-        t_ns=t_ns,
-        cause=Cause.UNREACHABLE,
-        detail=f"no joints reach ({x:.3f}, {y:.3f}, {z:.3f}) m; "
-        f"the nearest miss it by {error_m * 1e3:.1f} mm",
-    )
 
 
 def _check_given(

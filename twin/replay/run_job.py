@@ -18,7 +18,6 @@ from bridge.errors import EpisodeError, GstError
 from bridge.robots.robot import Robot, read_robot, robot_of
 from bridge.task.plan import Plan
 from bridge.task.verdict import SAME_ENGINE, Verdict, is_same_engine
-from twin.replay.config import ReplayConfig
 from twin.replay.divergence import diverge
 from twin.replay.execution import (
     check_covers,
@@ -86,7 +85,11 @@ def _replay(job: ReplayJob) -> tuple[Verdict, dict[str, Any] | None]:
     """Replay and write an episode: the verdict, and where it diverges from the others."""
     source, divergence = _open(job), None
     job.config.refuse_soft(source.scene.task.soft_objects)
-    result = _with_samples(source, _run(source, source.scene, job.config))
+    scene, plan = source.scene, source.plan_as_executed
+    if source.tracks is None:
+        result = _with_samples(source, replay_plan(plan, scene, job.config))
+    else:
+        result = replay_joints(*source.tracks, scene, job.config, plan=plan)
     if source.tracks is not None:
         recording = _recording(source, *source.tracks)
         if job.config.mode == "kinematic":
@@ -170,12 +173,6 @@ def recorded_joints(
     return np.asarray(track.at(np.array([stamp_ns]))[0, order])
 
 
-def _run(source: _Source, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
-    if source.tracks is None:
-        return replay_plan(source.plan_as_executed, scene, config)
-    return replay_joints(*source.tracks, scene, config, plan=source.plan_as_executed)
-
-
 def _tracks(job: ReplayJob, episode: Episode, robot: Robot) -> Tracks:
     """Recorded joints and widths, cut to the execution."""
     plan_id, end_ns = job.plan_id, job.start_ns + job.length_ns()
@@ -210,7 +207,7 @@ def _with_samples(source: _Source, result: ReplayResult) -> ReplayResult:
     commanded = command_of(plan, scene, config)
     verdict = with_samples(
         result.verdict,
-        lambda *drawn: replay_plan(plan, *drawn, commanded=commanded).verdict,
+        lambda *drawn: replay_plan(plan, *drawn, commanded=commanded, known=result).verdict,
         scene,
         config,
         identity=source.job.episode_sha256,

@@ -240,66 +240,52 @@ def replay_run(
     run: RunFolder,
     config: ReplayRunConfig,
     output: Output,
-    imported: tuple[list[dict[str, Any]], dict[str, str]] = ([], {}),
+    imported: tuple[list[dict[str, Any]], dict[str, str]] = ([], {}),  # by ``replay_imported``
 ) -> dict[str, Any]:
     """Replay all trial episodes of a run; replays that are there already are kept.
 
-    Args:
-        imported: What ``replay_imported`` found before.
-
-    Returns:
-        ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes`` that
-        could not be read and ``nothing_to_replay`` in others, with reasons, replays of ``imported``
-        recordings, what was said ``against_recorded`` labels, and the scene hash.
+    Returns ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes``
+    that could not be read and ``nothing_to_replay`` in others, with reasons, replays of
+    ``imported`` recordings, what was said ``against_recorded`` labels, and the scene hash.
     """
     run.refuse_empty()
     with runner_for(config) as runner:
-        return _replay_trajectories(run, config, output, runner, imported)
-
-
-def _replay_trajectories(
-    run: RunFolder,
-    config: ReplayRunConfig,
-    output: Output,
-    runner: Runner,
-    imported: tuple[list[dict[str, Any]], dict[str, str]],
-) -> dict[str, Any]:
-    scene_hash = _scene_hash(run, config, output)
-    jobs, skipped, prepared = _all_jobs(run, scene_hash, config, runner, output)
-    motions, unusable = imported
-    skipped |= unusable
-    _say_what_is_missing(run, jobs, output)
-    if config.render:
-        for note in describe_undrawn(run, _tasks(jobs)):
-            output.say(note)
-    rows, todo = there_already(jobs, force=config.force)
-    if todo:
-        refuse_full(run.derived_dir)  # and make it: each node is asked whether it is there
-    told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
-    with output.progress("replay", len(todo)) as advance:
-        for done, row in enumerate(_replayed(todo, runner, output), start=1):
-            rows.append(row)
-            advance(done, f"{row['episode']} {row['trajectory']} {row['mode']}")
-            what = (row["episode"], row["plan"], row["error"])
-            if row["error"] and what not in told:
-                told.add(what)
-                output.say(f"{row['episode']} {row['plan']}: not evaluated: {row['error']}")
-    rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
-    labels = recorded_labels(run, sorted({row["episode"] for row in rows}))
-    return {
-        "run": str(run.path),
-        "scene_hash": scene_hash,
-        "counts": count_verdicts(rows),
-        "against_recorded": against_recorded(rows, labels),
-        "skipped_episodes": skipped,
-        "nothing_to_replay": {
-            name: each.why_not
-            for name, each in prepared.items()
-            if each.why_not and (each.was_meant or not (rows or motions))
-        },
-        "imported": motions,
-        "rows": rows,
-    }
+        scene_hash = _scene_hash(run, config, output)
+        jobs, skipped, prepared = _all_jobs(run, scene_hash, config, runner, output)
+        motions, unusable = imported
+        skipped |= unusable
+        _say_what_is_missing(run, jobs, output)
+        if config.render:
+            for note in describe_undrawn(run, _tasks(jobs)):
+                output.say(note)
+        rows, todo = there_already(jobs, force=config.force)
+        if todo:
+            refuse_full(run.derived_dir)  # and make it: each node is asked whether it is there
+        told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
+        with output.progress("replay", len(todo)) as advance:
+            for done, row in enumerate(_replayed(todo, runner, output), start=1):
+                rows.append(row)
+                advance(done, f"{row['episode']} {row['trajectory']} {row['mode']}")
+                what = (row["episode"], row["plan"], row["error"])
+                if row["error"] and what not in told:
+                    told.add(what)
+                    output.say(f"{row['episode']} {row['plan']}: not evaluated: {row['error']}")
+        rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
+        labels = recorded_labels(run, sorted({row["episode"] for row in rows}))
+        return {
+            "run": str(run.path),
+            "scene_hash": scene_hash,
+            "counts": count_verdicts(rows),
+            "against_recorded": against_recorded(rows, labels),
+            "skipped_episodes": skipped,
+            "nothing_to_replay": {
+                name: each.why_not
+                for name, each in prepared.items()
+                if each.why_not and (each.was_meant or not (rows or motions))
+            },
+            "imported": motions,
+            "rows": rows,
+        }
 
 
 def _all_jobs(

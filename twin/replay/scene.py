@@ -98,9 +98,8 @@ class StartStates:
 
     def at(self, stamp_ns: int) -> StartState:
         """The state a plan found that began, or was made, at a source time [ns]."""
-        begun = [
-            item for item in self._known if item[0].after_ns is None or item[0].after_ns < stamp_ns
-        ]
+        known = self._known
+        begun = [each for each in known if each[0].after_ns is None or each[0].after_ns < stamp_ns]
         if not begun:
             return self._nothing("no quiet frames before it")
         phase, state = begun[-1]
@@ -110,9 +109,8 @@ class StartStates:
 
     def after(self, plan_id: str) -> StartState:
         """The state that the last execution of a plan left behind."""
-        ends = [
-            state for phase, state in self._known if (phase.name, phase.plan_id) == ("end", plan_id)
-        ]
+        end = ("end", plan_id)
+        ends = [state for phase, state in self._known if (phase.name, phase.plan_id) == end]
         return ends[-1] if ends else self._nothing("no quiet frames after the execution")
 
     def _nothing(self, reason: str) -> StartState:

@@ -1,13 +1,14 @@
 """Replay one trajectory, planned or executed, and judge it: I(tau) = ik x clearance x terminal."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from bridge.episode.streams import JointTrack
+from bridge.geometry.signals import runs_of_true
 from bridge.robots.robot import robot_of
 from bridge.task import predicate
 from bridge.task.causes import Cause
@@ -33,6 +34,7 @@ from twin.replay.motion import held_of, motion_failures, payload_unknown
 from twin.replay.path import JointPath, check_path, path_of_plan
 from twin.replay.result import ReplayResult, States
 from twin.replay.scene import ReplayScene
+from twin.replay.varied import to_measure
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 
@@ -58,10 +60,9 @@ def terminal_factor(
         return Factor(value=None, detail="a kinematic replay does not move objects")
     burst = states.burst
     if burst is not None:
-        detail = f"{burst.object_id}: {burst.found}"
-        bodies = (burst.object_id,)
-        failure = Failure(t_ns=burst.t_ns, cause=Cause.EXPLODED, bodies=bodies, detail=detail)
-        return factor_from([failure])
+        body, t_ns, cause = burst.object_id, burst.t_ns, Cause.EXPLODED
+        detail = f"{body}: {burst.found}"
+        return Factor(value=False, first_t_ns=t_ns, cause=cause, bodies=(body,), detail=detail)
     if unreachable_ns is not None:
         detail = f"the trajectory cannot be executed beyond {unreachable_ns * 1e-9:.2f} s"
         return Factor(value=None, detail=detail)
@@ -115,17 +116,8 @@ def findings_of(task: Task, rollout: predicate.Rollout, side: str) -> list[Any]:
     asked = any(finding.kind == predicate.ALLOWED_CONTACTS for finding in findings)
     if rollout.contacts is not None and not asked:
         findings.append(predicate.evaluate_contacts(task, rollout))
-    return [
-        {
-            "side": side,
-            "kind": finding.kind,
-            "object": finding.object_id,
-            "value": finding.value,
-            "detail": finding.detail,
-            "short_m": finding.short_m,
-        }
-        for finding in findings
-    ]
+    records = [{"side": side, **asdict(finding)} for finding in findings]
+    return [{"object": record.pop("object_id"), **record} for record in records]
 
 
 def reason_of(verdict: Verdict) -> str | None:
@@ -197,6 +189,7 @@ def replay_plan(
     *,
     commanded: Commanded | None = None,
     refuse_early: bool = False,
+    known: ReplayResult | None = None,
 ) -> ReplayResult:
     """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
 
@@ -204,10 +197,15 @@ def replay_plan(
         commanded: What ``command_of`` found, if it was asked: varied replays command the same.
         refuse_early: Simulate nothing once a check that needs no physics says no. The commanded
             path itself must then keep clear, too.
+        known: A replay of the same plan by physics, of which this one is a variation: what the two
+            have in common is taken from it. Not with soft bodies, nor where it was refused.
     """
+    if refuse_early or scene.task.soft_objects:
+        known = None
     commanded = commanded or command_of(plan, scene, config)
     commanded = replace(commanded, path=commanded.path.with_late_gripper(config.grip_delay_s))
-    return _replay(commanded, plan, scene, config, refuse_early=refuse_early)
+    case = _Case(commanded=commanded, plan=plan, scene=scene, config=config).ready()
+    return case.judged(case.moved(refuse_early=refuse_early, known=known))
 
 
 def replay_joints(
@@ -218,7 +216,18 @@ def replay_joints(
     path = path_of_execution(track, widths, plan, config, robot_of(scene.urdf))
     failures = check_path(path, robot, hulls_of(robot))
     commanded = Commanded(path=path, trajectory="executed", failures=failures)
-    return _replay(commanded, plan, scene, config)
+    case = _Case(commanded=commanded, plan=plan, scene=scene, config=config).ready()
+    return case.judged(case.moved())
+
+
+def judge_states(
+    commanded: Commanded, states: States, plan: Plan, scene: ReplayScene, config: ReplayConfig
+) -> ReplayResult:
+    """Judge what physics did while somebody else steered (``plan`` says what), as if replayed."""
+    case = _Case(commanded=commanded, plan=plan, scene=scene, config=config)
+    monitor = case.monitor()
+    clear_m = _clearance_m(monitor, states)
+    return case.judged(Moved(states=states, clearance_m=clear_m, monitor=monitor, by_physics=True))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,158 +236,134 @@ class Moved:
 
     states: States
     clearance_m: Float[np.ndarray, " num_steps"]
+    """Not a number where a varied replay did not measure it."""
     monitor: ClearanceMonitor
     """What it saw, in those states or before them."""
     by_physics: bool
-    measured: bool
+    measured: bool = True
     """Whether clearances are of the whole motion, not of its first state alone."""
 
 
-def _replay(
-    commanded: Commanded,
-    plan: Plan,
-    scene: ReplayScene,
-    config: ReplayConfig,
-    *,
-    refuse_early: bool = False,
-) -> ReplayResult:
-    plan = limited_to_task(plan, scene.task)
-    if config.mode == "dynamic":
-        scene = free_start(scene, soft_models(scene))
-    moved = _move(commanded, plan, scene, config, refuse_early=refuse_early)
-    return _result(commanded, moved, plan, scene, config)
+@dataclass(frozen=True, kw_only=True)
+class _Case:
+    """What is commanded, in which scene, and how it is judged."""
 
+    commanded: Commanded
+    plan: Plan
+    scene: ReplayScene
+    config: ReplayConfig
 
-def judge_states(
-    commanded: Commanded, states: States, plan: Plan, scene: ReplayScene, config: ReplayConfig
-) -> ReplayResult:
-    """Judge what physics did while somebody else steered (``plan`` says what), as if replayed."""
-    hulls = hulls_of(load_robot(scene.urdf))
-    monitor = ClearanceMonitor(scene, plan, hulls, config)
-    moved = Moved(
-        states=states,
-        clearance_m=_clearance_m(monitor, states, list(scene.movable())),
-        monitor=monitor,
-        by_physics=True,
-        measured=True,
-    )
-    return _result(commanded, moved, plan, scene, config)
+    def ready(self) -> "_Case":
+        """With what its task allows, and objects that lie in each other moved apart."""
+        scene = self.scene
+        if self.config.mode == "dynamic":
+            scene = free_start(scene, soft_models(scene))
+        return replace(self, scene=scene, plan=limited_to_task(self.plan, scene.task))
 
+    def monitor(self) -> ClearanceMonitor:
+        """One that has seen nothing yet."""
+        hulls = hulls_of(load_robot(self.scene.urdf))
+        return ClearanceMonitor(self.scene, self.plan, hulls, self.config)
 
-def _result(
-    commanded: Commanded, moved: Moved, plan: Plan, scene: ReplayScene, config: ReplayConfig
-) -> ReplayResult:
-    states = replace(moved.states, contacts=moved.monitor.contacts())
-    Ts_base_tcp = load_robot(scene.urdf).Ts_base_tcp(states.joints_rad)
-    verdict = _judge(states, Ts_base_tcp, commanded, moved, plan, scene, config)
-    return ReplayResult(
-        **vars(states),
-        verdict=replace(verdict, reason=reason_of(verdict)),
-        Ts_base_tcp=Ts_base_tcp,
-        clearance_m=moved.clearance_m,
-    )
+    def moved(self, *, refuse_early: bool = False, known: ReplayResult | None = None) -> Moved:
+        """Follow the path, with physics unless it is refused before."""
+        path, scene, config = self.commanded.path, self.scene, self.config
+        monitor, measured = self.monitor(), True
+        _pre_grasp(monitor, path)
+        by_physics = dynamic = config.mode == "dynamic"
+        stamps_ns = path.dense_times_ns(config.states_hz)
+        if dynamic and refuse_early:
+            found = self.commanded.failures or monitor.failures
+            measured = not (found or any(self.commanded.checks.values()))
+            ahead = self.monitor()
+            if measured:
+                _clearance_m(ahead, follow(path, scene, stamps_ns))
+            by_physics = measured and not ahead.failures
+        if by_physics:
+            states = simulate(path, scene, monitor.hulls, config, known=known)
+        else:
+            states = follow(path, scene, stamps_ns if measured else stamps_ns[:1])
+        where = None if known is None else to_measure(known, states, scene, monitor)
+        return Moved(
+            states=states,
+            clearance_m=_clearance_m(monitor, states, where),
+            monitor=monitor,
+            by_physics=by_physics,
+            measured=measured,
+        )
 
+    def judged(self, moved: Moved) -> ReplayResult:
+        """Every state, with the verdict on them."""
+        states = replace(moved.states, contacts=moved.monitor.contacts())
+        Ts_base_tcp = load_robot(self.scene.urdf).Ts_base_tcp(states.joints_rad)
+        verdict = self._verdict(states, Ts_base_tcp, moved)
+        return ReplayResult(
+            **vars(states),
+            verdict=replace(verdict, reason=reason_of(verdict)),
+            Ts_base_tcp=Ts_base_tcp,
+            clearance_m=moved.clearance_m,
+        )
 
-def _move(
-    commanded: Commanded,
-    plan: Plan,
-    scene: ReplayScene,
-    config: ReplayConfig,
-    *,
-    refuse_early: bool,
-) -> Moved:
-    """Follow the path, with physics unless it is refused before."""
-    path, hulls = commanded.path, hulls_of(load_robot(scene.urdf))
-    monitor = ClearanceMonitor(scene, plan, hulls, config)
-    _pre_grasp(monitor, path)
-    dynamic = config.mode == "dynamic"
-    by_physics, measured = dynamic, True
-    stamps_ns = path.dense_times_ns(config.states_hz)
-    if dynamic and refuse_early:
-        found = commanded.failures or monitor.failures or any(commanded.checks.values())
-        measured = not found
-        ahead = ClearanceMonitor(scene, plan, hulls, config)
-        if measured:
-            _clearance_m(ahead, follow(path, scene, stamps_ns), [])
-        by_physics = measured and not ahead.failures
-    if by_physics:
-        states = simulate(path, scene, hulls, config)
-    else:
-        states = follow(path, scene, stamps_ns if measured else stamps_ns[:1])
-    return Moved(
-        states=states,
-        clearance_m=_clearance_m(monitor, states, list(scene.movable())),
-        monitor=monitor,
-        by_physics=by_physics,
-        measured=measured,
-    )
-
-
-def _judge(
-    states: States,
-    Ts_base_tcp: Float[np.ndarray, "num_steps 4 4"],
-    commanded: Commanded,
-    moved: Moved,
-    plan: Plan,
-    scene: ReplayScene,
-    config: ReplayConfig,
-) -> Verdict:
-    """Every factor and check, and what is worth knowing beside them."""
-    path, checks = commanded.path, commanded.checks
-    # What was executed is judged by where things end: it is known whether they were dropped.
-    planned = moved.by_physics and commanded.trajectory == "planned"
-    if planned:
-        off_rad = states.joints_rad - path.joints_at(states.stamps_ns)
-        record = load_robot(scene.urdf).record
-        simulated = stops_of_arm(states.stamps_ns, off_rad, states.arm_force_N, record)
-        checks = {**checks, "limits": checks["limits"] + simulated}
-    unreachable_ns = commanded.unreachable_ns
-    if moved.by_physics or config.mode == "kinematic":
-        terminal = terminal_factor(states, scene, config, unreachable_ns=unreachable_ns)
-    else:
+    def _verdict(
+        self, states: States, Ts_base_tcp: Float[np.ndarray, "num_steps 4 4"], moved: Moved
+    ) -> Verdict:
+        """Every factor and check, and what is worth knowing beside them."""
+        commanded, scene, config = self.commanded, self.scene, self.config
+        path, checks, unreachable_ns = commanded.path, commanded.checks, commanded.unreachable_ns
+        # What was executed is judged by where things end: it is known whether they were dropped.
+        planned = moved.by_physics and commanded.trajectory == "planned"
+        if planned:
+            off_rad = states.joints_rad - path.joints_at(states.stamps_ns)
+            record = load_robot(scene.urdf).record
+            simulated = stops_of_arm(states.stamps_ns, off_rad, states.arm_force_N, record)
+            checks = {**checks, "limits": checks["limits"] + simulated}
         terminal = Factor(value=None, detail=REFUSED_BEFORE)
-    undecided = (
-        _clearance_undecided(scene, unreachable_ns, states) if moved.measured else REFUSED_BEFORE
-    )
-    findings = findings_of(scene.task, states, "replayed") if moved.by_physics else ()
-    return Verdict(
-        plan_id=plan.id,
-        trajectory=commanded.trajectory,
-        mode=config.mode,
-        engine=engine_of(scene.task, config),
-        seed=config.seed,
-        scene_hash=scene.scene_hash,
-        calibration_id=scene.calibration_id,
-        ik=factor_from(commanded.failures),
-        clearance=factor_from(moved.monitor.failures, undecided=undecided),
-        terminal=terminal,
-        warnings=(HELD_BEFORE,) if predicate.already_true_at_start(scene.task, states) else (),
-        findings=tuple(findings),
-        checks={
-            name: factor_from(found, undecided=commanded.unknown if name == "limits" else None)
-            for name, found in checks.items()
-        },
-        grasps=grasps_seen(plan, path, states, Ts_base_tcp) if planned else (),
-        nearest=moved.monitor.nearest() if moved.measured else None,
-    )
+        undecided: str | None = REFUSED_BEFORE
+        if moved.by_physics or config.mode == "kinematic":
+            terminal = terminal_factor(states, scene, config, unreachable_ns=unreachable_ns)
+        if moved.measured:
+            undecided = _clearance_undecided(scene, unreachable_ns, states)
+        findings = findings_of(scene.task, states, "replayed") if moved.by_physics else ()
+        return Verdict(
+            plan_id=self.plan.id,
+            trajectory=commanded.trajectory,
+            mode=config.mode,
+            engine=engine_of(scene.task, config),
+            seed=config.seed,
+            scene_hash=scene.scene_hash,
+            calibration_id=scene.calibration_id,
+            ik=factor_from(commanded.failures),
+            clearance=factor_from(moved.monitor.failures, undecided=undecided),
+            terminal=terminal,
+            warnings=(HELD_BEFORE,) if predicate.already_true_at_start(scene.task, states) else (),
+            findings=tuple(findings),
+            checks={
+                name: factor_from(found, undecided=commanded.unknown if name == "limits" else None)
+                for name, found in checks.items()
+            },
+            grasps=grasps_seen(self.plan, path, states, Ts_base_tcp) if planned else (),
+            nearest=moved.monitor.nearest() if moved.measured else None,
+        )
 
 
 def _clearance_m(
-    monitor: ClearanceMonitor, states: States, movable: list[str]
+    monitor: ClearanceMonitor,
+    states: States,
+    where: Bool[np.ndarray, " num_steps"] | None = None,  # everywhere
 ) -> Float[np.ndarray, " num_steps"]:
-    known = {name: Ts for name, Ts in states.Ts_base_object.items() if name in movable}
-    return np.array(
-        [
-            monitor.measure(
-                int(t_ns),
+    moving = {n: Ts for n, Ts in states.Ts_base_object.items() if n in monitor.scene.movable()}
+    found = np.full(len(states.stamps_ns), np.nan)
+    for first, end in [(0, len(found))] if where is None else runs_of_true(where):
+        monitor.leap()
+        for index in range(max(first - 1, 0), end):
+            found[index] = monitor.measure(
+                int(states.stamps_ns[index]),
                 states.joints_rad[index],
                 float(states.width_m[index]),
-                {name: Ts[index] for name, Ts in known.items()},
+                {name: Ts[index] for name, Ts in moving.items()},
                 {name: nodes[index] for name, nodes in states.nodes_m.items()},
             )
-            for index, t_ns in enumerate(states.stamps_ns)
-        ]
-    )
+    return found
 
 
 def follow(path: JointPath, scene: ReplayScene, stamps_ns: Int[np.ndarray, " num_steps"]) -> States:

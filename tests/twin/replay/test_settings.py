@@ -20,10 +20,6 @@ NUMBERS = [
 ]
 
 
-def made(config: Any, name: str, value: float) -> Any:
-    return config(**{name: value})
-
-
 @pytest.mark.parametrize(
     ("config", "name"), NUMBERS, ids=lambda item: getattr(item, "__name__", item)
 )
@@ -33,7 +29,7 @@ def test_what_is_no_number_or_less_than_nothing_is_refused_by_its_name(
 ) -> None:
     """A distance is never below NaN: with it as a limit everything would be accepted."""
     with pytest.raises(OptionError, match=f"--{name.replace('_', '-')} "):
-        made(config, name, value)
+        config(**{name: value})
 
 
 def test_there_are_numbers_to_try_in_every_settings_record() -> None:
@@ -44,6 +40,6 @@ def test_there_are_numbers_to_try_in_every_settings_record() -> None:
 def test_a_rate_or_a_force_of_nothing_is_refused() -> None:
     for name in ("rate_hz", "solver_iterations"):
         with pytest.raises(OptionError, match="makes no sense"):
-            made(PhysicsConfig, name, 0)
+            PhysicsConfig(**{name: 0})
     with pytest.raises(OptionError, match="makes no sense"):
-        made(PhysicsConfig, "grip_force_N", 0.0)
+        PhysicsConfig(grip_force_N=0.0)

@@ -67,12 +67,8 @@ class BoundingSpheres:
         Never too large; too small by what the finest points leave uncovered, and by 2 % of it.
         """
         answers = np.empty(len(R))
-        nearest(*_values(grid), R, t, *self._trees, answers)
+        nearest(grid.values_m, grid.origin_m, grid.voxel_m, R, t, *self._trees, answers)
         return np.asarray(answers - self._cover)
-
-
-def _values(grid: SdfGrid) -> tuple[np.ndarray, np.ndarray, float]:
-    return grid.values_m, grid.origin_m, grid.voxel_m
 
 
 def grid_distances_m(
@@ -85,9 +81,8 @@ def grid_distances_m(
     behind it as deep as it was.
     """
     answers, unturned = np.empty(len(points_m)), np.tile(np.eye(3), (len(points_m), 1, 1))
-    surface_to_grid(
-        *_values(grid), unturned, np.ascontiguousarray(points_m), np.zeros((1, 3)), answers
-    )
+    where = unturned, np.ascontiguousarray(points_m), np.zeros((1, 3))
+    surface_to_grid(grid.values_m, grid.origin_m, grid.voxel_m, *where, answers)
     return answers
 
 

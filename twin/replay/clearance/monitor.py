@@ -67,9 +67,12 @@ def half_way(a: State, b: State) -> State:
 
     Objects that leapt, or are known at one of the two only, are left out.
     """
-    poses = {}
-    for name in a.Ts_base_object.keys() & b.Ts_base_object.keys():
+    poses, nodes = {}, {}
+    for name in (*a.Ts_base_object, *a.nodes_m):
         if object_travel_m(a, b, name, 0.0) > MAX_LEAP_M:
+            continue
+        if name in a.nodes_m:
+            nodes[name] = (a.nodes_m[name] + b.nodes_m[name]) / 2
             continue
         (q_a, p_a), (q_b, p_b) = (se3.split(each.Ts_base_object[name]) for each in (a, b))
         q = se3.interpolate_quaternion(q_a, q_b, np.array(0.5))
@@ -79,11 +82,7 @@ def half_way(a: State, b: State) -> State:
         joints_rad=(a.joints_rad + b.joints_rad) / 2,
         width_m=(a.width_m + b.width_m) / 2,
         Ts_base_object=poses,
-        nodes_m={
-            name: (a.nodes_m[name] + b.nodes_m[name]) / 2
-            for name in a.nodes_m.keys() & b.nodes_m.keys()
-            if object_travel_m(a, b, name, 0.0) <= MAX_LEAP_M
-        },
+        nodes_m=nodes,
     )
 
 
@@ -111,14 +110,21 @@ class Reach:
                     self._per_rad[row, joint_ids.index(joint)] = reach
                 # The joint's own slide, if it is one, moves it by at most its range.
                 reach += float(np.linalg.norm(model.jointPlacements[joint].translation))
-                reach += _slide_m(model, joint)
+                if "P" in model.joints[joint].shortname().removeprefix("JointModel"):
+                    index = model.joints[joint].idx_q
+                    ends = model.lowerPositionLimit[index], model.upperPositionLimit[index]
+                    reach += float(np.abs(ends).max())
                 joint = int(model.parents[joint])
             self._fingers[row] = _per_width(robot, int(frame.parentJoint), reach=ends_m)
 
-    def travel_m(self, a: State, b: State) -> Float[np.ndarray, " num_links"]:
+    def travel_m(
+        self,
+        turned_rad: Float[np.ndarray, "*num_steps num_joints"],
+        opened_m: float | Float[np.ndarray, "*num_steps"],
+    ) -> Float[np.ndarray, "*num_steps num_links"]:
         """How far any point of each link moved at most [m], if joints and width moved straight."""
-        turned = np.abs(b.joints_rad - a.joints_rad)
-        return np.asarray(self._per_rad @ turned + self._fingers * abs(b.width_m - a.width_m))
+        opened = np.multiply.outer(np.abs(opened_m), self._fingers)
+        return np.asarray(np.abs(turned_rad) @ self._per_rad.T + opened)
 
 
 def _per_width(robot: RobotModel, joint: int, *, reach: float) -> float:
@@ -146,15 +152,6 @@ def object_travel_m(a: State, b: State, name: str, radius_m: float) -> float:
     # Rotations an angle apart differ by a matrix of norm sqrt(8) sin(angle / 2).
     turned = 2 * asin(min(1.0, hypot(*change[:3, :3].ravel().tolist()) / sqrt(8)))
     return hypot(*change[:3, 3].tolist()) + turned * radius_m
-
-
-def _slide_m(model: Any, joint: int) -> float:
-    """Largest displacement of a prismatic joint; 0 for one that turns."""
-    item = model.joints[joint]
-    if "P" not in item.shortname().removeprefix("JointModel"):
-        return 0.0
-    ends = (model.lowerPositionLimit[item.idx_q], model.upperPositionLimit[item.idx_q])
-    return float(np.abs(ends).max())
 
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
@@ -199,7 +196,7 @@ class ClearanceMonitor:
         self.hulls = hulls
         self._allowed_at = allowed_at(plan.stages)
         self.failures: list[Failure] = []
-        self._scene = scene
+        self.scene = scene
         self._around = Surroundings(scene, hulls, config.eps_col_m)
         self._links = self._around.links
         self._objects = self._around.objects
@@ -207,23 +204,27 @@ class ClearanceMonitor:
         self._radii = np.array([link.radius_m for link in self._links])
         # How far off a body that stands still may be: as localisation says, one deviation.
         fixed = {n: c for n, c in scene.covariances.items() if n in scene.containers()}
-        self._sigma_m = {
+        self.sigma_m = {
             name: float(np.sqrt(np.linalg.eigvalsh(np.asarray(c)[:3, :3]).max()))
             for name, c in fixed.items()
         }
         self.lacking_m: dict[tuple[str, ...], float] = {}  # of bodies: how much farther apart
-        self._late_m = np.zeros(len(self._links))
-        # The most by which a pair must keep more than ``eps_col_m``.
-        self._more_m = max(self._sigma_m.values(), default=0.0)
         gripper = hulls.robot.record.gripper
         self._hand = [k for k, s in enumerate(self._links) if s.body in gripper.links]
-        self._object_late_m: dict[str, float] = {}
-        self._reach = Reach(hulls)
+        self.reach = Reach(hulls)
         self._contacts: dict[tuple[str, str, bool], list[Contact]] = {}
-        self._last: _Look | None = None
         self._last_ns = 0
         self._nearest: tuple[float, Pair, int] | None = None
         self._first_centre: dict[str, Float[np.ndarray, " 3"]] = {}
+        self.leap()
+
+    def leap(self) -> None:
+        """Say nothing of what was between the state before and the next one."""
+        self._last: _Look | None = None
+        self._late_m = np.zeros(len(self._links))
+        self._object_late_m: dict[str, float] = {}
+        # The most by which a pair must keep more than ``eps_col_m``.
+        self._more_m = max(self.sigma_m.values(), default=0.0)
 
     def measure(
         self,
@@ -240,11 +241,7 @@ class ClearanceMonitor:
         A body that comes too close between two calls is therefore missed by half a millimetre at
         most, and the smallest distance in between is returned.
         """
-        nodes = (
-            {}
-            if nodes_m is None
-            else {name: np.asarray(rows, dtype=np.float64) for name, rows in nodes_m.items()}
-        )
+        nodes = {n: np.asarray(rows, dtype=np.float64) for n, rows in (nodes_m or {}).items()}
         state = State(
             t_ns=t_ns,
             joints_rad=joints_rad,
@@ -273,18 +270,23 @@ class ClearanceMonitor:
         }  # a leap is no speed
         self._object_late_m = {n: m * share for n, m in steps.items() if m <= MAX_LEAP_M}
         late_m = max([float(self._late_m.max()), *self._object_late_m.values()])
-        self._more_m = min(late_m, MAX_LEAP_M) + max(self._sigma_m.values(), default=0.0)
+        self._more_m = min(late_m, MAX_LEAP_M) + max(self.sigma_m.values(), default=0.0)
 
     def least_m(self, pair: Pair) -> float:
         """How far a pair that may not touch must be apart now: farther when it is fast."""
         body, piece, other, _ = pair
         late_m = self._object_late_m.get(body, 0.0) if piece < 0 else float(self._late_m[piece])
-        return self.config.eps_col_m + min(late_m, MAX_LEAP_M) + self._sigma_m.get(other, 0.0)
+        return self.config.eps_col_m + min(late_m, MAX_LEAP_M) + self.sigma_m.get(other, 0.0)
 
     def _look(self, state: State) -> _Look:
         """Measure every pair that is near, or the nearest one."""
         self.hulls.place(state.joints_rad, state.width_m)
-        moved = [name for name, T in state.Ts_base_object.items() if self._has_moved(name, T)]
+        starts = self.scene.Ts_base_object
+        moved = [
+            name
+            for name, T in state.Ts_base_object.items()
+            if hypot(*(T[:3, 3] - starts[name][:3, 3]).tolist()) > MOVED_M
+        ]
         soft = {n: p for n, p in state.nodes_m.items() if self._nodes_have_moved(n, p)}
         allowed = self._allowed_at(state.t_ns)
         distances, cut = self._around.measure(
@@ -306,7 +308,9 @@ class ClearanceMonitor:
         return [*before, middle, *self._between(middle, b, halvings - 1)]
 
     def _may_have_touched(self, a: _Look, b: _Look) -> bool:
-        links_m = self._reach.travel_m(a.state, b.state)
+        links_m = self.reach.travel_m(
+            b.state.joints_rad - a.state.joints_rad, b.state.width_m - a.state.width_m
+        )
         objects_m = {
             name: object_travel_m(a.state, b.state, name, solid.radius_m)
             for name, solid in self._objects.items()
@@ -364,8 +368,8 @@ class ClearanceMonitor:
         self.hulls.place(joints_rad, width_m)
         R, t = self.hulls.rotations, self.hulls.translations
         centres = np.matmul(R, self._centres)[:, :, 0] + t
-        for name, T in self._scene.movable().items():
-            model = self._scene.task.objects[name]
+        for name, T in self.scene.movable().items():
+            model = self.scene.task.objects[name]
             solid = self._objects[name]
             limit_m = PRE_GRASP_DEPTH_M
             if model.soft is not None:  # it gives way, and is localised less exactly
@@ -400,10 +404,6 @@ class ClearanceMonitor:
         distance_m, (body, _, other, _), t_ns = self._nearest
         return {"t_ns": t_ns, "distance_m": distance_m, "bodies": [body, other]}
 
-    def _has_moved(self, name: str, T: Float[np.ndarray, "4 4"]) -> bool:
-        start = self._scene.Ts_base_object[name]
-        return hypot(*(T[:3, 3] - start[:3, 3]).tolist()) > MOVED_M
-
     def _nodes_have_moved(self, name: str, nodes: Float[np.ndarray, "num_nodes 3"]) -> bool:
         """Against where the body had come to rest, because it sags when it is put down."""
         centre = nodes.mean(axis=0)
@@ -419,7 +419,7 @@ class ClearanceMonitor:
         if may_touch:
             # An object that drops may lie deep for one step: the solver's doing, not the plan's.
             # Neither is a finger among the nodes of a soft body that it squeezes as it may.
-            solid = body not in self._objects and other not in self._scene.task.soft_objects
+            solid = body not in self._objects and other not in self.scene.task.soft_objects
             if distance < -MAX_CONTACT_DEPTH_M and solid:
                 self._fail(t_ns, Cause.DEEP_CONTACT, body, other, distance)
             return np.inf

@@ -111,9 +111,6 @@ def _window(
     return x, y, z
 
 
-ContainerPanel = tuple[str, int, PanelBox]
-"""A container, which of its boxes it is, and that box."""
-
 _STILL_M = 1e-9
 _SAMPLES = 4
 
@@ -123,7 +120,7 @@ StaticObstacle = tuple[Solid, int, Float[np.ndarray, "4 4"]]
 
 
 def static_obstacles(
-    panels: Sequence[ContainerPanel],
+    panels: Sequence[tuple[str, int, PanelBox]],  # a container, which of its boxes, and that box
     table_height_m: float,  # of its top, over the robot's base
 ) -> list[StaticObstacle]:
     """The table and the panels, each in its own frame."""

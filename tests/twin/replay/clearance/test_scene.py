@@ -18,7 +18,7 @@ from twin.replay.clearance.bodies import (
     planes_of,
 )
 from twin.replay.clearance.bounding_spheres import bounding_spheres_of, grid_distances_m
-from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
+from twin.replay.clearance.monitor import ClearanceMonitor, Reach
 from twin.replay.clearance.static_obstacles import unmodelled_obstacles
 from twin.replay.clearance.surroundings import Surroundings, posture_clearance
 from twin.replay.config import ReplayConfig
@@ -183,9 +183,7 @@ def test_reach_bounds_how_far_any_point_of_a_link_moves(hulls: RobotHulls) -> No
                 for hull, R, t in zip(hulls.hulls, hulls.rotations, hulls.translations, strict=True)
             ]
         moved = [np.linalg.norm(q - p, axis=1).max() for p, q in zip(before, after, strict=True)]
-        bounds = reach.travel_m(
-            State(t_ns=0, joints_rad=a, width_m=0.02), State(t_ns=1, joints_rad=b, width_m=0.06)
-        )
+        bounds = reach.travel_m(b - a, 0.04)
         assert np.all(np.array(moved) <= bounds + 1e-9)
 
 

@@ -141,29 +141,6 @@ def draws(scene: ReplayScene, count: int) -> list[ReplayScene]:
     ]
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_pose_error_is_drawn_about_the_axes_of_the_base(
-    script: SimpleNamespace, axis: int
-) -> None:
-    """Unsure about one axis of the base only, however the object lies."""
-    scene = script.scene()
-    T = se3.transform_from(np.array([0.7, 0.5, -0.3, 0.4]), np.array([0.5, -0.1, 0.3]))
-    spread = np.zeros(6)
-    spread[[axis, 3 + axis]] = (1e-4, 4e-2)
-    scene = replace(
-        scene,
-        Ts_base_object={**scene.Ts_base_object, "cube": T},
-        covariances={"cube": np.diag(spread)},
-    )
-    others = [index for index in range(3) if index != axis]
-    for draw in draws(scene, 30):
-        moved = draw.Ts_base_object["cube"]
-        turn = se3.vector_from_rotation(moved[:3, :3] @ T[:3, :3].T)
-        np.testing.assert_allclose(turn[others], 0.0, atol=1e-12)
-        np.testing.assert_allclose((moved[:3, 3] - T[:3, 3])[others], 0.0, atol=1e-12)
-        assert turn[axis] != 0.0
-
-
 def test_correlated_errors_are_drawn_with_their_correlation(script: SimpleNamespace) -> None:
     """The sample covariance is that of the localisation, all six numbers of it."""
     scene = script.scene()

@@ -276,24 +276,18 @@ def calibration(**identified: Any) -> Calibration:
     return Calibration(record={"physics": {"identified": identified}}, cameras={})
 
 
-def test_calibrated_settings_have_its_values_and_its_spreads() -> None:
+def test_calibrated_settings_have_its_values_and_spreads_but_where_the_user_set_one() -> None:
     known = calibration(
         grip_force_N={"value": 14.0, "sigma_log": 0.05}, finger_friction={"value": 0.9}
     )
-    config = calibrated(ReplayConfig(), known, load_task("cube_into_box"))
+    task, nominal = load_task("cube_into_box"), ReplayConfig()
+    config = calibrated(nominal, known, task)
     assert config.physics.grip_force_N == 14.0
     assert config.variation.calibrated == (("grip_force_N", 0.05),)
     assert config.variation.physics_spreads()["grip_force_N"] == 0.05
-    assert calibrated(ReplayConfig(), None, load_task("cube_into_box")) == ReplayConfig()
-    assert calibrated(ReplayConfig(), calibration(), load_task("cube_into_box")) == ReplayConfig()
-
-
-def test_what_the_user_set_is_varied_by_the_prior() -> None:
-    known = calibration(grip_force_N={"value": 14.0, "sigma_log": 0.05})
-    mine = ReplayConfig(physics=PhysicsConfig(grip_force_N=11.0))
-    config = calibrated(mine, known, load_task("cube_into_box"))
-    assert config.physics.grip_force_N == 11.0
-    assert config.variation.calibrated == ()
+    assert calibrated(nominal, None, task) == calibrated(nominal, calibration(), task) == nominal
+    mine = calibrated(ReplayConfig(physics=PhysicsConfig(grip_force_N=11.0)), known, task)
+    assert (mine.physics.grip_force_N, mine.variation.calibrated) == (11.0, ())
 
 
 def test_numbers_with_which_nothing_can_be_replayed_are_refused() -> None:

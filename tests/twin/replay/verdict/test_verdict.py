@@ -26,17 +26,6 @@ def test_the_cube_is_carried_between_the_fingers(good: ReplayResult) -> None:
     assert slip.max() < 4e-3
 
 
-@pytest.mark.slow
-def test_a_grasp_beside_the_cube_is_rejected_by_the_terminal_state(script: SimpleNamespace) -> None:
-    scene = script.scene()
-    plan = script.plan(scene, grasp_offset_m=(0.06, 0.0, 0.0))
-    verdict = replay_plan(plan, scene, ReplayConfig()).verdict
-    assert verdict.terminal.value is False
-    assert verdict.terminal.cause == "inside"
-    assert verdict.terminal.bodies == ("cube", "box")
-    assert verdict.accepted is False
-
-
 @pytest.mark.parametrize("mode", ["kinematic", pytest.param("dynamic", marks=pytest.mark.slow)])
 def test_a_dip_below_the_table_is_rejected_by_clearance(
     script: SimpleNamespace, mode: Mode
