@@ -222,7 +222,9 @@ class Robot:
             for mesh in shape.iter("mesh"):
                 try:
                     found = self._mesh(mesh.get("filename", ""), path.parent)
-                    mesh.set("filename", found if lost is None else str(resolve_mesh(found)))
+                    mesh.set("filename", found)
+                    if lost is not None:
+                        resolve_mesh(found)
                 except UsageError as error:
                     missing.append(f"the link {link.get('name')!r}: {error}")
                     link.remove(shape)

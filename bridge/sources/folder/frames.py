@@ -126,6 +126,19 @@ def checked_rotation(
     return se3.nearest_rotation(R)
 
 
+def pose_of(path: Path, values: Any, where: str) -> Float[np.ndarray, "4 4"] | None:
+    """Read a pose of the camera in the world, 4 x 4; None where tracking was lost."""
+    try:
+        T = np.array(values, dtype=np.float64)
+    except (ValueError, TypeError):
+        T = np.empty(0)
+    if T.shape not in ((4, 4), (3, 4)):
+        raise FolderError(path=path, found=f"{where} is no 4 x 4 of numbers")
+    if not np.isfinite(T).all():
+        return None
+    return se3.from_rotation(checked_rotation(path, T[:3, :3], where), T[:3, 3])
+
+
 @dataclass(frozen=True, kw_only=True)
 class StoredColor:
     """A colour image as it lies in a folder."""

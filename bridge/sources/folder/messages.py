@@ -36,7 +36,7 @@ from bridge.sources.folder.frames import (
     StoredColor,
     camera_of,
     check_size,
-    checked_rotation,
+    pose_of,
     read_color,
     read_stored_depth,
     require_image,
@@ -258,7 +258,9 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         depth_path = require_image(
             folder / f"{stem}.depth.png", what="depth", named_by=f"{color_path.name} belongs to it"
         )
-        T_world_depth = _read_pose(folder / f"{stem}.pose.txt")
+        pose_path, T_world_depth = folder / f"{stem}.pose.txt", None
+        if pose_path.is_file():
+            T_world_depth = pose_of(pose_path, _matrix(pose_path, (4, 4)), "the pose")
         if T_world_depth is None:
             num_unposed += 1
             continue
@@ -269,11 +271,10 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         raise FolderError(
             path=folder, found="no frame has a pose", hint="Add frame-XXXXXX.pose.txt files."
         )
-    height, width = read_stored_depth(frames[0].depth_path).shape
+    size = read_stored_depth(frames[0].depth_path).shape[::-1]
     given = _read_intrinsics(folder / INTRINSICS_FILE)
-    depth = config.depth_intrinsics or given
-    T_color_depth = np.eye(4)
-    T_color_depth[:3, 3] = T_COLOR_DEPTH_NOMINAL_M
+    depth, color = config.depth_intrinsics or given, config.color_intrinsics
+    T_color_depth = se3.from_rotation(np.eye(3), T_COLOR_DEPTH_NOMINAL_M)
     return FolderIndex(
         path=folder,
         layout="7-Scenes",
@@ -282,18 +283,10 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         depth_invalid_values=INVALID_VALUES,
         depth_encoding="",
         depth_camera=camera_of(
-            depth,
-            DEPTH_INTRINSICS,
-            (width, height),
-            option="--depth-intrinsics",
-            path=folder,
+            depth, DEPTH_INTRINSICS, size, option="--depth-intrinsics", path=folder
         ),
         color_camera=camera_of(
-            config.color_intrinsics,
-            COLOR_INTRINSICS,
-            (width, height),
-            option="--color-intrinsics",
-            path=folder,
+            color, COLOR_INTRINSICS, size, option="--color-intrinsics", path=folder
         ),
         T_depth_color=se3.invert(T_color_depth),
         frames=tuple(frames),
@@ -311,18 +304,6 @@ def _assumed(config: FolderConfig, *, given_by_file: bool) -> dict[str, str]:
     if config.color_intrinsics is None:
         assumed["color_intrinsics"] = f"{COLOR_INTRINSICS}, nominal, not measured"
     return assumed
-
-
-def _read_pose(path: Path) -> Float[np.ndarray, "4 4"] | None:
-    """Return ``T_world_depth``; None where there is no file or tracking was lost."""
-    if not path.is_file():
-        return None
-    T = _matrix(path, (4, 4))
-    if not np.isfinite(T).all():
-        return None
-    T[:3, :3] = checked_rotation(path, T[:3, :3], "the pose")
-    T[3] = (0.0, 0.0, 0.0, 1.0)
-    return T
 
 
 def _read_intrinsics(path: Path) -> tuple[float, float, float, float] | None:
