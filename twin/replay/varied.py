@@ -5,7 +5,7 @@ comes near an object, ends once all lie still and it comes near none any more, a
 measured again where it may be too small now. No other link may touch objects.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -24,7 +24,8 @@ its fingers may have been told to move a tenth of a second later."""
 HASTE = 1.5
 """Bodies keep so many of the tool's or an object's steps more: ``LATE_S`` asks for 0.6 of their
 own, and half of one may be lost between two states."""
-Places = Mapping[str, Sequence[float] | Float[np.ndarray, "*num_steps 3"]]
+
+Places = Mapping[str, Float[np.ndarray, "*num_steps 3"]]
 
 
 @lru_cache(maxsize=4)
@@ -48,7 +49,7 @@ def hand_near(
     middle_m, half_m = hand_box(hulls)
     found = np.zeros(len(known.stamps_ns), dtype=bool)
     for name, place in places.items():
-        away_m = np.asarray(place) - known.Ts_base_tcp[:, :3, 3]
+        away_m = place - known.Ts_base_tcp[:, :3, 3]
         local = np.einsum("nji,nj->ni", known.Ts_base_tcp[:, :3, :3], away_m) - middle_m
         gaps = np.linalg.norm(np.maximum(np.abs(local) - half_m, 0.0), axis=1)
         found |= gaps < np.linalg.norm(scene.task.objects[name].size_m) / 2 + AWAY_M
