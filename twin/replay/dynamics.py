@@ -121,10 +121,8 @@ def simulate(
     soft = soft_models(scene)
     samples = Samples(scene, soft)
     settling = round(config.settle_before_s * rate)
-    first, movable = 0, scene.movable()
-    if known is not None:
-        starts = {name: T[:3, 3] for name, T in movable.items()}
-        first = int(hand_near(known, starts, scene, hulls).argmax())
+    places = {name: T[:3, 3] for name, T in scene.movable().items()}
+    first = 0 if known is None else int(hand_near(known, places, scene, hulls).argmax())
     at = first - settling // STATE_EVERY
     with open_world(config.engine, hulls.robot.urdf, mesh_hulls(hulls), config.physics) as world:
         spawn(world, scene, soft)
@@ -147,7 +145,7 @@ def simulate(
             if not samples.take(world, stamps[step + 1]):
                 break
             if known is not None and state % STATE_EVERY == 0 and samples.lie():
-                places = {name: world.object_pose(name)[:3] for name in movable}
+                places = {name: np.array(world.object_pose(name)[:3]) for name in places}
                 if not hand_near(known, places, scene, hulls)[state:].any():
                     samples.fill(known, slice(state + 1, None))
                     break

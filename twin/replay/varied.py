@@ -5,7 +5,7 @@ comes near an object, ends once all lie still and it comes near none any more, a
 measured again where it may be too small now. No other link may touch objects.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -24,7 +24,8 @@ its fingers may have been told to move a tenth of a second later."""
 HASTE = 1.5
 """Bodies keep so many of the tool's or an object's steps more: ``LATE_S`` asks for 0.6 of their
 own, and half of one may be lost between two states."""
-Places = Mapping[str, Sequence[float] | Float[np.ndarray, "*num_steps 3"]]
+
+Places = Mapping[str, Float[np.ndarray, "*num_steps 3"]]
 
 
 @lru_cache(maxsize=4)
@@ -48,7 +49,7 @@ def hand_near(
     middle_m, half_m = hand_box(hulls)
     found = np.zeros(len(known.stamps_ns), dtype=bool)
     for name, place in places.items():
-        away_m = np.asarray(place) - known.Ts_base_tcp[:, :3, 3]
+        away_m = place - known.Ts_base_tcp[:, :3, 3]
         local = np.einsum("nji,nj->ni", known.Ts_base_tcp[:, :3, :3], away_m) - middle_m
         gaps = np.linalg.norm(np.maximum(np.abs(local) - half_m, 0.0), axis=1)
         found |= gaps < np.linalg.norm(scene.task.objects[name].size_m) / 2 + AWAY_M
@@ -59,9 +60,10 @@ def to_measure(
     known: ReplayResult, states: States, scene: ReplayScene, monitor: ClearanceMonitor
 ) -> Bool[np.ndarray, " num_steps"]:
     """The states of a varied replay in which a clearance may be too small."""
-    known_m, found = known.clearance_m, np.zeros(len(known.stamps_ns), dtype=bool)
+    known_m, found = known.clearance_m, np.isnan(known.clearance_m)
     joints, widths = states.joints_rad - known.joints_rad, states.width_m - known.width_m
     moved = monitor.reach.travel_m(joints, widths).max(axis=1)
+    deepest_m = min((contact.min_distance_m for contact in known.contacts or ()), default=0.0)
     step = np.linalg.norm(np.diff(known.Ts_base_tcp[:, :3, 3], axis=0), axis=1)
     for name, Ts in states.Ts_base_object.items():
         before, size_m = known.Ts_base_object[name], scene.task.objects[name].size_m
@@ -72,10 +74,9 @@ def to_measure(
         left = [np.linalg.norm(T[:, :3, 3] - T[0, :3, 3], axis=1) > MOVED_M for T in (Ts, before)]
         found |= left[0] != left[1]
         # What the hand may touch may be deeper in it than before.
-        touched = states.finger_contact.get(name)
-        if touched is None:
-            touched = hand_near(known, {name: Ts[:, :3, 3]}, scene, monitor.hulls)
-        found |= touched & (shift > MAX_CONTACT_DEPTH_M / 2)
+        near = hand_near(known, {name: Ts[:, :3, 3]}, scene, monitor.hulls)
+        touched = states.finger_contact.get(name, near)
+        found |= touched & (shift > MAX_CONTACT_DEPTH_M + deepest_m)
     clear_m = np.minimum(known_m, np.append(np.inf, known_m[:-1])) - moved
     least_m = monitor.config.eps_col_m + max(monitor.sigma_m.values(), default=0.0)
     return np.asarray(found | (clear_m < least_m + HASTE * np.append(0.0, step)))

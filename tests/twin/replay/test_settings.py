@@ -9,7 +9,7 @@ import pytest
 from bridge.errors import OptionError
 from twin.gate.config import GateConfig
 from twin.physics.config import PhysicsConfig
-from twin.replay.config import ReplayConfig
+from twin.replay.config import ReplayConfig, ReplayRunConfig
 
 CONFIGS = (GateConfig, ReplayConfig, PhysicsConfig)
 NUMBERS = [
@@ -37,9 +37,10 @@ def test_there_are_numbers_to_try_in_every_settings_record() -> None:
     assert len(NUMBERS) > 12
 
 
-def test_a_rate_or_a_force_of_nothing_is_refused() -> None:
-    for name in ("rate_hz", "solver_iterations"):
-        with pytest.raises(OptionError, match="makes no sense"):
-            PhysicsConfig(**{name: 0})
-    with pytest.raises(OptionError, match="makes no sense"):
-        PhysicsConfig(grip_force_N=0.0)
+NOTHING = [(PhysicsConfig, n) for n in ("rate_hz", "solver_iterations", "grip_force_N")]
+
+
+@pytest.mark.parametrize(("config", "name"), [*NOTHING, (ReplayRunConfig, "workers")])
+def test_a_number_or_a_force_of_nothing_is_refused(config: Any, name: str) -> None:
+    with pytest.raises(OptionError, match=f"--{name.replace('_', '-')} .*makes no sense"):
+        config(**{name: 0.0 if name.endswith("_N") else 0})

@@ -281,12 +281,7 @@ class ClearanceMonitor:
     def _look(self, state: State) -> _Look:
         """Measure every pair that is near, or the nearest one."""
         self.hulls.place(state.joints_rad, state.width_m)
-        starts = self.scene.Ts_base_object
-        moved = [
-            name
-            for name, T in state.Ts_base_object.items()
-            if hypot(*(T[:3, 3] - starts[name][:3, 3]).tolist()) > MOVED_M
-        ]
+        moved = [name for name, T in state.Ts_base_object.items() if self._has_moved(name, T)]
         soft = {n: p for n, p in state.nodes_m.items() if self._nodes_have_moved(n, p)}
         allowed = self._allowed_at(state.t_ns)
         distances, cut = self._around.measure(
@@ -403,6 +398,10 @@ class ClearanceMonitor:
             return None
         distance_m, (body, _, other, _), t_ns = self._nearest
         return {"t_ns": t_ns, "distance_m": distance_m, "bodies": [body, other]}
+
+    def _has_moved(self, name: str, T: Float[np.ndarray, "4 4"]) -> bool:
+        start = self.scene.Ts_base_object[name]
+        return hypot(*(T[:3, 3] - start[:3, 3]).tolist()) > MOVED_M
 
     def _nodes_have_moved(self, name: str, nodes: Float[np.ndarray, "num_nodes 3"]) -> bool:
         """Against where the body had come to rest, because it sags when it is put down."""

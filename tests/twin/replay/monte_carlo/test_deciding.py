@@ -136,9 +136,7 @@ def test_what_was_drawn_is_kept_and_decides(script: SimpleNamespace) -> None:
 
 
 def draws(scene: ReplayScene, count: int) -> list[ReplayScene]:
-    return [
-        draw_variation(sample_rng(0, "start", k), scene, ReplayConfig())[0] for k in range(count)
-    ]
+    return [draw_variation(sample_rng(0, "s", k), scene, ReplayConfig())[0] for k in range(count)]
 
 
 def test_correlated_errors_are_drawn_with_their_correlation(script: SimpleNamespace) -> None:

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from scipy import stats
 from verdicts import verdict_of
 
-from bridge.errors import GstError, UsageError
+from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
-from twin.replay.config import UNKNOWN_POSE_M, ReplayConfig, ReplayRunConfig, VariationConfig
+from twin.replay.config import UNKNOWN_POSE_M, ReplayConfig, VariationConfig
 from twin.replay.monte_carlo import decided, draw_variation, given_upright, sample_rng, with_samples
 from twin.replay.path import path_of_plan
 from twin.replay.rebuilt_scene import calibrated
@@ -288,10 +288,3 @@ def test_calibrated_settings_have_its_values_and_spreads_but_where_the_user_set_
     assert calibrated(nominal, None, task) == calibrated(nominal, calibration(), task) == nominal
     mine = calibrated(ReplayConfig(physics=PhysicsConfig(grip_force_N=11.0)), known, task)
     assert (mine.physics.grip_force_N, mine.variation.calibrated) == (11.0, ())
-
-
-def test_numbers_with_which_nothing_can_be_replayed_are_refused() -> None:
-    with pytest.raises(UsageError, match="--workers 0 makes no sense"):
-        ReplayRunConfig(workers=0)
-    with pytest.raises(UsageError, match="--samples -1 makes no sense"):
-        ReplayRunConfig(samples=-1)

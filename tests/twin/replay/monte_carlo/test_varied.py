@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import coal
 import numpy as np
@@ -10,31 +11,24 @@ import pytest
 from twin.physics.world import World
 from twin.replay.clearance.bodies import placement_of
 from twin.replay.config import ReplayConfig
-from twin.replay.monte_carlo import draw_variation, sample_rng
 from twin.replay.result import ReplayResult
 from twin.replay.varied import AWAY_M, hand_near
 from twin.replay.verdict import replay_plan
 from twin.robot.collision import hulls_of, signed_distance
 from twin.robot.model import load_robot
 
+CASES = [("box", 0.003, None), ("cube", 0.03, "terminal"), ("box", 0.2, "terminal")]
+"""A little to the side; beside the fingers; where nothing is put down."""
 
-@pytest.mark.parametrize(
-    ("name", "y_m", "fails"),
-    [("box", 0.003, None), ("cube", 0.03, "terminal"), ("box", 0.2, "terminal")],
-)
+
+@pytest.mark.parametrize("case", CASES)
 def test_it_ends_as_a_whole_replay_does_and_simulates_less(
-    script: SimpleNamespace,
-    good: ReplayResult,
-    monkeypatch: pytest.MonkeyPatch,
-    name: str,
-    y_m: float,
-    fails: str | None,
+    script: SimpleNamespace, good: ReplayResult, monkeypatch: pytest.MonkeyPatch, case: Any
 ) -> None:
-    """A little to the side; beside the fingers; where nothing is put down."""
+    name, y_m, fails = case
     scene, steps, one_step = script.scene(), list[int](), World.step
     monkeypatch.setattr(World, "step", lambda world: (steps.append(1), one_step(world)))
-    plan = script.plan(scene)
-    _, config = draw_variation(sample_rng(0, "start", 0), scene, ReplayConfig())
+    plan, config = script.plan(scene), ReplayConfig(grip_delay_s=0.05)
     there = replace(scene, Ts_base_object={n: T.copy() for n, T in scene.Ts_base_object.items()})
     there.Ts_base_object[name][1, 3] += y_m
     whole = replay_plan(plan, there, config)

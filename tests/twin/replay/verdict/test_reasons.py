@@ -134,9 +134,6 @@ def test_a_factor_names_the_earliest_failure_in_whatever_order_they_were_found(
     first = sorted(times_ns)[0]
     assert (factor.value, factor.first_t_ns) == (False, first)
     assert (factor.cause, factor.bodies) == (causes[first], (str(first),))
-
-
-def test_without_a_failure_a_factor_is_true_or_open() -> None:
     assert factor_from([]).value is True
     assert factor_from([], undecided="why").value is None
 
