@@ -290,6 +290,7 @@ class Lifecycle:
         if not self.is_finishing:  # else they are of the time after its end
             take.refuse(rest())
         self._reserve.release()
+        take.ledger.answering = tuple  # nobody was asked
         try:
             take.close(end_ns=now_ns, reason=reason, outcome=None, health=self._health())
             error = DiskError(path=take.writer.path, cause=cause, is_finished=True)

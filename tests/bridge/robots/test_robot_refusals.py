@@ -1,5 +1,6 @@
 """What a robot file may hold, field by field, and how one that may not is refused."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,6 +87,12 @@ def test_the_record_travels_in_the_description(name: str) -> None:
 
 def test_a_description_without_a_record_is_the_default_robots() -> None:
     assert robot_of('<robot name="unheard_of"/>').name == DEFAULT_ROBOT
+    panda, ur10 = (
+        re.sub('<robot name="[^"]*"', '<robot name="mine"', read_robot(name).urdf_text())
+        for name in ("panda", "ur10_parallel_gripper")
+    )
+    assert robot_of(panda).name == "panda", "no other file has these joints"
+    assert robot_of(ur10).name == DEFAULT_ROBOT, "several have these"
     assert robot_of("").name == DEFAULT_ROBOT
     default = read_robot(DEFAULT_ROBOT)
     assert default.description() == default.urdf_text()
