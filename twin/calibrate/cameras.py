@@ -5,7 +5,7 @@ in its depth images.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -254,7 +254,10 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     episodes = _readable(run, output)
     where = placement(episodes)
     described = [item for item in episodes if streams.robot_description(item) is not None]
-    base = next(map(streams.recorded_robot, described), robot_of("")).base_frame
+    robot = next(map(streams.recorded_robot, described), robot_of(""))
+    base, arm = robot.base_frame, next(map(streams.robot_description, described), None) or ""
+    link = config.link or ("tool0" if 'name="tool0"' in arm else robot.tool_frame)
+    config = replace(config, link=link)
     found: dict[str, Any] = {}
     reasons: dict[str, str] = {}
     seen = sorted({*where, *target_cameras(episodes)})

@@ -30,8 +30,8 @@ class CalibrateConfig:
     mount: Mount = "auto"
     """Where the camera of a target sits: in the hand, or fixed with the target in the hand; auto:
     whichever explains the pairs."""
-    link: str = "tool0"
-    """Link that carries the camera, or the target of a fixed camera."""
+    link: str = ""
+    """Link that carries camera or target: tool0, or where there is none the robot's tool frame."""
     seed: int = 0
     """Of the resampling behind the intervals."""
     workers: int | None = None
