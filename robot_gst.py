@@ -109,7 +109,6 @@ CORE: tuple[leaves.Command, ...] = (
         "bridge.cli.exchange",
         """
         import rgbd | An RGB-D folder: scene.json, TUM, 7-Scenes. | DIR runs/x
-        import images | The same, as NeRF programs keep them. | DIR runs/x
         import rosbag2 | A rosbag2 recording, byte for byte. | BAG runs/x
         export tum | Cameras as folders of the TUM RGB-D layout. | EPISODE DIR
         export rosbag2 | An episode as a rosbag2 folder. | EPISODE DIR

@@ -6,6 +6,8 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
+from bridge.errors import MissingDependencyError
+
 EXTRAS = {
     "base": "read, write, check and list episodes",
     "record": "record from zenoh; ROS 2 messages; colour images",
@@ -70,8 +72,7 @@ def how_to_get(missing: ModuleNotFoundError) -> str:
     package = PACKAGES.get(module, module)
     for extra in EXTRAS:
         if package in packages_of(extra):
-            how = f"pip install 'robot-gst[{extra}]'"
-            return f"{package} is not installed, and this needs it. Install the extra: {how}."
+            return str(MissingDependencyError(package=package, extra=extra, purpose="this"))
     raise missing
 
 

@@ -28,9 +28,9 @@ class OptionError(UsageError):
     """A number given on the command line or in a settings file is outside its range."""
 
     def __init__(self, *, name: str, value: int | float, allowed: str) -> None:
-        """Remember the option as it is spelt on the command line."""
-        self.name = "--" + name.replace("_", "-")
-        super().__init__(f"{self.name} {value:g} makes no sense; it must be {allowed}.")
+        """Name the option as it is spelt on the command line."""
+        option = "--" + name.replace("_", "-")
+        super().__init__(f"{option} {value:g} makes no sense; it must be {allowed}.")
 
 
 def refuse_outside(
@@ -48,9 +48,7 @@ class MissingDependencyError(GstError):
     """An optional package is not installed."""
 
     def __init__(self, *, package: str, extra: str, purpose: str) -> None:
-        """Remember the package and the extra that brings it."""
-        self.package = package
-        self.extra = extra
+        """Name the package and the extra that brings it."""
         super().__init__(
             f"{package} is not installed, and {purpose} needs it. "
             f"Install the extra: pip install 'robot-gst[{extra}]'."
@@ -61,8 +59,7 @@ class PathNotFoundError(UsageError):
     """A file or folder named by the user is not there."""
 
     def __init__(self, *, path: Path, what: str, hint: str) -> None:
-        """Remember which path was missing."""
-        self.path = path
+        """Name what was looked for."""
         super().__init__(f"{what} not found: {path}. {hint}")
 
 
@@ -70,9 +67,7 @@ class EpisodeError(BridgeError):
     """An episode file breaks its contract."""
 
     def __init__(self, *, path: Path, found: str, hint: str) -> None:
-        """Remember the file and what was found in it."""
-        self.path = path
-        self.found = found
+        """Name the file and what was found in it."""
         super().__init__(f"{path}: {found}. {hint}")
 
 
@@ -80,8 +75,7 @@ class SchemaVersionError(EpisodeError):
     """A record was written by a newer major version than this reader knows."""
 
     def __init__(self, *, path: Path, name: str, found: int, known: int) -> None:
-        """Remember its name."""
-        self.name = name
+        """Name the record, not the file alone."""
         super().__init__(
             path=path,
             found=f"{name} has schema version {found}, this reader knows {known}",
@@ -93,8 +87,7 @@ class UndefinedStatisticError(GstError):
     """A statistic has no value on this data; the reason is the message."""
 
     def __init__(self, *, statistic: str, reason: str) -> None:
-        """Remember the statistic's name and the reason."""
-        self.statistic = statistic
+        """Remember the reason."""
         self.reason = reason
         super().__init__(f"{statistic} is undefined: {reason}.")
 
@@ -103,9 +96,7 @@ class InvalidRecordError(BridgeError):
     """A JSON record (plan, verdict, event ...) does not fit its schema."""
 
     def __init__(self, *, name: str, where: str, found: str) -> None:
-        """Remember the record's name and the offending place."""
-        self.name = name
-        self.where = where
+        """Name the record and the offending place."""
         super().__init__(
             f"{name} is invalid at {where or 'the top level'}: {found}. "
             "See docs/episode_format.md for its schema."

@@ -27,6 +27,7 @@ _TOLD = {
     "ctl list|ctl --last": "robot-gst ls RUN lists what is recorded.",
     "import trials": "robot-gst open TABLE RUN keeps any table of trials in a run.",
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
+    "import images": "robot-gst import rgbd reads the same folders.",
     "import splats": "robot-gst rebuild makes scenes; splat viewers open scene/background.ply.",
 }
 GONE = {

@@ -64,7 +64,7 @@ LEAVES: dict[str, Leaf] = {
         modules=("dashboards.opening", "dashboards.robot_file", "dashboards.scene_index"),
         extra="record",
         purpose="opening what others recorded",
-        entries={"robot_in": "dashboards.robot_file:robot_in"},
+        entries={"propose": "dashboards.robot_file:propose"},
         commands=commands_of(
             START,
             "dashboards.opening",

@@ -139,11 +139,6 @@ class Worker:
         self._num_begun = 0
 
     @property
-    def pid(self) -> int:
-        """Of the process."""
-        return self.process.pid
-
-    @property
     def busy(self) -> bool:
         """Whether an answer is still to come."""
         return self._num_begun > 0
@@ -245,26 +240,11 @@ class Runner(Protocol):
         """End what was started."""
 
 
-class Serial:
-    """One after another in this process, in the order they came."""
-
-    def run(
-        self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
-    ) -> Iterator[tuple[Item, Answer | Failed]]:
-        """See ``Runner``."""
-        for item in items:
-            yield item, do(function, item)
-
-    def __enter__(self) -> "Serial":
-        """Nothing was started."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to end."""
-
-
 class ProcessPool:
-    """Processes side by side; they start once there is work and stay until the end."""
+    """Processes side by side; they start once there is work and stay until the end.
+
+    A pool of none does the work here, one item after another in the order they came.
+    """
 
     def __init__(self, size: int, *, prepare: Function | None = None, quiet: bool = False) -> None:
         """Start nothing yet."""
@@ -291,6 +271,9 @@ class ProcessPool:
 
         The longest go first, so that no process is left with a long one at the end (Graham 1969).
         """
+        if not self._size:
+            yield from ((item, do(function, item)) for item in items)
+            return
         todo = deque((item, ATTEMPTS) for item in sorted(items, key=cost, reverse=True))
         at_work: dict[Worker, tuple[Item, int]] = {}
         try:
@@ -381,7 +364,7 @@ class ProcessPool:
 
 
 ALONE = ProcessPool(0)
-"""Maps in this process."""
+"""Works in this process."""
 
 
 def _do_chunk(
@@ -419,7 +402,7 @@ def cores() -> int:
 def runner_of(workers: int | None) -> Runner:
     """This process, or several: one for each core where nobody said a number."""
     size = workers or default_size()
-    return ProcessPool(size) if size > 1 else Serial()
+    return ProcessPool(size) if size > 1 else ALONE
 
 
 def default_size() -> int:

@@ -85,7 +85,7 @@ def how_to_activate() -> str:
 
 
 def _err() -> Console:
-    return Console(stderr=True, soft_wrap=True)
+    return Console(stderr=True, soft_wrap=True, emoji=False)
 
 
 def _bar(label: str, total: int) -> Iterator[Advance]:

@@ -211,10 +211,13 @@ class Pages:
     def numbers(self, request: Request) -> Response:
         """``/numbers``: every measurement of the evaluation, by what it is about."""
         known = judge(self._run(request))
+        asked = request.query_params.get("q", "")[:200]
+        words = asked.lower().split()
         parts: dict[str, list[Measurement]] = {}
         for each in known.measurements:
-            parts.setdefault(each.id.partition(".")[0], []).append(each)
-        return self._page("numbers.html", request, parts=parts, known=known)
+            if all(word in f"{each.id} {each.definition}".lower() for word in words):
+                parts.setdefault(each.id.partition(".")[0], []).append(each)
+        return self._page("numbers.html", request, parts=parts, known=known, asked=asked)
 
     def episode(self, request: Request) -> Response:
         """``/episode/<id>``: one trial and its replays."""

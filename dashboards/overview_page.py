@@ -3,6 +3,7 @@
 Measurements are chosen by id; nothing is computed.
 """
 
+import re
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -81,6 +82,7 @@ class TrialList(Screen):
     def columns(self) -> tuple[tuple[str, str], ...]:
         """Order and title of the columns in which any trial of the screen has something."""
         shown = {
+            "start": any(t.start_id for t in self.trials),
             "planned": any(t.planned_replay or t.sim_planned is not None for t in self.trials),
             "executed": any(t.executed_replay or t.sim_executed is not None for t in self.trials),
             "gate": any(t.verdict is not None for t in self.trials),
@@ -151,16 +153,21 @@ def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
     """Choose the numbers to read first: of plans, else of motions, else what was recorded."""
     by_id = {each.id: each for each in judgement.measurements}
     side = agreeing_side(by_id)
+    rates: list[Measurement] = []
     if all(each.value is None for name, each in by_id.items() if name.startswith("agreement.")):
-        rates = [each for name, each in by_id.items() if name.startswith("rate.recorded.")]
-        for each in [each for each in rates if each.value is not None][: len(NUMBERS)]:
-            parts = [part.replace("_", " ") for part in each.id.split(".")[2:] if part != "-"]
+        recorded = [each for name, each in by_id.items() if name.startswith("rate.recorded.")]
+        rates = [each for each in recorded if each.value is not None][: len(NUMBERS)]
+        for each in rates:
+            told = re.sub(r"\+([0-9a-f]{4})", lambda found: chr(int(found[1], 16)), each.id)
+            parts = [part.replace("_", " ") for part in told.split(".")[2:] if part != "-"]
             yield f"Recorded success, {' · '.join(parts)}", each
     for name, title in NUMBERS.items():
         found = by_id.get(name.replace(SIM_SIDE, side))
         interval = None if found is None else found.interval
         may_be_none = not interval or interval.low <= 0 <= interval.high
-        if found is not None and not (name.endswith("_r") and may_be_none):
+        if found is None or (rates and found.value is None):  # a run without a twin
+            continue
+        if not (name.endswith("_r") and may_be_none):
             yield (title if found.id == name else "Executed in the twin, as recorded"), found
 
 

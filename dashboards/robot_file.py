@@ -57,11 +57,6 @@ class Joint:
         return slides or bool(FINGERS.search(self.name) or JAWS.search(self.child))
 
 
-def robot_in(path: Path) -> Robot:
-    """Return the robot that ``propose`` finds in a URDF."""
-    return propose(path)[0]
-
-
 def propose(path: Path) -> tuple[Robot, list[str]]:
     """Propose a robot file for a URDF; also what was chosen and nobody said.
 
@@ -77,7 +72,8 @@ def propose(path: Path) -> tuple[Robot, list[str]]:
         mesh_folders=_mesh_folders(path),
         folder=path.absolute().parent,
     )
-    root = robot.parsed(robot.urdf)
+    lost: list[str] = []
+    root = robot.parsed(robot.urdf, lost)
     joints = _joints(root)
     if len(joints) > MOST_JOINTS:
         raise UsageError(f"{path} has {len(joints)} joints; up to {MOST_JOINTS} are looked at.")
@@ -86,16 +82,17 @@ def propose(path: Path) -> tuple[Robot, list[str]]:
     gripper, told = _gripper([joint for joint in below if joint.kind != "fixed"])
     driven = {joint.name for joint in arm} | {finger.joint for finger in gripper.fingers}
     tool_frame, unsure = _tool(arm[-1].child, below, gripper)
+    base_frame, carriers = _root(arm, joints)
     proposed = replace(
         robot,
         name=re.sub(r"\W+", "_", root.get("name") or path.stem),
         joints=tuple(joint.name for joint in arm),
-        base_frame=_root(arm[0].parent, joints),
+        base_frame=base_frame,
         tool_frame=tool_frame,
         gripper=gripper,
         held=tuple(each.name for each in joints if each.moves and each.name not in driven),
     )
-    return proposed, notes + told + unsure
+    return proposed, notes + carriers + told + unsure + lost
 
 
 def _mesh_folders(path: Path) -> dict[str, str]:
@@ -191,11 +188,13 @@ def _below(link: str, joints: list[Joint]) -> list[Joint]:
     return found
 
 
-def _root(link: str, joints: list[Joint]) -> str:
-    above = {joint.child: joint.parent for joint in joints}
+def _root(arm: list[Joint], joints: list[Joint]) -> tuple[str, list[str]]:
+    """Where all hangs, and which other joints move the arm."""
+    above, link, others = {joint.child: joint for joint in joints}, arm[-1].child, list[str]()
     while link in above:
-        link = above[link]
-    return link
+        others += [above[link].name] if above[link].moves and above[link] not in arm else []
+        link = above[link].parent
+    return link, [f"{name} moves the arm and is held at 0" for name in others]
 
 
 def _gripper(moving: list[Joint]) -> tuple[Gripper, list[str]]:

@@ -107,7 +107,7 @@ def robot_check(robot: str, /, *, urdf_out: Path | None = None, output: Output =
 
     found = check_robot(robot, urdf_out=urdf_out)
     output.result(found, describe_robot(found))
-    return 0
+    return 2 if found["hulls"] is None else 0
 
 
 def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Output = OUTPUT) -> int:

@@ -15,6 +15,6 @@ class UnreadableFileError(TwinError):
     hint = "Make it again: robot-gst rebuild RUN --force."
 
     def __init__(self, *, path: Path, found: str, hint: str = "") -> None:
-        """Remember the file and what is wrong with it."""
-        self.path, self.found = path, found
+        """Remember what is wrong with the file."""
+        self.found = found
         super().__init__(f"{path}: {found}. {hint or self.hint}")

@@ -150,19 +150,14 @@ def import_rgbd(
     from bridge.episode.run_folder import RunFolder
     from bridge.exchange.output import Unused, tell_unused
     from bridge.exchange.rgbd import write_scan
-    from bridge.sources.folder.messages import (
-        describe_folder,
-        folder_messages,
-        num_frames,
-        read_index,
-    )
+    from bridge.sources.folder.messages import describe_folder, folder_messages, read_index
 
     index = read_index(folder, config)
     output.say(f"{index.path}: {index.summary}")
     for name, value in index.assumed.items():
         output.say(f"  assumed {name.replace('_', ' ')}: {value}")
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
-    total = num_frames(index, config)
+    total = len(index.frames)
     with output.progress("import", total) as advance:
 
         def messages() -> Iterator[StampedMessage]:
@@ -183,9 +178,6 @@ def import_rgbd(
     }
     output.result(data, f"{path}: {total} frames of a folder in {index.layout} layout")
     return tell_unused(output, unused)
-
-
-import_images = import_rgbd
 
 
 def import_rosbag2(
@@ -239,7 +231,7 @@ def import_rosbag2(
         output.say(f"  {old} is called {new} in the episode")
     output.result(
         data,
-        f"{report.path}: {report.messages} messages on {len(report.topics)} topics "
-        f"of {len(report.files)} files",
+        f"{report.path}: messages: {report.messages}, topics: {len(report.topics)}, "
+        f"files: {len(report.files)}",
     )
     return tell_unused(output, report.unused)

@@ -32,11 +32,9 @@ def task_check(*files: str, output: Output = OUTPUT) -> int:
         try:
             file = chosen_task_file(name)
             task = file.task()
-        except TaskFileError as error:
-            found.append({"file": name, "ok": False, "problems": list(error.problems)})
-            texts.append(str(error))
         except UsageError as error:
-            found.append({"file": name, "ok": False, "problems": [str(error)]})
+            problems = error.problems if isinstance(error, TaskFileError) else [str(error)]
+            found.append({"file": name, "ok": False, "problems": [*problems]})
             texts.append(str(error))
         else:
             found.append({"file": name, "ok": True, "sha256": file.sha256, "task": asdict(task)})

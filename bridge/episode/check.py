@@ -244,4 +244,6 @@ def _judge_presence(
     )
     for topic, found in reports.items():
         report.topics.setdefault(topic, TopicCheck()).presence = found
-    report.findings += findings_of(reports, report.presences, span.end_ns)
+    untold = records.get("drops", {}).get("untold_tails")
+    told = untold if isinstance(untold, list) else ()
+    report.findings += findings_of(reports, report.presences, span.end_ns, told)

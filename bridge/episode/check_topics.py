@@ -50,8 +50,9 @@ class Decoder:
         """Type or encoding of topics that are kept, and that nothing here reads."""
         self.findings: list[HealthFinding] = []
         """What the recorder noticed of clocks, and of itself."""
-        self._depth_sizes: dict[str, tuple[int, int]] = {}
-        self._info_sizes: dict[str, tuple[int, int]] = {}
+        self._sizes: dict[str, dict[str, None]] = {}
+        """By topic, the sizes of its images."""
+        self._info_sizes: dict[str, str] = {}
 
     def decode(self, topic: str, message: ScannedMessage) -> None:
         """Read one message; raises BridgeError where it is not what topic and type promise."""
@@ -76,18 +77,20 @@ class Decoder:
 
     def _decode_contract(self, topic: str, type_name: str, data: bytes) -> None:
         if topic.endswith(DEPTH_IMAGE) and type_name in (schema.IMAGE, schema.COMPRESSED_IMAGE):
-            height, width = DepthImage.from_message(type_name, data).depth_mm.shape
-            before = self._depth_sizes.setdefault(topic, (width, height))
-            if before != (width, height):
-                found = (
-                    f"a depth image of {width} x {height} after one of {before[0]} x {before[1]}"
-                )
+            before = next(iter(self._sizes.get(topic, ())), None)
+            size = self._see_size(topic, DepthImage.from_message(type_name, data).depth_mm.shape)
+            if before not in (None, size):
+                found = f"a depth image of {size} after one of {before}"
                 raise codec.MalformedMessageError(type_name=type_name, found=found)
         elif type_name == schema.IMAGE:
-            check_image(topic, image_header(data))
+            header = image_header(data)
+            check_image(topic, header)
+            self._see_size(topic, (header.height, header.width))
+        elif type_name == schema.COMPRESSED_IMAGE:
+            self._see_size(topic, CompressedColor.from_cdr(data).decoded().shape)
         elif type_name == schema.CAMERA_INFO:
             camera = CameraInfo.from_cdr(data).camera
-            self._info_sizes[topic] = (camera.width, camera.height)
+            self._info_sizes[topic] = f"{camera.width} x {camera.height}"
         elif type_name == schema.DROPS:
             self._add_losses(parse_record(data, name="drops", package="bridge.episode"))
         elif type_name == schema.EVENT:
@@ -106,22 +109,24 @@ class Decoder:
         if unnumbered:
             self.unnumbered[topic] = unnumbered
 
+    def _see_size(self, topic: str, shape: tuple[int, ...]) -> str:
+        size = f"{shape[1]} x {shape[0]}"
+        self._sizes.setdefault(topic, {})[size] = None
+        return size
+
     def size_faults(self) -> list[str]:
-        """Sentences on depth images that are not of the size their camera info says."""
-        faults = []
-        for topic, size in self._depth_sizes.items():
-            said = self._info_sizes.get(topic.removesuffix("image") + "info")
-            if said is not None and said != size:
-                faults.append(
-                    f"{topic}: images of {size[0]} x {size[1]}, "
-                    f"its camera info says {said[0]} x {said[1]}"
-                )
-        return faults
+        """Sentences on images that are not of the size their camera info says."""
+        return [
+            f"{topic}: images of {size}, its camera info says {said}"
+            for topic, sizes in self._sizes.items()
+            if (said := self._info_sizes.get(topic.removesuffix("image") + "info")) is not None
+            for size in sizes
+            if size != said
+        ]
 
 
 _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.JOINT_STATE: JointSample.from_cdr,
-    schema.COMPRESSED_IMAGE: lambda data: CompressedColor.from_cdr(data).decoded(),
     schema.TF_MESSAGE: transforms_from_cdr,
     schema.POSE_STAMPED: PoseSample.from_cdr,
     schema.STRING: string_from_cdr,

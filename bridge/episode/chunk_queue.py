@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk
 
+LOOK_S = 0.05
+"""The thread looks for chunks this often, rather than being woken by each."""
 _INDEX_BYTES = 15
 """Of a message index without entries, which have 16 bytes each."""
 
@@ -56,7 +58,6 @@ class ChunkQueue:
             else:
                 self._bulk.append(chunk)
                 self.bulk_bytes += _size(chunk)
-            self._changed.notify_all()
 
     def raise_error(self) -> None:
         """Raise what the disk said since the last call; with the call after, it is tried again."""
@@ -77,15 +78,13 @@ class ChunkQueue:
         """Wait until a chunk may be added."""
         if not self._waiting() or self._waiting() + num_bytes <= limit:
             return
+        self._wait_until(lambda: not self._waiting() or self._waiting() + num_bytes <= limit)
+
+    def _wait_until(self, is_so: Callable[[], bool]) -> None:
         self.raise_error()
         with self._changed:
-            self._changed.wait_for(
-                lambda: (
-                    self._error is not None
-                    or not self._waiting()
-                    or self._waiting() + num_bytes <= limit
-                )
-            )
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._error is not None or is_so())
         self.raise_error()
 
     def drain(self) -> None:
@@ -94,15 +93,7 @@ class ChunkQueue:
         Raises:
             OSError: When the disk refuses; what waits is kept, and tried again with the next call.
         """
-        self.raise_error()
-        with self._changed:
-            self._changed.wait_for(
-                lambda: (
-                    self._error is not None
-                    or not (self._small or self._bulk or self._busy_since_s is not None)
-                )
-            )
-        self.raise_error()
+        self._wait_until(lambda: not (self._small or self._bulk or self._busy_since_s is not None))
 
     def oldest_s(self) -> float | None:
         """When the oldest small message came that is not on the disk yet, None without one."""
@@ -118,11 +109,8 @@ class ChunkQueue:
         turn_of_bulk = False
         while True:
             with self._changed:
-                self._changed.wait_for(
-                    lambda: (
-                        self._is_ending or (not self._is_held and bool(self._small or self._bulk))
-                    )
-                )
+                while not self._is_ending and (self._is_held or not (self._small or self._bulk)):
+                    self._changed.wait(LOOK_S)
                 if self._is_ending:
                     break
                 small = [] if turn_of_bulk and self._bulk else [each.chunk for each in self._small]

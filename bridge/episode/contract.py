@@ -8,7 +8,7 @@ that ends long before the recording does.
 
 import json
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -296,9 +296,14 @@ def _rate_breach(presence: Presence, rule: TopicRule, lost: int) -> Iterable[str
 
 
 def findings_of(
-    reports: Mapping[str, TopicReport], presences: Mapping[str, Presence], end_ns: int
+    reports: Mapping[str, TopicReport],
+    presences: Mapping[str, Presence],
+    end_ns: int,
+    untold: Collection[str] = (),
 ) -> Iterator[HealthFinding]:
-    """Say where a contract was broken, what fell silent, and whose rate fell."""
+    """Say where a contract was broken, what fell silent or ended untold, and whose rate fell."""
+    if not any(presence.messages for presence in presences.values()):
+        yield HealthFinding(name="nothing_recorded", about="all topics", text="no message came")
     for topic, report in reports.items():
         presence = presences.get(topic, Presence())
         span = {"first_ns": presence.first_ns, "last_ns": presence.last_ns}
@@ -308,6 +313,9 @@ def findings_of(
             text = f"nothing came in the last {report.tail_s:.1f} s"
             span = {"first_ns": presence.last_ns, "last_ns": end_ns}
             yield HealthFinding(name="tail_unknown", about=topic, text=text, **span)
+        elif topic in untold:
+            text = "in the end its source did not say how many messages it had sent"
+            yield HealthFinding(name="tail_untold", about=topic, text=text, **span)
         if report.slow is not None:
             first_ns, last_ns, count = report.slow
             text = (

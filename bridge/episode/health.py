@@ -23,7 +23,7 @@ NAMES = (
     *("contract_broken", "drops_not_logged", "drops_logged", "cut_short", "tail_unknown"),
     *("recovered", "rate_collapsed", "frozen_image", "empty_depth", "nan_joints", "stamp_zero"),
     *("stamp_stuck", "odd_times", "clock_jump", "host_clock_jump", "deaf", "unreadable"),
-    "mixed_types",
+    *("mixed_types", "tail_untold", "nothing_recorded"),
 )
 """Every name; of several the first stands for all. With one of them an episode is not clean."""
 

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -136,6 +137,13 @@ class RunFolder:
     def episodes(self) -> list[Path]:
         """Recorded episodes, in name order."""
         return [*map(self.episodes_dir.joinpath, file_names(self.episodes_dir))]
+
+    def free_id(self, kind: str) -> str:
+        """The first number after a kind's name of which nothing is left, labels neither."""
+        folders = (self.episodes_dir, self.derived_dir, self.notes_dir)
+        taken = {name.split(".")[0] for folder in folders for name in file_names(folder, "")}
+        ids = (f"{kind}_{number:04d}" for number in count(1))
+        return next(each for each in ids if each not in taken)
 
     def unfinished(self) -> list[Path]:
         """Files in ``episodes/`` and ``derived/`` that are being written, or were left behind."""

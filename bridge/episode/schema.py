@@ -1,6 +1,5 @@
 """Message types and the schema of each. ``docs/episode_format.md`` explains them field by field."""
 
-import json
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -96,22 +95,12 @@ class Schema:
 def schema_for(name: str) -> Schema | None:
     """Return the schema of a type this project knows, or None."""
     if name in ROS_TYPES:
-        text = schema_text(name)
-        return Schema(
-            name=name, schema_encoding="ros2msg", message_encoding="cdr", data=text.encode()
-        )
-    if name in _JSON_SCHEMAS:
+        definition, message, text = "ros2msg", "cdr", schema_text(name)
+    elif name in _JSON_SCHEMAS:
         package, path = _JSON_SCHEMAS[name]
         text = resources.files(package).joinpath(path).read_text()
-        return Schema(
-            name=name, schema_encoding="jsonschema", message_encoding="json", data=text.encode()
-        )
-    return None
-
-
-def json_schema_version(name: str) -> int:
-    """Return the major version of one of our JSON schemas."""
-    schema = schema_for(name)
-    if schema is None or schema.schema_encoding != "jsonschema":
-        raise KeyError(f"{name} has no JSON schema")
-    return int(json.loads(schema.data).get("version", 1))
+        definition, message = "jsonschema", "json"
+    else:
+        return None
+    data = text.encode()
+    return Schema(name=name, schema_encoding=definition, message_encoding=message, data=data)

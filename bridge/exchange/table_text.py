@@ -9,6 +9,7 @@ import difflib
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date, datetime, time
 from pathlib import Path
@@ -363,6 +364,8 @@ def _decoded(path: Path) -> str:
     try:
         return data.decode("utf-16" if utf_16 else "utf-8-sig")
     except UnicodeDecodeError as error:
+        with suppress(UnicodeDecodeError):
+            return data.decode("cp1252")  # as Excel saves CSV in Western Europe
         raise _no_text(path, error) from error
 
 

@@ -194,13 +194,10 @@ def align_rigid(
         p_target_m: The same points in the target frame.
         weights: Of the squared distances; None: all alike.
     """
-    if weights is None:
-        source, target = p_source_m.mean(axis=0), p_target_m.mean(axis=0)
-        cross = (p_target_m - target).T @ (p_source_m - source)
-    else:
-        share = weights / weights.sum()
-        source, target = share @ p_source_m, share @ p_target_m
-        cross = ((p_target_m - target) * share[:, None]).T @ (p_source_m - source)
+    each = np.ones(len(p_source_m)) if weights is None else weights
+    share = each / each.sum()
+    source, target = share @ p_source_m, share @ p_target_m
+    cross = ((p_target_m - target) * share[:, None]).T @ (p_source_m - source)
     R = nearest_rotation(cross)
     return from_rotation(R, target - R @ source)
 

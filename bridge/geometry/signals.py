@@ -15,15 +15,10 @@ def runs_of_true(flags: Bool[np.ndarray, " num_steps"]) -> list[tuple[int, int]]
     return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
 
 
-def lag_of_least_cost(
-    costs: Float[np.ndarray, " num_lags"],
-    lags_s: Float[np.ndarray, " num_lags"] = LAGS_S,
-    *,
-    equal: float = EQUAL_M,
-) -> float:
-    """Choose the lag at which two signals differ least [s].
+def lag_of_least_cost(costs_m: Float[np.ndarray, " num_lags"]) -> float:
+    """Choose which of ``LAGS_S`` two motions differ least at [s].
 
     Of lags that fit equally well the smallest is taken: a motion that hardly moves has none.
     """
-    near = lags_s[costs <= costs.min() + equal]
+    near = LAGS_S[costs_m <= costs_m.min() + EQUAL_M]
     return float(near[np.argmin(np.abs(near))])

@@ -23,11 +23,6 @@ def decode_depth_png(data: bytes) -> UInt16[np.ndarray, "height width"]:
         return np.asarray(image).astype(np.uint16)
 
 
-def undo_rotation(stored: UInt16[np.ndarray, "height width"]) -> UInt16[np.ndarray, "height width"]:
-    """Rotate the bits of each value left by 13, that is v = (d >> 3) | (d << 13)."""
-    return (stored >> np.uint16(3)) | (stored << np.uint16(13))
-
-
 def to_millimetres(
     stored: UInt16[np.ndarray, "height width"],
     *,
@@ -36,7 +31,8 @@ def to_millimetres(
     encoding: str = "",
 ) -> UInt16[np.ndarray, "height width"]:
     """Apply a folder's decode rules; every invalid code becomes 0."""
-    values = undo_rotation(stored) if encoding == ROTATED_ENCODING else stored
+    rotated = encoding == ROTATED_ENCODING  # the bits of each, left by 13
+    values = (stored >> np.uint16(3)) | (stored << np.uint16(13)) if rotated else stored
     invalid = np.isin(stored, list(invalid_values)) | (values == 0)
     millimetres = np.rint(values * (unit_m * 1e3))
     return np.where(invalid | (millimetres > 65535), 0, millimetres).astype(np.uint16)

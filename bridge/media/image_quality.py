@@ -146,19 +146,14 @@ class SsimMaps:
 
     zero: Float[np.ndarray, "height width channels"]
 
-    @property
-    def valid(self) -> Float[np.ndarray, "inner_height inner_width channels"]:
-        """Windows inside the image."""
-        return self.zero[BORDER:-BORDER, BORDER:-BORDER]
-
     def mean(
         self, padding: Padding, *, mask: Bool[np.ndarray, "height width"] | None = None
     ) -> float:
         """Average over pixels and channels; with a mask, over window centres inside it."""
-        values = self.valid if padding == "valid" else self.zero
+        inner = slice(BORDER, -BORDER) if padding == "valid" else slice(None)
+        values = self.zero[inner, inner]
         if mask is not None:
-            inside = mask[BORDER:-BORDER, BORDER:-BORDER] if padding == "valid" else mask
-            values = values[inside]
+            values = values[mask[inner, inner]]
         if values.size == 0:
             raise UndefinedStatisticError(
                 statistic="SSIM", reason="the mask holds no window centre away from the border"

@@ -86,12 +86,10 @@ class ClockBook:
                 for jump in clock.jumps[-1:]
             )
 
-    def topics_of_others(self, answers: list[ClockAnswer]) -> set[str]:
-        """What those publish who have answered before and are not among these."""
-        here = {(answer.source, answer.identity) for answer in answers}
+    def answering(self) -> set[str]:
+        """What those publish who have answered."""
         with self._lock:
-            others = [clock.topics for key, clock in self._clocks.items() if key not in here]
-        return set().union(*others)
+            return set().union(*(clock.topics for clock in self._clocks.values()))
 
     def status(self) -> list[Record]:
         """What goes into the recorder's status, by source."""
@@ -148,7 +146,7 @@ class ClockAsker:
     def settle(self) -> None:
         """Ask everybody how many messages they have sent by now.
 
-        An answer comes behind the messages: while those of a source still come, it is asked again.
+        An answer comes behind the messages: while some come, who did not answer is asked again.
         """
         for _ in range(MOST_ASKS):
             asked_s, seen, answers = time.monotonic(), self._seen(), []
@@ -157,8 +155,7 @@ class ClockAsker:
             for answer in answers:
                 self._told(answer.sent)
             is_answered = time.monotonic() < asked_s + SETTLE_S
-            late, now = self._book.topics_of_others(answers), self._seen()
-            if is_answered or all(now.get(topic) == seen.get(topic) for topic in late):
+            if is_answered or self._seen() == seen:
                 return
 
     def close(self) -> None:

@@ -7,14 +7,15 @@ behind a stop.
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
-from itertools import count
 from typing import Any, TypeVar
 
 import msgspec
 
 from bridge.episode import metadata
-from bridge.episode.run_folder import RunFolder, check_episode_id
+from bridge.episode.catalogue import sidecar_path
+from bridge.episode.run_folder import check_episode_id
 from bridge.episode.topics import policy_key
+from bridge.errors import UsageError
 from bridge.record.errors import ControlError
 from bridge.record.recorder import Recorder
 from bridge.task.record import check_record
@@ -85,7 +86,10 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         named = request.get("id")
         info = parse_info("new" if named is None else named, request.get("info", {}))
         if named is None:
-            info = replace(info, id=numbered(recorder.run, info.kind))
+            info = replace(info, id=recorder.run.free_id(info.kind))
+        elif (label := sidecar_path(recorder.run, info.id)).is_file():
+            how = "Choose another name, or move it away."
+            raise UsageError(f"{label} is the label of an earlier {info.id}. {how}")
         task = parse_task_file(request.get("task_file"))
         who_acts = _ask_policy(session, info)
         info = replace(info, tags=tuple(dict.fromkeys((*info.tags, *who_acts))))
@@ -118,20 +122,13 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         "stop": ({"outcome", "discard"}, stop),
         "mark": ({"text"}, lambda request: recorder.mark(_text(request))),
         "label": ({"text", "outcome", "episode"}, label),
-        "list": ({"last"}, lambda request: recorder.episodes(_whole_number(request, "last"))),
+        "list": (None, lambda request: recorder.episodes(MAX_LISTED)),
         "status": (None, lambda request: recorder.status()),
     }
     return [
         session.serve(control_key(recorder.config.recorder, verb), _json_handler(verb, *how))
         for verb, how in verbs.items()
     ]
-
-
-def numbered(run: RunFolder, kind: str) -> str:
-    """The first free number after a kind's name, as an episode's id."""
-    taken = {path.name.split(".")[0] for path in run.episodes_dir.iterdir()}
-    ids = (f"{kind}_{number:04d}" for number in count(1))
-    return next(each for each in ids if each not in taken)
 
 
 ASK_S = 10.0
@@ -181,15 +178,6 @@ def _only(request: dict[str, Any], verb: str, known: set[str]) -> None:
         raise ControlError(
             f"{verb} does not know {', '.join(unknown)}. It knows: {', '.join(sorted(known))}."
         )
-
-
-def _whole_number(request: dict[str, Any], name: str) -> int:
-    number = request.get(name, MAX_LISTED)
-    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= MAX_LISTED:
-        raise ControlError(
-            f"{name} must be a whole number from 1 to {MAX_LISTED}, got {number!r:.80}."
-        )
-    return number
 
 
 def _text(request: dict[str, Any]) -> str:

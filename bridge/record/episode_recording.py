@@ -25,6 +25,7 @@ from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.record.clocks import StampJumps
 from bridge.record.config import RecorderConfig
+from bridge.record.encoders import encode
 from bridge.record.inspection import (
     GOOD,
     MessageState,
@@ -191,7 +192,7 @@ class EpisodeRecording:
         self._clock_steps_ns: list[int] = []
         self._is_summed_up = False
         disk = config.disk
-        self._writer = EpisodeWriter(
+        self.writer = EpisodeWriter(
             folder / f"{info.id}{SUFFIX}",
             config=WriterConfig(
                 chunk_bytes=1 << 20,
@@ -206,43 +207,29 @@ class EpisodeRecording:
             for record in clocks:
                 self.write_clock(record, start_ns)
         except OSError as error:
-            self._writer.discard()
+            self.writer.discard()
             raise BridgeError(
-                f"cannot write {self.part_path}: {error.strerror}. Choose another folder."
+                f"cannot write {self.writer.part_path}: {error.strerror}. Choose another folder."
             ) from error
 
     def _say_what_it_is(self, contract: Contract | None, task: TaskFile | None) -> None:
-        self._writer.describe(self.info)
+        self.writer.describe(self.info)
         if contract is not None:
-            self._writer.add_metadata(RECORD_NAME, contract.to_record())
+            self.writer.add_metadata(RECORD_NAME, contract.to_record())
         if task is not None:
-            self._writer.attach(
+            self.writer.attach(
                 ATTACHMENT, task.data, media_type=MEDIA_TYPE, log_time_ns=self.start_ns
             )
 
     @property
-    def part_path(self) -> Path:
-        """The file while it is open."""
-        return self._writer.part_path
-
-    @property
-    def path(self) -> Path:
-        """The episode's file when it is finished."""
-        return self._writer.path
-
-    def refuse_removed(self) -> None:
-        """Raise OSError where somebody removed or replaced the file."""
-        self._writer.refuse_removed()
-
-    @property
     def keeps_up(self) -> bool:
         """Whether little enough waits for the disk to give it more images."""
-        return self._writer.backlog_bytes < self._config.disk.backlog_bytes
+        return self.writer.backlog_bytes < self._config.disk.backlog_bytes
 
     @property
     def disk(self) -> dict[str, float]:
         """How far the disk is behind, for the status."""
-        return {"write_lag_s": self._writer.lag_s, "busy_s": self._writer.busy_s}
+        return {"write_lag_s": self.writer.lag_s, "busy_s": self.writer.busy_s}
 
     def _repeat_latched(self, stamp_ns: int) -> None:
         samples = self._latched()
@@ -258,6 +245,8 @@ class EpisodeRecording:
         if channel is None:
             self.ledger.count_refused(item)
             return
+        if item.is_bulk and item.finding is None:
+            encode(item, self._config)
         is_known = channel.content.knows(item.sample.data)
         finding = GOOD if is_known else item.finding or channel.inspect(item.sample.data)
         self._look(channel, item, finding, is_known=is_known)
@@ -302,7 +291,7 @@ class EpisodeRecording:
         if self.info.stand_in:  # by its clock, which may run ahead of this one
             stamp_ns = max(self.start_ns, source_ns or 0)
         log_ns = channel.later(stamp_ns)
-        self._writer.write(
+        self.writer.write(
             sample.topic,
             sample.data,
             schema_record=channel.record,
@@ -321,7 +310,7 @@ class EpisodeRecording:
         if before > self._closed_second:
             self._closed_second = before
             self._write_ledger(before, now_ns, health)
-        self._writer.tick()
+        self.writer.tick()
 
     def _write_ledger(self, before: int | None, now_ns: int, health: dict[str, int]) -> None:
         closed = list(self.ledger.close_seconds(before))
@@ -336,7 +325,7 @@ class EpisodeRecording:
         self, topic: str, record: dict[str, Any], type_name: str, stamp_ns: int
     ) -> None:
         log_ns = self._channels.later(topic, stamp_ns)
-        self._writer.write(topic, record, type_name=type_name, log_time_ns=log_ns)
+        self.writer.write(topic, record, type_name=type_name, log_time_ns=log_ns)
 
     def write_clock(self, record: dict[str, Any], stamp_ns: int) -> None:
         """Append readings of a source's clock."""
@@ -392,10 +381,10 @@ class EpisodeRecording:
         if not self._is_summed_up:
             self._sum_up(end_ns, reason, outcome or self.outcome)
             self._is_summed_up = True
-        return self._writer.close()
+        return self.writer.close()
 
     def _sum_up(self, end_ns: int, reason: str, outcome: metadata.Outcome | None) -> None:
-        writer = self._writer
+        writer = self.writer
         if outcome is not None:
             writer.add_metadata("outcome", metadata.to_strings(outcome))
         writer.add_metadata("drops", self.ledger.to_metadata())
@@ -419,21 +408,22 @@ class EpisodeRecording:
             self.ledger.presences, self._contract, span, lost, by_habit=not self.info.stand_in
         )
         presences = self.ledger.presences
-        self._of_presence = tuple(findings_of(self.presence, presences, span.end_ns))
+        untold = self.ledger.untold_tails()
+        self._of_presence = tuple(findings_of(self.presence, presences, span.end_ns, untold))
         record = {
             "topics": {topic: asdict(report) for topic, report in self.presence.items()},
             "unnumbered": self.ledger.unnumbered(),
         }
         values = {name: json.dumps(value) for name, value in record.items()}
-        self._writer.add_metadata(PRESENCE_RECORD, values)
+        self.writer.add_metadata(PRESENCE_RECORD, values)
         told = json.dumps([asdict(finding) for finding in self.findings()])
-        self._writer.add_metadata(health.RECORD_NAME, {"findings": told})
+        self.writer.add_metadata(health.RECORD_NAME, {"findings": told})
 
     def discard(self) -> None:
         """Remove the file: the take was not wanted."""
-        self._writer.discard()
+        self.writer.discard()
 
     def abandon(self) -> None:
         """Stop without finishing; the ``.part`` file stays."""
         with contextlib.suppress(OSError):  # the disk that failed may fail again
-            self._writer.abandon()
+            self.writer.abandon()

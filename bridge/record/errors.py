@@ -53,8 +53,7 @@ class FolderTakenError(UsageError):
     """Another recorder writes into the folder."""
 
     def __init__(self, *, run: Path) -> None:
-        """Remember the folder."""
-        self.run = run
+        """Name the folder."""
         super().__init__(
             f"another recorder records into {run} already. Stop it, or give this one a run folder "
             "of its own."
@@ -65,8 +64,7 @@ class NoSpaceError(BridgeError):
     """An episode was not started: the disk has too little space."""
 
     def __init__(self, *, folder: Path, free_mb: int, wanted_mb: int) -> None:
-        """Remember how much there was."""
-        self.folder = folder
+        """Say how much there was."""
         super().__init__(
             f"{folder} has {free_mb} MB free, and {wanted_mb} MB must be left. Free some space, "
             "choose another disk, or lower --min-free-mb and --footer-mb."
@@ -77,8 +75,7 @@ class DiskError(BridgeError):
     """The disk ended a recording."""
 
     def __init__(self, *, path: Path, cause: str, is_finished: bool) -> None:
-        """Remember the file, and whether it could be finished."""
-        self.path = path
+        """Name the file, and whether it could be finished."""
         kept = (
             "The episode was finished with all that was written until then"
             if is_finished

@@ -50,7 +50,7 @@ def inspector(type_name: str, encoding: str, topic: str = "") -> Callable[[bytes
         return lambda data: MessageState.UNDECODABLE
     if known.message_encoding == "cdr":
         return lambda data: _inspect_cdr(topic, type_name, data)
-    version = schema.json_schema_version(type_name)
+    version = int(json.loads(known.data).get("version", 1))
     return lambda data: _inspect_json(version, data)
 
 

@@ -7,7 +7,7 @@ sent = received - repeated + gaps + queue_drops.
 import json
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -78,6 +78,8 @@ class Ledger:
         """Start empty."""
         self.warnings: list[str] = []
         self.presences: dict[str, Presence] = {}
+        self.answering: Callable[[], Collection[str]] = tuple
+        """Topics whose sources have said, some time, how many messages they had sent."""
         self._max_topics = max_topics
         self._totals: dict[str, Tally] = {}
         self._open: dict[tuple[int, str], Tally] = {}
@@ -184,6 +186,10 @@ class Ledger:
         """Topics of which not every publisher said how many messages it had sent."""
         return sorted({topic for topic, _ in self._streams - self._told})
 
+    def untold_tails(self) -> list[str]:
+        """Those among them whose source said it before, and in the end did not."""
+        return sorted({*self.answering()}.intersection(self.uncounted_tails()))
+
     def to_metadata(self) -> dict[str, str]:
         """The ``drops`` metadata record: totals, counts by topic, and warnings.
 
@@ -196,5 +202,6 @@ class Ledger:
             "warnings": self.warnings,
             "several_publishers": sorted(topic for topic, n in publishers.items() if n > 1),
             "uncounted_tails": self.uncounted_tails(),
+            "untold_tails": self.untold_tails(),
         }
         return {name: json.dumps(value) for name, value in record.items()}

@@ -112,6 +112,7 @@ class Lifecycle:
         """What the topics of the next episode promise."""
         self.earlier_clocks: Callable[[], list[Answer]] = list
         """Readings of the sources' clocks made before an episode."""
+        self.answering: Callable[[], set[str]] = set
         self._reserve = DiskReserve(run.episodes_dir, config.disk.reserve_mb)
         self.free_bytes = free_bytes(run.path)
         self._run = run
@@ -174,18 +175,15 @@ class Lifecycle:
         news, self.take.news = self.take.news, []
         return news
 
-    def look_at_file(self) -> None:
-        """Raise OSError where the open file is gone from its place."""
-        if self.take is not None:
-            self.take.refuse_removed()
-
     @property
     def may_ask_disk(self) -> bool:
         """Whether the disk answers, so that asking it for names and space holds nobody up."""
         return self.take is None or self.take.disk["busy_s"] < UNANSWERED_S
 
     def look_at_disk(self) -> str:
-        """Return why the open episode must end now, or ""."""
+        """Return why the open episode must end now, or ""; raise OSError where its file is gone."""
+        if self.take is not None:
+            self.take.writer.refuse_removed()
         lacks, free_mb, min_mb = self._space()
         if self.take is None or not lacks:
             return ""
@@ -221,6 +219,7 @@ class Lifecycle:
             task=task,
             clocks=self.earlier_clocks(),
         )
+        self.take.ledger.answering = self.answering
         self.take.ledger.begin(command.ticket)
         return {"ok": True, "episode": info.id}
 
@@ -282,7 +281,7 @@ class Lifecycle:
     ) -> DiskError:
         """End a recording the disk has refused, and finish its file if there is any way."""
         take = self.take
-        path = take.part_path if take else self._run.episodes_dir
+        path = take.writer.part_path if take else self._run.episodes_dir
         error = DiskError(path=path, cause=cause, is_finished=False)
         reason = f"{metadata.IN_RESERVE if in_reserve else metadata.BY_DISK}{cause}"
         if take is None:
@@ -293,7 +292,7 @@ class Lifecycle:
         self._reserve.release()
         try:
             take.close(end_ns=now_ns, reason=reason, outcome=None, health=self._health())
-            error = DiskError(path=take.path, cause=cause, is_finished=True)
+            error = DiskError(path=take.writer.path, cause=cause, is_finished=True)
             self.last_episode = take.info.id
         except OSError:
             take.abandon()

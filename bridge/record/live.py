@@ -180,7 +180,7 @@ class LiveRecorder:
         core = self.core = Recorder(
             run, now_ns=session.now_ns, config=config, preview=previews.show, task=task
         )
-        core.note_recovered([_recovery_record(report) for report in reports])
+        core.also_tell("recovered", lambda: [_recovery_record(report) for report in reports])
         self._previews = previews
         self._ended = threading.Event()
         self._subscribers = [

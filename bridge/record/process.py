@@ -1,5 +1,7 @@
 """The recorder as a process: a status line, a clean end."""
 
+import contextlib
+import ctypes
 import threading
 import time
 from pathlib import Path
@@ -23,6 +25,17 @@ WAIT_S = 0.25
 """How often it looks whether the required topics are there."""
 
 
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # as mallopt(3) numbers them
+KEPT_BYTES = 32 << 20
+
+
+def keep_freed_memory() -> None:
+    """Let the memory of one image serve the next, rather than ask the system for each."""
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        for threshold in (M_TRIM_THRESHOLD, M_MMAP_THRESHOLD):
+            ctypes.CDLL(None).mallopt(threshold, KEPT_BYTES)
+
+
 def run_recorder(
     run_path: Path,
     *,
@@ -44,6 +57,7 @@ def run_recorder(
     Returns:
         The answer to the last stop if this call stopped an episode, else None.
     """
+    keep_freed_memory()
     with open_session(wire) as session:
         run = RunFolder.create(run_path)
         recorder = LiveRecorder(session, run, config, output.say, task)

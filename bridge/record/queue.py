@@ -208,8 +208,8 @@ class Flow:
 class InputQueue:
     """Filled by network threads, emptied by the writer thread."""
 
-    def __init__(self, limits: QueueConfig, hand_over: Callable[[Item], None]) -> None:
-        """Set the budgets."""
+    def __init__(self, limits: QueueConfig, hand_over: Callable[[Item, bool], bool]) -> None:
+        """Set the budgets; ``hand_over`` is told whether an image is watched, and may take it."""
         self._limits = limits
         self._bulk_budget = limits.camera_queue_mb * BYTES_PER_MB
         self._small_budget = limits.small_queue_mb * BYTES_PER_MB
@@ -275,10 +275,8 @@ class InputQueue:
                 self.images_in += 1
             else:
                 self._small_in += cost
-            if flow.is_image:
-                item.for_preview = for_preview
-                self._hand_over(item)
-            else:
+            item.for_preview = for_preview
+            if not (flow.is_image and self._hand_over(item, sample.topic in self.watched)):
                 self._entries.append(item)
 
     def _new_flow(self, sample: WireSample) -> Flow:

@@ -75,6 +75,7 @@ class Recorder:
         self.presence = PresenceMonitor(self.input_queue.seen, tell=self.note)
         self.clocks = ClockBook(tell=self.note, write=self._write_clock)
         self._life.earlier_clocks = self.clocks.earlier
+        self._life.answering = self.clocks.answering
         self.settle: Callable[[], None] = lambda: None
         """Asks publishers how many messages they have sent; what has not come is counted."""
         self.news: deque[str] = deque(maxlen=MAX_NEWS)
@@ -272,17 +273,9 @@ class Recorder:
         episodes = [asdict(read_entry(self.run, path)) for path in paths[-last:]]
         return {"ok": True, "of": len(paths), "episodes": episodes}
 
-    def declare_latched(self, topic: str) -> None:
-        """Begin later episodes with the last message of a topic; its publisher says so."""
-        self.input_queue.latched.declare(topic)
-
     def forget(self, prefix: str, but: tuple[str, ...] = ()) -> None:
         """Repeat no latched message of topics that begin so: their publisher has gone."""
         self._aside(lambda command: self._life.latched.forget(prefix, but))
-
-    def note_recovered(self, reports: list[Answer]) -> None:
-        """Show in the status what was found cut off when the recorder began."""
-        self._status.recovered = reports
 
     def also_tell(self, name: str, ask: Callable[[], object]) -> None:
         """Add something to every status and episode; ``ask`` must answer at once."""
@@ -392,7 +385,6 @@ class Recorder:
                     self.note(news)
         if now_s >= self._next_look_s and self._life.may_ask_disk:
             self._next_look_s = now_s + LOOK_S
-            self._life.look_at_file()
             if (cause := self._life.look_at_disk()) and not self._status.failing:
                 self._end_because(cause)
 

@@ -52,7 +52,7 @@ class Ros2Graph:
             is_last = topic not in self._publishers.values()
         if alive:
             if endpoint.transient_local:
-                self._recorder.declare_latched(topic)
+                self._recorder.input_queue.latched.declare(topic)
                 self._fetcher.submit(self._fetch_history, endpoint)
             self._recorder.presence.publisher(topic, is_there=True)
         elif was_there and is_last:

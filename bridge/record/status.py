@@ -39,8 +39,6 @@ class Status:
         self.failing = ""
         """What the disk said, while the episode is still being finished."""
         self.clock_steps = 0
-        self.recovered: list[dict[str, Any]] = []
-        """What was found cut off when the recorder began."""
         self.others: dict[str, Callable[[], object]] = {}
         self._run = run
         self._config = config
@@ -86,7 +84,6 @@ class Status:
             "write_lag_s": round(disk["write_lag_s"], 2),
             "stalled_s": round(stalled_s, 1) if stalled_s > STALLED_S else 0.0,
             "clock_steps": self.clock_steps,
-            "recovered": self.recovered,
             "seen": self._input_queue.seen(),
             "rates_hz": self._rates_hz,
         }

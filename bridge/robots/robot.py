@@ -161,19 +161,19 @@ class Robot:
         """Return the URDF text of the bare arm, as its package or file holds it."""
         return self._file(self.urdf).read_text()
 
-    def urdf_text(self) -> str:
+    def urdf_text(self, lost: list[str] | None = None) -> str:
         """Return the URDF text with all that is attached.
 
-        Meshes of packages that are not known everywhere become paths.
+        Meshes of packages that are not known everywhere become paths; ``lost`` is as in ``parsed``.
 
         Raises:
             UsageError: A file or a mesh is missing, or an attached file hangs on nothing.
         """
-        arm = self.parsed(self.urdf)
+        arm = self.parsed(self.urdf, lost)
         for element in arm.findall("transmission"):
             arm.remove(element)
         for name in self.attached:
-            part = self.parsed(name)
+            part = self.parsed(name, lost)
             self._mount(part, arm, name)
             there = {link.get("name"): link for link in arm.findall("link")}
             for item in part:
@@ -186,12 +186,12 @@ class Robot:
         arm.set("name", self.name)
         return ET.tostring(arm, encoding="unicode")
 
-    def description(self) -> str:
+    def description(self, lost: list[str] | None = None) -> str:
         """Return the URDF text with this record in it: what is published and recorded.
 
         A URDF of the default robot needs none.
         """
-        text = self.urdf_text()
+        text = self.urdf_text(lost)
         if self.name == DEFAULT_ROBOT:
             return text
         record = {key: value for key, value in asdict(self).items() if key not in _OF_FILES}
@@ -199,8 +199,11 @@ class Robot:
         ET.SubElement(root, RECORD_TAG).text = json.dumps(record, separators=(",", ":"))
         return ET.tostring(root, encoding="unicode")
 
-    def parsed(self, uri: str) -> ET.Element:
-        """Read a URDF, its meshes as paths; UsageError says what is wrong with it."""
+    def parsed(self, uri: str, lost: list[str] | None = None) -> ET.Element:
+        """Read a URDF, its meshes as paths; UsageError says what is wrong with it.
+
+        ``lost`` takes what is said of meshes that are not there; their shapes are left out.
+        """
         path = self._file(uri)
         text = _UNREAD.sub(lambda found: b"\n" * found[0].count(b"\n"), path.read_bytes())
         if b"<xacro:" in text:
@@ -214,14 +217,19 @@ class Robot:
             raise UsageError(f"{path} is not XML ({error}).") from error
         if root.tag != "robot":
             raise UsageError(f"{path} has the root element <{root.tag}>, not <robot>.")
-        lost: dict[str, None] = {}
-        for mesh in root.iter("mesh"):
-            try:
-                mesh.set("filename", self._mesh(mesh.get("filename", ""), path.parent))
-            except UsageError as error:
-                lost[str(error)] = None
-        if lost:
-            raise UsageError(" ".join(lost))
+        missing = [] if lost is None else lost
+        for link, shape in [(each, part) for each in root.iter("link") for part in each]:
+            for mesh in shape.iter("mesh"):
+                try:
+                    found = self._mesh(mesh.get("filename", ""), path.parent)
+                    mesh.set("filename", found)
+                    if lost is not None:
+                        resolve_mesh(found)
+                except UsageError as error:
+                    missing.append(f"the link {link.get('name')!r}: {error}")
+                    link.remove(shape)
+        if missing and lost is None:
+            raise UsageError(" ".join(missing))
         return root
 
     def _mesh(self, uri: str, folder: Path) -> str:
@@ -267,7 +275,7 @@ _ODD = (msgspec.ValidationError, AttributeError, TypeError, ValueError)
 def read_robot(name: str) -> Robot:
     """Read a robot file by its name in ``datasets/robots``, or by its path; or guess at a URDF."""
     if name.endswith((".urdf", ".xacro")):
-        return typing.cast(Robot, load_leaf("open", "robot_in")(Path(name)))
+        return typing.cast(Robot, load_leaf("open", "propose")(Path(name))[0])
     path = dataset_file("robots", name)
     try:
         table = tomllib.loads(path.read_text())
@@ -282,8 +290,8 @@ def read_robot(name: str) -> Robot:
 def robot_of(urdf: str) -> Robot:
     """Return the robot that a description is of.
 
-    That is the record the description carries; else the robot file that has the name of the URDF;
-    else the default robot, with which old episodes were recorded.
+    That is the record the description carries; else the robot file that has the name of the URDF,
+    or alone has its joints; else the default robot, with which old episodes were recorded.
     """
     carried = re.search(rf"<{RECORD_TAG}\b[^>]*>(.*?)</{RECORD_TAG}>", urdf, re.DOTALL)
     if carried is not None:
@@ -295,8 +303,12 @@ def robot_of(urdf: str) -> Robot:
                 "Name the robot's file: --robot FILE.toml."
             ) from error
     name = robot_name(urdf)
-    files = {path.stem for path in (datasets_folder() / "robots").glob("*.toml")}
-    return read_robot(name if name in files else DEFAULT_ROBOT)
+    files = sorted(path.stem for path in (datasets_folder() / "robots").glob("*.toml"))
+    if name in files:
+        return read_robot(name)
+    joints = set(re.findall(r'<joint\b[^>]*\bname="([^"]+)"', urdf))
+    fits = [robot for robot in map(read_robot, files) if joints.issuperset(robot.joints)]
+    return fits[0] if len(fits) == 1 else read_robot(DEFAULT_ROBOT)
 
 
 @dataclass(frozen=True, kw_only=True)

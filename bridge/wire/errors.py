@@ -18,8 +18,7 @@ class NoPeerError(WireError):
     """Nobody listens at the endpoints we should connect to."""
 
     def __init__(self, *, endpoints: tuple[str, ...]) -> None:
-        """Remember the endpoints that were tried."""
-        self.endpoints = endpoints
+        """Name the endpoints that were tried."""
         where = " or ".join(public(endpoint) for endpoint in endpoints)
         refused = ""
         if any(endpoint.startswith(_WITH_CERTIFICATES) for endpoint in endpoints):
@@ -34,8 +33,7 @@ class PortTakenError(WireError):
     """Another process listens where we should."""
 
     def __init__(self, *, endpoint: str) -> None:
-        """Remember the endpoint that is in use."""
-        self.endpoint = endpoint
+        """Name the endpoint that is in use."""
         super().__init__(
             f"{public(endpoint)} is in use by another process, perhaps a second recorder or a "
             "zenoh router. Stop it, or pass --listen with another port (for example "
@@ -51,8 +49,7 @@ class BadTopicError(UsageError):
     """A topic name cannot travel on zenoh."""
 
     def __init__(self, *, topic: str, found: str) -> None:
-        """Remember the topic."""
-        self.topic = topic
+        """Name the topic."""
         super().__init__(
             f"topic {topic!r} cannot be published: {found}. "
             "A topic starts with one slash, has no empty parts and none of * $ ? #."
@@ -67,9 +64,7 @@ class NoReplyError(WireError):
     """Nobody answered a request in time."""
 
     def __init__(self, *, key: str, timeout_s: float) -> None:
-        """Remember what was asked and how long we waited."""
-        self.key = key
-        self.timeout_s = timeout_s
+        """Name what was asked and how long we waited."""
         super().__init__(
             f"nobody answered on {key} (waited at most {timeout_s:g} s). "
             "Is the other side running, and is its name spelled as it was started?"

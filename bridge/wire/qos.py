@@ -13,8 +13,6 @@ from bridge.episode.topics import service_of_topic
 class Qos:
     """One choice for one topic; use the presets."""
 
-    name: str
-    """What the preset is called in tables and errors."""
     block: bool
     """Wait for space when the network is behind; otherwise the message is lost and the receiver
     sees a gap in the numbers."""
@@ -41,7 +39,7 @@ class Qos:
     """Pictures for a person; the first to go."""
 
 
-Qos.CAMERA = Qos(name="camera", block=False, priority="data_low", shared_memory=True)
-Qos.CONTROL = Qos(name="control", block=False, priority="real_time")
-Qos.RELIABLE = Qos(name="reliable", block=True, priority="data")
-Qos.PREVIEW = Qos(name="preview", block=False, priority="background", is_remote=True)
+Qos.CAMERA = Qos(block=False, priority="data_low", shared_memory=True)
+Qos.CONTROL = Qos(block=False, priority="real_time")
+Qos.RELIABLE = Qos(block=True, priority="data")
+Qos.PREVIEW = Qos(block=False, priority="background", is_remote=True)

@@ -52,13 +52,11 @@ class Service:
         self,
         key: str,
         handler: Callable[[bytes], bytes],
-        max_waiting: int,
-        side_by_side: int = 1,
+        side_by_side: int,
     ) -> None:
         """Use ``WireSession.serve``."""
         self._key = key
         self._handler = handler
-        self._max_waiting = max_waiting
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._inner: Any = None
         self._threads = [
@@ -74,12 +72,12 @@ class Service:
 
     def take(self, query: Any) -> None:
         """Queue a request, on the network thread; one too many is refused at once."""
-        if self._requests.qsize() < self._max_waiting:
+        if self._requests.qsize() < MAX_WAITING:
             self._requests.put(query)
             return
         with query, contextlib.suppress(zenoh.ZError):
             query.reply_err(
-                f"busy: {self._max_waiting} requests on {self._key} wait already. "
+                f"busy: {MAX_WAITING} requests on {self._key} wait already. "
                 "Ask again later, or start another one under its own name."
             )
 
@@ -270,6 +268,14 @@ class WireSession:
         with _naming(WireConfigError, f"cannot subscribe to {key_expression!r}"):
             return Subscriber(self._inner.declare_subscriber(key_expression, handler))
 
+    def follow(self, topic: str, callback: Callable[[WireSample], None]) -> None:
+        """Receive a topic, or all below ``/**``, ROS 2 nodes' too: what they keep comes first."""
+        ros = f"*{topic}" if topic.endswith("**") else f"*{topic}/*/*"
+        for key in (topic[1:], ros):
+            self.subscribe(key, callback)
+        for sample in self.query_all(f"{ros}/@adv/**", timeout_s=2.0):
+            callback(sample)
+
     def open_loopback(self) -> "WireSession":
         """Open a client of the endpoint this session listens on, else of one it connects to.
 
@@ -286,11 +292,10 @@ class WireSession:
         key: str,
         handler: Callable[[bytes], bytes],
         *,
-        max_waiting: int = MAX_WAITING,
         side_by_side: int = 1,
     ) -> Service:
         """Answer requests on a key; a ``GstError`` of the handler goes back as the answer."""
-        service = Service(key, handler, max_waiting, side_by_side)
+        service = Service(key, handler, side_by_side)
         callback = zenoh.handlers.Callback(service.take, indirect=False)
         try:
             service.start(self._inner.declare_queryable(key, callback))

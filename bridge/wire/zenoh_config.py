@@ -30,10 +30,8 @@ _QUOTED_VALUE = re.compile(r"(invalid (?:type|value): [a-z ]+?) (?:\".*\"|`[^`]*
 _WRONG_SYNTAX = re.compile(
     r"--> (?P<line>\d+):(?P<column>\d+).*\n\s*= (?P<message>.*?)(?: at /|$)", re.DOTALL
 )
-_OURS_WHERE_THE_FILE_IS_SILENT = {
-    # Room for about 1 MB of joints (5 s at 500 Hz) while a receiver hangs, before any is dropped.
-    "transport/link/tx/queue/size/real_time": 16,
-}
+_QUEUE, _QUEUE_SIZE = "transport/link/tx/queue/size/real_time", 16
+"""Room for about 1 MB of joints (5 s at 500 Hz) while a receiver hangs, before any is dropped."""
 
 
 def zenoh_config(config: WireConfig) -> Any:
@@ -49,10 +47,8 @@ def zenoh_config(config: WireConfig) -> Any:
         "scouting/delay": 0,  # there is nobody to wait for without scouting
     }
     made = zenoh.Config() if config.config is None else _config_from_file(config)
-    plain = zenoh.Config()
-    for key, value in _OURS_WHERE_THE_FILE_IS_SILENT.items():
-        if made.get_json(key) == plain.get_json(key):
-            settings[key] = value
+    if made.get_json(_QUEUE) == zenoh.Config().get_json(_QUEUE):  # the file is silent
+        settings[_QUEUE] = _QUEUE_SIZE
     for key, value in settings.items():
         try:
             made.insert_json5(key, json.dumps(value))

@@ -10,6 +10,7 @@ from evaluator.result import Cell, Table
 AGREE, WORLD, ACTIONS, UNKNOWN = "end alike", "world", "actions", "not known"
 """``WORLD``: the trial's own motion, replayed in the twin, ends as the rollout did. ``ACTIONS``:
 it ends as the trial did, so that the policy did something else in the rollout."""
+COLUMNS = {WORLD: "same motion, other end", ACTIONS: "other motion"}
 SAID = {
     WORLD: "The same motion ends otherwise in the twin: ",
     ACTIONS: "The policy moved otherwise in the twin: ",
@@ -36,17 +37,10 @@ def attribution_table(rows: Sequence[TrialRow]) -> tuple[Table, ...]:
     lines: list[dict[str, Cell]] = []
     for (task, policy), members in [*by_group.items(), (("", "all"), known)]:
         counts = Counter(found for _, found in members)
-        lines.append(
-            {
-                "task": task,
-                "policy": policy,
-                "trials": len(members),
-                AGREE: counts[AGREE],
-                "same motion, other end": counts[WORLD],
-                "other motion": counts[ACTIONS],
-                UNKNOWN: counts[UNKNOWN],
-            }
-        )
+        line: dict[str, Cell] = {"task": task, "policy": policy, "trials": len(members)}
+        for kind in (AGREE, WORLD, ACTIONS, UNKNOWN):
+            line[COLUMNS.get(kind, kind)] = counts[kind]
+        lines.append(line)
     table = Table.of(
         lines,
         id="attribution",

@@ -156,14 +156,19 @@ def compare_end_points(
                 left_out[Exclusion(episode=episode, scope="end points", reason=why)] = None
     if not rows:
         return Part()
+    error = "end-point error (mm)"
+    rows.sort(key=lambda row: (str(row["body"]), row[error] is None, float(row[error] or 0)))
+    told = {row["body"]: row for row in reversed(rows) if row[error] is not None}
+    nearest = [f"{each['body']}: {each['engine']}, {each[error]} mm" for each in told.values()]
     table = Table.of(
         rows,
         id=table_id,
         title=f"End points: {task}",
-        note="Medians over recorded runs. A replay is compared with the run that it was made "
-        "from, other simulated runs with every recorded one (mean over them). Displacement: "
-        "end minus start, so where a body began plays no part. Path: mean distance after both "
-        "clocks are begun where the body leaves its start and the remaining lag is taken out. "
+        note=f"Nearest to the recorded end: {'; '.join(reversed(nearest)) or 'none'}. Medians over "
+        "recorded runs. A replay is compared with the run that it was made from, other simulated "
+        "runs with every recorded one (mean over them). Displacement: end minus start, so where a "
+        "body began plays no part. Path: mean distance after both clocks are begun where the "
+        "body leaves its start and the remaining lag is taken out. "
         "Intervals of the end point: order statistics, 95 %. Runs that something was fitted to do "
         "not count.",
     )

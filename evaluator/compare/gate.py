@@ -1,9 +1,9 @@
 """Trial by trial: does what the twin said agree with what happened?"""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from bridge.episode.metadata import CONTROL
-from evaluator.compare.measure import measured
+from evaluator.compare.measure import grouped, measured
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, answered, names_of
 from evaluator.measurements import AGREED, NPV, PHI, PPV
@@ -41,10 +41,22 @@ def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:
         ("verdict", lambda row: row.verdict, "the verdict before motion"),
         ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
     ]
-    if any(unheeded_verdict(row) is not None for row in rows):
-        words = "the verdict before motion, recorded and not obeyed (without replanning)"
-        sides.append(("verdict_unheeded", unheeded_verdict, words))
+    told = "the verdict before motion, recorded and not obeyed (without replanning)"
+    twice = "another trial of the same policy from the same start"
+    rare = [("verdict_unheeded", unheeded_verdict, told), ("repeated", repeated(rows), twice)]
+    sides += [side for side in rare if any(side[1](row) is not None for row in rows)]
     return [measurement for side in sides for measurement in _agreement_of(rows, *side)]
+
+
+def repeated(rows: Iterable[TrialRow]) -> Answer:
+    """How the trial ended that was a start's first of two: no twin knows more of the second."""
+    starts = grouped(
+        (row for row in rows if row.start_id and row.recorded is not None),
+        lambda row: (row.cell, row.task, row.condition, row.policy, row.start_id),
+    )
+    twos = (two for each in starts.values() for two in zip(each[::2], each[1::2], strict=False))
+    ends = {id(second): first.recorded for first, second in twos}
+    return lambda row: ends.get(id(row))
 
 
 def _agreement_of(

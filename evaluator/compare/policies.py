@@ -542,8 +542,8 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         note=f"Group-sequential score test, {words}, extended by doubling; alpha {plan.alpha:g} "
         "holds however often one looks; over all tasks each is counted in turn. All questions "
         "share it (Holm), a primary one has it alone, the same in each task share another, "
-        "progress and time to success a third. Intervals hold at every look. Trials without an "
-        "outcome are failures.",
+        "progress and time to success a third. Intervals hold at every look. Trials that "
+        "ended without an answer are failures; those that nobody labelled do not count.",
     )
     return Part(
         measurements=tuple(_measured(each) for each in answers), tables=(table, *_standing(answers))

@@ -54,10 +54,7 @@ def _agreement(first: str, second: str, raters: Mapping[str, Labels]) -> dict[st
         "agree": sum(a == b for a, b in pairs),
         "only the first says success": sum(a and not b for a, b in pairs),
         "only the other says success": sum(b and not a for a, b in pairs),
-        "kappa": None,
-        "low": None,
-        "high": None,
-        "why undefined": None,
+        **dict.fromkeys(("kappa", "low", "high", "why undefined")),
     }
     try:
         line["kappa"] = kappa(Confusion.of(pairs))

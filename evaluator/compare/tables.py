@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from evaluator.compare.gate import confusion_of, heeded_verdict, unheeded_verdict
 from evaluator.compare.measure import RATE_COLUMNS, rate_row
 from evaluator.compare.rows import RateGroup, TrialRow
-from evaluator.result import Cell, Table
+from evaluator.compare.success import Answer
+from evaluator.result import Table
 
 EXECUTED = "executed in twin"
 """The twin's side of a group in which nobody published a plan."""
@@ -94,29 +95,21 @@ def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
 
 def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     """What the twin said against what happened, counted over trials."""
-    lines: list[dict[str, Cell]] = []
-    for name, answer_of in (
+    ends = ("success", "failure")
+    kinds = [f"predicted {foretold}, {word} {end}" for foretold in ends for end in ends]
+    sides: tuple[tuple[str, Answer], ...] = (
         ("sim planned", lambda row: row.sim_planned),
         ("verdict before motion", lambda row: row.verdict),
         ("verdict, not obeyed (without replanning)", unheeded_verdict),
         ("verdict, obeyed (with replanning)", heeded_verdict),
         ("sim executed (diagnosis)", lambda row: row.sim_executed),
-    ):
-        counts = confusion_of(rows, answer_of)
-        lines.append(
-            {
-                "twin": name,
-                f"predicted success, {word} success": counts.true_positive,
-                f"predicted success, {word} failure": counts.false_positive,
-                f"predicted failure, {word} success": counts.false_negative,
-                f"predicted failure, {word} failure": counts.true_negative,
-                "trials": counts.n,
-            }
-        )
-    return Table.of(
-        lines,
+    )
+    counted = [(name, confusion_of(rows, answer_of)) for name, answer_of in sides]
+    return Table(
         id="confusion",
         title="Prediction of the twin against the outcome",
+        columns=("twin", *kinds, "trials"),
+        rows=tuple((name, *counts, counts.n) for name, counts in counted),
         note="Trials with a known outcome in which a plan was executed. A verdict before motion "
         "that predicted failure refused the plan; it was executed anyway, because the answer was "
         "only recorded. With replanning refused plans are not executed, so the gate's misses there "

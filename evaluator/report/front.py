@@ -418,6 +418,10 @@ def _summary(results: Results, num_tasks: int) -> list[str]:
         who = "Twin" if side == "sim_planned" else "Without plans, what was executed in the twin"
         of = f"{rate.k} of {rate.n} trials ({100 * rate.k / rate.n:.0f} %"
         parts.append(f"{who} and recorded outcome agree in {of}{_by_chance(results, rate.n)}).")
+    again = by_id.get("agreement.repeated.rate")
+    if again is not None and (again.n or 0) >= SAYS_LITTLE:
+        pairs = f"{again.k} of {again.n} pairs of trials from one start"
+        parts.append(f"The cell agrees with itself in {pairs} ({100 * (again.value or 0):.0f} %).")
     bias = by_id.get("agreement.bias_pp")
     if bias and bias.value is not None and (bias.n or 0) > 1 and (num_tasks > 1 or bias.interval):
         size = f"{_points(bias.value)} {'below' if bias.value < 0 else 'above'}"

@@ -196,7 +196,6 @@ def test_a_reader_that_has_seen_enough_is_no_traceback(tmp_path: Path) -> None:
         ["publish", "standin", "--rounds", "0"],
         ["publish", "standin", "--image-scale", "0"],
         ["publish", "standin", "--rate-hz", "-1"],
-        ["import", "rgbd", "DIR", "RUN", "--max-frames", "-1"],
         ["import", "rgbd", "DIR", "RUN", "--rate-hz", "nan"],
         ["record", "RUN", "--camera-queue-mb", "-1"],
         ["record", "RUN", "--small-queue-mb", "0"],

@@ -16,12 +16,12 @@ from patience import wait_until
 
 from bridge import process_pool
 from bridge.process_pool import (
+    ALONE,
     ATTEMPTS,
     MOST,
     Failed,
     NoProcessError,
     ProcessPool,
-    Serial,
     TimeIsUpError,
     Worker,
     WorkerDiedError,
@@ -46,11 +46,11 @@ def test_every_piece_comes_back_with_its_answer_from_another_process() -> None:
 
 
 def test_one_process_gives_the_same_answers_in_order() -> None:
-    with Serial() as runner:
+    with ALONE as runner:
         assert list(runner.run(eval, ["1 + 1", "2 + 2"], len)) == [("1 + 1", 2), ("2 + 2", 4)]
 
 
-@pytest.mark.parametrize("runner", [Serial(), ProcessPool(2)])
+@pytest.mark.parametrize("runner", [ALONE, ProcessPool(2)])
 def test_what_goes_wrong_with_one_piece_is_its_answer_and_the_others_go_on(runner: Any) -> None:
     answers = run(runner, ["1 / 0", "2 + 2", "nonsense"])
     assert answers["2 + 2"] == 4
@@ -64,7 +64,7 @@ def test_what_goes_wrong_with_one_piece_is_its_answer_and_the_others_go_on(runne
 
 def test_a_disk_that_refuses_is_no_bug_and_a_missing_file_of_ours_is() -> None:
     full = "(_ for _ in ()).throw(OSError(28, 'No space left on device', '/run/derived/a.mcap'))"
-    answers = run(Serial(), [f"next({full})", "open('/nowhere/at/all')"])
+    answers = run(ALONE, [f"next({full})", "open('/nowhere/at/all')"])
     refused, missing = answers[f"next({full})"], answers["open('/nowhere/at/all')"]
     assert refused.message == "the disk refuses at /run/derived/a.mcap: No space left on device"
     assert refused.known
@@ -175,7 +175,7 @@ def test_a_worker_that_hangs_is_noticed_and_ended() -> None:
     with pytest.raises(TimeIsUpError, match=r"no answer within 0\.05 s"):
         worker.finish(0.05)
     assert worker.busy
-    pid = worker.pid
+    pid = worker.process.pid
     worker.close()
     assert pid is not None
     assert not _alive(pid)
@@ -195,7 +195,7 @@ def test_a_worker_that_stops_listening_is_noticed_and_ended(size: int) -> None:
     with closing(Worker()) as worker:
         worker.begin(len, b"")
         assert worker.finish(60.0) == 0
-        os.kill(worker.pid, signal.SIGSTOP)
+        os.kill(worker.process.pid, signal.SIGSTOP)
         with pytest.raises(TimeIsUpError):
             _ask(worker, bytes(size), 0.1)
 
@@ -210,7 +210,7 @@ def test_half_an_answer_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPat
     with closing(Worker()) as worker:
         worker.begin(bytes, 3_000_000)
         assert wait([worker.outlet], 60)
-        os.kill(worker.pid, signal.SIGSTOP)  # a socket holds less than that
+        os.kill(worker.process.pid, signal.SIGSTOP)  # a socket holds less than that
         with pytest.raises(TimeIsUpError):
             worker.finish(60.0)
 

@@ -33,7 +33,8 @@ def test_a_line_says_how_much_is_left_judging_by_what_it_took(
         advance(done, "trial_1")
         clock[0] += 1.0
         advance(done + 1, "too soon for another line")
-    assert capsys.readouterr().err == told
+    Output().say("--policy a:x: no")  # no picture of what stands between colons
+    assert capsys.readouterr().err == f"{told}--policy a:x: no\n"
 
 
 def test_a_command_that_says_nothing_is_at_work_or_waits_for_others(

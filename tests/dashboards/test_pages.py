@@ -21,6 +21,7 @@ from dashboards.moments import Moment
 from dashboards.overview_page import first_numbers
 from dashboards.twin_page import build_twin
 from evaluator.report.front import front
+from evaluator.report.page import breakable
 from evaluator.result import Interval, load_results
 from robot_gst import run as type_here
 
@@ -39,6 +40,19 @@ def test_the_overview_shows_the_numbers_of_results_json(
     assert "Stand-in cell" in text
 
 
+def test_numbers_are_found_by_words_of_their_ids_and_definitions(
+    browser: Any, shared_run: RunFolder
+) -> None:
+    known = load_results(shared_run.path).measurements
+    wanted = [m.id for m in known if "psnr" in f"{m.id} {m.definition}".lower()]
+    assert 0 < len(wanted) < len(known)
+    text = browser.get("/numbers", params={"q": "PSNR"}).text
+    shown = [m.id for m in known if f"<code>{breakable(m.id)}</code>" in text]
+    assert shown == wanted
+    assert "<details open>" in text
+    assert "No number is called" in browser.get("/numbers?q=psnr+nonsense").text
+
+
 @pytest.mark.parametrize(
     ("low", "high", "is_first"), [(0.1, 0.9, True), (-0.9, -0.2, True), (-0.9, 1.0, False)]
 )
@@ -51,6 +65,15 @@ def test_a_correlation_that_may_be_none_is_no_first_number(
     found: Any = SimpleNamespace(measurements=(r,))
     titles = [name for name, _ in first_numbers(found)]
     assert titles == ["Success rates, correlation r"] * is_first
+
+
+def test_a_task_is_called_as_its_makers_call_it(copy: RunFolder) -> None:
+    old = next(m for m in judged(copy).measurements if m.id.startswith("rate.recorded."))
+    rate = replace(old, id="rate.recorded.W+00fcrfel_auf_Block.-.act")
+    found: Any = SimpleNamespace(measurements=(rate,))
+    assert [name for name, _ in first_numbers(found)] == [
+        "Recorded success, Würfel auf Block · act"
+    ]
 
 
 def test_the_first_page_begins_with_the_answer_and_the_worst(

@@ -134,6 +134,19 @@ def test_other_simulated_runs_are_compared_with_every_recorded_one(lab: Any) -> 
     assert np.median(ways) < np.median(ends) - 0.005
 
 
+def test_the_nearest_engine_stands_first_and_is_named(lab: Any) -> None:
+    run, _ = lab()
+    (table,) = compare_run(run).tables
+    rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    errors = [row["end-point error (mm)"] for row in rows if row["body"] == "cube"]
+    assert len(errors) == 2
+    assert errors == sorted(errors)
+    engines = [row["engine"] for row in rows if row["body"] == "cube"]
+    nearest = min(engines, key=lambda engine: value(run, engine, "end_point").value)
+    assert engines[0] == nearest
+    assert f"cube: {nearest}, {errors[0]} mm" in table.note
+
+
 def test_runs_something_was_fitted_to_do_not_count_and_are_named(lab: Any) -> None:
     fitted = ("push_0", "push_2", "push_4", "push_6")
     run, _ = lab(fitted=fitted)

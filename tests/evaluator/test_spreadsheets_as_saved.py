@@ -300,6 +300,15 @@ def test_rates_that_cannot_be_are_refused(
         trials_rates.rates_of(read_rows(path, ("task", "side"), trials_rates.COLUMNS))
 
 
+def test_a_table_that_excel_saved_in_western_europe_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "de.csv"
+    path.write_bytes(
+        "task;policy;outcome\nWürfel;act;Erfolg\nWürfel;act;Fehlschlag\n".encode("cp1252")
+    )
+    rate = compare_csv(path).results().get("rate.recorded.W+00fcrfel.-.act")
+    assert (rate.k, rate.n) == (1, 2)
+
+
 def test_a_table_that_is_neither_is_refused(
     write_table: Callable[[str], Path], tmp_path: Path
 ) -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from joint_samples import at_positions
 
 from bridge.episode import schema
+from bridge.episode.catalogue import label_episode
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
@@ -26,6 +27,7 @@ from evaluator.compare.attribution import (
     attributed,
     attribution_table,
 )
+from evaluator.report.front import front
 from evaluator.report.wording import headlines
 
 STEP_NS = 8_000_000
@@ -139,20 +141,12 @@ def trials(write_table: Callable[[str], Path], lines: list[str]) -> Comparison:
     return compare_csv(write_table(HEADER + "\n".join(lines) + "\n"))
 
 
-def line(
-    number: int,
-    recorded: bool | None,
-    sim: bool | None,
-    *,
-    condition: str = "without_replanning",
-    verdict: str = "",
-    p: str = "",
-    policy: str = "x",
-) -> str:
+def line(number: int, recorded: bool | None, sim: bool | None, **more: str) -> str:
     words = {True: "success", False: "failure", None: ""}
-    start = f"s{number % 1000}"
+    found = {"condition": "without_replanning", "verdict": "", "p": "", "policy": "x"} | more
     return (
-        f"t{number},cube,{condition},{policy},{start},{words[recorded]},{words[sim]},{verdict},{p}"
+        f"t{number},cube,{found['condition']},{found['policy']},s{number % 1000},{words[recorded]},"
+        f"{words[sim]},{found['verdict']},{found['p']}"
     )
 
 
@@ -172,24 +166,34 @@ def test_the_gate_is_judged_where_it_was_not_obeyed(write_table: Callable[[str],
     assert results.get("agreement.verdict_unheeded.phi").value == pytest.approx(0.7071, abs=1e-4)
 
 
+def test_two_trials_of_a_policy_from_one_start_are_held_against_each_other(
+    write_table: Callable[[str], Path],
+) -> None:
+    """Each once: a third has no other, one of another policy or without an end is none."""
+    starts = [(True, True), (True, False), (False, False, True), (None, False, False), (True,)]
+    starts += [(True, True)] * 7
+    lines = [
+        line(1000 * turn + start, end, True)
+        for start, ends in enumerate(starts)
+        for turn, end in enumerate(ends)
+    ]
+    results = trials(write_table, [*lines, line(5004, False, True, policy="y")]).results()
+    told = dict(front(results).answers)["In numbers"]
+    assert "The cell agrees with itself in 10 of 11 pairs of trials from one start (91 %)." in told
+
+
 def test_subtasks_make_a_funnel(write_table: Callable[[str], Path]) -> None:
     text = "trial_id,task,unit,k,n\na,tidy,subtask,3,3\nb,tidy,subtask,1,3\nc,tidy,subtask,0,3\n"
     comparison = compare_csv(write_table(text))
     funnel = next(table for table in comparison.tables if table.id == "funnel")
-    assert [row[2:5] for row in funnel.rows] == [
-        ("subtask_1", 3, 2),
-        ("subtask_2", 2, 1),
-        ("subtask_3", 1, 1),
-    ]
+    passed = [("subtask_1", 3, 2), ("subtask_2", 2, 1), ("subtask_3", 1, 1)]
+    assert [row[2:5] for row in funnel.rows] == passed
     stage = comparison.results().get("stage.tidy.-.subtask_2")
     assert (stage.k, stage.n) == (1, 2)
     assert stage.interval is not None
 
 
 def test_labelled_stages_of_an_episode_make_a_funnel(maker: Any) -> None:
-    from bridge.episode.catalogue import label_episode
-    from bridge.episode.metadata import Outcome
-
     for name, second in (("t1", "success"), ("t2", "failure"), ("t3", "unknown")):
         maker.trial(name, start_id=name)
         stages = ({"id": "grasp", "result": "success"}, {"id": "release", "result": second})
@@ -206,9 +210,6 @@ def test_labelled_stages_of_an_episode_make_a_funnel(maker: Any) -> None:
 
 
 def test_units_mixed_in_one_cell_are_undefined_and_named(maker: Any) -> None:
-    from bridge.episode.catalogue import label_episode
-    from bridge.episode.metadata import Outcome
-
     for name, unit in (("t1", "object"), ("t2", "subtask")):
         maker.trial(name, start_id=name)
         label_episode(maker.run, name, Outcome(result="success", unit=unit, k=2, n=2))
@@ -229,10 +230,8 @@ def tables(draw: st.DrawFn) -> str:
     for number in range(count):
         condition = draw(st.sampled_from(["without_replanning", "with_replanning", "other, one"]))
         task, policy = draw(st.sampled_from("ab")), draw(st.sampled_from(["", "x", "y/../z"]))
-        start, p = (
-            draw(st.sampled_from(["", "s1", "s2"])),
-            draw(st.sampled_from(["", "0", "1", "0.5"])),
-        )
+        start = draw(st.sampled_from(["", "s1", "s2"]))
+        p = draw(st.sampled_from(["", "0", "1", "0.5"]))
         answers = ",".join(draw(WORDS) for _ in names)
         lines.append(f't{number},{task},"{condition}",{policy},{start},{p},{answers}')
     return "\n".join(lines) + "\n"

@@ -9,7 +9,7 @@ import pytest
 
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.images import depth_to_compact, image_to_jpeg
+from bridge.episode.cdr.images import depth_to_compact, image_header, image_to_jpeg
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.depth import RVL_FORMAT, unpack
@@ -38,10 +38,12 @@ def write(path: Path) -> None:
         for index in range(COUNT):
             stamp_ns = START_NS + index * 33_333_333
             raw = DepthImage(stamp_ns=stamp_ns, frame_id="camera", depth_mm=depth(index)).to_cdr()
+            compact = depth_to_compact(image_header(raw))
+            jpeg = image_to_jpeg(image_header(color(index)))
             for topic, data, name in (
                 ("/c/cam/raw/depth/image", raw, schema.IMAGE),
-                ("/c/cam/compact/depth/image", depth_to_compact(raw), schema.COMPRESSED_IMAGE),
-                ("/c/cam/raw/color/image", image_to_jpeg(color(index)), schema.COMPRESSED_IMAGE),
+                ("/c/cam/compact/depth/image", compact, schema.COMPRESSED_IMAGE),
+                ("/c/cam/raw/color/image", jpeg, schema.COMPRESSED_IMAGE),
             ):
                 assert data is not None
                 writer.write(topic, data, type_name=name, log_time_ns=stamp_ns)
@@ -81,7 +83,7 @@ def test_rerun_sees_depth_and_colour(tmp_path: Path) -> None:
         np.testing.assert_array_equal(again, depth(index))
 
     jpeg = found["/c/cam/raw/color/image"]["EncodedImage:blob"]
-    ours = image_to_jpeg(color(0))
+    ours = image_to_jpeg(image_header(color(0)))
     assert ours is not None
     assert pixels_of(jpeg[0]).tobytes() == CompressedColor.from_cdr(ours).data
 

@@ -249,11 +249,7 @@ def _ended(piece: Piece) -> Ended:
 def weighed(
     draws: Sequence[PosteriorDraw], trials: Sequence[Trial], *, workers: int | None, output: Output
 ) -> list[PosteriorDraw]:
-    """Give each draw the weight that the trials leave it; in their order, weights sum to 1.
-
-    Args:
-        workers: Processes that replay side by side, one for each core by default; 1: this alone.
-    """
+    """Give each draw the weight that the trials leave it; in their order, weights sum to 1."""
     pieces = [(number, trial, draw) for number, draw in enumerate(draws) for trial in trials]
     logs = np.log([draw.weight for draw in draws])
     counts = np.zeros((len(draws), 2, 2), dtype=int)

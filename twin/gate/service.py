@@ -117,7 +117,7 @@ def watch_cell(session: Any, cell: str, take: Callable[[str, bytes, int, str], N
     watched = [cell_topic(cell, CAMERAS) + "**", cell_topic(cell, EVENT)]
     watched += [cell_topic(cell, JOINT_STATES), TF, TF_STATIC, ROBOT_DESCRIPTION]
     for topic in watched:
-        session.subscribe(topic[1:], on_sample)
+        session.follow(topic, on_sample)
 
 
 def claim_gate(session: Any, cell: str) -> None:

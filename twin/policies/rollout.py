@@ -109,9 +109,11 @@ class Acted:
 
 def roll_out(job: RolloutJob) -> dict[str, Any]:
     """Do one rollout and write it; what a user can act on becomes a row, not an exception."""
+    info = EpisodeInfo(id=job.episode_path.stem, kind="trial")
     try:
         run = RunFolder.open(job.run_path)
         episode = Episode.open(job.episode_path)
+        info = episode.info
         start = open_start(run, episode)
         if job.drawn is not None:
             *_, start = drawn_starts(start, job.drawn + 1, job.seed)
@@ -121,8 +123,7 @@ def roll_out(job: RolloutJob) -> dict[str, Any]:
         finally:
             policy.close()
     except GstError as error:
-        unknown = EpisodeInfo(id=job.episode_path.stem, kind="trial")
-        return _row(job, unknown, unknown.id, Acted(problem=str(error)), None)
+        return _row(job, info, info.start_id or info.id, Acted(problem=str(error)), None)
 
 
 def _roll_out(

@@ -111,8 +111,6 @@ def roll_out_run(run: RunFolder, config: RolloutConfig, output: Output) -> dict[
                 raise UsageError(f"{job.episode_path.stem}: {answer.message}")
             rows.append(answer)
             advance(done, job.episode_path.stem)
-    for reason in dict.fromkeys(row["problem"] for row in rows if row["problem"]):
-        output.say(reason)
     rows.sort(key=lambda row: (row["task"], row["start_id"], row["number"]))
     found = {"run": str(run.path), "rows": rows, "table": str(write_table(run))}
     quantities = jobs[0].vary

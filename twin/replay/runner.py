@@ -190,7 +190,7 @@ def _nothing_to_replay(
     try:
         urdf = read_robot(robot).description() if robot else streams.robot_description(episode)
         if urdf is None:
-            known = f"record {ROBOT_DESCRIPTION}, attach robot.urdf, or name it: --robot ur5"
+            known = f"record {ROBOT_DESCRIPTION}, attach robot.urdf, or name it: --robot FILE.toml"
             return Prepared(why_not=f"nobody said which robot it is; {known}")
         described = robot_of(urdf)
         check_joints(streams.joint_track(episode), f"episode {info.id}", described)

@@ -24,18 +24,19 @@ _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
     """Read a robot file, build all that replays need of it, and say what was found."""
-    record, text = read_robot(name), ""
+    record, text, lost = read_robot(name), "<robot/>", list[str]()
     try:
-        text = record.description()
+        text = record.description(lost)
         robot = RobotModel(text)
-        hulls = RobotHulls(robot)
+        hulls = None if lost else RobotHulls(robot)
     except GstError as error:
-        more = [f"\n  {level}: {told}" for level, told in _in_text(record, text)] if text else []
+        more = [f"\n  {level}: {told}" for level, told in _in_text(record, text, lost)]
         raise UsageError(f"{record.name}: {error}{''.join(more)}") from error
+    unknown = [None] * len(robot.joints)
     rng = np.random.default_rng(_SEED)  # of poses that some posture reaches
     postures = rng.uniform(robot.lower_rad, robot.upper_rad, (_POSES, len(robot.joints)))
     reached = sum(solve_ik(robot, robot.T_base_tcp(q), IkConfig()).reached for q in postures)
-    if urdf_out is not None:
+    if urdf_out is not None and hulls is not None:
         urdf_out.parent.mkdir(parents=True, exist_ok=True)
         urdf_out.write_text(text)
     return {
@@ -49,9 +50,7 @@ def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
                 "lower_rad": float(robot.lower_rad[index]),
                 "upper_rad": float(robot.upper_rad[index]),
                 "velocity_rad_s": float(robot.velocity_limit_rad_s[index]),
-                "acceleration_rad_s2": None
-                if record.acceleration_rad_s2 is None
-                else record.acceleration_rad_s2[index],
+                "acceleration_rad_s2": (record.acceleration_rad_s2 or unknown)[index],
                 "effort_Nm": float(robot.model.effortLimit[robot.effort_id(joint)]),
                 "home_rad": float(robot.home_rad[index]),
             }
@@ -60,12 +59,13 @@ def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
         "gripper": _widths(record.gripper),
         "mass_kg": float(sum(inertia.mass for inertia in robot.model.inertias)),
         "payload_kg": record.payload_kg,
-        "hulls": len(hulls.hulls),
+        "hulls": None if hulls is None else len(hulls.hulls),
         "inverse": "closed form" if UrInverse.for_robot(robot) is not None else "iteration",
         "reached": f"{reached} of {_POSES} random poses",
-        "limits": _limits_of_use(robot, hulls),
+        "limits": _limits_of_use(robot, record.held),
         "findings": [
-            {"level": level, "found": found} for level, found in _findings(robot, hulls, text)
+            {"level": level, "found": found}
+            for level, found in (*_in_text(record, text, lost), *_findings(robot, hulls, text))
         ],
     }
 
@@ -84,7 +84,7 @@ def _widths(gripper: Gripper) -> dict[str, Any] | None:
     }
 
 
-def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
+def _limits_of_use(robot: RobotModel, held: tuple[str, ...]) -> list[str]:
     """What cannot be done with this robot, or is not known of it."""
     record, found = robot.record, []
     lost = [name for name in record.finger_joints if not robot.model.existJointName(name)]
@@ -96,9 +96,8 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
         found.append(
             "of a pose the position is reached; the tool turns as far as its joints let it"
         )
-    bare = sorted({*record.gripper.finger_links} - {hull.link for hull in hulls.hulls})
-    if bare:
-        found.append(f"{', '.join(bare)} have no collision shapes: they touch nothing")
+    if held:
+        found.append(f"held at 0: {', '.join(held)}")
     limits = {
         "acceleration limits are": record.acceleration_rad_s2,
         "payload is": record.payload_kg,
@@ -106,15 +105,17 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
     return found + [f"{name} not known" for name, value in limits.items() if value is None]
 
 
-def _findings(robot: RobotModel, hulls: RobotHulls, text: str) -> Iterator[tuple[str, str]]:
+def _findings(robot: RobotModel, hulls: RobotHulls | None, text: str) -> Iterator[tuple[str, str]]:
     """Say of each link and joint what it cannot be used for: kinematic, dynamic or gate."""
-    yield from _in_text(robot.record, text)
     for lacking in without_dynamics(robot):
         yield "dynamic", f"the URDF gives {lacking}"
+    if hulls is None:
+        return
     watched = Counter(hull.link for hull in hulls.hulls)
+    bodies = robot.bodies.union(robot.record.gripper.finger_links)
     for link in ET.fromstring(text).findall("link"):
         name, shapes = link.get("name", ""), len(link.findall("collision"))
-        if watched[name] < shapes or (name in robot.bodies and not shapes):
+        if watched[name] < shapes or (name in bodies and not shapes):
             told = f"{watched[name]} of its {shapes} collision shapes are read"
             yield "gate", f"the link {name!r} is not watched: {told}"
     if oversized := hulls.oversized():
@@ -124,8 +125,9 @@ def _findings(robot: RobotModel, hulls: RobotHulls, text: str) -> Iterator[tuple
         yield "kinematic", f"{links} are not watched against each other: {why}"
 
 
-def _in_text(record: Robot, text: str) -> Iterator[tuple[str, str]]:
-    """What numbers of a description cannot be, whether or not an arm can be made of it."""
+def _in_text(record: Robot, text: str, lost: list[str]) -> Iterator[tuple[str, str]]:
+    """What a description lacks or cannot mean, whether or not an arm can be made of it."""
+    yield from (("gate", told) for told in lost)
     root = ET.fromstring(text)
     limits = {joint.get("name"): joint.find("limit") for joint in root.findall("joint")}
     for index, name in enumerate(record.joints):
@@ -171,7 +173,7 @@ def describe_robot(found: dict[str, Any]) -> str:
             told = ", ".join(f"{width} m at {value:.4f}" for width, value in values.items())
             lines.append(f"  gripper {joint}: {told}")
     lines.append(
-        f"{found['hulls']} collision hulls; inverse kinematics by {found['inverse']}, "
+        f"{found['hulls'] or 'no'} collision hulls; inverse kinematics by {found['inverse']}, "
         f"{found['reached']} reached"
     )
     lines += [f"{finding['level']}: {finding['found']}" for finding in found["findings"]]

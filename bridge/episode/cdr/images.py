@@ -96,9 +96,8 @@ def no_encoding(encoding: str, known: Iterable[str]) -> MalformedMessageError:
     return MalformedMessageError(type_name=schema.IMAGE, found=found, hint=hint)
 
 
-def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
+def image_to_jpeg(header: ImageHeader, quality: int = JPEG_QUALITY) -> bytes | None:
     """Make a raw image of ``COLOR_LAYOUTS`` a CompressedImage; None of another encoding."""
-    header = image_header(data)
     if header.encoding not in COLOR_LAYOUTS:
         return None
     layout, channels = COLOR_LAYOUTS[header.encoding]
@@ -110,9 +109,8 @@ def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
     return _compressed_image(header, "jpeg", [jpeg])
 
 
-def depth_to_compact(data: Buffer) -> bytes | None:
+def depth_to_compact(header: ImageHeader) -> bytes | None:
     """Make a raw depth image of 16 bits a CompressedImage without loss; None of another one."""
-    header = image_header(data)
     if header.encoding not in DEPTH_ENCODINGS:
         return None
     packed = pack_rvl(pixel_rows(header), swap_bytes=bool(header.is_bigendian))

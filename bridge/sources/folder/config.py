@@ -11,9 +11,7 @@ class FolderError(UsageError):
     """An RGB-D folder breaks its contract."""
 
     def __init__(self, *, path: Path, found: str, hint: str = "Restore the file.") -> None:
-        """Remember the file and what was found in it."""
-        self.path = path
-        self.found = found
+        """Name the file and what was found in it."""
         super().__init__(f"{path}: {found}. {hint}")
 
 
@@ -30,8 +28,6 @@ class FolderConfig:
     """Name of the camera in topics and frames."""
     rate_hz: float | None = None
     """Frames per second of a folder without times, 30 if not given; real times are kept."""
-    max_frames: int | None = None
-    """Stop after so many frames."""
     depth_intrinsics: tuple[float, float, float, float] | None = None
     """FX FY CX CY of the depth camera [px, OpenCV]; not for scene.json, which holds its own."""
     color_intrinsics: tuple[float, float, float, float] | None = None
@@ -43,8 +39,7 @@ class FolderConfig:
         """Refuse names that cannot be part of a topic, and numbers that make no sense."""
         for what, name in (("cell", self.cell), ("camera", self.camera)):
             refuse_bad_name(what, name)
-        allowed = {"rate_hz": (0.001, 1000), "max_frames": (1, 10**9), "depth_unit_m": (1e-6, 1)}
-        refuse_outside(self, allowed)
+        refuse_outside(self, {"rate_hz": (0.001, 1000), "depth_unit_m": (1e-6, 1)})
         for option in ("depth_intrinsics", "color_intrinsics"):
             values = getattr(self, option)
             if values is not None and not min(values[:2]) > 0:

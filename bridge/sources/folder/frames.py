@@ -1,10 +1,10 @@
 """What every layout of an RGB-D folder is read into, and the checks they share."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -21,6 +21,7 @@ ROTATION_TOLERANCE = 0.01
 """Poses written with five digits are off by 5e-4; more than this is not a rotation."""
 VGA = (640, 480)
 """Size of the images that nominal intrinsics are given for."""
+Image = TypeVar("Image")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +126,19 @@ def checked_rotation(
     return se3.nearest_rotation(R)
 
 
+def pose_of(path: Path, values: Any, where: str) -> Float[np.ndarray, "4 4"] | None:
+    """Read a pose of the camera in the world, 4 x 4; None where tracking was lost."""
+    try:
+        T = np.array(values, dtype=np.float64)
+    except (ValueError, TypeError):
+        T = np.empty(0)
+    if T.shape not in ((4, 4), (3, 4)):
+        raise FolderError(path=path, found=f"{where} is no 4 x 4 of numbers")
+    if not np.isfinite(T).all():
+        return None
+    return se3.from_rotation(checked_rotation(path, T[:3, :3], where), T[:3, 3])
+
+
 @dataclass(frozen=True, kw_only=True)
 class StoredColor:
     """A colour image as it lies in a folder."""
@@ -139,13 +153,7 @@ class StoredColor:
 
 def read_color(path: Path) -> StoredColor:
     """Read a colour image."""
-    try:
-        stored = path.read_bytes()
-        return StoredColor(stored=stored, image_u8=decode_color(stored))
-    except (UnreadableImageError, OSError) as error:
-        raise FolderError(
-            path=path, found=str(error).rstrip("."), hint="Restore the file or remove the frame."
-        ) from error
+    return _decoded(path, lambda stored: StoredColor(stored=stored, image_u8=decode_color(stored)))
 
 
 def check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
@@ -160,8 +168,12 @@ def check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
 
 def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
     """Read the numbers of a 16-bit depth image."""
+    return _decoded(path, decode_depth_png)
+
+
+def _decoded(path: Path, decode: Callable[[bytes], Image]) -> Image:
     try:
-        return decode_depth_png(path.read_bytes())
+        return decode(path.read_bytes())
     except (UnreadableImageError, OSError) as error:
         raise FolderError(
             path=path, found=str(error).rstrip("."), hint="Restore the file or remove the frame."

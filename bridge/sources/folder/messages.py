@@ -36,7 +36,7 @@ from bridge.sources.folder.frames import (
     StoredColor,
     camera_of,
     check_size,
-    checked_rotation,
+    pose_of,
     read_color,
     read_stored_depth,
     require_image,
@@ -71,29 +71,21 @@ INFO_PERIOD_S = 1.0
 """Calibration and static transforms are repeated this often [s]."""
 
 
-def num_frames(index: FolderIndex, config: FolderConfig) -> int:
-    """How many frames will be sent."""
-    return min(len(index.frames), config.max_frames or len(index.frames))
-
-
 def frame_times_ns(index: FolderIndex, config: FolderConfig) -> list[tuple[int, int]]:
     """Stamps of colour and depth of every frame [ns]: real times, or the rate asked for, from 0.
 
     Raises:
         UsageError: When a rate is asked of a folder that has real times.
     """
-    count = num_frames(index, config)
     if not index.has_times:
         period_ns = ns_from_s(1.0 / (config.rate_hz or DEFAULT_RATE_HZ))
-        return [(number * period_ns, number * period_ns) for number in range(count)]
+        return [(number * period_ns, number * period_ns) for number in range(len(index.frames))]
     if config.rate_hz is not None:
         raise UsageError(
             f"--rate-hz {config.rate_hz:g} was given, but {index.path} says when each frame was "
             "taken. Leave the option out."
         )
-    return [
-        (frame.color_stamp_ns or 0, frame.depth_stamp_ns or 0) for frame in index.frames[:count]
-    ]
+    return [(frame.color_stamp_ns or 0, frame.depth_stamp_ns or 0) for frame in index.frames]
 
 
 def describe_folder(index: FolderIndex, config: FolderConfig) -> dict[str, Any]:
@@ -120,7 +112,7 @@ def folder_messages(index: FolderIndex, config: FolderConfig) -> Iterator[list[S
     pose = next(poses, None)
     color_camera: Camera | None = None
     next_info_ns = min(times[0])
-    for number, (frame, stamps) in enumerate(zip(index.frames, times, strict=False), start=1):
+    for number, (frame, stamps) in enumerate(zip(index.frames, times, strict=True), start=1):
         color = read_color(frame.color_path)
         if color_camera is None:
             shown = color.image_u8.shape[1] / index.depth_camera.width
@@ -143,7 +135,7 @@ def _pose_messages(
     """One pose per frame, or all that the folder has from before the first to after the last."""
     if index.poses is None:
         stamps = [color_ns for color_ns, _ in times]
-        transforms = [frame.T_world_depth for frame in index.frames[: len(times)]]
+        transforms = [frame.T_world_depth for frame in index.frames]
     else:
         inside = index.poses.stamps_ns
         ends = [at for pair in times for at in pair]
@@ -266,7 +258,9 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         depth_path = require_image(
             folder / f"{stem}.depth.png", what="depth", named_by=f"{color_path.name} belongs to it"
         )
-        T_world_depth = _read_pose(folder / f"{stem}.pose.txt")
+        pose_path, T_world_depth = folder / f"{stem}.pose.txt", None
+        if pose_path.is_file():
+            T_world_depth = pose_of(pose_path, _matrix(pose_path, (4, 4)), "the pose")
         if T_world_depth is None:
             num_unposed += 1
             continue
@@ -277,11 +271,10 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         raise FolderError(
             path=folder, found="no frame has a pose", hint="Add frame-XXXXXX.pose.txt files."
         )
-    height, width = read_stored_depth(frames[0].depth_path).shape
+    size = read_stored_depth(frames[0].depth_path).shape[::-1]
     given = _read_intrinsics(folder / INTRINSICS_FILE)
-    depth = config.depth_intrinsics or given
-    T_color_depth = np.eye(4)
-    T_color_depth[:3, 3] = T_COLOR_DEPTH_NOMINAL_M
+    depth, color = config.depth_intrinsics or given, config.color_intrinsics
+    T_color_depth = se3.from_rotation(np.eye(3), T_COLOR_DEPTH_NOMINAL_M)
     return FolderIndex(
         path=folder,
         layout="7-Scenes",
@@ -290,18 +283,10 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         depth_invalid_values=INVALID_VALUES,
         depth_encoding="",
         depth_camera=camera_of(
-            depth,
-            DEPTH_INTRINSICS,
-            (width, height),
-            option="--depth-intrinsics",
-            path=folder,
+            depth, DEPTH_INTRINSICS, size, option="--depth-intrinsics", path=folder
         ),
         color_camera=camera_of(
-            config.color_intrinsics,
-            COLOR_INTRINSICS,
-            (width, height),
-            option="--color-intrinsics",
-            path=folder,
+            color, COLOR_INTRINSICS, size, option="--color-intrinsics", path=folder
         ),
         T_depth_color=se3.invert(T_color_depth),
         frames=tuple(frames),
@@ -319,18 +304,6 @@ def _assumed(config: FolderConfig, *, given_by_file: bool) -> dict[str, str]:
     if config.color_intrinsics is None:
         assumed["color_intrinsics"] = f"{COLOR_INTRINSICS}, nominal, not measured"
     return assumed
-
-
-def _read_pose(path: Path) -> Float[np.ndarray, "4 4"] | None:
-    """Return ``T_world_depth``; None where there is no file or tracking was lost."""
-    if not path.is_file():
-        return None
-    T = _matrix(path, (4, 4))
-    if not np.isfinite(T).all():
-        return None
-    T[:3, :3] = checked_rotation(path, T[:3, :3], "the pose")
-    T[3] = (0.0, 0.0, 0.0, 1.0)
-    return T
 
 
 def _read_intrinsics(path: Path) -> tuple[float, float, float, float] | None:

@@ -22,6 +22,7 @@ from bridge.sources.folder.frames import (
     FolderFrame,
     FolderIndex,
     checked_rotation,
+    pose_of,
     refuse_bent,
     refuse_scale_without_use,
     require_image,
@@ -165,12 +166,7 @@ def _frame(path: Path, entry: Any, where: str) -> FolderFrame | None:
     for name, file in files.items():
         require_image(file, what=name, named_by=f"{path} names it in {where}")
     pose = _value(path, entry, "T_world_cam")
-    if pose is None:
+    T = None if pose is None else pose_of(path, pose, f"T_world_cam of {where}")
+    if T is None:
         return None
-    T = np.array(pose, dtype=float)
-    if T.shape != (4, 4):
-        raise FolderError(path=path, found=f"T_world_cam of {where} is not 4x4", hint=_KEYS_HINT)
-    if not np.isfinite(T).all():
-        return None
-    T[:3, :3] = checked_rotation(path, T[:3, :3], where)
     return FolderFrame(color_path=files["color"], depth_path=files["depth"], T_world_depth=T)

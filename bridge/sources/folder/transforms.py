@@ -20,7 +20,7 @@ from bridge.sources.folder.config import FolderConfig, FolderError
 from bridge.sources.folder.frames import (
     FolderFrame,
     FolderIndex,
-    checked_rotation,
+    pose_of,
     read_stored_depth,
     refuse_bent,
     refuse_scale_without_use,
@@ -136,16 +136,10 @@ def _frame_camera(path: Path, number: int, record: dict[str, Any]) -> tuple[Came
 
 
 def _frame_pose(path: Path, number: int, frame: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
-    try:
-        T = np.array(frame["transform_matrix"], dtype=np.float64)
-    except (KeyError, ValueError, TypeError) as error:
-        found = f"frame {number} has no transform_matrix ({error})"
-        raise FolderError(path=path, found=found) from error
-    if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
-        found = f"frame {number}: transform_matrix is no 4 x 4 of numbers"
-        raise FolderError(path=path, found=found)
-    T = np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
-    T[:3, :3] = checked_rotation(path, T[:3, :3], f"frame {number}")
+    what = f"transform_matrix of frame {number}"
+    T = pose_of(path, frame.get("transform_matrix"), what)
+    if T is None:
+        raise FolderError(path=path, found=f"{what} is not finite")
     return np.asarray(T @ OPENCV_FROM_OPENGL)
 
 

@@ -253,7 +253,7 @@ class Operator:
 
     def _recorded(self) -> list[dict[str, Any]]:
         """The run's episodes as the recorder lists them."""
-        answer = self._control("list", {"last": LISTED})
+        answer = self._control("list", {})
         episodes: list[dict[str, Any]] = answer["episodes"]
         if self._config.missing and answer["of"] > len(episodes):
             message = (

@@ -18,7 +18,8 @@ from mcap.writer import CompressionType, Writer
 
 import robot_gst
 from bridge.episode import schema
-from bridge.episode.cdr.messages import CameraInfo, DepthImage
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage
 from bridge.episode.check import CheckReport, check_episode
 from bridge.episode.check_topics import missing_numbers
 from bridge.episode.mcap import format as mcap_format
@@ -28,6 +29,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.topics import DROPS
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry.camera import Camera
+from bridge.media.color import encode_jpeg, encode_png
 
 JOINTS = "/c/joint_states"
 DEPTH = "/c/cam/side/depth/image"
@@ -126,15 +128,24 @@ def test_rates_are_reported(tmp_path: Path) -> None:
     assert report.exit_code == 0
 
 
-def test_depth_images_that_do_not_fit_their_camera_are_found(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["raw depth", "JPEG", "PNG", "raw colour"])
+def test_images_that_do_not_fit_their_camera_are_found(tmp_path: Path, kind: str) -> None:
+    rgb = np.zeros((6, 8, 3), np.uint8)
+    stored = encode_png(rgb) if kind == "PNG" else encode_jpeg(rgb)
+    packed = CompressedColor(stamp_ns=0, frame_id="", format="", data=stored).to_cdr()
+    about = {"height": 6, "width": 8, "step": 24, "encoding": "rgb8", "data": rgb.tobytes()}
+    of_type = schema.COMPRESSED_IMAGE if kind in ("JPEG", "PNG") else schema.IMAGE
+    topic = DEPTH if "depth" in kind else DEPTH.replace("depth", "color")
+    images = {"raw depth": depth(8, 6), "raw colour": codec.encode(schema.IMAGE, about)}
+
     def fill(writer: EpisodeWriter) -> None:
         camera = Camera.from_ros(width=9, height=6, fx=5.0, fy=5.0, cx=4.0, cy=3.0)
         data = CameraInfo(stamp_ns=0, frame_id="", camera=camera).to_cdr()
-        topic = DEPTH.replace("image", "info")
-        writer.write(topic, data, type_name=schema.CAMERA_INFO, log_time_ns=1)
-        writer.write(DEPTH, depth(8, 6), type_name=schema.IMAGE, log_time_ns=2)
+        info = topic.replace("image", "info")
+        writer.write(info, data, type_name=schema.CAMERA_INFO, log_time_ns=1)
+        writer.write(topic, images.get(kind, packed), type_name=of_type, log_time_ns=2)
 
-    assert "its camera info says 9 x 6" in check(tmp_path, fill).faults[0]
+    assert "images of 8 x 6, its camera info says 9 x 6" in check(tmp_path, fill).faults[0]
 
 
 def foreign(path: Path, topic: str, name: str, data: bytes) -> Path:

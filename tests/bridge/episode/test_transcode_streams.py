@@ -5,7 +5,7 @@ import pytest
 
 from bridge.episode import schema, streams
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.images import depth_to_compact, image_to_jpeg
+from bridge.episode.cdr.images import depth_to_compact, image_header, image_to_jpeg
 from bridge.episode.cdr.messages import CameraInfo, DepthImage, FrameTransform, transforms_to_cdr
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
@@ -41,8 +41,8 @@ def record(path: Path, *, is_color_raw: bool, is_depth_raw: bool) -> Episode:
             stamp_ns = (index + 1) * STEP_NS
             raw = DepthImage(stamp_ns=stamp_ns, frame_id="eye", depth_mm=depth(index)).to_cdr()
             for stream, message, coded, is_raw in (
-                ("color", color(index), image_to_jpeg(color(index)), is_color_raw),
-                ("depth", raw, depth_to_compact(raw), is_depth_raw),
+                ("color", color(index), image_to_jpeg(image_header(color(index))), is_color_raw),
+                ("depth", raw, depth_to_compact(image_header(raw)), is_depth_raw),
             ):
                 data = message if is_raw else coded
                 name = schema.IMAGE if is_raw else schema.COMPRESSED_IMAGE

@@ -308,7 +308,7 @@ def test_keys_of_transforms_that_nobody_reads_are_named(
     (tmp_path / "0.png").write_bytes(encode_png(np.full((4, 6), 900, np.uint16)))
     frame = {"file_path": "images/0.png", "transform_matrix": pose, "depth_file_path": "0.png"}
     record = {"fl_x": 5.0, "w": 6, "h": 4, "frames": [frame, {**frame, "mask_path": "m.png"}]}
-    command = ["import", "images", str(tmp_path), str(tmp_path / "run")]
+    command = ["import", "rgbd", str(tmp_path), str(tmp_path / "run")]
     (tmp_path / "transforms.json").write_text(json.dumps(record))
     assert robot_gst.run([*command, "--episode", "scan0"]) == 0
     assert "not used: mask_path: not read" in capsys.readouterr().err

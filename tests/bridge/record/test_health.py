@@ -14,7 +14,7 @@ import robot_gst
 from bridge.clock import NS_PER_S, AnchoredClock
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.images import depth_to_compact
+from bridge.episode.cdr.images import depth_to_compact, image_header
 from bridge.episode.check import check_episode
 from bridge.episode.health import ContentWatch
 from bridge.episode.metadata import EpisodeInfo
@@ -43,6 +43,14 @@ def image(number: int, pixels: np.ndarray, encoding: str, **fields: object) -> b
 
 def noise(channels: int = 3, kind: type = np.uint8) -> np.ndarray:
     return RNG.integers(1, 255, (48, 64, channels)).astype(kind)
+
+
+def late(number: int, empty: np.ndarray) -> np.ndarray:
+    return empty if number < 30 else noise(1, np.uint16).astype(empty.dtype)
+
+
+def rvl(number: int, depth: np.ndarray) -> bytes:
+    return depth_to_compact(image_header(image(number, depth, "16UC1"))) or b""
 
 
 def joints(number: int, position: float = 0.5, **fields: object) -> bytes:
@@ -80,26 +88,9 @@ FAULTS: dict[str, tuple[str, str, str, Make]] = {
     "frozen raw": ("frozen_image", COLOR, schema.IMAGE, lambda n: image(n, STILL, "rgb8")),
     "frozen jpeg": ("frozen_image", COLOR, schema.COMPRESSED_IMAGE, lambda n: jpeg(n, STILL_JPEG)),
     "frozen depth": ("frozen_image", DEPTH, schema.IMAGE, lambda n: image(n, FLAT, "16UC1")),
-    "empty": (
-        "empty_depth",
-        DEPTH,
-        schema.IMAGE,
-        lambda n: image(n, EMPTY if n < 30 else noise(1, np.uint16), "16UC1"),
-    ),
-    "empty of no numbers": (
-        "empty_depth",
-        DEPTH,
-        schema.IMAGE,
-        lambda n: image(n, HOLES if n < 30 else noise(1, np.uint16).astype(np.float32), "32FC1"),
-    ),
-    "empty rvl": (
-        "empty_depth",
-        DEPTH,
-        schema.COMPRESSED_IMAGE,
-        lambda n: (
-            depth_to_compact(image(n, EMPTY if n < 30 else noise(1, np.uint16), "16UC1")) or b""
-        ),
-    ),
+    "empty": ("empty_depth", DEPTH, schema.IMAGE, lambda n: image(n, late(n, EMPTY), "16UC1")),
+    "holes": ("empty_depth", DEPTH, schema.IMAGE, lambda n: image(n, late(n, HOLES), "32FC1")),
+    "empty rvl": ("empty_depth", DEPTH, schema.COMPRESSED_IMAGE, lambda n: rvl(n, late(n, EMPTY))),
     "nan": ("nan_joints", JOINTS, schema.JOINT_STATE, lambda n: joints(n, np.nan)),
     "infinity": ("nan_joints", JOINTS, schema.JOINT_STATE, lambda n: joints(n, -np.inf)),
     "no stamps": ("stamp_zero", JOINTS, schema.JOINT_STATE, lambda n: joints(n, **UNSET)),

@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 from bridge.clock import AnchoredClock
 from bridge.data_files import datasets_folder
 from bridge.episode import schema, streams
+from bridge.episode.check import check_episode
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.recover import recover_parts
@@ -17,7 +18,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
 from bridge.errors import UsageError
 from bridge.record.config import QueueConfig, RecorderConfig
-from bridge.record.control import numbered, parse_task_file
+from bridge.record.control import parse_task_file
 from bridge.record.errors import ControlError, LifecycleError
 from bridge.record.recorder import Recorder
 from bridge.task.check import TaskFileError
@@ -164,7 +165,18 @@ def test_an_ending_recorder_starts_nothing_and_forgives_a_stop_at_the_same_momen
 def test_an_episode_without_an_id_gets_the_next_number_of_its_kind(run: RunFolder) -> None:
     for name in ("trial_0001.mcap", "trial_0002.mcap.part", "scan_0003.mcap"):
         (run.episodes_dir / name).touch()
-    assert [numbered(run, kind) for kind in ("trial", "scan")] == ["trial_0003", "scan_0001"]
+    assert [run.free_id(kind) for kind in ("trial", "scan")] == ["trial_0003", "scan_0001"]
+    (run.episodes_dir / "trial_0002.mcap.part").unlink()  # deleted, and its label forgotten
+    run.notes_dir.mkdir()
+    (run.notes_dir / "trial_0002.outcome.json").touch()
+    assert run.free_id("trial") == "trial_0003"
+
+
+def test_an_episode_without_a_message_is_not_clean(recorder: Recorder, run: RunFolder) -> None:
+    recorder.start(INFO)
+    assert "nothing_recorded" in str(recorder.stop())
+    report = check_episode(path_of(run))
+    assert (report.summary, report.exit_code) == ("nothing recorded", 3)
 
 
 TEXT = (datasets_folder() / "tasks" / "cube_into_box.toml").read_text()

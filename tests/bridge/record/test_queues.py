@@ -25,7 +25,11 @@ class Queues:
     def __init__(self, **limits: object) -> None:
         """Open the queues."""
         self.images: deque[queue.Item] = deque()
-        self.input_queue = queue.InputQueue(QueueConfig(**limits), self.images.append)  # type: ignore[arg-type]
+        self.input_queue = queue.InputQueue(QueueConfig(**limits), self._take)  # type: ignore[arg-type]
+
+    def _take(self, item: queue.Item, is_watched: bool) -> bool:
+        self.images.append(item)
+        return True
 
     def encode(self, count: int | None = None) -> None:
         for _ in range(len(self.images) if count is None else count):

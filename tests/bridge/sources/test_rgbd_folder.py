@@ -233,7 +233,7 @@ def test_a_matrix_that_is_no_rotation_is_refused(
 ) -> None:
     index_record["frames"][1]["T_world_cam"][0][0] = -1.0
     rewrite(folder, index_record)
-    with pytest.raises(FolderError, match=r"rotation of frames\[1\] is none"):
+    with pytest.raises(FolderError, match=r"rotation of T_world_cam of frames\[1\] is none"):
         read_index(folder)
 
 

@@ -142,6 +142,6 @@ def test_intrinsics_stand_in_the_file_and_an_image_that_lacks_is_named(tmp_path:
 def test_an_image_of_another_size_ends_the_import_and_leaves_nothing(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path / "folder")
     (folder / "images" / "003.jpg").write_bytes(encode_jpeg(np.zeros((8, 8, 3), np.uint8)))
-    words = ["import", "images", str(folder), str(tmp_path / "run"), "--quiet"]
+    words = ["import", "rgbd", str(folder), str(tmp_path / "run"), "--quiet"]
     assert robot_gst.run(words) == 2
     assert not list((tmp_path / "run" / "episodes").glob("*.mcap"))

@@ -9,7 +9,7 @@ from patience import wait_until
 
 from bridge.episode import schema
 from bridge.errors import GstError, UsageError
-from bridge.wire import errors
+from bridge.wire import errors, session
 from bridge.wire import publisher as publishing
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import NoPeerError, PortTakenError, WireConfigError
@@ -67,8 +67,9 @@ def test_a_refusal_carries_the_message(router: WireSession, client: WireSession)
 
 
 def test_more_requests_than_may_wait_are_refused_at_once(
-    router: WireSession, client: WireSession
+    router: WireSession, client: WireSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(session, "MAX_WAITING", 1)
     working, release = threading.Event(), threading.Event()
 
     def slow(payload: bytes) -> bytes:
@@ -76,7 +77,7 @@ def test_more_requests_than_may_wait_are_refused_at_once(
         release.wait(10.0)
         return payload
 
-    router.serve("cell/slow", slow, max_waiting=1)
+    router.serve("cell/slow", slow)
     answers: list[bytes] = []
     refusals: queue.Queue[str] = queue.Queue()
 
@@ -231,7 +232,7 @@ PRESETS = (Qos.CAMERA, Qos.CONTROL, Qos.RELIABLE, Qos.PREVIEW)
 TYPE_HASH = "RIHS01_" + "a" * 64
 
 
-@pytest.mark.parametrize("qos", PRESETS, ids=lambda qos: qos.name)
+@pytest.mark.parametrize("qos", PRESETS, ids=lambda qos: qos.priority)
 def test_every_preset_delivers_and_keeps_its_word(
     router: WireSession, client: WireSession, qos: Qos
 ) -> None:
@@ -309,7 +310,7 @@ def test_a_full_pool_falls_back_to_the_network_and_never_waits(
 def test_only_cameras_use_the_pool(router: WireSession, endpoint: str) -> None:
     with open_session(WireConfig(connect=(endpoint,), shared_memory_mb=1)) as session:
         for qos in PRESETS:
-            made = session.publisher(f"/a/{qos.name}", schema.IMAGE, qos=qos)
+            made = session.publisher(f"/a/{qos.priority}", schema.IMAGE, qos=qos)
             assert (made._pool is not None) is (qos is Qos.CAMERA)
 
 
@@ -356,6 +357,39 @@ def test_a_cache_is_asked_for_what_it_kept(router: WireSession, client: WireSess
     assert client.query_all("nobody/**", timeout_s=5.0) == []
     router.serve("large/a", lambda payload: bytes(1_500_000))
     assert client.query_all("large/**", timeout_s=5.0, max_mb=1) == []
+
+
+def test_a_topic_is_followed_whoever_publishes_it(router: WireSession, endpoint: str) -> None:
+    import zenoh
+    from zenoh.ext import CacheConfig, declare_advanced_publisher
+
+    config = zenoh.Config.from_json5(
+        f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}},'
+        " timestamping: {enabled: true}, scouting: {multicast: {enabled: false}}}"
+    )
+    kind = "sensor_msgs::msg::dds_::{}_/" + TYPE_HASH
+    got: list[WireSample] = []
+    with zenoh.open(config) as node:
+        key = f"0/tf_static/tf2_msgs::msg::dds_::TFMessage_/{TYPE_HASH}"
+        latched = declare_advanced_publisher(node, key, cache=CacheConfig())
+        latched.put(b"before")
+        wait_until(lambda: router.query_all(f"{key}/@adv/**", timeout_s=5.0), "its cache")
+        for topic in ("/tf_static", "/lab/joint_states", "/lab/cam/**"):
+            router.follow(topic, got.append)
+        node.put("0/lab/joint_states/" + kind.format("JointState"), b"ros")
+        node.put("0/lab/cam/a/color/image/" + kind.format("Image"), b"ros")
+        node.put("0/other/joint_states/" + kind.format("JointState"), b"no")
+        node.put("lab/joint_states", b"ours")
+        latched.put(b"after")
+        wait_until(lambda: len(got) >= 5, "all five")
+    assert [(each.topic, each.data) for each in got] == [
+        ("/tf_static", b"before"),
+        ("/lab/joint_states", b"ros"),
+        ("/lab/cam/a/color/image", b"ros"),
+        ("/lab/joint_states", b"ours"),
+        ("/tf_static", b"after"),
+    ]
+    assert got[1].type_name == schema.JOINT_STATE
 
 
 def test_numbers_of_zenoh_itself_are_read(router: WireSession, client: WireSession) -> None:

@@ -111,5 +111,5 @@ class FakeSession:
     def serve(self, key: str, handler: Callable[[bytes], bytes], *, side_by_side: int = 1) -> None:
         self.services[key] = handler
 
-    def subscribe(self, key: str, callback: Callable[[Any], None]) -> None:
-        self.subscriptions[key] = callback
+    def follow(self, topic: str, callback: Callable[[Any], None]) -> None:
+        self.subscriptions[topic] = callback

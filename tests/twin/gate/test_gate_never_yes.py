@@ -209,15 +209,15 @@ def test_only_cameras_events_joints_and_transforms_are_subscribed() -> None:
     session, taken = FakeSession(), []
     watch_cell(session, "standin", lambda *item: taken.append(item))
     assert sorted(session.subscriptions) == [
-        "robot_description",
-        "standin/cam/**",
-        "standin/event",
-        "standin/joint_states",
-        "tf",
-        "tf_static",
+        "/robot_description",
+        "/standin/cam/**",
+        "/standin/event",
+        "/standin/joint_states",
+        "/tf",
+        "/tf_static",
     ]
     sample = SimpleNamespace(topic="/tf", data=b"x", received_ns=3, type_name="t")
-    session.subscriptions["tf"](sample)
+    session.subscriptions["/tf"](sample)
     assert taken == [("/tf", b"x", 3, "t")]
 
 

@@ -139,7 +139,7 @@ def test_a_process_stopped_between_two_plans_holds_no_more_than_one(twin: TwinPr
     """A plan with frames is more than a pipe takes: it would be sent for ever."""
     assert asked(twin, "1 + 1") == 2
     assert twin._worker is not None
-    os.kill(twin._worker.pid, signal.SIGSTOP)
+    os.kill(twin._worker.process.pid, signal.SIGSTOP)
     with pytest.raises(UndecidedError, match=r"wall-clock limit .*; it was stopped"):
         asked(twin, "1 + 1" + " " * 3_000_000, within_s=0.2)
     assert asked(twin, "2 + 2") == 4

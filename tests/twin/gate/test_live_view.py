@@ -9,7 +9,7 @@ from live_cell import CAMERA, IMAGE, S, calibrate, event, look, place, shoot
 
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.images import depth_to_compact
+from bridge.episode.cdr.images import depth_to_compact, image_header
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -43,7 +43,7 @@ def ready() -> LiveView:
 def test_raw_colour_and_compressed_depth_are_frames_too() -> None:
     depth_mm = np.arange(1000, 1048, dtype=np.uint16).reshape(6, 8)
     raw_depth = DepthImage(stamp_ns=S, frame_id="d", depth_mm=depth_mm).to_cdr()
-    compact = depth_to_compact(raw_depth)
+    compact = depth_to_compact(image_header(raw_depth))
     assert compact is not None
     pixels = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
     message = {

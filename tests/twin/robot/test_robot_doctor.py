@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+import robot_gst
 from bridge.errors import UsageError
+from dashboards.robot_file import propose
 from twin.robot.check import check_robot
 from twin.robot.collision import convex_hull, link_hulls
 from twin.robot.model import RobotModel
@@ -116,15 +118,6 @@ def test_what_a_description_lacks_is_named_with_its_level(
             r"  gate: the joint 'j6' has a speed of 0.*\n  dynamic: the inertia of the link 'l0'",
         ),
         (
-            URDF.replace(
-                "</robot>",
-                '<link name="a"><visual><geometry><mesh filename="a.stl"/>'
-                '</geometry></visual><visual><geometry><mesh filename="b.stl"/></geometry></visual>'
-                "</link></robot>",
-            ),
-            "a.stl' is not there .* '.*b.stl' is not there",
-        ),
-        (
             URDF.replace("<link", '<xacro:property name="a" value="1"/><link', 1),
             "is a xacro file; expand it first: xacro .*arm.urdf",
         ),
@@ -135,6 +128,29 @@ def test_what_no_engine_takes_is_refused_with_every_name(
 ) -> None:
     with pytest.raises(UsageError, match=found):
         check_robot(written(tmp_path, urdf))
+
+
+def test_links_without_their_meshes_hinder_the_gate_and_no_motion(tmp_path: Path) -> None:
+    rail = (
+        '<link name="floor"/><joint name="rail" type="prismatic"><parent link="floor"/>'
+        '<child link="l0"/><axis xyz="1 0 0"/><limit lower="0" upper="2" velocity="1" effort="9"/>'
+        "</joint></robot>"
+    )
+    urdf = of_link(3, SHAPE, '<mesh filename="package://own/a.stl"/>').replace("</robot>", rail)
+    record = RECORD.replace('"l0"', '"floor"') + 'held = ["rail"]\n'
+    name = written(tmp_path, urdf.replace(SHAPE, '<mesh filename="b.stl"/>', 1), record)
+    found, whole = check_robot(name), check_robot(written(tmp_path, URDF))
+    assert [item["level"] for item in found["findings"]] == ["gate", "gate"]
+    first, second = (item["found"] for item in found["findings"])
+    assert first.startswith(f"the link 'l0': '{tmp_path}/b.stl' is not there")
+    assert second.startswith("the link 'l3': mesh 'package://own/a.stl' is in package 'own'")
+    assert (found["hulls"], found["reached"]) == (None, whole["reached"])
+    assert "held at 0: rail" in found["limits"]
+    (tmp_path / "arm.urdf").write_text(urdf)
+    assert robot_gst.run(["robot", "check", str(tmp_path / "arm.urdf")]) == 2
+    notes = propose(tmp_path / "arm.urdf")[1]
+    assert "rail moves the arm and is held at 0" in notes
+    assert [note.partition(":")[0] for note in notes if "mesh" in note] == ["the link 'l3'"]
 
 
 @pytest.mark.parametrize("how", ["capsule", "capsule of pinocchio", "sphere", "cone"])

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
-from twin.scene.raster.rasteriser import NUM_PLANES, load_native
+from twin.scene.raster.rasteriser import load_native
 
 L1_SHARE = 0.8
 """0.8 L1 + 0.2 (1 - SSIM), as in 3D Gaussian splatting (Kerbl et al. 2023, Eq. 7)."""
@@ -46,7 +46,7 @@ class Loss:
         return value, mse, gradient
 
     def _depth(self, planes: np.ndarray, depth_m: np.ndarray, gradient: np.ndarray) -> float:
-        gradient[3:NUM_PLANES] = 0.0
+        gradient[3:] = 0.0
         valid = depth_m > 0
         count = int(valid.sum())
         if self.depth_weight == 0 or count == 0:

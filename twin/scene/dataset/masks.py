@@ -215,6 +215,7 @@ STEADY_VIEWS, STEADY_FRACTION = 3, 0.05
 """A depth that so many views or more measure, and that varies by less, stays."""
 REACH_PERCENTILE = 95.0
 """Of the depths that stay in what was found: as far as that it may have more."""
+DARK_LEVELS = 8
 EGO_GROW_PX = 3
 """Masks grow by this much at half size: what is so near is out of focus and shadows its edge."""
 
@@ -251,6 +252,19 @@ def find_ego_mask(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height wid
     if not MIN_SHARE <= mask.mean() <= MAX_SHARE:
         return None
     mask = mask | _more_of_it(mask, np.stack([view.half.depth_m for view in chosen]))
+    return mask if mask.mean() <= MAX_SHARE else None
+
+
+def find_dark_rim(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height width"] | None:
+    """Find what lies beside a fisheye's circle: the corners that are black in all views."""
+    halves = [view.half for view in views]
+    dark = np.all([(h.planes_u8.max(0) <= DARK_LEVELS) & (h.depth_m <= 0) for h in halves], axis=0)
+    pieces, _ = ndimage.label(dark)
+    corners = pieces[[0, 0, -1, -1], [0, -1, 0, -1]]
+    if (corners == 0).sum() > 1:
+        return None
+    rim = np.isin(pieces, corners[corners > 0])
+    mask = np.asarray(ndimage.binary_dilation(rim, iterations=EGO_GROW_PX), dtype=bool)
     return mask if mask.mean() <= MAX_SHARE else None
 
 

@@ -290,7 +290,7 @@ class ScanReport:
         for name, share in self.ego_mask_shares.items():
             found.append(
                 f"{100 * share:.0f} % of the image of {name} moves with the camera, as a gripper "
-                "before it does, and was left out"
+                "or a dark rim does, and was left out"
             )
         if self.moving_fraction >= MUCH_MOVED:
             found.append(

@@ -13,6 +13,7 @@ from twin.scene.dataset.geometry_search import camera_pose_at, check_geometry
 from twin.scene.dataset.masks import (
     ReferenceView,
     choose_reference_views,
+    find_dark_rim,
     find_ego_mask,
     find_moving,
     without_ego,
@@ -175,16 +176,18 @@ def _colour_remarks(read: _Read) -> list[str]:
 def _set_ego_pixels_aside(
     choices: Sequence[FrameChoice], read: _Read, robot: RobotFrames
 ) -> dict[int, Bool[np.ndarray, "height width"]]:
-    """Take out of points and views what moves with a camera, where no joints tell the robot."""
+    """Take out of points and views what moves with a camera: no joints tell its robot, or a rim."""
     found: dict[int, np.ndarray] = {}
     for index, choice in enumerate(choices):
-        if choice.stationary or robot.knows(choice.episode):
-            continue
         mine = [place for place, owner in enumerate(read.choice_of_view) if owner == index]
-        mask = find_ego_mask([read.views[place] for place in mine])
-        if mask is None:
+        views = [read.views[place] for place in mine]
+        asked = [find_dark_rim] if views else []
+        if not (choice.stationary or robot.knows(choice.episode)):
+            asked.append(find_ego_mask)
+        masks = [mask for mask in (ask(views) for ask in asked) if mask is not None]
+        if not masks:
             continue
-        found[index] = mask
+        mask = found[index] = np.logical_or.reduce(masks)
         for place in mine:
             seen, shown = read.points[place], read.views[place]
             read.points[place], read.views[place] = without_ego(seen, shown, mask)

@@ -287,15 +287,8 @@ def _target(camera: Camera, image_u8: np.ndarray, depth_m: np.ndarray) -> Target
 
 def _halved_camera(camera: Camera) -> Camera:
     """The camera whose pixels are blocks of 2 x 2, exactly: an odd edge makes a whole block."""
-    return replace(
-        camera,
-        width=-(-camera.width // 2),
-        height=-(-camera.height // 2),
-        fx=camera.fx / 2,
-        fy=camera.fy / 2,
-        cx=camera.cx / 2,
-        cy=camera.cy / 2,
-    )
+    width, height = camera.width + camera.width % 2, camera.height + camera.height % 2
+    return replace(camera, width=width, height=height).scaled(0.5)
 
 
 def _blocks(rows: np.ndarray, camera: Camera) -> np.ndarray:

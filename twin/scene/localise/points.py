@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from bridge.episode.streams import RgbdFrame
@@ -26,13 +26,6 @@ MAX_HUE_DIFFERENCE_RAD = 0.4
 """Between a pixel's hue and the object's, around the grey axis."""
 MIN_LUMINANCE = 0.003
 """Darker pixels, in linear light of 0 to 1, have no dependable hue."""
-
-
-def linear_image(
-    image_u8: UInt8[np.ndarray, "height width 3"],
-) -> Float[np.ndarray, "height width 3"]:
-    """Linear light of 0 to 1."""
-    return np.asarray(_LINEAR[image_u8])
 
 
 def likeness(
@@ -135,7 +128,7 @@ def _view(frames: Sequence[RgbdFrame], task: Task) -> CameraView:
     count = measured.sum(axis=0)
     depth = np.where(measured, depths, 0.0).sum(axis=0) / np.maximum(count, 1)
     depth[2 * count < len(frames)] = 0.0
-    image = np.mean([linear_image(frame.image_u8) for frame in frames], axis=0)
+    image = np.mean([_LINEAR[frame.image_u8] for frame in frames], axis=0)
     p_base = se3.apply(newest.T_base_depth, newest.depth_camera.unproject(depth)[depth > 0])
     p_base = p_base[_in_search_area(p_base, task)]
     p_color = se3.apply(se3.invert(newest.T_base_color), p_base)

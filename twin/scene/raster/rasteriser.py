@@ -20,10 +20,6 @@ from twin.errors import TwinError
 from twin.scene.frames.rgbd import Target
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 
-NUM_PLANES = 5
-"""Red, green, blue, sum of weighted depth, sum of weights. Depth is that of each Gaussian's own
-surface: where the ray of the pixel is densest in it, not where its centre lies."""
-
 
 class SplatExtensionMissingError(TwinError):
     """The compiled part of ``twin.scene`` is not there."""
@@ -265,7 +261,10 @@ class Rasteriser:
     def draw_planes(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
-        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
+        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black.
+
+        Depth of a Gaussian is where the ray is densest in it, not where its centre lies.
+        """
         *rows, harmonics = _tables(dict(arrays(cloud)))
         place, cuts = native_camera(camera, T_base_camera), self.config
         planes: np.ndarray = self._native.draw(

@@ -105,7 +105,8 @@ def test_a_required_topic_that_is_missing_refuses_a_start(cell: FaultCell) -> No
     answer = asker.ask("start", {"id": "t0", "anyway": True})["ok"]
     assert answer["missing"] == [f"{JOINTS} has not been seen"]
     answer = asker.ask("stop")["ok"]
-    (found,) = answer["findings"]
+    found, nothing = answer["findings"]
+    assert nothing["name"] == "nothing_recorded"
     assert (found["name"], found["about"]) == ("contract_broken", JOINTS)
     assert found["text"] == "no message, and the contract requires it"
     assert check_code(cell.path("t0")) == 3

@@ -9,6 +9,8 @@ from fault_cell import FaultCell
 from fault_messages import JOINTS, MIX
 from patience import wait_until
 
+from bridge.episode.check import check_episode
+
 STOP_S = 3.0
 HUGE_BYTES = 200_000_000
 
@@ -61,7 +63,8 @@ def test_a_publisher_killed_and_come_back_is_no_gap(cell: FaultCell) -> None:
     assert all(item.digest in digests for item in second.sent())
     of_first = len(found) - len(second.sent())
     assert 0.8 * len(first.sent()) < of_first <= len(first.sent())
-    assert check_code(path) == 0
+    # Whether the first one had said its count before it was killed is chance.
+    assert {each.name for each in check_episode(path).findings} <= {"tail_untold"}
 
 
 @pytest.mark.slow

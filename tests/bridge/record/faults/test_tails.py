@@ -82,8 +82,13 @@ def test_of_a_source_that_was_killed_the_tail_is_not_known(
         publish(other)
         announce(source, "lab")
         publish(source, kept=3)
+        wait_until(lambda: len(recorder.status()["clocks"]) == 2, "both sources")
         source._inner.close()  # as the end of its process does
         assert stopped(recorder, sent=60, tails=[TOPIC]) == 7
+    found = check_episode(recorder.run.episodes_dir / "t1.mcap").findings
+    assert [(each.name, each.about) for each in found if "tail" in each.name] == [
+        ("tail_untold", TOPIC)
+    ]
 
 
 def test_answers_of_wrong_shape_count_nothing_and_end_nothing(

@@ -6,7 +6,7 @@ import textured_room
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.dataset.masks import find_ego_mask, without_ego
+from twin.scene.dataset.masks import find_dark_rim, find_ego_mask, without_ego
 from twin.scene.frames.rgbd import PointSet, Target, TrainingView
 
 FULL = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
@@ -132,6 +132,34 @@ def test_a_camera_that_stands_still_says_nothing(views: list[TrainingView]) -> N
     assert find_ego_mask(with_gripper(same, depth_m=0.0)) is None
     assert find_ego_mask(with_gripper(views[:4], depth_m=0.0)) is None
     assert find_ego_mask([]) is None
+
+
+def test_what_lies_beside_a_lens_circle_is_found_and_a_dark_thing_is_not(
+    views: list[TrainingView],
+) -> None:
+    def dark(mask: np.ndarray) -> list[TrainingView]:
+        return [
+            replace(
+                view,
+                half=replace(
+                    view.half,
+                    planes_u8=np.where(mask, np.uint8(0), view.half.planes_u8),
+                    depth_m=np.where(mask, np.float32(0), view.half.depth_m),
+                ),
+            )
+            for view in views
+        ]
+
+    rows, columns = np.mgrid[0 : HALF.height, 0 : HALF.width] + 0.5
+    rim = np.hypot(rows - HALF.height / 2, columns - HALF.width / 2) > 0.55 * HALF.width
+    found = find_dark_rim(dark(rim))
+    assert found is not None
+    assert found[rim].all()
+    assert found.sum() < 1.6 * rim.sum()
+    assert find_dark_rim([*dark(rim), views[0]]) is None  # one view shows the scene there
+    thing = (rows < 30) & (columns < 40)  # in one corner
+    assert find_dark_rim(dark(thing)) is None
+    assert find_dark_rim(views) is None
 
 
 def test_points_and_pixels_of_the_gripper_are_left_out(views: list[TrainingView]) -> None:

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bridge.media.color import linear_from_srgb
 from bridge.task.task_file import load_task
 from twin.scene.localise.objects import fit_table
-from twin.scene.localise.points import clusters, likeness, linear_image, voxel_mean
+from twin.scene.localise.points import clusters, likeness, voxel_mean
 from twin.scene.shape.known import pose_of, rectangle_yaw_rad, surface_distances
 
 TASK = load_task("cube_into_box")
@@ -77,7 +78,7 @@ def test_the_table_fit_finds_a_tilted_and_lifted_plane() -> None:
 @settings(max_examples=50, deadline=None)
 @given(shade=st.floats(0.15, 1.0))
 def test_likeness_does_not_depend_on_shading(shade: float) -> None:
-    albedo = linear_image(np.array([[[200, 45, 40]]], dtype=np.uint8))
+    albedo = linear_from_srgb(np.array([[[200, 45, 40]]]) / 255.0)
     like = likeness(albedo * shade, (200, 45, 40))
     np.testing.assert_allclose(like, 1.0, atol=1e-5)
 
