@@ -255,16 +255,15 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     where = placement(episodes)
     described = [item for item in episodes if streams.robot_description(item) is not None]
     robot = next(map(streams.recorded_robot, described), robot_of(""))
-    base, arm = robot.base_frame, next(map(streams.robot_description, described), None) or ""
-    link = config.link or ("tool0" if 'name="tool0"' in arm else robot.tool_frame)
-    config = replace(config, link=link)
+    has_tool0 = any('name="tool0"' in (streams.robot_description(e) or "") for e in described)
+    config = replace(config, link=config.link or ("tool0" if has_tool0 else robot.tool_frame))
     found: dict[str, Any] = {}
     reasons: dict[str, str] = {}
     seen = sorted({*where, *target_cameras(episodes)})
     for camera_id in [config.camera] if config.camera else seen:
         try:
             place = where.get(camera_id, NO_DEPTH)
-            found[camera_id] = _camera(episodes, camera_id, place, config, base)
+            found[camera_id] = _camera(episodes, camera_id, place, config, robot.base_frame)
         except GstError as error:
             if config.camera:
                 raise
