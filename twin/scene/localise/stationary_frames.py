@@ -12,6 +12,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from twin.scene.frames.camera_poses import (
+    AROUND_NS,
     CameraPoses,
     base_tree,
     calibrated_poses,
@@ -22,8 +23,6 @@ from twin.scene.frames.pairing import check_camera, paired_stamps_ns
 from twin.scene.frames.selection import rgbd_camera_ids, spread, with_true_depth
 from twin.scene.store.calibration import Calibration
 
-STATIONARY_WINDOW_NS = 40_000_000
-"""A camera is still when its pose is the same this long before and after an image."""
 STATIONARY_DISTANCE_M = 1e-3
 STATIONARY_ANGLE_RAD = 3e-3
 
@@ -110,9 +109,9 @@ def is_stationary(
     tree: TransformTree, frame_id: str, stamp_ns: int, until_ns: int | None = None
 ) -> bool:
     """Say whether a frame's pose is the same shortly before and after an instant."""
-    last_ns = stamp_ns + STATIONARY_WINDOW_NS
+    last_ns = stamp_ns + AROUND_NS
     last_ns = last_ns if until_ns is None else min(last_ns, until_ns)
-    before = tree.T_root_frame(frame_id, stamp_ns - STATIONARY_WINDOW_NS)
+    before = tree.T_root_frame(frame_id, stamp_ns - AROUND_NS)
     after = tree.T_root_frame(frame_id, last_ns)
     return same_pose(
         before, after, distance_m=STATIONARY_DISTANCE_M, angle_rad=STATIONARY_ANGLE_RAD
