@@ -175,8 +175,7 @@ def _tree_of(
     camera_id: str,
     stamps_ns: Int[np.ndarray, " num_stamps"],
 ) -> TransformTree:
-    known = scene.record.get("cameras", [])
-    by_hand = {item["id"] for item in known if item["poses_from"] == "hand-eye"}
+    by_hand = [c["id"] for c in scene.record.get("cameras", []) if c["poses_from"] == "hand-eye"]
     calibration = read_calibration(run)
     place = calibration.cameras.get(camera_id) if calibration and camera_id in by_hand else None
     if place is None:

@@ -114,11 +114,7 @@ def open_trial(run: RunFolder, scene: Scene, recorded: Episode) -> TrialInScene:
     task = task_of(recorded)
     parts, notes = trial_parts(run, scene, recorded, task, tracks.first(), moved)
     soft = [] if task is None else [name for name in task.soft_objects if name in parts.objects]
-    notes += (
-        [f"{', '.join(soft)}: soft, drawn unbent; robot-gst replay --render bends it"]
-        if soft
-        else []
-    )
+    notes += [f"{', '.join(soft)}: drawn unbent; replay --render bends"] if soft else []
     return TrialInScene(
         recorded=recorded,
         parts=parts,

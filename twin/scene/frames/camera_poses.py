@@ -247,10 +247,7 @@ def calibrated_poses(
     mount: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_frames"],
 ) -> CameraPoses:
-    """Pose a camera's images as ``robot-gst calibrate`` says it is mounted.
-
-    And just before and after each: between far images a hand that stood still would seem to move.
-    """
+    """Pose a camera around its images as ``robot-gst calibrate`` says it is mounted."""
     instants = np.unique(stamps_ns[:, None] + np.array([-AROUND_NS, 0, AROUND_NS]))
     return CameraPoses(
         tree=calibrated_tree(episode, camera_id, mount, instants),

@@ -23,8 +23,7 @@ from twin.scene.frames.pairing import check_camera, paired_stamps_ns
 from twin.scene.frames.selection import rgbd_camera_ids, spread, with_true_depth
 from twin.scene.store.calibration import Calibration
 
-STATIONARY_DISTANCE_M = 1e-3
-STATIONARY_ANGLE_RAD = 3e-3
+STATIONARY_DISTANCE_M, STATIONARY_ANGLE_RAD = 1e-3, 3e-3
 
 HeldOut = Mapping[str, Collection[int]]
 """Stamps of frames to leave out, by camera id."""
@@ -122,9 +121,7 @@ def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Pos
     """Where the cameras of an episode are, as far as they were calibrated."""
     mounts = {} if calibration is None else calibration.cameras
     return {
-        camera_id: calibrated_poses(
-            episode, camera_id, mounts[camera_id], paired_stamps_ns(episode, camera_id)
-        )
-        for camera_id in rgbd_camera_ids(episode)
-        if camera_id in mounts
+        key: calibrated_poses(episode, key, mounts[key], paired_stamps_ns(episode, key))
+        for key in rgbd_camera_ids(episode)
+        if key in mounts
     }
