@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import DepthImage, PoseSample
+from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import CAMERAS, DEPTH_IMAGE, DEPTH_INFO, TARGET_POSE, is_truth
@@ -26,12 +26,10 @@ from twin.robot.model import load_robot
 from twin.robot.posture import Posture, PostureTrack, distinct_postures, posture_track
 from twin.scene.align.align import RobotNotAlignedError, align_robot
 from twin.scene.align.view import RobotView
-from twin.scene.frames.camera_poses import base_tree, same_pose
+from twin.scene.frames.camera_poses import base_tree, never_moves
 from twin.scene.store.calibration import CALIBRATION_FILE, write_calibration
 
 FIXED, MOVING, NO_DEPTH = "fixed", "moving", "no depth"
-STILL_M, STILL_RAD = 0.002, 0.0035
-NUM_LOOKS = 12
 MAX_POSTURES = 6
 """A fixed camera is found from the robot in this many different postures, those farthest apart."""
 
@@ -62,14 +60,8 @@ def depth_cameras(episode: Episode) -> list[str]:
 def _moves(episode: Episode, camera_id: str) -> bool:
     frame = streams.camera_info(episode, camera_id, "depth").frame_id
     tree = streams.transform_tree(episode)
-    stamps = np.linspace(episode.start_ns, episode.end_ns, NUM_LOOKS).astype(np.int64)
-    try:
-        poses = [tree.T_root_frame(frame, int(stamp)) for stamp in stamps]
-    except BridgeError:
-        return False
-    return not all(
-        same_pose(poses[0], T, distance_m=STILL_M, angle_rad=STILL_RAD) for T in poses[1:]
-    )
+    posed_ns = tree.stamps_ns(frame) if frame in tree.frames() else np.zeros(0, dtype=np.int64)
+    return len(posed_ns) > 0 and not never_moves(tree, frame, posed_ns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,13 +135,9 @@ def _tracks(episodes: Sequence[Episode]) -> dict[str, PostureTrack]:
 
 
 def _stationary(episode: Episode, camera_id: str, track: PostureTrack) -> Iterator[_Seen]:
-    topic = streams.find_camera_topic(episode, camera_id, "depth/image")
-    if topic is None:
-        return
-    for message in episode.messages([topic]):
-        stamp = DepthImage.from_message(message.type_name, message.data).stamp_ns
-        if track.is_stationary(stamp):
-            yield _Seen(episode=episode, stamp_ns=stamp, posture=track.at(stamp))
+    for image in streams.depth_images(episode, camera_id):
+        if track.is_stationary(image.stamp_ns):
+            yield _Seen(episode=episode, stamp_ns=image.stamp_ns, posture=track.at(image.stamp_ns))
 
 
 def _load(episode: Episode, camera_id: str, chosen: Sequence[_Seen]) -> Iterator[RobotView]:
@@ -246,11 +234,7 @@ def _stops(
 
 
 def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -> dict[str, Any]:
-    """Find every camera the run has data of, and write ``scene/calibration.json``.
-
-    A camera is found from pose pairs of a target where there are some, otherwise, when it stands
-    still, from the robot in its depth images.
-    """
+    """Find every camera the run has data of, and write ``scene/calibration.json``."""
     episodes = _readable(run, output)
     where = placement(episodes)
     described = [item for item in episodes if streams.robot_description(item) is not None]

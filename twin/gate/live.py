@@ -44,9 +44,9 @@ from bridge.robots.robot import robot_of
 from bridge.task.record import parse_record
 from twin.errors import TwinError
 from twin.robot.posture import PostureTrack, check_joints
-from twin.scene.frames.camera_poses import CameraPoses, rooted_in_base
+from twin.scene.frames.camera_poses import AROUND_NS, CameraPoses, rooted_in_base
 from twin.scene.frames.selection import with_true_depth
-from twin.scene.localise.stationary_frames import STATIONARY_WINDOW_NS, common_root, is_stationary
+from twin.scene.localise.stationary_frames import common_root, is_stationary
 from twin.scene.store.calibration import Calibration, MountedCamera, mounted_tree, unknown_postures
 
 KEPT_IMAGES = 6
@@ -102,7 +102,7 @@ class LiveCell:
             return CameraPoses(tree=self.tree, source="tf")
         track = None if mount.fixed else self.track
         # Around each image too: between far images a motion of the hand would not show.
-        window = np.array([-STATIONARY_WINDOW_NS, 0, STATIONARY_WINDOW_NS])
+        window = np.array([-AROUND_NS, 0, AROUND_NS])
         instants = np.unique(stamps_ns[:, None] + window)
         lost = unknown_postures(track, instants)
         if lost.issuperset(stamps_ns.tolist()) and len(stamps_ns):
@@ -130,7 +130,7 @@ def frames_of(
     pairs = [
         (color, depth)
         for color, depth in _pairs(camera)
-        if color.stamp_ns - STATIONARY_WINDOW_NS >= quiet_since_ns
+        if color.stamp_ns - AROUND_NS >= quiet_since_ns
     ]
     stamps_ns = np.array([color.stamp_ns for color, _ in pairs], dtype=np.int64)
     poses = cell.poses(camera_id, frame_id, camera.infos["depth"].frame_id, stamps_ns)

@@ -175,11 +175,9 @@ def _tree_of(
     camera_id: str,
     stamps_ns: Int[np.ndarray, " num_stamps"],
 ) -> TransformTree:
-    known = scene.record.get("cameras", [])
-    if not any((item["id"], item["poses_from"]) == (camera_id, "hand-eye") for item in known):
-        return base_tree(episode)
+    by_hand = [c["id"] for c in scene.record.get("cameras", []) if c["poses_from"] == "hand-eye"]
     calibration = read_calibration(run)
-    place = None if calibration is None else calibration.cameras.get(camera_id)
+    place = calibration.cameras.get(camera_id) if calibration and camera_id in by_hand else None
     if place is None:
         return base_tree(episode)
     return calibrated_tree_at(episode, camera_id, place, stamps_ns)

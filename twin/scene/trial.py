@@ -111,7 +111,10 @@ def open_trial(run: RunFolder, scene: Scene, recorded: Episode) -> TrialInScene:
         reason = f" ({remark})" if remark else ""
         robot = f"not drawn: the scene has no robot splats{reason}"
     tracks, moved = _recorded_tracks(run, scene, recorded, postures)
-    parts, notes = trial_parts(run, scene, recorded, task_of(recorded), tracks.first(), moved)
+    task = task_of(recorded)
+    parts, notes = trial_parts(run, scene, recorded, task, tracks.first(), moved)
+    soft = [] if task is None else [name for name in task.soft_objects if name in parts.objects]
+    notes += [f"{', '.join(soft)}: drawn unbent; replay --render bends"] if soft else []
     return TrialInScene(
         recorded=recorded,
         parts=parts,

@@ -45,6 +45,8 @@ def same_pose(
 
 FAR_NS = 500_000_000
 """A pose published farther away in time says nothing of a camera that moves."""
+AROUND_NS = 40_000_000
+"""A camera is still when its pose is the same this long before and after an image."""
 STATIONARY_M, STATIONARY_RAD = 0.002, 0.0035
 """A camera whose pose varies less than these stands still."""
 LOOKS = 40
@@ -245,9 +247,10 @@ def calibrated_poses(
     mount: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_frames"],
 ) -> CameraPoses:
-    """Pose a camera's images as ``robot-gst calibrate`` says it is mounted."""
+    """Pose a camera around its images as ``robot-gst calibrate`` says it is mounted."""
+    instants = np.unique(stamps_ns[:, None] + np.array([-AROUND_NS, 0, AROUND_NS]))
     return CameraPoses(
-        tree=calibrated_tree(episode, camera_id, mount, stamps_ns),
+        tree=calibrated_tree(episode, camera_id, mount, instants),
         source="hand-eye",
         unposed_ns=without_joints(episode, mount, stamps_ns),
         depth_scale=mount.depth_scale,

@@ -12,6 +12,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from twin.scene.frames.camera_poses import (
+    AROUND_NS,
     CameraPoses,
     base_tree,
     calibrated_poses,
@@ -22,10 +23,7 @@ from twin.scene.frames.pairing import check_camera, paired_stamps_ns
 from twin.scene.frames.selection import rgbd_camera_ids, spread, with_true_depth
 from twin.scene.store.calibration import Calibration
 
-STATIONARY_WINDOW_NS = 40_000_000
-"""A camera is still when its pose is the same this long before and after an image."""
-STATIONARY_DISTANCE_M = 1e-3
-STATIONARY_ANGLE_RAD = 3e-3
+STATIONARY_DISTANCE_M, STATIONARY_ANGLE_RAD = 1e-3, 3e-3
 
 HeldOut = Mapping[str, Collection[int]]
 """Stamps of frames to leave out, by camera id."""
@@ -110,9 +108,9 @@ def is_stationary(
     tree: TransformTree, frame_id: str, stamp_ns: int, until_ns: int | None = None
 ) -> bool:
     """Say whether a frame's pose is the same shortly before and after an instant."""
-    last_ns = stamp_ns + STATIONARY_WINDOW_NS
+    last_ns = stamp_ns + AROUND_NS
     last_ns = last_ns if until_ns is None else min(last_ns, until_ns)
-    before = tree.T_root_frame(frame_id, stamp_ns - STATIONARY_WINDOW_NS)
+    before = tree.T_root_frame(frame_id, stamp_ns - AROUND_NS)
     after = tree.T_root_frame(frame_id, last_ns)
     return same_pose(
         before, after, distance_m=STATIONARY_DISTANCE_M, angle_rad=STATIONARY_ANGLE_RAD
@@ -123,9 +121,7 @@ def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Pos
     """Where the cameras of an episode are, as far as they were calibrated."""
     mounts = {} if calibration is None else calibration.cameras
     return {
-        camera_id: calibrated_poses(
-            episode, camera_id, mounts[camera_id], paired_stamps_ns(episode, camera_id)
-        )
-        for camera_id in rgbd_camera_ids(episode)
-        if camera_id in mounts
+        key: calibrated_poses(episode, key, mounts[key], paired_stamps_ns(episode, key))
+        for key in rgbd_camera_ids(episode)
+        if key in mounts
     }

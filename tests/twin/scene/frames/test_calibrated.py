@@ -15,6 +15,7 @@ from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.terminal import Output
 from twin.robot.posture import PostureTrack
 from twin.scene.frames.selection import choose_frames, find_sources
+from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
 from twin.scene.settings import FrameConfig
 from twin.scene.store import calibration as calibration_module
 from twin.scene.store.calibration import read_calibration, write_calibration
@@ -80,3 +81,15 @@ def test_without_any_joints_at_its_images_a_camera_is_refused(
     joints_at(monkeypatch, np.arange(100 * S, 101 * S, S // 100), moving(100))
     with pytest.raises(GstError, match="was taken while joints said where it is"):
         choose_frames(find_sources(run), FrameConfig(), Output(quiet=True), read_calibration(run))
+
+
+def test_a_hand_that_stands_still_at_each_image_is_seen_to(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between far images it went elsewhere."""
+    stamps = np.arange(9 * S // 10, 4 * S, S // 100)
+    stops = np.clip((stamps - 95 * S // 100) // (S // 10), 0, 29)
+    joints_at(monkeypatch, stamps, moving(30)[stops])
+    episode = Episode.open(run.episodes_dir / "scan.mcap")
+    poses = calibrated_cameras(episode, read_calibration(run))
+    assert len(stationary_frames(episode, 30, evenly=True, poses=poses)) == 30
