@@ -161,7 +161,8 @@ def test_an_episode_without_messages_is_whole(live: LiveCell) -> None:
     assert (answer["messages"], answer["lost"]) == (0, 0)
     assert read(live.path("empty")) == []
     assert metadata(live.path("empty"), "drops")["topics"] == {}
-    assert check_code(live.path("empty")) == 0
+    assert [each["name"] for each in answer["findings"]] == ["nothing_recorded"]
+    assert check_code(live.path("empty")) == 3  # whole, and named
 
 
 VERBS = ("start", "stop", "mark", "label", "list", "status")
