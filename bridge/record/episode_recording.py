@@ -187,6 +187,8 @@ class EpisodeRecording:
         self._others = others
         self._channels = Channels(config.queues.max_topics, self.ledger.warn, config.msg_folder)
         self._num_latched = 0
+        self._begins_ns, self._waits = start_ns, info.stand_in
+        """A stand-in's first message says when, for its clock may run ahead of this one."""
         self._closed_second = second_of(start_ns)
         self._records: deque[dict[str, Any]] = deque()
         self._clock_steps_ns: list[int] = []
@@ -203,7 +205,8 @@ class EpisodeRecording:
         )
         try:
             self._say_what_it_is(contract, task)
-            self._repeat_latched(start_ns)
+            if not self._waits:
+                self._repeat_latched(start_ns)
             for record in clocks:
                 self.write_clock(record, start_ns)
         except OSError as error:
@@ -241,6 +244,9 @@ class EpisodeRecording:
 
     def write(self, item: Item) -> None:
         """Append a message, whatever it is, and book it."""
+        if self._waits and item.sample.source_ns:
+            self._begins_ns, self._waits = max(self.start_ns, item.sample.source_ns), False
+            self._repeat_latched(self._begins_ns)
         channel = self._channels.of(item.sample, item.type_name)
         if channel is None:
             self.ledger.count_refused(item)
@@ -288,8 +294,8 @@ class EpisodeRecording:
         source_ns = sample.source_ns
         if source_ns is None and channel.stamp_ns is not None:
             source_ns = channel.stamp_ns(sample.data)
-        if self.info.stand_in:  # by its clock, which may run ahead of this one
-            stamp_ns = max(self.start_ns, source_ns or 0)
+        if self.info.stand_in:
+            stamp_ns = max(self._begins_ns, source_ns or 0)
         log_ns = channel.later(stamp_ns)
         self.writer.write(
             sample.topic,
@@ -324,7 +330,7 @@ class EpisodeRecording:
     def _write_json(
         self, topic: str, record: dict[str, Any], type_name: str, stamp_ns: int
     ) -> None:
-        log_ns = self._channels.later(topic, stamp_ns)
+        log_ns = self._channels.later(topic, max(stamp_ns, self._begins_ns))
         self.writer.write(topic, record, type_name=type_name, log_time_ns=log_ns)
 
     def write_clock(self, record: dict[str, Any], stamp_ns: int) -> None:

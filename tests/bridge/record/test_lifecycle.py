@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from bridge.clock import AnchoredClock
+from bridge.clock import NS_PER_S, AnchoredClock
 from bridge.data_files import datasets_folder
 from bridge.episode import schema, streams
 from bridge.episode.check import check_episode
@@ -54,6 +54,24 @@ def test_messages_come_out_as_they_went_in(
             if channel.topic == "/cell/joint_states"
         ]
     assert found == [(s.data, s.source_ns, s.received_ns, s.sequence) for s in sent]
+
+
+def test_an_episode_of_a_stand_in_cell_whose_clock_runs_ahead_is_as_long_as_its_motion(
+    recorder: Recorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder.receive(make_sample(topic="/robot_description", type_name=schema.STRING))
+    recorder.start(EpisodeInfo(id="t1", kind="trial", cell="cell", stand_in=True))
+    ahead_ns = make_sample().received_ns + 60 * NS_PER_S
+    for number in range(5):
+        recorder.receive(make_sample(source_ns=ahead_ns + number * NS_PER_S))
+    recorder.stop()
+    with path_of(run).open("rb") as stream:
+        found = [
+            (channel.topic, m.log_time) for _, channel, m in make_reader(stream).iter_messages()
+        ]
+    assert ("/robot_description", ahead_ns) in found
+    times_ns = [log_ns for _, log_ns in found]
+    assert (min(times_ns), max(times_ns)) == (ahead_ns, ahead_ns + 4 * NS_PER_S)
 
 
 def test_latched_messages_open_every_episode(
