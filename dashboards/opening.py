@@ -235,7 +235,7 @@ def _bag(path: Path) -> Found:
     count = count_messages(path)
     renamed = [f"{old} will be {new}" for old, new in names.items() if not old.endswith("_info")]
     return Found(
-        what=f"a bag of {f'{count} messages, ' if count else ''}topics: {len(seen.types)}",
+        what=f"a bag{f' of {count} messages' if count else ''}, topics: {len(seen.types)}",
         holds=(*robot, *cameras, *renamed, *_proposal(seen, names, file)),
         record="the same nodes, live (docs/recording.md, section 4)",
         rebuild="; ".join(views),
