@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 from bridge.cli.exchange import import_rgbd, import_rosbag2
 from bridge.clock import NS_PER_S
-from bridge.data_files import datasets_folder
 from bridge.episode import schema
 from bridge.episode import topics as named
 from bridge.episode.catalogue import find_episodes
@@ -29,7 +28,7 @@ from bridge.exchange.driver_names import mapped
 from bridge.exchange.rosbag2 import METADATA_FILE, count_messages, find_files, unpacked
 from bridge.exchange.trials_csv import trials_path, trials_text
 from bridge.leaves import load_leaf
-from bridge.robots.robot import Robot, read_robot, robot_of
+from bridge.robots.robot import Robot, read_robot, robot_of, robots_with
 from bridge.sources.folder.messages import find_frames, read_index
 from bridge.sources.folder.scene_json import INDEX_NAME
 from bridge.sources.folder.transforms import TRANSFORMS
@@ -289,12 +288,9 @@ def _robot(seen: Survey, asked: str = "") -> tuple[list[str], list[str], list[Ro
     if not tracks:
         return [], [f"joint states on a topic that ends in {named.JOINT_STATES}"], []
     topic, joints = max(tracks.items(), key=lambda item: len(item[1]))
-    files = sorted((datasets_folder() / "robots").glob("*.toml"))
     urdf = seen.first.get(named.ROBOT_DESCRIPTION)
-    known = [robot_of(string_from_cdr(urdf))] if urdf else [read_robot(f.stem) for f in files]
-    known = [read_robot(asked)] if asked else known
-    fits = [robot for robot in known if set(robot.joints) <= set(joints)]
-    fits = [robot for robot in fits if len(robot.joints) == max(len(r.joints) for r in fits)]
+    known = [robot_of(string_from_cdr(urdf))] if urdf else []
+    fits = robots_with(joints, [read_robot(asked)] if asked else known)
     name = " or ".join(robot.name for robot in fits) or "none of the robot files"
     name += ", by the names of its joints (another: --map)" if fits and not (urdf or asked) else ""
     lacks = [] if fits else ["a robot file with its joints (docs/robots.md)"]

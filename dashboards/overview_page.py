@@ -3,7 +3,6 @@
 Measurements are chosen by id; nothing is computed.
 """
 
-import re
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from bridge.task.scripted_motion import RECORD_NAME
 from dashboards.comparison import Judgement
 from dashboards.moments import Cause, cause_of
 from dashboards.twin_page import any_recorded, has_depth
+from evaluator.quantity import unslug
 from evaluator.report.wording import SIM_SIDE, agreeing_side
 from evaluator.result import Measurement
 from evaluator.review_index import FACETS, RESULTS, IndexedFile, ReviewIndex, Selection, stamp_of
@@ -158,8 +158,7 @@ def first_numbers(judgement: Judgement) -> Iterator[tuple[str, Measurement]]:
         recorded = [each for name, each in by_id.items() if name.startswith("rate.recorded.")]
         rates = [each for each in recorded if each.value is not None][: len(NUMBERS)]
         for each in rates:
-            told = re.sub(r"\+([0-9a-f]{4})", lambda found: chr(int(found[1], 16)), each.id)
-            parts = [part.replace("_", " ") for part in told.split(".")[2:] if part != "-"]
+            parts = [unslug(part) for part in each.id.split(".")[2:] if part != "-"]
             yield f"Recorded success, {' · '.join(parts)}", each
     for name, title in NUMBERS.items():
         found = by_id.get(name.replace(SIM_SIDE, side))

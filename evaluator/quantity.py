@@ -21,6 +21,11 @@ def slug(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_+-]+", "_", text) or "-"
 
 
+def unslug(part: str) -> str:
+    """Words that a part of a measurement id stands for: ``slug`` backwards, signs as blanks."""
+    return re.sub(r"\+([0-9a-f]{4})", lambda found: chr(int(found[1], 16)), part).replace("_", " ")
+
+
 PLURALS = {"pair of runs": "pairs of runs", "policy": "policies"}
 
 

@@ -302,7 +302,7 @@ def findings_of(
     untold: Collection[str] = (),
 ) -> Iterator[HealthFinding]:
     """Say where a contract was broken, what fell silent or ended untold, and whose rate fell."""
-    if not any(each.messages for t, each in presences.items() if not t.startswith("/recorder/")):
+    if not any(presences[topic].messages for topic in presences.keys() - OF_RECORDER):
         yield HealthFinding(name="nothing_recorded", about="all topics", text="no message came")
     for topic, report in reports.items():
         presence = presences.get(topic, Presence())

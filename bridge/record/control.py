@@ -12,10 +12,8 @@ from typing import Any, TypeVar
 import msgspec
 
 from bridge.episode import metadata
-from bridge.episode.catalogue import sidecar_path
 from bridge.episode.run_folder import check_episode_id
 from bridge.episode.topics import policy_key
-from bridge.errors import UsageError
 from bridge.record.errors import ControlError
 from bridge.record.recorder import Recorder
 from bridge.task.record import check_record
@@ -87,9 +85,6 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         info = parse_info("new" if named is None else named, request.get("info", {}))
         if named is None:
             info = replace(info, id=recorder.run.free_id(info.kind))
-        elif (label := sidecar_path(recorder.run, info.id)).is_file():
-            how = "Choose another name, or move it away."
-            raise UsageError(f"{label} is the label of an earlier {info.id}. {how}")
         task = parse_task_file(request.get("task_file"))
         who_acts = _ask_policy(session, info)
         info = replace(info, tags=tuple(dict.fromkeys((*info.tags, *who_acts))))

@@ -12,6 +12,7 @@ from typing import Any
 
 from bridge.clock import s_from_ns
 from bridge.episode import metadata
+from bridge.episode.catalogue import sidecar_path
 from bridge.episode.contract import Contract
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
@@ -236,6 +237,9 @@ class Lifecycle:
                 f"{left} is being written, or left from a take that was cut off. "
                 "Recover it or move it away, or choose another episode id."
             )
+        if (label := sidecar_path(self._run, episode_id)).is_file():
+            how = "Choose another name, or move it away."
+            raise UsageError(f"{label} is the label of an earlier {episode_id}. {how}")
         lacks, free_mb, min_mb = self._space()
         if lacks:
             raise NoSpaceError(folder=self._run.path, free_mb=free_mb, wanted_mb=min_mb)

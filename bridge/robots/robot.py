@@ -13,7 +13,7 @@ import sysconfig
 import tomllib
 import typing
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from difflib import get_close_matches
 from functools import lru_cache
@@ -303,12 +303,25 @@ def robot_of(urdf: str) -> Robot:
                 "Name the robot's file: --robot FILE.toml."
             ) from error
     name = robot_name(urdf)
-    files = sorted(path.stem for path in (datasets_folder() / "robots").glob("*.toml"))
-    if name in files:
+    if name in _shipped():
         return read_robot(name)
-    joints = set(re.findall(r'<joint\b[^>]*\bname="([^"]+)"', urdf))
-    fits = [robot for robot in map(read_robot, files) if joints.issuperset(robot.joints)]
+    fits = robots_with(re.findall(r'<joint\b[^>]*\bname="([^"]+)"', urdf))
     return fits[0] if len(fits) == 1 else read_robot(DEFAULT_ROBOT)
+
+
+def _shipped() -> list[str]:
+    return sorted(path.stem for path in (datasets_folder() / "robots").glob("*.toml"))
+
+
+def robots_with(joints: Iterable[str], known: Sequence[Robot] = ()) -> list[Robot]:
+    """Robots, of the robot files unless others are given, that have only these joints.
+
+    Of several, those that have the most of them.
+    """
+    there = set(joints)
+    known = known or [read_robot(name) for name in _shipped()]
+    fits = [robot for robot in known if there.issuperset(robot.joints)]
+    return [robot for robot in fits if len(robot.joints) == max(len(r.joints) for r in fits)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -237,10 +237,10 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     """Find every camera the run has data of, and write ``scene/calibration.json``."""
     episodes = _readable(run, output)
     where = placement(episodes)
-    described = [item for item in episodes if streams.robot_description(item) is not None]
-    robot = next(map(streams.recorded_robot, described), robot_of(""))
-    has_tool0 = any('name="tool0"' in (streams.robot_description(e) or "") for e in described)
-    config = replace(config, link=config.link or ("tool0" if has_tool0 else robot.tool_frame))
+    urdf = next(filter(None, map(streams.robot_description, episodes)), "")
+    robot = robot_of(urdf)
+    link = "tool0" if 'name="tool0"' in urdf else robot.tool_frame
+    config = replace(config, link=config.link or link)
     found: dict[str, Any] = {}
     reasons: dict[str, str] = {}
     seen = sorted({*where, *target_cameras(episodes)})

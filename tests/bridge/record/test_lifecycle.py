@@ -190,6 +190,14 @@ def test_an_episode_without_an_id_gets_the_next_number_of_its_kind(run: RunFolde
     assert run.free_id("trial") == "trial_0003"
 
 
+def test_an_episode_takes_no_name_whose_label_is_left(recorder: Recorder, run: RunFolder) -> None:
+    run.notes_dir.mkdir()
+    (run.notes_dir / "t1.outcome.json").touch()
+    with pytest.raises(UsageError, match=r"t1\.outcome\.json is the label of an earlier t1\."):
+        recorder.start(INFO)
+    assert not path_of(run).exists()
+
+
 def test_an_episode_without_a_message_is_not_clean(recorder: Recorder, run: RunFolder) -> None:
     recorder.start(INFO)
     assert "nothing_recorded" in str(recorder.stop())

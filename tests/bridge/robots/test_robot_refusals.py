@@ -87,11 +87,12 @@ def test_the_record_travels_in_the_description(name: str) -> None:
 
 def test_a_description_without_a_record_is_the_default_robots() -> None:
     assert robot_of('<robot name="unheard_of"/>').name == DEFAULT_ROBOT
-    panda, ur10 = (
+    panda, xarm, ur10 = (
         re.sub('<robot name="[^"]*"', '<robot name="mine"', read_robot(name).urdf_text())
-        for name in ("panda", "ur10_parallel_gripper")
+        for name in ("panda", "xarm7_parallel_gripper", "ur10_parallel_gripper")
     )
     assert robot_of(panda).name == "panda", "no other file has these joints"
+    assert robot_of(xarm).name == "xarm7_parallel_gripper", "no other has so many of these"
     assert robot_of(ur10).name == DEFAULT_ROBOT, "several have these"
     assert robot_of("").name == DEFAULT_ROBOT
     default = read_robot(DEFAULT_ROBOT)
