@@ -10,6 +10,7 @@ from jaxtyping import Float
 from bridge.episode import streams
 from bridge.episode.catalogue import find_episodes
 from bridge.episode.catalogue_query import CatalogueQuery
+from bridge.episode.executions import EXECUTION, executed_events
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -24,7 +25,6 @@ from twin.replay.run_job import recorded_start
 from twin.replay.scene import ReplayScene, localised_starts
 from twin.robot.model import load_robot
 from twin.robot.posture import width_track
-from twin.scene.localise.episode import first_execution_ns
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import scene_hash_of
 
@@ -76,8 +76,7 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
     if urdf is None:
         raise PolicyError(f"{episode.path}: nobody recorded which robot it is (robot_description)")
     task = streams.task_file(episode).task()
-    begun_ns = first_execution_ns(episode)
-    stamp_ns = begun_ns or streams.first_stamp_ns(episode) or episode.start_ns
+    stamp_ns = _begun_ns(episode) or streams.first_stamp_ns(episode) or episode.start_ns
     found = localised_starts(run, episode, task, scene_hash=scene_hash_of(run)).at(0)  # at first
     scene = replace(
         read_rebuilt_scene(run, task),
@@ -101,6 +100,12 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
         config=for_task(ReplayConfig(), read_calibration(run), task),
         response=response_of(run, episode, robot),
     )
+
+
+def _begun_ns(episode: Episode) -> int | None:
+    """When the execution began, to the event: cameras took their pictures so long before it."""
+    begun = (e["stamp_ns"] for e in executed_events(episode) if e["type"] == EXECUTION[0])
+    return min(map(int, begun), default=None)
 
 
 def _width_m(episode: Episode, urdf: str, stamp_ns: int) -> float:

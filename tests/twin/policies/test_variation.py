@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawn_run import T0
 from test_rollouts import QUIET, config
 
 from bridge.episode.reader import Episode
@@ -86,6 +87,15 @@ def test_cameras_turn_about_themselves_and_light_scales_pictures(run: RunFolder)
     for name, picture in bright.items():
         assert picture.max() > 100
         np.testing.assert_allclose(dim[name], picture / 2, atol=0.51)
+
+
+def test_a_rollout_begins_when_its_trial_moved(run: RunFolder) -> None:
+    """Not before: pictures are as old as they were then."""
+    start = open_start(run, trial_episodes(run, "")[0])
+    moved_ns = 200_000_000  # a joint state each; the arm moves from the first on
+    assert T0 <= start.stamp_ns <= T0 + moved_ns
+    shutters = TwinCameras(run, start).shutters.values()
+    assert {shutter.first_ns for shutter in shutters} == {T0 - start.stamp_ns}
 
 
 def rows_where(is_failure: np.ndarray, amounts: np.ndarray) -> list[dict[str, Any]]:
