@@ -2,7 +2,8 @@
 
 A policy that acts otherwise because it sees something else is no judge of the twin's physics. The
 yardstick is the policy itself: how much its answer changes from one recorded picture to the next,
-and when it is asked the same thing twice.
+and when it is asked the same thing twice. States are the same until the fingers first close: what
+they have touched may then lie elsewhere than the twin draws it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,6 +29,8 @@ from twin.scene.trial import open_trial
 
 INSTANTS = 12
 """So many states of a trial are looked at."""
+CLOSES_M = 0.001
+"""Fingers that close by less have touched nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +95,7 @@ def visual_gap(
 def recorded_states(
     run: RunFolder, episode: Episode, names: Sequence[str], instants: int
 ) -> Iterator[State]:
-    """Instants of a trial, spread over it, as cameras saw them and as the twin draws them."""
+    """Instants of a trial until its fingers close, as cameras saw them and as the twin draws."""
     scene = read_scene(run)
     trial = open_trial(run, scene, episode)
     pictures = {name: list(streams.color_images(episode, name)) for name in names}
@@ -100,6 +103,8 @@ def recorded_states(
         return
     clock = [item.stamp_ns for item in pictures[names[0]][:-1]]
     seen = [t for t in clock if trial.postures.covers(t)]
+    widths_m = np.array([trial.postures.at(t).width_m for t in seen])
+    seen = seen[: int((np.maximum.accumulate(widths_m) - widths_m < CLOSES_M).cumprod().sum())]
     if not seen:
         return
     chosen = np.unique(np.linspace(0, len(seen) - 1, instants).round().astype(int))
@@ -151,7 +156,8 @@ def describe_gap(gap: Mapping[str, Any]) -> list[str]:
     if "lit" in rendered:
         alone += f"; in the light of other trials {rendered['lit']:.3g}"
     return [
-        f"visual gap: the twin's pictures of {gap['instants']} states of {gap['episode']} change "
-        f"its actions by {rendered['all']:.3g} (rms; {alone}); the next recorded picture does by "
-        f"{gap['following']:.3g}, asking again by {gap['again']:.3g}{times}"
+        f"visual gap, until the fingers close: the twin's pictures of {gap['instants']} states of "
+        f"{gap['episode']} change its actions by {rendered['all']:.3g} (rms; {alone}); the next "
+        f"recorded picture does by {gap['following']:.3g}, asking again by {gap['again']:.3g}"
+        f"{times}"
     ]

@@ -16,7 +16,7 @@ from bridge.geometry import se3
 from twin.policies import colours
 from twin.policies.cell import TwinCell
 from twin.policies.colours import gains_of
-from twin.policies.gap import State, describe_gap, visual_gap
+from twin.policies.gap import State, describe_gap, recorded_states, visual_gap
 from twin.policies.mapping import DEFAULT, Interpreter
 from twin.policies.policy import open_policy
 from twin.policies.runs import TABLE, describe_rollouts, roll_out_run
@@ -24,7 +24,7 @@ from twin.policies.starts import Start, open_start, trial_episodes
 from twin.policies.variation import draw, effects, read_quantities, varied_start
 from twin.policies.views import Gains, TwinCameras, lit
 from twin.robot.model import load_robot
-from twin.robot.posture import Posture
+from twin.robot.posture import Posture, PostureTrack
 from twin.scene.render import render
 from twin.scene.settings import RenderConfig
 
@@ -265,6 +265,19 @@ def test_brightness_is_what_it_goes_by(run: RunFolder) -> None:
     text = describe_gap(found)[0]
     assert f"by {rms['all']:.3g}"[:6] in text
     assert "10 states of trial_1" in text
+
+
+def test_states_end_where_the_fingers_close(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def closing(track: PostureTrack, stamp_ns: int) -> Posture:
+        joints_rad = at(track, stamp_ns).joints_rad
+        return Posture(joints_rad=joints_rad, width_m=0.05 - 0.01 * (stamp_ns > T0 + 700_000_000))
+
+    at = PostureTrack.at
+    monkeypatch.setattr(PostureTrack, "at", closing)
+    states = recorded_states(run, trial_episodes(run, "")[0], CAMERAS, 20)  # pictures every 0.2 s
+    assert [state.posture.width_m for state in states] == [0.05] * 4
 
 
 def mean_of(run: RunFolder, name: str) -> float:
