@@ -1,7 +1,8 @@
 """Chunks of a live recording on their way to the disk.
 
 A thread of its own writes them, so that nobody waits for the disk. Each write takes all chunks of
-small messages and then one of images, so that small messages wait for one write and their own.
+small messages and then one of images, so that small messages wait for one write and their own. What
+the disk refused it may take without the images.
 """
 
 import threading
@@ -106,6 +107,7 @@ class ChunkQueue:
         return 0.0 if since_s is None else self._monotonic() - since_s
 
     def _work(self) -> None:
+        error = None
         while True:
             with self._changed:
                 while not self._is_ending and (self._is_held or not (self._small or self._bulk)):
@@ -113,7 +115,7 @@ class ChunkQueue:
                 if self._is_ending:
                     break
                 small = [each.chunk for each in self._small]
-                bulk = [self._bulk[0]] if self._bulk else []
+                bulk = [self._bulk[0]] if self._bulk and not (small and error) else []
                 self._busy_since_s = self._monotonic()
             error = None
             try:

@@ -79,3 +79,19 @@ def test_what_the_disk_refused_is_told_once_kept_and_tried_again(queue: Any) -> 
     disk.let_go.release()
     made.drain()
     assert disk.written == [["joints"]]
+
+
+def test_small_messages_are_saved_where_the_disk_has_no_room_for_an_image(queue: Any) -> None:
+    disk, made = queue
+    disk.error = OSError("full")
+    made.add(chunk("joints 1"), is_small=True, since_s=0.0)
+    assert disk.begun.acquire(timeout=10.0)
+    made.add(chunk("joints 2"), is_small=True, since_s=0.0)
+    made.add(chunk("image"), is_small=False, since_s=0.0)
+    disk.let_go.release()
+    with pytest.raises(OSError, match="full"):
+        made.drain()
+    disk.error = None
+    disk.let_go.release(9)
+    made.drain()
+    assert disk.written == [["joints 1", "joints 2"], ["image"]]
