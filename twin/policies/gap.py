@@ -27,10 +27,8 @@ from twin.scene.standpoint import poses_in_scene
 from twin.scene.store.folder import read_scene
 from twin.scene.trial import open_trial
 
-INSTANTS = 12
-"""So many states of a trial are looked at."""
-CLOSES_M = 0.001
-"""Fingers that close by less have touched nothing."""
+INSTANTS, CLOSES_M = 12, 0.001
+"""So many states of a trial are looked at; fingers that close by less have touched nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,14 +99,13 @@ def recorded_states(
     pictures = {name: list(streams.color_images(episode, name)) for name in names}
     if trial.postures is None or not all(len(items) > 1 for items in pictures.values()):
         return
-    clock = [item.stamp_ns for item in pictures[names[0]][:-1]]
-    seen = [t for t in clock if trial.postures.covers(t)]
+    seen = [t.stamp_ns for t in pictures[names[0]][:-1] if trial.postures.covers(t.stamp_ns)]
     widths_m = np.array([trial.postures.at(t).width_m for t in seen])
     seen = seen[: int((np.maximum.accumulate(widths_m) - widths_m < CLOSES_M).cumprod().sum())]
     if not seen:
         return
     chosen = np.unique(np.linspace(0, len(seen) - 1, instants).round().astype(int))
-    cameras = {name: streams.camera_info(episode, name).camera for name in names}
+    cameras = {name: streams.camera_info(episode, name) for name in names}
     rasteriser = open_rasteriser()
     stamps = np.array([seen[k] for k in chosen], dtype=np.int64)
     trees = {name: poses_in_scene(run, scene, episode, name, stamps) for name in names}
@@ -117,7 +114,7 @@ def recorded_states(
         frames = {
             name: Frame(
                 stamp_ns=stamp_ns,
-                T_base_camera=tree.T_root_frame(_frame_id(episode, name), stamp_ns),
+                T_base_camera=tree.T_root_frame(cameras[name].frame_id, stamp_ns),
                 Ts_base_object=places,
                 posture=posture,
                 urdf=trial.postures.urdf,
@@ -133,14 +130,10 @@ def recorded_states(
             recorded={name: pictures[name][k].image_u8() for name, k in near.items()},
             following={name: pictures[name][k + 1].image_u8() for name, k in near.items()},
             rendered={
-                name: trial.parts.drawn_as(rasteriser, cameras[name], frame).image_u8
+                name: trial.parts.drawn_as(rasteriser, cameras[name].camera, frame).image_u8
                 for name, frame in frames.items()
             },
         )
-
-
-def _frame_id(episode: Episode, camera_id: str) -> str:
-    return streams.camera_info(episode, camera_id).frame_id
 
 
 def describe_gap(gap: Mapping[str, Any]) -> list[str]:

@@ -76,7 +76,8 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
     if urdf is None:
         raise PolicyError(f"{episode.path}: nobody recorded which robot it is (robot_description)")
     task = streams.task_file(episode).task()
-    stamp_ns = _begun_ns(episode) or streams.first_stamp_ns(episode) or episode.start_ns
+    begun_ns = [int(e["stamp_ns"]) for e in executed_events(episode) if e["type"] == EXECUTION[0]]
+    stamp_ns = min(begun_ns, default=streams.first_stamp_ns(episode) or episode.start_ns)
     found = localised_starts(run, episode, task, scene_hash=scene_hash_of(run)).at(0)  # at first
     scene = replace(
         read_rebuilt_scene(run, task),
@@ -100,12 +101,6 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
         config=for_task(ReplayConfig(), read_calibration(run), task),
         response=response_of(run, episode, robot),
     )
-
-
-def _begun_ns(episode: Episode) -> int | None:
-    """When the execution began, to the event: cameras took their pictures so long before it."""
-    begun = (e["stamp_ns"] for e in executed_events(episode) if e["type"] == EXECUTION[0])
-    return min(map(int, begun), default=None)
 
 
 def _width_m(episode: Episode, urdf: str, stamp_ns: int) -> float:

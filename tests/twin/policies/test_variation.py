@@ -92,8 +92,7 @@ def test_cameras_turn_about_themselves_and_light_scales_pictures(run: RunFolder)
 def test_a_rollout_begins_when_its_trial_moved(run: RunFolder) -> None:
     """Not before: pictures are as old as they were then."""
     start = open_start(run, trial_episodes(run, "")[0])
-    moved_ns = 200_000_000  # a joint state each; the arm moves from the first on
-    assert T0 <= start.stamp_ns <= T0 + moved_ns
+    assert T0 <= start.stamp_ns <= T0 + 200_000_000  # it moves from its first joint state on
     shutters = TwinCameras(run, start).shutters.values()
     assert {shutter.first_ns for shutter in shutters} == {T0 - start.stamp_ns}
 
