@@ -179,7 +179,7 @@ def grip_of(trials: Sequence[Sent]) -> tuple[float, float]:
     if not len(lines):
         return 0.0, math.inf
     delays_s, speeds_m_s = lines.T
-    free = np.abs(speeds_m_s / np.quantile(speeds_m_s, 0.75) - 1.0) < FREE
+    free = np.abs(speeds_m_s / np.quantile(speeds_m_s, 0.75, method="higher") - 1.0) < FREE
     delay_s, speed_m_s = np.median(delays_s[free]), np.median(speeds_m_s[free])
     return max(0.0, round(float(delay_s), 4)), round(float(speed_m_s), 4)
 

@@ -71,6 +71,9 @@ def test_delay_lags_stiffness_and_fingers_are_found_again(start: Start) -> None:
     found = stiffness_of(trials, delay_s, lags_s, robot)
     np.testing.assert_allclose(found, STIFFNESS, rtol=0.15)
     assert grip_of(trials) == pytest.approx((0.09, 0.15), abs=1e-3)
+    slow_m = 0.085 - (0.085 - trials[0].widths.position) / 3
+    held_up = trials[0]._replace(widths=replace(trials[0].widths, position=slow_m))
+    assert grip_of([held_up, trials[0], held_up]) == pytest.approx((0.09, 0.15), abs=1e-3)
     free = [each._replace(loads_Nm=0.0 * each.loads_Nm) for each in trials]
     assert set(stiffness_of(free, delay_s, lags_s, robot)) == {np.inf}
 
