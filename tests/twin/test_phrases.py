@@ -63,7 +63,6 @@ def asker() -> Asker:
         ("the white mug", {"grey cylinder"}),  # in shade white is grey
         ("the parcel", {"brown thing"}),  # noisy depth hides its shape; the block may be a cup
         ("a cyan cup", {"cyan block"}),
-        ("the cyan block", {"cyan block"}),
         ("yellow", {"yellow ball"}),
         ("the left cube", {"green cube"}),
         ("the right cube", {"red cube"}),
