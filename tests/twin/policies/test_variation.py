@@ -266,12 +266,9 @@ def test_brightness_is_what_it_goes_by(run: RunFolder) -> None:
     assert "10 states of trial_1" in text
 
 
-def test_states_end_where_the_fingers_close(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_states_end_where_fingers_close(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     def closing(track: PostureTrack, stamp_ns: int) -> Posture:
-        joints_rad = at(track, stamp_ns).joints_rad
-        return Posture(joints_rad=joints_rad, width_m=0.05 - 0.01 * (stamp_ns > T0 + 700_000_000))
+        return replace(at(track, stamp_ns), width_m=0.05 - 0.01 * (stamp_ns > T0 + 700_000_000))
 
     at = PostureTrack.at
     monkeypatch.setattr(PostureTrack, "at", closing)
