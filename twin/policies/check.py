@@ -56,8 +56,7 @@ def check_policy(run: RunFolder, config: RolloutConfig) -> dict[str, Any]:
 
 def _first(speak: Interpreter, cell: TwinCell, rows: np.ndarray) -> dict[str, Any]:
     """Where the answer leads, as far as the limits let it."""
-    begun = cell.target_rad.copy()
-    refused, followed = "", 0
+    begun, refused, followed = cell.target_rad.copy(), "", 0
     try:
         for row in rows:
             target = speak.target(row, cell.target_rad, cell.target_width_m)

@@ -201,8 +201,10 @@ def _closings(trial: Sent) -> Iterator[tuple[float, float]]:
 
 
 def _of_targets(episode: Episode, robot: RobotModel) -> Sent | None:
-    """Targets of a policy, each a line of one period from the one before."""
+    """Targets of a policy, each a line of one period from the one before; one alone says little."""
     sent = streams.joint_track(episode, POLICY_TARGETS)
+    if len(sent.stamps_ns) < 2:
+        return None
     joints = in_order(streams.joint_track(episode), robot.record, episode.info.id)
     targets = in_order(sent, robot.record, episode.info.id)
     first_ns, period_ns = sent.stamps_ns[:1], round(float(np.median(np.diff(sent.stamps_ns))))
@@ -212,8 +214,7 @@ def _of_targets(episode: Episode, robot: RobotModel) -> Sent | None:
         position=np.concatenate([joints.at(first_ns), targets.position]),
     )
     widths_m = sent.position[:, sent.names.index(GRIPPER_WIDTH)]
-    closed = _closed_ns(sent.stamps_ns.tolist(), widths_m.tolist())
-    return _sent(episode, robot, targets, closed)
+    return _sent(episode, robot, targets, _closed_ns(sent.stamps_ns.tolist(), widths_m.tolist()))
 
 
 def _of_plans(episode: Episode, robot: RobotModel) -> Sent | None:

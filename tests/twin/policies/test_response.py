@@ -113,6 +113,9 @@ def test_a_trial_teaches_the_others_of_its_run(tmp_path: Path, run: RunFolder) -
         write_trial(folder, recorded(np.random.default_rng(n)), f"trial_{n}", n * 10**11)
         for n in (1, 2)
     )
+    once = recorded(np.random.default_rng(3))
+    two = track(np.array([0.0, 0.1]), once.joints.position[:2])  # of which one is sent
+    write_trial(folder, once._replace(targets=two), "trial_0", 10**10)
     found = response_of(folder, first, robot)
     assert found.delay_s == pytest.approx(DELAY_S, abs=0.009)  # one reading every 8 ms
     np.testing.assert_allclose(found.lags_s, LAGS_S, atol=0.009)
@@ -122,13 +125,10 @@ def test_a_trial_teaches_the_others_of_its_run(tmp_path: Path, run: RunFolder) -
     nothing_sent = Episode.open(run.episodes_dir / "trial_1.mcap")
     assert response_of(run, nothing_sent, robot) == AT_ONCE
     shutter = shutter_of(first, "side", 10**11 + 500_000_000)
-    assert shutter.period_ns == 200_000_000
-    assert shutter.first_ns == -100_000_000
+    assert (shutter.period_ns, shutter.first_ns) == (200_000_000, -100_000_000)
     assert shutter.late_ns == pytest.approx(60_000_000, abs=8_000_000)
-    assert [replace(shutter, late_ns=60).newest_ns(100_000_000 + k) for k in (59, 60)] == [
-        -100_000_000,
-        100_000_000,
-    ]
+    late = replace(shutter, late_ns=60)
+    assert [late.newest_ns(100_000_000 + k) for k in (59, 60)] == [-100_000_000, 100_000_000]
     assert ALWAYS.newest_ns(12345) == 12345
 
 
