@@ -104,6 +104,8 @@ class CellFile:
     """Ranges of what else differs from what is published; empty: nothing does."""
     ranges_of: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     """Per task: ranges, of ``uniform`` or ``deviations``, that are its own."""
+    each_start: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Factors on ``uniform`` for each start's own objects; empty: a session has the same ones."""
 
     def noise_for(self, task_name: str) -> PlannerNoise:
         """Return how wrong the scripted planner is at a task."""
@@ -118,10 +120,8 @@ def load_cell(name: str) -> CellFile:
     path = dataset_file("cells", name)
     table = read_tables(path)
     try:
-        if "like" in table:
-            table = _laid_over(_named_as_like(table["like"]), table)
-        return _cell_from(table)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        return _cell_from(_whole(table))
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         message = (
             f"{path} is not a cell file: {type(error).__name__} {error}. "
             "Compare it with datasets/cells/standin.toml."
@@ -129,22 +129,18 @@ def load_cell(name: str) -> CellFile:
         raise UsageError(message) from error
 
 
-def _named_as_like(name: str) -> dict[str, Any]:
-    table = read_tables(dataset_file("cells", name))
-    if "like" in table:  # two files to look at are enough to know a cell
-        message = f"like {name!r}, which itself is like {table['like']!r}"
-        raise ValueError(message)
-    return table
+def _whole(table: dict[str, Any]) -> dict[str, Any]:
+    if "like" not in table:
+        return table
+    return _laid_over(_whole(read_tables(dataset_file("cells", table["like"]))), table)
 
 
 def _laid_over(base: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     """Lay what a table names over another; tables inside of it likewise."""
     merged = dict(base)
     for key, value in table.items():
-        if isinstance(value, dict) and isinstance(base.get(key), dict):
-            merged[key] = _laid_over(base[key], value)
-        else:
-            merged[key] = value
+        nested = isinstance(value, dict) and isinstance(base.get(key), dict)
+        merged[key] = _laid_over(base[key], value) if nested else value
     return merged
 
 
@@ -159,7 +155,7 @@ def _cell_from(table: dict[str, Any]) -> CellFile:
         home_m=(x, y, z),
         max_joint_speed_rad_s=table["robot"]["max_joint_speed_rad_s"],
         cameras={key: _mount_from(value) for key, value in table["cameras"].items()},
-        uniform={key: (low, high) for key, (low, high) in table["hidden"]["uniform"].items()},
+        uniform=_ranges(table["hidden"]["uniform"]),
         normal=dict(table["hidden"]["normal"]),
         sensors=SensorModel(**table["sensors"]),
         planner=planner,
@@ -169,9 +165,9 @@ def _cell_from(table: dict[str, Any]) -> CellFile:
         planner_of=planner_of,
         deviations=_deviations(table["hidden"].get("deviations", {})),
         ranges_of={
-            task: {key: (low, high) for key, (low, high) in ranges.items()}
-            for task, ranges in table["hidden"].get("tasks", {}).items()
+            task: _ranges(ranges) for task, ranges in table["hidden"].get("tasks", {}).items()
         },
+        each_start=_ranges(table["hidden"].get("each_start", {})),
     )
 
 
@@ -181,6 +177,10 @@ def _deviations(table: dict[str, list[float]]) -> dict[str, tuple[float, float]]
         wrong = sorted(set(table) ^ set(RANGES))
         message = f"hidden.deviations: {', '.join(wrong)}: missing or unknown"
         raise ValueError(message)
+    return _ranges(table)
+
+
+def _ranges(table: dict[str, list[float]]) -> dict[str, tuple[float, float]]:
     return {key: (low, high) for key, (low, high) in table.items()}
 
 
@@ -269,12 +269,21 @@ class HiddenParameters:
         return record
 
 
-def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenParameters:
-    """Draw one laboratory; the same cell file and seed give the same one."""
+def draw_hidden(
+    cell: CellFile, seed: int, task: Task | None = None, start_seed: int | None = None
+) -> HiddenParameters:
+    """Draw one laboratory; the same cell file and seed give the same one.
+
+    With a start's seed, where starts have objects of their own, it is as they are at that start.
+    """
     rng = np.random.default_rng([HIDDEN_STREAM, seed])
     own = {} if task is None else cell.ranges_of.get(task.name, {})
     ranges = cell.uniform | {key: own[key] for key in own if key in cell.uniform}
     uniform = {key: float(rng.uniform(*ranges[key])) for key in sorted(ranges)}
+    if start_seed is not None:
+        own_rng = np.random.default_rng([HIDDEN_STREAM, seed, start_seed])
+        for key in sorted(cell.each_start):
+            uniform[key] *= float(own_rng.uniform(*cell.each_start[key]))
     errors = {}
     for camera_id in sorted(cell.cameras):
         shift = rng.normal(0.0, cell.normal[f"{camera_id}_camera_m"], 3)
@@ -288,6 +297,7 @@ def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenPa
             seed,
             cameras=sorted(cell.cameras),
             objects={} if task is None else task.objects,
+            start_seed=start_seed,
         )
         offset = offset + np.array(deviations.joint_zero_rad)
     return HiddenParameters(

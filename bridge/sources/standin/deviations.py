@@ -128,16 +128,14 @@ class Deviations:
     def lens(self, camera_id: str, camera: Camera) -> Lens:
         """The true camera behind a published one."""
         focal, cx, cy, k1, k2 = self.lenses[camera_id]
-        return Lens(
-            width=camera.width,
-            height=camera.height,
+        true = replace(
+            camera,
             fx=camera.fx * focal,
             fy=camera.fy * focal,
             cx=camera.cx + cx * camera.width,
             cy=camera.cy + cy * camera.width,
-            k1=k1,
-            k2=k2,
         )
+        return Lens(**vars(true), k1=k1, k2=k2)
 
     def put_down(
         self, task: Task, declared: Mapping[str, Float[np.ndarray, "4 4"]]
@@ -207,11 +205,17 @@ def draw_deviations(
     *,
     cameras: Iterable[str],
     objects: Mapping[str, ObjectModel],
+    start_seed: int | None = None,
 ) -> Deviations:
-    """Draw one laboratory; each quantity has a stream of its own, so that none shifts another."""
+    """Draw one laboratory; each quantity has a stream of its own, so that none shifts another.
+
+    With a start's seed the objects that are not fixed are others, drawn for that start.
+    """
 
     def draw(key: str, whose: str, count: int) -> tuple[float, ...]:
         stream = [DEVIATION_STREAM, seed, zlib.crc32(f"{key} {whose}".encode())]
+        if start_seed is not None and whose in objects and not objects[whose].fixed:
+            stream.append(start_seed)
         low, high = ranges[key]
         return tuple(float(v) for v in np.random.default_rng(stream).uniform(low, high, count))
 
