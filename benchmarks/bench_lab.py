@@ -12,7 +12,6 @@ Started again it goes on where it was; ``--report`` only prints what there is, a
 
 import argparse
 import json
-import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,15 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cell_run import START_NS, UNGATED, FileSession
+from cell_run import FileSession, record_ungated
 from measure import ROOT, Target, print_targets, report_targets
 
 from bridge.episode.run_folder import RunFolder
 from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import execute_plan, label_trial
-from bridge.sources.standin.session import run_session
-from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import Streams
 from bridge.task.find import chosen_task_file
 from bridge.task.protocol import SEEDS_PER_SESSION
@@ -99,21 +96,6 @@ class SeeingSession(FileSession):
         return super().query(key, payload, timeout_s=timeout_s)
 
 
-def record(run: RunFolder, task: str, seed: int) -> None:
-    """Record a session's trials."""
-    config = SessionConfig(
-        cell=WIRE,
-        cell_file=CELL,
-        task=task,
-        seed=seed,
-        scan=False,
-        trials=LEARNED + JUDGED,
-        conditions=(UNGATED,),
-        rate_hz=RATE_HZ,
-    )
-    run_session(SeeingSession(run, task), config, QUIET, start_ns=START_NS)
-
-
 def as_published(task: Task) -> StandinCell:
     """The cell's own engine in a laboratory that is what it says: friction, weight and force."""
     file = load_cell(CELL)
@@ -176,14 +158,13 @@ def judged(run: RunFolder, name: str, seed: int) -> Session:
 def session(folder: Path, task: str, seed: int) -> Session:
     """Record and judge what is missing of a session."""
     path = folder / f"{task}_{seed}"
-    done, recorded = path / "judged.json", path / "recorded"
+    done = path / "judged.json"
     if not done.is_file():
         began_s = time.process_time()
-        if not recorded.is_file():
-            shutil.rmtree(path, ignore_errors=True)
-            record(RunFolder.create(path), task, seed)
-            recorded.touch()
-        found = judged(RunFolder.open(path), task, seed)
+        run = RunFolder.open(path) if path.is_dir() else RunFolder.create(path)
+        sees, settings = SeeingSession(run, task), {"cell": WIRE, "rate_hz": RATE_HZ}
+        record_ungated(run, task, seed, LEARNED + JUDGED, CELL, sees, **settings)
+        found = judged(run, task, seed)
         found["cpu_s"] = round(time.process_time() - began_s, 1)
         done.write_text(json.dumps(found) + "\n")
         good = sum(row["success"] for row in found["rows"])

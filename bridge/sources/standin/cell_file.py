@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +20,7 @@ from bridge.task.task_file import Task
 
 SCHEMA_VERSION = 1
 PERCEPTIONS = ("noise", "gate")
+Ranges = dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +93,7 @@ class CellFile:
     home_m: tuple[float, float, float]
     max_joint_speed_rad_s: float
     cameras: dict[str, CameraMount]
-    uniform: dict[str, tuple[float, float]]
+    uniform: Ranges
     normal: dict[str, float]
     sensors: SensorModel
     planner: PlannerNoise
@@ -100,11 +102,11 @@ class CellFile:
     clutter: tuple[Clutter, ...] = ()
     planner_of: dict[str, PlannerNoise] = field(default_factory=dict)
     """Tasks the planner is differently wrong at."""
-    deviations: dict[str, tuple[float, float]] = field(default_factory=dict)
+    deviations: Ranges = field(default_factory=dict)
     """Ranges of what else differs from what is published; empty: nothing does."""
-    ranges_of: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    ranges_of: dict[str, Ranges] = field(default_factory=dict)
     """Per task: ranges, of ``uniform`` or ``deviations``, that are its own."""
-    each_start: dict[str, tuple[float, float]] = field(default_factory=dict)
+    each_start: Ranges = field(default_factory=dict)
     """Factors on ``uniform`` for each start's own objects; empty: a session has the same ones."""
 
     def noise_for(self, task_name: str) -> PlannerNoise:
@@ -148,40 +150,34 @@ def _cell_from(table: dict[str, Any]) -> CellFile:
     if table["schema_version"] > SCHEMA_VERSION:
         message = f"schema_version {table['schema_version']} is newer than {SCHEMA_VERSION}"
         raise ValueError(message)
-    x, y, z = table["robot"]["home_m"]
     planner, planner_of = _planners(table["planner"])
+    hidden, seeds = table["hidden"], msgspec.convert(table["seeds"], dict[str, tuple[int, int]])
     return CellFile(
         name=table["name"],
-        home_m=(x, y, z),
+        home_m=msgspec.convert(table["robot"]["home_m"], tuple[float, float, float]),
         max_joint_speed_rad_s=table["robot"]["max_joint_speed_rad_s"],
         cameras={key: _mount_from(value) for key, value in table["cameras"].items()},
-        uniform=_ranges(table["hidden"]["uniform"]),
-        normal=dict(table["hidden"]["normal"]),
+        uniform=msgspec.convert(hidden["uniform"], Ranges),
+        normal=dict(hidden["normal"]),
         sensors=SensorModel(**table["sensors"]),
         planner=planner,
-        test_seeds=_pair(table["seeds"]["test"]),
-        development_seeds=_pair(table["seeds"]["development"]),
+        test_seeds=seeds["test"],
+        development_seeds=seeds["development"],
         clutter=tuple(_clutter_from(item) for item in table.get("clutter", [])),
         planner_of=planner_of,
-        deviations=_deviations(table["hidden"].get("deviations", {})),
-        ranges_of={
-            task: _ranges(ranges) for task, ranges in table["hidden"].get("tasks", {}).items()
-        },
-        each_start=_ranges(table["hidden"].get("each_start", {})),
+        deviations=_deviations(hidden.get("deviations", {})),
+        ranges_of=msgspec.convert(hidden.get("tasks", {}), dict[str, Ranges]),
+        each_start=msgspec.convert(hidden.get("each_start", {}), Ranges),
     )
 
 
-def _deviations(table: dict[str, list[float]]) -> dict[str, tuple[float, float]]:
+def _deviations(table: dict[str, Any]) -> Ranges:
     """Read the ranges; a cell has all of them or none."""
     if table and set(table) != set(RANGES):
         wrong = sorted(set(table) ^ set(RANGES))
         message = f"hidden.deviations: {', '.join(wrong)}: missing or unknown"
         raise ValueError(message)
-    return _ranges(table)
-
-
-def _ranges(table: dict[str, list[float]]) -> dict[str, tuple[float, float]]:
-    return {key: (low, high) for key, (low, high) in table.items()}
+    return msgspec.convert(table, Ranges)
 
 
 def _planners(table: dict[str, Any]) -> tuple[PlannerNoise, dict[str, PlannerNoise]]:
@@ -206,11 +202,6 @@ def _clutter_from(table: dict[str, Any]) -> Clutter:
         T_base_clutter=se3.small_motion(np.array([0.0, 0.0, table["yaw_rad"], *table["p_m"]])),
         color_srgb=tuple(table.get("color_srgb", (128, 128, 128))),
     )
-
-
-def _pair(values: list[int]) -> tuple[int, int]:
-    first, last = values
-    return first, last
 
 
 def _mount_from(table: dict[str, Any]) -> CameraMount:
@@ -272,10 +263,7 @@ class HiddenParameters:
 def draw_hidden(
     cell: CellFile, seed: int, task: Task | None = None, start_seed: int | None = None
 ) -> HiddenParameters:
-    """Draw one laboratory; the same cell file and seed give the same one.
-
-    With a start's seed, where starts have objects of their own, it is as they are at that start.
-    """
+    """Draw one laboratory, the same for one cell file and seed; as it is at a start, if any."""
     rng = np.random.default_rng([HIDDEN_STREAM, seed])
     own = {} if task is None else cell.ranges_of.get(task.name, {})
     ranges = cell.uniform | {key: own[key] for key in own if key in cell.uniform}

@@ -84,9 +84,13 @@ class WirePlanner:
         """Send the request; what comes back is believed only where it fits."""
         try:
             data = self._session.query(self._key, request.to_json(), timeout_s=self._timeout_s)
-            return PlanAnswer.from_json(data)
         except BridgeError as error:
             return PlanAnswer(reason=f"no planner answers on {self._key}: {error}", heard=False)
+        try:
+            return PlanAnswer.from_json(data)
+        except BridgeError as error:
+            reason = f"no planner answers on {self._key} with a plan or a reason: {error}"
+            return PlanAnswer(reason=reason, heard=False)
 
 
 @dataclass(frozen=True, kw_only=True)
