@@ -52,6 +52,8 @@ TASKS = (
 CELL, WIRE = "lab_mixed", "lab"
 FIRST, PER_TASK, DEVELOPMENT = 8200, 50, 1_000_200
 LEARNED, JUDGED = 4, 12
+PLANNED, PAIRS = 28, 400
+"""Sessions, and pairs of a good and a bad plan: with fewer a result is interim."""
 SAMPLES, DRAWS = 16, 32
 RATE_HZ = 1.0
 RESAMPLES = 2_000
@@ -212,11 +214,13 @@ def statistics(found: dict[str, np.ndarray], picked: np.ndarray) -> dict[str, fl
 
 
 def with_intervals(sessions: Sequence[Session]) -> dict[str, dict[str, float]]:
-    """Every statistic with the 95 % percentile interval of sessions resampled within tasks."""
+    """Every statistic with its 95 % interval: sessions resampled, within tasks that have more."""
     found, rng, table = columns(sessions), np.random.default_rng(0), {}
     strata = [[k for k, each in enumerate(sessions) if each["task"] == task] for task in TASKS]
+    if min(map(len, strata)) < 2:  # one alone would not vary
+        strata = [[*range(len(sessions))]]
     drawn = [
-        statistics(found, np.concatenate([rng.choice(each, len(each)) for each in strata if each]))
+        statistics(found, np.concatenate([rng.choice(each, len(each)) for each in strata]))
         for _ in range(RESAMPLES)
     ]
     for name, value in statistics(found, np.arange(len(sessions))).items():
@@ -261,11 +265,10 @@ def main() -> None:
     for name, value in table.items():
         print(f"{name:<40} {value['value']:6.2f} [{value['low']:.2f}, {value['high']:.2f}]")
     seen = columns(found)
-    of_session = [seen["of"] == k for k in range(len(found))]
-    num_pairs = sum(ranked(seen["success"][k], seen["rule"][k])[1] for k in of_session)
-    note = (
-        f"stand-in cell {CELL}, {len(found)} sessions, {len(seen['of'])} plans, {num_pairs} pairs"
-    )
+    of = [seen["of"] == k for k in range(len(found))]
+    num_pairs = sum(ranked(seen["success"][k], seen["rule"][k])[1] for k in of)
+    interim = ": interim" * (len(found) < PLANNED or num_pairs < PAIRS)
+    note = f"{CELL}, {len(found)} sessions, {len(seen['of'])} plans, {num_pairs} pairs{interim}"
     if given.development:
         print(f"{note}, development seeds")
         print_targets(targets(table))
