@@ -79,7 +79,7 @@ def propose(path: Path) -> tuple[Robot, list[str]]:
         raise UsageError(f"{path} has {len(joints)} joints; up to {MOST_JOINTS} are looked at.")
     arm, notes = _arm(joints, path)
     below = _below(arm[-1].child, joints)
-    gripper, told = _gripper([joint for joint in below if joint.kind != "fixed"])
+    gripper, told = _gripper([each for each in below if each.kind not in ("fixed", "continuous")])
     driven = {joint.name for joint in arm} | {finger.joint for finger in gripper.fingers}
     tool_frame, unsure = _tool(arm[-1].child, below, gripper)
     base_frame, carriers = _root(arm, joints)

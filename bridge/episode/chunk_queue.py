@@ -1,7 +1,8 @@
 """Chunks of a live recording on their way to the disk.
 
-A thread of its own writes them, so that nobody waits for the disk. Small messages never wait behind
-more than one write of images: their chunks go first.
+A thread of its own writes them, so that nobody waits for the disk. Each write takes all chunks of
+small messages and then one of images, so that small messages wait for one write and their own. What
+the disk refused it may take without the images.
 """
 
 import threading
@@ -106,35 +107,33 @@ class ChunkQueue:
         return 0.0 if since_s is None else self._monotonic() - since_s
 
     def _work(self) -> None:
-        turn_of_bulk = False
+        error = None
         while True:
             with self._changed:
                 while not self._is_ending and (self._is_held or not (self._small or self._bulk)):
                     self._changed.wait(LOOK_S)
                 if self._is_ending:
                     break
-                small = [] if turn_of_bulk and self._bulk else [each.chunk for each in self._small]
-                turn_of_bulk = bool(small)
-                chunks = small or [self._bulk[0]]
+                small = [each.chunk for each in self._small]
+                bulk = [self._bulk[0]] if self._bulk and not (small and error) else []
                 self._busy_since_s = self._monotonic()
             error = None
             try:
-                self._section.add_chunks(chunks)
+                self._section.add_chunks(small + bulk)
             except OSError as found:
                 error = found
             with self._changed:
                 self._busy_since_s = None
                 self._error, self._is_held = error, error is not None
                 if error is None:
-                    self._forget(len(chunks), is_small=bool(small))
+                    self._forget(len(small), len(bulk))
                 self._changed.notify_all()
 
-    def _forget(self, count: int, *, is_small: bool) -> None:
-        for _ in range(count):
-            if is_small:
-                self.small_bytes -= _size(self._small.popleft().chunk)
-            else:
-                self.bulk_bytes -= _size(self._bulk.popleft())
+    def _forget(self, num_small: int, num_bulk: int) -> None:
+        for _ in range(num_small):
+            self.small_bytes -= _size(self._small.popleft().chunk)
+        for _ in range(num_bulk):
+            self.bulk_bytes -= _size(self._bulk.popleft())
 
     def end(self) -> None:
         """End the thread after the write under way; what still waits is given up."""

@@ -226,8 +226,9 @@ class Robot:
                     if lost is not None:
                         resolve_mesh(found)
                 except UsageError as error:
-                    missing.append(f"the link {link.get('name')!r}: {error}")
-                    link.remove(shape)
+                    if shape.tag != "visual":  # nothing here is drawn from those
+                        missing.append(f"the link {link.get('name')!r}: {error}")
+                        link.remove(shape)
         if missing and lost is None:
             raise UsageError(" ".join(missing))
         return root

@@ -128,12 +128,7 @@ class WireSample:
     """Size of a payload beyond the subscription's limit; then ``data`` is empty, not a copy."""
 
 
-def copy_sample(
-    sample: Any,
-    received_ns: int,
-    *,
-    max_bytes: int = sys.maxsize,
-) -> WireSample:
+def copy_sample(sample: Any, received_ns: int, *, max_bytes: int = sys.maxsize) -> WireSample:
     """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory."""
     size = len(sample.payload)
     is_oversize = size > max_bytes

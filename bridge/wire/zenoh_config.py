@@ -30,8 +30,8 @@ _QUOTED_VALUE = re.compile(r"(invalid (?:type|value): [a-z ]+?) (?:\".*\"|`[^`]*
 _WRONG_SYNTAX = re.compile(
     r"--> (?P<line>\d+):(?P<column>\d+).*\n\s*= (?P<message>.*?)(?: at /|$)", re.DOTALL
 )
-_QUEUE, _QUEUE_SIZE = "transport/link/tx/queue/size/real_time", 16
-"""Room for about 1 MB of joints (5 s at 500 Hz) while a receiver hangs, before any is dropped."""
+_QUEUES, _QUEUE_SIZE = "transport/link/tx/queue/size", 16
+"""Room for 1 MB: 5 s of joints at 500 Hz, or a whole image while zenoh's own thread is asleep."""
 
 
 def zenoh_config(config: WireConfig) -> Any:
@@ -47,8 +47,8 @@ def zenoh_config(config: WireConfig) -> Any:
         "scouting/delay": 0,  # there is nobody to wait for without scouting
     }
     made = zenoh.Config() if config.config is None else _config_from_file(config)
-    if made.get_json(_QUEUE) == zenoh.Config().get_json(_QUEUE):  # the file is silent
-        settings[_QUEUE] = _QUEUE_SIZE
+    if made.get_json(_QUEUES) == zenoh.Config().get_json(_QUEUES):  # the file is silent
+        settings |= {f"{_QUEUES}/{name}": _QUEUE_SIZE for name in ("real_time", "data_low")}
     for key, value in settings.items():
         try:
             made.insert_json5(key, json.dumps(value))

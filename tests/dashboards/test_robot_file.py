@@ -105,6 +105,13 @@ def test_jaws_that_slide_open_by_the_sum_of_their_ways(tmp_path: Path, mimic: bo
     assert robot.held == ()
 
 
+def test_a_horn_that_spins_beside_the_jaws_is_held(tmp_path: Path) -> None:
+    horn = joint("gripper", "continuous", "arm_5", "horn") + link("horn")
+    robot, _ = propose(written(tmp_path, chain("arm", 6, "base") + horn + jaws("arm_5")))
+    assert [finger.joint for finger in robot.gripper.fingers] == ["jaw_a", "jaw_b"]
+    assert (len(robot.joints), robot.held) == (6, ("gripper",))
+
+
 def test_a_hand_whose_width_nobody_gives_is_held_and_said_to_be(tmp_path: Path) -> None:
     turning = joint("finger_joint", "revolute", "arm_5", "finger") + link("finger")
     robot, notes = propose(written(tmp_path, chain("arm", 6, "base") + turning))

@@ -1,11 +1,12 @@
 """Settings of ``calibrate``; imports nothing heavy, so that --help is quick."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
+from bridge.terminal import RARE
 
 Mount = Literal["auto", "hand", "fixed"]
 
@@ -23,7 +24,7 @@ class CalibrateConfig:
     posterior: bool = False
     """Which friction, masses, force and common shift agree with the trials executed in this run,
     written to RUN/scene/calibration.json; samples of replays and of the gate then draw from it."""
-    draws: int = 64
+    draws: Annotated[int, RARE] = 64
     """With --posterior: draws from the priors, each replayed through every trial."""
     camera: str = ""
     """Only this camera."""
@@ -32,11 +33,10 @@ class CalibrateConfig:
     whichever explains the pairs."""
     link: str = ""
     """Link that carries camera or target: tool0, or where there is none the robot's tool frame."""
-    seed: int = 0
+    seed: Annotated[int, RARE] = 0
     """Of the resampling behind the intervals."""
     workers: int | None = None
-    """With --physics and --posterior: processes that simulate side by side; one for each core, at
-    most 8, when no number is given."""
+    """With --physics and --posterior: processes side by side; none: one a core, at most 8."""
 
     def __post_init__(self) -> None:
         """Refuse numbers with which nothing can be found."""

@@ -44,7 +44,7 @@ class GateConfig:
     min_p_success: float = 0.0
     """Refuse a plan that the nominal replay accepts when fewer of its samples succeed, as a
     fraction; 0 leaves the nominal replay alone to decide."""
-    frame_wait_s: float = 10.0
+    frame_wait_s: Annotated[float, RARE] = 10.0
     """Wait this long for fresh frames before giving up."""
     replay: Annotated[ReplayConfig, Parameter(name="replay"), RARE] = field(
         default_factory=ReplayConfig

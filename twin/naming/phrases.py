@@ -13,6 +13,7 @@ from twin.naming.things import NAMED, Instance, SemanticScene, SemanticsError
 from twin.naming.words import (
     ALONE,
     ANY_THING,
+    SHAPE_WORDS,
     SIZES,
     colour_of,
     known_words,
@@ -32,8 +33,9 @@ NEARLY = 0.7
 """Score of a thing whose colour only nearly has that name."""
 SAYS_YES = 0.5
 """Activation from which a model means a thing."""
-CUPS, CUP_M = ("mug", "cup"), (0.07, 0.17)
-"""And their longest extents."""
+CUPS = ("mug", "cup")
+CUP_M, BOX_M = (0.07, 0.17), (0.2, 0.5)
+"""Longest extents of what may be a cup, or a box, where noisy depth hides its shape."""
 PLACES = {"left": (0, 1), "leftmost": (0, 1), "right": (0, -1), "rightmost": (0, -1),
           "front": (2, 1), "nearest": (2, 1), "back": (2, -1), "rear": (2, -1)}  # fmt: skip
 """Words for the first along an axis of the camera."""
@@ -175,8 +177,9 @@ class Asker:
         own = [item for item in items if nouns <= set(words_of(item.label))]
         named = [item for item in own if item.source == NAMED]
         shaped = [item for item in items if nouns <= names_of(item.label)]
-        cups = [item for item in items if nouns <= set(CUPS) and _is_cup_sized(item)]
-        return [named, own, shaped, cups] if nouns else [shaped]
+        sure = [item for item in shaped if _names_by_size(item) != CUPS]
+        unsure = [item for item in items if nouns <= set(_names_by_size(item))]
+        return [named, own, sure, unsure, shaped] if nouns else [shaped]
 
     def _has_size(self, item: Instance, word: str, pool: Sequence[Instance]) -> bool:
         """Sizes compare with others of that name, or else with all; "open" and "flat" with it."""
@@ -219,11 +222,14 @@ class Asker:
         return over and bool(-half[2] - TOUCH_M < bottom_m < half[2] - TOUCH_M)
 
 
-def _is_cup_sized(item: Instance) -> bool:
-    """A box or less of this size, as noisy depth shows it, may be a cup."""
+def _names_by_size(item: Instance) -> tuple[str, ...]:
+    """What a box or less, as noisy depth shows it, may be besides."""
     short, long = min(item.size_m), max(item.size_m)
-    is_unsure = item.source != NAMED and words_of(item.label)[-1] in ("box", "block", "thing")
-    return is_unsure and CUP_M[0] < long < CUP_M[1] and short > 0.6 * long
+    if item.source == NAMED or words_of(item.label)[-1] not in ("box", "block", "thing"):
+        return ()
+    if CUP_M[0] < long < CUP_M[1] and short > 0.6 * long:
+        return CUPS
+    return SHAPE_WORDS["block"] if BOX_M[0] < long < BOX_M[1] and short > 0.25 * long else ()
 
 
 def _is_plural(text: str) -> bool:

@@ -124,18 +124,10 @@ def known_words() -> set[str]:
 
 def kind_of(label: str) -> str:
     """Which parts to look for: "container", "animal" or "other"."""
-    shape, words = shape_in(label), words_of(label)
-    if shape == "open container" or (
-        shape is None and _any_of(words, SHAPE_WORDS["open container"])
-    ):
+    shape, words = shape_in(label), set(words_of(label))
+    if shape == "open container" or (shape is None and words & set(SHAPE_WORDS["open container"])):
         return "container"
-    if shape is None and _any_of(words, ANIMALS):
-        return "animal"
-    return "other"
-
-
-def _any_of(words: list[str], names: tuple[str, ...]) -> bool:
-    return any(word in names for word in words)
+    return "animal" if shape is None and words & set(ANIMALS) else "other"
 
 
 def label_of(key: str, colour: str, *, is_open: bool, shape: str = "") -> str:

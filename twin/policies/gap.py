@@ -2,7 +2,8 @@
 
 A policy that acts otherwise because it sees something else is no judge of the twin's physics. The
 yardstick is the policy itself: how much its answer changes from one recorded picture to the next,
-and when it is asked the same thing twice.
+and when it is asked the same thing twice. States are the same until the fingers first close: what
+they have touched may then lie elsewhere than the twin draws it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,8 +27,8 @@ from twin.scene.standpoint import poses_in_scene
 from twin.scene.store.folder import read_scene
 from twin.scene.trial import open_trial
 
-INSTANTS = 12
-"""So many states of a trial are looked at."""
+INSTANTS, CLOSES_M = 12, 0.001
+"""So many states of a trial are looked at; fingers that close by less have touched nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,18 +93,19 @@ def visual_gap(
 def recorded_states(
     run: RunFolder, episode: Episode, names: Sequence[str], instants: int
 ) -> Iterator[State]:
-    """Instants of a trial, spread over it, as cameras saw them and as the twin draws them."""
+    """Instants of a trial until its fingers close, as cameras saw them and as the twin draws."""
     scene = read_scene(run)
     trial = open_trial(run, scene, episode)
     pictures = {name: list(streams.color_images(episode, name)) for name in names}
     if trial.postures is None or not all(len(items) > 1 for items in pictures.values()):
         return
-    clock = [item.stamp_ns for item in pictures[names[0]][:-1]]
-    seen = [t for t in clock if trial.postures.covers(t)]
+    seen = [t.stamp_ns for t in pictures[names[0]][:-1] if trial.postures.covers(t.stamp_ns)]
+    widths_m = np.array([trial.postures.at(t).width_m for t in seen])
+    seen = seen[: int((np.maximum.accumulate(widths_m) - widths_m < CLOSES_M).cumprod().sum())]
     if not seen:
         return
     chosen = np.unique(np.linspace(0, len(seen) - 1, instants).round().astype(int))
-    cameras = {name: streams.camera_info(episode, name).camera for name in names}
+    cameras = {name: streams.camera_info(episode, name) for name in names}
     rasteriser = open_rasteriser()
     stamps = np.array([seen[k] for k in chosen], dtype=np.int64)
     trees = {name: poses_in_scene(run, scene, episode, name, stamps) for name in names}
@@ -112,7 +114,7 @@ def recorded_states(
         frames = {
             name: Frame(
                 stamp_ns=stamp_ns,
-                T_base_camera=tree.T_root_frame(_frame_id(episode, name), stamp_ns),
+                T_base_camera=tree.T_root_frame(cameras[name].frame_id, stamp_ns),
                 Ts_base_object=places,
                 posture=posture,
                 urdf=trial.postures.urdf,
@@ -128,14 +130,10 @@ def recorded_states(
             recorded={name: pictures[name][k].image_u8() for name, k in near.items()},
             following={name: pictures[name][k + 1].image_u8() for name, k in near.items()},
             rendered={
-                name: trial.parts.drawn_as(rasteriser, cameras[name], frame).image_u8
+                name: trial.parts.drawn_as(rasteriser, cameras[name].camera, frame).image_u8
                 for name, frame in frames.items()
             },
         )
-
-
-def _frame_id(episode: Episode, camera_id: str) -> str:
-    return streams.camera_info(episode, camera_id).frame_id
 
 
 def describe_gap(gap: Mapping[str, Any]) -> list[str]:
@@ -151,7 +149,8 @@ def describe_gap(gap: Mapping[str, Any]) -> list[str]:
     if "lit" in rendered:
         alone += f"; in the light of other trials {rendered['lit']:.3g}"
     return [
-        f"visual gap: the twin's pictures of {gap['instants']} states of {gap['episode']} change "
-        f"its actions by {rendered['all']:.3g} (rms; {alone}); the next recorded picture does by "
-        f"{gap['following']:.3g}, asking again by {gap['again']:.3g}{times}"
+        f"visual gap, until the fingers close: the twin's pictures of {gap['instants']} states of "
+        f"{gap['episode']} change its actions by {rendered['all']:.3g} (rms; {alone}); the next "
+        f"recorded picture does by {gap['following']:.3g}, asking again by {gap['again']:.3g}"
+        f"{times}"
     ]

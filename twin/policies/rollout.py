@@ -31,7 +31,7 @@ from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.result import ReplayResult
 from twin.replay.run_job import cell_of
 
-ROLLOUT_VERSION = 3
+ROLLOUT_VERSION = 4
 """Raise it when the same inputs give another rollout, so that old files are redone."""
 LOOK_S = 0.5
 """How often it is asked whether the task is done."""

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from bridge.episode import streams
 from bridge.episode.catalogue import find_episodes
 from bridge.episode.catalogue_query import CatalogueQuery
+from bridge.episode.executions import EXECUTION, executed_events
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -24,7 +25,6 @@ from twin.replay.run_job import recorded_start
 from twin.replay.scene import ReplayScene, localised_starts
 from twin.robot.model import load_robot
 from twin.robot.posture import width_track
-from twin.scene.localise.episode import first_execution_ns
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import scene_hash_of
 
@@ -76,8 +76,8 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
     if urdf is None:
         raise PolicyError(f"{episode.path}: nobody recorded which robot it is (robot_description)")
     task = streams.task_file(episode).task()
-    begun_ns = first_execution_ns(episode)
-    stamp_ns = begun_ns or streams.first_stamp_ns(episode) or episode.start_ns
+    begun_ns = [int(e["stamp_ns"]) for e in executed_events(episode) if e["type"] == EXECUTION[0]]
+    stamp_ns = min(begun_ns, default=streams.first_stamp_ns(episode) or episode.start_ns)
     found = localised_starts(run, episode, task, scene_hash=scene_hash_of(run)).at(0)  # at first
     scene = replace(
         read_rebuilt_scene(run, task),

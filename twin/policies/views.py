@@ -23,7 +23,7 @@ from twin.robot.posture import Posture
 from twin.scene.backdrop import Backdrop
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
 from twin.scene.gaussians import GaussianCloud, concatenate
-from twin.scene.objects.decompose import covered, without
+from twin.scene.objects.decompose import covered, lowered, without
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.raster.rasteriser import Rasteriser, View
 from twin.scene.standpoint import sized_camera
@@ -178,7 +178,7 @@ class TwinCameras:
         if parts.links:
             posture = Posture(joints_rad=sight.joints_rad, width_m=sight.width_m)
             over.append(parts.robot_at(posture, self._drawable.urdf))
-        hidden = self._covered(moving, places, nodes) & ~rest.covered
+        hidden = self._covered(moving, places, nodes)[0] & ~rest.covered
         padded = np.zeros(len(rest.cloud), dtype=bool)
         padded[: len(hidden)] = hidden
         covered, T_base_tcp = padded if hidden.any() else None, robot.T_base_tcp(sight.joints_rad)
@@ -196,10 +196,10 @@ class TwinCameras:
         parts = self._drawable.parts
         resting = frozenset(name for name in parts.objects if keys.get(name) == last.get(name))
         if self._resting is None or self._resting.objects != resting:
-            covered = self._covered(resting, places, nodes)
+            hidden, beside = self._covered(resting, places, nodes)
             clouds = [self._object_at(n, places, nodes) for n in parts.objects if n in resting]
-            cloud = concatenate([without(parts.background, covered), *clouds])
-            self._resting = Resting(cloud=cloud, objects=resting, covered=covered)
+            cloud = concatenate([lowered(without(parts.background, hidden), beside), *clouds])
+            self._resting = Resting(cloud=cloud, objects=resting, covered=hidden)
         return self._resting
 
     def _object_at(self, name: str, places: Places, nodes: Nodes) -> GaussianCloud:
@@ -209,8 +209,8 @@ class TwinCameras:
 
     def _covered(
         self, names: Iterable[str], places: Places, nodes: Nodes
-    ) -> Bool[np.ndarray, " num_splats"]:
-        """Background that some of the objects cover; soft ones cover none."""
+    ) -> Bool[np.ndarray, "2 num_splats"]:
+        """Background that some of the objects cover, or beside them; soft ones cover none."""
         parts = self._drawable.parts
         rigid = [n for n in names if n not in self._drawable.bindings or n not in nodes]
         where = {name: places.get(name, parts.objects[name].T_base_object) for name in rigid}

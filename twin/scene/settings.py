@@ -94,7 +94,7 @@ class FitConfig:
     """Fit exactly this many images: the result is then reproducible, on slow machines too."""
     seed: int = 0
     """Order of the frames, and nothing else: the rest leaves nothing to chance."""
-    threads: int = 0
+    threads: Annotated[int, RARE] = 0
     """0: all cores. The result does not depend on it."""
 
     def __post_init__(self) -> None:

@@ -44,7 +44,7 @@ def queue() -> Any:
     made.end()
 
 
-def test_small_messages_wait_behind_one_write_of_images_at_most(queue: Any) -> None:
+def test_small_messages_wait_for_the_write_under_way_alone(queue: Any) -> None:
     disk, made = queue
     made.add(chunk("image 1"), is_small=False, since_s=0.0)
     assert disk.begun.acquire(timeout=10.0)
@@ -54,9 +54,16 @@ def test_small_messages_wait_behind_one_write_of_images_at_most(queue: Any) -> N
         made.add(chunk(name), is_small=True, since_s=1.0)
     assert made.oldest_s() == 1.0
     assert (made.small_bytes, made.bulk_bytes) == (200, 300)
+    disk.let_go.release()
+    assert disk.begun.acquire(timeout=10.0)
+    made.add(chunk("joints 3"), is_small=True, since_s=2.0)
     disk.let_go.release(9)
     made.drain()
-    assert disk.written == [["image 1"], ["joints 1", "joints 2"], ["image 2"], ["image 3"]]
+    assert disk.written == [
+        ["image 1"],
+        ["joints 1", "joints 2", "image 2"],
+        ["joints 3", "image 3"],
+    ]
     assert (made.small_bytes, made.bulk_bytes, made.oldest_s()) == (0, 0, None)
 
 
@@ -72,3 +79,19 @@ def test_what_the_disk_refused_is_told_once_kept_and_tried_again(queue: Any) -> 
     disk.let_go.release()
     made.drain()
     assert disk.written == [["joints"]]
+
+
+def test_small_messages_are_saved_where_the_disk_has_no_room_for_an_image(queue: Any) -> None:
+    disk, made = queue
+    disk.error = OSError("full")
+    made.add(chunk("joints 1"), is_small=True, since_s=0.0)
+    assert disk.begun.acquire(timeout=10.0)
+    made.add(chunk("joints 2"), is_small=True, since_s=0.0)
+    made.add(chunk("image"), is_small=False, since_s=0.0)
+    disk.let_go.release()
+    with pytest.raises(OSError, match="full"):
+        made.drain()
+    disk.error = None
+    disk.let_go.release(9)
+    made.drain()
+    assert disk.written == [["joints 1", "joints 2"], ["image"]]

@@ -112,8 +112,10 @@ def test_meshes_are_found_beside_the_urdf_and_in_named_folders(tmp_path: Path) -
     assert f'filename="{tmp_path}/meshes/flange.stl"' in named
     beside = URDF.replace("package://mine", "meshes")
     assert f'filename="{tmp_path}/meshes/flange.stl"' in read(tmp_path, ARM, beside).urdf_text()
+    gone = beside.replace("flange.stl", "gone.stl")
+    assert 'filename="meshes/gone.stl"' in read(tmp_path, ARM, gone).urdf_text(), "not needed"
     with pytest.raises(UsageError, match=r"gone\.stl.* is not there"):
-        read(tmp_path, ARM, beside.replace("flange.stl", "gone.stl")).urdf_text()
+        read(tmp_path, ARM, gone.replace("visual", "collision")).urdf_text()
 
 
 def test_a_tool_that_hangs_on_nothing_is_refused_with_the_links_there_are(tmp_path: Path) -> None:

@@ -210,6 +210,23 @@ def test_a_configuration_file_is_not_quoted(tmp_path: Path, text: str, match: st
     assert "31337" not in everything_said(caught.value)
 
 
+def test_queues_hold_an_image_unless_the_file_says_otherwise(tmp_path: Path) -> None:
+    from bridge.wire.zenoh_config import zenoh, zenoh_config
+
+    def room_bytes(config: WireConfig, name: str) -> int:
+        made = zenoh_config(config)
+        batch_bytes = int(made.get_json("transport/link/tx/batch_size"))
+        return batch_bytes * int(made.get_json(f"transport/link/tx/queue/size/{name}"))
+
+    for name in (Qos.CONTROL.priority, Qos.CAMERA.priority):
+        assert room_bytes(WireConfig(), name) > 480 * 640 * 3 + 1000
+    path = tmp_path / "zenoh.json5"
+    path.write_text("{transport: {link: {tx: {queue: {size: {data_low: 3}}}}}}")
+    assert room_bytes(WireConfig(config=path), "data_low") == 3 * 65_535
+    usual = zenoh.Config().get_json("transport/link/tx/queue/size/real_time")
+    assert room_bytes(WireConfig(config=path), "real_time") == int(usual) * 65_535
+
+
 def test_settings_of_an_endpoint_are_not_shown(
     router: WireSession, endpoint: str, tmp_path: Path
 ) -> None:

@@ -54,18 +54,16 @@ def raising(observation: dict[str, Any]) -> np.ndarray:
     raise KeyError("wrist")
 
 
-def nodding(observation: dict[str, Any]) -> np.ndarray:
+def nodding(observation: dict[str, Any], joint: int = 0) -> np.ndarray:
     """Turns the whole arm slowly."""
     rows = np.repeat(np.array(observation["agent_pos"], dtype=np.float64)[None], 10, axis=0)
-    rows[:, 0] += 0.03 * np.arange(1, 11)
+    rows[:, joint] += 0.03 * np.arange(1, 11)
     return rows
 
 
 def pressing(observation: dict[str, Any]) -> np.ndarray:
     """Brings the arm down, through the table."""
-    rows = np.repeat(np.array(observation["agent_pos"], dtype=np.float64)[None], 10, axis=0)
-    rows[:, 1] += 0.03 * np.arange(1, 11)
-    return rows
+    return nodding(observation, joint=1)
 
 
 def nodding_until_it_turned(observation: dict[str, Any]) -> Any:

@@ -63,6 +63,27 @@ def test_the_tool_starts_and_stops_gently_and_goes_as_far_as_the_keys_say(tmp_pa
     np.testing.assert_allclose(speed[38, :2], 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("key", "back", "entry"),
+    [
+        ("w", "s", 0),
+        ("a", "d", 1),
+        ("r", "f", 2),
+        ("right", "left", 3),
+        ("up", "down", 4),
+        ("q", "e", 5),
+    ],
+)
+def test_each_key_moves_one_way_and_another_one_back(
+    tmp_path: Path, key: str, back: str, entry: int
+) -> None:
+    there = rows(key_file(tmp_path, f"{key} 1\nwait 0.6\n")).sum(axis=0)[:6]
+    home = rows(key_file(tmp_path, f"{back} 1\nwait 0.6\n")).sum(axis=0)[:6]
+    assert there[entry] > 0
+    assert not np.delete(there, entry).any()
+    np.testing.assert_allclose(home, -there)
+
+
 def test_each_press_turns_the_gripper_round(tmp_path: Path) -> None:
     widths = rows(key_file(tmp_path, "wait 0.2\nspace 1\nwait 0.2\nspace\nwait 1.5\n"))[:, 6]
     assert widths[2] == 0.08  # as it was

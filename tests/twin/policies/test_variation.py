@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawn_run import T0
 from test_rollouts import QUIET, config
 
 from bridge.episode.reader import Episode
@@ -15,7 +16,7 @@ from bridge.geometry import se3
 from twin.policies import colours
 from twin.policies.cell import TwinCell
 from twin.policies.colours import gains_of
-from twin.policies.gap import State, describe_gap, visual_gap
+from twin.policies.gap import State, describe_gap, recorded_states, visual_gap
 from twin.policies.mapping import DEFAULT, Interpreter
 from twin.policies.policy import open_policy
 from twin.policies.runs import TABLE, describe_rollouts, roll_out_run
@@ -23,7 +24,7 @@ from twin.policies.starts import Start, open_start, trial_episodes
 from twin.policies.variation import draw, effects, read_quantities, varied_start
 from twin.policies.views import Gains, TwinCameras, lit
 from twin.robot.model import load_robot
-from twin.robot.posture import Posture
+from twin.robot.posture import Posture, PostureTrack
 from twin.scene.render import render
 from twin.scene.settings import RenderConfig
 
@@ -86,6 +87,14 @@ def test_cameras_turn_about_themselves_and_light_scales_pictures(run: RunFolder)
     for name, picture in bright.items():
         assert picture.max() > 100
         np.testing.assert_allclose(dim[name], picture / 2, atol=0.51)
+
+
+def test_a_rollout_begins_when_its_trial_moved(run: RunFolder) -> None:
+    """Not before: pictures are as old as they were then."""
+    start = open_start(run, trial_episodes(run, "")[0])
+    assert T0 <= start.stamp_ns <= T0 + 200_000_000  # it moves from its first joint state on
+    shutters = TwinCameras(run, start).shutters.values()
+    assert {shutter.first_ns for shutter in shutters} == {T0 - start.stamp_ns}
 
 
 def rows_where(is_failure: np.ndarray, amounts: np.ndarray) -> list[dict[str, Any]]:
@@ -255,6 +264,19 @@ def test_brightness_is_what_it_goes_by(run: RunFolder) -> None:
     text = describe_gap(found)[0]
     assert f"by {rms['all']:.3g}"[:6] in text
     assert "10 states of trial_1" in text
+
+
+def test_states_end_where_the_fingers_close(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def closing(track: PostureTrack, stamp_ns: int) -> Posture:
+        joints_rad = at(track, stamp_ns).joints_rad
+        return Posture(joints_rad=joints_rad, width_m=0.05 - 0.01 * (stamp_ns > T0 + 700_000_000))
+
+    at = PostureTrack.at
+    monkeypatch.setattr(PostureTrack, "at", closing)
+    states = recorded_states(run, trial_episodes(run, "")[0], CAMERAS, 20)  # pictures every 0.2 s
+    assert [state.posture.width_m for state in states] == [0.05] * 4
 
 
 def mean_of(run: RunFolder, name: str) -> float:

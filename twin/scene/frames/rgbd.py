@@ -268,7 +268,8 @@ def training_view(surface: FrameSurface) -> TrainingView:
     """Prepare one frame; the half-size image is the mean of 2 x 2 pixels."""
     frame = surface.frame
     depth_m = surface.depth_in_color_camera()
-    half = _halved_camera(frame.color_camera)
+    width, height = (side + side % 2 for side in frame.image_u8.shape[1::-1])
+    half = replace(frame.color_camera, width=width, height=height).scaled(0.5)  # whole blocks
     total = _blocks(frame.image_u8, half).sum(axis=(1, 3), dtype=np.uint16)
     return TrainingView(
         camera_id=frame.camera_id,
@@ -283,12 +284,6 @@ def _target(camera: Camera, image_u8: np.ndarray, depth_m: np.ndarray) -> Target
     planes = np.ascontiguousarray(np.moveaxis(image_u8, -1, 0), dtype=np.uint8)
     everywhere = np.ones(depth_m.shape, dtype=bool)
     return Target(camera=camera, planes_u8=planes, depth_m=depth_m, static_mask=everywhere)
-
-
-def _halved_camera(camera: Camera) -> Camera:
-    """The camera whose pixels are blocks of 2 x 2, exactly: an odd edge makes a whole block."""
-    width, height = camera.width + camera.width % 2, camera.height + camera.height % 2
-    return replace(camera, width=width, height=height).scaled(0.5)
 
 
 def _blocks(rows: np.ndarray, camera: Camera) -> np.ndarray:

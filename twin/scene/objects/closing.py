@@ -62,7 +62,9 @@ def closed_object(
     looks = [look for look in looks if look.shown.any()]
     if not looks:
         return None
-    spacing_m = _spacing_m(mesh, looks)
+    near_m = [float(np.median(look.expected_m[look.shown])) / look.camera.fx for look in looks]
+    finest_m = max(FOOTPRINTS * float(np.quantile(near_m, NEAREST_SHARE)), LEAST_SPACING_M)
+    spacing_m = max(finest_m, float(np.sqrt(surface_area_m2([mesh]) / MOST_SPLATS)))
     p, normals = even_points([mesh], spacing_m)
     p = within_edges(p, normals, [mesh], spacing_m)
     colors, weights = (
@@ -162,13 +164,6 @@ def _trust(
     around = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=bool)
     trust = np.where(ndimage.binary_dilation(bends, around), NEAR_BEND, 1.0)
     return np.where(ndimage.binary_dilation(beside, around), NEAR_OUTLINE, trust)
-
-
-def _spacing_m(mesh: Mesh, looks: Sequence[_Look]) -> float:
-    """As fine as the views that come nearest resolve, and not too many."""
-    footprints = [float(np.median(look.expected_m[look.shown])) / look.camera.fx for look in looks]
-    fine_m = FOOTPRINTS * float(np.quantile(footprints, NEAREST_SHARE))
-    return max(fine_m, LEAST_SPACING_M, float(np.sqrt(surface_area_m2([mesh]) / MOST_SPLATS)))
 
 
 def weighted_median(

@@ -90,6 +90,8 @@ def fill_footprint(
 
 UNDER_M = 0.008
 """Background this far below an object is covered by it."""
+BESIDE_M, LOWERED_M = 0.02, 0.002
+"""Table this near to an object is drawn so far below z = 0."""
 TRANSPARENT_LOGIT = -30.0
 OBJECT_VERSION = 4
 
@@ -110,8 +112,16 @@ def uncovered(
     objects: Mapping[str, ObjectSplats],
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
 ) -> GaussianCloud:
-    """The background, transparent where closed objects stand in it or on it."""
-    return without(background, covered(background, objects, Ts_base_object))
+    """The background, transparent where closed objects stand in or on it, lowered beside them."""
+    hidden, beside = covered(background, objects, Ts_base_object)
+    return lowered(without(background, hidden), beside)
+
+
+def lowered(cloud: GaussianCloud, beside: Bool[np.ndarray, " num_splats"]) -> GaussianCloud:
+    """Some of a table's Gaussians below it: as measured they would be drawn over objects' feet."""
+    means = cloud.means_m.copy()
+    means[beside, 2] = np.minimum(means[beside, 2], -LOWERED_M)
+    return replace(cloud, means_m=means)
 
 
 def without(cloud: GaussianCloud, hidden: Bool[np.ndarray, " num_splats"]) -> GaussianCloud:
@@ -124,23 +134,24 @@ def covered(
     background: GaussianCloud,
     objects: Mapping[str, ObjectSplats],
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
-) -> Bool[np.ndarray, " num_splats"]:
-    """Which Gaussians of the background lie in a closed object, or just under it."""
-    means, found = background.means_m, np.zeros(len(background), dtype=bool)
+) -> Bool[np.ndarray, "2 num_splats"]:
+    """Which Gaussians lie in a closed object or just under it, and which of the table beside it."""
+    means, found = background.means_m, np.zeros((2, len(background)), dtype=bool)
     for name, T in Ts_base_object.items():
         sdf = objects[name].sdf
         if sdf is None:
             continue
-        reach_m = sdf.voxel_m * float(np.linalg.norm(sdf.values_m.shape)) + UNDER_M
+        reach_m = sdf.voxel_m * float(np.linalg.norm(sdf.values_m.shape)) + BESIDE_M
         near = np.ones(len(means), dtype=bool)
         for axis in range(3):
             near &= np.abs(means[:, axis] - np.float32(T[axis, 3])) < reach_m
         ids = np.flatnonzero(near)
-        p = means[ids].astype(np.float64)
-        for up_m in (0.0, UNDER_M / 2, UNDER_M):
-            lifted = se3.apply(se3.invert(T), p + up_m * UP)
-            there = sdf.may_hold(lifted)
-            found[ids[there][sdf.distance(lifted[there]) < 0]] = True
+        p = se3.apply(se3.invert(T), means[ids].astype(np.float64))
+        there = sdf.may_hold(p, BESIDE_M)
+        ids, lifts_m = ids[there], np.multiply.outer((0.0, UNDER_M / 2, UNDER_M), T[2, :3])
+        distance_m = sdf.distance(p[there] + lifts_m[:, None]).min(axis=0)
+        found[0, ids] |= distance_m < 0
+        found[1, ids] |= (distance_m < BESIDE_M) & (np.abs(means[ids, 2]) < TABLE_M)
     return found
 
 
@@ -163,7 +174,16 @@ class LibraryObject:
         place.mkdir(parents=True, exist_ok=True)
         write_ply(place / "gaussians.ply", self.splats.cloud)
         names, geometry = self._write_geometry(place)
-        about = self._record() | geometry
+        about = {
+            "schema_version": OBJECT_VERSION,
+            "id": self.model.id,
+            "scanned_in": self.episode_id,
+            "frame": "all files of this folder are in the object frame",
+            "num_splats": len(self.splats.cloud),
+            "num_completed": int(self.splats.cloud.completed.sum()),
+            "T_base_object": se3.pose_record(self.splats.T_base_object),
+            **geometry,
+        }
         about["files"] = {
             name: provenance.hash_file(place / name) for name in ("gaussians.ply", *names)
         }
@@ -194,18 +214,6 @@ class LibraryObject:
         }
         source = f"{made} {shape.num_views} views"
         return [MESH, SDF], {"shape_source": source, "geometry": geometry}
-
-    def _record(self) -> dict[str, Any]:
-        cloud = self.splats.cloud
-        return {
-            "schema_version": OBJECT_VERSION,
-            "id": self.model.id,
-            "scanned_in": self.episode_id,
-            "frame": "all files of this folder are in the object frame",
-            "num_splats": len(cloud),
-            "num_completed": int(cloud.completed.sum()),
-            "T_base_object": se3.pose_record(self.splats.T_base_object),
-        }
 
 
 @dataclass(frozen=True, kw_only=True)

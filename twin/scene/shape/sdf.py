@@ -11,8 +11,6 @@ from twin.npz import UnreadableArraysError, read_npz, write_npz
 
 MAX_VOXELS = 16_000_000
 """Larger files are refused."""
-NEXT_TO_M = 1e-6
-"""Points this near a grid are looked up in it, on account of rounding."""
 LEVEL_STEPS = 24
 """Halvings on the way to the level that keeps a volume."""
 _NAMES = ("values_m", "origin_m", "voxel_m", "closed")
@@ -43,16 +41,15 @@ class SdfGrid:
         far = np.hypot(np.maximum(value, 0.0), e) if self.closed else value - e
         return np.asarray(np.where(e > 0, far, value).reshape(points_m.shape[:-1]))
 
-    def may_hold(self, points_m: Float[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num"]:
-        """Whether points may be in the solid: those beyond a closed grid are not."""
+    def may_hold(
+        self, points_m: Float[np.ndarray, "num_points 3"], margin_m: float
+    ) -> Bool[np.ndarray, " num_points"]:
+        """Whether points may be so near to the solid; those farther from a closed grid are not."""
         if not self.closed:
             return np.ones(len(points_m), dtype=bool)
-        end = self.origin_m + (np.array(self.values_m.shape) - 1.0) * self.voxel_m
-        found = np.ones(len(points_m), dtype=bool)
-        for axis in range(3):
-            along = points_m[:, axis]
-            found &= (along > self.origin_m[axis] - NEXT_TO_M) & (along < end[axis] + NEXT_TO_M)
-        return found
+        end_m = self.origin_m + (np.array(self.values_m.shape) - 1.0) * self.voxel_m
+        beyond_m = np.maximum(self.origin_m - points_m, points_m - end_m)
+        return np.asarray(beyond_m.max(axis=1, initial=-np.inf) < margin_m)
 
     def save(self, path: Path) -> None:
         """Write an npz file."""

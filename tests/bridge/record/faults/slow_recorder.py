@@ -1,8 +1,9 @@
-"""robot-gst on a slow disk: each write of an episode takes so long."""
+"""robot-gst on a slow disk: each write of an episode takes so long; a file says when it began."""
 
 import os
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import robot_gst
@@ -11,11 +12,15 @@ REAL = os.pwritev
 
 
 def main() -> None:
-    delay_s = float(sys.argv.pop(1))
+    delay_s, path = float(sys.argv.pop(1)), Path(sys.argv.pop(1))
 
     def slow(*arguments: Any) -> int:
+        begun_ns = time.time_ns()
         time.sleep(delay_s)
-        return REAL(*arguments)
+        written = REAL(*arguments)
+        with path.open("a") as begun:
+            begun.write(f"{begun_ns}\n")
+        return written
 
     os.pwritev = slow
     sys.exit(robot_gst.main())

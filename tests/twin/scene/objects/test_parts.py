@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.episode.run_folder import RunFolder
+from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
@@ -68,8 +69,6 @@ def test_putting_together_gives_every_gaussian_back(
 
 
 def test_an_object_name_cannot_leave_the_scene_folder(tmp_path: Path) -> None:
-    from bridge.errors import UsageError
-
     with pytest.raises(UsageError, match="not usable as a file name"):
         read_objects(RunFolder(tmp_path), {"objects": {"../../etc": {}}})
 
@@ -78,7 +77,6 @@ def test_a_table_just_under_a_closed_object_is_not_drawn_and_one_beside_it_is(
     written: tuple[RunFolder, dict, GaussianCloud, np.ndarray],
 ) -> None:
     run, record, background, T = written
-    cube = read_objects(run, record)["cube"]
     centres = np.arange(-0.03, 0.0301, 0.001)
     from_middle = np.abs(np.stack(np.meshgrid(centres, centres, centres, indexing="ij"), axis=-1))
     sdf = SdfGrid(
@@ -86,7 +84,7 @@ def test_a_table_just_under_a_closed_object_is_not_drawn_and_one_beside_it_is(
         origin_m=np.full(3, -0.03),
         voxel_m=0.001,
     )
-    closed = replace(cube, T_base_object=T, sdf=sdf)
+    closed = replace(read_objects(run, record)["cube"], T_base_object=T, sdf=sdf)
     scene = MovableScene(background=background, objects={"cube": closed}, links={})
     p = se3.apply(se3.invert(T), background.means_m.astype(np.float64))
     under = (np.abs(p[:, :2]) < 0.0195).all(axis=1)
@@ -99,6 +97,9 @@ def test_a_table_just_under_a_closed_object_is_not_drawn_and_one_beside_it_is(
     assert hidden[-1]  # 6 mm below the cube
     assert hidden[:-1][under].all()
     np.testing.assert_array_equal(drawn[:-1][beside], before[:-1][beside])
+    z, off_m = scene.at({}).means_m[: len(p), 2], (np.abs(p) - 0.02).max(axis=1)
+    assert (z[off_m < 0.012] <= -0.002).all()  # nothing of it is drawn over the cube's foot
+    np.testing.assert_array_equal(z[off_m > 0.035], background.means_m[off_m > 0.035, 2])
     elsewhere = T.copy()
     elsewhere[:3, 3] += [0.0, 0.2, 0.1]
     np.testing.assert_array_equal(scene.at({"cube": elsewhere}).opacities()[: len(before)], before)
