@@ -200,13 +200,13 @@ def statistics(found: dict[str, np.ndarray], picked: np.ndarray) -> dict[str, fl
     for name in FORECASTS:
         said = found[name]
         above = np.array([ranked(success[each], said[each]) for each in members]).sum(axis=0)
-        values[f"AUC {name}"] = above[0] / above[1] if above[1] else np.nan
+        values[f"AUC {name}"] = float(above[0] / above[1]) if above[1] else np.nan
         values[f"accuracy {name}"] = float(((said > 0.5) == success)[rows].mean())
         values[f"Brier {name}"] = float(np.mean((said - success)[rows] ** 2))
-        shares = [[column[each].mean() for column in (said, success)] for each in members]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            values[f"r of sessions {name}"] = float(np.corrcoef(np.transpose(shares))[0, 1])
     for part in PARTS:
+        shares = [[found[key][each].mean() for key in (part, "success")] for each in members]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            values[f"r of sessions {part}"] = float(np.corrcoef(np.transpose(shares))[0, 1])
         for other, what in product(FORECASTS[len(PARTS) :], ("AUC", "accuracy", "Brier")):
             more = values[f"{what} {part}"] - values[f"{what} {other}"]
             values[f"{what} {part} minus {other}"] = more
