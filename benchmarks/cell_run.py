@@ -79,13 +79,21 @@ class _Topic:
 
 
 def record_ungated(
-    run: RunFolder, task: str, seed: int, trials: int, cell_file: str = ""
+    run: RunFolder,
+    task: str,
+    seed: int,
+    trials: int,
+    cell_file: str = "",
+    session: FileSession | None = None,
+    **settings: Any,
 ) -> list[Path]:
     """Record one session of trials that nobody judges beforehand, unless it is there.
 
     Args:
         run: Where to; one session, one laboratory, one run.
         cell_file: A cell of ``datasets/cells``; empty: the task's own.
+        session: Who writes, where it does more than that.
+        settings: Of the session, where they are not the usual ones.
 
     Returns:
         The episodes, one per trial.
@@ -102,7 +110,8 @@ def record_ungated(
         scan=False,
         trials=trials,
         conditions=(UNGATED,),
+        **settings,
     )
-    session = FileSession(run.episodes_dir)
-    run_session(session, config, Output(quiet=True), start_ns=START_NS)
+    wire = session or FileSession(run.episodes_dir)
+    run_session(wire, config, Output(quiet=True), start_ns=START_NS)
     return paths

@@ -3,7 +3,6 @@
 import json
 import os
 import platform
-import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -42,27 +41,6 @@ def machine() -> dict[str, Any]:
         "python": platform.python_version(),
         "system": platform.platform(),
     }
-
-
-def report(name: str, rows: dict[str, list[float]], *, reference: str, note: str) -> None:
-    """Print medians and ratios to the reference, and store them under benchmarks/results."""
-    medians = {label: statistics.median(times) for label, times in rows.items()}
-    print(f"{name}: {note}")
-    for label, median in medians.items():
-        ratio = medians[reference] / median
-        print(f"  {label:<34} {median * 1e3:9.2f} ms   {ratio:7.2f} x {reference}")
-    record = {
-        "benchmark": name,
-        "note": note,
-        "unit": "CPU seconds",
-        "reference": reference,
-        "medians": medians,
-        "repeats": {label: len(times) for label, times in rows.items()},
-        "all": rows,
-        "machine": machine(),
-        "software": software(),
-    }
-    store(name, record)
 
 
 @dataclass(frozen=True, kw_only=True)

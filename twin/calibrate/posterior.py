@@ -29,7 +29,7 @@ from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success
 from bridge.task.task_file import Task
 from bridge.terminal import Output
-from twin.replay.config import BoxDraw, PosteriorDraw, ReplayConfig
+from twin.replay.config import UNKNOWN_LOG, BoxDraw, PosteriorDraw, ReplayConfig
 from twin.replay.dynamics import free_start, simulate, soft_models
 from twin.replay.monte_carlo import with_draw
 from twin.replay.path import path_of_plan
@@ -44,8 +44,6 @@ FRICTION = (0.05, 1.2)
 """Of a pair of surfaces: from steel on PTFE to rubber on what is dry (handbooks' tables of sliding
 friction). A coefficient that is published has not been measured here; every one is as likely as
 its double."""
-FACTOR_LOG = 0.4
-"""Spread of the logarithm of masses and forces, as ``calibrate --physics`` has it beforehand."""
 BIAS_M = 0.005
 """Standard deviation, along x and y each, of what localisation is off as a whole; the same."""
 WRONG = (0.4, 1.6)
@@ -108,7 +106,7 @@ def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDra
     unit = qmc.Sobol(d=6 + 4 * len(movers), scramble=True, seed=0).random(count)
     z = ndtri(np.clip(unit, 1e-6, 1 - 1e-6))
     frictions = FRICTION[0] * (FRICTION[1] / FRICTION[0]) ** unit[:, :2]
-    factors = np.exp(FACTOR_LOG * z[:, 2:4])
+    factors = np.exp(UNKNOWN_LOG * z[:, 2:4])
     return [
         PosteriorDraw(
             finger_pair_friction=float(finger),

@@ -55,12 +55,9 @@ UNKNOWN_POSE_M = 0.005
 """Standard deviation along x and y of an object whose localisation states none [m]."""
 UNKNOWN_POSE_RAD = 0.05
 """Standard deviation about the vertical of such an object [rad]."""
-FRICTION_LOG = 0.2
-"""Spread of the logarithm of each friction coefficient: two of three samples lie within 20 %."""
-GRIP_FORCE_LOG = 0.15
-"""Spread of the logarithm of the grip force."""
-MASS_LOG = 0.2
-"""Spread of the logarithm of each movable object's mass."""
+UNKNOWN_LOG = 0.4
+"""Spread of the logarithm of a friction, a mass or a force that nobody measured: two of three lie
+within a factor of 1.5. Nothing narrower is known of an object by its description."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +90,7 @@ class VariationConfig:
         What a calibration finds of fingers and surfaces is found together with the objects: their
         own coefficient is then not varied once more.
         """
-        spreads = dict.fromkeys(FRICTIONS, FRICTION_LOG) | {GRIP_FORCE: GRIP_FORCE_LOG}
+        spreads = dict.fromkeys((*FRICTIONS, GRIP_FORCE), UNKNOWN_LOG)
         if self.posterior:
             spreads = dict.fromkeys(spreads, 0.0)
         known = dict(self.calibrated)
@@ -103,7 +100,7 @@ class VariationConfig:
 
     def mass_spread(self, name: str) -> float:
         """Spread of the logarithm of an object's mass; draws of a posterior have it already."""
-        return dict(self.masses).get(name, 0.0 if self.posterior else MASS_LOG)
+        return dict(self.masses).get(name, 0.0 if self.posterior else UNKNOWN_LOG)
 
 
 Mode = Literal["kinematic", "dynamic"]

@@ -19,7 +19,7 @@ from twin.replay.deciding import goes_with_success, what_decides
 from twin.replay.scene import StartState
 from twin.replay.verdict import KINEMATIC_ENGINE, engine_of
 
-REPLAY_VERSION = 28
+REPLAY_VERSION = 29
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 

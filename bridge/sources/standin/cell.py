@@ -11,7 +11,7 @@ from bridge.clock import ns_from_s
 from bridge.errors import BridgeError
 from bridge.robots.default import MAX_WIDTH_M, ROBOT
 from bridge.robots.stop import PressedStop
-from bridge.sources.standin.cell_file import CellFile, HiddenParameters
+from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.render import Layer, Renderer, measure_color, measure_depth
 from bridge.sources.standin.streams import Streams
@@ -130,6 +130,13 @@ class StandinCell:
         lab = [*lab_surfaces(self._seed, deviations), *clutter]
         robot = robot_surfaces(deviations)
         return Renderer([*robot, *object_surfaces(self.world.task, deviations), *lab])
+
+    def take_objects(self, start_seed: int) -> None:
+        """Work with the objects of a start, where each has its own of their kind."""
+        if self.file.each_start:
+            self.hidden = draw_hidden(self.file, self._seed, self.task, start_seed)
+            self.world = World(self.task, self.hidden, self.file.clutter)
+            vars(self).pop("_renderer", None)
 
     def reset(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
         """Bring the arm home with an open gripper and put the objects down where declared.

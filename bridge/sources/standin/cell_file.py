@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +20,7 @@ from bridge.task.task_file import Task
 
 SCHEMA_VERSION = 1
 PERCEPTIONS = ("noise", "gate")
+Ranges = dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +93,7 @@ class CellFile:
     home_m: tuple[float, float, float]
     max_joint_speed_rad_s: float
     cameras: dict[str, CameraMount]
-    uniform: dict[str, tuple[float, float]]
+    uniform: Ranges
     normal: dict[str, float]
     sensors: SensorModel
     planner: PlannerNoise
@@ -100,10 +102,12 @@ class CellFile:
     clutter: tuple[Clutter, ...] = ()
     planner_of: dict[str, PlannerNoise] = field(default_factory=dict)
     """Tasks the planner is differently wrong at."""
-    deviations: dict[str, tuple[float, float]] = field(default_factory=dict)
+    deviations: Ranges = field(default_factory=dict)
     """Ranges of what else differs from what is published; empty: nothing does."""
-    ranges_of: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    ranges_of: dict[str, Ranges] = field(default_factory=dict)
     """Per task: ranges, of ``uniform`` or ``deviations``, that are its own."""
+    each_start: Ranges = field(default_factory=dict)
+    """Factors on ``uniform`` for each start's own objects; empty: a session has the same ones."""
 
     def noise_for(self, task_name: str) -> PlannerNoise:
         """Return how wrong the scripted planner is at a task."""
@@ -118,10 +122,8 @@ def load_cell(name: str) -> CellFile:
     path = dataset_file("cells", name)
     table = read_tables(path)
     try:
-        if "like" in table:
-            table = _laid_over(_named_as_like(table["like"]), table)
-        return _cell_from(table)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        return _cell_from(_whole(table))
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         message = (
             f"{path} is not a cell file: {type(error).__name__} {error}. "
             "Compare it with datasets/cells/standin.toml."
@@ -129,22 +131,18 @@ def load_cell(name: str) -> CellFile:
         raise UsageError(message) from error
 
 
-def _named_as_like(name: str) -> dict[str, Any]:
-    table = read_tables(dataset_file("cells", name))
-    if "like" in table:  # two files to look at are enough to know a cell
-        message = f"like {name!r}, which itself is like {table['like']!r}"
-        raise ValueError(message)
-    return table
+def _whole(table: dict[str, Any]) -> dict[str, Any]:
+    if "like" not in table:
+        return table
+    return _laid_over(_whole(read_tables(dataset_file("cells", table["like"]))), table)
 
 
 def _laid_over(base: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     """Lay what a table names over another; tables inside of it likewise."""
     merged = dict(base)
     for key, value in table.items():
-        if isinstance(value, dict) and isinstance(base.get(key), dict):
-            merged[key] = _laid_over(base[key], value)
-        else:
-            merged[key] = value
+        nested = isinstance(value, dict) and isinstance(base.get(key), dict)
+        merged[key] = _laid_over(base[key], value) if nested else value
     return merged
 
 
@@ -152,36 +150,34 @@ def _cell_from(table: dict[str, Any]) -> CellFile:
     if table["schema_version"] > SCHEMA_VERSION:
         message = f"schema_version {table['schema_version']} is newer than {SCHEMA_VERSION}"
         raise ValueError(message)
-    x, y, z = table["robot"]["home_m"]
     planner, planner_of = _planners(table["planner"])
+    hidden, seeds = table["hidden"], msgspec.convert(table["seeds"], dict[str, tuple[int, int]])
     return CellFile(
         name=table["name"],
-        home_m=(x, y, z),
+        home_m=msgspec.convert(table["robot"]["home_m"], tuple[float, float, float]),
         max_joint_speed_rad_s=table["robot"]["max_joint_speed_rad_s"],
         cameras={key: _mount_from(value) for key, value in table["cameras"].items()},
-        uniform={key: (low, high) for key, (low, high) in table["hidden"]["uniform"].items()},
-        normal=dict(table["hidden"]["normal"]),
+        uniform=msgspec.convert(hidden["uniform"], Ranges),
+        normal=dict(hidden["normal"]),
         sensors=SensorModel(**table["sensors"]),
         planner=planner,
-        test_seeds=_pair(table["seeds"]["test"]),
-        development_seeds=_pair(table["seeds"]["development"]),
+        test_seeds=seeds["test"],
+        development_seeds=seeds["development"],
         clutter=tuple(_clutter_from(item) for item in table.get("clutter", [])),
         planner_of=planner_of,
-        deviations=_deviations(table["hidden"].get("deviations", {})),
-        ranges_of={
-            task: {key: (low, high) for key, (low, high) in ranges.items()}
-            for task, ranges in table["hidden"].get("tasks", {}).items()
-        },
+        deviations=_deviations(hidden.get("deviations", {})),
+        ranges_of=msgspec.convert(hidden.get("tasks", {}), dict[str, Ranges]),
+        each_start=msgspec.convert(hidden.get("each_start", {}), Ranges),
     )
 
 
-def _deviations(table: dict[str, list[float]]) -> dict[str, tuple[float, float]]:
+def _deviations(table: dict[str, Any]) -> Ranges:
     """Read the ranges; a cell has all of them or none."""
     if table and set(table) != set(RANGES):
         wrong = sorted(set(table) ^ set(RANGES))
         message = f"hidden.deviations: {', '.join(wrong)}: missing or unknown"
         raise ValueError(message)
-    return {key: (low, high) for key, (low, high) in table.items()}
+    return msgspec.convert(table, Ranges)
 
 
 def _planners(table: dict[str, Any]) -> tuple[PlannerNoise, dict[str, PlannerNoise]]:
@@ -206,11 +202,6 @@ def _clutter_from(table: dict[str, Any]) -> Clutter:
         T_base_clutter=se3.small_motion(np.array([0.0, 0.0, table["yaw_rad"], *table["p_m"]])),
         color_srgb=tuple(table.get("color_srgb", (128, 128, 128))),
     )
-
-
-def _pair(values: list[int]) -> tuple[int, int]:
-    first, last = values
-    return first, last
 
 
 def _mount_from(table: dict[str, Any]) -> CameraMount:
@@ -269,12 +260,18 @@ class HiddenParameters:
         return record
 
 
-def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenParameters:
-    """Draw one laboratory; the same cell file and seed give the same one."""
+def draw_hidden(
+    cell: CellFile, seed: int, task: Task | None = None, start_seed: int | None = None
+) -> HiddenParameters:
+    """Draw one laboratory, the same for one cell file and seed; as it is at a start, if any."""
     rng = np.random.default_rng([HIDDEN_STREAM, seed])
     own = {} if task is None else cell.ranges_of.get(task.name, {})
     ranges = cell.uniform | {key: own[key] for key in own if key in cell.uniform}
     uniform = {key: float(rng.uniform(*ranges[key])) for key in sorted(ranges)}
+    if start_seed is not None:
+        own_rng = np.random.default_rng([HIDDEN_STREAM, seed, start_seed])
+        for key in sorted(cell.each_start):
+            uniform[key] *= float(own_rng.uniform(*cell.each_start[key]))
     errors = {}
     for camera_id in sorted(cell.cameras):
         shift = rng.normal(0.0, cell.normal[f"{camera_id}_camera_m"], 3)
@@ -288,6 +285,7 @@ def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenPa
             seed,
             cameras=sorted(cell.cameras),
             objects={} if task is None else task.objects,
+            start_seed=start_seed,
         )
         offset = offset + np.array(deviations.joint_zero_rad)
     return HiddenParameters(

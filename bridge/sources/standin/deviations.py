@@ -8,6 +8,7 @@ drawn goes to the topics below ``/standin/truth`` only.
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -128,16 +129,14 @@ class Deviations:
     def lens(self, camera_id: str, camera: Camera) -> Lens:
         """The true camera behind a published one."""
         focal, cx, cy, k1, k2 = self.lenses[camera_id]
-        return Lens(
-            width=camera.width,
-            height=camera.height,
+        true = replace(
+            camera,
             fx=camera.fx * focal,
             fy=camera.fy * focal,
             cx=camera.cx + cx * camera.width,
             cy=camera.cy + cy * camera.width,
-            k1=k1,
-            k2=k2,
         )
+        return Lens(**vars(true), k1=k1, k2=k2)
 
     def put_down(
         self, task: Task, declared: Mapping[str, Float[np.ndarray, "4 4"]]
@@ -207,19 +206,24 @@ def draw_deviations(
     *,
     cameras: Iterable[str],
     objects: Mapping[str, ObjectModel],
+    start_seed: int | None = None,
 ) -> Deviations:
-    """Draw one laboratory; each quantity has a stream of its own, so that none shifts another."""
+    """Draw one laboratory; each quantity has a stream of its own, so that none shifts another.
 
-    def draw(key: str, whose: str, count: int) -> tuple[float, ...]:
+    With a start's seed the objects that are not fixed are others, drawn for that start.
+    """
+
+    def draw(key: str, whose: str = "", count: int = 1) -> Any:
         stream = [DEVIATION_STREAM, seed, zlib.crc32(f"{key} {whose}".encode())]
+        if start_seed is not None and whose in objects and not objects[whose].fixed:
+            stream.append(start_seed)
         low, high = ranges[key]
         return tuple(float(v) for v in np.random.default_rng(stream).uniform(low, high, count))
 
     def one(key: str, whose: str = "") -> float:
-        return draw(key, whose, 1)[0]
+        return float(draw(key, whose)[0])
 
     num_joints = len(ARM_JOINTS)
-    tilt_x, tilt_y = draw("table_tilt_rad", "", 2)
     lenses = {}
     for camera_id in cameras:
         cx, cy = draw("principal_point_fraction", camera_id, 2)
@@ -228,7 +232,7 @@ def draw_deviations(
     return Deviations(
         objects={key: _draw_object(model, draw) for key, model in objects.items()},
         table_height_m=one("table_height_m"),
-        table_tilt_rad=(tilt_x, tilt_y),
+        table_tilt_rad=draw("table_tilt_rad", count=2),
         link_length_m={link: one("link_length_m", link) for link in LONGER_LINKS},
         joint_zero_rad=draw("joint_zero_rad", "", num_joints),
         joint_drag_Nm=draw("joint_drag_Nm", "", num_joints),
@@ -242,22 +246,16 @@ def draw_deviations(
 
 
 def _draw_object(model: ObjectModel, draw: Any) -> ObjectDeviation:
+    own = partial(draw, whose=model.id)
     if model.wall_m > 0:
-        wide, deep = draw("container_size_scale", model.id, 2)
-        (high,) = draw("container_height_scale", model.id, 1)
-        x, y = draw("container_shift_m", model.id, 2)
-        tilt_x, tilt_y = draw("container_tilt_rad", model.id, 2)
-        (yaw,) = draw("container_yaw_rad", model.id, 1)
         return ObjectDeviation(
-            size_scale=(wide, deep, high),
-            lip_m=draw("container_lip_m", model.id, 1)[0],
-            shift_m=(x, y),
-            turn_rad=(tilt_x, tilt_y, yaw),
+            size_scale=(*own("container_size_scale", count=2), *own("container_height_scale")),
+            lip_m=own("container_lip_m")[0],
+            shift_m=own("container_shift_m", count=2),
+            turn_rad=(*own("container_tilt_rad", count=2), *own("container_yaw_rad")),
         )
-    x, y, z = draw("object_size_scale", model.id, 3)
-    weight_x, weight_y, weight_z = draw("object_centre_of_mass", model.id, 3)
     return ObjectDeviation(
-        size_scale=(x, y, z),
-        rebate_m=draw("object_rebate_m", model.id, 1)[0],
-        centre_of_mass=(weight_x, weight_y, weight_z),
+        size_scale=own("object_size_scale", count=3),
+        rebate_m=own("object_rebate_m")[0],
+        centre_of_mass=own("object_centre_of_mass", count=3),
     )

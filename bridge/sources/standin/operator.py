@@ -308,6 +308,7 @@ class Operator:
     def scan(self) -> None:
         """Record one scan with the objects where the first trial has them."""
         cell, start_seed = self._cell, self.start_seeds(1)[0]
+        cell.take_objects(start_seed)
         scan_id = f"scan_{self._next_number('scan'):04d}"
         cell.reset(self.start_poses(start_seed, "scan"))
         self._begin(self._info(scan_id, kind="scan", start_seed=start_seed))
@@ -369,6 +370,7 @@ class Operator:
     def _attempt(self, info: EpisodeInfo, treatment: Treatment, seed: int) -> Outcome:
         """Put the objects down, look, plan, execute and label, in an episode."""
         cell, retry = self._cell, info.kind == RETRY
+        cell.take_objects(info.start_seed or 0)
         cell.reset(self.start_poses(info.start_seed or 0, treatment.name, retry=retry))
         self._begin(info)
         cell.cameras_running = True

@@ -31,19 +31,11 @@ TRUTH_PARAMETERS = topics.cell_topic(topics.TRUTH, "/parameters")
 
 
 @runtime_checkable
-class Publisher(Protocol):
-    """What a topic is written to."""
-
-    def put(self, data: bytes, *, source_ns: int) -> None:
-        """Send one message."""
-
-
-@runtime_checkable
 class Session(Protocol):
     """The part of ``bridge.wire.session.WireSession`` that the cell uses."""
 
-    def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> Publisher:
-        """Announce a topic."""
+    def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> Any:
+        """Announce a topic; what is returned takes messages by ``put(data, source_ns=...)``."""
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask and wait."""
@@ -69,7 +61,7 @@ class Streams:
         """Publish under ``/<cell>/``."""
         self._session = session
         self._cell = cell
-        self._publishers: dict[str, Publisher] = {}
+        self._publishers: dict[str, Any] = {}
         self._latest_joints: tuple[bytes, int] | None = None
 
     def _put(self, topic: str, data: bytes, stamp_ns: int, type_name: str | None = None) -> None:

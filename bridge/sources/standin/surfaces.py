@@ -7,7 +7,7 @@ away sees them without aliasing.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +52,7 @@ class Texture:
         return np.asarray(self.image.reshape(-1, 3).take(index, axis=0))
 
 
+@lru_cache(maxsize=1)
 def table_texture(size_m: tuple[float, float], centre_m: tuple[float, float], seed: int) -> Texture:
     """Wooden boards along y with grain, and patches of coloured tape and checkers."""
     rng = np.random.default_rng([7, seed])

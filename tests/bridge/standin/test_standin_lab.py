@@ -25,24 +25,10 @@ from bridge.task.task_file import Task, load_task
 SEED = 9_000_000
 LABS = range(SEED, SEED + 4)
 COMPILED = (
-    "body_pos",
-    "body_quat",
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "geom_pos",
-    "geom_quat",
-    "geom_size",
-    "geom_friction",
-    "geom_solref",
-    "geom_solimp",
-    "jnt_range",
-    "dof_armature",
-    "dof_damping",
-    "dof_frictionloss",
-    "actuator_gainprm",
-    "actuator_biasprm",
-    "actuator_forcerange",
+    *("body_pos", "body_quat", "body_mass", "body_inertia", "body_ipos"),
+    *("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_solref", "geom_solimp"),
+    *("jnt_range", "dof_armature", "dof_damping", "dof_frictionloss"),
+    *("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
 )
 FROZEN = {
     # Made with the code before there was a laboratory.
@@ -89,15 +75,8 @@ def hidden_of(lab: CellFile, task: Task, seed: int = SEED) -> HiddenParameters:
 def cell_of(
     lab: CellFile, task: Task, session: Any, hidden: HiddenParameters, scale: float = 0.25
 ) -> StandinCell:
-    return StandinCell(
-        lab,
-        task,
-        hidden,
-        Streams(session, "lab"),
-        config=CellConfig(rate_hz=0.0, scale=scale),
-        seed=SEED,
-        start_ns=0,
-    )
+    streams, config = Streams(session, "lab"), CellConfig(rate_hz=0.0, scale=scale)
+    return StandinCell(lab, task, hidden, streams, config=config, seed=SEED, start_ns=0)
 
 
 def test_a_draw_is_the_seeds_and_the_tasks(lab: CellFile, stack: Task) -> None:
@@ -113,6 +92,22 @@ def test_a_draw_is_the_seeds_and_the_tasks(lab: CellFile, stack: Task) -> None:
         assert (
             draw_hidden(lab, seed, slippery).mass_scale == draw_hidden(lab, seed, stack).mass_scale
         )
+
+
+def test_each_start_has_objects_of_its_own_in_one_laboratory(make_session: type) -> None:
+    mixed, task = load_cell("lab_mixed"), load_task("heavy_block_into_box")
+    cell, met = cell_of(mixed, task, make_session(), hidden_of(mixed, task)), []
+    for start in (7, 8, 7):
+        cell.take_objects(start)
+        record = cell.hidden.to_record()
+        own = [record.pop(name) for name in mixed.each_start]
+        block = record["deviations"]["objects"].pop("block")
+        size = np.array(task.objects["block"].size_m) * block["size_scale"]
+        assert cell.world.task.objects["block"].size_m == pytest.approx(size)
+        met.append((record, own, block))
+    first, other, again = met
+    assert first == again
+    assert [a == b for a, b in zip(first, other, strict=True)] == [True, False, False]
 
 
 def test_a_laboratory_hides_everything_or_nothing(tmp_path: Path) -> None:
