@@ -28,6 +28,7 @@ from bridge.wire.errors import NoReplyError
 FROZEN = {
     # SHA-256 of the files that were there before: what was recorded with them names their hash.
     ("cells", "lab"): "6d372fd7101387df",
+    ("cells", "lab_mixed"): "d7e9e3e7f1aaca7f",
     ("cells", "standin"): "5ea62810956d071b",
     ("cells", "standin_toys"): "86202f6783135dfa",
     ("cells", "standin_toys_steady"): "0ef80d4f758d2c69",
