@@ -11,9 +11,6 @@ import numpy as np
 from bridge.whole_file import write_whole
 from twin.errors import UnreadableFileError
 
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The earliest time a zip file can say; the real one would change the file's hash."""
-
 
 class UnreadableArraysError(UnreadableFileError):
     """An npz file is damaged, too large, or not what was expected."""
@@ -22,12 +19,7 @@ class UnreadableArraysError(UnreadableFileError):
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays, whole or not at all."""
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        for name, rows in arrays.items():
-            body = io.BytesIO()
-            np.lib.format.write_array(body, np.asarray(rows, order="C"), allow_pickle=False)
-            about = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
-            archive.writestr(about, body.getvalue(), compress_type=zipfile.ZIP_DEFLATED)
+    np.savez_compressed(stream, allow_pickle=False, **arrays)
     write_whole(path, stream.getvalue())
 
 

@@ -64,13 +64,14 @@ def _moves(episode: Episode, camera_id: str) -> bool:
     return len(posed_ns) > 0 and not never_moves(tree, frame, posed_ns)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Seen:
     """A depth image that shows the robot standing still."""
 
     episode: Episode
     stamp_ns: int
     posture: Posture
+    urdf: str
 
 
 def find_fixed_camera(
@@ -81,13 +82,18 @@ def find_fixed_camera(
     The search begins where the recording has the camera; when the robot is not there, or the
     recording does not say, the whole table is searched.
     """
-    tracks = _tracks(episodes)
-    seen = [
-        item
-        for episode in episodes
-        if str(episode.path) in tracks
-        for item in _stationary(episode, camera_id, tracks[str(episode.path)])
-    ]
+    seen, reasons = list[_Seen](), list[GstError]()
+    for episode in episodes:
+        try:
+            track = posture_track(episode)
+        except GstError as error:
+            reasons.append(error)
+            continue
+        stamps = [image.stamp_ns for image in streams.depth_images(episode, camera_id)]
+        at_rest = filter(track.is_stationary, stamps)
+        seen += [_Seen(episode, ns, track.at(ns), track.urdf) for ns in at_rest]
+    if reasons and len(reasons) == len(episodes):
+        raise reasons[0]
     if not seen:
         raise RobotNotAlignedError(
             found=f"camera {camera_id} has no depth image with the robot standing still",
@@ -96,7 +102,7 @@ def find_fixed_camera(
     joints = np.array([item.posture.joints_rad for item in seen])
     chosen = [seen[index] for index in distinct_postures(joints, MAX_POSTURES)]
     views = [view for episode in episodes for view in _load(episode, camera_id, chosen)]
-    robot = load_robot(tracks[str(chosen[0].episode.path)].urdf)
+    robot = load_robot(chosen[0].urdf)
     nominal = _nominal_pose(chosen[0], camera_id)
     try:
         alignment = align_robot(views, robot, start=nominal, seed=seed)
@@ -118,26 +124,6 @@ def find_fixed_camera(
         record["correction_m"] = float(np.linalg.norm(change[:3, 3]))
         record["correction_rad"] = float(se3.rotation_angle_rad(change[:3, :3]))
     return record
-
-
-def _tracks(episodes: Sequence[Episode]) -> dict[str, PostureTrack]:
-    """Postures of the episodes that have them; when none has, the first one's reason."""
-    tracks: dict[str, PostureTrack] = {}
-    reasons: list[GstError] = []
-    for episode in episodes:
-        try:
-            tracks[str(episode.path)] = posture_track(episode)
-        except GstError as error:
-            reasons.append(error)
-    if not tracks and reasons:
-        raise reasons[0]
-    return tracks
-
-
-def _stationary(episode: Episode, camera_id: str, track: PostureTrack) -> Iterator[_Seen]:
-    for image in streams.depth_images(episode, camera_id):
-        if track.is_stationary(image.stamp_ns):
-            yield _Seen(episode=episode, stamp_ns=image.stamp_ns, posture=track.at(image.stamp_ns))
 
 
 def _load(episode: Episode, camera_id: str, chosen: Sequence[_Seen]) -> Iterator[RobotView]:

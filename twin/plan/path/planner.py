@@ -16,7 +16,6 @@ from twin.replay.clearance.bodies import own_links_touch
 from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
-from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 from twin.robot.model import RobotModel
 
@@ -283,7 +282,7 @@ def _straight_knots(robot: RobotModel, start_rad: Joints, T_base_goal: Pose) -> 
     turns = (se3.interpolate_quaternion(q_start, q_goal, np.array(s)) for s in shares)
     places = p_start + shares[:, None] * (p_goal - p_start)
     Ts = np.stack([se3.transform_from(q, p) for q, p in zip(turns, places, strict=True)])
-    followed = follow_poses(robot, Ts, start_rad=start_rad, config=IkConfig())
+    followed = follow_poses(robot, Ts, start_rad=start_rad)
     if not followed.reached.all():
         share = shares[int(np.argmin(followed.reached))]
         detail = f"no joints reach the pose at {share * way_m * 1e3:.0f} of {way_m * 1e3:.0f} mm"
