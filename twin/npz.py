@@ -11,6 +11,8 @@ import numpy as np
 from bridge.whole_file import write_whole
 from twin.errors import UnreadableFileError
 
+_UNREADABLE = (OSError, EOFError, ValueError, TypeError, MemoryError)
+
 
 class UnreadableArraysError(UnreadableFileError):
     """An npz file is damaged, too large, or not what was expected."""
@@ -26,20 +28,14 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def read_npz(path: Path, names: Sequence[str], max_bytes: int) -> dict[str, np.ndarray]:
     """Read named arrays; sizes are checked before anything is unpacked, pickles are refused."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            sizes = {about.filename: about.file_size for about in archive.infolist()}
-            wanted = [f"{name}.npy" for name in names]
-            missing = [name for name in wanted if name not in sizes]
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [name for name in names if name not in archive]
             if missing:
                 raise UnreadableArraysError(path=path, found=f"without {', '.join(missing)}")
-            total = sum(sizes[name] for name in wanted)
+            total = sum(archive.zip.getinfo(f"{name}.npy").file_size for name in names)
             if total > max_bytes:
                 found = f"holds {total} bytes, more than the {max_bytes} that are allowed"
                 raise UnreadableArraysError(path=path, found=found)
-            streams = {name: io.BytesIO(archive.read(f"{name}.npy")) for name in names}
-            return {
-                name: np.lib.format.read_array(stream, allow_pickle=False)
-                for name, stream in streams.items()
-            }
-    except (OSError, ValueError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+            return {name: archive[name] for name in names}
+    except (*_UNREADABLE, zipfile.BadZipFile, zlib.error) as error:
         raise UnreadableArraysError(path=path, found=f"not a file of arrays ({error})") from error

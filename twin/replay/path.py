@@ -432,14 +432,13 @@ def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Fa
     for t_ns, row, width in zip(times, joints, widths, strict=True):
         hulls.place(row, float(width))
         if links_touch():
-            closest = hulls.self_distance()
+            distance_m, links = hulls.self_distance()
             failures.append(
                 Failure(
                     t_ns=int(t_ns),
                     cause=Cause.SELF_COLLISION,
-                    bodies=closest.links,
-                    detail=f"{closest.links[0]} is {-closest.distance_m * 1e3:.1f} mm inside "
-                    f"{closest.links[1]}",
+                    bodies=links,
+                    detail=f"{links[0]} is {-distance_m * 1e3:.1f} mm inside {links[1]}",
                 )
             )
             break

@@ -26,8 +26,6 @@ POSITION_TOLERANCE_M, ROTATION_TOLERANCE_RAD = 0.0005, math.radians(0.1)
 """A pose counts as reached where the tool misses it by no more (errata resolution 9)."""
 MAX_ITERATIONS = 60
 """Of one descent."""
-RESTARTS = 20
-"""Other starts after the warm one fails; of arms without a closed form ten times as many."""
 _CONVERGED = 1e-8
 """Norm of the error twist at which iterating stops: far below the tolerance, so that a round
 trip is exact and the tolerance decides feasibility only."""
@@ -52,13 +50,12 @@ def pose_error(robot: RobotModel, joints_rad: Joints, T_base_tcp: Pose) -> tuple
 
 
 def solve_ik(
-    robot: RobotModel,
-    T_base_tcp: Pose,
-    *,
-    warm_start_rad: Joints | None = None,
-    restarts: int = RESTARTS,
+    robot: RobotModel, T_base_tcp: Pose, *, warm_start_rad: Joints | None = None, restarts: int = 20
 ) -> IkSolution:
-    """The best joints within limits for a pose, by the warm start (None: home); see ``reached``."""
+    """The best joints within limits for a pose, by the warm start (None: home); see ``reached``.
+
+    Where it fails so many other starts are tried; of arms without a closed form ten times as many.
+    """
     start = robot.home_rad if warm_start_rad is None else warm_start_rad
     best = _descend(robot, T_base_tcp, start)
     if not best.reached and len(start) < NUM_POSE:

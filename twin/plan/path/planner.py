@@ -175,9 +175,9 @@ class Mover:
             Ts = {name: rows[index] for name, rows in poses.items()}
             monitor.measure(int(stamps[index]), joints, self.width_m, Ts)
             if links_touch():
-                closest = hulls.self_distance()
-                told = f"{closest.links[0]} touches {closest.links[1]}"
-                refusals.append(_refused(closest.links, told, -closest.distance_m))
+                distance_m, links = hulls.self_distance()
+                told = f"{links[0]} touches {links[1]}"
+                refusals.append(_refused(links, told, -distance_m))
                 break
         for failure in monitor.failures:
             one, other = failure.bodies
