@@ -97,4 +97,4 @@ def _left(
     """What is left between the two ways to each second image [m, rad]."""
     scaled = Q.copy()
     scaled[:, :3, 3] *= scale
-    return np.linalg.norm(misfits(P, scaled, X, X).reshape(-1, 2, 3), axis=2)
+    return np.asarray(np.linalg.norm(misfits(P, scaled, X, X).reshape(-1, 2, 3), axis=2))
