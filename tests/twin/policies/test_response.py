@@ -24,7 +24,6 @@ from twin.policies.identify import Sent, grip_of, lags_of, response_of, stiffnes
 from twin.policies.response import AT_ONCE, Controller, Response
 from twin.policies.shutter import ALWAYS, shutter_of
 from twin.policies.starts import Start
-from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
 from twin.robot.model import load_robot
 
@@ -157,7 +156,7 @@ def test_a_pressed_arm_gives_way_like_its_springs(start: Start) -> None:
         T = cell.robot.T_base_tcp(HOME)
         while cell._world.arm_force_N() < 60.0:
             T[2, 3] -= 0.004
-            target = solve_ik(cell.robot, T, IkConfig(), warm_start_rad=cell.target_rad).joints_rad
+            target = solve_ik(cell.robot, T, warm_start_rad=cell.target_rad).joints_rad
             cell.go(target, 0.0, 0.1)
         cell.hold(1.0)
         joints_rad = cell.posture()[0]
