@@ -179,7 +179,6 @@ def test_a_rigid_object_is_no_soft_body() -> None:
         ({"young_pa": 0.0}, "mass, stiffness"),
         ({"mass_kg": float("nan")}, "mass, stiffness"),
         ({"damping_s": -1.0}, "damping time"),
-        ({"friction": -0.1}, "friction"),
     ],
 )
 def test_impossible_material_is_refused(
