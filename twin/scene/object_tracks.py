@@ -3,12 +3,12 @@
 A trial is localised while nothing is executed. In between the joints and the fingers say what
 happened: an object between the fingers when they stop closing goes with the tool until they open,
 as cameras saw it in the hand on the way, else as it lay before. What is let go elsewhere than it is
-found fell there, in the time that gravity takes. One that was never held was moved by something
-else, and changes place when that is known.
+found fell there, in the time that gravity takes. One that was never held was pushed while the hand
+was near, or else changes place when that is known.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
-from twin.robot.model import load_robot
+from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack
 from twin.scene.localise.held import BETWEEN_M, Grip, executions_ns, grips_between
 from twin.scene.shape.known import turned_alike
@@ -26,6 +26,7 @@ FELL_M = 0.05
 """An object found this far from where it was let go did not stay there."""
 MOVED_M = 0.005
 """Less than this is the scatter of localisation."""
+STEP_NS = 40_000_000
 GRAVITY_M_S2 = 9.81
 TIPS = 3.0
 """What lands aside tips over an edge first, from near its balance: it takes as many times as long.
@@ -140,13 +141,40 @@ def carried_tracks(
                 if track is not None and robot is not None and not model.fixed
                 else []
             )
-            T, held = spans[name][-1].T_end, _held(name, plan_id, localised)
-            carried = _carried(model, T, grips, held)
-            after = seen.get(plan_id)
-            added, note = _moved(model, carried or [_rest(end_ns, T)], after, held=bool(carried))
+            T, in_hand = spans[name][-1].T_end, _held(name, plan_id, localised)
+            carried = _carried(model, T, grips, in_hand)
+            after, held = seen.get(plan_id), bool(carried)
+            if not held:
+                near = end_ns, end_ns
+                if after is not None and track is not None and robot is not None:
+                    near = _near_ns(model, T, after, track, robot, (start_ns, end_ns))
+                carried = [replace(_rest(near[0], T), end_ns=near[1])]
+            added, note = _moved(model, carried, after, held=held)
             spans[name] += added
             notes += [f"{name} {note}"] if note else []
     return ObjectTracks(spans=spans, absent=frozenset(absent), notes=tuple(notes))
+
+
+def _near_ns(
+    model: ObjectModel,
+    T_before: Float[np.ndarray, "4 4"],
+    T_after: Float[np.ndarray, "4 4"],
+    track: PostureTrack,
+    robot: RobotModel,
+    span_ns: tuple[int, int],
+) -> tuple[int, int]:
+    """From when the hand came to where an object lay to when it left where it lies: it pushed."""
+    stamps = np.arange(span_ns[0], span_ns[1], STEP_NS)
+    tool_m = np.array([robot.T_base_tcp(track.at(ns).joints_rad)[:3, 3] for ns in stamps.tolist()])
+    far_m = [np.linalg.norm(tool_m - T[:3, 3], axis=1) for T in (T_before, T_after)]
+    before, after = (stamps[each < _reach_m(model)] for each in far_m)
+    if not len(before) or not len(after) or after[-1] < before[0]:
+        return span_ns[1], span_ns[1]
+    return int(before[0]), int(after[-1])
+
+
+def _reach_m(model: ObjectModel) -> float:
+    return BETWEEN_M + max(model.size_m) / 2
 
 
 def _seen(
@@ -173,13 +201,12 @@ def _carried(
     held: Mapping[int, Float[np.ndarray, "4 4"]],
 ) -> list[_Span]:
     """Pushed by closing fingers, carried, and left where they opened; each from there again."""
-    reach_m = BETWEEN_M + max(model.size_m) / 2
     T, spans = T_base_object, []
     for grip in grips:
         T_hand = se3.invert(grip.T_base_tcp_start) @ T
         if grip.start_ns in held:
             T_hand = turned_alike(held[grip.start_ns], T_hand, model)
-        if np.linalg.norm(T_hand[:3, 3]) < reach_m:
+        if np.linalg.norm(T_hand[:3, 3]) < _reach_m(model):
             start_ns, taken = grip.start_ns, grip.T_base_tcp_start @ T_hand
             spans += [
                 _Span(start_ns=grip.closing_ns, end_ns=start_ns, T_start=T, T_end=taken),
@@ -206,7 +233,7 @@ def _moved(
     """What one execution did to an object, and what had to be assumed.
 
     Args:
-        spans: By the joints; the last one is where it lies then.
+        spans: By the joints; the last one is where it lies then, or while it may be pushed.
     """
     *before, rest = spans
     if after is None and held and model.soft is not None:  # toys are dropped
@@ -225,7 +252,7 @@ def _moved(
     if away_m <= MOVED_M:
         return [], ""
     note = f"was moved by {away_m * 100:.0f} cm without being held: drawn there afterwards"
-    return [_rest(rest.start_ns, after)], note
+    return [replace(rest, T_end=after), _rest(rest.end_ns, after)], note
 
 
 def _fallen(
