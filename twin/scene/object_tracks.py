@@ -29,8 +29,7 @@ MOVED_M = 0.005
 STEP_NS = 40_000_000
 GRAVITY_M_S2 = 9.81
 TIPS = 3.0
-"""What lands aside tips over an edge first, from near its balance: it takes as many times as long.
-"""
+"""What lands aside tips over an edge first, from near its balance: so many times as long."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +56,11 @@ class _Span:
         if self.T_start is self.T_end:
             return self.T_end
         share = (stamp_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
-        return _between(self.T_start, self.T_end, float(np.clip(share, 0.0, 1.0)) ** self.power)
+        share = float(np.clip(share, 0.0, 1.0)) ** self.power
+        (R_a, p_a), (R_b, p_b) = ((T[:3, :3], T[:3, 3]) for T in (self.T_start, self.T_end))
+        turn = se3.vector_from_rotation(R_a.T @ R_b)
+        R = R_a @ se3.rotation_from_vector(share * turn)
+        return se3.from_rotation(R, p_a + share * (p_b - p_a))
 
 
 def _rest(start_ns: int, T_base_object: Float[np.ndarray, "4 4"]) -> _Span:
@@ -141,40 +144,35 @@ def carried_tracks(
                 if track is not None and robot is not None and not model.fixed
                 else []
             )
-            T, in_hand = spans[name][-1].T_end, _held(name, plan_id, localised)
-            carried = _carried(model, T, grips, in_hand)
-            after, held = seen.get(plan_id), bool(carried)
-            if not held:
-                near = end_ns, end_ns
-                if after is not None and track is not None and robot is not None:
-                    near = _near_ns(model, T, after, track, robot, (start_ns, end_ns))
-                carried = [replace(_rest(near[0], T), end_ns=near[1])]
-            added, note = _moved(model, carried, after, held=held)
+            T, held = spans[name][-1].T_end, _held(name, plan_id, localised)
+            carried = _carried(model, T, grips, held)
+            after = seen.get(plan_id)
+            near = _while_near(model, T, after, track, robot, (start_ns, end_ns))
+            added, note = _moved(model, carried or [near], after, held=bool(carried))
             spans[name] += added
             notes += [f"{name} {note}"] if note else []
     return ObjectTracks(spans=spans, absent=frozenset(absent), notes=tuple(notes))
 
 
-def _near_ns(
+def _while_near(
     model: ObjectModel,
-    T_before: Float[np.ndarray, "4 4"],
-    T_after: Float[np.ndarray, "4 4"],
-    track: PostureTrack,
-    robot: RobotModel,
+    T: Float[np.ndarray, "4 4"],
+    after: Float[np.ndarray, "4 4"] | None,
+    track: PostureTrack | None,
+    robot: RobotModel | None,
     span_ns: tuple[int, int],
-) -> tuple[int, int]:
-    """From when the hand came to where an object lay to when it left where it lies: it pushed."""
-    stamps = np.arange(span_ns[0], span_ns[1], STEP_NS)
-    tool_m = np.array([robot.T_base_tcp(track.at(ns).joints_rad)[:3, 3] for ns in stamps.tolist()])
-    far_m = [np.linalg.norm(tool_m - T[:3, 3], axis=1) for T in (T_before, T_after)]
-    before, after = (stamps[each < _reach_m(model)] for each in far_m)
-    if not len(before) or not len(after) or after[-1] < before[0]:
-        return span_ns[1], span_ns[1]
-    return int(before[0]), int(after[-1])
-
-
-def _reach_m(model: ObjectModel) -> float:
-    return BETWEEN_M + max(model.size_m) / 2
+) -> _Span:
+    """From when the hand came to where an object lay to when it left where it lies, or the end."""
+    begin_ns, end_ns = span_ns[1], span_ns[1]
+    if after is not None and track is not None and robot is not None:
+        stamps = range(*span_ns, STEP_NS)
+        tool_m = [robot.T_base_tcp(track.at(ns).joints_rad)[:3, 3] for ns in stamps]
+        away_m = [np.linalg.norm(tool_m - each[:3, 3], axis=1) for each in (T, after)]
+        reach_m = BETWEEN_M + max(model.size_m) / 2
+        old, new = (np.flatnonzero(each < reach_m) for each in away_m)
+        if len(old) and len(new) and new[-1] > old[0]:
+            begin_ns, end_ns = stamps[old[0]], stamps[new[-1]]
+    return _Span(start_ns=begin_ns, end_ns=end_ns, T_start=T, T_end=T)
 
 
 def _seen(
@@ -206,7 +204,7 @@ def _carried(
         T_hand = se3.invert(grip.T_base_tcp_start) @ T
         if grip.start_ns in held:
             T_hand = turned_alike(held[grip.start_ns], T_hand, model)
-        if np.linalg.norm(T_hand[:3, 3]) < _reach_m(model):
+        if np.linalg.norm(T_hand[:3, 3]) < BETWEEN_M + max(model.size_m) / 2:
             start_ns, taken = grip.start_ns, grip.T_base_tcp_start @ T_hand
             spans += [
                 _Span(start_ns=grip.closing_ns, end_ns=start_ns, T_start=T, T_end=taken),
@@ -266,13 +264,3 @@ def _fallen(
     end_ns = start_ns + round(1e9 * float(fall_s))
     fall = _Span(start_ns=start_ns, end_ns=end_ns, T_start=T_start, T_end=T_end, power=2)
     return [fall, _rest(end_ns, T_end)]
-
-
-def _between(
-    T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"], share: float
-) -> Float[np.ndarray, "4 4"]:
-    turn = se3.vector_from_rotation(T_a[:3, :3].T @ T_b[:3, :3])
-    T = T_a.copy()
-    T[:3, :3] = T_a[:3, :3] @ se3.rotation_from_vector(share * turn)
-    T[:3, 3] += share * (T_b[:3, 3] - T_a[:3, 3])
-    return T
