@@ -145,7 +145,7 @@ def _steps_of(question: Question, config: ReplayConfig) -> int:
     return steps
 
 
-def _asked(gate: GateConfig, run_path: Path, plan: Plan, seen: ReplayScene) -> Question:
+def asked(gate: GateConfig, run_path: Path, plan: Plan, seen: ReplayScene) -> Question:
     """A question as a gate with these settings has it."""
     config = replace(gate.replay, mode="dynamic", samples=gate.samples)
     config.refuse_soft(seen.task.soft_objects)
@@ -162,7 +162,7 @@ def _asked(gate: GateConfig, run_path: Path, plan: Plan, seen: ReplayScene) -> Q
 
 def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
     """Judge here as a gate does without samples; UndecidedError: a replay has too many steps."""
-    return lambda plan: answer(_asked(GateConfig(samples=0), run_path, plan, scene))
+    return lambda plan: answer(asked(GateConfig(samples=0), run_path, plan, scene))
 
 
 class TwinProcess(AbstractContextManager["TwinProcess"]):
@@ -205,7 +205,7 @@ class TwinProcess(AbstractContextManager["TwinProcess"]):
             urdf=urdf,
             start_rad=start_rad,
         )
-        question = _asked(self._config, self._run_path, plan, seen)
+        question = asked(self._config, self._run_path, plan, seen)
         verdict: Verdict = self._do("replay", answer, question, ends_s)
         return verdict
 
