@@ -167,11 +167,11 @@ class LiveRecorder:
         if config.msg_folder is not None:  # complain now, not at the first message
             read_definitions(config.msg_folder)
         find_contract(run.path, config.contract)  # the same
+        schema.ros_types()  # a fifth of a second that no message waits for
         self.run = run
         self._folder_lock = lock_folder(
             run.episodes_dir, FolderTakenError(run=run.path), shared=config.shares_folder
         )
-        self._recorder = config.recorder
         self.session = session
         reports = recover_parts(run)
         for report in reports:

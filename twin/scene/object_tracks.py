@@ -27,6 +27,9 @@ FELL_M = 0.05
 MOVED_M = 0.005
 """Less than this is the scatter of localisation."""
 GRAVITY_M_S2 = 9.81
+TIPS = 3.0
+"""What lands aside tips over an edge first, from near its balance: it takes as many times as long.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,9 +231,12 @@ def _moved(
 def _fallen(
     start_ns: int, T_start: Float[np.ndarray, "4 4"], T_end: Float[np.ndarray, "4 4"]
 ) -> list[_Span]:
-    """From one place to another, as long as a free fall takes over that distance."""
-    fall_m = float(np.linalg.norm(T_start[:3, 3] - T_end[:3, 3]))
-    end_ns = start_ns + round(1e9 * float(np.sqrt(2 * fall_m / GRAVITY_M_S2)))
+    """From one place to another, as long as a free fall takes over that distance, or tipping."""
+    way_m = T_start[:3, 3] - T_end[:3, 3]
+    fall_s = np.sqrt(2 * np.linalg.norm(way_m) / GRAVITY_M_S2)
+    if np.linalg.norm(way_m[:2]) > FELL_M / 2:
+        fall_s *= TIPS
+    end_ns = start_ns + round(1e9 * float(fall_s))
     fall = _Span(start_ns=start_ns, end_ns=end_ns, T_start=T_start, T_end=T_end, power=2)
     return [fall, _rest(end_ns, T_end)]
 

@@ -70,6 +70,15 @@ def test_the_status_is_published_and_fits_its_schema(
     assert not any(topic.startswith("/rec/") for topic in status["seen"])
 
 
+def test_no_first_message_waits_for_the_definitions_of_types(
+    tmp_path: Path, wire: WireConfig
+) -> None:
+    """Making them takes long on a busy machine, and a kill would cost what comes meanwhile."""
+    schema.ros_types.cache_clear()
+    with open_recorder(tmp_path / "run", wire=wire):
+        assert schema.ros_types.cache_info().currsize == 1
+
+
 def test_the_recorder_is_seen_while_it_lives(
     tmp_path: Path, wire: WireConfig, endpoint: str
 ) -> None:

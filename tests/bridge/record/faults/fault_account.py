@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ import robot_gst
 from bridge.episode.topics import CLOCKS, DROPS
 
 LOSSES = ("gaps", "queue_drops")
+TAIL_S = 0.5
 
 
 class Found(NamedTuple):
@@ -75,6 +77,41 @@ def lost(tally: dict[str, int]) -> int:
 def check_code(path: Path) -> int:
     """The exit code of ``robot-gst check``."""
     return robot_gst.run(["check", str(path), "--quiet"])
+
+
+def beginnings(found: list[Found], sent: list[Sent]) -> dict[str, int]:
+    """The number of each topic's messages, which are its first ones without holes."""
+    kept = {}
+    for topic in {item.topic for item in sent}:
+        numbers = [item.sequence for item in found if item.topic == topic]
+        assert numbers == list(range(len(numbers))), topic
+        kept[topic] = len(numbers)
+    return kept
+
+
+def only_the_tail_is_missing(
+    found: list[Found], sent: list[Sent], writes: Path, killed_ns: int
+) -> None:
+    """Of each topic a beginning without holes, up to less than a kill may cost.
+
+    The recorder writes at least each half second, and all that came half a second before a write.
+    ``writes`` (slow_recorder.py) says when it wrote, and how long its writing thread was away on a
+    busy machine: messages may wait as long to be taken, their chunk to be closed and written.
+    """
+    times: dict[str, list[int]] = {"tick": [], "began": [], "ended": []}
+    for what, at_ns in map(str.split, writes.read_text().splitlines()):
+        times[what].append(int(at_ns))
+    begun, ended = times["began"], times["ended"]
+    away_ns = max(after - before for before, after in pairwise([*times["tick"], killed_ns]))
+    limit_ns = 1e9 * TAIL_S + 3 * away_ns
+    left = [(item, after.put_ns) for item, after in pairwise(sent)]  # by then it had been put
+    before_ns = begun[len(ended) - 1] - limit_ns
+    for topic, kept in beginnings(found, sent).items():
+        old = sum(item.topic == topic and left_ns < before_ns for item, left_ns in left)
+        assert kept >= old, f"{topic}: {kept} of {old} in the file"
+    if len(begun) == len(ended):
+        late = [item for item, left_ns in left if ended[-1] < left_ns < killed_ns - limit_ns]
+        assert not late, f"no write for {(killed_ns - ended[-1]) / 1e9:.3f} s"
 
 
 def nothing_invented(

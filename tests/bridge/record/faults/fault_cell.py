@@ -154,6 +154,14 @@ class FaultCell:
         self.children.append(child)
         return child
 
+    @property
+    def writes(self) -> Path:
+        return self.folder / "writes"
+
+    def slow(self, delay_s: float = 0.0) -> str:
+        """A program for ``record`` that notes when it writes, see slow_recorder.py."""
+        return f"{CHILD.with_name('slow_recorder.py')} {delay_s} {self.writes}"
+
     def publisher(self, endpoint: str = "") -> PublisherChild:
         name = f"publisher{len(self.children)}"
         child = PublisherChild(endpoint or self.endpoint, self.folder, name)
