@@ -60,7 +60,9 @@ def read_soft_nodes(replay: Recording, name: str) -> SoftNodes | None:
         return None
     count = len(whole) if whole.all() else int(whole.argmin())
     stamps_ns = np.array([sample.stamp_ns for sample in samples[:count]], dtype=np.int64)
-    return SoftNodes(stamps_ns=stamps_ns, points_m=_in_object(points_m[:count], track, stamps_ns))
+    states = zip(track.at(stamps_ns).transforms(), points_m[:count], strict=True)
+    own_m = np.stack([se3.apply(se3.invert(T), places_m) for T, places_m in states])
+    return SoftNodes(stamps_ns=stamps_ns, points_m=own_m)
 
 
 Bent = tuple[Float[np.ndarray, "num_nodes 3"], Float[np.ndarray, "num_states num_nodes 4 4"]]
@@ -73,21 +75,17 @@ def bent(
     track: PoseTrajectory,
     own_ns: Int[np.ndarray, " num_samples"],
 ) -> Bent | None:
-    """Move the nodes of an object as ``bend`` does; None where there are none that can be drawn."""
-    nodes = read_soft_nodes(replay, name)
-    return None if nodes is None else bend(nodes, track, own_ns)
-
-
-def bend(
-    nodes: SoftNodes,
-    track: PoseTrajectory,
-    own_ns: Int[np.ndarray, " num_samples"],
-) -> Bent:
-    """Move nodes to where they are, at the page's samples or as many as there is room for.
+    """Move an object's nodes to where they are, at as many of the samples as there is room for.
 
     Args:
         own_ns: The page's samples on the replay's clock, evenly spaced.
+
+    Returns:
+        None where there are no nodes that can be drawn.
     """
+    nodes = read_soft_nodes(replay, name)
+    if nodes is None:
+        return None
     rest_m = nodes.rest_m
     num_nodes = len(rest_m)
     _, around = cKDTree(rest_m).query(rest_m, k=min(NUM_NEIGHBOURS + 1, num_nodes))
@@ -102,13 +100,3 @@ def bend(
         Ts[row, :, :3, :3] = R
         Ts[row, :, :3, 3] = seen_m - np.einsum("nij,nj->ni", R, rest_m)
     return rest_m, Ts
-
-
-def _in_object(
-    p_base_node_m: Float[np.ndarray, "num_states num_nodes 3"],
-    track: PoseTrajectory,
-    stamps_ns: Int[np.ndarray, " num_states"],
-) -> Float[np.ndarray, "num_states num_nodes 3"]:
-    Ts_base_object = track.at(stamps_ns).transforms()
-    pairs = zip(Ts_base_object, p_base_node_m, strict=True)
-    return np.stack([se3.apply(se3.invert(T), points_m) for T, points_m in pairs])

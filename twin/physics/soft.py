@@ -5,16 +5,17 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int32
+from jaxtyping import Float, Float32, Int, Int32
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
+from bridge.task.meshes.catalogue import toy_mesh
 from bridge.task.meshes.lattice import Lattice, fill, make_lattice, volumes_m3
-from bridge.task.task_file import ObjectModel
+from bridge.task.meshes.solids import Solid
+from bridge.task.task_file import ObjectModel, SoftMaterial
 from twin.errors import TwinError
 
 
@@ -121,7 +122,7 @@ def _coarse_lattice(nodes: bytes, tets: bytes, cell_m: float) -> tuple[Lattice, 
     spacing_m = float(np.cbrt(5 * volumes_m3(points, fours).mean()))
     if spacing_m >= FINER * cell_m:
         return None
-    distance = _SignedDistance(points, fours)
+    distance = _signed_distance(points, fours)
     while spacing_m < FINER * cell_m:
         try:
             found = fill(distance, points.min(axis=0), points.max(axis=0), cell_m * _ROUNDED)
@@ -140,40 +141,31 @@ def _in_one_piece(lattice: Lattice) -> bool:
     return int(connected_components(graph, directed=False)[0]) == 1
 
 
-class _SignedDistance:
+def _signed_distance(
+    nodes_m: Float[np.ndarray, "num_nodes 3"], tets: Int32[np.ndarray, "num_tets 4"]
+) -> Solid:
     """Distance to the surface of a lattice, negative inside.
 
     To samples of the surface, a sixth of an edge apart: what is as far as a cell is off by a
     hundredth of one.
     """
+    corners = nodes_m[surface_triangles(tets)]
+    steps = [(i, j) for i in range(_SPLIT + 1) for j in range(_SPLIT + 1 - i)]
+    weights = np.array([(i, j, _SPLIT - i - j) for i, j in steps]) / _SPLIT
+    surface = cKDTree(np.einsum("sk,tkc->tsc", weights, corners).reshape(-1, 3))
+    middles = cKDTree(nodes_m[tets].mean(axis=1))
+    corner = nodes_m[tets[:, 0]]
+    to_weights = np.linalg.inv(np.swapaxes(nodes_m[tets[:, 1:]] - corner[:, None], 1, 2))
 
-    def __init__(
-        self, nodes_m: Float[np.ndarray, "num_nodes 3"], tets: Int32[np.ndarray, "num_tets 4"]
-    ) -> None:
-        corners = nodes_m[surface_triangles(tets)]
-        steps = [(i, j) for i in range(_SPLIT + 1) for j in range(_SPLIT + 1 - i)]
-        weights = np.array([(i, j, _SPLIT - i - j) for i, j in steps]) / _SPLIT
-        self._surface = cKDTree(np.einsum("sk,tkc->tsc", weights, corners).reshape(-1, 3))
-        self._middles = cKDTree(nodes_m[tets].mean(axis=1))
-        self._corner = nodes_m[tets[:, 0]]
-        edges = nodes_m[tets[:, 1:]] - self._corner[:, None]
-        self._to_weights = np.linalg.inv(np.swapaxes(edges, 1, 2))
-
-    def __call__(
-        self, points_m: Float[np.ndarray, "num_points 3"]
-    ) -> Float[np.ndarray, " num_points"]:
-        distance, _ = self._surface.query(points_m)
-        return np.asarray(np.where(self._inside(points_m), -distance, distance))
-
-    def _inside(
-        self, points_m: Float[np.ndarray, "num_points 3"]
-    ) -> Bool[np.ndarray, " num_points"]:
-        _, near = self._middles.query(points_m, k=min(_NEAREST, self._middles.n))
-        near = near.reshape(len(points_m), -1)
-        local = points_m[:, None] - self._corner[near]
-        inner = np.einsum("nkij,nkj->nki", self._to_weights[near], local)
+    def distance(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+        away, _ = surface.query(p)
+        _, near = middles.query(p, k=min(_NEAREST, middles.n))
+        near = near.reshape(len(p), -1)
+        inner = np.einsum("nkij,nkj->nki", to_weights[near], p[:, None] - corner[near])
         least = np.minimum(inner.min(axis=2), 1.0 - inner.sum(axis=2))
-        return np.asarray((least >= -1e-9).any(axis=1))
+        return np.asarray(np.where((least >= -1e-9).any(axis=1), -away, away))
+
+    return distance
 
 
 POISSON_RANGE = (0.0, 0.45)
@@ -217,10 +209,6 @@ class SoftModel:
     """Rayleigh damping: the stiffness times this resists the speed of deformation [s]."""
     size_m: tuple[float, float, float]
     """Outer extents at rest."""
-    friction: float | None = None
-    """Sliding friction, multiplied by the partner's; None: ``PhysicsConfig.object_friction``."""
-    triangles: Int32[np.ndarray, "num_triangles 3"] | None = None
-    """Surface, outward; None: the faces that belong to one tetrahedron."""
     skin_m: Float32[np.ndarray, "num_points 3"] | None = None
     """Points of the true surface, which may lie outside of the lattice; None: the nodes."""
 
@@ -244,23 +232,16 @@ class SoftModel:
             )
         if not (np.isfinite(self.damping_s) and self.damping_s >= 0):
             raise SoftBodyError(found=f"a damping time of {self.damping_s} s")
-        if self.friction is not None and not 0 <= self.friction <= 10:
-            raise SoftBodyError(found=f"a friction of {self.friction}")
         if not (self.mass_fraction > 0).all():
             raise SoftBodyError(found="nodes without mass")
 
     @staticmethod
     def from_task(model: ObjectModel) -> "SoftModel":
         """Fill the mesh that a task names with its own lattice (``bridge.task.meshes``)."""
-        if model.soft is None:
-            raise SoftBodyError(found=f"no soft table: {model.id} is rigid")
-        mesh, lattice = _mesh_and_lattice(model.mesh or "", model.size_m, model.soft.cell_m)
-        nodes = lattice.points_m.astype(np.float32)
-        tets = lattice.tetrahedra.astype(np.int32)
-        return _soft_model(
-            model, nodes, tets, _lumped(nodes, tets), model.soft.cell_m,
-            skin=mesh.vertices_m.astype(np.float32),
-        )  # fmt: skip
+        cell_m = _material(model).cell_m
+        mesh = toy_mesh(model.mesh or "", model.size_m)
+        skin = mesh.vertices_m.astype(np.float32)
+        return _filled(model, make_lattice(mesh, cell_m), cell_m, skin)
 
     @staticmethod
     def from_lattice(arrays: Mapping[str, np.ndarray], model: ObjectModel) -> "SoftModel":
@@ -269,8 +250,7 @@ class SoftModel:
         One that is finer than the task asks for (``soft.cell_m``) is replaced by a coarser lattice
         of the same solid, with the fine surface as skin: docs/decisions/0017-contact-physics.md.
         """
-        if model.soft is None:
-            raise SoftBodyError(found=f"no soft table: {model.id} is rigid")
+        cell_m = _material(model).cell_m
         missing = [
             name for name in ("nodes_m", "tets", "mass_fraction", "spacing_m") if name not in arrays
         ]
@@ -282,15 +262,11 @@ class SoftModel:
             np.asarray(arrays["tets"], dtype=np.int32),
             np.asarray(arrays["mass_fraction"], dtype=np.float32),
             float(arrays["spacing_m"]),
-            skin=None,
         )
-        coarse = coarse_lattice(fine.nodes_m, fine.tets, model.soft.cell_m)
+        coarse = coarse_lattice(fine.nodes_m, fine.tets, cell_m)
         if coarse is None:
             return fine
-        nodes = coarse[0].points_m.astype(np.float32)
-        tets = coarse[0].tetrahedra.astype(np.int32)
-        skin = fine.nodes_m[np.unique(fine.surface())]
-        return _soft_model(model, nodes, tets, _lumped(nodes, tets), coarse[1], skin=skin)
+        return _filled(model, *coarse, skin=fine.nodes_m[np.unique(fine.surface())])
 
     def volume_m3(self) -> float:
         """Volume of the tetrahedra at rest."""
@@ -298,7 +274,7 @@ class SoftModel:
 
     def surface(self) -> Int32[np.ndarray, "num_triangles 3"]:
         """Triangles of the surface, counter-clockwise seen from outside."""
-        return surface_triangles(self.tets) if self.triangles is None else self.triangles
+        return surface_triangles(self.tets)
 
     @cached_property
     def rest_edges(self) -> tuple[Int[np.ndarray, "num_edges 2"], Float[np.ndarray, " num_edges"]]:
@@ -389,21 +365,24 @@ def _num_inverted(
     return int((volumes <= 0).sum())
 
 
-@lru_cache(maxsize=16)
-def _mesh_and_lattice(
-    mesh: str, size_m: tuple[float, float, float], cell_m: float
-) -> tuple[ToyMesh, Lattice]:
-    found = toy_mesh(mesh, size_m)
-    return found, make_lattice(found, cell_m)
-
-
-def _lumped(
-    nodes: Float32[np.ndarray, "num_nodes 3"], tets: Int32[np.ndarray, "num_tets 4"]
-) -> Float32[np.ndarray, " num_nodes"]:
-    """A quarter of each tetrahedron's volume at each of its nodes."""
+def _filled(
+    model: ObjectModel,
+    lattice: Lattice,
+    spacing_m: float,
+    skin: Float32[np.ndarray, "num_points 3"],
+) -> SoftModel:
+    """A body as heavy everywhere: a quarter of a tetrahedron's mass at each of its nodes."""
+    nodes, tets = lattice.points_m.astype(np.float32), lattice.tetrahedra.astype(np.int32)
     shares = np.zeros(len(nodes))
     np.add.at(shares, tets, volumes_m3(nodes.astype(np.float64), tets)[:, None] / 4)
-    return np.asarray((shares / shares.sum()).astype(np.float32))
+    mass_fraction = (shares / shares.sum()).astype(np.float32)
+    return _soft_model(model, nodes, tets, mass_fraction, spacing_m, skin)
+
+
+def _material(model: ObjectModel) -> SoftMaterial:
+    if model.soft is None:
+        raise SoftBodyError(found=f"no soft table: {model.id} is rigid")
+    return model.soft
 
 
 def _soft_model(
@@ -412,12 +391,9 @@ def _soft_model(
     tets: Int32[np.ndarray, "num_tets 4"],
     mass_fraction: Float32[np.ndarray, " num_nodes"],
     spacing_m: float,
-    *,
-    skin: Float32[np.ndarray, "num_points 3"] | None,
+    skin: Float32[np.ndarray, "num_points 3"] | None = None,
 ) -> SoftModel:
-    soft = model.soft
-    if soft is None:
-        raise SoftBodyError(found=f"no soft table: {model.id} is rigid")
+    soft = _material(model)
     return SoftModel(
         nodes_m=nodes,
         tets=tets,

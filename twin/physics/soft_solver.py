@@ -1,13 +1,13 @@
 """How soft bodies, and the convex pieces they touch, are handed to the native solver."""
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from jaxtyping import Float, Int32
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
@@ -82,14 +82,10 @@ def _primitive(collision: ET.Element) -> ConvexPiece | None:
 
 
 def _origin(element: ET.Element | None) -> Float[np.ndarray, "4 4"]:
-    T = np.eye(4)
     if element is None:
-        return T
-    T[:3, 3] = _numbers(element.get("xyz", "0 0 0"))
-    turns: Sequence[float] = _numbers(element.get("rpy", "0 0 0")).tolist()
-    for axis, angle in enumerate(turns):  # roll about x first, then pitch, then yaw
-        T[:3, :3] = se3.rotation_from_vector(np.eye(3)[axis] * angle) @ T[:3, :3]
-    return T
+        return np.eye(4)
+    turns = Rotation.from_euler("xyz", _numbers(element.get("rpy", "0 0 0")))
+    return se3.from_rotation(turns.as_matrix(), _numbers(element.get("xyz", "0 0 0")))
 
 
 def _numbers(text: str) -> Float[np.ndarray, "3"]:
@@ -109,7 +105,6 @@ def add_body(
     model: SoftModel,
     T_base_object: Float[np.ndarray, "4 4"],
     *,
-    young_pa: float,
     friction: float,
 ) -> tuple[int, Float[np.ndarray, " num_nodes"]]:
     """Hand a body at rest to a solver; its number there, and the masses of its nodes [kg]."""
@@ -122,7 +117,7 @@ def add_body(
         masses,
         surface_samples(surface),
         np.ascontiguousarray(surface),
-        young_pa,
+        model.young_pa,
         model.poisson,
         model.damping_s,
         min(model.damping_s * omega**2, CRITICAL * omega),

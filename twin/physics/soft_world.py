@@ -5,12 +5,11 @@ from their old poses to the new ones. What they push back with reaches PyBullet 
 on boxes as velocity, on the arm as a force, on the fingers as a slower drive.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.physics.arm import Arm, Hulls, LinkPose
@@ -20,54 +19,12 @@ from twin.physics.soft import Skin, SoftHealth, SoftModel, bind_points, health_o
 from twin.physics.soft_solver import ConvexPiece, SoftSolver, add_body, box_piece, link_pieces
 from twin.physics.unseen import EVEN, Unseen, box_inertia
 
-# What soft bodies do to the robot: forces on its links, and fingers that yield.
-# Called in every physics step, so in plain numbers: arrays of three cost more than the sums.
-
 Three = tuple[float, float, float]
 SUBSTEPS = 10
 """Substeps of soft bodies within each physics step: 2400 a second at 240 steps."""
 
 
-class Reaction:
-    """Carries what the soft bodies did in one step into the next step of the rigid world."""
-
-    def __init__(self, arm: Arm, link_of: Mapping[int, str], period_s: float) -> None:
-        """Remember who is who."""
-        self._arm, self._link_of, self._period_s = arm, link_of, period_s
-        self._yields = False
-
-    def apply(
-        self,
-        pushed: Sequence[int],
-        pushes: Float[np.ndarray, "num_pieces 15"],
-        poses: Mapping[str, LinkPose],
-    ) -> None:
-        """Push the arm and slow the fingers."""
-        opening = 0.0
-        wrenches: dict[str | None, list[float]] = {}
-        for piece in pushed:
-            link = self._link_of.get(piece)
-            if link is None:
-                continue
-            p, q = poses[link]
-            row = (pushes[piece, :6] / self._period_s).tolist()
-            force, moment = tuple(row[:3]), tuple(row[3:])
-            finger = self._arm.links[link] in self._arm.finger_links
-            if finger:
-                opening += _dot(force, _rotated(q, self._arm.opening_axes[link]))
-            # The fingers' own forces meet in what carries them; their drive feels the rest.
-            wrench = wrenches.setdefault(None if finger else link, [0.0] * 6)
-            for k, value in enumerate((*force, *_sum(moment, _cross(p, force)))):
-                wrench[k] += value
-        for link, wrench in wrenches.items():
-            force, moment = tuple(wrench[:3]), tuple(wrench[3:])
-            size = _dot(force, force)
-            # Where the force alone has the moment, but for a twist about itself.
-            point = tuple(value / size for value in _cross(force, moment)) if size else force
-            self._arm.push(link, force, point)
-        if wrenches or self._yields:
-            self._arm.yield_fingers(opening / len(self._arm.finger_links))
-        self._yields = bool(wrenches)
+# Called in every physics step, so in plain numbers: arrays of three cost more than the sums.
 
 
 def _dot(a: tuple[float, ...], b: tuple[float, ...]) -> float:
@@ -120,11 +77,11 @@ class SoftWorld:
         self._free: dict[int, int] = {}
         self._solver: SoftSolver | None = None
         self._num_pieces = 0
-        self._links: list[str] = []
         self._link_pieces: dict[str, list[int]] = {}
         self._link_ids: list[int] = []
-        self._reaction: Reaction | None = None
+        self._link_of: dict[int, str] = {}
         self._states: dict[str, LinkPose] = {}
+        self._yields = False
         self._pushed: list[int] = []
         self._fits: dict[str, Float[np.ndarray, "4 4"]] = {}
         self._pushes: Float[np.ndarray, "num_pieces 15"] = np.zeros((0, 15))
@@ -190,13 +147,12 @@ class SoftWorld:
                 continue  # PyBullet has no number for the root; it stands still on the table
             finger = self._arm.links[link] in self._arm.finger_links
             friction = config.finger_friction if finger else config.surface_friction
-            self._links.append(link)
-            self._link_pieces[link] = [
+            numbers = [
                 self._add(piece, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), friction) for piece in pieces
             ]
-        self._link_ids = [self._arm.links[link] for link in self._links]
-        link_of = {piece: link for link in self._links for piece in self._link_pieces[link]}
-        self._reaction = Reaction(self._arm, link_of, self._period_s)
+            self._link_pieces[link] = numbers
+            self._link_of |= dict.fromkeys(numbers, link)
+            self._link_ids.append(self._arm.links[link])
         self.place_links()
 
     def place_links(self) -> None:
@@ -204,8 +160,8 @@ class SoftWorld:
         if self._solver is None:
             return
         poses = self._arm.link_poses(self._link_ids)
-        for link, (p, q) in zip(self._links, poses, strict=True):
-            for piece in self._link_pieces[link]:
+        for pieces, (p, q) in zip(self._link_pieces.values(), poses, strict=True):
+            for piece in pieces:
                 self._solver.place(piece, np.array([*p, *q]))
 
     def add(
@@ -213,10 +169,8 @@ class SoftWorld:
     ) -> None:
         """Add a soft body at rest."""
         rest = model.nodes_m.astype(np.float64)
-        friction = self._config.object_friction if model.friction is None else model.friction
-        index, _ = add_body(
-            self._begun(), model, T_base_object, young_pa=model.young_pa, friction=friction
-        )
+        friction = self._config.object_friction
+        index, _ = add_body(self._begun(), model, T_base_object, friction=friction)
         skin, points = None, rest
         if model.skin_m is not None:
             points = model.skin_m.astype(np.float64)
@@ -232,34 +186,48 @@ class SoftWorld:
 
     def push_rigid(self) -> None:
         """Hand to the robot what the soft bodies did in the last step."""
-        if self._reaction is not None and self._states:
-            self._reaction.apply(self._pushed, self._pushes, self._states)
+        opening = 0.0
+        wrenches: dict[str | None, list[float]] = {}
+        for piece in self._pushed:
+            link = self._link_of.get(piece)
+            if link is None:
+                continue
+            p, q = self._states[link]
+            row = (self._pushes[piece, :6] / self._period_s).tolist()
+            force, moment = tuple(row[:3]), tuple(row[3:])
+            finger = self._arm.links[link] in self._arm.finger_links
+            if finger:
+                opening += _dot(force, _rotated(q, self._arm.opening_axes[link]))
+            # The fingers' own forces meet in what carries them; their drive feels the rest.
+            wrench = wrenches.setdefault(None if finger else link, [0.0] * 6)
+            for k, value in enumerate((*force, *_sum(moment, _cross(p, force)))):
+                wrench[k] += value
+        for carrier, wrench in wrenches.items():
+            force, moment = tuple(wrench[:3]), tuple(wrench[3:])
+            size = _dot(force, force)
+            # Where the force alone has the moment, but for a twist about itself.
+            point = tuple(value / size for value in _cross(force, moment)) if size else force
+            self._arm.push(carrier, force, point)
+        if wrenches or self._yields:
+            self._arm.yield_fingers(opening / len(self._arm.finger_links))
+        self._yields = bool(wrenches)
 
     def step(self) -> None:
         """Advance the soft bodies to where PyBullet is."""
         if self._solver is None:
             return
         self._fits.clear()
-        states = self._arm.link_poses(self._link_ids)
-        self._states = dict(zip(self._links, states, strict=True))
-        poses = [
-            (*p, *q)
-            for link, (p, q) in self._states.items()
-            for _ in range(len(self._link_pieces[link]))
-        ]
-        for body in self._free:
-            p, q = self._client.getBasePositionAndOrientation(body)
-            poses.append((*p, *q))
-        self._solver.step(self._driven(), np.array(poses))
+        links = self._arm.link_poses(self._link_ids)
+        self._states = dict(zip(self._link_pieces, links, strict=True))
+        states = [self._states[link] for link in self._link_of.values()]
+        states += [self._client.getBasePositionAndOrientation(body) for body in self._free]
+        driven = np.array([*self._link_of, *self._free.values()], dtype=np.int32)
+        self._solver.step(driven, np.array([(*p, *q) for p, q in states]))
         self._pushed, self._pushes = self._solver.pushed(), self._solver.pushes()
         for body, piece in self._free.items():
             change = self._pushes[piece, 6:]
             if change.any():
                 self._change(body, change)
-
-    def _driven(self) -> Int32[np.ndarray, " num_driven"]:
-        pieces = [piece for link in self._links for piece in self._link_pieces[link]]
-        return np.array([*pieces, *self._free.values()], dtype=np.int32)
 
     def _change(self, body: int, change: Float[np.ndarray, "9"]) -> None:
         """Add to the speed, the turning and the place of a box."""
@@ -301,9 +269,8 @@ class SoftWorld:
         """Whether a finger touched a body in the last step."""
         touched = set(self._begun().touched(self.names[object_id].index))
         return any(
-            self._arm.links[link] in self._arm.finger_links
-            and not touched.isdisjoint(self._link_pieces[link])
-            for link in self._links
+            self._arm.links[link] in self._arm.finger_links and not touched.isdisjoint(pieces)
+            for link, pieces in self._link_pieces.items()
         )
 
 

@@ -252,11 +252,7 @@ _ACTIONS = {
 
 
 def card_text(shape: DatasetShape, kind: ActionKind, table: list[dict[str, Any]]) -> str:
-    """Return the text; every choice that changes a number is in it.
-
-    Args:
-        kind: What the column ``action`` holds: ``plan`` or ``next_state``.
-    """
+    """Return the text; every choice that changes a number is in it."""
     cameras = ", ".join(shape.cameras) or "none"
     stand_in, in_twin = (sum(bool(row[k]) for row in table) for k in ("stand_in", "rollout"))
     origin = "Recorded from a real cell, as its episodes say."

@@ -24,22 +24,11 @@ from bridge.episode.metadata import EpisodeInfo, Outcome, imported_info
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.topics import (
-    COLOR_IMAGE,
-    JOINT_STATES,
-    camera_topic,
-    cell_topic,
-)
+from bridge.episode.topics import COLOR_IMAGE, JOINT_STATES, camera_topic, cell_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange.lerobot import layout
-from bridge.exchange.lerobot.layout import (
-    RESTORE,
-    DatasetInfo,
-    LeRobotFormatError,
-    parquet,
-    read_info,
-)
+from bridge.exchange.lerobot.layout import DatasetInfo, LeRobotFormatError, parquet
 from bridge.exchange.lerobot.video import read_frames
 from bridge.exchange.output import is_of_stand_in
 from bridge.media.color import JPEG_MAGIC, JPEG_QUALITY, encode_jpeg
@@ -85,7 +74,7 @@ class EpisodeRows:
             return np.asarray(values.flatten()).reshape(len(values), -1)
         return np.asarray(values)
 
-    def broken(self, found: str, *, row: int = 0, hint: str = RESTORE) -> LeRobotFormatError:
+    def broken(self, found: str, *, row: int = 0, hint: str = layout.RESTORE) -> LeRobotFormatError:
         """Build the error that names a row of the episode, counted from 0."""
         found = f"row {self.first_row + row}: {found}"
         return LeRobotFormatError(path=self.entry.data_path, found=found, hint=hint)
@@ -171,10 +160,11 @@ def _entry(info: DatasetInfo, path: Path, number: int, row: dict[str, Any]) -> E
     try:
         videos = {
             key: VideoSpan(
-                path=info.video_file(
-                    key,
-                    int(row[f"videos/{key}/chunk_index"]),
-                    int(row[f"videos/{key}/file_index"]),
+                path=info.file(
+                    info.video_path,
+                    video_key=key,
+                    chunk_index=int(row[f"videos/{key}/chunk_index"]),
+                    file_index=int(row[f"videos/{key}/file_index"]),
                 ),
                 from_s=float(row[f"videos/{key}/from_timestamp"]),
             )
@@ -185,14 +175,18 @@ def _entry(info: DatasetInfo, path: Path, number: int, row: dict[str, Any]) -> E
             index=int(row["episode_index"]),
             length=int(row["length"]),
             tasks=tuple(str(task) for task in row.get("tasks") or ()),
-            data_path=info.data_file(int(row["data/chunk_index"]), int(row["data/file_index"])),
+            data_path=info.file(
+                info.data_path,
+                chunk_index=int(row["data/chunk_index"]),
+                file_index=int(row["data/file_index"]),
+            ),
             videos=videos,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise LeRobotFormatError(
             path=path,
             found=f"row {number}: {type(error).__name__} {error}",
-            hint=f"The columns are those of LeRobotDataset v3.0. {RESTORE}",
+            hint=f"The columns are those of LeRobotDataset v3.0. {layout.RESTORE}",
         ) from error
 
 
@@ -296,7 +290,7 @@ def import_lerobot(
         wanted: Numbers of episodes; None is all.
         task: Name of the task they are trials of; "": that which the dataset names for each.
     """
-    info = read_info(folder)
+    info = layout.read_info(folder)
     plan = _plan(info, cell)
     entries = read_episodes(info, wanted)
     origin = {"dataset": folder.resolve().name, "info_sha256": hash_file(folder / layout.INFO_PATH)}

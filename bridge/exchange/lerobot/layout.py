@@ -81,7 +81,6 @@ class LeRobotFormatError(BridgeError):
 class Feature:
     """One column or one camera."""
 
-    key: str
     dtype: str
     shape: tuple[int, ...]
     names: tuple[str, ...]
@@ -104,26 +103,13 @@ class DatasetInfo:
     fps: float
     robot_type: str
     data_path: str
-    video_path: str | None
+    video_path: str
     features: dict[str, Feature]
     version: str
     episodes_per_chunk: int | None = None
     """Of version 2, where each episode has files of its own; None in version 3."""
 
-    def data_file(self, chunk_index: int, file_index: int) -> Path:
-        """Return a data file by its indices."""
-        return self._inside(self.data_path, chunk_index=chunk_index, file_index=file_index)
-
-    def video_file(self, video_key: str, chunk_index: int, file_index: int) -> Path:
-        """Return a video file by its camera and indices."""
-        return self._inside(
-            self.video_path or VIDEO_PATH,
-            video_key=video_key,
-            chunk_index=chunk_index,
-            file_index=file_index,
-        )
-
-    def _inside(self, template: str, **values: int | str) -> Path:
+    def file(self, template: str, **values: int | str) -> Path:
         """Fill in a path template; only plain fields, and never out of the folder."""
 
         def fill(match: re.Match[str]) -> str:
@@ -177,7 +163,7 @@ def read_info(folder: Path) -> DatasetInfo:
             fps=fps,
             robot_type=str(record.get("robot_type") or ""),
             data_path=places[0] or DATA_PATH,
-            video_path=places[1] or None,
+            video_path=places[1] or VIDEO_PATH,
             features=features,
             version=version,
             episodes_per_chunk=per_chunk,
@@ -198,9 +184,8 @@ def _feature(key: str, record: dict[str, Any]) -> Feature:
             names = [last] if shape[0] == 1 else [f"{last}_{i}" for i in range(shape[0])]
     found = record.get("info") or record.get("video_info") or {}
     is_depth = any(found.get(name) is True for name in ("is_depth_map", "video.is_depth_map"))
-    return Feature(
-        key=key, dtype=str(record["dtype"]), shape=shape, names=tuple(names), is_depth=is_depth
-    )
+    dtype = str(record["dtype"])
+    return Feature(dtype=dtype, shape=shape, names=tuple(names), is_depth=is_depth)
 
 
 def _flat_names(names: object) -> list[str]:

@@ -1,13 +1,13 @@
 """RealSense frames and calibration as messages of an episode."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
-from bridge.clock import split_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import (
@@ -15,6 +15,7 @@ from bridge.episode.cdr.messages import (
     CompressedColor,
     DepthImage,
     FrameTransform,
+    header,
     transforms_to_cdr,
 )
 from bridge.episode.schema import StampedMessage
@@ -31,37 +32,33 @@ Mount = tuple[str, Float[np.ndarray, "4 4"]]
 """Parent frame and ``T_parent_color``."""
 
 
+class _Entry(msgspec.Struct):
+    parent: Annotated[str, msgspec.Meta(min_length=1)]
+    p_m: tuple[float, float, float]
+    q_wxyz: tuple[float, float, float, float]
+
+
 def read_mounts(path: Path, cameras: list[str]) -> dict[str, Mount]:
     """Read the pose of the colour cameras."""
     if not path.is_file():
         raise PathNotFoundError(path=path, what="mounts file", hint="Check --mounts.")
     try:
-        entries = json.loads(path.read_bytes())
-    except ValueError as error:
-        raise MountsError(path=path, found=f"not JSON ({error})") from error
-    if not isinstance(entries, dict):
-        raise MountsError(path=path, found="not a table of cameras")
+        entries = msgspec.json.decode(path.read_bytes(), type=dict[str, msgspec.Raw])
+    except msgspec.DecodeError as error:
+        raise MountsError(path=path, found=str(error)) from error
     mounts = {}
-    for name, entry in entries.items():
+    for name, text in entries.items():
         if name not in cameras:
             listed = ", ".join(cameras)
             raise MountsError(path=path, found=f"camera {name!r} is not one of {listed}")
-        mounts[name] = _mount(path, name, entry)
+        try:
+            entry = msgspec.json.decode(text, type=_Entry)
+        except msgspec.DecodeError as error:
+            raise MountsError(path=path, found=f"{name}: {error}") from error
+        if not abs(np.linalg.norm(entry.q_wxyz) - 1.0) < ROUNDED:
+            raise MountsError(path=path, found=f"{name}: q_wxyz is not a unit quaternion")
+        mounts[name] = entry.parent, se3.transform_from(np.array(entry.q_wxyz), np.array(entry.p_m))
     return mounts
-
-
-def _mount(path: Path, name: str, entry: object) -> Mount:
-    try:
-        parent = str(entry["parent"])  # type: ignore[index]
-        p_m = np.array(entry["p_m"], dtype=np.float64)  # type: ignore[index]
-        q_wxyz = np.array(entry["q_wxyz"], dtype=np.float64)  # type: ignore[index]
-    except (KeyError, TypeError, ValueError) as error:
-        raise MountsError(path=path, found=f"{name}: {error!r}") from error
-    if p_m.shape != (3,) or q_wxyz.shape != (4,) or not parent:
-        raise MountsError(path=path, found=f"{name}: wrong number of values")
-    if not (np.isfinite(p_m).all() and abs(np.linalg.norm(q_wxyz) - 1.0) < ROUNDED):
-        raise MountsError(path=path, found=f"{name}: q_wxyz is not a unit quaternion")
-    return parent, se3.transform_from(q_wxyz, p_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,11 +110,7 @@ class CameraMessages:
     def facts(
         self, calibration: Calibration, mount: Mount | None, stamp_ns: int
     ) -> list[StampedMessage]:
-        """Intrinsics of both streams, and where depth and colour are.
-
-        Args:
-            calibration: Intrinsics of both streams, and ``T_color_depth``.
-        """
+        """Intrinsics of both streams, and where depth and colour are."""
         transforms = [
             FrameTransform(
                 stamp_ns=stamp_ns,
@@ -158,12 +151,8 @@ class CameraMessages:
                 data=encode_jpeg(frame.image_u8, self._config.quality, subsampling="420"),
             ).to_cdr()
         height, width, _ = frame.image_u8.shape
-        sec, nanosec = split_ns(frame.stamp_ns)
         message = {
-            "header": {
-                "stamp": {"sec": sec, "nanosec": nanosec},
-                "frame_id": self.color_frame,
-            },
+            "header": header(frame.stamp_ns, self.color_frame),
             "height": height,
             "width": width,
             "encoding": "rgb8",

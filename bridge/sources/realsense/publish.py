@@ -6,9 +6,7 @@ from typing import Any
 
 import pyrealsense2 as rs
 
-from bridge.episode.topics import (
-    camera_topic,
-)
+from bridge.episode.topics import camera_topic
 from bridge.errors import GstError
 from bridge.sources.device_samples import Announcer, NumberedPublisher
 from bridge.sources.realsense.config import (

@@ -47,16 +47,15 @@ class Gripper:
     """A straight line from a signal to the distance between the fingers."""
 
     signal: Signal
-    open_value: float
-    closed_value: float
-    open_m: float
-    closed_m: float
+    config: "UrConfig"
 
     def width_m(self, values: Mapping[str, Value]) -> float:
         """Distance between the fingers, within its ends [m]."""
-        span = self.closed_value - self.open_value
-        closed = (self.signal.read(values) - self.open_value) / span
-        return self.open_m + min(max(closed, 0.0), 1.0) * (self.closed_m - self.open_m)
+        config = self.config
+        span = config.gripper_closed_value - config.gripper_open_value
+        closed = (self.signal.read(values) - config.gripper_open_value) / span
+        reach_m = config.gripper_closed_m - config.gripper_open_m
+        return config.gripper_open_m + min(max(closed, 0.0), 1.0) * reach_m
 
 
 def parse_signal(text: str) -> Signal:
@@ -136,10 +135,4 @@ class UrConfig:
         """The gripper's mapping, or None."""
         if self.gripper == "none":
             return None
-        return Gripper(
-            signal=parse_signal(self.gripper),
-            open_value=self.gripper_open_value,
-            closed_value=self.gripper_closed_value,
-            open_m=self.gripper_open_m,
-            closed_m=self.gripper_closed_m,
-        )
+        return Gripper(signal=parse_signal(self.gripper), config=self)

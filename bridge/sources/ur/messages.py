@@ -45,16 +45,6 @@ _SAFETY = {
 }
 
 
-def robot_mode_name(number: int) -> str:
-    """Name of a robot mode."""
-    return _ROBOT.get(number, f"UNKNOWN_{number}")
-
-
-def safety_mode_name(number: int) -> str:
-    """Name of a safety mode."""
-    return _SAFETY.get(number, f"UNKNOWN_{number}")
-
-
 CONTROLLER_TCP_FRAME = "tool0_controller"
 """The controller's active tool centre point, as ROS drivers of UR arms call it."""
 SPEED_NAME = "speed_scaling"
@@ -109,8 +99,10 @@ def mode_event(
     cell: str, robot_mode: int | None, safety_mode: int | None, stamp_ns: int
 ) -> StampedMessage:
     """What the controller says of itself, as an event (type note)."""
-    robot = None if robot_mode is None else robot_mode_name(robot_mode)
-    safety = None if safety_mode is None else safety_mode_name(safety_mode)
+    robot, safety = (
+        None if number is None else names.get(number, f"UNKNOWN_{number}")
+        for names, number in ((_ROBOT, robot_mode), (_SAFETY, safety_mode))
+    )
     record = {
         "schema_version": 1,
         "stamp_ns": stamp_ns,

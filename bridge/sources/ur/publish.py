@@ -95,16 +95,13 @@ class ArmPublisher:
         self._speed = _Topic(cell_topic(cell, SPEED_SCALING), state, speed)
         self._streams: dict[str, NumberedPublisher] = {}
         self._clock = HostClock()
-        self._rate_hz = SLOW_HZ
+        self.rate_hz = SLOW_HZ
+        """Samples a second that the connection brings."""
         self._last_s: float | None = None
         self._number = 0
         self._slow_number = -1
         self._modes: tuple[int | None, int | None] = (None, None)
         self._said_speed = (0.0, -NS_PER_S, 0)
-
-    def begin(self, rate_hz: float) -> None:
-        """Say how many samples a second the connection that follows brings."""
-        self._rate_hz = rate_hz
 
     def put(self, sample: Sample) -> int:
         """Publish one sample; return how many are missing directly before it."""
@@ -117,7 +114,7 @@ class ArmPublisher:
         if stamp_ns is None:
             return 0
         self._every_sample(sample, stamp_ns)
-        slow_number = self._number // max(1, round(self._rate_hz / SLOW_HZ))
+        slow_number = self._number // max(1, round(self.rate_hz / SLOW_HZ))
         if slow_number != self._slow_number:
             self._slow_number = slow_number
             self._slowly(sample, stamp_ns)
@@ -134,7 +131,7 @@ class ArmPublisher:
         last_s, self._last_s = self._last_s, robot_s
         steps = 1
         if last_s is not None and last_s < robot_s < last_s + LONGEST_GAP_S:
-            steps = max(1, round((robot_s - last_s) * self._rate_hz))
+            steps = max(1, round((robot_s - last_s) * self.rate_hz))
         self._number += steps
         return steps - 1
 
@@ -212,12 +209,18 @@ class UrSource:
         announce(session, config.cell)
         announcer = Announcer(session)
         if urdf is not None:
-            announcer.fact("urdf", _description(urdf, session.now_ns()))
+            description = StampedMessage(
+                topic=ROBOT_DESCRIPTION,
+                type_name=schema.STRING,
+                data=string_to_cdr(urdf),
+                stamp_ns=session.now_ns(),
+            )
+            announcer.fact("urdf", description)
         arm = ArmPublisher(session, config, announcer, robot)
         connections = 1
         try:
             while client is not None:
-                arm.begin(client.rate_hz)
+                arm.rate_hz = client.rate_hz
                 _read(client, arm, stop=stop, output=output)
                 client = _connect_again(session, host, config, stop=stop)
                 if client is not None:
@@ -256,15 +259,6 @@ def _robot(urdf: str | None) -> Robot:
             f"{NUM_JOINTS}."
         )
     return robot
-
-
-def _description(urdf: str, stamp_ns: int) -> StampedMessage:
-    return StampedMessage(
-        topic=ROBOT_DESCRIPTION,
-        type_name=schema.STRING,
-        data=string_to_cdr(urdf),
-        stamp_ns=stamp_ns,
-    )
 
 
 def _connect(session: WireSession, host: str, config: UrConfig, output: Output) -> RtdeClient:

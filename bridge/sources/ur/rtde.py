@@ -252,11 +252,7 @@ class RtdeClient:
         now_ns: Callable[[], int],
         on_text: Callable[[str], None],
     ) -> None:
-        """Connect, agree on what is sent, and start it.
-
-        Args:
-            port: 30004, unless forwarded.
-        """
+        """Connect, agree on what is sent, and start it."""
         self._now_ns = now_ns
         required = ("timestamp", *wish.required)
         self._link = RtdeLink(host, port, on_text=on_text)

@@ -38,9 +38,9 @@ def test_every_gripper_of_the_guide_is_understood(options: str) -> None:
     app = robot_gst.build_app()
     tokens = ["publish", "ur", "192.168.1.10", *shlex.split(options)]
     _, bound, *_ = app.parse_args(tokens, print_error=False, exit_on_error=False)
-    gripper = bound.arguments["config"].make_gripper()
-    assert gripper is not None
-    assert gripper.open_m > gripper.closed_m
+    config = bound.arguments["config"]
+    assert config.make_gripper() is not None
+    assert config.gripper_open_m > config.gripper_closed_m
 
 
 def test_there_is_enough_to_test() -> None:

@@ -24,6 +24,8 @@ from bridge.sources.standin.render import Renderer
 from bridge.sources.standin.surfaces import lab_surfaces
 from twin.calibrate import cameras
 from twin.calibrate.cameras import placement, recorded_pairs
+from twin.calibrate.carried import find_carried_camera
+from twin.calibrate.hand_eye import UndeterminedCameraError
 from twin.robot.model import load_robot
 from twin.scene.align.align import RobotNotAlignedError
 from twin.scene.store.calibration import (
@@ -276,6 +278,19 @@ def test_a_camera_in_the_hand_is_found_by_its_images_of_a_scan(
     left = se3.invert(se3.invert(found[:-1]) @ found[1:]) @ se3.invert(true[:-1]) @ true[1:]
     assert np.median(np.linalg.norm(left[:, :3, 3], axis=1)) < 5e-4
     assert np.median(se3.rotation_angle_rad(left[:, :3, :3])) < 1e-3
+
+
+def test_two_images_of_a_scan_do_not_say_where_a_camera_sits(run: RunFolder) -> None:
+    recording = Recording(run.episodes_dir / "scan.mcap", np.array(cell_views.POSTURES[:2]), "scan")
+    recording.intrinsics("wrist")
+    for index in range(2):
+        stamp = recording.stamp(index)
+        recording.transform("wrist", np.eye(4), stamp)
+        recording.color("wrist", np.full((240, 320, 3), 0.5), stamp)
+        recording.depth("wrist", np.ones((240, 320)), stamp)
+    recording.writer.close()
+    with pytest.raises(UndeterminedCameraError, match="too few of its images of scans meet"):
+        find_carried_camera([Episode.open(run.episodes()[0])], "wrist", "tool0")
 
 
 def test_a_run_without_data_says_what_is_missing(

@@ -25,7 +25,6 @@ def soft_box(
     mass_kg: float = 0.03,
     young_pa: float = 6e4,
     poisson: float = 0.2,
-    friction: float = 1.0,
     damping_s: float = 0.01,
 ) -> SoftModel:
     """A box of cubes around the origin, five tetrahedra each."""
@@ -52,7 +51,6 @@ def soft_box(
         poisson=poisson,
         damping_s=damping_s,
         size_m=tuple(cell_m * n for n in cells),
-        friction=friction,
     )
 
 

@@ -102,7 +102,7 @@ def dropped(model: SoftModel, height_m: float, steps: int) -> tuple[np.ndarray, 
     solver.add_collider(piece.planes, piece.corners_m, below, 0.8, 0.0, np.ones(3))
     T = np.eye(4)
     T[2, 3] = height_m
-    index, _ = add_body(solver, model, T, young_pa=model.young_pa, friction=model.friction or 0.8)
+    index, _ = add_body(solver, model, T, friction=0.8)
     none = np.zeros(0, dtype=np.int32), np.zeros((0, 7))
     for _ in range(steps):
         solver.step(*none)
@@ -167,7 +167,7 @@ def let_hang(
     ]
     T = np.eye(4)
     T[2, 3] = z
-    index, _ = add_body(solver, model, T, young_pa=model.young_pa, friction=1.0)
+    index, _ = add_body(solver, model, T, friction=1.0)
     before = np.nan
     for step in range(CLOSING + RESTING + round(hang_s / PERIOD_S)):
         y = apart - (squeeze_m + 0.001) * min(1.0, (step + 1) / CLOSING)

@@ -33,12 +33,16 @@ def slab(solver: SoftSolver, at: np.ndarray, size_m: tuple[float, ...], friction
 
 
 def put(
-    solver: SoftSolver, model: SoftModel, *at: float, R: np.ndarray | None = None
+    solver: SoftSolver,
+    model: SoftModel,
+    *at: float,
+    R: np.ndarray | None = None,
+    friction: float = 1.0,
 ) -> tuple[int, np.ndarray]:
     T = np.eye(4)
     T[:3, :3] = np.eye(3) if R is None else R
     T[:3, 3] = at
-    return add_body(solver, model, T, young_pa=model.young_pa, friction=model.friction or 0.0)
+    return add_body(solver, model, T, friction=friction)
 
 
 def run(solver: SoftSolver, steps: int) -> None:
@@ -126,7 +130,7 @@ def test_friction_holds_below_its_cone_and_slides_above(
     turn = np.arctan(slope)
     R = se3.rotation_from_vector(np.array([0.0, turn, 0.0]))
     slab(solver, np.concatenate([R @ [0, 0, -0.2], pose(0, 0, 0, turn)[3:]]), (4.0, 2.0, 0.4), 0.5)
-    model = box_of_cells((4, 4, 2), friction=1.0)
+    model = box_of_cells((4, 4, 2))
     index, _ = put(solver, model, *(R @ [0, 0, 0.014]), R=R)
     run(solver, 60)
     before = solver.nodes(index).mean(axis=0)
@@ -175,8 +179,8 @@ def test_a_fast_body_does_not_pass_a_thin_wall(box_of_cells: Boxes) -> None:
 def test_a_finger_that_comes_down_dents_a_toy_and_does_not_burst_it(box_of_cells: Boxes) -> None:
     solver = empty()
     slab(solver, pose(0, 0, -0.2), (2.0, 2.0, 0.4), 0.8)
-    model = box_of_cells((5, 4, 4), young_pa=8e4, friction=0.8)
-    index, _ = put(solver, model, 0.0, 0.0, 0.028)
+    model = box_of_cells((5, 4, 4), young_pa=8e4)
+    index, _ = put(solver, model, 0.0, 0.0, 0.028, friction=0.8)
     high, low, steps = 0.056 + 0.036, 0.016 + 0.035, 28
     finger = slab(solver, pose(0, 0.012, high), (0.02, 0.012, 0.07), 0.0)
     worst = 0.0
