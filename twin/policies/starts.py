@@ -14,7 +14,7 @@ from bridge.episode.executions import EXECUTION, executed_events
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
-from bridge.robots.robot import robot_of
+from bridge.robots.robot import Robot
 from bridge.task.task_file import Task
 from twin.policies.errors import PolicyError
 from twin.policies.identify import response_of
@@ -96,15 +96,14 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
         episode_path=episode.path,
         scene=scene,
         joints_rad=joints_rad,
-        width_m=_width_m(episode, urdf, stamp_ns),
+        width_m=_width_m(episode, robot.record, stamp_ns),
         stamp_ns=stamp_ns,
         config=for_task(ReplayConfig(), read_calibration(run), task),
         response=response_of(run, episode, robot),
     )
 
 
-def _width_m(episode: Episode, urdf: str, stamp_ns: int) -> float:
-    robot = robot_of(urdf)
+def _width_m(episode: Episode, robot: Robot, stamp_ns: int) -> float:
     try:
         return float(width_track(episode, robot).at(np.array([stamp_ns]))[0, 0])
     except GstError:

@@ -39,10 +39,23 @@ def unpack(data: bytes) -> Any:
 
 
 @contextmanager
+def listening(talk: Callable[[ServerConnection], None]) -> Iterator[str]:
+    """A server on the loopback address; yields its address."""
+    with serve(talk, "127.0.0.1", 0, compression=None, max_size=None) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@contextmanager
 def served(
     answer: Answer, metadata: bytes | str | None = b"\x80"
 ) -> Iterator[tuple[str, list[str]]]:
-    """A server on the loopback address; yields its address and the keys that were sent."""
+    """A server that answers; yields its address and the keys that were sent."""
     keys: list[str] = []
 
     def talk(socket: ServerConnection) -> None:
@@ -54,14 +67,8 @@ def served(
             assert isinstance(message, bytes)
             socket.send(answer(message))
 
-    with serve(talk, "127.0.0.1", 0, compression=None, max_size=None) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}", keys
-        finally:
-            server.shutdown()
-            thread.join()
+    with listening(talk) as address:
+        yield address, keys
 
 
 def test_a_thousand_frames_there_and_back(monkeypatch: pytest.MonkeyPatch) -> None:

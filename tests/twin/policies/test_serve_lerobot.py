@@ -3,7 +3,6 @@
 import hashlib
 import runpy
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from websockets.sync.server import serve
+from test_openpi import listening
 
 from bridge.robots.default import ROBOT
 from twin.policies.errors import PolicyError
@@ -51,14 +50,10 @@ def policy(
     monkeypatch.setitem(sys.modules, "lerobot.policies.factory", factory)
     (tmp_path / "model.safetensors").write_bytes(b"learned")
     talk = runpy.run_path(str(EXAMPLES / "serve_lerobot.py"))["Server"](str(tmp_path)).talk
-    with serve(talk, "127.0.0.1", 0, compression=None, max_size=None) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        client = ServedPolicy(f"ws://127.0.0.1:{server.socket.getsockname()[1]}", 20.0)
+    with listening(talk) as address:
+        client = ServedPolicy(address, 20.0)
         yield client, shown
         client.close()
-        server.shutdown()
-        thread.join()
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_masses_frictions_and_places_are_changed_by_their_shares(start: Start) -
     )
 
 
-def test_cameras_turn_about_themselves_and_light_scales_pictures(run: RunFolder) -> None:
+def test_cameras_turn_about_themselves(run: RunFolder) -> None:
     start = open_start(run, trial_episodes(run, "")[0])
     plain = TwinCameras(run, start)
     drawn = {"camera.side.angle": (0.0, 0.0, 0.1), "camera.side.position": (0.0, 0.0, 0.02)}
@@ -80,13 +80,6 @@ def test_cameras_turn_about_themselves_and_light_scales_pictures(run: RunFolder)
     wrist = [cameras.viewpoints["wrist"].T_tcp_camera for cameras in (moved, plain)]
     assert wrist[0] is not None
     np.testing.assert_allclose(*wrist, atol=1e-12)
-    cell = TwinCell(start)
-    dim = TwinCameras(run, start, drawn={"light": (-0.5,)}).draw(cell)
-    bright = plain.draw(cell)
-    cell.close()
-    for name, picture in bright.items():
-        assert picture.max() > 100
-        np.testing.assert_allclose(dim[name], picture / 2, atol=0.51)
 
 
 def test_a_rollout_begins_when_its_trial_moved(run: RunFolder) -> None:
@@ -218,8 +211,9 @@ def test_a_policy_sees_the_light(run: RunFolder) -> None:
     assert np.array_equal(found["side"], plain["side"])
     expected = np.clip(plain["wrist"] * np.array(LIGHT), 0, 255)
     assert np.abs(found["wrist"] - expected).max() <= 0.5 + 1e-3
-    assert found["wrist"].max() > 0
+    assert found["wrist"].max() > 100
     assert np.abs(dark["wrist"] - 0.5 * expected).max() <= 0.5 + 1e-3
+    assert np.abs(dark["side"] - 0.5 * plain["side"]).max() <= 0.5 + 1e-3
     assert np.array_equal(lit(plain, gains)["wrist"], found["wrist"])
 
 
