@@ -41,11 +41,18 @@ def test_the_grasp_is_found_also_when_it_comes_late(script: SimpleNamespace, lag
     assert np.all(np.diff(np.flatnonzero(closed)) == 1)
 
 
+def still_arm(times: np.ndarray) -> JointTrack:
+    return JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
+
+
+def gripper(times: np.ndarray, width: np.ndarray) -> JointTrack:
+    return JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
+
+
 def test_the_command_presses_only_while_something_is_held(script: SimpleNamespace) -> None:
     times, width = recorded_grasp(0.2)
-    track = JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
-    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
-    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig(), ROBOT)
+    plan, track = script.plan(script.scene()), still_arm(times)
+    path = path_of_execution(track, gripper(times, width), plan, ReplayConfig(), ROBOT)
     at = {t: float(path.width_at(np.array([round(t * 1e9)]))[0]) for t in (0.5, 3.0, 5.2)}
     assert at[0.5] == pytest.approx(OPEN_M, abs=1e-3)
     assert at[3.0] == pytest.approx(HELD_M - 0.01, abs=1e-3)
@@ -58,9 +65,8 @@ def test_stamps_count_from_the_first_one_and_repeats_are_dropped(script: SimpleN
     times, width = recorded_grasp(0.0)
     stamps = np.concatenate([times, times[-1:]]) + 1_700_000_000_000_000_000
     width = np.append(width, width[-1])
-    track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=np.zeros((len(stamps), 6)))
-    widths = JointTrack(names=("gripper_width",), stamps_ns=stamps, position=width[:, None])
-    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig(), ROBOT)
+    plan, track = script.plan(script.scene()), still_arm(stamps)
+    path = path_of_execution(track, gripper(stamps, width), plan, ReplayConfig(), ROBOT)
     assert path.times_ns[0] == 0
     assert np.all(np.diff(path.times_ns) > 0)
     assert path.end_ns() == times[-1]
@@ -84,19 +90,14 @@ def test_stages_take_the_times_the_recording_gives_them(script: SimpleNamespace)
 def test_joints_that_were_not_recorded_are_not_made_up(script: SimpleNamespace) -> None:
     times, width = recorded_grasp(0.0)
     plan = script.plan(script.scene())
-    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
-    there = (times < 2_000_000_000) | (times > 3_000_000_000)
-    track = JointTrack(
-        names=ARM_JOINTS, stamps_ns=times[there], position=np.zeros((int(there.sum()), 6))
-    )
+    track = still_arm(times[(times < 2_000_000_000) | (times > 3_000_000_000)])
     with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 2\.0 s on"):
-        path_of_execution(track, widths, plan, ReplayConfig(), ROBOT)
+        path_of_execution(track, gripper(times, width), plan, ReplayConfig(), ROBOT)
 
 
 def test_a_recording_that_stops_early_or_starts_late_is_refused(script: SimpleNamespace) -> None:
     stamps = np.arange(2_000_000_000, 4_000_000_000, 8_000_000)
-    track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=np.zeros((len(stamps), 6)))
-    plan = script.plan(script.scene())
+    track, plan = still_arm(stamps), script.plan(script.scene())
     cut = cut_track(track, 2_000_000_000, 5_000_000_000)
     check_covers(cut, "joints", 4_400_000_000, plan.id)
     with pytest.raises(UnusablePlanError, match=r"no joints were recorded for 1\.0 s at its end"):
@@ -104,10 +105,6 @@ def test_a_recording_that_stops_early_or_starts_late_is_refused(script: SimpleNa
     late = cut_track(track, 1_000_000_000, 3_000_000_000)
     with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 0\.0 s on"):
         path_of_execution(late, late, plan, ReplayConfig(), ROBOT)
-
-
-def still_arm(times: np.ndarray) -> JointTrack:
-    return JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
 
 
 @pytest.mark.parametrize(
@@ -154,8 +151,8 @@ def test_a_joint_that_is_not_the_arms_may_say_nothing(script: SimpleNamespace) -
     position = np.tile(np.arange(7.0), (len(times), 1)) / 10
     position[:, 0] = np.nan
     track = JointTrack(names=names, stamps_ns=times, position=position)
-    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
-    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig(), ROBOT)
+    plan = script.plan(script.scene())
+    path = path_of_execution(track, gripper(times, width), plan, ReplayConfig(), ROBOT)
     assert path.joints_rad[0] == pytest.approx([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
 
 

@@ -175,20 +175,6 @@ def duck(instance: int, x: float, y: float, yaw_rad: float = 0.0) -> list[Piece]
     ]
 
 
-def sloth(instance: int, x: float, y: float) -> list[Piece]:
-    """On its belly: a body, a head and four limbs, 18 cm long."""
-    pieces = [
-        ellipsoid(instance, [x, y, 0.028], [0.055, 0.030, 0.028], BROWN, "body"),
-        ellipsoid(instance, [x + 0.068, y, 0.040], [0.025, 0.025, 0.024], BROWN, "head"),
-    ]
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            start = [x + sx * 0.03, y + sy * 0.022, 0.018]
-            end = [x + sx * 0.055, y + sy * 0.062, 0.012]
-            pieces.append(rod(instance, start, end, 0.011, BROWN, "limbs"))
-    return pieces
-
-
 def basket(instance: int, x: float, y: float) -> list[Piece]:
     """An open box with an arched handle and a rim of another shade."""
     color, dark = (0.70, 0.52, 0.30), (0.5, 0.35, 0.2)

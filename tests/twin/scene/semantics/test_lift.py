@@ -2,14 +2,9 @@ import numpy as np
 import pytest
 from table_scene import World, iou
 
-from bridge.geometry.camera import Camera
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_from_masks
-from twin.scene.semantics.lift import Viewpoint, render_labels
-
-SMALL = Viewpoint(
-    camera=Camera(width=24, height=16, fx=20.0, fy=20.0, cx=12.0, cy=8.0), T_base_camera=np.eye(4)
-)
+from twin.scene.semantics.lift import render_labels
 
 
 @pytest.fixture
