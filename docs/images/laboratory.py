@@ -15,7 +15,7 @@ from side_by_side import write_rows
 
 from bridge.episode.cdr.messages import CompressedColor
 from bridge.media.color import decode_color
-from bridge.sources.standin.cell import CellConfig, StandinCell
+from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import NO_ERROR, plan_pick_and_place
@@ -66,7 +66,7 @@ def filmed(name: str, seed: int, start: int) -> tuple[list[np.ndarray], str]:
         task,
         draw_hidden(file, seed, task),
         Streams(film, "lab"),
-        config=CellConfig(rate_hz=1.0),
+        rate_hz=1.0,
         seed=seed,
         start_ns=0,
     )

@@ -62,7 +62,7 @@ def robot_links() -> tuple[LinkModel, ...]:
     elements = {item.attrib["name"]: item for item in root.findall("link")}
     joints = root.findall("joint")
     links = []
-    waiting: list[tuple[str, ET.Element | None]] = [(BASE_FRAME, None)]
+    waiting = [(BASE_FRAME, ET.Element("joint", type="fixed"))]
     while waiting:
         name, joint = waiting.pop(0)
         links.append(_link(elements[name], joint))
@@ -77,27 +77,20 @@ def _child_of(joint: ET.Element, tag: str) -> str:
     return "" if found is None else found.attrib["link"]
 
 
-def _link(element: ET.Element, joint: ET.Element | None) -> LinkModel:
-    inertial = element.find("inertial")
-    mass = None if inertial is None else inertial.find("mass")
-    tensor = None if inertial is None else inertial.find("inertia")
+def _link(element: ET.Element, joint: ET.Element) -> LinkModel:
+    tensor, limit = element.find("inertial/inertia"), joint.find("limit")
     names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    values = [0.0] * 6 if tensor is None else [float(tensor.attrib[name]) for name in names]
-    xx, yy, zz, xy, xz, yz = values
-    axis = None if joint is None else joint.find("axis")
-    limit = None if joint is None else joint.find("limit")
+    xx, yy, zz, xy, xz, yz = (_number(tensor, name) for name in names)
     return LinkModel(
         name=element.attrib["name"],
-        parent=None if joint is None else _child_of(joint, "parent"),
-        joint=None if joint is None else joint.attrib["name"],
-        joint_type="fixed" if joint is None else joint.attrib["type"],
-        axis=_vector(None if axis is None else axis.attrib["xyz"], (1.0, 0.0, 0.0)),
-        limits=(0.0, 0.0)
-        if limit is None
-        else (float(limit.attrib["lower"]), float(limit.attrib["upper"])),
+        parent=_child_of(joint, "parent") or None,
+        joint=joint.get("name"),
+        joint_type=joint.attrib["type"],
+        axis=_vector(joint.find("axis"), "xyz", "1 0 0"),
+        limits=(_number(limit, "lower"), _number(limit, "upper")),
         T_parent_link=_origin(joint),
-        mass_kg=0.0 if mass is None else float(mass.attrib["value"]),
-        T_link_inertial=_origin(inertial),
+        mass_kg=_number(element.find("inertial/mass"), "value"),
+        T_link_inertial=_origin(element.find("inertial")),
         inertia_kgm2=np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
         shapes=tuple(_shapes(element)),
     )
@@ -112,14 +105,19 @@ def _shapes(element: ET.Element) -> list[LinkShape]:
             shapes.append(LinkShape(T_link_shape=_origin(collision), mesh=path, box_m=None))
         elif box is not None and element.attrib["name"] != "ee_link":
             # ee_link holds a 1 cm marker box inside the flange, not a part of the robot.
-            size = _vector(box.attrib["size"], (0.0, 0.0, 0.0))
+            size = _vector(box, "size")
             shapes.append(LinkShape(T_link_shape=_origin(collision), mesh=None, box_m=size))
     return shapes
 
 
-def _vector(text: str | None, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    if text is None:
-        return default
+def _number(element: ET.Element | None, name: str) -> float:
+    return 0.0 if element is None else float(element.get(name, "0"))
+
+
+def _vector(
+    element: ET.Element | None, name: str, default: str = "0 0 0"
+) -> tuple[float, float, float]:
+    text = default if element is None else element.get(name, default)
     x, y, z = (float(value) for value in text.split())
     return x, y, z
 
@@ -129,9 +127,8 @@ def _origin(element: ET.Element | None) -> Float[np.ndarray, "4 4"]:
     origin = None if element is None else element.find("origin")
     if origin is None:
         return np.eye(4)
-    roll, pitch, yaw = _vector(origin.attrib.get("rpy"), (0.0, 0.0, 0.0))
-    q = Rotation.from_euler("xyz", (roll, pitch, yaw)).as_quat(scalar_first=True)
-    return se3.transform_from(q, np.array(_vector(origin.attrib.get("xyz"), (0.0, 0.0, 0.0))))
+    q = Rotation.from_euler("xyz", _vector(origin, "rpy")).as_quat(scalar_first=True)
+    return se3.transform_from(q, np.array(_vector(origin, "xyz")))
 
 
 def true_links(deviations: Deviations | None) -> tuple[LinkModel, ...]:

@@ -17,7 +17,7 @@ from bridge.episode.metadata import Outcome
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.sources.standin import planner
-from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
+from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.destination import release_slots
 from bridge.sources.standin.kinematics import yaw_of
@@ -60,7 +60,7 @@ def trial(task: Task, file: CellFile, session: Any) -> tuple[Outcome, StandinCel
         task,
         draw_hidden(file, SEED),
         Streams(session, "standin"),
-        config=CellConfig(rate_hz=0.0),
+        rate_hz=0.0,
         seed=SEED,
         start_ns=0,
     )
@@ -128,7 +128,6 @@ def test_the_same_seed_gives_the_same_squeeze(
             task,
             draw_hidden(toys_cell, seed),
             Streams(session, "standin"),
-            config=CellConfig(),
             seed=seed,
             start_ns=0,
         )
@@ -270,7 +269,6 @@ def test_the_operator_puts_toys_down_a_little_off(
         sloth,
         nominal_hidden(toys_cell),
         Streams(session, "standin"),
-        config=CellConfig(),
         seed=SEED,
         start_ns=0,
     )
