@@ -407,28 +407,22 @@ class World:
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[self._arm] = joints_rad
         self._data.qpos[self._fingers] = MAX_WIDTH_M / 2
-        self._pending.clear()
-        self.place(Ts_base_object)
-        self.command(joints_rad, MAX_WIDTH_M)
-        self._data.ctrl[:] = self._pending[0]
-        mujoco.mj_forward(self._model, self._data)
-
-    def place(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
-        """Move objects by hand; the arm stays as it is."""
         for object_id, T in Ts_base_object.items():
             q, p = se3.split(T)
             if object_id in self._soft:
                 body = self._soft[object_id]
-                self._data.qpos[body.addresses] = body.qpos_at(T)
-                self._data.qvel[body.dofs] = 0.0
+                moved_m = se3.apply(T, body.rest_nodes_m) - body.rest_nodes_m
+                self._data.qpos[body.addresses] = moved_m
             elif self.task.objects[object_id].fixed:
                 mocap = int(self._model.body(object_id).mocapid[0])
                 self._data.mocap_pos[mocap], self._data.mocap_quat[mocap] = p, q
             else:
                 address = self._joint_address(object_id)
                 self._data.qpos[address : address + 7] = np.concatenate([p, q])
-                dof = int(self._model.joint(object_id).dofadr[0])
-                self._data.qvel[dof : dof + 6] = 0.0
+        mujoco.mj_forward(self._model, self._data)
+        self._pending.clear()
+        self.command(joints_rad, MAX_WIDTH_M)
+        self._data.ctrl[:] = self._pending[0]
         mujoco.mj_forward(self._model, self._data)
 
     def command(self, joints_rad: Float[np.ndarray, "6"], width_m: float) -> None:
@@ -488,7 +482,7 @@ class World:
     def Ts_base_object(self) -> dict[str, Float[np.ndarray, "4 4"]]:
         """True poses of all objects."""
         return {
-            object_id: self._soft[object_id].pose_of(self.nodes_m(object_id))
+            object_id: se3.align_rigid(self._soft[object_id].rest_nodes_m, self.nodes_m(object_id))
             if object_id in self._soft
             else self.T_base_body(object_id)
             for object_id in self.task.objects
@@ -509,8 +503,10 @@ class World:
     def extents_m(
         self, object_id: str, T_base_object: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "3"]:
-        """Outer extents of a soft object along the axes of its pose."""
-        return self._soft[object_id].extents_m(self.nodes_m(object_id), T_base_object)
+        """Outer extents of a soft object's deformed surface along the axes of its pose."""
+        surface_m = self._soft[object_id].skin_weights @ self.nodes_m(object_id)
+        local_m = (surface_m - T_base_object[:3, 3]) @ T_base_object[:3, :3]
+        return np.asarray(np.ptp(local_m, axis=0))
 
     def finger_contact(self) -> dict[str, bool]:
         """Per object: whether a finger touches it now."""

@@ -25,7 +25,6 @@ from bridge.sources.standin.operator import Operator, execute_plan, label_trial,
 from bridge.sources.standin.render import Renderer
 from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig
-from bridge.sources.standin.soft import SoftBody
 from bridge.sources.standin.streams import Streams
 from bridge.sources.standin.surfaces import clutter_surfaces, lab_surfaces, object_surfaces
 from bridge.sources.standin.world import World
@@ -141,15 +140,14 @@ def test_the_same_seed_gives_the_same_squeeze(
 
 def test_a_soft_body_tells_the_pose_it_was_given(sloth: Task, toys_cell: CellFile) -> None:
     world = World(sloth, nominal_hidden(toys_cell))
-    body: SoftBody = world._soft["sloth"]
     rng = np.random.default_rng(4)
     for _ in range(20):
         q = rng.normal(size=4)
         T = se3.transform_from(q / np.linalg.norm(q), rng.uniform(-0.5, 0.5, 3))
-        nodes = body.rest_nodes_m + body.qpos_at(T)
-        np.testing.assert_allclose(body.pose_of(nodes), T, atol=1e-9)
+        world.reset(np.zeros(6), {"sloth": T})
+        np.testing.assert_allclose(world.Ts_base_object()["sloth"], T, atol=1e-9)
         np.testing.assert_allclose(
-            body.extents_m(nodes, T), sloth.objects["sloth"].size_m, atol=1e-9
+            world.extents_m("sloth", T), sloth.objects["sloth"].size_m, atol=1e-9
         )
 
 
