@@ -39,7 +39,7 @@ from twin.gate.config import GateConfig
 from twin.gate.gate import Gate, JudgedTasks, no_verdict
 from twin.gate.live import LiveView
 from twin.gate.service import serve_localisation
-from twin.gate.twin_process import _asked, answer, look
+from twin.gate.twin_process import answer, asked, look
 from twin.replay.config import PosteriorDraw
 
 TASKS = (
@@ -126,10 +126,10 @@ def own_engine(cell: StandinCell, trial: Trial) -> bool:
 
 def p_success(run: RunFolder, trial: Trial, draws: Sequence[PosteriorDraw]) -> dict[str, Any]:
     """The verdict of a gate that knows these draws."""
-    asked = _asked(GateConfig(samples=SAMPLES), run.path, trial.plan, trial.scene)
-    variation = replace(asked.config.variation, posterior=tuple(draws))
-    config = replace(asked.config, variation=variation)
-    verdict = answer(replace(asked, config=config))
+    question = asked(GateConfig(samples=SAMPLES), run.path, trial.plan, trial.scene)
+    variation = replace(question.config.variation, posterior=tuple(draws))
+    config = replace(question.config, variation=variation)
+    verdict = answer(replace(question, config=config))
     causes = Counter(filter(None, (verdict.samples or {}).get("cause", ())))
     p = None if verdict.p_success is None else verdict.p_success["value"]
     return {"p": p, "accepted": verdict.accepted, "reason": verdict.reason, "causes": dict(causes)}

@@ -44,7 +44,6 @@ from twin.plan.grasp.search import GraspConfig, GraspSearcher
 from twin.plan.problem import Grasp, NoPlanError, Problem, Shape
 from twin.plan.shapes import shapes_of
 from twin.replay.scene import ReplayScene
-from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
 from twin.robot.model import load_robot
 from twin.scene.localise.objects import localise_objects
@@ -145,7 +144,7 @@ def nominal_grasp(problem: Problem, key: str) -> Grasp:
     yaw = min(((yaw + t + np.pi) % (2 * np.pi) - np.pi for t in turns), key=abs)
     T_base_tcp = tool_down(se3.apply(T, np.array(model.grasp_m)), yaw)
     home = problem.scene.start_rad
-    joints = solve_ik(problem.robot, T_base_tcp, IkConfig(), warm_start_rad=home).joints_rad
+    joints = solve_ik(problem.robot, T_base_tcp, warm_start_rad=home).joints_rad
     return Grasp(
         object_id=key, T_object_tcp=se3.invert(T) @ T_base_tcp, width_m=0.0,
         open_m=ROBOT.gripper.max_width_m, margin=0.0, joints_rad=joints, pregrasp_m=APPROACH_M,
@@ -158,7 +157,7 @@ def line(T: np.ndarray, shift_m: np.ndarray, joints: np.ndarray) -> np.ndarray:
     for share in np.arange(1, STEPS + 1) / STEPS:
         there = T.copy()
         there[:3, 3] += share * shift_m
-        found = solve_ik(robot, there, IkConfig(), warm_start_rad=rows[-1])
+        found = solve_ik(robot, there, warm_start_rad=rows[-1])
         rows.append(found.joints_rad)
     return np.array(rows)
 

@@ -37,7 +37,6 @@ def cpu_us(work: Callable[[], object], *, repeats: int, each: int = 1) -> float:
 
 def inverse_rows(num_poses: int) -> list[Target]:
     from bridge.robots.default import ROBOT
-    from twin.robot.config import IkConfig
     from twin.robot.inverse import UrInverse, pose_error, solve_ik
     from twin.robot.model import load_robot
 
@@ -53,7 +52,7 @@ def inverse_rows(num_poses: int) -> list[Target]:
     few = Ts[: max(num_poses // 10, 10)]
     solved = []
     cold_us = cpu_us(
-        lambda: solved.append(sum(solve_ik(robot, T, IkConfig()).reached for T in few)),
+        lambda: solved.append(sum(solve_ik(robot, T).reached for T in few)),
         repeats=1,
         each=len(few),
     )
@@ -87,7 +86,6 @@ def eaik_us(Ts: np.ndarray) -> float | None:
 
 def warm_rows(robot: object, rng: np.random.Generator) -> list[Target]:
     """Along 40 smooth joint paths of 50 poses, each solved from the one before."""
-    from twin.robot.config import IkConfig
     from twin.robot.follow import follow_poses
     from twin.robot.inverse import solve_ik
 
@@ -100,13 +98,13 @@ def warm_rows(robot: object, rng: np.random.Generator) -> list[Target]:
         for path, poses in zip(paths, Ts, strict=True):
             joints = path[0]
             for T in poses:
-                solution = solve_ik(robot, T, IkConfig(), warm_start_rad=joints)
+                solution = solve_ik(robot, T, warm_start_rad=joints)
                 joints = solution.joints_rad
                 reached.append(solution.reached)
 
     def follow() -> None:
         for path, poses in zip(paths, Ts, strict=True):
-            follow_poses(robot, poses, start_rad=path[0], config=IkConfig())
+            follow_poses(robot, poses, start_rad=path[0])
 
     warm_us = cpu_us(warm, repeats=3, each=2000)
     follow_us = cpu_us(follow, repeats=3, each=2000)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
 from typing import Any, NamedTuple
@@ -20,9 +20,10 @@ from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode import topics as named
 from bridge.episode.catalogue import find_episodes
-from bridge.episode.cdr.messages import JointSample, string_from_cdr
+from bridge.episode.cdr.messages import JointSample, string_from_cdr, string_to_cdr
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.streams import robot_description
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.exchange.driver_names import mapped
 from bridge.exchange.rosbag2 import METADATA_FILE, count_messages, find_files, unpacked
@@ -139,11 +140,11 @@ def open(
 
 
 def _mapped(file: Path | None, bring: Callable[..., int]) -> tuple[str, dict[str, Any]]:
-    """The robot and the options of an import that a map names."""
+    """The robot, where the import leaves it to replays, and the options that a map names."""
     known = signature(bring).parameters
     try:
         options = {} if file is None else tomllib.loads(file.read_text("utf-8"))
-        robot = str(options.pop("robot", ""))
+        robot = "" if "robot" in known else str(options.pop("robot", ""))
         if topics := dict(options.pop("topics", {})):
             options["remap"] = tuple(f"{old}={new}" for old, new in topics.items())
         if "config" in known:
@@ -287,7 +288,8 @@ def _robot(seen: Survey, asked: str = "") -> tuple[list[str], list[str], list[Ro
     }
     if not tracks:
         return [], [f"joint states on a topic that ends in {named.JOINT_STATES}"], []
-    topic, joints = max(tracks.items(), key=lambda item: len(item[1]))
+    topic = max(tracks, key=lambda each: len(tracks[each]))
+    joints = [*tracks.pop(topic), *chain(*tracks.values())]  # of others they are joined in
     urdf = seen.first.get(named.ROBOT_DESCRIPTION)
     known = [robot_of(string_from_cdr(urdf))] if urdf else []
     fits = robots_with(joints, [read_robot(asked)] if asked else known)
@@ -427,6 +429,9 @@ def _survey(run: RunFolder) -> Survey:
     for path in run.episodes()[:MOST_EPISODES]:
         with suppress(GstError):  # ls and check say what is wrong with it
             episode = Episode.open(path)
+            if named.ROBOT_DESCRIPTION not in seen.types and (urdf := robot_description(episode)):
+                seen.types[named.ROBOT_DESCRIPTION] = schema.STRING
+                seen.first[named.ROBOT_DESCRIPTION] = string_to_cdr(urdf)
             for topic, about in episode.topics().items():
                 if topic not in seen.types and about.count:
                     seen.types[topic] = about.type_name

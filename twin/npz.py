@@ -11,8 +11,7 @@ import numpy as np
 from bridge.whole_file import write_whole
 from twin.errors import UnreadableFileError
 
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The earliest time a zip file can say; the real one would change the file's hash."""
+_UNREADABLE = (OSError, EOFError, ValueError, TypeError, MemoryError)
 
 
 class UnreadableArraysError(UnreadableFileError):
@@ -22,32 +21,21 @@ class UnreadableArraysError(UnreadableFileError):
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays, whole or not at all."""
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        for name, rows in arrays.items():
-            body = io.BytesIO()
-            np.lib.format.write_array(body, np.asarray(rows, order="C"), allow_pickle=False)
-            about = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
-            archive.writestr(about, body.getvalue(), compress_type=zipfile.ZIP_DEFLATED)
+    np.savez_compressed(stream, allow_pickle=False, **arrays)
     write_whole(path, stream.getvalue())
 
 
 def read_npz(path: Path, names: Sequence[str], max_bytes: int) -> dict[str, np.ndarray]:
     """Read named arrays; sizes are checked before anything is unpacked, pickles are refused."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            sizes = {about.filename: about.file_size for about in archive.infolist()}
-            wanted = [f"{name}.npy" for name in names]
-            missing = [name for name in wanted if name not in sizes]
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            missing = [name for name in names if name not in archive]
             if missing:
                 raise UnreadableArraysError(path=path, found=f"without {', '.join(missing)}")
-            total = sum(sizes[name] for name in wanted)
+            total = sum(archive.zip.getinfo(f"{name}.npy").file_size for name in names)
             if total > max_bytes:
                 found = f"holds {total} bytes, more than the {max_bytes} that are allowed"
                 raise UnreadableArraysError(path=path, found=found)
-            streams = {name: io.BytesIO(archive.read(f"{name}.npy")) for name in names}
-            return {
-                name: np.lib.format.read_array(stream, allow_pickle=False)
-                for name, stream in streams.items()
-            }
-    except (OSError, ValueError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+            return {name: archive[name] for name in names}
+    except (*_UNREADABLE, zipfile.BadZipFile, zlib.error) as error:
         raise UnreadableArraysError(path=path, found=f"not a file of arrays ({error})") from error

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from bridge.clock import ClockChoice
 from bridge.episode.schema import StampedMessage
 from bridge.sources.folder.config import FolderConfig
-from bridge.terminal import Output
+from bridge.terminal import RARE, Output
 
 OUTPUT = Output()
 
@@ -187,7 +187,8 @@ def import_rosbag2(
     *,
     episode: str | None = None,
     task: str | None = None,
-    remap: tuple[str, ...] = (),
+    robot: str | None = None,
+    remap: Annotated[tuple[str, ...], RARE] = (),
     output: Output = OUTPUT,
 ) -> int:
     """Turn a rosbag2 recording into an episode; every message stays byte for byte.
@@ -200,6 +201,7 @@ def import_rosbag2(
         run: Run folder; made where needed.
         episode: Id of the new episode; by default from the name of the bag.
         task: Name or file of the task it is a trial of.
+        robot: Robot file or URDF; the episode carries it, whatever description was recorded.
         remap: OLD=NEW: another name for a topic, such as /front/rgb=/cam/front/color/image.
             Without any, topics of known camera drivers are renamed.
     """
@@ -209,15 +211,17 @@ def import_rosbag2(
     from bridge.episode.run_folder import RunFolder
     from bridge.exchange.output import tell_unused
     from bridge.exchange.rosbag2 import count_messages, import_bag
+    from bridge.robots.robot import read_robot
 
     stem = re.sub(r"(\.mcap|\.db3)?(\.zstd)?$", "", bag.resolve().name)
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_-")
     total = count_messages(bag)
     opened, name = RunFolder.create(run), episode or plain or "bag"
     of_task = task_of_run(opened, task) if task else ""
+    urdf = read_robot(robot).description() if robot else ""
     with output.progress("import", total) as advance:
         report = import_bag(
-            bag, opened, episode_id=name, task=of_task, remap=remap, advance=advance
+            bag, opened, episode_id=name, task=of_task, urdf=urdf, remap=remap, advance=advance
         )
     data = {
         "file": str(report.path),

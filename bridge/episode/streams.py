@@ -344,17 +344,21 @@ def object_pose_topics(episode: Episode) -> dict[str, str]:
     }
 
 
+ROBOT_FILE = "robot.urdf"
+"""Attachment with the robot's description, of more weight than a recorded one."""
+
+
 def recorded_robot(episode: Episode) -> Robot:
     """Return the robot an episode was recorded with; one without a description: the default."""
     return robot_of(robot_description(episode) or "")
 
 
 def robot_description(episode: Episode) -> str | None:
-    """Return the URDF text, from ``/robot_description`` or the attachment ``robot.urdf``."""
-    for message in episode.messages([ROBOT_DESCRIPTION]):
-        return string_from_cdr(message.data)
-    attached = episode.attachment("robot.urdf")
-    return None if attached is None else attached.decode()
+    """Return the URDF text: the attachment ``ROBOT_FILE``, else ``/robot_description``."""
+    if (attached := episode.attachment(ROBOT_FILE)) is not None:
+        return attached.decode()
+    messages = episode.messages([ROBOT_DESCRIPTION])
+    return next((string_from_cdr(message.data) for message in messages), None)
 
 
 def task_file(episode: Episode, name: str = "") -> TaskFile:

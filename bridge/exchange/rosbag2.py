@@ -24,6 +24,7 @@ from bridge.episode.mcap.walk import DAMAGE
 from bridge.episode.metadata import EpisodeInfo, imported_info
 from bridge.episode.provenance import hash_file
 from bridge.episode.run_folder import RunFolder, check_episode_id
+from bridge.episode.streams import ROBOT_FILE
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError, MissingDependencyError, PathNotFoundError
 from bridge.exchange.driver_names import mapped
@@ -136,6 +137,7 @@ def import_bag(
     *,
     episode_id: str,
     task: str = "",
+    urdf: str = "",
     remap: Sequence[str] = (),
     advance: Callable[[int, str], None] = lambda done, note: None,
 ) -> ImportReport:
@@ -144,6 +146,7 @@ def import_bag(
     Args:
         source: A file, or a folder with ``metadata.yaml`` or several files.
         task: Name of the task it is a trial of; "": it is not known to be one.
+        urdf: The robot's description, in place of one that was recorded.
         remap: OLD=NEW of topics; without any, those of known camera drivers are renamed.
     """
     check_episode_id(episode_id)
@@ -151,7 +154,7 @@ def import_bag(
     with unpacked(sources, run.episodes_dir.parent) as bag:
         stand_in = is_of_stand_in(source)
         info = imported_info(episode_id, task, tags=("rosbag2",), stand_in=stand_in)
-        return _import(bag, sources, run, info, mapped(bag.types(), remap), advance)
+        return _import(bag, sources, run, info, urdf, mapped(bag.types(), remap), advance)
 
 
 @contextmanager
@@ -170,6 +173,7 @@ def _import(
     sources: list[Path],
     run: RunFolder,
     info: EpisodeInfo,
+    urdf: str,
     names: dict[str, str],
     advance: Callable[[int, str], None],
 ) -> ImportReport:
@@ -178,6 +182,8 @@ def _import(
     unread: dict[str, Unused] = {}
     try:
         writer.describe(info)
+        if urdf:
+            writer.attach(ROBOT_FILE, urdf.encode(), media_type="application/xml", log_time_ns=0)
         bag.copy_attachments(writer)
         for done, item in enumerate(bag.messages(), start=1):
             topic = names.get(item.topic, item.topic)

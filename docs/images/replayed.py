@@ -4,7 +4,10 @@ Example: .venv/bin/python docs/images/replayed.py runs/toys docs/images/replayed
 Needs robot-gst replay RUN --render. Columns: recorded, planned in the twin, executed in the twin.
 Of a plan that was never executed there is one column, and no recording beside it. The picture of
 the README (twin.jpg): --episode trial_0002 --trajectory executed --at 0.35 0.65 --headings, after
-robot-gst replay RUN --episode trial_0002 --render of the demo.
+robot-gst replay RUN --episode trial_0002 --render of the demo. The tasks of the laboratory
+(laboratory.jpg): --tasks --at 0 0.45 0.7 1, of robot-gst trials RUN --policies nominal --arms
+without --trials 1 --seed 1000001 --task push_cube_to_mark stack_two_cubes slippery_block_into_box
+heavy_block_into_box sloth_over_rim; each row is the first trial of a task, as recorded.
 """
 
 import argparse
@@ -14,6 +17,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from side_by_side import GAP_PX, write_rows
 
+from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.media.color import decode_color
@@ -68,6 +72,20 @@ def headings(texts: list[str], width: int) -> np.ndarray:
     return np.asarray(image)
 
 
+def of_tasks(run: RunFolder, camera_id: str, fractions: list[float]) -> list[np.ndarray]:
+    """What was recorded of the first trial of each task, and above it how the trial ended."""
+    found: dict[str, np.ndarray] = {}
+    for path in run.episodes():
+        episode = Episode.open(path)
+        if episode.info.kind != "trial" or episode.info.task in found:
+            continue
+        row = np.hstack(rows(columns(run, path.stem, camera_id, []), fractions))
+        outcome = outcome_of(run, episode)
+        text = f"{episode.info.task}: {outcome.result if outcome else 'not labelled'}"
+        found[episode.info.task] = np.vstack([headings([text], row.shape[1]), row])
+    return list(found.values())
+
+
 def main() -> None:
     """Read the run, write one JPEG."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -79,12 +97,17 @@ def main() -> None:
     parser.add_argument("--at", type=float, nargs="+", help="instants, 0 to 1, instead of --rows")
     parser.add_argument("--trajectory", nargs="+", default=["planned", "executed"])
     parser.add_argument("--headings", action="store_true", help="name the columns")
+    parser.add_argument("--tasks", action="store_true", help="a row of instants for each task")
     given = parser.parse_args()
     run = RunFolder.open(given.run)
+    fractions = given.at or np.linspace(FIRST, LAST, given.rows).tolist()
+    if given.tasks:
+        write_rows(of_tasks(run, given.camera, fractions), given.out)
+        return
     images = columns(run, given.episode, given.camera, given.trajectory)
     if not images:
         parser.error(f"{given.episode} has no images of a camera {given.camera!r}")
-    pictures = rows(images, given.at or np.linspace(FIRST, LAST, given.rows).tolist())
+    pictures = rows(images, fractions)
     if given.headings:
         is_stand_in = Episode.open(run.episodes_dir / f"{given.episode}.mcap").info.stand_in
         texts = ["recorded" + (", stand-in cell" if is_stand_in else "")]

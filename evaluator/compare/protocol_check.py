@@ -31,16 +31,18 @@ def as_designed(rows: Sequence[TrialRow], protocol: Protocol | None) -> list[Tri
     if protocol is None or protocol.primary is None:
         return list(rows)
     arms = {code: name.rpartition(", ")[::2] for name, code in protocol.codes.items()}
-    policies = {each.policy for each in protocol.policies}
+    arms_of = {each.policy: each.arms for each in protocol.policies}
     found = []
     for row in rows:
         if not row.file and {row.recorded, row.sim_planned, row.plan_id} == {None}:
             continue
-        if row.policy in arms:
-            policy, arm = arms[row.policy]
+        policy, arm = arms.get(row.policy, (row.policy, ""))
+        if not row.condition and len(arms_of.get(policy, ())) == 1:  # an import names none
+            (arm,) = arms_of[policy]
+        if arm:
             condition = treatment_of(CONDITION_OF_ARM[arm], arm)
             row = replace(row, policy=policy, condition=condition)  # noqa: PLW2901
-        if not row.study_arm and row.policy in policies:
+        if not row.study_arm and row.policy in arms_of:
             arm = ARM_OF_CONDITION.get(row.condition, "")
             row = replace(row, study_arm=arm)  # noqa: PLW2901
         found.append(row)

@@ -72,6 +72,22 @@ def test_a_study_carried_out_as_designed_has_no_departure(tmp_path: Path, made: 
     assert questions[0]["answer"].endswith("stop here")
 
 
+def test_trials_that_name_no_condition_are_of_the_one_arm_there_is(tmp_path: Path) -> None:
+    """As episodes are that were imported and labelled."""
+    one_arm = replace(STUDY, policies=("act", "pi0"), arms=("without",), blind=False)
+    lock(tmp_path, design(one_arm, WANTED))
+
+    def forget(lines: list[Line]) -> None:
+        for line in lines:
+            line["condition"] = ""
+            if line["policy"] == "pi0" and int(line["start_id"].rpartition("/")[2]) % 5 < 4:
+                line["recorded"] = "success"
+
+    results = filled(tmp_path, forget)
+    assert departures(results) == set()
+    assert int(rows_of(results, "comparisons")[0]["shared starts"]) > 0
+
+
 def leave_blank(lines: list[Line]) -> None:
     lines[0]["recorded"] = ""
 

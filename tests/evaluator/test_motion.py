@@ -248,11 +248,6 @@ def line(offset_m: float = 0.0, num: int = 21) -> np.ndarray:
     return p
 
 
-def test_a_constant_offset_has_the_textbook_psnr() -> None:
-    image = np.full((16, 16, 3), 0.5)
-    assert psnr_db(image, image + 0.1) == pytest.approx(20.0)
-
-
 def test_a_mask_counts_only_its_pixels() -> None:
     image = picture()
     other = image.copy()

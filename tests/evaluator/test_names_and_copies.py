@@ -46,14 +46,6 @@ def test_two_names_of_one_id_are_refused_with_their_rows(
         compare_csv(path)
 
 
-def test_rates_of_two_tasks_of_one_id_are_refused_with_their_rows(
-    write_table: Callable[[str], Path],
-) -> None:
-    path = write_table("task,side,rate\na.b,sim,0.5\na b,sim,0.4\n")
-    with pytest.raises(AlikeNamesError, match=r"'a.b' \(row 2\) and 'a b' \(row 3\)"):
-        compare_csv(path)
-
-
 def test_tasks_in_any_script_keep_their_own_rates(write_table: Callable[[str], Path]) -> None:
     lines = ["a,方块,c,success,success", "b,方块,c,success,success", "c,鸭子,c,failure,success"]
     comparison = compare_csv(write_table(HEADER + "\n".join(lines) + "\n"))

@@ -148,7 +148,8 @@ def test_thresholds_are_read_by_short_name_by_id_and_several_at_once() -> None:
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (("r=high", "mood=1", "agreement=80", "1.5"), "--fail-under"),
+        (("r=high", "mood=1"), "--fail-under"),
+        (("agreement=80", "1.5"), "fraction from 0 to 1"),
         (("r=nan", "inf", "psnr=-inf"), "no limit"),
         (("r=80", "ppv=1.5", "ssim=-2"), "at most 1"),
     ],

@@ -1,7 +1,7 @@
 """``robot-gst calibrate RUN --cameras``: each camera from what was recorded of it.
 
-From pose pairs of a target where there are some; otherwise, when it stands still, from the robot
-in its depth images.
+From pose pairs of a target where there are some; otherwise from the robot in its depth images when
+it stands still, and when it moves from its images of scans.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +20,7 @@ from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
 from bridge.robots.robot import robot_of
 from bridge.terminal import Output
+from twin.calibrate.carried import find_carried_camera
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.hand_eye import PosePairs, find_camera
 from twin.robot.model import load_robot
@@ -29,22 +30,19 @@ from twin.scene.align.view import RobotView
 from twin.scene.frames.camera_poses import base_tree, never_moves
 from twin.scene.store.calibration import CALIBRATION_FILE, write_calibration
 
-FIXED, MOVING, NO_DEPTH = "fixed", "moving", "no depth"
 MAX_POSTURES = 6
 """A fixed camera is found from the robot in this many different postures, those farthest apart."""
 
 
-def placement(episodes: Sequence[Episode]) -> dict[str, str]:
-    """Cameras with depth images and intrinsics: ``fixed``, or ``moving`` in any episode.
+def placement(episodes: Sequence[Episode]) -> dict[str, bool]:
+    """Cameras with depth images and intrinsics, and whether they move in any episode.
 
     A camera that no transform mentions counts as fixed: it can still be found from the robot.
     """
-    found: dict[str, str] = {}
+    found: dict[str, bool] = {}
     for episode in episodes:
         for camera_id in depth_cameras(episode):
-            moves = _moves(episode, camera_id)
-            if moves or found.get(camera_id) != MOVING:
-                found[camera_id] = MOVING if moves else FIXED
+            found[camera_id] = found.get(camera_id, False) or _moves(episode, camera_id)
     return found
 
 
@@ -64,30 +62,34 @@ def _moves(episode: Episode, camera_id: str) -> bool:
     return len(posed_ns) > 0 and not never_moves(tree, frame, posed_ns)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Seen:
     """A depth image that shows the robot standing still."""
 
     episode: Episode
     stamp_ns: int
     posture: Posture
+    urdf: str
 
 
-def find_fixed_camera(
-    episodes: Sequence[Episode], camera_id: str, base: str, *, seed: int
-) -> dict[str, Any]:
+def find_fixed_camera(episodes: Sequence[Episode], camera_id: str, base: str) -> dict[str, Any]:
     """Find the pose and depth scale of a fixed depth camera in the robot's base frame.
 
     The search begins where the recording has the camera; when the robot is not there, or the
     recording does not say, the whole table is searched.
     """
-    tracks = _tracks(episodes)
-    seen = [
-        item
-        for episode in episodes
-        if str(episode.path) in tracks
-        for item in _stationary(episode, camera_id, tracks[str(episode.path)])
-    ]
+    seen, reasons = list[_Seen](), list[GstError]()
+    for episode in episodes:
+        try:
+            track = posture_track(episode)
+        except GstError as error:
+            reasons.append(error)
+            continue
+        stamps = [image.stamp_ns for image in streams.depth_images(episode, camera_id)]
+        at_rest = filter(track.is_stationary, stamps)
+        seen += [_Seen(episode, ns, track.at(ns), track.urdf) for ns in at_rest]
+    if reasons and len(reasons) == len(episodes):
+        raise reasons[0]
     if not seen:
         raise RobotNotAlignedError(
             found=f"camera {camera_id} has no depth image with the robot standing still",
@@ -96,14 +98,14 @@ def find_fixed_camera(
     joints = np.array([item.posture.joints_rad for item in seen])
     chosen = [seen[index] for index in distinct_postures(joints, MAX_POSTURES)]
     views = [view for episode in episodes for view in _load(episode, camera_id, chosen)]
-    robot = load_robot(tracks[str(chosen[0].episode.path)].urdf)
+    robot = load_robot(chosen[0].urdf)
     nominal = _nominal_pose(chosen[0], camera_id)
     try:
-        alignment = align_robot(views, robot, start=nominal, seed=seed)
+        alignment = align_robot(views, robot, start=nominal)
     except RobotNotAlignedError:
         if nominal is None:
             raise
-        alignment = align_robot(views, robot, seed=seed)
+        alignment = align_robot(views, robot)
     record = {
         "method": "depth of the robot against its description",
         "mount": "fixed",
@@ -118,26 +120,6 @@ def find_fixed_camera(
         record["correction_m"] = float(np.linalg.norm(change[:3, 3]))
         record["correction_rad"] = float(se3.rotation_angle_rad(change[:3, :3]))
     return record
-
-
-def _tracks(episodes: Sequence[Episode]) -> dict[str, PostureTrack]:
-    """Postures of the episodes that have them; when none has, the first one's reason."""
-    tracks: dict[str, PostureTrack] = {}
-    reasons: list[GstError] = []
-    for episode in episodes:
-        try:
-            tracks[str(episode.path)] = posture_track(episode)
-        except GstError as error:
-            reasons.append(error)
-    if not tracks and reasons:
-        raise reasons[0]
-    return tracks
-
-
-def _stationary(episode: Episode, camera_id: str, track: PostureTrack) -> Iterator[_Seen]:
-    for image in streams.depth_images(episode, camera_id):
-        if track.is_stationary(image.stamp_ns):
-            yield _Seen(episode=episode, stamp_ns=image.stamp_ns, posture=track.at(image.stamp_ns))
 
 
 def _load(episode: Episode, camera_id: str, chosen: Sequence[_Seen]) -> Iterator[RobotView]:
@@ -246,8 +228,8 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     seen = sorted({*where, *target_cameras(episodes)})
     for camera_id in [config.camera] if config.camera else seen:
         try:
-            place = where.get(camera_id, NO_DEPTH)
-            found[camera_id] = _camera(episodes, camera_id, place, config, robot.base_frame)
+            moves = where.get(camera_id)
+            found[camera_id] = _camera(episodes, camera_id, moves, config, robot.base_frame)
         except GstError as error:
             if config.camera:
                 raise
@@ -273,24 +255,32 @@ def _readable(run: RunFolder, output: Output) -> list[Episode]:
 
 
 def _camera(
-    episodes: Sequence[Episode], camera_id: str, where: str, config: CalibrateConfig, base: str
+    episodes: Sequence[Episode],
+    camera_id: str,
+    moves: bool | None,
+    config: CalibrateConfig,
+    base: str,
 ) -> dict[str, Any]:
     if camera_id in target_cameras(episodes):
         pairs = recorded_pairs(episodes, camera_id, config.link)
         return target_record(pairs, config, base)
     topic = f"...{CAMERAS}{camera_id}{TARGET_POSE}"
-    if where == NO_DEPTH:
+    if moves is None:
         raise UsageError(
             f"camera {camera_id} has neither target poses (topic {topic}) "
             "nor depth images with intrinsics. Record one of them."
         )
-    if where == MOVING:
-        raise UsageError(
-            f"camera {camera_id} moves with the robot and there are no target poses of it. Record "
-            f"a target from 10 to 20 places on {topic}."
-        )
+    if moves:
+        scans = [episode for episode in episodes if episode.info.kind == "scan"]
+        try:
+            return find_carried_camera(scans, camera_id, config.link)
+        except GstError as error:
+            raise UsageError(
+                f"camera {camera_id} moves with the robot, there are no target poses of it, and "
+                f"{error}. Record a target from 10 to 20 places on {topic}."
+            ) from error
     with_depth = [episode for episode in episodes if camera_id in depth_cameras(episode)]
-    return find_fixed_camera(with_depth, camera_id, base, seed=config.seed)
+    return find_fixed_camera(with_depth, camera_id, base)
 
 
 def target_record(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[str, Any]:
@@ -323,9 +313,11 @@ def _describe(item: Mapping[str, Any]) -> str:
     text = f"{item['mount']}, residual {item['residual_m']['value'] * 1e3:.2f} mm"
     if "residual_rad" in item:
         text += f" and {np.degrees(item['residual_rad']):.3f} degrees, {item['num_pairs']} pairs"
+    if "sigma_m" in item:
         known_mm, outliers = item["sigma_m"] * 1e3, item["num_outliers"]
         return f"{text}, {outliers} outliers; position known to {known_mm:.2f} mm"
-    text += f", robot seen in {item['num_postures']} postures, fitness {item['fitness']:.2f}"
+    if "fitness" in item:
+        text += f", robot seen in {item['num_postures']} postures, fitness {item['fitness']:.2f}"
     text += f", depth scale {item['depth_scale']:.4f}"
     if "correction_m" in item:
         moved, turned = item["correction_m"] * 1e3, float(np.degrees(item["correction_rad"]))

@@ -33,11 +33,9 @@ class CalibrateConfig:
     whichever explains the pairs."""
     link: str = ""
     """Link that carries camera or target: tool0, or where there is none the robot's tool frame."""
-    seed: Annotated[int, RARE] = 0
-    """Of the resampling behind the intervals."""
     workers: int | None = None
     """With --physics and --posterior: processes side by side; none: one a core, at most 8."""
 
     def __post_init__(self) -> None:
         """Refuse numbers with which nothing can be found."""
-        refuse_outside(self, {"seed": (0, 2**31), "workers": (1, 1024), "draws": (2, 100_000)})
+        refuse_outside(self, {"workers": (1, 1024), "draws": (2, 100_000)})

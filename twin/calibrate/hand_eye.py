@@ -42,24 +42,33 @@ def motions(
 def solve_hand_eye(
     Ts_a: Float[np.ndarray, "num_pairs 4 4"], Ts_b: Float[np.ndarray, "num_pairs 4 4"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Solve AX = XB for X from the motions between all poses.
+    """Solve AX = XB for X from the motions between all poses."""
+    return solve_motions(*motions(Ts_a, Ts_b))[0]
+
+
+def solve_motions(
+    P: Float[np.ndarray, "num_motions 4 4"],
+    Q: Float[np.ndarray, "num_motions 4 4"],
+    *,
+    scaled: bool = False,
+) -> tuple[Float[np.ndarray, "4 4"], float]:
+    """Solve PX = XQ for X, where ``scaled`` with a factor of the translations of Q, else 1.
 
     Park and Martin, "Robot sensor calibration: solving AX = XB on the Euclidean group" (1994):
     the rotation that lays the rotation vectors of Q over those of P, then linear least squares
     for the translation. The rotation is found by singular values, which unlike their square root
     of a matrix also refuses mirror images.
     """
-    P, Q = motions(Ts_a, Ts_b)
     alpha, beta = se3.vector_from_rotation(P[:, :3, :3]), se3.vector_from_rotation(Q[:, :3, :3])
     clear = np.linalg.norm(alpha, axis=1) < HALF_TURN_RAD
     clear &= np.linalg.norm(beta, axis=1) < HALF_TURN_RAD
     if clear.sum() < 2:
         clear[:] = True
     R = se3.nearest_rotation(alpha[clear].T @ beta[clear])
-    left = P[:, :3, :3] - np.eye(3)
-    right = Q[:, :3, 3] @ R.T - P[:, :3, 3]
-    t, *_ = np.linalg.lstsq(left.reshape(-1, 3), right.reshape(-1), rcond=None)
-    return se3.from_rotation(R, t)
+    seen = Q[:, :3, 3] @ R.T
+    left = np.concatenate([P[:, :3, :3] - np.eye(3), -scaled * seen[:, :, None]], axis=2)
+    x, *_ = np.linalg.lstsq(left.reshape(-1, 4), (seen - P[:, :3, 3]).reshape(-1), rcond=None)
+    return se3.from_rotation(R, x[:3]), 1.0 + float(x[3])
 
 
 MIN_PAIRS = 4

@@ -53,8 +53,6 @@ NEAR_M = 0.01
 """Standard deviation of where an object ends about where the twin has it end, at the right draw."""
 ASTRAY = 0.1
 """Weight that a draw keeps however far from there: what falls ends anywhere."""
-
-
 EDGE_SHARE = 0.4
 """Widest step along an edge, in half the smallest extent; every share up to it is as likely: toy
 blocks and worn parts have roundings of 1 to 5 mm on edges of 25 to 40 mm."""

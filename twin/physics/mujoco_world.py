@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import mujoco
 import numpy as np
@@ -23,7 +23,6 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.robot import Robot, mimics_of, robot_of
 from twin.physics.arm import Hulls, Joints, PhysicsError, require_parts, write_description
-from twin.physics.bending import SoftBodies
 from twin.physics.config import FINGER_SPEED_M_S, RIGID_ONLY, PhysicsConfig
 from twin.physics.unseen import EVEN, Unseen, box_inertia
 from twin.physics.world import TABLE_M, Box
@@ -232,7 +231,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         self._data: Any = None
         self._compile()
 
-    def soft_bodies(self) -> SoftBodies:
+    def soft_bodies(self) -> NoReturn:
         """Soft bodies, which this engine does not replay."""
         raise UsageError(RIGID_ONLY)
 

@@ -10,7 +10,7 @@ same bits on every run.
 from collections.abc import Callable, Sequence
 from math import cos, hypot
 from operator import methodcaller
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,6 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.leaves import load_leaf
 from twin.physics.arm import Arm, Hulls, Joints, PhysicsError, Press
-from twin.physics.bending import SoftBodies
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import Client, give_client_back, open_client, pybullet
 from twin.physics.unseen import EVEN, Unseen, box_inertia
@@ -150,8 +149,8 @@ class World(Bodies):
         self._undamp(self.robot.id)
         self._press = Press(self.robot)
         self._description = (urdf, mesh_hulls_m)
-        self._soft: SoftBodies | None = None
-        self._solids: list[Callable[[SoftBodies], None]] = []
+        self._soft: Any = None  # what the leaf ``soft`` begins, when asked
+        self._solids: list[Callable[[Any], None]] = []
 
     def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> list[int]:
         """Add solid boxes that never move, one body each; returns the body ids."""
@@ -246,14 +245,14 @@ class World(Bodies):
     def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
         """Pose of an object that moves; of a soft one, the rigid motion nearest to its nodes."""
         if (soft := self._softly(object_id)) is not None:
-            return soft.T_base_object(object_id).copy()
+            return np.array(soft.T_base_object(object_id))
         pose = np.array(self.object_pose(object_id))
         return se3.transform_from(pose[3:], pose[:3])
 
     def finger_touches(self, object_id: str) -> bool:
         """Whether a finger is in contact with an object that moves."""
         if (soft := self._softly(object_id)) is not None:
-            return soft.finger_touches(object_id)
+            return bool(soft.finger_touches(object_id))
         body = self._free(object_id)
         return any(
             point[8] <= 0.0
@@ -271,24 +270,24 @@ class World(Bodies):
                     x, y, z = x + newton * along_x, y + newton * along_y, z + newton * along_z
         return hypot(x, y, z)
 
-    def soft_bodies(self) -> SoftBodies:
+    def soft_bodies(self) -> Any:
         """What is soft in this world; asking the first time begins it."""
         if self._soft is None:
             begin = load_leaf("soft", "world")
-            soft: SoftBodies = begin(self.client, self.robot, *self._description, self.config)
+            soft = begin(self.client, self.robot, *self._description, self.config)
             for add in self._solids:
                 add(soft)
             self._soft, self._solids = soft, []
         return self._soft
 
-    def _meet(self, add: Callable[[SoftBodies], None]) -> None:
+    def _meet(self, add: Callable[[Any], None]) -> None:
         """Let soft bodies meet a solid, at once or when they begin."""
         if self._soft is None:
             self._solids.append(add)
         else:
             add(self._soft)
 
-    def _softly(self, object_id: str) -> SoftBodies | None:
+    def _softly(self, object_id: str) -> Any:
         """The soft bodies, where an object is one of them."""
         has = self._soft is not None and object_id in self._soft.names
         return self._soft if has else None

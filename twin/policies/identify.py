@@ -22,15 +22,15 @@ from bridge.episode.catalogue_query import CatalogueQuery
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
-from bridge.episode.topics import GRIPPER_STATE, POLICY_TARGETS
+from bridge.episode.topics import POLICY_TARGETS
 from bridge.errors import GstError
-from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.task.plan import Plan
 from twin.calibrate.weights import readings
 from twin.policies.response import AT_ONCE, Response, carrying_Nm, largest_Nm
 from twin.replay.execution import in_order, stages_as_executed
 from twin.replay.path import path_of_plan
 from twin.robot.model import RobotModel, load_robot
+from twin.robot.posture import width_in, width_track
 
 TRIALS = 12
 """So many trials teach it, the nearest in time."""
@@ -213,8 +213,9 @@ def _of_targets(episode: Episode, robot: RobotModel) -> Sent | None:
         stamps_ns=np.concatenate([first_ns, sent.stamps_ns + period_ns]),
         position=np.concatenate([joints.at(first_ns), targets.position]),
     )
-    widths_m = sent.position[:, sent.names.index(GRIPPER_WIDTH)]
-    return _sent(episode, robot, targets, _closed_ns(sent.stamps_ns.tolist(), widths_m.tolist()))
+    widths_m = width_in(sent.names, sent.position, robot.record)
+    told = [] if widths_m is None else _closed_ns(sent.stamps_ns.tolist(), widths_m.tolist())
+    return _sent(episode, robot, targets, told)
 
 
 def _of_plans(episode: Episode, robot: RobotModel) -> Sent | None:
@@ -285,4 +286,4 @@ def _sent(
         own_Nm = [carrying_Nm(robot, joints_rad) for joints_rad in seen.position]
         efforts = JointTrack(names=robot.joints, stamps_ns=times_ns, position=efforts_Nm)
         loads_Nm = efforts.at(seen.stamps_ns) - np.array(own_Nm)
-    return Sent(targets, seen, closed, streams.joint_track(episode, GRIPPER_STATE), loads_Nm)
+    return Sent(targets, seen, closed, width_track(episode, robot.record), loads_Nm)

@@ -18,7 +18,6 @@ from bridge.episode.provenance import hash_settings
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from twin.policies.errors import PolicyError, RefusedError
-from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
 from twin.robot.model import RobotModel
 
@@ -241,7 +240,7 @@ class Interpreter:
             T = self._robot.T_base_tcp(last_rad)
             T[:3, 3] += pose[:3]
             T[:3, :3] = se3.rotation_from_vector(pose[3:]) @ T[:3, :3]
-        found = solve_ik(self._robot, T, IkConfig(restarts=0), warm_start_rad=last_rad)
+        found = solve_ik(self._robot, T, warm_start_rad=last_rad, restarts=0)
         if not found.reached:
             p = ", ".join(f"{x:.3f}" for x in T[:3, 3])
             raise RefusedError(

@@ -46,6 +46,7 @@ from twin.policies.limits import Knot, refuse_target
 from twin.policies.mapping import Interpreter, is_end, read_mapping
 from twin.policies.policy import open_policy, who_acts
 from twin.robot.model import RobotModel, load_robot
+from twin.robot.posture import width_in
 
 HOLD_S, STOP_S = 0.2, 1.0
 """Without a fresh observation for so long the arm is held, and the trial stopped."""
@@ -392,9 +393,12 @@ class Trial:
             raise PolicyError(f"the cell's joint states lack {', '.join(missing)}")
         joints_rad = sample.position[[sample.names.index(name) for name in robot.joints]]
         gripper = self._view.seen.get(cell_topic(self._cell, GRIPPER_STATE))
-        if gripper is None:
-            return joints_rad, robot.record.gripper.max_width_m
-        return joints_rad, float(JointSample.from_cdr(gripper.sample.data).position[0])
+        if gripper is not None:
+            return joints_rad, float(JointSample.from_cdr(gripper.sample.data).position[0])
+        widths_m = width_in(sample.names, sample.position[None], robot.record)
+        if widths_m is None:
+            raise PolicyError(f"nobody says the gripper's width [m] on a topic ...{GRIPPER_STATE}")
+        return joints_rad, float(widths_m[0])
 
     def _about(self) -> dict[str, Any]:
         """What does not fit into tags."""

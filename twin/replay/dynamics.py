@@ -17,7 +17,6 @@ from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from bridge.leaves import load_leaf
 from bridge.task.task_file import ObjectModel
-from twin.physics.bending import SoftShape
 from twin.physics.engines import PhysicsWorld, open_world
 from twin.physics.unseen import EVEN
 from twin.replay.clearance.bodies import placed_panels, placement_of
@@ -34,13 +33,13 @@ LIFT_M = 0.0002
 """Objects localised into their support start this far above it instead."""
 
 
-def soft_models(scene: ReplayScene) -> dict[str, SoftShape]:
+def soft_models(scene: ReplayScene) -> dict[str, Any]:
     """The soft objects that were localised: the scene's lattice where it has one, else the task's.
 
     Their extents at rest are those of the task file either way, so that the same shape predicate
     judges both.
     """
-    models: dict[str, SoftShape] = {}
+    models: dict[str, Any] = {}
     for name in scene.movable():
         model = scene.task.objects[name]
         if model.soft is not None:
@@ -48,7 +47,7 @@ def soft_models(scene: ReplayScene) -> dict[str, SoftShape]:
     return models
 
 
-def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftShape]) -> None:
+def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, Any]) -> None:
     """Put table, containers and objects where the scene says."""
     world.add_table(scene.table_height_m)
     for name, T in scene.containers().items():
@@ -63,7 +62,7 @@ def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftShape]
             world.add_free(name, np.array(model.size_m), model.mass_kg, T_free, unseen)
 
 
-def outline_m(model: ObjectModel, soft: SoftShape | None) -> Float[np.ndarray, "num_points 3"]:
+def outline_m(model: ObjectModel, soft: Any) -> Float[np.ndarray, "num_points 3"]:
     """Points whose hull holds the object, in its own frame [m]: of its lattice, or else its box."""
     if soft is not None:
         return np.asarray(soft.nodes_m, dtype=np.float64)
@@ -171,7 +170,7 @@ LIE_STATES, LIE = 15, 1e-4
 class Samples:
     """Collects states while a world runs."""
 
-    def __init__(self, scene: ReplayScene, soft: dict[str, SoftShape]) -> None:
+    def __init__(self, scene: ReplayScene, soft: dict[str, Any]) -> None:
         """Begin without any."""
         self._soft, self._fixed = list(soft), scene.containers()
         self._rows: list[tuple[int, Float[np.ndarray, " num_joints"], float, float]] = []
@@ -204,8 +203,8 @@ class Samples:
     def lie(self) -> bool:
         """Whether no rigid object has moved in the last ``LIE_STATES``."""
         recent = [[row[0] for row in rows[-LIE_STATES - 1 :]] for rows in self._seen.values()]
-        at_rest = all(np.ptp(poses, axis=0).max() < LIE for poses in recent)
-        return at_rest and len(self._rows) > LIE_STATES
+        columns = (column for poses in recent for column in zip(*poses, strict=True))
+        return len(self._rows) > LIE_STATES and all(max(c) - min(c) < LIE for c in columns)
 
     def fill(self, known: States, steps: slice) -> None:
         """Put in known states of the arm before or after all others; objects lie as there."""
@@ -278,7 +277,7 @@ class _Solid:
     fixed: bool = False
 
 
-def free_start(scene: ReplayScene, soft: Mapping[str, SoftShape]) -> ReplayScene:
+def free_start(scene: ReplayScene, soft: Mapping[str, Any]) -> ReplayScene:
     """Move objects apart that lie in each other or in a container by little.
 
     The object that can move is moved, along the direction of least depth; of two, each by half.

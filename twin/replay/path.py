@@ -24,14 +24,12 @@ from twin.errors import TwinError
 from twin.replay.clearance.bodies import own_links_touch
 from twin.replay.config import PATH_RATE_HZ, PATH_STEP_S
 from twin.replay.failure import Failure
+from twin.robot import inverse
 from twin.robot.collision import RobotHulls
-from twin.robot.config import IkConfig
 from twin.robot.follow import Clearance, follow_poses
 from twin.robot.inverse import pose_error, solve_ik
 from twin.robot.model import RobotModel
 
-IK = IkConfig()
-"""When a pose counts as reached."""
 MAX_JOINT_STEP_RAD = 0.3
 """Largest change of a joint within one path step; more is a jump [rad]."""
 _LIMIT_SLACK_RAD = 1e-3
@@ -279,7 +277,7 @@ def path_of_plan(
         if is_open:
             begin_rad = knots.joints[-1] if knots.joints else start_rad
             Ts = np.stack([target.T for target in run])
-            ways = follow_poses(robot, Ts, start_rad=begin_rad, config=IK, clearance=clearance)
+            ways = follow_poses(robot, Ts, start_rad=begin_rad, clearance=clearance)
             for target, joints, reached in zip(run, ways.joints_rad, ways.reached, strict=True):
                 if not reached:
                     knots.stop(robot, target, joints)
@@ -345,7 +343,7 @@ def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel) -> None:
             continue
         failure = _check_given(robot, target.t_ns, given, target.T)
         if failure is not None:
-            solution = solve_ik(robot, target.T, IK, warm_start_rad=given)
+            solution = solve_ik(robot, target.T, warm_start_rad=given)
             given = solution.joints_rad
             if not solution.reached:
                 knots.stop(robot, target, given)
@@ -411,7 +409,7 @@ def _check_given(
     if outside:
         return outside[0]
     offset, angle = pose_error(robot, given, T)
-    if offset <= IK.position_tolerance_m and angle <= IK.rotation_tolerance_rad:
+    if offset <= inverse.POSITION_TOLERANCE_M and angle <= inverse.ROTATION_TOLERANCE_RAD:
         return None
     return Failure(
         t_ns=t_ns,
@@ -434,14 +432,13 @@ def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Fa
     for t_ns, row, width in zip(times, joints, widths, strict=True):
         hulls.place(row, float(width))
         if links_touch():
-            closest = hulls.self_distance()
+            distance_m, links = hulls.self_distance()
             failures.append(
                 Failure(
                     t_ns=int(t_ns),
                     cause=Cause.SELF_COLLISION,
-                    bodies=closest.links,
-                    detail=f"{closest.links[0]} is {-closest.distance_m * 1e3:.1f} mm inside "
-                    f"{closest.links[1]}",
+                    bodies=links,
+                    detail=f"{links[0]} is {-distance_m * 1e3:.1f} mm inside {links[1]}",
                 )
             )
             break

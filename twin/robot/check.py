@@ -11,7 +11,6 @@ import numpy as np
 from bridge.errors import GstError, UsageError
 from bridge.robots.robot import Gripper, Robot, number_of, read_robot
 from twin.robot.collision import RobotHulls
-from twin.robot.config import IkConfig
 from twin.robot.inverse import NUM_POSE, UrInverse, solve_ik
 from twin.robot.model import RobotModel, without_dynamics
 
@@ -35,7 +34,7 @@ def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
     unknown = [None] * len(robot.joints)
     rng = np.random.default_rng(_SEED)  # of poses that some posture reaches
     postures = rng.uniform(robot.lower_rad, robot.upper_rad, (_POSES, len(robot.joints)))
-    reached = sum(solve_ik(robot, robot.T_base_tcp(q), IkConfig()).reached for q in postures)
+    reached = sum(solve_ik(robot, robot.T_base_tcp(q)).reached for q in postures)
     if urdf_out is not None and hulls is not None:
         urdf_out.parent.mkdir(parents=True, exist_ok=True)
         urdf_out.write_text(text)

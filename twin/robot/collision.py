@@ -154,14 +154,6 @@ depend on what coal computed before, in tests by 3e-13 m: cut off, the same repl
 bytes in every process."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SelfDistance:
-    """The closest pair of links that should stay apart."""
-
-    distance_m: float
-    links: tuple[str, str]
-
-
 def signed_distance(
     first: coal.CollisionGeometry,
     T_first: coal.Transform3s,
@@ -218,14 +210,14 @@ class RobotHulls:
             self._placements[index] = placed
         return placed
 
-    def self_distance(self) -> SelfDistance:
-        """Closest pair at the placed posture; infinite when there is no pair to check."""
+    def self_distance(self) -> tuple[float, tuple[str, str]]:
+        """Distance [m] and links of the closest pair that should stay apart; infinite: none."""
         best, links = np.inf, ("", "")
         for first, second in self.pairs:
             distance = self.distance_m(first, second)
             if distance < best:
                 best, links = distance, (self.hulls[first].link, self.hulls[second].link)
-        return SelfDistance(distance_m=best, links=links)
+        return best, links
 
     def distance_m(self, first: int, second: int) -> float:
         """Signed distance of two hulls, by their numbers [m]."""

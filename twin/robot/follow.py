@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from twin.robot.config import IkConfig
 from twin.robot.inverse import NUM_BRANCHES, Joints, UrInverse, solutions, solve_ik
 from twin.robot.model import RobotModel
 
@@ -51,14 +50,13 @@ def follow_poses(
     Ts_base_tcp: Poses,
     *,
     start_rad: Joints | None,  # before the first pose; None: any
-    config: IkConfig,
     clearance: Clearance | None = None,  # asked only about postures that are wanted
 ) -> Followed:
     """Find joints for every pose of a path; an arm with a UR's geometry in closed form."""
     inverse = UrInverse.for_robot(robot)
     count = len(Ts_base_tcp)
     if inverse is None and start_rad is None and count:
-        return _freest(robot, Ts_base_tcp, config, clearance)
+        return _freest(robot, Ts_base_tcp, clearance)
     joints = np.zeros((count, len(robot.arm_ids)))
     branch = np.full(count, NO_BRANCH, dtype=np.int64)
     if inverse is not None and count:
@@ -69,12 +67,10 @@ def follow_poses(
             tree = _Tree(inverse, raw[known], valid[known], start_rad, robot.home_rad)
             branch[known], joints[known] = tree.choose(clearance)
     exact = inverse is not None and inverse.geometry.deviation < _EXACT_M
-    return _completed(robot, Ts_base_tcp, joints, branch, start_rad, config, exact=exact)
+    return _completed(robot, Ts_base_tcp, joints, branch, start_rad, exact=exact)
 
 
-def _freest(
-    robot: RobotModel, Ts_base_tcp: Poses, config: IkConfig, clearance: Clearance | None
-) -> Followed:
+def _freest(robot: RobotModel, Ts_base_tcp: Poses, clearance: Clearance | None) -> Followed:
     """Iterate from several postures for the first pose, until one leads to the end freely.
 
     That is without a jump and without a touch; else the one that comes farthest is kept.
@@ -82,9 +78,9 @@ def _freest(
     best: tuple[tuple[int, int, int], Followed] | None = None
     unknown = np.full(len(Ts_base_tcp), NO_BRANCH, dtype=np.int64)
     nothing = np.zeros((len(Ts_base_tcp), len(robot.joints)))
-    for first in solutions(robot, Ts_base_tcp[0], config):
+    for first in solutions(robot, Ts_base_tcp[0]):
         start_rad = first.joints_rad
-        way = _completed(robot, Ts_base_tcp, nothing, unknown, start_rad, config, exact=False)
+        way = _completed(robot, Ts_base_tcp, nothing, unknown, start_rad, exact=False)
         steps = np.abs(np.diff(way.joints_rad[way.reached], axis=0))
         asked = way.joints_rad[way.reached][:: -(-len(Ts_base_tcp) // _MAX_ASKED)]
         touching = clearance is not None and len(asked) and clearance(asked) < 0
@@ -104,7 +100,6 @@ def _completed(
     joints: Float[np.ndarray, "num_poses num_joints"],
     branch: Int[np.ndarray, " num_poses"],
     start_rad: Joints | None,
-    config: IkConfig,
     *,
     exact: bool,
 ) -> Followed:
@@ -120,7 +115,7 @@ def _completed(
         else:
             ahead = np.flatnonzero(branch != NO_BRANCH)[:1]
             warm = joints[ahead[0]] if start_rad is None and len(ahead) else start_rad
-        solution = solve_ik(robot, Ts_base_tcp[index], config, warm_start_rad=warm)
+        solution = solve_ik(robot, Ts_base_tcp[index], warm_start_rad=warm)
         joints[index] = solution.joints_rad
         if not solution.reached:
             joints[index:], reached[index:] = joints[index], False

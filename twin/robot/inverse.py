@@ -18,11 +18,14 @@ from scipy.linalg.lapack import dposv
 from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
-from twin.robot.config import IkConfig
 from twin.robot.model import RobotModel
 
 Pose = Float[np.ndarray, "4 4"]
 Joints = Float[np.ndarray, " num_joints"]
+POSITION_TOLERANCE_M, ROTATION_TOLERANCE_RAD = 0.0005, math.radians(0.1)
+"""A pose counts as reached where the tool misses it by no more (errata resolution 9)."""
+MAX_ITERATIONS = 60
+"""Of one descent."""
 _CONVERGED = 1e-8
 """Norm of the error twist at which iterating stops: far below the tolerance, so that a round
 trip is exact and the tolerance decides feasibility only."""
@@ -47,18 +50,21 @@ def pose_error(robot: RobotModel, joints_rad: Joints, T_base_tcp: Pose) -> tuple
 
 
 def solve_ik(
-    robot: RobotModel, T_base_tcp: Pose, config: IkConfig, *, warm_start_rad: Joints | None = None
+    robot: RobotModel, T_base_tcp: Pose, *, warm_start_rad: Joints | None = None, restarts: int = 20
 ) -> IkSolution:
-    """The best joints within limits for a pose, by the warm start (None: home); see ``reached``."""
+    """The best joints within limits for a pose, by the warm start (None: home); see ``reached``.
+
+    Where it fails so many other starts are tried; of arms without a closed form ten times as many.
+    """
     start = robot.home_rad if warm_start_rad is None else warm_start_rad
-    best = _descend(robot, T_base_tcp, start, config)
+    best = _descend(robot, T_base_tcp, start)
     if not best.reached and len(start) < NUM_POSE:
-        return _position_first(robot, T_base_tcp, warm_start_rad, config)
+        return _position_first(robot, T_base_tcp, warm_start_rad, restarts)
     if not best.reached:
-        best = _from_nearest(robot, T_base_tcp, best, start, config)
-        return _nearer(robot, T_base_tcp, best, start, config) if best.reached else best
+        best = _from_nearest(robot, T_base_tcp, best, start, restarts)
+        return _nearer(robot, T_base_tcp, best, start) if best.reached else best
     if warm_start_rad is None and len(start) > NUM_POSE:
-        return _nearer(robot, T_base_tcp, best, start, config)
+        return _nearer(robot, T_base_tcp, best, start)
     return best
 
 
@@ -89,10 +95,10 @@ def _features(Ts: Float[np.ndarray, "num_poses 4 4"]) -> Float[np.ndarray, "num_
 
 
 def _from_nearest(
-    robot: RobotModel, T_base_tcp: Pose, best: IkSolution, near_rad: Joints, config: IkConfig
+    robot: RobotModel, T_base_tcp: Pose, best: IkSolution, near_rad: Joints, restarts: int
 ) -> IkSolution:
     """Begin at the branches of the closed form, then at the postures whose poses are nearest."""
-    if not (np.isfinite(T_base_tcp).all() and config.restarts):
+    if not (np.isfinite(T_base_tcp).all() and restarts):
         return best
     rows, tree = _postures(robot)
     inverse, branches = UrInverse.for_robot(robot), rows[:0]
@@ -100,10 +106,10 @@ def _from_nearest(
         raw, valid, _ = inverse.solve(T_base_tcp[None])
         branches = raw[0, valid[0]]
         branches = branches[np.abs(branches - near_rad).sum(axis=1).argsort(kind="stable")]
-    count = config.restarts * (_STARTS_PER_RESTART if inverse is None else 1)
+    count = restarts * (_STARTS_PER_RESTART if inverse is None else 1)
     found = tree.query(_features(T_base_tcp[None])[0], k=min(count, len(rows)))[1]
     for start_rad in (*branches, *rows[np.atleast_1d(found)]):
-        other = _descend(robot, T_base_tcp, start_rad, config)
+        other = _descend(robot, T_base_tcp, start_rad)
         if other.reached or other.position_error_m < best.position_error_m:
             best = other
         if best.reached:
@@ -116,28 +122,28 @@ _TURN_WEIGHT, _LITTLE_RAD = 0.05, 0.35
 
 
 def _position_first(
-    robot: RobotModel, T_base_tcp: Pose, warm_start_rad: Joints | None, config: IkConfig
+    robot: RobotModel, T_base_tcp: Pose, warm_start_rad: Joints | None, restarts: int
 ) -> IkSolution:
     """Put the tool where it is wanted, turned as nearly so as an arm of few joints can.
 
     ``reached`` is of the position alone. What a warm start leads to is taken where little is left,
     so that a path stays one; else the posture that turns the tool best, of those near the pose.
     """
-    enough_rad = config.rotation_tolerance_rad if warm_start_rad is None else _LITTLE_RAD
+    enough_rad = ROTATION_TOLERANCE_RAD if warm_start_rad is None else _LITTLE_RAD
     tries = [(robot.home_rad if warm_start_rad is None else warm_start_rad, _TURN_WEIGHT)]
-    if config.restarts and np.isfinite(T_base_tcp).all():
+    if restarts and np.isfinite(T_base_tcp).all():
         rows, tree = _postures(robot)
-        near = tree.query(_features(T_base_tcp[None])[0], k=3 * config.restarts)[1]
+        near = tree.query(_features(T_base_tcp[None])[0], k=3 * restarts)[1]
         tries += [(rows[index], _TURN_WEIGHT) for index in near]
         away_m = np.linalg.norm(tree.data[:, :3] - T_base_tcp[:3, 3], axis=1)
-        tries += [(rows[index], 0.0) for index in np.argsort(away_m)[: config.restarts]]
+        tries += [(rows[index], 0.0) for index in np.argsort(away_m)[:restarts]]
     found: list[tuple[bool, float, int, IkSolution]] = []
     for start_rad, weight in tries:
         if not weight and not min(found)[0]:
             break
-        turned = _descend(robot, T_base_tcp, start_rad, config, weight)
-        other = _descend(robot, T_base_tcp, turned.joints_rad, config, 0.0)
-        is_there = other.position_error_m <= config.position_tolerance_m
+        turned = _descend(robot, T_base_tcp, start_rad, weight)
+        other = _descend(robot, T_base_tcp, turned.joints_rad, 0.0)
+        is_there = other.position_error_m <= POSITION_TOLERANCE_M
         missed = other.rotation_error_rad if is_there else other.position_error_m
         found.append((not is_there, missed, len(found), replace(other, reached=is_there)))
         if is_there and missed <= enough_rad:
@@ -151,12 +157,12 @@ _LOOKED_AT = 80
 """Nearest known postures from which further solutions are looked for."""
 
 
-def solutions(robot: RobotModel, T_base_tcp: Pose, config: IkConfig) -> Iterator[IkSolution]:
+def solutions(robot: RobotModel, T_base_tcp: Pose) -> Iterator[IkSolution]:
     """Yield what ``solve_ik`` finds, then other solutions of an arm without a closed form.
 
     Each differs from all before by half a radian in some joint. They are looked for one at a time.
     """
-    first = solve_ik(robot, T_base_tcp, config)
+    first = solve_ik(robot, T_base_tcp)
     yield first
     if not first.reached:
         return
@@ -164,7 +170,7 @@ def solutions(robot: RobotModel, T_base_tcp: Pose, config: IkConfig) -> Iterator
     found = [first.joints_rad]
     _, near = tree.query(_features(T_base_tcp[None])[0], k=_LOOKED_AT)
     for index in near.tolist():
-        other = _descend(robot, T_base_tcp, rows[index], config)
+        other = _descend(robot, T_base_tcp, rows[index])
         away = other.joints_rad - np.array(found)
         if other.reached and np.abs(away).max(axis=1).min() > _DISTINCT_RAD:
             yield other
@@ -180,7 +186,7 @@ _STEP_RAD, _SETTLED_RAD = 0.3, 1e-3
 
 
 def _nearer(
-    robot: RobotModel, T_base_tcp: Pose, found: IkSolution, wanted_rad: Joints, config: IkConfig
+    robot: RobotModel, T_base_tcp: Pose, found: IkSolution, wanted_rad: Joints
 ) -> IkSolution:
     """Go from a solution to the one near it that is nearest to a posture.
 
@@ -190,7 +196,7 @@ def _nearer(
     turned = found.joints_rad + _TURN * turns
     inside = (turned >= robot.lower_rad) & (turned <= robot.upper_rad)
     joints = np.where(inside, turned, found.joints_rad)
-    best = _descend(robot, T_base_tcp, joints, config)
+    best = _descend(robot, T_base_tcp, joints)
     if not best.reached:
         return found
     if len(joints) <= NUM_POSE:
@@ -207,7 +213,7 @@ def _nearer(
         if size < _SETTLED_RAD:
             break
         step *= min(1.0, _STEP_RAD / size)
-        other = _descend(robot, T_base_tcp, best.joints_rad + step, config)
+        other = _descend(robot, T_base_tcp, best.joints_rad + step)
         closer = np.linalg.norm(wanted_rad - other.joints_rad) < np.linalg.norm(away)
         if not (other.reached and closer):
             break
@@ -216,11 +222,7 @@ def _nearer(
 
 
 def _descend(
-    robot: RobotModel,
-    T_base_tcp: Pose,
-    start_rad: Joints,
-    config: IkConfig,
-    turn_weight: float | None = None,
+    robot: RobotModel, T_base_tcp: Pose, start_rad: Joints, turn_weight: float | None = None
 ) -> IkSolution:
     """One descent. Calls into pinocchio take a microsecond each, so each is made once a step.
 
@@ -235,7 +237,7 @@ def _descend(
     damping, last = 1e-6, math.inf
     accepted, misses = joints, target
     jacobian, error = np.zeros((6, len(joints))), np.zeros(6)
-    for _ in range(config.max_iterations):
+    for _ in range(MAX_ITERATIONS):
         q[arm] = joints
         pin.computeJointJacobians(model, data, q)
         difference = pin.updateFramePlacement(model, data, tcp_id).actInv(target)
@@ -271,8 +273,8 @@ def _descend(
         position_error_m=position,
         rotation_error_rad=rotation,
         reached=last < math.inf  # nothing was tried of a pose that is no number
-        and position <= config.position_tolerance_m
-        and rotation <= config.rotation_tolerance_rad,
+        and position <= POSITION_TOLERANCE_M
+        and rotation <= ROTATION_TOLERANCE_RAD,
     )
 
 

@@ -1,7 +1,7 @@
 """Recorded postures: joints at an instant, whether the robot stood still, whether time ran back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -141,21 +141,27 @@ def width_track(episode: Episode, robot: Robot) -> JointTrack:
     Where no gripper state was recorded, it follows from a finger among the joint states. A fixed
     tool has no width: 0 whenever the joints were recorded.
     """
-    fingers = robot.gripper.fingers
     try:
         return joint_track(episode, GRIPPER_STATE)
     except EpisodeError:
         arm = joint_track(episode)
-        if GRIPPER_WIDTH in arm.names:  # one vector holds all, as in LeRobot's state
-            column = arm.names.index(GRIPPER_WIDTH)
-            return replace(arm, names=(GRIPPER_WIDTH,), position=arm.position[:, [column]])
-        finger = next((item for item in fingers if item.joint in arm.names), None)
-        if fingers and finger is None:
+        widths_m = width_in(arm.names, arm.position, robot)
+        if widths_m is None:
             raise
-    widths = np.zeros(len(arm.stamps_ns))
+    return JointTrack(names=(GRIPPER_WIDTH,), stamps_ns=arm.stamps_ns, position=widths_m[:, None])
+
+
+def width_in(
+    names: Sequence[str], position: Float[np.ndarray, "num_rows num_joints"], robot: Robot
+) -> Float[np.ndarray, " num_rows"] | None:
+    """What joint states say of the width [m]; None where its fingers are not among them."""
+    if GRIPPER_WIDTH in names:  # one vector holds all, as in LeRobot's state
+        return position[:, names.index(GRIPPER_WIDTH)]
+    fingers = robot.gripper.fingers
+    finger = next((item for item in fingers if item.joint in names), None)
     if finger is not None:
-        widths = np.asarray(finger.width(arm.position[:, arm.names.index(finger.joint)]))
-    return JointTrack(names=(GRIPPER_WIDTH,), stamps_ns=arm.stamps_ns, position=widths[:, None])
+        return np.asarray(finger.width(position[:, names.index(finger.joint)]))
+    return None if fingers else np.zeros(len(position))
 
 
 def check_joints(arm: JointTrack, source: str, robot: Robot) -> None:

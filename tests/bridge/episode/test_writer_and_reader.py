@@ -108,13 +108,6 @@ def test_an_exception_while_writing_leaves_only_the_part_file(tmp_path: Path) ->
     assert path.with_name("broken.mcap.part").exists()
 
 
-def test_text_with_an_mcap_name_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "text.mcap"
-    path.write_text("hello")
-    with pytest.raises(EpisodeError, match="not a finished MCAP file"):
-        Episode.open(path)
-
-
 def test_a_newer_schema_version_is_refused_with_both_numbers(tmp_path: Path) -> None:
     path = tmp_path / "new.mcap"
     with EpisodeWriter(path) as writer:

@@ -3,6 +3,7 @@
 import json
 import sqlite3
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -161,13 +162,22 @@ REALSENSE = ("/camera/camera/color", "/camera/camera/aligned_depth_to_color")
 
 
 def xarm(
-    folder: Path, joints: int, *, arm: str = "/xarm", camera: tuple[str, str] = REALSENSE
+    folder: Path,
+    joints: int,
+    *,
+    arm: str = "/xarm",
+    camera: tuple[str, str] = REALSENSE,
+    gripper: str = "",
 ) -> Path:
-    """An xArm with its driver's joint states and a RealSense in the hand, by rosbags alone."""
+    """An xArm with its driver's joint states and a RealSense in the hand, by rosbags alone.
+
+    The gripper's joint is said with the others, or, ours, by a driver of its own.
+    """
     store = get_typestore(Stores.ROS2_HUMBLE)
     msgs = store.types
     color, depth = camera
-    names = [*(f"joint{n}" for n in range(1, joints + 1)), "drive_joint"]
+    arms = [f"joint{n}" for n in range(1, joints + 1)]
+    fingers = ["gripper_left_finger_joint" if gripper else "drive_joint"]
     image = np.zeros((24, 32, 3), np.uint8)
     depth_mm = np.full((24, 32), 500, "<u2")
 
@@ -202,7 +212,7 @@ def xarm(
             roi=region,
         )
 
-    def turned(ns: int) -> Any:
+    def turned(ns: int, names: list[str]) -> Any:
         return msgs["sensor_msgs/msg/JointState"](
             header=header(ns, ""),
             name=names,
@@ -223,7 +233,8 @@ def xarm(
         return msgs["tf2_msgs/msg/TFMessage"](transforms=[one])
 
     said = {
-        f"{arm}/joint_states": (10, turned),
+        f"{arm}/joint_states": (10, partial(turned, names=arms + fingers * (not gripper))),
+        **({f"{gripper}/joint_states": (20, partial(turned, names=fingers))} if gripper else {}),
         f"{color}/image_raw": (100, lambda ns: picture(ns, "rgb8", image)),
         f"{color}/camera_info": (100, lens),
         f"{depth}/image_raw": (

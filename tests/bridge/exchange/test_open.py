@@ -13,6 +13,7 @@ from starlette.testclient import TestClient
 
 from bridge.data_files import datasets_folder
 from bridge.episode.reader import Episode
+from bridge.episode.streams import recorded_robot
 from dashboards.app import create_app
 from dashboards.library import Library
 
@@ -99,6 +100,11 @@ def test_a_bag_of_an_xarm_and_a_realsense_is_named(tmp_path: Path, say: Say) -> 
     assert "a map for" not in text
 
 
+def test_a_gripper_that_has_joint_states_of_its_own_is_there(tmp_path: Path, say: Say) -> None:
+    bag = strangers.xarm(tmp_path / "seven", 7, gripper="/xarm_gripper")
+    assert "replay: ready" in say(bag)
+
+
 def test_a_map_names_what_a_bag_does_not_say(tmp_path: Path, say: Say) -> None:
     bag = strangers.xarm(
         tmp_path / "six", 6, arm="/ufactory", camera=("/head/seen", "/head/depth_seen")
@@ -126,6 +132,7 @@ def test_a_map_names_what_a_bag_does_not_say(tmp_path: Path, say: Say) -> None:
     assert f"next: robot-gst rebuild {tmp_path / 'run'}" in text
     (path,) = (tmp_path / "run" / "episodes").iterdir()
     assert Episode.open(path).info.task == "cube_into_box"
+    assert recorded_robot(Episode.open(path)).name == "six"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.schema import ROS_TYPES, schema_text
+from bridge.episode.streams import recorded_robot
 from bridge.errors import BridgeError, EpisodeError, PathNotFoundError, UsageError
 from bridge.exchange.driver_names import mapped
 from bridge.exchange.rosbag2 import find_files, import_bag
@@ -59,6 +61,19 @@ def bag(path: Path, times: range, *, schema: bytes = b"string data\n") -> Path:
     writer.finish()
     path.write_bytes(stream.getvalue())
     return path
+
+
+def test_the_robot_that_is_named_counts_more_than_a_recorded_one(
+    make_trial: Callable[..., Path], tmp_path: Path
+) -> None:
+    trial = make_trial(kind="imported")
+    assert recorded_robot(Episode.open(trial)).name == "ur5_parallel_gripper"
+    words = ["import", "rosbag2", str(trial), str(tmp_path / "run"), "--episode", "e"]
+    assert robot_gst.run([*words, "--robot", "xarm7_parallel_gripper"]) == 0
+    episode = Episode.open(tmp_path / "run" / "episodes" / "e.mcap")
+    assert recorded_robot(episode).name == "xarm7_parallel_gripper"
+    assert robot_gst.run([*words[:-1], "f", "--robot", "nobodys"]) == 2
+    assert not (tmp_path / "run" / "episodes" / "f.mcap").exists()
 
 
 def folder_bag(folder: Path, *names: str, extra: str = "") -> Path:

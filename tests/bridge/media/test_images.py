@@ -120,17 +120,6 @@ def test_a_value_beyond_16_bits_is_refused() -> None:
         unpack(RVL_FORMAT, bytes(12) + struct.pack("<ii", 1, 1) + stream)
 
 
-@given(st.binary(max_size=400), st.integers(1, 40), st.integers(1, 40))
-def test_arbitrary_rvl_streams_give_the_stated_size_or_one_error(
-    stream: bytes, width: int, height: int
-) -> None:
-    try:
-        found = unpack(RVL_FORMAT, bytes(12) + struct.pack("<ii", width, height) + stream)
-        assert found.shape == (height, width)
-    except UnreadableImageError:
-        pass
-
-
 VALUES = np.arange(65536, dtype=np.uint16).reshape(256, 256)
 
 

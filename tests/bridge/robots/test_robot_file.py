@@ -72,26 +72,6 @@ def test_fingers_of_the_default_robot_share_the_width() -> None:
     assert [finger.value(0.05) for finger in ROBOT.gripper.fingers] == [0.025, 0.025]
 
 
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        (ARM.replace("schema_version = 1", "schema_version = 2"), "schema_version"),
-        (ARM + "colour = 'red'\n", "robot has no colour"),
-        (ARM + "[gripper]\njaws = 2\n", "gripper has no jaws"),
-        (ARM + "[gripper]\nfingers = [{ joint = 'a' }]\n", "needs max_width_m"),
-        (ARM + "[gripper]\nfinger_links = ['a']\n", "among the gripper's links"),
-        (ARM.replace('"left_2"', '"left_1"'), "named twice"),
-        (ARM + "velocity_rad_s = [1.0, 2.0]\n", "one positive number per joint"),
-        (ARM.replace("name =", "nam ="), "robot has no nam"),
-        ('schema_version = 1\nname = "mine"\nurdf = "mine.urdf"\n', "joints"),
-        ("joints = [", "not a robot file"),
-    ],
-)
-def test_a_file_that_is_not_a_robot_is_refused(tmp_path: Path, text: str, found: str) -> None:
-    with pytest.raises(UsageError, match=found):
-        read_robot(written(tmp_path, text))
-
-
 def test_an_unknown_robot_is_answered_with_those_that_exist() -> None:
     with pytest.raises(UsageError, match=r"no robot named 'r2d2'.*ur5_parallel_gripper"):
         read_robot("r2d2")

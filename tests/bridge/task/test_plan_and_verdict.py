@@ -16,7 +16,7 @@ from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
 from bridge.task.plan import Plan, Ranking, Stage, SteeredBy, Waypoint
 from bridge.task.plan_request import PlanAnswer, PlanRequest, Refusal
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Factor
 
 number = st.floats(-2, 2, allow_nan=False)
 waypoints = st.builds(
@@ -120,41 +120,6 @@ def test_the_stage_of_an_instant_is_found() -> None:
         "place",
         "place",
     ]
-
-
-def verdict(ik: bool | None, clearance: bool | None, terminal: bool | None) -> Verdict:
-    close = Factor(value=clearance, first_t_ns=5, bodies=("wrist", "table"))
-    return verdict_of("p1", ik=ik, clearance=close, terminal=terminal, engine="pybullet")
-
-
-values = st.sampled_from([True, False, None])
-
-
-@given(values, values, values)
-def test_acceptance_is_the_three_valued_product(
-    ik: bool | None, clearance: bool | None, terminal: bool | None
-) -> None:
-    factors = (ik, clearance, terminal)
-    accepted = verdict(*factors).accepted
-    if False in factors:
-        assert accepted is False
-    elif None in factors:
-        assert accepted is None
-    else:
-        assert accepted is True
-
-
-@given(values, values, values)
-def test_a_verdict_survives_the_round_trip(
-    ik: bool | None, clearance: bool | None, terminal: bool | None
-) -> None:
-    original = verdict(ik, clearance, terminal)
-    assert Verdict.from_json(original.to_json()) == original
-
-
-def test_the_first_failing_factor_is_named_in_order() -> None:
-    assert verdict(True, False, False).first_failing == "clearance"
-    assert verdict(True, None, True).first_failing is None
 
 
 POSE = se3.pose_record(

@@ -259,6 +259,11 @@ MOVED = {"kind": "moved", "object": "cube"}
         ({**MOVED, "by_m": 0.1}, "needs a direction"),
         ({**MOVED, "by_m": 0.1, "direction": "up"}, "direction: 'up' is unknown"),
         ({**MOVED, "direction": "left"}, "says no limit"),
+        ({**MOVED, "at_least_m": 1, "direction": [0, 0, 0]}, "success[0].direction: has no length"),
+        ({**MOVED, "target_m": [1, 1]}, "belong together"),
+        ({**MOVED, "at_least_m": 2, "at_most_m": 1}, "above"),
+        ({**ON_TABLE, "support": "cube"}, "success[0].support: cube cannot be in, on"),
+        ({"kind": "on", "object": "cube", "suport": "block"}, "Did you mean 'support'?"),
         ({**MOVED, "by_m": 0.1, "target_m": [0, 0], "direction": "left"}, "give one"),
         ({"kind": "outside", "object": "cube", "container": "block"}, "is no container"),
         (

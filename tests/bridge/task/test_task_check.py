@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import bridge.task
 import robot_gst
 from bridge.cli import tasks
 from bridge.data_files import datasets_folder
@@ -114,28 +113,6 @@ def test_a_damaged_file_is_a_task_or_is_refused(data: st.DataObject) -> None:
         lines[at] = data.draw(st.sampled_from(["", *(f"{key}= {value}" for value in values)]))
     with contextlib.suppress(TaskFileError):
         assert isinstance(TaskFile("\n".join(lines).encode(), "x").task(), Task)
-
-
-ON_BLOCK = (Path(str(bridge.task.__file__)).parent / "template.toml").read_text()
-
-
-@pytest.mark.parametrize(
-    ("new", "place", "said"),
-    [
-        ('kind = "on"\nobject = "cube"\nsupport = "cube"', "success[0].support", "beside itself"),
-        ('kind = "on"\nobject = "cube"\nsuport = "block"', "success[0]", "'support'?"),
-        ('kind = "moved"\nobject = "cube"', "success[0]", "says no limit"),
-        ('kind = "moved"\nobject = "cube"\ntarget_m = [1, 1]', "success[0]", "belong together"),
-        ('kind = "moved"\nobject = "cube"\nat_least_m = 2\nat_most_m = 1', "success[0]", "above"),
-        ('kind = "moved"\nobject = "cube"\nat_least_m = 1\ndirection = [0, 0, 0]',
-         "success[0].direction", "no length"),
-    ],
-)  # fmt: skip
-def test_relations_that_cannot_be_are_refused(new: str, place: str, said: str) -> None:
-    old = 'kind = "on"\nobject = "cube"\nsupport = "block"\ntolerance_m = 0.008\nmargin_m = 0.0'
-    assert old in ON_BLOCK
-    found = problems(ON_BLOCK.replace(old, new))
-    assert any(text.startswith(f"{place}: ") and said in text for text in found), found
 
 
 def test_nothing_lies_on_what_is_open_above() -> None:

@@ -16,7 +16,6 @@ import pytest
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import UsageError
 from bridge.terminal import Output
 from evaluator.cli import evaluate
 from evaluator.compare import compare_csv, compare_run
@@ -149,27 +148,6 @@ def test_evaluate_prints_json_that_is_the_results_file(
     assert evaluate(six_trials.run.path, output=Output(json=True)) == 0
     record = json.loads(capsys.readouterr().out)
     assert record == json.loads((six_trials.run.results_dir / "results.json").read_text())
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_agreement_below_the_threshold_ends_with_three(
-    evaluated: Evaluated, six_trials: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert evaluated.code == 0  # five of six, and the threshold was 0.8
-    assert evaluate(six_trials.run.path, fail_under=0.9) == 3
-    assert "the threshold is 0.9" in capsys.readouterr().err
-
-
-def test_undefined_agreement_never_passes_a_threshold(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert evaluate(PAPER, out=tmp_path / "out", fail_under=0.0) == 3
-    assert "undefined" in capsys.readouterr().err
-
-
-def test_a_threshold_in_percent_is_refused(six_trials: Any) -> None:
-    with pytest.raises(UsageError, match="fraction from 0 to 1"):
-        evaluate(six_trials.run.path, fail_under=80.0)
 
 
 def test_a_run_without_trials_still_gets_a_report(

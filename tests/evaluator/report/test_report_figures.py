@@ -3,7 +3,7 @@
 import re
 import sys
 import xml.etree.ElementTree as ET
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -109,16 +109,6 @@ def test_nothing_is_drawn_beyond_the_edge(drawn: list[Drawing]) -> None:
                 assert 0 <= float(mark.get(name) or 0) <= most, (item.id, ET.tostring(mark))
             for name in ("y", "y1", "y2", "cy"):
                 assert 0 <= float(mark.get(name) or 0) <= item.height
-
-
-def test_a_figure_that_has_lost_its_data_is_removed(tmp_path: Path, paper: Comparison) -> None:
-    write_report(paper, tmp_path)
-    stale, mine = (tmp_path / "figures" / name for name in ("scatter.svg", "mine.svg"))
-    assert stale.is_file()
-    mine.write_text("<svg/>")
-    write_report(replace(paper, groups=()), tmp_path)
-    assert not stale.exists()
-    assert mine.exists()
 
 
 def plain(frame: pd.DataFrame) -> list[dict[str, Any]]:

@@ -221,11 +221,3 @@ def test_a_table_without_a_twin_is_told_nothing_about_one(tmp_path: Path) -> Non
     for text in shown(tmp_path, trials):
         for word in ("replay", "verdict", "sim_planned", "agree", "--samples", "gate"):
             assert word not in text, (word, text)
-
-
-@pytest.mark.parametrize(("k", "words"), [(0, "nothing succeeded, 0 of 6"), (3, "everything")])
-def test_a_study_of_which_all_trials_end_alike_says_so(tmp_path: Path, k: int, words: str) -> None:
-    trials = "task,policy,recorded,sim_planned\n" + "".join(
-        f"cup,{policy},{int(i < k)},{int(i < 1)}\n" for policy in "AB" for i in range(3)
-    )
-    assert words in shown(tmp_path, trials)[0]

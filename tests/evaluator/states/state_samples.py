@@ -18,7 +18,6 @@ from bridge.task.plan import Plan, Stage
 START_NS = 10_000_000_000
 STEP_NS = 100_000_000
 PLAN_ID = "p1"
-BOX_M = (0.5, 0.2, 0.0)
 IN_BOX_M = (0.5, 0.2, 0.026)
 """A cube of 40 mm on the box's floor of 6 mm."""
 

@@ -12,7 +12,7 @@ from bridge.task.meshes.lattice import volumes_m3
 from bridge.task.task_file import ObjectModel, load_task
 from twin.physics.arm import PhysicsError
 from twin.physics.config import PhysicsConfig
-from twin.physics.soft import SoftBodyError, SoftModel, bind_points, rigid_fit, surface_triangles
+from twin.physics.soft import SoftBodyError, SoftModel, rigid_fit, surface_triangles
 from twin.physics.world import World
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
@@ -139,16 +139,6 @@ def test_the_surface_is_closed_and_points_outward(model: SoftModel) -> None:
     a, b, c = (model.nodes_m[triangles[:, k]].astype(np.float64) for k in range(3))
     enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
     assert enclosed == pytest.approx(model.volume_m3(), rel=1e-5)
-
-
-def test_points_bound_to_tetrahedra_follow_any_affine_map(model: SoftModel) -> None:
-    nodes = model.nodes_m.astype(np.float64)
-    points = np.random.default_rng(0).uniform(nodes.min(axis=0), nodes.max(axis=0), (60, 3))
-    skin = bind_points(points, nodes, model.tets)
-    affine = np.eye(3) + 0.2 * np.random.default_rng(1).normal(size=(3, 3))
-    np.testing.assert_allclose(
-        skin.points_m(nodes @ affine.T + 0.3), points @ affine.T + 0.3, atol=1e-9
-    )
 
 
 def test_a_rigid_fit_recovers_the_motion(model: SoftModel) -> None:

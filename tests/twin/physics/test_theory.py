@@ -202,11 +202,14 @@ def test_a_stepped_box_is_as_wide_as_before_and_its_faces_are_smaller() -> None:
 
 
 @each_engine
+@pytest.mark.parametrize("off_m", [(0.0, 0.0, 0.0), (0.006, -0.004, 0.01)])
 @pytest.mark.parametrize("edge_m", [0.0, 0.004])
-def test_a_pose_comes_out_as_it_went_in_wherever_the_weight_is(engine: str, edge_m: float) -> None:
+def test_a_pose_comes_out_as_it_went_in_wherever_the_weight_is(
+    engine: str, edge_m: float, off_m: tuple[float, float, float]
+) -> None:
     T = at(2, 2, 2, TURN)
     with cell(engine) as world:
-        unseen = Unseen(edge_m=edge_m, centre_of_mass_m=(0.006, -0.004, 0.01))
+        unseen = Unseen(edge_m=edge_m, centre_of_mass_m=off_m)
         world.add_free("cube", CUBE, MASS_KG, T, unseen)
         world.reset_robot(HOME, 0.08)
         np.testing.assert_allclose(world.T_base_object("cube"), T, atol=1e-6)
@@ -260,8 +263,8 @@ def test_what_rests_rests_on_its_own_face_wherever_its_weight_is(
 ) -> None:
     unseen = Unseen(edge_m=edge_m, centre_of_mass_m=(0.003, 0.002, -0.008))
     with cell(engine) as world:
-        world.add_table(0.0)
-        world.add_free("cube", CUBE, MASS_KG, at(0.8, 0.3, 0.0203), unseen)
+        world.add_table(-0.3)
+        world.add_free("cube", CUBE, MASS_KG, at(0.8, 0.3, -0.2797), unseen)
         world.reset_robot(HOME, 0.08)
         p = poses(world, "cube", RATE_HZ)[-1, :3]
-    np.testing.assert_allclose(p, [0.8, 0.3, 0.02], atol=5e-4)
+    np.testing.assert_allclose(p, [0.8, 0.3, -0.28], atol=5e-4)

@@ -27,6 +27,7 @@ from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.sources.standin.driven import HOLD_NS, STOP_NS
 from bridge.sources.standin.session import run_session
 from bridge.sources.standin.settings import SessionConfig
+from bridge.sources.standin.streams import Streams
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
@@ -167,6 +168,16 @@ def test_a_camera_that_the_cell_lacks_is_named(
         _, _, label, moved = laboratory.trial()
     assert "nothing came on /standin/cam/front/color/image in 3 s" in label
     assert "the cell shows /robot_description, " in label
+    assert moved < 0.01
+
+
+def test_a_gripper_of_which_nobody_speaks_is_not_taken_for_open(
+    laboratory: Laboratory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Streams, "gripper", lambda *_: None)
+    with laboratory.acting(NODDING):
+        _, _, label, moved = laboratory.trial()
+    assert "nobody says the gripper's width [m] on a topic .../gripper/state" in label
     assert moved < 0.01
 
 

@@ -24,7 +24,6 @@ from twin.policies.identify import Sent, grip_of, lags_of, response_of, stiffnes
 from twin.policies.response import AT_ONCE, Controller, Response
 from twin.policies.shutter import ALWAYS, shutter_of
 from twin.policies.starts import Start
-from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
 from twin.robot.model import load_robot
 
@@ -78,8 +77,13 @@ def test_delay_lags_stiffness_and_fingers_are_found_again(start: Start) -> None:
     assert set(stiffness_of(free, delay_s, lags_s, robot)) == {np.inf}
 
 
-def write_trial(run: RunFolder, trial: Sent, name: str, first_ns: int) -> Episode:
-    """Joints and fingers as they were, targets one period ahead, pictures 60 ms late."""
+def write_trial(
+    run: RunFolder, trial: Sent, name: str, first_ns: int, *, fingers: bool = False
+) -> Episode:
+    """Joints and fingers as they were, targets one period ahead, pictures 60 ms late.
+
+    With ``fingers`` the width is said by a finger among the joint states, as many drivers do.
+    """
     path = run.episodes_dir / f"{name}.mcap"
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id=name, kind="trial", task="cube_into_box"))
@@ -92,11 +96,17 @@ def write_trial(run: RunFolder, trial: Sent, name: str, first_ns: int) -> Episod
         say("/robot_description", schema.STRING, first_ns, string_to_cdr(ROBOT.urdf_text()))
         width_m = np.where(trial.targets.stamps_ns < 2.79e9, 0.085, 0.0)[:-1]
         ahead = np.column_stack([trial.targets.position[1:], width_m])
+        finger, widths_m = ROBOT.gripper.fingers[0], trial.widths.at(trial.joints.stamps_ns)
+        joints, arm = ARM_JOINTS, trial.joints.position
+        if fingers:
+            joints, arm = (*joints, finger.joint), np.hstack([arm, finger.value(widths_m)])
         for topic, names, stamps_ns, rows in (
-            ("joint_states", ARM_JOINTS, trial.joints.stamps_ns, trial.joints.position),
+            ("joint_states", joints, trial.joints.stamps_ns, arm),
             ("policy/targets", (*ARM_JOINTS, GRIPPER_WIDTH), trial.targets.stamps_ns[:-1], ahead),
             ("gripper/state", (GRIPPER_WIDTH,), trial.widths.stamps_ns, trial.widths.position),
         ):
+            if fingers and topic == "gripper/state":
+                continue
             for stamp_ns, row in zip((first_ns + stamps_ns).tolist(), rows, strict=True):
                 sample = at_positions(stamp_ns, names, row)
                 say(f"/cell/{topic}", schema.JOINT_STATE, stamp_ns, sample)
@@ -107,10 +117,15 @@ def write_trial(run: RunFolder, trial: Sent, name: str, first_ns: int) -> Episod
     return Episode.open(path)
 
 
-def test_a_trial_teaches_the_others_of_its_run(tmp_path: Path, run: RunFolder) -> None:
+@pytest.mark.parametrize("fingers", [False, True])
+def test_a_trial_teaches_the_others_of_its_run(
+    tmp_path: Path, run: RunFolder, fingers: bool
+) -> None:
     robot, folder = load_robot(ROBOT.urdf_text()), RunFolder.create(tmp_path / "taught")
     first, _ = (
-        write_trial(folder, recorded(np.random.default_rng(n)), f"trial_{n}", n * 10**11)
+        write_trial(
+            folder, recorded(np.random.default_rng(n)), f"trial_{n}", n * 10**11, fingers=fingers
+        )
         for n in (1, 2)
     )
     once = recorded(np.random.default_rng(3))
@@ -157,7 +172,7 @@ def test_a_pressed_arm_gives_way_like_its_springs(start: Start) -> None:
         T = cell.robot.T_base_tcp(HOME)
         while cell._world.arm_force_N() < 60.0:
             T[2, 3] -= 0.004
-            target = solve_ik(cell.robot, T, IkConfig(), warm_start_rad=cell.target_rad).joints_rad
+            target = solve_ik(cell.robot, T, warm_start_rad=cell.target_rad).joints_rad
             cell.go(target, 0.0, 0.1)
         cell.hold(1.0)
         joints_rad = cell.posture()[0]

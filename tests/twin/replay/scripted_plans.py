@@ -13,7 +13,6 @@ from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import Task, load_task
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
-from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
 from twin.robot.model import load_robot
 
@@ -36,7 +35,7 @@ def joints_over(scene: ReplayScene, x: float, y: float, z: float) -> np.ndarray:
     """Tool at this place of the base frame, pointing straight down."""
     T = np.diag([1.0, -1.0, -1.0, 1.0])
     T[:3, 3] = (x, y, z)
-    solution = solve_ik(load_robot(scene.urdf), T, IkConfig())
+    solution = solve_ik(load_robot(scene.urdf), T)
     assert solution.reached
     return solution.joints_rad
 
@@ -111,7 +110,7 @@ def with_joints(plan: Plan, scene: ReplayScene, step_s: float = 0.08) -> Plan:
     tau = []
     joints = None
     for stamp, p, q, T in zip(stamps, dense.p_m, dense.q_wxyz, dense.transforms(), strict=True):
-        joints = solve_ik(robot, T, IkConfig(), warm_start_rad=joints).joints_rad
+        joints = solve_ik(robot, T, warm_start_rad=joints).joints_rad
         last = [waypoint for waypoint in plan.tau if waypoint.t_ns <= stamp][-1]
         tau.append(
             replace(

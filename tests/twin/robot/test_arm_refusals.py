@@ -175,10 +175,6 @@ def test_links_said_to_overlap_are_not_watched() -> None:
 FOREARM = re.compile(r'(<link name="forearm_link">.*?)<collision>.*?</collision>', re.DOTALL)
 
 
-def test_an_arm_of_which_every_link_has_a_shape_is_watched() -> None:
-    assert RobotHulls(RobotModel(ROBOT.urdf_text())).blind() is None
-
-
 def test_a_link_that_can_be_seen_and_has_no_shape_is_named() -> None:
     text, count = FOREARM.subn(r"\1", ROBOT.urdf_text())
     assert count == 1

@@ -9,9 +9,15 @@ from scipy.spatial.transform import Rotation
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.robots.robot import read_robot
-from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
-from twin.robot.inverse import UrInverse, pose_error, solutions, solve_ik
+from twin.robot.inverse import (
+    POSITION_TOLERANCE_M,
+    ROTATION_TOLERANCE_RAD,
+    UrInverse,
+    pose_error,
+    solutions,
+    solve_ik,
+)
 from twin.robot.model import RobotModel, load_robot
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
@@ -103,25 +109,6 @@ def test_a_wrist_inside_the_shoulder_cylinder_has_no_answer(
         assert valid.any() == reachable
 
 
-def test_joints_are_within_limits_and_whole_turns_are_used_to_stay_there(robot: RobotModel) -> None:
-    urdf = ROBOT.urdf_text()
-    shifted = re.sub(
-        r'(<joint name="shoulder_pan_joint".*?lower=")[^"]*(" upper=")[^"]*(")',
-        r"\g<1>0.0\g<2>6.28318530718\g<3>",
-        urdf,
-        flags=re.DOTALL,
-    )
-    narrow = RobotModel(shifted)
-    assert narrow.lower_rad[0] == 0.0
-    inverse = UrInverse.for_robot(narrow)
-    assert inverse is not None
-    Ts = robot.Ts_base_tcp(np.random.default_rng(14).uniform(-3.0, 3.0, (100, 6)))
-    joints, valid, _ = inverse.solve(Ts)
-    assert valid.any(axis=1).all()
-    assert np.all(joints[valid] >= narrow.lower_rad - 1e-6)
-    assert np.all(joints[valid] <= narrow.upper_rad + 1e-6)
-
-
 FIVE = ("so100", "so101")
 ITERATED = ("panda", "kinova_j2s6s200", "xarm7_parallel_gripper", "z1", *FIVE)
 
@@ -141,14 +128,13 @@ def postures(robot: RobotModel, count: int, seed: int) -> np.ndarray:
 
 
 def check_reached(robot: RobotModel, rows: np.ndarray) -> None:
-    config = IkConfig()
     for row in rows:
         T = robot.T_base_tcp(row)
-        found = solve_ik(robot, T, config)
+        found = solve_ik(robot, T)
         assert found.reached, row.tolist()
         position_m, rotation_rad = pose_error(robot, found.joints_rad, T)
-        assert position_m <= config.position_tolerance_m
-        assert rotation_rad <= config.rotation_tolerance_rad
+        assert position_m <= POSITION_TOLERANCE_M
+        assert rotation_rad <= ROTATION_TOLERANCE_RAD
         assert np.all(found.joints_rad >= robot.lower_rad)
         assert np.all(found.joints_rad <= robot.upper_rad)
 
@@ -167,27 +153,27 @@ def test_an_arm_of_five_joints_reaches_every_position_and_turns_as_far_as_it_can
     for row in postures(robot, 60, seed=5):
         T = robot.T_base_tcp(row)
         T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
-        found = solve_ik(robot, T, IkConfig())
+        found = solve_ik(robot, T)
         assert found.reached
         position_m, left_rad = pose_error(robot, found.joints_rad, T)
-        assert position_m <= IkConfig().position_tolerance_m
+        assert position_m <= POSITION_TOLERANCE_M
         assert left_rad == pytest.approx(found.rotation_error_rad, abs=1e-6)
-        warm = solve_ik(robot, T, IkConfig(), warm_start_rad=found.joints_rad)
+        warm = solve_ik(robot, T, warm_start_rad=found.joints_rad)
         assert warm.reached
         assert warm.rotation_error_rad <= left_rad + 1e-3
         T[:3, 3] *= 10
-        assert not solve_ik(robot, T, IkConfig(restarts=1)).reached
+        assert not solve_ik(robot, T, restarts=1).reached
 
 
 def test_a_pose_out_of_reach_of_seven_joints_is_not_reached() -> None:
     robot = model("panda")
     T = robot.T_base_tcp(robot.home_rad)
     T[:3, 3] = (1.5, 0.0, 0.3)
-    found = solve_ik(robot, T, IkConfig(restarts=2))
+    found = solve_ik(robot, T, restarts=2)
     assert not found.reached
     assert found.position_error_m > 0.4
     T[:3, :3] = np.nan
-    assert not solve_ik(robot, T, IkConfig(restarts=2)).reached
+    assert not solve_ik(robot, T, restarts=2).reached
 
 
 @pytest.mark.parametrize("name", ["panda", "xarm7_parallel_gripper"])
@@ -196,18 +182,18 @@ def test_the_seventh_joint_goes_towards_home_and_then_moves_least(name: str) -> 
     q, p = se3.split(robot.T_base_tcp(robot.home_rad))
     shares = np.linspace(0.0, 1.0, 60)[:, None]
     Ts = se3.transform_from(np.tile(q, (60, 1)), p + shares * np.array([0.05, 0.15, -0.1]))
-    followed = follow_poses(robot, Ts, start_rad=None, config=IkConfig())
+    followed = follow_poses(robot, Ts, start_rad=None)
     assert followed.reached.all()
     np.testing.assert_allclose(followed.joints_rad[0], robot.home_rad, atol=1e-6)
     assert np.abs(np.diff(followed.joints_rad, axis=0)).max() < 0.02
-    again = follow_poses(robot, Ts, start_rad=None, config=IkConfig())
+    again = follow_poses(robot, Ts, start_rad=None)
     assert np.array_equal(again.joints_rad, followed.joints_rad)
     # What the pose leaves open: found from elsewhere, it comes to the same side of the arm.
     rng = np.random.default_rng(0)
-    far = solve_ik(robot, Ts[0], IkConfig()).joints_rad
+    far = solve_ik(robot, Ts[0]).joints_rad
     assert np.abs(far - robot.home_rad).max() < 1e-6
     other = rng.uniform(robot.lower_rad, robot.upper_rad)
-    free = solve_ik(robot, robot.T_base_tcp(other), IkConfig()).joints_rad
+    free = solve_ik(robot, robot.T_base_tcp(other)).joints_rad
     assert np.linalg.norm(free - robot.home_rad) <= np.linalg.norm(other - robot.home_rad) + 1e-6
 
 
@@ -216,15 +202,15 @@ def test_a_path_is_followed_from_another_posture_where_the_first_one_ends_or_tou
     name: str,
 ) -> None:
     """Somebody stands where the arm would be that begins nearest to home."""
-    robot, config = model(name), IkConfig()
+    robot = model(name)
     q, p = se3.split(robot.T_base_tcp(robot.home_rad))
     shares = np.linspace(0.0, 1.0, 20)[:, None]
     Ts = se3.transform_from(np.tile(q, (20, 1)), p + shares * np.array([0.02, 0.05, -0.03]))
-    found = [item.joints_rad for item in solutions(robot, Ts[0], config)]
+    found = [item.joints_rad for item in solutions(robot, Ts[0])]
     assert len(found) > 2
     for row in found:
         np.testing.assert_allclose(robot.T_base_tcp(row), Ts[0], atol=1e-6)
-    plain = follow_poses(robot, Ts, start_rad=None, config=config)
+    plain = follow_poses(robot, Ts, start_rad=None)
     np.testing.assert_allclose(plain.joints_rad[0], found[0], atol=1e-6)
     asked = []
 
@@ -232,7 +218,7 @@ def test_a_path_is_followed_from_another_posture_where_the_first_one_ends_or_tou
         asked.append(len(rows))
         return np.abs(rows - plain.joints_rad[0]).max(axis=1) - 0.4
 
-    other = follow_poses(robot, Ts, start_rad=None, config=config, clearance=clearance)
+    other = follow_poses(robot, Ts, start_rad=None, clearance=clearance)
     assert other.reached.all()
     assert len(asked) > 1
     assert np.abs(other.joints_rad - plain.joints_rad[0]).max(axis=1).min() > 0.4

@@ -63,10 +63,6 @@ class MotionReplay:
             "motion": None if self.motion is None else self.motion.to_record(),
         }
 
-    def cost(self) -> float:
-        """All take about as long."""
-        return 1.0
-
     def needed_paths(self) -> tuple[Path, ...]:
         """What a process on another machine must see."""
         return (self.run_path,)
@@ -180,7 +176,7 @@ def replay_imported(
     rows = []
     with runner_for(config) as runner, output.progress("imported", len(items)) as advance:
         for done, (item, answer) in enumerate(
-            runner.run(run_motion_replay, items, MotionReplay.cost), start=1
+            runner.run(run_motion_replay, items, lambda _: 1.0), start=1
         ):
             if isinstance(answer, Failed):
                 skipped[item.episode_id] = answer.message

@@ -8,7 +8,6 @@ from twin.replay.clearance.bodies import own_links_touch
 from twin.replay.clearance.surroundings import Surroundings
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
-from twin.robot.config import IkConfig
 from twin.robot.inverse import UrInverse, solutions, solve_ik
 from twin.robot.model import RobotModel
 
@@ -80,9 +79,9 @@ def _reaching(robot: RobotModel, T_base_tcp: Pose, near_rad: Joints | None = Non
         raw, valid, _ = inverse.solve(T_base_tcp[None])
         return np.asarray(raw[0, valid[0]])
     if near_rad is None:
-        found = list(solutions(robot, T_base_tcp, IkConfig()))
+        found = list(solutions(robot, T_base_tcp))
     else:
-        found = [solve_ik(robot, T_base_tcp, IkConfig(), warm_start_rad=near_rad)]
+        found = [solve_ik(robot, T_base_tcp, warm_start_rad=near_rad)]
     rows = [item.joints_rad for item in found if item.reached]
     return np.array(rows).reshape(-1, len(robot.joints))
 

@@ -16,7 +16,6 @@ from twin.replay.clearance.bodies import own_links_touch
 from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
-from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 from twin.robot.model import RobotModel
 
@@ -176,9 +175,9 @@ class Mover:
             Ts = {name: rows[index] for name, rows in poses.items()}
             monitor.measure(int(stamps[index]), joints, self.width_m, Ts)
             if links_touch():
-                closest = hulls.self_distance()
-                told = f"{closest.links[0]} touches {closest.links[1]}"
-                refusals.append(_refused(closest.links, told, -closest.distance_m))
+                distance_m, links = hulls.self_distance()
+                told = f"{links[0]} touches {links[1]}"
+                refusals.append(_refused(links, told, -distance_m))
                 break
         for failure in monitor.failures:
             one, other = failure.bodies
@@ -283,7 +282,7 @@ def _straight_knots(robot: RobotModel, start_rad: Joints, T_base_goal: Pose) -> 
     turns = (se3.interpolate_quaternion(q_start, q_goal, np.array(s)) for s in shares)
     places = p_start + shares[:, None] * (p_goal - p_start)
     Ts = np.stack([se3.transform_from(q, p) for q, p in zip(turns, places, strict=True)])
-    followed = follow_poses(robot, Ts, start_rad=start_rad, config=IkConfig())
+    followed = follow_poses(robot, Ts, start_rad=start_rad)
     if not followed.reached.all():
         share = shares[int(np.argmin(followed.reached))]
         detail = f"no joints reach the pose at {share * way_m * 1e3:.0f} of {way_m * 1e3:.0f} mm"

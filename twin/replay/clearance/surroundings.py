@@ -248,7 +248,7 @@ def posture_clearance(
     def one(joints_rad: Float[np.ndarray, " num_joints"]) -> float:
         hulls.place(joints_rad, gripper.max_width_m)
         if links_touch():
-            return hulls.self_distance().distance_m
+            return hulls.self_distance()[0]
         return around.least_m(hand) - config.eps_col_m
 
     return lambda joints_rad: np.array([one(row) for row in joints_rad])

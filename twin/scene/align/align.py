@@ -205,11 +205,7 @@ class _Candidate:
 
 
 def align_robot(
-    views: Sequence[RobotView],
-    robot: RobotModel,
-    *,
-    start: Float[np.ndarray, "4 4"] | None = None,
-    seed: int = 0,
+    views: Sequence[RobotView], robot: RobotModel, *, start: Float[np.ndarray, "4 4"] | None = None
 ) -> Alignment:
     """Find the pose ``T_base_source`` of a scene in which a robot stands, and the depth scale.
 
@@ -225,11 +221,9 @@ def align_robot(
         )
     surfaces = [PosedSurface(robot, view.posture) for view in views]
     starts = [ScenePose(T_base_source=T) for T in _starts(views, robot, start)]
-    coarse = [_refined(views, surfaces, pose, fine=False, seed=seed) for pose in starts]
+    coarse = [_refined(views, surfaces, pose, fine=False) for pose in starts]
     best, others = _ranked(coarse)
-    finals = [
-        _refined(views, surfaces, item.pose, fine=True, seed=seed) for item in (best, *others)
-    ]
+    finals = [_refined(views, surfaces, item.pose, fine=True) for item in (best, *others)]
     best, others = _ranked(finals)
     margin = None
     if start is None:
@@ -249,12 +243,7 @@ def align_robot(
 
 
 def _refined(
-    views: Sequence[RobotView],
-    surfaces: Sequence[PosedSurface],
-    pose: ScenePose,
-    *,
-    fine: bool,
-    seed: int,
+    views: Sequence[RobotView], surfaces: Sequence[PosedSurface], pose: ScenePose, *, fine: bool
 ) -> _Candidate:
     """Coarse without the scale, which a wrong place would abuse; fine with it."""
     refined, equations = refine(
@@ -264,7 +253,6 @@ def _refined(
         stages=FINE if fine else COARSE,
         num_points=NUM_POINTS if fine else COARSE_POINTS,
         with_scale=fine,
-        seed=seed,
     )
     return _Candidate(
         pose=refined, looked=depth_errors(views, surfaces, refined), equations=equations

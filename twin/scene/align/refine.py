@@ -60,7 +60,6 @@ def refine(
     stages: Sequence[tuple[float, int]],
     num_points: int,
     with_scale: bool = True,
-    seed: int = 0,
 ) -> tuple[ScenePose, Equations]:
     """Lay measured points on the posed surface: Gauss-Newton with Tukey's weights.
 
@@ -68,7 +67,7 @@ def refine(
         num_points: At most this many points of all views, at least 200 of each visible link.
         with_scale: Whether the depth scale is estimated; otherwise the fit is rigid.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     pose = start
     equations = None
     for gate_m, iterations in stages:

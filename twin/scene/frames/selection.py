@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.episode import streams
+from bridge.episode.metadata import RETRY
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
@@ -104,7 +105,7 @@ class Sources:
 
 
 def find_sources(run: RunFolder) -> Sources:
-    """Take all scans; without a scan, every episode that has posed RGB-D frames.
+    """Take all scans; else what has posed RGB-D frames and is no trial; else the trials.
 
     An episode that cannot be read is passed over, with a remark.
     """
@@ -130,6 +131,7 @@ def find_sources(run: RunFolder) -> Sources:
             "depth can be looked at, and not rebuilt."
         )
         raise NoFramesError(message)
+    usable = [episode for episode in usable if episode.info.kind not in ("trial", RETRY)] or usable
     kinds = sorted({episode.info.kind for episode in usable})
     remarks.insert(
         0, f"no scan in this run: using {len(usable)} episode(s) of kind {', '.join(kinds)}"

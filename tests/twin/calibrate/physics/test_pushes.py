@@ -196,11 +196,11 @@ def test_the_least_error_is_found_again_on_resamples() -> None:
     grid = 0.01 + 0.001 * rng.random((6, 2, 4, 3))
     grid[:, 1, 2, 0] = 0.002
     assert least(grid, range(6)) == (1, 2, 0)
-    assert (resampled(grid, 0) == (1, 2, 0)).all()
+    assert (resampled(grid) == (1, 2, 0)).all()
     grid[:3, 0, 0, 0] = (
         0.0  # best for three runs, bad for the others: best where only these are drawn
     )
-    share = (resampled(grid, 0) == (0, 0, 0)).all(axis=1).mean()
+    share = (resampled(grid) == (0, 0, 0)).all(axis=1).mean()
     assert share == pytest.approx(2**-6, abs=0.012)
 
 

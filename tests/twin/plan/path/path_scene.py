@@ -14,7 +14,6 @@ from twin.plan.path.world import World, build_world
 from twin.plan.problem import Problem
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of
-from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 from twin.robot.model import load_robot
 
@@ -73,7 +72,7 @@ class Pairs:
 
 
 def joints_at(problem: Problem, T: np.ndarray, near: np.ndarray | None) -> np.ndarray | None:
-    found = follow_poses(problem.robot, T[None], start_rad=near, config=IkConfig())
+    found = follow_poses(problem.robot, T[None], start_rad=near)
     return found.joints_rad[0] if found.reached[0] else None
 
 

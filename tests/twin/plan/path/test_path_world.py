@@ -91,7 +91,7 @@ def test_a_way_that_is_called_free_is_free_by_coal_all_along(pairs: Pairs) -> No
                 problem.scene.movable(), [], near_m=EPS_M, counts=lambda body, other: True
             )
             assert min(distances.values()) >= EPS_M
-            assert hulls.self_distance().distance_m > 0
+            assert hulls.self_distance()[0] > 0
     assert blocked > 2
 
 

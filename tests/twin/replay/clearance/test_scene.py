@@ -24,7 +24,6 @@ from twin.replay.clearance.surroundings import Surroundings, posture_clearance
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, hulls_of
-from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
 from twin.robot.model import load_robot
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
@@ -201,7 +200,7 @@ def test_a_post_passed_between_two_states_is_not_missed(
     before = joints_over(scene, 0.62, -0.3 - 0.13, 0.2)
     T = robot.T_base_tcp(before)
     T[1, 3] += 0.26
-    after = solve_ik(robot, T, IkConfig(), warm_start_rad=before).joints_rad
+    after = solve_ik(robot, T, warm_start_rad=before).joints_rad
     assert monitor.measure(0, before, 0.0, {}) > 0.01
     lowest = monitor.measure(2_000_000_000, after, 0.0, {})
     if static is None:
@@ -224,7 +223,7 @@ def test_a_thin_wall_of_the_box_is_not_jumped_over(script: SimpleNamespace) -> N
     before = joints_over(scene, wall_x - 0.03, 0.19, 0.045)
     T = robot.T_base_tcp(before)
     T[0, 3] += 0.06
-    after = solve_ik(robot, T, IkConfig(), warm_start_rad=before).joints_rad
+    after = solve_ik(robot, T, warm_start_rad=before).joints_rad
     monitor.measure(0, before, 0.0, {})
     monitor.measure(20_000_000, after, 0.0, {})
     assert any(failure.bodies[1] == "box" for failure in monitor.failures)

@@ -206,7 +206,7 @@ def test_every_failure_along_a_path_names_its_first_instant() -> None:
     t_ns, bodies = checked(fold)["self_collision"]
     index = int(np.searchsorted(times, t_ns))
     hulls.place(fold[index], 0.08)
-    assert hulls.self_distance().distance_m <= 0
+    assert hulls.self_distance()[0] <= 0
     hulls.place(fold[index - 1], 0.08)
-    assert hulls.self_distance().distance_m > 0
+    assert hulls.self_distance()[0] > 0
     assert len(bodies) == 2

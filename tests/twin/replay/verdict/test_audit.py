@@ -30,9 +30,6 @@ OVER_M = 0.002
 """A plant says at least this much more than what is there."""
 
 
-YES = Factor(value=True)
-
-
 def held(
     scene: ReplayScene, postures_rad: list[np.ndarray], width_m: float, said_m: float
 ) -> ReplayResult:

@@ -195,23 +195,6 @@ def test_a_path_faster_than_the_robot_is_refused(
     assert bool(found) == bool(causes)
 
 
-def test_accelerations_are_those_of_theory() -> None:
-    """A parabola through 20 rad/s^2 is beyond the limit of 15, one through 10 is not."""
-    robot = load_robot(ROBOT.urdf_text())
-    seconds = np.arange(0, 0.31, 0.01)
-    for acceleration, refused in ((20.0, True), (10.0, False)):
-        # Up and down again, so that it ends at rest.
-        half = 0.5 * acceleration * np.minimum(seconds, 0.15) ** 2
-        rest = np.maximum(seconds - 0.15, 0.0)
-        whole = half + acceleration * 0.15 * rest - 0.5 * acceleration * rest**2
-        found = motion_failures(path_with(whole.tolist(), 0.01), robot)
-        named = [item for item in found if item.cause == "joint_acceleration"]
-        assert bool(named) == refused
-        if refused:
-            assert "elbow_joint is accelerated at" in named[0].detail
-            assert "the limit is 15.00 rad/s^2" in named[0].detail
-
-
 def test_a_robot_that_would_stop_by_itself_is_not_told_to_go_on() -> None:
     path = path_with([0.0, 0.0], 1.0)
     states = States(

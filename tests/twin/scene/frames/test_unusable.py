@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,18 @@ def write(
     with monkeypatch.context() as spoilt:
         spoilt.setattr(textured_room, "transforms_to_cdr", lambda items: encode(change(items)))
         textured_room.write_episode(run.episodes_dir / f"{name}.mcap", num_frames=num_frames)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "taken"),
+    [("scan imported trial", "scan"), ("imported trial retry", "imported"), ("trial", "trial")],
+)
+def test_scans_are_taken_else_what_is_no_trial(tmp_path: Path, kinds: str, taken: str) -> None:
+    """A bag that was imported without a task is the scan of those that are trials."""
+    folder = RunFolder.create(tmp_path / "run")
+    for kind in kinds.split():
+        textured_room.write_episode(folder.episodes_dir / f"{kind}.mcap", num_frames=2, kind=kind)
+    assert [episode.info.kind for episode in find_sources(folder).episodes] == [taken]
 
 
 def later(seconds: float) -> Change:
