@@ -32,7 +32,7 @@ from cell_run import FileSession
 from measure import Target, report_targets
 
 from bridge.episode.reader import Episode
-from bridge.sources.standin.cell import CellConfig, StandinCell
+from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.streams import Streams
 from bridge.task.protocol import SEEDS_PER_SESSION
@@ -53,10 +53,8 @@ def one_trial(folder: Path, cell_name: str, seed: int, name: str, mass_kg: float
     model = replace(published.objects[key], mass_kg=mass_kg / hidden.mass_scale)
     task = replace(published, objects={**published.objects, key: model})
     session = FileSession(folder)
-    config = CellConfig(rate_hz=0.0)
-    cell = StandinCell(
-        file, task, hidden, Streams(session, "standin"), config=config, seed=seed, start_ns=0
-    )
+    streams = Streams(session, "standin")
+    cell = StandinCell(file, task, hidden, streams, rate_hz=0.0, seed=seed, start_ns=0)
     info = {"kind": "trial", "task": name, "stand_in": True}
     start = {"id": f"{cell_name}_{seed}", "info": info}
     session.query("start", json.dumps(start).encode(), timeout_s=1.0)

@@ -25,7 +25,7 @@ from cell_run import FileSession, record_ungated
 from measure import ROOT, Target, print_targets, report_targets
 
 from bridge.episode.run_folder import RunFolder
-from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
+from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.streams import Streams
@@ -110,8 +110,8 @@ def as_published(task: Task) -> StandinCell:
         joint_offset_rad=np.zeros(6),
         deviations=None,
     )
-    unheard, config = Streams(FileSession(Path()), WIRE), CellConfig(rate_hz=0.0)
-    return StandinCell(file, task, hidden, unheard, config=config, seed=0, start_ns=0)
+    unheard = Streams(FileSession(Path()), WIRE)
+    return StandinCell(file, task, hidden, unheard, rate_hz=0.0, seed=0, start_ns=0)
 
 
 def own_engine(cell: StandinCell, trial: Trial) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry.camera import Camera
 from bridge.media.color import decode_color, encode_jpeg
-from bridge.sources.standin.cell import CellConfig, StandinCell
+from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import STILL_S
 from bridge.sources.standin.scan import joint_move, scan_joints
@@ -90,9 +90,7 @@ class _Laboratory:
         self.file = load_cell(self.task.cell)
         self.tap = Tap({key: mount.camera for key, mount in self.file.cameras.items()})
         hidden = nominal_hidden(self.file) if honest else draw_hidden(self.file, seed)
-        self.cell = StandinCell(
-            self.file, self.task, hidden, self.tap, config=CellConfig(), seed=seed, start_ns=0
-        )
+        self.cell = StandinCell(self.file, self.task, hidden, self.tap, seed=seed, start_ns=0)
         self.cell.reset({**self.task.draw_start(np.random.default_rng(seed)), **(moved or {})})
         self.cell.announce()
         self.cell.wait(1.2 if moved else 0.4)

@@ -8,8 +8,9 @@ links carries the tool, the schedule that the joints were given, and the boxes o
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -18,14 +19,15 @@ from bridge.task.record import made_of
 
 RECORD_NAME = "scripted_motion"
 _VERSION = 1
+Positive = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PushedBox:
     """A box that stands on the table."""
 
-    size_m: tuple[float, float, float]
-    mass_kg: float
+    size_m: tuple[Positive, Positive, Positive]
+    mass_kg: Positive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +50,11 @@ class ScriptedMotion:
     base_m: tuple[float, float, float]
     """Where the root of the URDF stands, its axes along those of the world."""
     targets: tuple[JointTarget, ...]
-    gain_hz: float
+    gain_hz: Positive
     """Speed that a joint is told per distance to its target."""
-    limit_rad_s: float
-    period_s: float
-    duration_s: float
+    limit_rad_s: Positive
+    period_s: Positive
+    duration_s: Positive
     boxes: Mapping[str, PushedBox] = field(default_factory=dict)
     """By object id; empty where the tool alone moves."""
 
@@ -92,22 +94,8 @@ class ScriptedMotion:
             found = f"schema version {version!r}, known is {_VERSION}"
             raise InvalidRecordError(name=RECORD_NAME, where="schema_version", found=found)
         motion = made_of(ScriptedMotion, record, name=RECORD_NAME)
-        motion._check()
-        return motion
-
-    def _check(self) -> None:
-        boxes = [value for box in self.boxes.values() for value in (*box.size_m, box.mass_kg)]
-        numbers = (self.gain_hz, self.limit_rad_s, self.period_s, self.duration_s, *boxes)
-        if not all(np.isfinite(value) and value > 0 for value in numbers):
-            raise InvalidRecordError(
-                name=RECORD_NAME,
-                where="gain, limit, period, duration, or a box's size or mass",
-                found="not above zero",
-            )
-        unknown = {name for item in self.targets for name in item.joints_rad} - set(self.joints)
+        unknown = {name for item in motion.targets for name in item.joints_rad} - {*motion.joints}
         if unknown:
-            raise InvalidRecordError(
-                name=RECORD_NAME,
-                where="targets",
-                found=f"{', '.join(sorted(unknown))} is none of {', '.join(self.joints)}",
-            )
+            found = f"{', '.join(sorted(unknown))} is none of {', '.join(motion.joints)}"
+            raise InvalidRecordError(name=RECORD_NAME, where="targets", found=found)
+        return motion

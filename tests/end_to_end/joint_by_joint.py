@@ -49,10 +49,10 @@ class Pendant(operator.Operator):
         cell.reset(poses)
         self._begin(info)
         cell.cameras_running = True
-        rest_s = operator.wait_s(operator.LOOK_S, cell.config.rate_hz)
+        rest_s = operator.wait_s(operator.LOOK_S, cell.rate_hz)
         cell.wait(rest_s)
         move_by_hand(cell, poses, BESIDE_M * ((info.trial or 0) % 2 == 0))
-        cell.wait(operator.wait_s(operator.SETTLE_S, cell.config.rate_hz))
+        cell.wait(operator.wait_s(operator.SETTLE_S, cell.rate_hz))
         outcome = operator.label_trial(cell.world.task, cell.truth, executed=False)
         cell.cameras_running = False
         self._end(outcome)

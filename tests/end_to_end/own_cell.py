@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT))
 from bridge.geometry import se3  # noqa: E402
 from bridge.robots.default import MAX_WIDTH_M  # noqa: E402
 from bridge.sources.realsense import publish  # noqa: E402
-from bridge.sources.standin.cell import TICK_NS, CellConfig, StandinCell  # noqa: E402
+from bridge.sources.standin.cell import TICK_NS, StandinCell  # noqa: E402
 from bridge.sources.standin.cell_file import CellFile, draw_hidden, load_cell  # noqa: E402
 from bridge.sources.standin.kinematics import arm_kinematics  # noqa: E402
 from bridge.sources.standin.scan import joint_move, scan_joints  # noqa: E402
@@ -68,9 +68,8 @@ class Tape:
 def perform(file: CellFile) -> dict[str, Tape]:
     """Let the laboratory do everything beforehand: a scan and three trials, from home to home."""
     task = chosen_task_file(TASK).task()
-    config = CellConfig(rate_hz=1.5, scale=2.0)
-    hidden = draw_hidden(file, SEED, task)
-    cell = StandinCell(file, task, hidden, Tape(), config=config, seed=SEED, start_ns=0)
+    hidden, how = draw_hidden(file, SEED, task), {"rate_hz": 1.5, "scale": 2.0}
+    cell = StandinCell(file, task, hidden, Tape(), seed=SEED, start_ns=0, **how)
     tapes = {}
     for name, start in {"scan_1": 1, "trial_1": 1, "trial_2": 2, "trial_3": 3}.items():
         tape = tapes[name] = cell.streams = Tape(cell)

@@ -57,8 +57,6 @@ class _SoftBody:
     model: SoftModel
     skin: Skin | None
     rest_extents_m: Float[np.ndarray, "3"]
-    rest_m: Float[np.ndarray, "num_nodes 3"]
-    weights: Float[np.ndarray, " num_nodes"]
 
 
 class SoftWorld:
@@ -180,8 +178,6 @@ class SoftWorld:
             model=model,
             skin=skin,
             rest_extents_m=np.ptp(points, axis=0),
-            rest_m=rest,
-            weights=model.mass_fraction.astype(np.float64),
         )
 
     def push_rigid(self) -> None:
@@ -246,8 +242,9 @@ class SoftWorld:
         """Rigid motion nearest to a body's nodes; of a body that burst no numbers."""
         # Pose and extents of one state ask for the same fit.
         if object_id not in self._fits:
-            body = self.names[object_id]
-            fit = rigid_fit(body.rest_m, self.nodes_m(object_id), body.weights)
+            model = self.names[object_id].model
+            rest_m, weights = (a.astype(np.float64) for a in (model.nodes_m, model.mass_fraction))
+            fit = rigid_fit(rest_m, self.nodes_m(object_id), weights)
             fit.setflags(write=False)
             self._fits[object_id] = fit
         return self._fits[object_id]

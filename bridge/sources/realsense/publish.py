@@ -86,9 +86,13 @@ class CameraWorker:
             stop.set()
 
     def _open(self) -> CameraDevice | None:
-        device = _find(self._list_devices, self._serial)
-        if device is None:
+        try:
+            here = [item for item in self._list_devices() if serial_of(item) == self._serial]
+        except RuntimeError:  # it went away while being asked
             return None
+        if not here:
+            return None
+        device = here[0]
         try:
             opened = CameraDevice(
                 device, self._config, camera=self.camera, now_ns=self._session.now_ns
@@ -219,10 +223,3 @@ def choose_cameras(config: RealSenseConfig, list_devices: ListDevices) -> dict[s
         if serial not in serials:
             raise CameraNotFoundError(wanted=f"{name} with serial number {serial}", found=listed)
     return wanted
-
-
-def _find(list_devices: ListDevices, serial: str) -> Any | None:
-    try:
-        return next((item for item in list_devices() if serial_of(item) == serial), None)
-    except RuntimeError:  # it went away while being asked
-        return None

@@ -46,16 +46,6 @@ class StoppedError(BridgeError):
         super().__init__("the session was stopped before its end; what was recorded is complete.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class CellConfig:
-    """How the cell runs; none of it changes its difficulty."""
-
-    rate_hz: float = 5.0
-    """Frames per second of each camera during trials; 0 takes none."""
-    scale: float = 1.0
-    """Resize the images of the cell file (320 x 240)."""
-
-
 @dataclass
 class TruthLog:
     """What really happened since the last reset, at 30 Hz; the operator looks at this."""
@@ -86,15 +76,21 @@ class StandinCell:
         hidden: HiddenParameters,
         streams: Streams,
         *,
-        config: CellConfig,
         seed: int,
         start_ns: int,
         first_start: int = 0,
+        rate_hz: float = 5.0,
+        scale: float = 1.0,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Build the laboratory and wait at home."""
+        """Build the laboratory and wait at home.
+
+        Args:
+            rate_hz: Frames per second of each camera during trials; 0 takes none.
+            scale: Of images, times what the cell file says (320 x 240).
+        """
         self.file, self.task, self.hidden, self.streams = cell, task, hidden, streams
-        self.config = config
+        self.rate_hz = rate_hz
         self.world = World(task, hidden, cell.clutter)
         self._steps_per_tick = round(TICK_NS * 1e-9 / self.world.step_s)
         self.kinematics = arm_kinematics()
@@ -102,9 +98,7 @@ class StandinCell:
         self.home_rad = self.kinematics.joints_for(home, np.array(HOME_SEED_RAD))
         self.truth = TruthLog()
         self.now_ns = start_ns
-        self._cameras = {
-            key: mount.camera.scaled(config.scale) for key, mount in cell.cameras.items()
-        }
+        self._cameras = {key: mount.camera.scaled(scale) for key, mount in cell.cameras.items()}
         self._lenses = self._cameras  # what takes the pictures; published is what it should be
         if hidden.deviations is not None:
             self._lenses = {
@@ -209,7 +203,7 @@ class StandinCell:
         self._publish_robot(efforts_Nm)
         if self._is_due("truth", TRUTH_NS):
             self._publish_truth()
-        rate = self.config.rate_hz
+        rate = self.rate_hz
         if self.cameras_running and rate > 0 and self._is_due("camera", ns_from_s(1 / rate)):
             self.capture()
 

@@ -1,13 +1,13 @@
 """What stands about on the stand-in's table and is nobody's task: a mug and a can, z up."""
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.task.meshes import solids
+from bridge.task.meshes.solids import Distances, Points
 from bridge.task.meshes.toys import DESIGNS, Design
 
 
-def mug_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+def mug_solid(p: Points) -> Distances:
     """A mug with one handle."""
     wall = solids.cylinder(p, 0.040, -0.047, 0.047)
     handle = solids.ring(p, (0.0, -0.043, 0.0), 0, 0.024, 0.0065)
@@ -16,7 +16,7 @@ def mug_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_p
     return solids.cut(whole, solids.cylinder(p, 0.035, -0.040, 0.080), 0.003)
 
 
-def mug_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+def mug_paint(p: Points) -> Points:
     """Petrol with white dots outside, off-white inside."""
     colors = np.tile([0.12, 0.40, 0.44], (len(p), 1))
     turn = np.arctan2(p[:, 1], p[:, 0]) * 6 / np.pi
@@ -27,14 +27,14 @@ def mug_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_po
     return colors
 
 
-def can_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+def can_solid(p: Points) -> Distances:
     """A tin with a bead at either end."""
     body = solids.cylinder(p, 0.036, -0.054, 0.054)
     beads = [solids.ring(p, (0.0, 0.0, end * 0.053), 2, 0.0355, 0.0022) for end in (-1.0, 1.0)]
     return solids.blend_all([body, *beads], 0.002)
 
 
-def can_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+def can_paint(p: Points) -> Points:
     """Tin ends, a red label with a cream band and a row of squares."""
     colors = np.tile([0.66, 0.67, 0.69], (len(p), 1))
     label = (np.abs(p[:, 2]) < 0.049) & (np.hypot(p[:, 0], p[:, 1]) > 0.0352)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.errors import UsageError
-from bridge.sources.standin.kinematics import yaw_of
+from bridge.sources.standin.kinematics import Pose, yaw_of
 from bridge.task.check import TABLE
 from bridge.task.relations import BESIDE_GAP_M, direction_of
 from bridge.task.task_file import ObjectModel, Task
@@ -34,7 +34,7 @@ class Destination:
     """inside, on or at."""
     model: ObjectModel
     """Of what is there; of the object itself where that is a spot on the table."""
-    T_base: Float[np.ndarray, "4 4"]
+    T_base: Pose
     """Pose of what is there; of a spot its place on the table and the tool's turn there."""
     is_turned: bool = False
     """Whether the tool has to turn to how the spot lies: fingers on either side of the gap."""
@@ -78,9 +78,7 @@ class Destination:
         return lies + float(np.round((yaw - lies) / np.pi)) * np.pi
 
 
-def destination_of(
-    task: Task, object_id: str, seen: Mapping[str, Float[np.ndarray, "4 4"]]
-) -> Destination:
+def destination_of(task: Task, object_id: str, seen: Mapping[str, Pose]) -> Destination:
     """Find where an object belongs by the success predicates, and where that is."""
     goal, mark = task.goal_of(object_id), task.mark_of(object_id)
     if goal in (None, ("on", TABLE)) and mark is not None:
@@ -103,9 +101,7 @@ def destination_of(
     return Destination(id=target, relation=relation, model=model, T_base=seen[target])
 
 
-def _beside(
-    task: Task, object_id: str, seen: Mapping[str, Float[np.ndarray, "4 4"]]
-) -> Destination:
+def _beside(task: Task, object_id: str, seen: Mapping[str, Pose]) -> Destination:
     """The spot before a side of the reference, in the middle of the gap that is asked for.
 
     The side is the one that looks most in the direction asked for, else towards where the object

@@ -15,6 +15,8 @@ from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M, ROBOT, TCP_FRAME
 from bridge.task.plan import Waypoint
 
+Pose = Float[np.ndarray, "4 4"]
+Joints = Float[np.ndarray, "6"]
 TOLERANCE_M = 1e-5
 TOLERANCE_RAD = 1e-5
 DAMPING_START = 1e-4
@@ -53,9 +55,7 @@ class Kinematics:
         self._q_ids = np.array([joint.idx_q for joint in joints])
         self._v_ids = np.array([joint.idx_v for joint in joints])
 
-    def why_refused(
-        self, joints_rad: Float[np.ndarray, "6"], last_rad: Float[np.ndarray, "6"], in_s: float
-    ) -> str:
+    def why_refused(self, joints_rad: Joints, last_rad: Joints, in_s: float) -> str:
         """Why the controller refuses a target; empty: it does not."""
         model, ids = self._model, self._q_ids
         lower, upper = model.lowerPositionLimit[ids], model.upperPositionLimit[ids]
@@ -68,21 +68,17 @@ class Kinematics:
             return f"limits: {ARM_JOINTS[index]} at {at}"
         return ""
 
-    def T_base_tcp(self, joints_rad: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+    def T_base_tcp(self, joints_rad: Joints) -> Pose:
         """Return where the tool is at these joints."""
         return self.T_base_frame(joints_rad, TCP_FRAME)
 
-    def T_base_frame(
-        self, joints_rad: Float[np.ndarray, "6"], frame: str
-    ) -> Float[np.ndarray, "4 4"]:
+    def T_base_frame(self, joints_rad: Joints, frame: str) -> Pose:
         """Return where a link is at these joints, gripper closed."""
         pinocchio.framesForwardKinematics(self._model, self._data, self._full(joints_rad))
         placement = self._data.oMf[self._model.getFrameId(frame)]
         return np.array(placement.homogeneous)
 
-    def joints_for(
-        self, T_base_tcp: Float[np.ndarray, "4 4"], joints_seed_rad: Float[np.ndarray, "6"]
-    ) -> Float[np.ndarray, "6"]:
+    def joints_for(self, T_base_tcp: Pose, joints_seed_rad: Joints) -> Joints:
         """Solve the inverse problem from a nearby start: Levenberg-Marquardt on SE(3)."""
         target = pinocchio.SE3(T_base_tcp)
         joints = joints_seed_rad.astype(np.float64).copy()
@@ -112,16 +108,16 @@ class Kinematics:
             beyond=[ARM_JOINTS[index] for index in np.flatnonzero(_past_limit(joints))],
         )
 
-    def _full(self, joints_rad: Float[np.ndarray, "6"]) -> Any:
+    def _full(self, joints_rad: Joints) -> Any:
         q = pinocchio.neutral(self._model)
         q[self._q_ids] = joints_rad
         return q
 
-    def _error(self, joints_rad: Float[np.ndarray, "6"], target: Any) -> Float[np.ndarray, "6"]:
+    def _error(self, joints_rad: Joints, target: Any) -> Joints:
         pinocchio.framesForwardKinematics(self._model, self._data, self._full(joints_rad))
         return np.array(pinocchio.log6(self._data.oMf[self._frame].actInv(target)).vector)
 
-    def _jacobian(self, joints_rad: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6 6"]:
+    def _jacobian(self, joints_rad: Joints) -> Float[np.ndarray, "6 6"]:
         full = pinocchio.computeFrameJacobian(
             self._model, self._data, self._full(joints_rad), self._frame, pinocchio.LOCAL
         )
@@ -134,7 +130,7 @@ def arm_kinematics() -> Kinematics:
     return Kinematics()
 
 
-def tool_down(p_m: Float[np.ndarray, "3"], yaw_rad: float) -> Float[np.ndarray, "4 4"]:
+def tool_down(p_m: Float[np.ndarray, "3"], yaw_rad: float) -> Pose:
     """Pose ``T_base_tcp`` with the tool pointing down; yaw 0 closes the fingers along base y."""
     T = np.eye(4)
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -144,7 +140,7 @@ def tool_down(p_m: Float[np.ndarray, "3"], yaw_rad: float) -> Float[np.ndarray, 
     return T
 
 
-def _past_limit(joints_rad: Float[np.ndarray, "6"]) -> Bool[np.ndarray, "6"]:
+def _past_limit(joints_rad: Joints) -> Bool[np.ndarray, "6"]:
     return np.asarray(np.abs(joints_rad) > JOINT_LIMIT_RAD + 1e-9)
 
 
@@ -153,14 +149,14 @@ def wrap_rad(angle_rad: float) -> float:
     return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
-def yaw_of(T: Float[np.ndarray, "4 4"]) -> float:
+def yaw_of(T: Pose) -> float:
     """Angle of the x axis in the horizontal plane [rad]."""
     return float(np.arctan2(T[1, 0], T[0, 0]))
 
 
 def slerp_poses(
-    T_start: Float[np.ndarray, "4 4"],
-    T_end: Float[np.ndarray, "4 4"],
+    T_start: Pose,
+    T_end: Pose,
     fractions: Float[np.ndarray, " num_poses"],
 ) -> Float[np.ndarray, "num_poses 4 4"]:
     """Straight line in position, constant axis in rotation."""
@@ -187,7 +183,7 @@ class Leg:
 
     name: str
     stage: str
-    T_base_tcp: Float[np.ndarray, "4 4"]
+    T_base_tcp: Pose
     duration_s: float
     g: int
     law: TimeLaw = minimum_jerk
@@ -201,13 +197,11 @@ class Track:
 
     tau: tuple[Waypoint, ...]
     bounds: Mapping[str, tuple[int, int]]
-    T_base_tcp: Float[np.ndarray, "4 4"]
+    T_base_tcp: Pose
     """Where the tool is at the end."""
 
     @staticmethod
-    def at_rest(
-        T_base_tcp: Float[np.ndarray, "4 4"], joints_rad: Float[np.ndarray, "6"]
-    ) -> "Track":
+    def at_rest(T_base_tcp: Pose, joints_rad: Joints) -> "Track":
         """Start with an open gripper."""
         return Track(
             tau=(_waypoint(0, T_base_tcp, joints_rad, 0),),
@@ -244,9 +238,7 @@ def follow_legs(
     return Track(tau=tuple(tau), bounds=bounds, T_base_tcp=T_from)
 
 
-def _waypoint(
-    t_ns: int, T: Float[np.ndarray, "4 4"], joints_rad: Float[np.ndarray, "6"], g: int
-) -> Waypoint:
+def _waypoint(t_ns: int, T: Pose, joints_rad: Joints, g: int) -> Waypoint:
     """The gripper wide open, or told to shut (g)."""
     q, p = se3.split(T)
     w, x, y, z = (float(value) for value in q)

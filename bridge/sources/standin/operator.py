@@ -160,7 +160,7 @@ def execute_plan(cell: StandinCell, plan: Plan) -> None:
         cell.follow(times[first : last + 1] - times[first], joints[first : last + 1])
     _end_stage(cell, plan, stage_id)
     streams.event("execution_ended", cell.now_ns, plan_id=plan.id)
-    cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
+    cell.wait(wait_s(SETTLE_S, cell.rate_hz))
 
 
 def _end_stage(cell: StandinCell, plan: Plan, stage_id: str | None) -> None:
@@ -377,7 +377,7 @@ class Operator:
         if self._controller is not None:  # the policy's runner looks first
             outcome = self._drive(info, self._controller)
         else:
-            cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
+            cell.wait(wait_s(LOOK_S, cell.rate_hz))
             outcome = self._plan(info, treatment, seed)
         text = f"{outcome.result}: {outcome.detail}"
         cell.streams.event("label", cell.now_ns, text=text, outcome=asdict(outcome))
@@ -392,7 +392,7 @@ class Operator:
         if stopped == STOPPED_BY_OPERATOR:
             self._open = False
             raise StoppedError
-        cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
+        cell.wait(wait_s(SETTLE_S, cell.rate_hz))
         if problem:
             return void_trial(cell.task, problem)
         stopped = stopped or cell.stopped
@@ -405,7 +405,7 @@ class Operator:
         if decision.plan is not None:
             execute_plan(cell, decision.plan)
         else:
-            cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
+            cell.wait(wait_s(LOOK_S, cell.rate_hz))
         if decision.void and not treatment.study_arm:
             return void_trial(cell.task, decision.remark)
         executed, remark, stopped = decision.plan is not None, decision.remark, cell.stopped

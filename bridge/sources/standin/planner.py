@@ -20,8 +20,10 @@ from bridge.sources.standin.cell_file import PlannerNoise
 from bridge.sources.standin.destination import Destination, destination_of, slots_of
 from bridge.sources.standin.kinematics import (
     WAYPOINT_S,
+    Joints,
     Kinematics,
     Leg,
+    Pose,
     TimeLaw,
     Track,
     UnreachablePoseError,
@@ -56,7 +58,7 @@ def planned_stages(
     task: Task,
     legs_of: Mapping[str, Sequence[Leg]],
     bounds: Mapping[str, tuple[int, int]],
-    seen: Mapping[str, Float[np.ndarray, "4 4"]],
+    seen: Mapping[str, Pose],
     places: Mapping[str, Destination | None],
 ) -> tuple[Stage, ...]:
     """What a plan says of each stage of its task: when it is, and where it leaves its object."""
@@ -100,9 +102,9 @@ def _predicted(
     model: ObjectModel,
     destination: Destination | None,
     legs: Sequence[Leg],
-    T_base_object: Float[np.ndarray, "4 4"],
+    T_base_object: Pose,
     table: Mapping[str, Any],
-) -> Float[np.ndarray, "4 4"]:
+) -> Pose:
     """Where a stage leaves its object: lifted, over where it belongs, lying there, or pushed."""
     tool = {leg.name: leg.T_base_tcp for leg in legs}
     place = {name: T_base_tcp[:3, 3] for name, T_base_tcp in tool.items()}
@@ -164,8 +166,8 @@ def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int 
 
 
 def perceive(
-    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]], noise: PlannerNoise, *, start_seed: int
-) -> dict[str, Float[np.ndarray, "4 4"]]:
+    Ts_base_object: Mapping[str, Pose], noise: PlannerNoise, *, start_seed: int
+) -> dict[str, Pose]:
     """Return the objects' poses as this planner sees them: shifted and turned a little.
 
     The same start is always seen with the same error.
@@ -183,11 +185,11 @@ def perceive(
 
 def plan_pick_and_place(
     task: Task,
-    seen: Mapping[str, Float[np.ndarray, "4 4"]],
+    seen: Mapping[str, Pose],
     error: GraspError | Sequence[GraspError],
     *,
     kinematics: Kinematics,
-    joints_start_rad: Float[np.ndarray, "6"],
+    joints_start_rad: Joints,
     max_joint_speed_rad_s: float,
     plan_id: str,
     condition: str,
@@ -234,10 +236,10 @@ Follow = Callable[[Track, list[Leg]], Track]
 
 def _each_in_turn(
     task: Task,
-    seen: Mapping[str, Float[np.ndarray, "4 4"]],
+    seen: Mapping[str, Pose],
     errors: Sequence[GraspError],
     track: Track,
-    T_home: Float[np.ndarray, "4 4"],
+    T_home: Pose,
     follow: Follow,
 ) -> tuple[Track, dict[str, list[Leg]], dict[str, Destination | None]]:
     """Move each object from where it is seen, past what was moved before it."""
@@ -255,8 +257,12 @@ def _each_in_turn(
             place = destination_of(task, key, then)  # which may have been moved before
             places[key] = place
             ways = _ways(task, key, seen[key], place, errors[index], slots[key])
-        # From object to object the wrist can wind up until each way goes past a joint's limit.
-        unwound = [[_turned_back(track, T_home, legs[0].stage), *legs] for legs in ways]
+        # From object to object the wrist can wind up until each way goes past a joint's limit:
+        # then it is first turned where it is, to how it is at home.
+        T_turned, stage = T_home.copy(), ways[0][0].stage
+        T_turned[:3, 3] = track.T_base_tcp[:3, 3]
+        back = Leg(name="turn_back", stage=stage, T_base_tcp=T_turned, duration_s=1.0, g=0)
+        unwound = [[back, *legs] for legs in ways]
         track, legs_of[key] = _first_reachable(track, [*ways, *unwound], follow)
         released = {"release": key}
         then[key] = _predicted(task.objects[key], places[key], legs_of[key], seen[key], released)
@@ -275,17 +281,10 @@ def _first_reachable(
     return follow(track, choices[-1]), choices[-1]
 
 
-def _turned_back(track: Track, T_home: Float[np.ndarray, "4 4"], stage: str) -> Leg:
-    """Turn the wrist where it is, to how it is at home."""
-    T = T_home.copy()
-    T[:3, 3] = track.T_base_tcp[:3, 3]
-    return Leg(name="turn_back", stage=stage, T_base_tcp=T, duration_s=1.0, g=0)
-
-
 def _ways(
     task: Task,
     object_id: str,
-    T_base_object: Float[np.ndarray, "4 4"],
+    T_base_object: Pose,
     destination: Destination,
     error: GraspError,
     slot_m: Float[np.ndarray, "2"],
@@ -305,7 +304,7 @@ def _ways(
 def _legs(
     task: Task,
     object_id: str,
-    T_base_object: Float[np.ndarray, "4 4"],
+    T_base_object: Pose,
     destination: Destination,
     yaw: float,
     error: GraspError,
@@ -391,9 +390,7 @@ def constant_speed(ramp: float) -> TimeLaw:
     return law
 
 
-def _pushes(
-    task: Task, object_id: str, T_base_object: Float[np.ndarray, "4 4"], error: GraspError
-) -> list[list[Leg]]:
+def _pushes(task: Task, object_id: str, T_base_object: Pose, error: GraspError) -> list[list[Leg]]:
     """Down behind the object with closed fingers, straight on to its mark, back and up.
 
     For each of the two turns of the wrist whose fingers are as wide in front, least turned first.
@@ -444,9 +441,7 @@ def _pushes(
     ]
 
 
-def _reach_m(
-    model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"], along: Float[np.ndarray, "3"]
-) -> float:
+def _reach_m(model: ObjectModel, T_base_object: Pose, along: Float[np.ndarray, "3"]) -> float:
     """From the middle of the closed fingers to that of the object they touch from behind [m].
 
     Where a ray from the middle leaves the object's outer box, against the push.

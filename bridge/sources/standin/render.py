@@ -70,7 +70,6 @@ class Renderer:
         self._colors = np.array([item.color for item in surfaces], dtype=np.float32)
         self._unmoving = [k for k, item in enumerate(surfaces) if item.body == ""]
         self._moving = [k for k, item in enumerate(surfaces) if item.body != ""]
-        self._painted = [k for k, item in enumerate(surfaces) if item.paint is not None]
 
     def backdrop(self, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> Layer:
         """See the laboratory without the bodies in it, for ``render`` from the same place."""
@@ -202,10 +201,11 @@ class Renderer:
         uvs: Float[np.ndarray, "num_hits 2"],
     ) -> None:
         """Colour painted surfaces by where on the undeformed surface each ray arrived."""
-        for index in self._painted:
-            item = self._surfaces[index]
+        for index, item in enumerate(self._surfaces):
+            if item.paint is None or item.paint_vertices_m is None:
+                continue
             mine = np.flatnonzero(surface_ids == index)
-            if len(mine) == 0 or item.paint is None or item.paint_vertices_m is None:
+            if len(mine) == 0:
                 continue
             corners = item.paint_vertices_m[item.triangles[triangle_ids[mine]]]
             u, v = uvs[mine, :1], uvs[mine, 1:]

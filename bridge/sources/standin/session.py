@@ -10,7 +10,7 @@ from typing import Any
 from bridge.clock import AnchoredClock
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.errors import BridgeError
-from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
+from bridge.sources.standin.cell import StandinCell, StoppedError
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import Operator
 from bridge.sources.standin.settings import SessionConfig
@@ -36,9 +36,10 @@ def run_session(
         task,
         draw_hidden(file, config.seed, task),
         Streams(session, config.cell),
-        config=CellConfig(rate_hz=config.rate_hz, scale=config.image_scale),
         seed=config.seed,
         first_start=config.first_start,
+        rate_hz=config.rate_hz,
+        scale=config.image_scale,
         start_ns=AnchoredClock().now_ns() if start_ns is None else start_ns,
         should_stop=should_stop,
     )
@@ -115,10 +116,10 @@ def describe(summary: dict[str, Any]) -> str:
         sums = summary["objects"].get(condition)
         told = f"; {sums['k']} of {sums['n']} objects" if sums else ""
         lines.append(f"  {condition}: {total} trials, {listed}{told}")
-    for condition, counts in summary.get("retries", {}).items():
+    for condition, counts in summary["retries"].items():
         listed = ", ".join(f"{count} {result}" for result, count in sorted(counts.items()))
         lines.append(f"  {condition}: {sum(counts.values())} retried after a failure, {listed}")
-    lines += [f"  {name} unknown: {why}" for name, why in summary.get("unknown", {}).items()]
+    lines += [f"  {name} unknown: {why}" for name, why in summary["unknown"].items()]
     if summary["stopped"]:
         lines.append("  stopped before the end")
     return "\n".join(lines)

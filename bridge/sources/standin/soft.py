@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from bridge.geometry import se3
 from bridge.sources.standin.cell_file import HiddenParameters
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.meshes.lattice import CORNERS, make_lattice
@@ -57,28 +56,12 @@ class SoftBody:
     """Bodies of the nodes, in the order of ``CORNERS``."""
     addresses: Int[np.ndarray, "8 3"]
     """Of their slide joints in qpos."""
-    dofs: Int[np.ndarray, "8 3"]
     rest_nodes_m: Float[np.ndarray, "8 3"]
     """In the object frame."""
     skin_weights: Float[np.ndarray, "num_vertices 8"]
     """From the nodes to the vertices of the object's mesh."""
     lattice_weights: Float[np.ndarray, "num_points 8"]
     """From the nodes to the points of the lattice."""
-
-    def qpos_at(self, T_base_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "8 3"]:
-        """Joint positions that put the undeformed body somewhere."""
-        return np.asarray(se3.apply(T_base_object, self.rest_nodes_m) - self.rest_nodes_m)
-
-    def pose_of(self, nodes_m: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "4 4"]:
-        """Rigid pose that comes nearest to where the nodes are."""
-        return se3.align_rigid(self.rest_nodes_m, nodes_m)
-
-    def extents_m(
-        self, nodes_m: Float[np.ndarray, "8 3"], T_base_object: Float[np.ndarray, "4 4"]
-    ) -> Float[np.ndarray, "3"]:
-        """Outer extents of the deformed surface along the axes of its pose."""
-        local = (self.skin_weights @ nodes_m - T_base_object[:3, 3]) @ T_base_object[:3, :3]
-        return np.asarray(np.ptp(local, axis=0))
 
 
 def soft_body(model: ObjectModel, mujoco_model: Any) -> SoftBody:
@@ -94,7 +77,6 @@ def soft_body(model: ObjectModel, mujoco_model: Any) -> SoftBody:
     return SoftBody(
         body_ids=np.array(ids),
         addresses=np.array([mujoco_model.jnt_qposadr[three] for three in joints]).astype(np.int64),
-        dofs=np.array([mujoco_model.jnt_dofadr[three] for three in joints]).astype(np.int64),
         rest_nodes_m=cage_nodes(low, high),
         skin_weights=cage_weights(mesh.vertices_m, low, high),
         lattice_weights=cage_weights(lattice.points_m, low, high),

@@ -30,12 +30,19 @@ from bridge.wire.qos import Qos
 TRUTH_PARAMETERS = topics.cell_topic(topics.TRUTH, "/parameters")
 
 
+class Publisher(Protocol):
+    """The part of ``bridge.wire.session.WirePublisher`` that the cell uses."""
+
+    def put(self, data: bytes, *, source_ns: int) -> None:
+        """Send one message of its topic."""
+
+
 @runtime_checkable
 class Session(Protocol):
     """The part of ``bridge.wire.session.WireSession`` that the cell uses."""
 
-    def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> Any:
-        """Announce a topic; what is returned takes messages by ``put(data, source_ns=...)``."""
+    def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> Publisher:
+        """Announce a topic."""
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask and wait."""
@@ -61,7 +68,7 @@ class Streams:
         """Publish under ``/<cell>/``."""
         self._session = session
         self._cell = cell
-        self._publishers: dict[str, Any] = {}
+        self._publishers: dict[str, Publisher] = {}
         self._latest_joints: tuple[bytes, int] | None = None
 
     def _put(self, topic: str, data: bytes, stamp_ns: int, type_name: str | None = None) -> None:

@@ -62,7 +62,7 @@ def robot_links() -> tuple[LinkModel, ...]:
     elements = {item.attrib["name"]: item for item in root.findall("link")}
     joints = root.findall("joint")
     links = []
-    waiting: list[tuple[str, ET.Element | None]] = [(BASE_FRAME, None)]
+    waiting = [(BASE_FRAME, ET.Element("joint", type="fixed"))]
     while waiting:
         name, joint = waiting.pop(0)
         links.append(_link(elements[name], joint))
@@ -77,27 +77,20 @@ def _child_of(joint: ET.Element, tag: str) -> str:
     return "" if found is None else found.attrib["link"]
 
 
-def _link(element: ET.Element, joint: ET.Element | None) -> LinkModel:
-    inertial = element.find("inertial")
-    mass = None if inertial is None else inertial.find("mass")
-    tensor = None if inertial is None else inertial.find("inertia")
+def _link(element: ET.Element, joint: ET.Element) -> LinkModel:
+    tensor, limit = element.find("inertial/inertia"), joint.find("limit")
     names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    values = [0.0] * 6 if tensor is None else [float(tensor.attrib[name]) for name in names]
-    xx, yy, zz, xy, xz, yz = values
-    axis = None if joint is None else joint.find("axis")
-    limit = None if joint is None else joint.find("limit")
+    xx, yy, zz, xy, xz, yz = (_number(tensor, name) for name in names)
     return LinkModel(
         name=element.attrib["name"],
-        parent=None if joint is None else _child_of(joint, "parent"),
-        joint=None if joint is None else joint.attrib["name"],
-        joint_type="fixed" if joint is None else joint.attrib["type"],
-        axis=_vector(None if axis is None else axis.attrib["xyz"], (1.0, 0.0, 0.0)),
-        limits=(0.0, 0.0)
-        if limit is None
-        else (float(limit.attrib["lower"]), float(limit.attrib["upper"])),
+        parent=_child_of(joint, "parent") or None,
+        joint=joint.get("name"),
+        joint_type=joint.attrib["type"],
+        axis=_vector(joint.find("axis"), "xyz", "1 0 0"),
+        limits=(_number(limit, "lower"), _number(limit, "upper")),
         T_parent_link=_origin(joint),
-        mass_kg=0.0 if mass is None else float(mass.attrib["value"]),
-        T_link_inertial=_origin(inertial),
+        mass_kg=_number(element.find("inertial/mass"), "value"),
+        T_link_inertial=_origin(element.find("inertial")),
         inertia_kgm2=np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
         shapes=tuple(_shapes(element)),
     )
@@ -112,14 +105,19 @@ def _shapes(element: ET.Element) -> list[LinkShape]:
             shapes.append(LinkShape(T_link_shape=_origin(collision), mesh=path, box_m=None))
         elif box is not None and element.attrib["name"] != "ee_link":
             # ee_link holds a 1 cm marker box inside the flange, not a part of the robot.
-            size = _vector(box.attrib["size"], (0.0, 0.0, 0.0))
+            size = _vector(box, "size")
             shapes.append(LinkShape(T_link_shape=_origin(collision), mesh=None, box_m=size))
     return shapes
 
 
-def _vector(text: str | None, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    if text is None:
-        return default
+def _number(element: ET.Element | None, name: str) -> float:
+    return 0.0 if element is None else float(element.get(name, "0"))
+
+
+def _vector(
+    element: ET.Element | None, name: str, default: str = "0 0 0"
+) -> tuple[float, float, float]:
+    text = default if element is None else element.get(name, default)
     x, y, z = (float(value) for value in text.split())
     return x, y, z
 
@@ -129,9 +127,8 @@ def _origin(element: ET.Element | None) -> Float[np.ndarray, "4 4"]:
     origin = None if element is None else element.find("origin")
     if origin is None:
         return np.eye(4)
-    roll, pitch, yaw = _vector(origin.attrib.get("rpy"), (0.0, 0.0, 0.0))
-    q = Rotation.from_euler("xyz", (roll, pitch, yaw)).as_quat(scalar_first=True)
-    return se3.transform_from(q, np.array(_vector(origin.attrib.get("xyz"), (0.0, 0.0, 0.0))))
+    q = Rotation.from_euler("xyz", _vector(origin, "rpy")).as_quat(scalar_first=True)
+    return se3.transform_from(q, np.array(_vector(origin, "xyz")))
 
 
 def true_links(deviations: Deviations | None) -> tuple[LinkModel, ...]:
@@ -410,28 +407,22 @@ class World:
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[self._arm] = joints_rad
         self._data.qpos[self._fingers] = MAX_WIDTH_M / 2
-        self._pending.clear()
-        self.place(Ts_base_object)
-        self.command(joints_rad, MAX_WIDTH_M)
-        self._data.ctrl[:] = self._pending[0]
-        mujoco.mj_forward(self._model, self._data)
-
-    def place(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
-        """Move objects by hand; the arm stays as it is."""
         for object_id, T in Ts_base_object.items():
             q, p = se3.split(T)
             if object_id in self._soft:
                 body = self._soft[object_id]
-                self._data.qpos[body.addresses] = body.qpos_at(T)
-                self._data.qvel[body.dofs] = 0.0
+                moved_m = se3.apply(T, body.rest_nodes_m) - body.rest_nodes_m
+                self._data.qpos[body.addresses] = moved_m
             elif self.task.objects[object_id].fixed:
                 mocap = int(self._model.body(object_id).mocapid[0])
                 self._data.mocap_pos[mocap], self._data.mocap_quat[mocap] = p, q
             else:
                 address = self._joint_address(object_id)
                 self._data.qpos[address : address + 7] = np.concatenate([p, q])
-                dof = int(self._model.joint(object_id).dofadr[0])
-                self._data.qvel[dof : dof + 6] = 0.0
+        mujoco.mj_forward(self._model, self._data)
+        self._pending.clear()
+        self.command(joints_rad, MAX_WIDTH_M)
+        self._data.ctrl[:] = self._pending[0]
         mujoco.mj_forward(self._model, self._data)
 
     def command(self, joints_rad: Float[np.ndarray, "6"], width_m: float) -> None:
@@ -491,7 +482,7 @@ class World:
     def Ts_base_object(self) -> dict[str, Float[np.ndarray, "4 4"]]:
         """True poses of all objects."""
         return {
-            object_id: self._soft[object_id].pose_of(self.nodes_m(object_id))
+            object_id: se3.align_rigid(self._soft[object_id].rest_nodes_m, self.nodes_m(object_id))
             if object_id in self._soft
             else self.T_base_body(object_id)
             for object_id in self.task.objects
@@ -512,8 +503,10 @@ class World:
     def extents_m(
         self, object_id: str, T_base_object: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "3"]:
-        """Outer extents of a soft object along the axes of its pose."""
-        return self._soft[object_id].extents_m(self.nodes_m(object_id), T_base_object)
+        """Outer extents of a soft object's deformed surface along the axes of its pose."""
+        surface_m = self._soft[object_id].skin_weights @ self.nodes_m(object_id)
+        local_m = (surface_m - T_base_object[:3, 3]) @ T_base_object[:3, :3]
+        return np.asarray(np.ptp(local_m, axis=0))
 
     def finger_contact(self) -> dict[str, bool]:
         """Per object: whether a finger touches it now."""

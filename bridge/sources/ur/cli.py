@@ -37,10 +37,14 @@ def publish_ur(
         zenoh_config: zenoh configuration (JSON5).
     """
     from bridge.sources.source import run_source
-    from bridge.sources.ur.publish import UrSource, describe_counts
+    from bridge.sources.ur.publish import UrSource
     from bridge.wire.config import WireConfig
 
     wire = WireConfig(connect=connect, config=zenoh_config)
     counts = run_source(UrSource(host, config), wire, output, duration_s=duration_s)
-    output.result(counts, describe_counts(counts))
+    text = (
+        f"{counts['samples']} samples sent, {counts['lost']} lost before they got here, "
+        f"{counts['connections']} connection{'s' if counts['connections'] != 1 else ''}"
+    )
+    output.result(counts, text)
     return 0

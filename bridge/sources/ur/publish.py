@@ -61,13 +61,6 @@ BARE_UR5 = "ur5"
 NUM_JOINTS = 6
 
 
-def wish_of(config: UrConfig) -> Wish:
-    """What the controller is asked for."""
-    gripper = config.make_gripper()
-    needed = () if gripper is None else (gripper.signal.variable,)
-    return Wish(required=(*REQUIRED, *needed), optional=OPTIONAL, rate_hz=config.rate_hz)
-
-
 class ArmPublisher:
     """Publishes one arm over any number of connections to its controller."""
 
@@ -204,7 +197,12 @@ class UrSource:
         """
         host, config = self.host, self.config
         urdf = read_urdf(config)
-        robot = _robot(urdf)
+        robot = robot_of(urdf or "")
+        if len(robot.joints) != NUM_JOINTS:
+            raise UsageError(
+                f"--robot {robot.name} has {len(robot.joints)} joints; a UR controller moves "
+                f"{NUM_JOINTS}."
+            )
         client: RtdeClient | None = _connect(session, host, config, output)
         announce(session, config.cell)
         announcer = Announcer(session)
@@ -233,14 +231,6 @@ class UrSource:
         return {**arm.counts(), "connections": connections}
 
 
-def describe_counts(counts: dict[str, Any]) -> str:
-    """One line for people."""
-    return (
-        f"{counts['samples']} samples sent, {counts['lost']} lost before they got here, "
-        f"{counts['connections']} connection{'s' if counts['connections'] != 1 else ''}"
-    )
-
-
 def read_urdf(config: UrConfig) -> str | None:
     """The robot's description: that of a robot file, or none."""
     if config.robot == "none":
@@ -250,22 +240,14 @@ def read_urdf(config: UrConfig) -> str | None:
     return read_robot(config.robot).description()
 
 
-def _robot(urdf: str | None) -> Robot:
-    """The robot whose joints the controller moves."""
-    robot = robot_of(urdf or "")
-    if len(robot.joints) != NUM_JOINTS:
-        raise UsageError(
-            f"--robot {robot.name} has {len(robot.joints)} joints; a UR controller moves "
-            f"{NUM_JOINTS}."
-        )
-    return robot
-
-
 def _connect(session: WireSession, host: str, config: UrConfig, output: Output) -> RtdeClient:
     def on_text(text: str) -> None:
         output.detail(f"{host} says: {text}")
 
-    client = RtdeClient(host, config.port, wish_of(config), now_ns=session.now_ns, on_text=on_text)
+    gripper = config.make_gripper()
+    needed = () if gripper is None else (gripper.signal.variable,)
+    wish = Wish(required=(*REQUIRED, *needed), optional=OPTIONAL, rate_hz=config.rate_hz)
+    client = RtdeClient(host, config.port, wish, now_ns=session.now_ns, on_text=on_text)
     version = ".".join(map(str, client.version))
     output.say(f"{host}: controller {version}, {client.rate_hz:g} samples a second")
     if client.missing:

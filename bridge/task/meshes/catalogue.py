@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.errors import UsageError
-from bridge.task.meshes.solids import Solid, mesh_of
+from bridge.task.meshes.solids import Distances, Points, Solid, mesh_of
 from bridge.task.meshes.toys import DESIGNS, Design, Paint, basket_design
 from bridge.task.task_file import BASKET, ObjectModel
 
@@ -41,13 +41,13 @@ def scaled_mesh(design: Design, size_m: tuple[float, float, float]) -> ToyMesh:
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     middle, scale = (low + high) / 2, np.array(size_m) / (high - low)
 
-    def natural(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+    def natural(p: Points) -> Points:
         return np.asarray(p / scale + middle)
 
-    def paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+    def paint(p: Points) -> Points:
         return design.paint(natural(p))
 
-    def solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+    def solid(p: Points) -> Distances:
         return np.asarray(design.solid(natural(p)) * float(np.cbrt(np.prod(scale))))
 
     return ToyMesh(

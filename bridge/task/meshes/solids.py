@@ -12,15 +12,18 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.errors import BridgeError
 
-Solid = Callable[[Float[np.ndarray, "num_points 3"]], Float[np.ndarray, " num_points"]]
+Points = Float[np.ndarray, "num_points 3"]
+Distances = Float[np.ndarray, " num_points"]
+Three = tuple[float, float, float]
+Solid = Callable[[Points], Distances]
 """Signed distance of points to a surface [m]; an estimate away from it."""
 
 
 def ellipsoid(
-    p: Float[np.ndarray, "num_points 3"],
-    centre: tuple[float, float, float],
-    radii: tuple[float, float, float],
-) -> Float[np.ndarray, " num_points"]:
+    p: Points,
+    centre: Three,
+    radii: Three,
+) -> Distances:
     """Distance to an ellipsoid with its axes along x, y and z, to first order."""
     q = p - np.array(centre)
     scaled = np.linalg.norm(q / np.array(radii), axis=1)
@@ -31,12 +34,12 @@ def ellipsoid(
 
 
 def capsule(
-    p: Float[np.ndarray, "num_points 3"],
-    start: tuple[float, float, float],
-    end: tuple[float, float, float],
+    p: Points,
+    start: Three,
+    end: Three,
     radius_start: float,
     radius_end: float,
-) -> Float[np.ndarray, " num_points"]:
+) -> Distances:
     """Distance to a rod with round ends whose radius changes along it."""
     a, b = np.array(start), np.array(end)
     along = np.clip((p - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
@@ -46,9 +49,7 @@ def capsule(
     )
 
 
-def cylinder(
-    p: Float[np.ndarray, "num_points 3"], radius: float, low: float, high: float
-) -> Float[np.ndarray, " num_points"]:
+def cylinder(p: Points, radius: float, low: float, high: float) -> Distances:
     """Distance to an upright cylinder around the z axis between two heights."""
     side = np.hypot(p[:, 0], p[:, 1]) - radius
     ends = np.abs(p[:, 2] - (low + high) / 2) - (high - low) / 2
@@ -56,21 +57,19 @@ def cylinder(
 
 
 def rounded_column(
-    p: Float[np.ndarray, "num_points 3"],
+    p: Points,
     half_x: float,
     half_y: float,
     corner: float,
     low: float,
     high: float,
-) -> Float[np.ndarray, " num_points"]:
+) -> Distances:
     """Distance to an upright column over a rectangle with round corners."""
     ends = np.abs(p[:, 2] - (low + high) / 2) - (high - low) / 2
     return _corner(outline(p, half_x, half_y, corner), ends)
 
 
-def outline(
-    p: Float[np.ndarray, "num_points 3"], half_x: float, half_y: float, corner: float
-) -> Float[np.ndarray, " num_points"]:
+def outline(p: Points, half_x: float, half_y: float, corner: float) -> Distances:
     """Distance in the horizontal plane to a rectangle with round corners."""
     x = np.abs(p[:, 0]) - (half_x - corner)
     y = np.abs(p[:, 1]) - (half_y - corner)
@@ -78,12 +77,12 @@ def outline(
 
 
 def ring(
-    p: Float[np.ndarray, "num_points 3"],
-    centre: tuple[float, float, float],
+    p: Points,
+    centre: Three,
     axis: int,
     radius: float,
     thickness: float,
-) -> Float[np.ndarray, " num_points"]:
+) -> Distances:
     """Distance to a torus: ``radius`` to the middle of the bead, ``thickness`` its own radius."""
     q = p - np.array(centre)
     others = [k for k in range(3) if k != axis]
@@ -91,31 +90,23 @@ def ring(
     return np.asarray(np.hypot(flat, q[:, axis]) - thickness)
 
 
-def blend(
-    first: Float[np.ndarray, " num_points"], second: Float[np.ndarray, " num_points"], width: float
-) -> Float[np.ndarray, " num_points"]:
+def blend(first: Distances, second: Distances, width: float) -> Distances:
     """Smallest of two distances with a fillet about ``width`` wide: a polynomial smooth minimum."""
     overlap = np.maximum(width - np.abs(first - second), 0.0) / width
     return np.asarray(np.minimum(first, second) - overlap**2 * width / 4)
 
 
-def blend_all(
-    distances: list[Float[np.ndarray, " num_points"]], width: float
-) -> Float[np.ndarray, " num_points"]:
+def blend_all(distances: list[Distances], width: float) -> Distances:
     """Join several solids with fillets."""
     return reduce(lambda first, second: blend(first, second, width), distances)
 
 
-def cut(
-    solid: Float[np.ndarray, " num_points"], tool: Float[np.ndarray, " num_points"], width: float
-) -> Float[np.ndarray, " num_points"]:
+def cut(solid: Distances, tool: Distances, width: float) -> Distances:
     """Take ``tool`` out of ``solid``, with an edge about ``width`` round."""
     return np.asarray(-blend(-solid, tool, width))
 
 
-def _corner(
-    first: Float[np.ndarray, " num_points"], second: Float[np.ndarray, " num_points"]
-) -> Float[np.ndarray, " num_points"]:
+def _corner(first: Distances, second: Distances) -> Distances:
     """Distance to the intersection of two half planes that meet at a right angle."""
     outside = np.hypot(np.maximum(first, 0.0), np.maximum(second, 0.0))
     return np.asarray(outside + np.minimum(np.maximum(first, second), 0.0))
@@ -147,8 +138,8 @@ class OpenSurfaceError(BridgeError):
 
 def mesh_of(
     solid: Solid,
-    low_m: tuple[float, float, float],
-    high_m: tuple[float, float, float],
+    low_m: Three,
+    high_m: Three,
     spacing_m: float,
 ) -> tuple[Float[np.ndarray, "num_vertices 3"], Int[np.ndarray, "num_triangles 3"]]:
     """Triangulate the surface of a solid, triangles counter-clockwise seen from outside.
@@ -201,9 +192,7 @@ def _net(
     return vertices, _triangles(vertices, quads)
 
 
-def project(
-    solid: Solid, points: Float[np.ndarray, "num_points 3"], largest_step_m: float
-) -> Float[np.ndarray, "num_points 3"]:
+def project(solid: Solid, points: Points, largest_step_m: float) -> Points:
     """Move points onto the surface along the gradient of the distance, in ``PROJECTIONS`` steps."""
     for _ in range(PROJECTIONS):
         value = solid(points)
@@ -215,9 +204,7 @@ def project(
     return points
 
 
-def gradient_of(
-    solid: Solid, points: Float[np.ndarray, "num_points 3"]
-) -> Float[np.ndarray, "num_points 3"]:
+def gradient_of(solid: Solid, points: Points) -> Points:
     """Central differences of a signed distance."""
     columns = []
     for axis in range(3):

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.task.meshes import solids
-from bridge.task.meshes.solids import Solid
+from bridge.task.meshes.solids import Distances, Points, Solid
 
-Paint = Callable[[Float[np.ndarray, "num_points 3"]], Float[np.ndarray, "num_points 3"]]
+Paint = Callable[[Points], Points]
 """Colour (sRGB, 0..1) of points of the surface."""
 
 
@@ -27,7 +27,7 @@ class Design:
     spacing_m: float
 
 
-def duck_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+def duck_solid(p: Points) -> Distances:
     """A bath duck: body with a flat underside, tail, wings, head and beak."""
     body = solids.ellipsoid(p, (-0.004, 0.0, -0.008), (0.031, 0.0235, 0.0205))
     tail = solids.capsule(p, (-0.026, 0.0, 0.000), (-0.034, 0.0, 0.010), 0.008, 0.004)
@@ -43,7 +43,7 @@ def duck_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_
     return solids.cut(whole, p[:, 2] + 0.0245, 0.004)
 
 
-def duck_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+def duck_paint(p: Points) -> Points:
     """Yellow, darker wings, an orange beak and black eyes with a white spot."""
     colors = np.tile([0.96, 0.80, 0.14], (len(p), 1))
     wing = np.abs(p[:, 1]) > 0.0225
@@ -58,7 +58,7 @@ def duck_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_p
     return colors
 
 
-def sloth_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+def sloth_solid(p: Points) -> Distances:
     """A plush sloth on its belly, limbs spread, with a waist to take it by."""
     chest = solids.ellipsoid(p, (0.027, 0.0, 0.000), (0.024, 0.0260, 0.0225))
     hips = solids.ellipsoid(p, (-0.040, 0.0, 0.000), (0.026, 0.0280, 0.0225))
@@ -75,7 +75,7 @@ def sloth_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num
     return solids.cut(whole, p[:, 2] + 0.0205, 0.004)
 
 
-def sloth_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+def sloth_paint(p: Points) -> Points:
     """Brown fur in strands, a light face with dark patches at the eyes, and dark claws."""
     strand = np.sin(p[:, 0] * 620.0 + 3.0 * np.sin(p[:, 1] * 260.0)) * np.sin(p[:, 1] * 540.0)
     colors = np.array([0.56, 0.43, 0.31]) * (1.0 + 0.13 * strand)[:, None]
@@ -144,7 +144,7 @@ def basket_design(inner_m: tuple[float, float, float], wall_m: float) -> Design:
     half_x, half_y, top = inner_m[0] / 2 + wall_m, inner_m[1] / 2 + wall_m, inner_m[2] + wall_m
     middle = half_x - wall_m / 2
 
-    def solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+    def solid(p: Points) -> Distances:
         shell = solids.rounded_column(p, half_x, half_y, CORNER_M, 0.0, top)
         cavity = solids.rounded_column(
             p, half_x - wall_m, half_y - wall_m, CORNER_M - wall_m, wall_m, top + 0.1
@@ -160,7 +160,7 @@ def basket_design(inner_m: tuple[float, float, float], wall_m: float) -> Design:
         handle = np.maximum(np.minimum(*handles), top - RIM_M / 2 - p[:, 2])
         return solids.blend_all([shell, rim, handle], 0.003)
 
-    def paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+    def paint(p: Points) -> Points:
         return _weave(p, top)
 
     reach = 3 * SPACING_M
@@ -177,7 +177,7 @@ def basket_design(inner_m: tuple[float, float, float], wall_m: float) -> Design:
     )
 
 
-def _weave(p: Float[np.ndarray, "num_points 3"], top: float) -> Float[np.ndarray, "num_points 3"]:
+def _weave(p: Points, top: float) -> Points:
     """Strands that go over and under each other; rim and handles are darker and wound."""
     around = np.where(np.abs(p[:, 0]) / 1.25 > np.abs(p[:, 1]), p[:, 1], p[:, 0])
     column = np.floor(around / WEAVE_M[0])

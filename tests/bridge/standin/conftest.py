@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from standin_hidden import nominal_hidden
 
-from bridge.sources.standin.cell import CellConfig, StandinCell
+from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.streams import Streams
 from bridge.task.task_file import Task, load_task
@@ -137,7 +137,8 @@ def make_cell(cell_file: CellFile, task: Task, reserved_seed: int) -> Callable[.
             task,
             draw_hidden(cell_file, seed) if hidden is None else hidden,
             Streams(session, "standin"),
-            config=CellConfig(rate_hz=rate_hz, scale=0.25),
+            rate_hz=rate_hz,
+            scale=0.25,
             seed=seed,
             start_ns=START_NS,
             **more,

@@ -12,7 +12,7 @@ from standin_plans import planned
 
 from bridge.data_files import dataset_file
 from bridge.geometry import se3
-from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
+from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.cell_file import CellFile, draw_hidden, load_cell
 from bridge.sources.standin.destination import destination_of
 from bridge.sources.standin.gate_sight import GateSight
@@ -150,7 +150,8 @@ def test_a_plan_that_leaves_the_block_runs_into_it_and_fails(
         task,
         draw_hidden(file, SEED, task),
         Streams(make_session(), "standin"),
-        config=CellConfig(rate_hz=0.0, scale=0.25),
+        rate_hz=0.0,
+        scale=0.25,
         seed=SEED,
         start_ns=0,
     )
@@ -207,7 +208,7 @@ def trial(lab: CellFile, task: Task, session: Any, **settings: Any) -> Any:
         task,
         replace(draw_hidden(lab, SEED, task), latency_s=0.0),
         Streams(session, "lab"),
-        config=CellConfig(rate_hz=0.0),
+        rate_hz=0.0,
         seed=SEED,
         start_ns=0,
     )

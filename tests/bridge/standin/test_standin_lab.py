@@ -15,7 +15,7 @@ from bridge.episode.topics import is_truth
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.sources.standin.cell import CellConfig, StandinCell
+from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.deviations import TILTED_ABOUT_M, Lens
 from bridge.sources.standin.streams import Streams
@@ -75,8 +75,8 @@ def hidden_of(lab: CellFile, task: Task, seed: int = SEED) -> HiddenParameters:
 def cell_of(
     lab: CellFile, task: Task, session: Any, hidden: HiddenParameters, scale: float = 0.25
 ) -> StandinCell:
-    streams, config = Streams(session, "lab"), CellConfig(rate_hz=0.0, scale=scale)
-    return StandinCell(lab, task, hidden, streams, config=config, seed=SEED, start_ns=0)
+    how = {"rate_hz": 0.0, "scale": scale, "seed": SEED, "start_ns": 0}
+    return StandinCell(lab, task, hidden, Streams(session, "lab"), **how)
 
 
 def test_a_draw_is_the_seeds_and_the_tasks(lab: CellFile, stack: Task) -> None:

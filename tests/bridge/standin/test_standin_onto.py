@@ -13,7 +13,7 @@ from standin_plans import planned
 import bridge.task
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.sources.standin.cell import CellConfig, StandinCell
+from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.cell_file import CellFile, draw_hidden
 from bridge.sources.standin.destination import ON_CLEARANCE_M
 from bridge.sources.standin.operator import execute_plan, label_trial
@@ -111,7 +111,8 @@ def test_the_cell_and_its_label_agree_with_where_it_was_put(
         onto,
         draw_hidden(cell_file, 9_000_000),
         Streams(make_session(), "standin"),
-        config=CellConfig(rate_hz=0.0, scale=0.25),
+        rate_hz=0.0,
+        scale=0.25,
         seed=9_000_000,
         start_ns=1_700_000_000_000_000_000,
     )
@@ -203,7 +204,7 @@ def test_friction_decides_whether_the_cube_stops_at_the_mark(
         push,
         hidden,
         Streams(make_session(), "standin"),
-        config=CellConfig(rate_hz=0.0),
+        rate_hz=0.0,
         seed=SEED,
         start_ns=0,
     )

@@ -17,7 +17,7 @@ from bridge.episode.metadata import Outcome
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.sources.standin import planner
-from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
+from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.destination import release_slots
 from bridge.sources.standin.kinematics import yaw_of
@@ -25,7 +25,6 @@ from bridge.sources.standin.operator import Operator, execute_plan, label_trial,
 from bridge.sources.standin.render import Renderer
 from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig
-from bridge.sources.standin.soft import SoftBody
 from bridge.sources.standin.streams import Streams
 from bridge.sources.standin.surfaces import clutter_surfaces, lab_surfaces, object_surfaces
 from bridge.sources.standin.world import World
@@ -60,7 +59,7 @@ def trial(task: Task, file: CellFile, session: Any) -> tuple[Outcome, StandinCel
         task,
         draw_hidden(file, SEED),
         Streams(session, "standin"),
-        config=CellConfig(rate_hz=0.0),
+        rate_hz=0.0,
         seed=SEED,
         start_ns=0,
     )
@@ -128,7 +127,6 @@ def test_the_same_seed_gives_the_same_squeeze(
             task,
             draw_hidden(toys_cell, seed),
             Streams(session, "standin"),
-            config=CellConfig(),
             seed=seed,
             start_ns=0,
         )
@@ -142,15 +140,14 @@ def test_the_same_seed_gives_the_same_squeeze(
 
 def test_a_soft_body_tells_the_pose_it_was_given(sloth: Task, toys_cell: CellFile) -> None:
     world = World(sloth, nominal_hidden(toys_cell))
-    body: SoftBody = world._soft["sloth"]
     rng = np.random.default_rng(4)
     for _ in range(20):
         q = rng.normal(size=4)
         T = se3.transform_from(q / np.linalg.norm(q), rng.uniform(-0.5, 0.5, 3))
-        nodes = body.rest_nodes_m + body.qpos_at(T)
-        np.testing.assert_allclose(body.pose_of(nodes), T, atol=1e-9)
+        world.reset(np.zeros(6), {"sloth": T})
+        np.testing.assert_allclose(world.Ts_base_object()["sloth"], T, atol=1e-9)
         np.testing.assert_allclose(
-            body.extents_m(nodes, T), sloth.objects["sloth"].size_m, atol=1e-9
+            world.extents_m("sloth", T), sloth.objects["sloth"].size_m, atol=1e-9
         )
 
 
@@ -270,7 +267,6 @@ def test_the_operator_puts_toys_down_a_little_off(
         sloth,
         nominal_hidden(toys_cell),
         Streams(session, "standin"),
-        config=CellConfig(),
         seed=SEED,
         start_ns=0,
     )

@@ -54,11 +54,12 @@ def test_a_record_reads_back_as_it_was_written() -> None:
     [
         ({"schema_version": 2}, "schema version 2"),
         ({"joints": None}, "joints"),
-        ({"gain_hz": 0}, "above zero"),
-        ({"limit_rad_s": float("nan")}, "above zero"),
+        ({"gain_hz": 0}, r"> 0\.0 - at `\$\.gain_hz`"),
+        ({"limit_rad_s": float("nan")}, "limit_rad_s"),
+        ({"period_s": float("inf")}, "period_s"),
         ({"base_m": [0, 0]}, "base_m"),
         ({"targets": [{"t_s": 0, "joints_rad": {"wrist": 1}}]}, "wrist is none of a, b"),
-        ({"boxes": {"cube": {"size_m": [1, 1, 0], "mass_kg": 1}}}, "not above zero"),
+        ({"boxes": {"cube": {"size_m": [1, 1, 0], "mass_kg": 1}}}, r"> 0\.0 - at `\$\.boxes"),
     ],
 )
 def test_a_damaged_record_is_refused(change: dict[str, Any], match: str) -> None:
