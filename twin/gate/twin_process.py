@@ -1,5 +1,6 @@
 """The twin in a process of its own: one that hangs is ended, one that dies takes nobody with it."""
 
+import gc
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -51,6 +52,8 @@ def get_ready(_: None) -> None:
     import twin.replay.rebuilt_scene  # noqa: PLC0415
     import twin.replay.verdict  # noqa: PLC0415
     import twin.scene.localise.mesh_fit  # noqa: F401, PLC0415
+
+    gc.freeze()  # nobody needs to look for garbage in what was imported
 
 
 def look(item: tuple[Path, Any, Task]) -> dict[str, Any]:
@@ -134,8 +137,7 @@ def _steps_of(question: Question, config: ReplayConfig) -> int:
     from twin.replay.path import check_usable  # noqa: PLC0415
     from twin.robot.model import load_robot  # noqa: PLC0415
 
-    robot = load_robot(question.seen.urdf)
-    check_usable(question.plan, robot)  # before its impossible times are steps
+    check_usable(question.plan, load_robot(question.seen.urdf))  # impossible times are no steps
     steps = max(1, num_steps(question.plan.tau[-1].t_ns, config))
     if steps > question.max_steps:
         raise UndecidedError(
@@ -197,11 +199,10 @@ class TwinProcess(AbstractContextManager["TwinProcess"]):
         ends_s: float,
     ) -> Verdict:
         """Replay a plan from where its objects were found and the arm stands."""
-        known = [(name, item.covariance) for name, item in found.items()]
         seen = ReplayScene(
             task=task,
             Ts_base_object={name: item.T_base_object for name, item in found.items()},
-            covariances={name: sure for name, sure in known if sure is not None},
+            covariances={n: x.covariance for n, x in found.items() if x.covariance is not None},
             urdf=urdf,
             start_rad=start_rad,
         )

@@ -203,8 +203,8 @@ class Samples:
     def lie(self) -> bool:
         """Whether no rigid object has moved in the last ``LIE_STATES``."""
         recent = [[row[0] for row in rows[-LIE_STATES - 1 :]] for rows in self._seen.values()]
-        at_rest = all(np.ptp(poses, axis=0).max() < LIE for poses in recent)
-        return at_rest and len(self._rows) > LIE_STATES
+        columns = (column for poses in recent for column in zip(*poses, strict=True))
+        return len(self._rows) > LIE_STATES and all(max(c) - min(c) < LIE for c in columns)
 
     def fill(self, known: States, steps: slice) -> None:
         """Put in known states of the arm before or after all others; objects lie as there."""

@@ -3,12 +3,12 @@
 A trial is localised while nothing is executed. In between the joints and the fingers say what
 happened: an object between the fingers when they stop closing goes with the tool until they open,
 as cameras saw it in the hand on the way, else as it lay before. What is let go elsewhere than it is
-found fell there, in the time that gravity takes. One that was never held was moved by something
-else, and changes place when that is known.
+found fell there, in the time that gravity takes. One that was never held was pushed while the hand
+was near, or else changes place when that is known.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
-from twin.robot.model import load_robot
+from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack
 from twin.scene.localise.held import BETWEEN_M, Grip, executions_ns, grips_between
 from twin.scene.shape.known import turned_alike
@@ -26,10 +26,10 @@ FELL_M = 0.05
 """An object found this far from where it was let go did not stay there."""
 MOVED_M = 0.005
 """Less than this is the scatter of localisation."""
+STEP_NS = 40_000_000
 GRAVITY_M_S2 = 9.81
 TIPS = 3.0
-"""What lands aside tips over an edge first, from near its balance: it takes as many times as long.
-"""
+"""What lands aside tips over an edge first, from near its balance: so many times as long."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,11 @@ class _Span:
         if self.T_start is self.T_end:
             return self.T_end
         share = (stamp_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
-        return _between(self.T_start, self.T_end, float(np.clip(share, 0.0, 1.0)) ** self.power)
+        share = float(np.clip(share, 0.0, 1.0)) ** self.power
+        (R_a, p_a), (R_b, p_b) = ((T[:3, :3], T[:3, 3]) for T in (self.T_start, self.T_end))
+        turn = se3.vector_from_rotation(R_a.T @ R_b)
+        R = R_a @ se3.rotation_from_vector(share * turn)
+        return se3.from_rotation(R, p_a + share * (p_b - p_a))
 
 
 def _rest(start_ns: int, T_base_object: Float[np.ndarray, "4 4"]) -> _Span:
@@ -143,10 +147,32 @@ def carried_tracks(
             T, held = spans[name][-1].T_end, _held(name, plan_id, localised)
             carried = _carried(model, T, grips, held)
             after = seen.get(plan_id)
-            added, note = _moved(model, carried or [_rest(end_ns, T)], after, held=bool(carried))
+            near = _while_near(model, T, after, track, robot, (start_ns, end_ns))
+            added, note = _moved(model, carried or [near], after, held=bool(carried))
             spans[name] += added
             notes += [f"{name} {note}"] if note else []
     return ObjectTracks(spans=spans, absent=frozenset(absent), notes=tuple(notes))
+
+
+def _while_near(
+    model: ObjectModel,
+    T: Float[np.ndarray, "4 4"],
+    after: Float[np.ndarray, "4 4"] | None,
+    track: PostureTrack | None,
+    robot: RobotModel | None,
+    span_ns: tuple[int, int],
+) -> _Span:
+    """From when the hand came to where an object lay to when it left where it lies, or the end."""
+    begin_ns, end_ns = span_ns[1], span_ns[1]
+    if after is not None and track is not None and robot is not None:
+        stamps = range(*span_ns, STEP_NS)
+        tool_m = [robot.T_base_tcp(track.at(ns).joints_rad)[:3, 3] for ns in stamps]
+        away_m = [np.linalg.norm(tool_m - each[:3, 3], axis=1) for each in (T, after)]
+        reach_m = BETWEEN_M + max(model.size_m) / 2
+        old, new = (np.flatnonzero(each < reach_m) for each in away_m)
+        if len(old) and len(new) and new[-1] > old[0]:
+            begin_ns, end_ns = stamps[old[0]], stamps[new[-1]]
+    return _Span(start_ns=begin_ns, end_ns=end_ns, T_start=T, T_end=T)
 
 
 def _seen(
@@ -173,13 +199,12 @@ def _carried(
     held: Mapping[int, Float[np.ndarray, "4 4"]],
 ) -> list[_Span]:
     """Pushed by closing fingers, carried, and left where they opened; each from there again."""
-    reach_m = BETWEEN_M + max(model.size_m) / 2
     T, spans = T_base_object, []
     for grip in grips:
         T_hand = se3.invert(grip.T_base_tcp_start) @ T
         if grip.start_ns in held:
             T_hand = turned_alike(held[grip.start_ns], T_hand, model)
-        if np.linalg.norm(T_hand[:3, 3]) < reach_m:
+        if np.linalg.norm(T_hand[:3, 3]) < BETWEEN_M + max(model.size_m) / 2:
             start_ns, taken = grip.start_ns, grip.T_base_tcp_start @ T_hand
             spans += [
                 _Span(start_ns=grip.closing_ns, end_ns=start_ns, T_start=T, T_end=taken),
@@ -206,7 +231,7 @@ def _moved(
     """What one execution did to an object, and what had to be assumed.
 
     Args:
-        spans: By the joints; the last one is where it lies then.
+        spans: By the joints; the last one is where it lies then, or while it may be pushed.
     """
     *before, rest = spans
     if after is None and held and model.soft is not None:  # toys are dropped
@@ -225,7 +250,7 @@ def _moved(
     if away_m <= MOVED_M:
         return [], ""
     note = f"was moved by {away_m * 100:.0f} cm without being held: drawn there afterwards"
-    return [_rest(rest.start_ns, after)], note
+    return [replace(rest, T_end=after), _rest(rest.end_ns, after)], note
 
 
 def _fallen(
@@ -239,13 +264,3 @@ def _fallen(
     end_ns = start_ns + round(1e9 * float(fall_s))
     fall = _Span(start_ns=start_ns, end_ns=end_ns, T_start=T_start, T_end=T_end, power=2)
     return [fall, _rest(end_ns, T_end)]
-
-
-def _between(
-    T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"], share: float
-) -> Float[np.ndarray, "4 4"]:
-    turn = se3.vector_from_rotation(T_a[:3, :3].T @ T_b[:3, :3])
-    T = T_a.copy()
-    T[:3, :3] = T_a[:3, :3] @ se3.rotation_from_vector(share * turn)
-    T[:3, 3] += share * (T_b[:3, 3] - T_a[:3, 3])
-    return T

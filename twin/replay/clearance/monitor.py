@@ -74,9 +74,9 @@ def half_way(a: State, b: State) -> State:
         if name in a.nodes_m:
             nodes[name] = (a.nodes_m[name] + b.nodes_m[name]) / 2
             continue
-        (q_a, p_a), (q_b, p_b) = (se3.split(each.Ts_base_object[name]) for each in (a, b))
-        q = se3.interpolate_quaternion(q_a, q_b, np.array(0.5))
-        poses[name] = se3.transform_from(q, (p_a + p_b) / 2)
+        q, p = se3.split(np.stack([each.Ts_base_object[name] for each in (a, b)]))
+        middle = se3.interpolate_quaternion(q[0], q[1], np.array(0.5))
+        poses[name] = se3.transform_from(middle, (p[0] + p[1]) / 2)
     return State(
         t_ns=(a.t_ns + b.t_ns + 1) // 2,
         joints_rad=(a.joints_rad + b.joints_rad) / 2,

@@ -104,7 +104,7 @@ def test_a_cube_that_looks_the_same_after_a_quarter_turn_does_not_spin_in_the_ha
     ("fell_m", "width_m", "before_s", "moved_s", "note"),
     [
         (0.2, 0.05, 6.9, 7.4, "cube lay 20 cm from where it was let go"),
-        (0.0, 0.0005, 8.9, 9.0, "without being held"),
+        (0.0, 0.0005, 1.0, 9.0, "without being held"),
     ],
 )
 def test_a_fall_and_a_push_are_said_and_change_the_place(
@@ -119,6 +119,19 @@ def test_a_fall_and_a_push_are_said_and_change_the_place(
     at = [found.at(round(t * S), T_tcp(t, track))["cube"] for t in (before_s, moved_s)]
     np.testing.assert_allclose(at[0], was, atol=1e-9)
     np.testing.assert_allclose(at[1], after, atol=1e-9)
+
+
+def test_what_is_pushed_moves_while_the_hand_is_near() -> None:
+    """The hand stands over it until 3.5 s, in the execution from 1 s on, and turns away then."""
+    track = posture_track(0.0005)
+    before = T_tcp(3, track) @ IN_HAND
+    after = before.copy()
+    after[0, 3] += 0.02
+    found = tracks(before, after, track)
+    x = [found.at(round(t * S), T_tcp(t, track))["cube"][0, 3] - before[0, 3] for t in range(10)]
+    np.testing.assert_allclose(x[:2], 0.0, atol=1e-9)
+    assert 0.002 < x[2] < x[3] < 0.018
+    np.testing.assert_allclose(x[5:], 0.02, atol=1e-9)
 
 
 def tipping_s(edge_m: float) -> float:
