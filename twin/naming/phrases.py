@@ -34,7 +34,7 @@ NEARLY = 0.7
 SAYS_YES = 0.5
 """Activation from which a model means a thing."""
 CUPS = ("mug", "cup")
-CUP_M, BOX_M = (0.07, 0.17), (0.2, 0.5)
+CUP_M, BOX_M = (0.07, 0.17), (0.2, 0.8)
 """Longest extents of what may be a cup, or a box, where noisy depth hides its shape."""
 PLACES = {"left": (0, 1), "leftmost": (0, 1), "right": (0, -1), "rightmost": (0, -1),
           "front": (2, 1), "nearest": (2, 1), "back": (2, -1), "rear": (2, -1)}  # fmt: skip

@@ -15,7 +15,8 @@ SHAPE_WORDS = {
     "cylinder": ("cylinder", "can", "cup", "mug", "bottle", "tube", "jar"),
     "ball": ("ball", "sphere", "orange", "apple"),
     "slab": ("book", "board", "magazine", "plate", "card", "tablet", "picture"),
-    "block": ("box", "package", "parcel", "case", "carton"),
+    "block": ("box", "bin", "package", "parcel", "case", "carton"),
+    "seat": ("chair", "seat", "stool", "armchair"),
     "thing": (),
 }  # fmt: skip
 """What a thing of a shape may be called."""

@@ -64,7 +64,7 @@ class MovedCamera:
         shift_mm, turn = 1e3 * float(np.linalg.norm(T[:3, 3])), se3.rotation_angle_rad(T[:3, :3])
         return (
             f"camera {camera_id} was moved by {shift_mm:.0f} mm and {np.degrees(turn):.1f} degrees "
-            "since the scan: registered again by what stands still before it"
+            "since the scan, or not calibrated: registered again by what stands still before it"
         )
 
 

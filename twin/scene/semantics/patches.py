@@ -39,7 +39,7 @@ LOOSENESS = 6.0
 MIN_PATCH = 12
 """Patches of fewer voxels join the neighbour with the cheapest border."""
 MIN_VOXELS = 25
-"""Things of fewer are noise."""
+"""Things of fewer are noise; on a floor, where they are larger, more are asked for."""
 LEAST_BEND = -0.1
 """Mean (n_j - n_i) . d over a border from which two patches are one thing."""
 LEAST_CONTACT = 0.2
@@ -131,7 +131,7 @@ def cut_into_patches(
 
     Args:
         height_m: Over the plane that was taken away from under them; None where there is none.
-        furniture: Things are so many times larger than on a table.
+        furniture: Things are so many times larger than on a table, and of many colours.
     """
     labels = np.zeros(len(points), dtype=np.int64)
     if voxel_m > MAX_VOXEL_M or not len(points):
@@ -150,10 +150,12 @@ def cut_into_patches(
         piece = _joined_outwards(patch, ~walls, p_m, pairs, border, None, max_size_m)
     else:
         height = _means_of(height_m[:, None], voxels.of_point)[:, 0]
-        sizes_m = np.array([sides_m(p_m[patch == k])[0] for k in range(int(patch.max()) + 1)])
-        walls = sizes_m[patch] > max_size_m
+        sizes_m = np.array([sides_m(p_m[patch == k]) for k in range(int(patch.max()) + 1)])
+        is_panel = np.all(sizes_m[:, :2] >= np.multiply(WALL_M, furniture), axis=1)
+        walls = ((sizes_m[:, 0] > max_size_m) | (is_panel & (furniture > 1)))[patch]
         piece = _joined_outwards(patch, ~walls, p_m, pairs, border, colour, max_size_m)
-        piece = _with_parts(piece, ~walls, p_m, height, pairs, colour)
+        told = 0.0 * colour if furniture > 1 else colour  # furniture has many
+        piece = _with_parts(piece, ~walls, p_m, height, pairs, told)
     number = np.zeros(len(voxels), dtype=np.int64)
     for key in np.unique(piece[~walls]):
         ids = np.flatnonzero(piece == key)
@@ -166,7 +168,7 @@ def cut_into_patches(
         else:
             stands = np.quantile(height[ids], 0.03) < furniture * MAX_LIFT_M
             is_thing = stands and wide_m >= MIN_WIDTH_ON_PLANE_M
-        if is_thing and len(ids) >= MIN_VOXELS:
+        if is_thing and len(ids) >= furniture * MIN_VOXELS:
             number[ids] = number.max() + 1
     return np.asarray(number[voxels.of_point])
 

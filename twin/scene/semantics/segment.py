@@ -32,6 +32,8 @@ PLANE_COLOURS = 0.75
 """This share of the plane's points says how much its colour varies."""
 FLOOR_M2, FURNITURE = 2.5, 3.0
 """A larger plane is a floor, and what stands on it may be so many times larger than on a table."""
+HIDDEN_M = 0.12
+"""Half the width of what hides the plane behind it, on a table."""
 VOXEL_SCALES = (1.0, 1.2, 1.45)
 """Of the voxels that the spacing of the points asks for."""
 SAME_IOU = 0.6
@@ -139,7 +141,8 @@ class OverPlane:
         self._points, self.plane = points, plane
         self._height = height = plane.height_m(points.p_m)
         self._lab = without_shading(lab_from_srgb(points.colors))
-        free = plane.under(points.p_m) & (height < self._furniture * MAX_HEIGHT_M)
+        around = plane.behind_things(self._furniture * HIDDEN_M)
+        free = around.under(points.p_m) & (height < self._furniture * MAX_HEIGHT_M)
         self._low = free & (np.abs(height) <= self._least_m)
         self._above = np.flatnonzero(free & (height > self._least_m))
         self._voxel_m = max(FINEST_VOXEL_M, 2.0 * _spacing(points.p_m[self._above]))

@@ -159,8 +159,13 @@ SLAB, BLOCK = 0.2, 0.4
 """Shortest over middle extent: less is a slab, more may be a block."""
 BLOCK_FILL = 0.55
 """Of the box around it, that a block's hull fills."""
-BLOCK_M = (0.1, 0.6)
+BLOCK_M = (0.1, 0.8)
 """Longest extent of what may be called so."""
+SEAT = "seat"
+SEAT_M, BACK_M, TALLEST_M = (0.36, 0.56), 0.65, 1.3
+"""Heights of seats, and of the backs of chairs."""
+SEAT_SHARE, BACK_SHARE = 0.25, 0.05
+"""Of what is seen from above."""
 LEAST_OF_A_BALL = 0.5
 """Shortest over longest side of what may be a ball, of which little more than half is seen."""
 
@@ -186,7 +191,14 @@ def _word(
         return "cylinder"
     if not rough and min(size_m) > LEAST_OF_A_BALL * long and _is_ball(xyh_m, long):
         return "ball"
-    return _bulk(xyh_m)
+    return SEAT if _is_seat(heights) else _bulk(xyh_m)
+
+
+def _is_seat(heights: HeightMap) -> bool:
+    """Whether people may sit: level at the height of a knee, and a back over some of its edge."""
+    top = heights.top_m[heights.footprint]
+    level = ((top > SEAT_M[0]) & (top < SEAT_M[1])).mean()
+    return bool(level > SEAT_SHARE and (top > BACK_M).mean() > BACK_SHARE and top.max() < TALLEST_M)
 
 
 def _along_principal(p_m: np.ndarray) -> np.ndarray:

@@ -95,6 +95,15 @@ class SupportPlane:
         cells[~inside] = 0
         return np.asarray(inside & self.footprint[cells[:, 0], cells[:, 1]])
 
+    def behind_things(self, reach_m: float) -> "SupportPlane":
+        """The plane with what things up to twice as wide hide of it: gaps in its outline."""
+        reach = reach_m / CELL_M
+        grid = np.pad(self.footprint, round(reach) + 1)
+        near = ndimage.distance_transform_edt(~grid) <= reach
+        whole = grid | (ndimage.distance_transform_edt(near) > reach)
+        x_m, y_m = (low_m - (round(reach) + 1) * CELL_M for low_m in self.corner_m)
+        return replace(self, footprint=whole, corner_m=(x_m, y_m))
+
 
 def find_support(points: SurfacePoints) -> SupportPlane:
     """Find the level plane that carries most of what is near it.

@@ -56,6 +56,12 @@ def test_a_missing_wall_does() -> None:
     assert measure_shape(from_above(height), CELL_M).cavity is None
 
 
+def test_a_seat_is_level_at_knee_height_and_has_a_back() -> None:
+    _, y = grid(half_m=0.25)
+    shapes = [from_above(np.where(y > 0.2, z, 0.45), 0.25) for z in (0.85, 0.45, 1.6)]
+    assert [measure_shape(p, 0.01).word == "seat" for p in shapes] == [True, False, False]
+
+
 @pytest.mark.parametrize(
     ("word", "size_m"),
     [("cube", (0.04, 0.04, 0.04)), ("box", (0.10, 0.04, 0.05)), ("flat box", (0.1, 0.08, 0.015))],

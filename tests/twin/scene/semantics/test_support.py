@@ -55,6 +55,15 @@ def test_the_footprint_covers_holes_and_ends_at_the_edge() -> None:
     assert plane.under(probes).tolist() == [True, True, False, False]
 
 
+def test_the_plane_goes_on_behind_what_hides_it_up_to_its_edge() -> None:
+    p = sheet(np.random.default_rng(3), 0.0, 0.4, 20000)
+    p = p[(np.abs(p[:, 0]) > 0.08) | (p[:, 1] < 0.1)]
+    plane = support.find_support(seen(p, np.tile(UP, (len(p), 1))))
+    probes = np.array([[0.0, 0.3, 0.1], [0.0, 0.5, 0.1], [0.5, 0.0, 0.1]])
+    assert not plane.under(probes).any()
+    assert plane.behind_things(0.12).under(probes).tolist() == [True, False, False]
+
+
 def test_the_answer_moves_with_the_scene() -> None:
     rng = np.random.default_rng(4)
     p = sheet(rng, 0.0, 0.3, 3000)
