@@ -9,9 +9,15 @@ from scipy.spatial.transform import Rotation
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.robots.robot import read_robot
-from twin.robot import inverse as ik
 from twin.robot.follow import follow_poses
-from twin.robot.inverse import UrInverse, pose_error, solutions, solve_ik
+from twin.robot.inverse import (
+    POSITION_TOLERANCE_M,
+    ROTATION_TOLERANCE_RAD,
+    UrInverse,
+    pose_error,
+    solutions,
+    solve_ik,
+)
 from twin.robot.model import RobotModel, load_robot
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
@@ -127,8 +133,8 @@ def check_reached(robot: RobotModel, rows: np.ndarray) -> None:
         found = solve_ik(robot, T)
         assert found.reached, row.tolist()
         position_m, rotation_rad = pose_error(robot, found.joints_rad, T)
-        assert position_m <= ik.POSITION_TOLERANCE_M
-        assert rotation_rad <= ik.ROTATION_TOLERANCE_RAD
+        assert position_m <= POSITION_TOLERANCE_M
+        assert rotation_rad <= ROTATION_TOLERANCE_RAD
         assert np.all(found.joints_rad >= robot.lower_rad)
         assert np.all(found.joints_rad <= robot.upper_rad)
 
@@ -150,7 +156,7 @@ def test_an_arm_of_five_joints_reaches_every_position_and_turns_as_far_as_it_can
         found = solve_ik(robot, T)
         assert found.reached
         position_m, left_rad = pose_error(robot, found.joints_rad, T)
-        assert position_m <= ik.POSITION_TOLERANCE_M
+        assert position_m <= POSITION_TOLERANCE_M
         assert left_rad == pytest.approx(found.rotation_error_rad, abs=1e-6)
         warm = solve_ik(robot, T, warm_start_rad=found.joints_rad)
         assert warm.reached

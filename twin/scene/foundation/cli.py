@@ -7,7 +7,14 @@ from bridge.terminal import Output
 OUTPUT = Output()
 
 
-def find(run: Path, words: str, /, *, clip: Path | None = None, output: Output = OUTPUT) -> int:
+def find(
+    run: Path,
+    words: str,
+    /,
+    *,
+    clip: Path | None = None,
+    output: Output = OUTPUT,
+) -> int:
     """Find what words mean in a rebuilt scene: objects and parts, with masks, poses and a picture.
 
     Exit code 3, and why, where nothing fits. Left and right are as in the picture.

@@ -44,7 +44,7 @@ class WeightsKind:
     class_name: str
     """In ``transformers``."""
     colours: Normalisation
-    """Of the images it was trained on."""
+    """Where the folder states none."""
     origin: str
     """Name under which its makers publish it."""
     licence: str
@@ -121,6 +121,22 @@ def _json(path: Path, kind: WeightsKind) -> dict[str, Any]:
     return content
 
 
+def read_normalisation(folder: Path, kind: WeightsKind) -> Normalisation:
+    """Mean and standard deviation of colours, from ``preprocessor_config.json`` if present."""
+    path = folder / "preprocessor_config.json"
+    if not path.is_file():
+        return kind.colours
+    content, values = _json(path, kind), []
+    for name, standard in zip(("image_mean", "image_std"), kind.colours, strict=True):
+        given = content.get(name, list(standard))
+        is_three = isinstance(given, list) and len(given) == 3
+        is_numbers = is_three and all(isinstance(v, int | float) and 0 <= v < 10 for v in given)
+        if not is_numbers or (name == "image_std" and 0 in given):
+            raise kind.refuse(folder, f"{path.name}: {name} is {given!r}")
+        values.append(tuple(float(v) for v in given))
+    return values[0], values[1]
+
+
 def _package(name: str) -> Any:
     """One of the packages of the extra."""
     try:
@@ -171,6 +187,7 @@ class Network:
         self._device = device_of(device)
         transformers = import_transformers()
         self._model = self._loaded(transformers, folder).to(self._device).eval()
+        self._normalisation = read_normalisation(folder, self.kind)
         self._max_tokens = int(self._model.config.text_config.max_position_embeddings)
         try:
             self._tokenizer = transformers.AutoTokenizer.from_pretrained(
@@ -243,5 +260,5 @@ class Network:
                     pixels, size=size, mode=mode, align_corners=False, antialias=True
                 ).clamp(0.0, 255.0)
             rows.append(pixels)
-        mean, deviation = (torch.tensor(each).view(1, 3, 1, 1) for each in self.kind.colours)
+        mean, deviation = (torch.tensor(each).view(1, 3, 1, 1) for each in self._normalisation)
         return ((torch.cat(rows) / 255.0 - mean) / deviation).to(self._device)

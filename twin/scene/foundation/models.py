@@ -119,7 +119,7 @@ class ClipEmbedder(Network):
         Args:
             masks: Of the same sizes, none empty; at least one.
         """
-        ground = np.rint(np.array(self.kind.colours[0]) * 255.0).astype(np.uint8)
+        ground = np.rint(np.array(self._normalisation[0]) * 255.0).astype(np.uint8)
         crops = [
             masked_crop(image, mask, ground) for image, mask in zip(images_u8, masks, strict=True)
         ]

@@ -117,3 +117,17 @@ def test_the_hash_changes_with_the_numbers_alone(folder: Path) -> None:
     before = loading.check_folder(folder, KIND)
     write_safetensors(folder / "model.safetensors", {"a": np.full((2, 3), 2.0), "b": np.zeros(4)})
     assert loading.check_folder(folder, KIND) != before
+
+
+def test_colours_are_normalised_as_the_folder_says(folder: Path) -> None:
+    assert loading.read_normalisation(folder, KIND) == KIND.colours
+    about = folder / "preprocessor_config.json"
+    about.write_text(json.dumps({"image_mean": [0.1, 0.2, 0.3], "size": 4}))
+    assert loading.read_normalisation(folder, KIND) == ((0.1, 0.2, 0.3), KIND.colours[1])
+    for broken in ([0.1], "x", [0.1, None, 0.2], [1, 2, 300]):
+        about.write_text(json.dumps({"image_std": broken}))
+        with pytest.raises(loading.WeightsError, match="image_std is"):
+            loading.read_normalisation(folder, KIND)
+    about.write_text(json.dumps({"image_std": [0.5, 0.0, 0.5]}))
+    with pytest.raises(loading.WeightsError, match="image_std is"):
+        loading.read_normalisation(folder, KIND)
