@@ -253,6 +253,8 @@ def test_a_summary_counts_objects_where_they_are_the_unit() -> None:
         "scan": False,
         "outcomes": {"without_replanning": {"failure": 2}},
         "objects": {"without_replanning": {"k": 7, "n": 10}},
+        "retries": {},
+        "unknown": {},
         "stopped": False,
     }
     assert "2 trials, 2 failure; 7 of 10 objects" in describe(json.loads(json.dumps(summary)))
