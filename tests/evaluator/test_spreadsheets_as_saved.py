@@ -16,7 +16,7 @@ from bridge.exchange.trials_csv import COLUMNS, TrialRecord, read_trials, write_
 from evaluator.compare import compare_csv, compare_run
 from evaluator.compare.intake import take
 from evaluator.compare.several import compare_several
-from evaluator.compare.spreadsheet import record_from_row
+from evaluator.compare.spreadsheet import record_from_row, row_from_record
 from evaluator.errors import AlikeNamesError
 
 PLAIN = "trial_id,task,policy,recorded,sim_planned,p_success\na,cup,A,success,failure,0.85\n"
@@ -230,6 +230,13 @@ def test_a_run_exported_as_trials_gives_the_same_numbers(six_trials: Any, tmp_pa
         mine, theirs = comparison.results().get(name), again.results().get(name)
         assert (mine.value, mine.k, mine.n) == (theirs.value, theirs.k, theirs.n)
     assert again.stand_in is True
+
+
+def test_unknown_stays_unknown(write_table: Callable[[str], Path]) -> None:
+    path = write_table("trial_id,task,recorded,sim_planned\na,cube,,success\nb,cube,unknown,\n")
+    rows = [row_from_record(record) for record in read_trials(path)]
+    assert [row.recorded for row in rows] == [None, None]
+    assert compare_csv(path).results().get("agreement.sim_planned.rate").value is None
 
 
 @pytest.mark.parametrize(

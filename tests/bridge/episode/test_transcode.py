@@ -157,6 +157,15 @@ def test_compressed_colour_is_no_depth() -> None:
         DepthImage.from_message(schema.COMPRESSED_IMAGE, color.to_cdr())
 
 
+def test_a_truncated_jpeg_is_one_error() -> None:
+    jpeg = image_to_jpeg(image_header(image(smooth_rgb(), "rgb8")))
+    assert jpeg is not None
+    color = CompressedColor.from_cdr(jpeg)
+    cut = CompressedColor(stamp_ns=0, frame_id="c", format="jpeg", data=color.data[:300])
+    with pytest.raises(UnreadableImageError, match="unreadable image"):
+        cut.image_u8()
+
+
 @settings(max_examples=300)
 @given(st.data())
 def test_damaged_images_give_a_message_or_one_error(data: st.DataObject) -> None:

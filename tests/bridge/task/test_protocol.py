@@ -102,6 +102,15 @@ def test_a_file_older_than_the_hash_is_read(tmp_path: Path) -> None:
     assert not old.edited
 
 
+def test_trials_carry_a_design_out_only_as_it_is(tmp_path: Path) -> None:
+    keep_protocol(tmp_path, DESIGN, has_trials=False)
+    written = (tmp_path / protocol.FILE_NAME).read_bytes()
+    keep_protocol(tmp_path, STUDY, has_trials=False)
+    assert (tmp_path / protocol.FILE_NAME).read_bytes() == written
+    with pytest.raises(UsageError, match="says something else about: rounds"):
+        keep_protocol(tmp_path, replace(STUDY, rounds=6), has_trials=False)
+
+
 def test_every_start_is_tried_in_all_arms_at_once_and_tasks_are_interleaved() -> None:
     tasks = tuple(replace(STUDY.tasks[0], task=name) for name in ("stack", "push"))
     study = replace(STUDY, tasks=tasks)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.media.image_quality import ImageShapeError
+from bridge.media.image_quality import PADDINGS, ImageShapeError, ssim_maps
 from evaluator.metrics.image import METRICS, RAW, SwappedColourError, refuse_swapped, score_pair
 
 PLAIN_METRICS = [metric for metric in METRICS.values() if not metric.id.startswith("lpips")]
@@ -20,6 +20,12 @@ def picture(seed: int = 0, size: tuple[int, int] = (40, 56)) -> np.ndarray:
 
 def noisy(image: np.ndarray, scale: float) -> np.ndarray:
     return np.clip(image + np.random.default_rng(9).normal(scale=scale, size=image.shape), 0, 1)
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+def test_ssim_of_an_image_with_itself_is_one_under_every_padding(padding: str) -> None:
+    image = picture()
+    assert ssim_maps(image, image).mean(padding) == pytest.approx(1.0)
 
 
 def test_every_metric_is_worse_with_more_noise() -> None:
@@ -37,6 +43,23 @@ def test_every_metric_is_symmetric(seed: int, scale: float) -> None:
     other = noisy(image, scale)
     there, back = (score_pair(a, b)[RAW].values for a, b in ((image, other), (other, image)))
     assert there == pytest.approx(back, abs=1e-12)
+
+
+def test_a_mirrored_or_turned_pair_keeps_its_scores() -> None:
+    image = picture(2)
+    other = noisy(image, 0.1)
+    turned = [np.rot90(i) for i in (image, other)]
+    for padding in PADDINGS:
+        expected = ssim_maps(image, other).mean(padding)
+        assert ssim_maps(*turned).mean(padding) == pytest.approx(expected, abs=1e-12)
+
+
+def test_an_exposure_offset_costs_psnr_and_hardly_ssim() -> None:
+    image = picture(4)
+    raw, gain = (score_pair(image, 0.9 * image)[how].values for how in ("raw", "gain"))
+    assert raw["psnr_db"] < 26
+    assert raw["ssim"] > 0.98
+    assert gain.get("psnr_db", 400.0) > 100  # rounding may even leave nothing
 
 
 def test_pixels_of_a_mask_are_scored_alone() -> None:
