@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ bench_lab = pytest.importorskip("bench_lab")
 PLANS = 12
 
 
-def laboratory(rng: np.random.Generator, num_sessions: int) -> list[dict[str, object]]:
+def laboratory(rng: np.random.Generator, num_sessions: int) -> list[dict[str, Any]]:
     """Sessions in which a forecast knows something, in steps of a quarter; some end all alike."""
     sessions = []
     for number in range(num_sessions):
@@ -29,7 +30,7 @@ def laboratory(rng: np.random.Generator, num_sessions: int) -> list[dict[str, ob
     return sessions
 
 
-def rank_sums(sessions: list[dict[str, object]]) -> tuple[np.ndarray, np.ndarray]:
+def rank_sums(sessions: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
     """Mann and Whitney's U of each session, and its number of pairs."""
     found = []
     for each in sessions:
