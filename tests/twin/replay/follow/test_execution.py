@@ -197,9 +197,9 @@ def test_of_several_jumps_the_first_is_named(robot: RobotModel) -> None:
     far = 2 * MAX_JOINT_STEP_RAD
     joints = path_with({(5, 4): far, (9, 1): -far, (14, 0): far})
     times = np.arange(len(joints), dtype=np.int64) * STEP_NS
-    for failure in jumps(times, joints, robot):
-        assert failure.t_ns == 4 * STEP_NS, "the instant before it jumps"
-        assert failure.bodies == (ARM_JOINTS[4],)
+    (failure,) = jumps(times, joints, robot)
+    assert failure.t_ns == 4 * STEP_NS, "the instant before it jumps"
+    assert failure.bodies == (ARM_JOINTS[4],)
 
 
 def test_a_width_holds_from_its_own_instant_until_the_next_one() -> None:
