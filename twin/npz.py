@@ -29,7 +29,7 @@ def read_npz(path: Path, names: Sequence[str], max_bytes: int) -> dict[str, np.n
     """Read named arrays; sizes are checked before anything is unpacked, pickles are refused."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            missing = [name for name in names if name not in archive]
+            missing = [name for name in names if f"{name}.npy" not in archive]
             if missing:
                 raise UnreadableArraysError(path=path, found=f"without {', '.join(missing)}")
             total = sum(archive.zip.getinfo(f"{name}.npy").file_size for name in names)

@@ -93,6 +93,10 @@ def test_an_array_of_objects_and_a_lying_header_are_refused(tmp_path: Path) -> N
         archive.writestr("rows.npy", data.replace(b"(4,)", b"(9,)"))
     with pytest.raises(UnreadableArraysError, match="bytes"):
         read_npz(path, ["rows"], 10**6)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("rows", data)
+    with pytest.raises(UnreadableArraysError, match="without rows"):
+        read_npz(path, ["rows"], 10**6)
 
 
 def test_smoothing_keeps_the_number_of_solid_voxels_even_in_thin_walls() -> None:
