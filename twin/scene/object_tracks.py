@@ -147,8 +147,8 @@ def carried_tracks(
             T, held = spans[name][-1].T_end, _held(name, plan_id, localised)
             carried = _carried(model, T, grips, held)
             after = seen.get(plan_id)
-            near = _while_near(model, T, after, track, robot, (start_ns, end_ns))
-            added, note = _moved(model, carried or [near], after, held=bool(carried))
+            ways = carried or [_while_near(model, T, after, track, robot, (start_ns, end_ns))]
+            added, note = _moved(model, ways, after, held=bool(carried))
             spans[name] += added
             notes += [f"{name} {note}"] if note else []
     return ObjectTracks(spans=spans, absent=frozenset(absent), notes=tuple(notes))
@@ -163,16 +163,18 @@ def _while_near(
     span_ns: tuple[int, int],
 ) -> _Span:
     """From when the hand came to where an object lay to when it left where it lies, or the end."""
-    begin_ns, end_ns = span_ns[1], span_ns[1]
-    if after is not None and track is not None and robot is not None:
-        stamps = range(*span_ns, STEP_NS)
-        tool_m = [robot.T_base_tcp(track.at(ns).joints_rad)[:3, 3] for ns in stamps]
-        away_m = [np.linalg.norm(tool_m - each[:3, 3], axis=1) for each in (T, after)]
-        reach_m = BETWEEN_M + max(model.size_m) / 2
-        old, new = (np.flatnonzero(each < reach_m) for each in away_m)
-        if len(old) and len(new) and new[-1] > old[0]:
-            begin_ns, end_ns = stamps[old[0]], stamps[new[-1]]
-    return _Span(start_ns=begin_ns, end_ns=end_ns, T_start=T, T_end=T)
+    at_end = _rest(span_ns[1], T)
+    if after is None or track is None or robot is None:
+        return at_end
+    if np.linalg.norm(after[:3, 3] - T[:3, 3]) <= MOVED_M:
+        return at_end
+    stamps = range(*span_ns, STEP_NS)
+    tool_m = [robot.T_base_tcp(track.at(ns).joints_rad)[:3, 3] for ns in stamps]
+    away_m = [np.linalg.norm(tool_m - each[:3, 3], axis=1) for each in (T, after)]
+    reach_m = BETWEEN_M + max(model.size_m) / 2
+    old, new = (np.flatnonzero(each < reach_m) for each in away_m)
+    pushed = len(old) and len(new) and new[-1] > old[0]
+    return replace(at_end, start_ns=stamps[old[0]], end_ns=stamps[new[-1]]) if pushed else at_end
 
 
 def _seen(
