@@ -183,7 +183,7 @@ def test_a_disk_that_refuses_is_one_sentence(
 def test_a_reader_that_has_seen_enough_is_no_traceback(tmp_path: Path) -> None:
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "robot_gst", "doctor", "--json"]
+    command = [sys.executable, "-m", "robot_gst", "doctor", "--json", "--quiet"]
     done = subprocess.run(command, cwd=ROOT, stdout=write, stderr=subprocess.PIPE, check=False)
     os.close(write)
     assert done.stderr == b""
