@@ -352,9 +352,10 @@ def _smallest_part(
 ) -> tuple[int, int] | None:
     """The smallest piece that is part of a neighbour of its colour, and that neighbour."""
     counts, links = np.bincount(pieces), pieces[pairs]
-    for piece in np.argsort(counts, kind="stable"):
+    links = links[links[:, 0] != links[:, 1]]
+    for piece in sorted(np.unique(links), key=lambda number: counts[number]):
         own = pieces == piece
-        mine = links[(links == piece).sum(axis=1) == 1]
+        mine = links[(links == piece).any(axis=1)]
         others, strength = np.unique(mine[mine != piece], return_counts=True)
         alike = [_colour_gap(own, pieces == other, colour) < MIN_COLOUR_GAP for other in others]
         others, strength = others[alike], strength[alike]

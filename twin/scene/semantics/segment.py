@@ -40,8 +40,6 @@ SAME_IOU = 0.6
 """Two things are one when they share this much of their union."""
 MAX_TAKEN = 0.3
 """Share of a thing that a stabler one may have."""
-
-
 ROUGHNESS_FACTOR = 3.0
 """Things are higher over the plane than so many times its roughness, as it was measured."""
 FINEST_VOXEL_M, WALL_VOXEL_M = 0.004, 0.008

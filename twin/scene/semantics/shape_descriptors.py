@@ -242,8 +242,6 @@ MIN_HANDLE = 0.012
 """Share of the points; less is noise at a rim or a foot."""
 MIN_SHARE = 0.005
 """A part has at least this share of the points."""
-
-
 RIM, FLOOR, HANDLE = 0.1, 0.12, 0.08
 """Rim is what is this near to the rim's height, floor the lowest of the cavity's depth, handle what
 stands this much above the rim; shares of the height, or of the depth."""
