@@ -272,11 +272,10 @@ def _container(
     span = RIM * cavity.rim_m
     margin = max(HANDLE * cavity.rim_m, heights.cell_m)
     wall = heights.top_m[heights.footprint & ~cavity.mask]
-    if (wall > cavity.rim_m + margin).mean() > MAX_HANDLE:
-        handle = np.zeros(len(xyh_m), dtype=bool)  # the rim is that high, but for a low place
-    else:
-        handle = (height > cavity.rim_m + margin) & (top_m > cavity.rim_m + 2 * margin)
-    handle |= _sticking_out(xyh_m, heights, cavity)
+    handle = _sticking_out(xyh_m, heights, cavity)
+    is_rim = (wall > cavity.rim_m + margin).mean() > MAX_HANDLE  # that high, but for a low place
+    if not is_rim and top_m > cavity.rim_m + 2 * margin:
+        handle |= height > cavity.rim_m + margin
     if handle.sum() < MIN_HANDLE * len(xyh_m):
         handle = np.zeros_like(handle)  # a ragged rim
     thick = max(FLOOR * depth, 0.004)
