@@ -9,7 +9,6 @@ import numpy as np
 from measure import Target, report_targets
 
 from record.cell import CellSpec
-from record.disk_full import run_disk_full, small_disk
 from record.frames import source_name
 from record.kill import kill_ours, kill_reference
 from record.stall import run_stall
@@ -221,44 +220,6 @@ def stall(plan: Plan) -> None:
     )
 
 
-def disk(plan: Plan) -> None:
-    """A disk that fills up."""
-    with small_disk(plan.folder / "small") as small:
-        if small is None:
-            print("record_disk_full: not measured, mounting a tmpfs is not allowed here")
-            return
-        run = run_disk_full(plan.spec, plan.folder / "disk", small)
-    beside = "foxglove-sdk and rerun stay silent (study)"
-    report_targets(
-        "record_disk_full",
-        [
-            Target(
-                what="disk full: error in the status after",
-                measured=run.status_after_s,
-                limit=1.0,
-                unit="s",
-                reference=beside,
-            ),
-            Target(what="disk full: end after", measured=run.exit_after_s, limit=1.0, unit="s"),
-            Target(
-                what="disk full: exit code is 1",
-                measured=run.exit_code == 1,
-                limit=1,
-                at_most=False,
-            ),
-            Target(
-                what="disk full: file finalised and valid",
-                measured=run.is_valid,
-                limit=1,
-                at_most=False,
-                reference=f"{run.messages} messages in it",
-            ),
-        ],
-        note=plan.note("tmpfs of 80 MB, no reserve"),
-        ours=asdict(run),
-    )
-
-
 def kill(plan: Plan) -> None:
     """Kill -9 at random instants, in four mixes: joints only or all, recording or finalising."""
     rng = np.random.default_rng(11)
@@ -302,4 +263,4 @@ def kill(plan: Plan) -> None:
     )
 
 
-SCENARIOS = {"ratio": ratio, "long": long, "hd": hd, "stall": stall, "disk": disk, "kill": kill}
+SCENARIOS = {"ratio": ratio, "long": long, "hd": hd, "stall": stall, "kill": kill}

@@ -13,8 +13,8 @@ from bridge.episode.catalogue_query import CatalogueQuery
 from bridge.episode.executions import EXECUTION, executed_events
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import GRIPPER_STATE
 from bridge.errors import GstError
-from bridge.robots.robot import Robot
 from bridge.task.task_file import Task
 from twin.policies.errors import PolicyError
 from twin.policies.identify import response_of
@@ -91,23 +91,21 @@ def open_start(run: RunFolder, episode: Episode) -> Start:
     joints_rad = recorded_start(episode, stamp_ns, robot.joints)
     if joints_rad is None:
         raise PolicyError(f"{episode.info.id} gives no start: nobody recorded where the arm was")
+    try:
+        widths = width_track(episode, robot.record)
+    except GstError as error:
+        why = f"nobody says the gripper's width [m] on a topic ...{GRIPPER_STATE}"
+        raise PolicyError(f"{episode.info.id} gives no start: {why}") from error
     return Start(
         id=episode.info.start_id or episode.info.id,
         episode_path=episode.path,
         scene=scene,
         joints_rad=joints_rad,
-        width_m=_width_m(episode, robot.record, stamp_ns),
+        width_m=float(widths.at(np.array([stamp_ns]))[0, 0]),
         stamp_ns=stamp_ns,
         config=for_task(ReplayConfig(), read_calibration(run), task),
         response=response_of(run, episode, robot),
     )
-
-
-def _width_m(episode: Episode, robot: Robot, stamp_ns: int) -> float:
-    try:
-        return float(width_track(episode, robot).at(np.array([stamp_ns]))[0, 0])
-    except GstError:
-        return robot.gripper.max_width_m
 
 
 def drawn_starts(start: Start, count: int, seed: int) -> Iterator[Start]:

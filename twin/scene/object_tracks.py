@@ -85,12 +85,7 @@ class ObjectTracks:
     def at(
         self, stamp_ns: int, T_base_tcp: Float[np.ndarray, "4 4"] | None
     ) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """Poses ``T_base_object`` at one instant.
-
-        Args:
-            T_base_tcp: Of the tool then; None where no joints are known: what is carried then
-                stays where it was taken.
-        """
+        """Poses ``T_base_object`` at one instant; without ``T_base_tcp`` what is carried stays."""
         found = {}
         for name, spans in self.spans.items():
             begun = [span for span in spans if span.start_ns <= stamp_ns]

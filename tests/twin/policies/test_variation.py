@@ -16,6 +16,7 @@ from bridge.geometry import se3
 from twin.policies import colours
 from twin.policies.cell import TwinCell
 from twin.policies.colours import gains_of
+from twin.policies.errors import PolicyError
 from twin.policies.gap import State, describe_gap, recorded_states, visual_gap
 from twin.policies.mapping import DEFAULT, Interpreter
 from twin.policies.policy import open_policy
@@ -191,6 +192,13 @@ def test_one_trial_alone_teaches_nothing(run: RunFolder, monkeypatch: pytest.Mon
         path.unlink()
     colours._trials.cache_clear()
     assert gains_of(run, Episode.open(last), CAMERAS) == {}
+
+
+def test_no_start_without_the_width(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gripper of which nobody spoke may hold something: it is not taken for open."""
+    monkeypatch.setattr("twin.robot.posture.GRIPPER_STATE", "/nobody/says")
+    with pytest.raises(PolicyError, match="trial_1 gives no start: nobody says the gripper's"):
+        open_start(run, trial_episodes(run, "")[0])
 
 
 def test_too_little_that_is_bright_enough_teaches_nothing(run: RunFolder) -> None:

@@ -38,6 +38,8 @@ BETWEEN_M = 0.03
 """An object this near to the tool, beside half its largest side, is between the fingers."""
 PLATEAU_M = 0.003
 """Fingers that are this near to the least opening of a grasp grasp what is between them."""
+OPENS_M = 0.0005
+"""Fingers that go this far from where they held a thing have let it go."""
 EMPTY_M = 0.002
 """Fingers that close to less have nothing between them."""
 CLOSES = 0.25
@@ -91,15 +93,16 @@ def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns:
         held = first + np.flatnonzero(width_m[first:last] <= least_m + PLATEAU_M)
         if least_m < EMPTY_M:
             continue
-        t0, t1 = int(stamps[held[0]]), int(stamps[held[-1]])
-        T0, T1 = (robot.T_base_tcp(track.at(t).joints_rad) for t in (t0, t1))
+        late = held[-1 - len(held) // 4 :]
+        opens_m = np.median(width_m[late]) + OPENS_M
+        t0, t1 = int(stamps[held[0]]), int(stamps[late[width_m[late] <= opens_m][-1]])
         grips.append(
             Grip(
                 closing_ns=int(stamps[first]),
                 start_ns=t0,
                 end_ns=t1,
-                T_base_tcp_start=T0,
-                T_base_tcp_end=T1,
+                T_base_tcp_start=robot.T_base_tcp(track.at(t0).joints_rad),
+                T_base_tcp_end=robot.T_base_tcp(track.at(t1).joints_rad),
             )
         )
     return grips
@@ -135,10 +138,8 @@ def held_objects(
             model = task.objects[name]
             away_m = last_seen_m.get(name, np.inf) - grip.T_base_tcp_start[:3, 3]
             is_near = np.linalg.norm(away_m) < BETWEEN_M + max(model.size_m) / 2
-            T = None
-            if is_near or model.soft is None:
-                T = fitted_in_hand(frames, task, model, surface)
-            if T is not None:
+            may_be = is_near or model.soft is None
+            if may_be and (T := fitted_in_hand(frames, task, model, surface)) is not None:
                 yield name, grip, T
 
 

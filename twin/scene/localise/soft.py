@@ -56,8 +56,6 @@ WELL_EXPLAINED = 0.9
 """With less it may lie on another side: more starts are tried."""
 WELL_SEEN_THROUGH = 0.12
 """So they are with more of its surface seen through."""
-HOPELESS = 0.5
-"""With less it is no such toy on any side: one on a wrong side explains two thirds."""
 TURNED_SHARE = 0.1
 """Clusters with fewer points than this share of the largest show too little of a toy to tell
 its sides apart."""
@@ -79,10 +77,7 @@ STANDS = 0.9
 
 
 def soft_shape(
-    views: Sequence[CameraView],
-    surface: MeshSurface,
-    model: ObjectModel,
-    fit: MeshFit,
+    views: Sequence[CameraView], surface: MeshSurface, model: ObjectModel, fit: MeshFit
 ) -> dict[str, Any]:
     """Extents along the axes of the fitted pose: those at rest, plus how far the seen ends moved.
 
@@ -170,6 +165,10 @@ def _cut(group: Cluster, model: ObjectModel, count: int) -> list[Cluster]:
     number = round(len(cells) * CELL_M**2 / one)
     if not 2 <= number <= count:
         return []
+    return _pieces(group, number)
+
+
+def _pieces(group: Cluster, number: int) -> list[Cluster]:
     _, labels = kmeans2(group.p_base, number, minit="++", seed=0)
     return [
         Cluster(p_base=group.p_base[labels == label], view_ids=group.view_ids[labels == label])
@@ -204,6 +203,11 @@ def fit_toys(
     surface = known_surface(model)
     enough = TURNED_SHARE * max((len(group) for group in groups), default=0)
     fits = [fit_toy(group, views, surface, turn=len(group) >= enough) for group in groups]
+    if len(models) > 1:  # what no toy explains may be two that touch
+        odd = [g for g, fit in zip(groups, fits, strict=True) if fit.explained < MIN_EXPLAINED]
+        halves = [half for group in odd for half in _pieces(group, 2) if len(half) >= enough]
+        groups += halves
+        fits += [fit_toy(half, views, surface, turn=True) for half in halves]
     good = [
         index
         for index, item in enumerate(fits)
@@ -234,17 +238,13 @@ def fit_toys(
 
 
 def fit_toy(
-    group: Cluster,
-    views: Sequence[CameraView],
-    surface: MeshSurface,
-    *,
-    turn: bool,
+    group: Cluster, views: Sequence[CameraView], surface: MeshSurface, *, turn: bool
 ) -> MeshFit:
     """Lay a toy's mesh onto points, standing first, on its other sides if that explains little."""
     standing = fit_mesh(group, views, surface, tilt_sigma_rad=TILT_SIGMA_RAD)
     doubtful = standing.seen_through > WELL_SEEN_THROUGH
     doubtful |= standing.explained < WELL_EXPLAINED
-    if not turn or not doubtful or standing.explained < HOPELESS:
+    if not turn or not doubtful:
         return standing
     lying = fit_mesh(group, views, surface, tilt_sigma_rad=10.0, lying=True)
     return min((standing, lying), key=lambda item: item.score)

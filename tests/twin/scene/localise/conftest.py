@@ -30,7 +30,7 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(curve * 255), 0, 255).astype(np.uint8)
 
 
-def linear_from_srgb(color: tuple[int, int, int]) -> np.ndarray:
+def linear_from_srgb(color: tuple[int, ...]) -> np.ndarray:
     c = np.array(color) / 255
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
@@ -66,11 +66,7 @@ class Stage:
         self.albedo.append(linear_from_srgb(color))
 
     def add_mesh(
-        self,
-        vertices_m: np.ndarray,
-        triangles: np.ndarray,
-        color: tuple[int, int, int],
-        T: np.ndarray,
+        self, vertices_m: np.ndarray, triangles: np.ndarray, color: tuple[int, ...], T: np.ndarray
     ) -> None:
         self.scene.add_triangles(
             o3d.core.Tensor(se3.apply(T, vertices_m).astype(np.float32)),

@@ -19,9 +19,13 @@ from twin.scene.localise.points import Cluster, fuse_stationary
 from twin.scene.shape.known import pose_of
 
 
-@pytest.mark.parametrize("yaw", [2.9, -1.7])
-def test_a_toy_is_found_whichever_way_it_looks(stage: Callable[..., Any], yaw: float) -> None:
-    T = pose_of(np.array([0.48, -0.17, 0.03, yaw]))
+@pytest.mark.parametrize("q", [(0.12, 0, 0, 0.99), (0.66, 0, 0, -0.75), (0.76, 0.25, -0.43, 0.42)])
+def test_a_toy_is_found_whichever_way_it_looks(
+    stage: Callable[..., Any], q: tuple[float, ...]
+) -> None:
+    """Standing it would explain less than half of the last one's points."""
+    q_wxyz, z_m = np.array(q) / np.linalg.norm(q), 0.088 if q[1] else 0.03
+    T = se3.transform_from(q_wxyz, np.array([0.48, -0.17, z_m]))
     toy = localise_objects(
         shoot(table_with(stage, (SLOTH.objects["sloth"], T))), only(SLOTH, "sloth")
     )["sloth"]
