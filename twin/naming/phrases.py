@@ -36,8 +36,9 @@ NEARLY = 0.7
 SAYS_YES = 0.5
 """Activation from which a model means a thing."""
 CUPS = ("mug", "cup")
-CUP_M, BOX_M = (0.07, 0.17), (0.1, 0.8)
-"""Longest extents of what may be a cup, or a box, where noisy depth hides its shape."""
+CUP_M, BOX_M, CARRIED_M = (0.07, 0.17), (0.1, 0.8), 0.2
+"""Longest extents of what may be a cup, or a box, where noisy depth hides its shape; a box shorter
+than the last is half as thick as it is long."""
 PLACES = {"left": (0, 1), "leftmost": (0, 1), "right": (0, -1), "rightmost": (0, -1),
           "front": (2, 1), "nearest": (2, 1), "back": (2, -1), "rear": (2, -1)}  # fmt: skip
 """Words for the first along an axis of the camera."""
@@ -230,7 +231,9 @@ def _names_by_size(item: Instance) -> tuple[str, ...]:
         return ()
     if CUP_M[0] < long < CUP_M[1] and short > 0.6 * long:
         return CUPS
-    return SHAPE_WORDS["block"] if BOX_M[0] < long < BOX_M[1] and short > 0.25 * long else ()
+    thickness = 0.25 if long > CARRIED_M else 0.5
+    is_box = BOX_M[0] < long < BOX_M[1] and short > thickness * long
+    return SHAPE_WORDS["block"] if is_box else ()
 
 
 def _is_plural(text: str) -> bool:
