@@ -169,8 +169,8 @@ class Asker:
             fit = [[item for item in sized if wanted <= set(map(colour_of, words_of(item.label)))]]
             seen = [replace(o, score=NEARLY * o.score) for o in sized if o.source != NAMED]
             fit += [[o for o in seen if wanted <= near_colours(o.color_srgb)[k]] for k in (0, 1)]
-            for items in filter(None, fit):
-                return [Found(item=item, score=item.score) for item in items], ""
+            for best in filter(None, fit):
+                return [Found(item=item, score=item.score) for item in best], ""
         return [], f"there is {labels}"
 
     def _called(self, nouns: set[str]) -> list[list[Instance]]:

@@ -199,7 +199,7 @@ class WithoutPlane:
         layer = ((height - height.min()) / LAYER_M).astype(np.int64)
         down = self._points.normals[ids, 2] < FACES_DOWN
         count, num_down = np.bincount(layer), np.bincount(layer, weights=down)
-        return ids[layer < int(np.argmax(num_down < MOSTLY * count))]
+        return np.asarray(ids[layer < int(np.argmax(num_down < MOSTLY * count))])
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""
