@@ -68,8 +68,6 @@ class Judged:
     """By object: the best agreement of any instance."""
     false: tuple[int, ...]
     """Instances that are no object on the list."""
-    ignored: Mapping[int, str]
-    """Instances that are something on the list which does not count."""
 
 
 def judge(
@@ -99,7 +97,6 @@ def judge(
         found={name: pair for name, pair in found.items() if groups[name] != "ignored"},
         best={item.name: float(value) for item, value in zip(objects, best, strict=True)},
         false=tuple(number for number in instances if number not in taken),
-        ignored={number: name for number, name in taken.items() if groups[name] == "ignored"},
     )
 
 

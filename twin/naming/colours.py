@@ -20,6 +20,9 @@ _WHITE = _XYZ_FROM_RGB.sum(axis=1)
 GREY_CHROMA = 11.0
 """Less colourful is black, grey or white."""
 GREYS = ("black", "grey", "white")
+VIVID, COLOURFUL, ONE_HUE = 1.5, 0.25, 0.7
+"""How far above ``GREY_CHROMA`` a thing shows its colour, on which share of it at least, and the
+mean of unit vectors along its hues from which they are one."""
 LIGHTNESS_WEIGHT = 0.3
 """Shading changes lightness, not the ratios of a and b to it."""
 DULL_CHROMA = 42.0
@@ -79,21 +82,35 @@ def colour_name(color: Float[np.ndarray, "3"]) -> str:
     return name
 
 
-def near_colours(color_srgb: tuple[int, int, int]) -> set[str]:
-    """Names of a colour, and of what it may be in other light: a white cup in shade is grey."""
+def main_colour(colors: Float[np.ndarray, "num_colours 3"]) -> Float[np.ndarray, "3"]:
+    """Of a thing: the middle of its colourful part, not of the frame around a green seat.
+
+    The middle of all where less than ``COLOURFUL`` of it is colourful, or that is of many hues.
+    """
+    ab = lab_from_srgb(colors)[:, 1:]
+    chroma = np.linalg.norm(ab, axis=1)
+    part = chroma > VIVID * GREY_CHROMA
+    if part.mean() >= COLOURFUL:
+        hue = np.linalg.norm((ab[part] / chroma[part, None]).mean(axis=0))
+        colors = colors[part] if hue > ONE_HUE else colors
+    return np.asarray(np.median(colors, axis=0), dtype=np.float64)
+
+
+def near_colours(color_srgb: tuple[int, int, int]) -> tuple[set[str], set[str]]:
+    """Names of a colour in other light, and in light of another colour, or faded, besides.
+
+    A white cup in shade is grey.
+    """
     if colour_name(np.array(color_srgb) / 255) in GREYS:
         values = np.clip(max(color_srgb) / 255 * np.array([0.75, 1.0, 1.4]), 0.0, 1.0)
-        return {colour_name(np.full(3, value)) for value in values}
+        names = {colour_name(np.full(3, value)) for value in values}
+        return names, names
     hue, saturation, value = colorsys.rgb_to_hsv(*(channel / 255 for channel in color_srgb))
-    shades = product((-0.04, 0.0, 0.04), (0.75, 1.0, 1.3), (0.75, 1.0, 1.4))
-    return {
-        colour_name(
-            np.array(
-                colorsys.hsv_to_rgb((hue + h) % 1.0, min(saturation * s, 1), min(value * v, 1))
-            )
-        )
-        for h, s, v in shades
-    }
+    near: dict[bool, set[str]] = {True: set(), False: set()}
+    for h, s, v in product((-0.04, 0.0, 0.04), (0.75, 1.0, 1.3), (0.75, 1.0, 1.4)):
+        shade = colorsys.hsv_to_rgb((hue + h) % 1.0, min(saturation * s, 1), min(value * v, 1))
+        near[h == 0 and s == 1].add(colour_name(np.array(shade)))
+    return near[True], near[True] | near[False]
 
 
 def without_shading(lab: Float[np.ndarray, "num_colours 3"]) -> Float[np.ndarray, "num_colours 3"]:

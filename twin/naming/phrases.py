@@ -13,8 +13,10 @@ from twin.naming.things import NAMED, Instance, SemanticScene, SemanticsError
 from twin.naming.words import (
     ALONE,
     ANY_THING,
+    PURPOSES,
     SHAPE_WORDS,
     SIZES,
+    THINGS_TOO,
     colour_of,
     known_words,
     names_of,
@@ -34,8 +36,9 @@ NEARLY = 0.7
 SAYS_YES = 0.5
 """Activation from which a model means a thing."""
 CUPS = ("mug", "cup")
-CUP_M, BOX_M = (0.07, 0.17), (0.2, 0.8)
-"""Longest extents of what may be a cup, or a box, where noisy depth hides its shape."""
+CUP_M, BOX_M, CARRIED_M = (0.07, 0.17), (0.1, 0.8), 0.2
+"""Longest extents of what may be a cup, or a box, where noisy depth hides its shape; a box shorter
+than the last is half as thick as it is long."""
 PLACES = {"left": (0, 1), "leftmost": (0, 1), "right": (0, -1), "rightmost": (0, -1),
           "front": (2, 1), "nearest": (2, 1), "back": (2, -1), "rear": (2, -1)}  # fmt: skip
 """Words for the first along an axis of the camera."""
@@ -152,23 +155,22 @@ class Asker:
                 if score > SAYS_YES
             ]
             return sorted(told, key=lambda each: -each.score), "" if told else "the model sees none"
-        wanted = {colour for word in words if (colour := colour_of(word))}
-        sizes = [word for word in words if word in SIZES]
-        nouns = [word for word in words if word not in sizes and not colour_of(word)]
+        own_head = words[-1:] if words[-1] in THINGS_TOO else []
+        colours = [word for word in words if colour_of(word) and word not in own_head]
+        wanted, sizes = set(map(colour_of, colours)), [word for word in words if word in SIZES]
+        nouns = [word for word in words[:-1] if word not in PURPOSES] + [words[-1]]
+        nouns = [word for word in nouns if word not in (*sizes, *colours)]
         unknown = [word for word in nouns if word not in known_words() | own]
         labels = ", ".join(sorted({item.label for item in items})) or "nothing"
         if unknown:
             return [], f"not known here: {', '.join(unknown)}; there is {labels}"
         for pool in self._called({word for word in nouns if word not in ANY_THING}):
             sized = [item for item in pool if all(self._has_size(item, w, pool) for w in sizes)]
-            exact = [item for item in sized if wanted <= set(map(colour_of, words_of(item.label)))]
-            near = [
-                replace(item, score=NEARLY * item.score)
-                for item in sized
-                if item.source != NAMED and wanted <= near_colours(item.color_srgb)
-            ]
-            if exact or near:
-                return [Found(item=item, score=item.score) for item in exact or near], ""
+            fit = [[item for item in sized if wanted <= set(map(colour_of, words_of(item.label)))]]
+            seen = [replace(o, score=NEARLY * o.score) for o in sized if o.source != NAMED]
+            fit += [[o for o in seen if wanted <= near_colours(o.color_srgb)[k]] for k in (0, 1)]
+            for best in filter(None, fit):
+                return [Found(item=item, score=item.score) for item in best], ""
         return [], f"there is {labels}"
 
     def _called(self, nouns: set[str]) -> list[list[Instance]]:
@@ -176,7 +178,7 @@ class Asker:
         items = self.scene.instances
         own = [item for item in items if nouns <= set(words_of(item.label))]
         named = [item for item in own if item.source == NAMED]
-        shaped = [item for item in items if nouns <= names_of(item.label)]
+        shaped = [item for item in items if nouns <= names_of(item.label, max(item.size_m))]
         sure = [item for item in shaped if _names_by_size(item) != CUPS]
         unsure = [item for item in items if nouns <= set(_names_by_size(item))]
         return [named, own, sure, unsure, shaped] if nouns else [shaped]
@@ -229,7 +231,9 @@ def _names_by_size(item: Instance) -> tuple[str, ...]:
         return ()
     if CUP_M[0] < long < CUP_M[1] and short > 0.6 * long:
         return CUPS
-    return SHAPE_WORDS["block"] if BOX_M[0] < long < BOX_M[1] and short > 0.25 * long else ()
+    thickness = 0.25 if long > CARRIED_M else 0.5
+    is_box = BOX_M[0] < long < BOX_M[1] and short > thickness * long
+    return SHAPE_WORDS["block"] if is_box else ()
 
 
 def _is_plural(text: str) -> bool:

@@ -36,23 +36,12 @@ def write_semantics(folder: Path, scene: SemanticScene, rows: Mapping[str, int])
     if sum(rows.values()) != len(scene.labels):
         message = f"{len(scene.labels)} labels for files with {dict(rows)} Gaussians."
         raise SemanticsError(message)
-    about = [_about(item, rows) for item in scene.instances]
-    table = {
-        "version": FORMAT_VERSION,
-        "source": scene.source,
-        "remark": scene.remark,
-        "rows": dict(rows),
-        "instances": about,
-    }
+    about = [about_item(item) | {"object": _object_of(item, rows)} for item in scene.instances]
+    known = {"source": scene.source, "remark": scene.remark, "instances": about}
+    table = {"version": FORMAT_VERSION, "rows": dict(rows)} | known
     path, coded = folder / SEMANTICS_FILE, np.frombuffer(json.dumps(table).encode(), dtype=np.uint8)
     write_npz(path, {"labels": scene.labels, "parts": _part_codes(scene), "about": coded})
-    return {
-        "file": SEMANTICS_FILE,
-        "sha256": provenance.hash_file(path),
-        "source": scene.source,
-        "remark": scene.remark,
-        "instances": about,
-    }
+    return {"file": SEMANTICS_FILE, "sha256": provenance.hash_file(path)} | known
 
 
 def _part_codes(scene: SemanticScene) -> UInt8[np.ndarray, " num_splats"]:
@@ -64,12 +53,12 @@ def _part_codes(scene: SemanticScene) -> UInt8[np.ndarray, " num_splats"]:
     return codes
 
 
-def _about(item: Instance, rows: Mapping[str, int]) -> dict[str, Any]:
+def about_item(item: Instance) -> dict[str, Any]:
+    """What is told and stored about one thing."""
     return {
         "id": item.id,
         "label": item.label,
         "name": item.name,
-        "object": _object_of(item, rows),
         "num_splats": int(item.mask.sum()),
         "score": round(item.score, 4),
         "source": item.source,
@@ -108,13 +97,11 @@ def read_semantics(folder: Path, rows: Mapping[str, int]) -> SemanticScene:
         if table["rows"] != dict(rows):
             message = f"made for files with {table['rows']} Gaussians, there are {dict(rows)}"
             raise ValueError(message)
+        for name, kind in (("labels", np.uint16), ("parts", np.uint8)):
+            if arrays[name].dtype != kind or arrays[name].shape != (sum(rows.values()),):
+                message = f"{name} of type {arrays[name].dtype} and shape {arrays[name].shape}"
+                raise ValueError(message)
         labels, codes = arrays["labels"], arrays["parts"]
-        if labels.dtype != np.uint16 or labels.shape != (sum(rows.values()),):
-            message = f"labels of type {labels.dtype} and shape {labels.shape}"
-            raise ValueError(message)
-        if codes.dtype != np.uint8 or codes.shape != labels.shape:
-            message = f"parts of type {codes.dtype} and shape {codes.shape}"
-            raise ValueError(message)
         instances = tuple(_instance(item, labels, codes) for item in table["instances"])
     except UnreadableArraysError as error:
         raise UnreadableSemanticsError(path=path, found=f"unreadable ({error.found})") from error

@@ -10,8 +10,6 @@ from twin.errors import TwinError
 
 UNKNOWN_SHAPE = "thing"
 """Word in labels for a shape that is no box, cylinder, ball or container."""
-
-
 NAMED = "task"
 """Source of an instance that is an object of the task."""
 

@@ -20,6 +20,11 @@ SHAPE_WORDS = {
     "thing": (),
 }  # fmt: skip
 """What a thing of a shape may be called."""
+HELD, HAND_M = ("book", "magazine", "card", "plate", "tablet", "apple", "orange", "dice", "brick",
+                "cup", "mug", "can", "bottle", "tube", "jar"), 0.45  # fmt: skip
+"""What a hand holds, and is not longer."""
+PURPOSES = ("recycling", "waste", "trash", "rubbish", "coffee", "tea", "office", "desk", "kitchen")
+"""Before a noun: what a thing is for, which its looks do not tell."""
 ROUND = ("bowl", "bucket", "cup", "mug", "pot")
 """Open containers that are called nothing else."""
 ANY_THING = ("thing", "object", "item", "stuff", "everything", "anything")
@@ -45,6 +50,8 @@ SAME_COLOURS = {
     "golden": "yellow", "gold": "yellow", "amber": "yellow",
     "chocolate": "brown", "magenta": "pink",
 }  # fmt: skip
+THINGS_TOO = ("orange", "lime", "olive", "chocolate", "cream", "ruby", "emerald", "gold")
+"""Colours that are things where nothing follows."""
 SAME_NOUNS = {
     "duckling": "duck", "ducky": "duck", "duckie": "duck", "plushie": "plush", "plushy": "plush",
     "hamper": "basket", "receptacle": "container", "vessel": "container", "pail": "bucket",
@@ -104,7 +111,7 @@ def shape_in(label: str) -> str | None:
     return max(ends, key=len, default=None)
 
 
-def names_of(label: str) -> set[str]:
+def names_of(label: str, longest_m: float = 0.0) -> set[str]:
     """Nouns that a label answers to: its own words, its kind, what its shape may be called.
 
     What somebody called a box is no mug, though both are open containers.
@@ -113,6 +120,7 @@ def names_of(label: str) -> set[str]:
     names = set(words) | set(ANY_THING) | set(KIND_NAMES[kind_of(label)])
     shape = shape_in(label)
     called = set(SHAPE_WORDS[shape] if shape is not None else ())
+    called -= set(HELD if longest_m > HAND_M else ())
     if shape == "open container" and words[-1] != "container":
         called -= set(ROUND)
     return names | called

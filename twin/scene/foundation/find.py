@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt16
 
 from bridge.episode.run_folder import RunFolder
-from bridge.geometry import se3
 from twin.naming.phrases import Answer, Found, Meaning
-from twin.naming.scene_file import BACKGROUND_KEY, read_semantics, read_vectors
+from twin.naming.scene_file import BACKGROUND_KEY, about_item, read_semantics, read_vectors
 from twin.naming.things import SemanticScene, SemanticsError
 from twin.scene.foundation.models import ClipEmbedder
 from twin.scene.foundation.stage import training_frames, viewpoint_of
@@ -134,18 +133,8 @@ def viewed(
 
 def about(found: Found) -> dict[str, Any]:
     """What is told about one thing or part."""
-    item = found.item
-    return {
-        "id": item.id,
-        "label": item.label,
-        "part": found.part,
-        "score": round(found.score, 3),
-        "source": item.source,
-        "T_base_instance": se3.pose_record(item.T_base_instance),
-        "size_m": list(item.size_m),
-        "num_splats": int(found.mask.sum()),
-        "parts": list(item.parts),
-    }
+    own = {"part": found.part, "score": round(found.score, 3), "num_splats": int(found.mask.sum())}
+    return about_item(found.item) | own
 
 
 def line_of(number: int, found: Found) -> str:

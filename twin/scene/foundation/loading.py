@@ -198,14 +198,11 @@ class Network:
             raise self.kind.refuse(folder, told) from error
 
     def _loaded(self, transformers: Any, folder: Path) -> Any:
-        model_class = getattr(transformers, self.kind.class_name, None)
+        kind, version = self.kind, transformers.__version__
+        model_class = getattr(transformers, kind.class_name, None)
         if model_class is None:
-            package = (
-                f"a transformers with {self.kind.class_name} (found {transformers.__version__})"
-            )
-            raise MissingDependencyError(
-                package=package, extra="foundation", purpose=self.kind.name
-            )
+            package = f"a transformers with {kind.class_name} (found {version})"
+            raise MissingDependencyError(package=package, extra="foundation", purpose=kind.name)
         strict = importlib.import_module("huggingface_hub.errors").StrictDataclassError
         try:
             model, report = model_class.from_pretrained(

@@ -120,9 +120,8 @@ class ClipEmbedder(Network):
             masks: Of the same sizes, none empty; at least one.
         """
         ground = np.rint(np.array(self._normalisation[0]) * 255.0).astype(np.uint8)
-        crops = [
-            masked_crop(image, mask, ground) for image, mask in zip(images_u8, masks, strict=True)
-        ]
+        pairs = zip(images_u8, masks, strict=True)
+        crops = [masked_crop(image, mask, ground) for image, mask in pairs]
         side = int(self._model.config.vision_config.image_size)
         pixels = self._pixels(crops, (side, side), "bicubic")
         with import_torch().inference_mode():

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from bridge.terminal import Advance
-from twin.naming.colours import colour_name
+from twin.naming.colours import colour_name, main_colour
 from twin.naming.things import NAMED, Instance, Mask, SemanticScene
 from twin.naming.words import kind_of, label_of
 from twin.scene.frames.rgbd import NEAR_M
@@ -252,7 +252,7 @@ def describe(
     p = cloud.means_m[ids].astype(np.float64)
     up = np.array([0.0, 0.0, _ground_m(p, plane)])
     measured = measure_shape(p - up, CELL_M)
-    color = np.clip(np.rint(np.median(cloud.colors[ids], axis=0) * 255), 0, 255)
+    color = np.clip(np.rint(main_colour(cloud.colors[ids]) * 255), 0, 255)
     label = item.label
     if key:
         is_open = measured.cavity is not None

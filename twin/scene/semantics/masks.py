@@ -153,10 +153,8 @@ def _named(
 ) -> dict[str, Any]:
     """What most of its masks are called, and how sure they are."""
     names: dict[str, float] = defaultdict(float)
-    scores = []
-    for frame, column in members:
-        score = observations[frame].scores[column]
+    scores = [observations[frame].scores[column] for frame, column in members]
+    for (frame, column), score in zip(members, scores, strict=True):
         names[observations[frame].labels[column]] += score
-        scores.append(score)
     label = max(sorted(names), key=lambda name: names[name])
     return {"label": label, "score": float(np.mean(scores))}

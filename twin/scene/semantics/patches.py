@@ -111,16 +111,6 @@ def _means_of(
     return np.asarray(sums / np.bincount(group)[:, None])
 
 
-def neighbour_pairs(
-    p_m: Float[np.ndarray, "num_voxels 3"], reach_m: float
-) -> Int[np.ndarray, "num_pairs 2"]:
-    """Pairs of points nearer than a distance, each once."""
-    if len(p_m) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    pairs = cKDTree(p_m).query_pairs(reach_m, output_type="ndarray")
-    return np.asarray(pairs, dtype=np.int64)
-
-
 def cut_into_patches(
     points: SurfacePoints,
     voxel_m: float,
@@ -137,7 +127,7 @@ def cut_into_patches(
     if voxel_m > MAX_VOXEL_M or not len(points):
         return labels
     voxels = make_voxels(points, voxel_m)
-    pairs = neighbour_pairs(voxels.p_m, REACH_VOXELS * voxel_m)
+    pairs = cKDTree(voxels.p_m).query_pairs(REACH_VOXELS * voxel_m, output_type="ndarray")
     if len(voxels) < MIN_VOXELS or not len(pairs):
         return labels
     p_m, max_size_m = voxels.p_m, furniture * MAX_SIZE_M
@@ -178,9 +168,9 @@ def _smoothed(
 ) -> tuple[Float[np.ndarray, "num_voxels 3"], Float[np.ndarray, "num_voxels 3"]]:
     """Normals and colours averaged over neighbours that face the same way and look alike."""
     normals, colour = voxels.normals, voxels.colour
-    pairs, itself = neighbour_pairs(voxels.p_m, 2.6 * voxel_m), np.arange(len(voxels))
-    a = np.concatenate([pairs[:, 0], pairs[:, 1], itself])
-    b = np.concatenate([pairs[:, 1], pairs[:, 0], itself])
+    left, right = cKDTree(voxels.p_m).query_pairs(2.6 * voxel_m, output_type="ndarray").T
+    itself = np.arange(len(voxels))
+    a, b = (np.concatenate(each) for each in ([left, right, itself], [right, left, itself]))
     for _ in range(2):
         alike = np.clip((normals[a] * normals[b]).sum(axis=1), 0.0, 1.0) ** 4
         gap = np.linalg.norm(colour[a] - colour[b], axis=1) / COLOUR_GAP
@@ -352,9 +342,10 @@ def _smallest_part(
 ) -> tuple[int, int] | None:
     """The smallest piece that is part of a neighbour of its colour, and that neighbour."""
     counts, links = np.bincount(pieces), pieces[pairs]
-    for piece in np.argsort(counts, kind="stable"):
+    links = links[links[:, 0] != links[:, 1]]
+    for piece in sorted(np.unique(links), key=lambda number: counts[number]):
         own = pieces == piece
-        mine = links[(links == piece).sum(axis=1) == 1]
+        mine = links[(links == piece).any(axis=1)]
         others, strength = np.unique(mine[mine != piece], return_counts=True)
         alike = [_colour_gap(own, pieces == other, colour) < MIN_COLOUR_GAP for other in others]
         others, strength = others[alike], strength[alike]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from twin.naming.colours import colour_name, lab_from_srgb, without_shading
+from twin.naming.colours import colour_name, lab_from_srgb, main_colour, without_shading
 from twin.scene.semantics.patches import cut_into_patches, within_outline
 from twin.scene.semantics.points import SurfacePoints
 from twin.scene.semantics.shape_descriptors import measure_shape
@@ -40,8 +40,6 @@ SAME_IOU = 0.6
 """Two things are one when they share this much of their union."""
 MAX_TAKEN = 0.3
 """Share of a thing that a stabler one may have."""
-
-
 ROUGHNESS_FACTOR = 3.0
 """Things are higher over the plane than so many times its roughness, as it was measured."""
 FINEST_VOXEL_M, WALL_VOXEL_M = 0.004, 0.008
@@ -78,6 +76,10 @@ class Segmentation:
     remark: str
     """Why nothing was found; empty otherwise."""
 
+
+FACES_DOWN, MOSTLY, LAYER_M = -0.3, 1 / 3, 0.02
+"""z of normals that a camera above seldom sees, and the share of a layer of a thing from which it
+is the thing's image in a shining floor."""
 
 Look = tuple[Int[np.ndarray, " num_points"], float]
 """What belongs together, seen with voxels of one size: index of each point's thing plus one, the
@@ -186,7 +188,18 @@ class WithoutPlane:
 
     def look(self, scale: float) -> Look:
         """Cut them, with voxels so many times as large as their spacing asks for."""
-        return _largest_first(cut_into_patches(self._points, scale * self._voxel_m)), WALL_VOXEL_M
+        labels = _largest_first(cut_into_patches(self._points, scale * self._voxel_m))
+        for number in range(1, int(labels.max(initial=0)) + 1):
+            labels[self._mirrored(np.flatnonzero(labels == number))] = 0
+        return labels, WALL_VOXEL_M
+
+    def _mirrored(self, ids: Int[np.ndarray, " num_mine"]) -> Int[np.ndarray, " num_mirrored"]:
+        """Of a thing's points those that metal under it mirrors: its lowest layers face down."""
+        height = self._points.p_m[ids, 2]
+        layer = ((height - height.min()) / LAYER_M).astype(np.int64)
+        down = self._points.normals[ids, 2] < FACES_DOWN
+        count, num_down = np.bincount(layer), np.bincount(layer, weights=down)
+        return np.asarray(ids[layer < int(np.argmax(num_down < MOSTLY * count))])
 
     def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
         """Describe the points of one thing."""
@@ -264,6 +277,5 @@ def _thing(
 ) -> Thing:
     xyh = np.concatenate([points.p_m[:, :2], height_m[:, None]], axis=1)
     shape = measure_shape(xyh, voxel_m, rough=rough)
-    color = np.median(points.colors, axis=0).astype(np.float64)
     score = _firmness(height_m, least_m)
-    return Thing(label=f"{colour_name(color)} {shape.word}", score=score)
+    return Thing(label=f"{colour_name(main_colour(points.colors))} {shape.word}", score=score)

@@ -242,8 +242,6 @@ MIN_HANDLE = 0.012
 """Share of the points; less is noise at a rim or a foot."""
 MIN_SHARE = 0.005
 """A part has at least this share of the points."""
-
-
 RIM, FLOOR, HANDLE = 0.1, 0.12, 0.08
 """Rim is what is this near to the rim's height, floor the lowest of the cavity's depth, handle what
 stands this much above the rim; shares of the height, or of the depth."""
@@ -274,11 +272,10 @@ def _container(
     span = RIM * cavity.rim_m
     margin = max(HANDLE * cavity.rim_m, heights.cell_m)
     wall = heights.top_m[heights.footprint & ~cavity.mask]
-    if (wall > cavity.rim_m + margin).mean() > MAX_HANDLE:
-        handle = np.zeros(len(xyh_m), dtype=bool)  # the rim is that high, but for a low place
-    else:
-        handle = (height > cavity.rim_m + margin) & (top_m > cavity.rim_m + 2 * margin)
-    handle |= _sticking_out(xyh_m, heights, cavity)
+    handle = _sticking_out(xyh_m, heights, cavity)
+    is_rim = (wall > cavity.rim_m + margin).mean() > MAX_HANDLE  # that high, but for a low place
+    if not is_rim and top_m > cavity.rim_m + 2 * margin:
+        handle |= height > cavity.rim_m + margin
     if handle.sum() < MIN_HANDLE * len(xyh_m):
         handle = np.zeros_like(handle)  # a ragged rim
     thick = max(FLOOR * depth, 0.004)

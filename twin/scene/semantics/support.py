@@ -23,8 +23,6 @@ from twin.scene.semantics.points import SurfacePoints
 
 UP = np.array([0.0, 0.0, 1.0])
 """Against gravity in the root frame of a robot cell."""
-
-
 MAX_TILT_RAD = 0.14
 """From level: poses may be wrong by a few degrees, a ramp is no table."""
 TOLERANCE_M = 0.006

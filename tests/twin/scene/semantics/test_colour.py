@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from skimage.color import rgb2lab
 
-from twin.naming.colours import COLOUR_NAMES, colour_name, lab_from_srgb
+from twin.naming.colours import COLOUR_NAMES, colour_name, lab_from_srgb, main_colour, near_colours
 
 
 @pytest.mark.parity
@@ -46,3 +46,16 @@ def test_people_would_agree_with_the_name(rgb: tuple[int, int, int], name: str) 
 def test_every_colour_has_a_name() -> None:
     for color in np.random.default_rng(1).uniform(size=(300, 3)):
         assert colour_name(color) in COLOUR_NAMES
+
+
+def test_a_thing_has_the_colour_of_its_colourful_part_unless_that_has_many() -> None:
+    frame, seat, hues = np.full((61, 3), 0.9), np.array([0.6, 0.7, 0.1]), 0.8 * np.eye(3)
+    np.testing.assert_allclose(main_colour(np.concatenate([frame, np.tile(seat, (30, 1))])), seat)
+    np.testing.assert_allclose(main_colour(np.concatenate([frame, np.tile(hues, (20, 1))])), 0.9)
+    np.testing.assert_allclose(main_colour(np.concatenate([frame, seat[None]])), 0.9)
+
+
+def test_grey_is_white_in_other_light_and_beige_only_in_light_of_another_hue() -> None:
+    in_light, near = near_colours((186, 172, 151))
+    assert "white" in near_colours((185, 189, 195))[0]
+    assert "white" in near - in_light

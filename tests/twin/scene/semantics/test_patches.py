@@ -47,6 +47,10 @@ PARCEL = [
     face([0, -0.2, 0.1], [0.1, 0, 0], [0, 0, 0.14], RED),
 ]
 """A box whose back is against the wall."""
+BEHIND = WALL.take(
+    ~((np.abs(WALL.p_m[:, 1] + 0.14) < 0.06) & (np.abs(WALL.p_m[:, 2] - 0.17) < 0.07))
+)
+"""What it leaves of the wall."""
 POSTER = face([0.0015, 0.05, 0.15], [0, 0.2, 0], [0, 0, 0.15], BLUE)
 
 
@@ -56,18 +60,23 @@ def share(labels: np.ndarray, mine: np.ndarray) -> float:
 
 
 def test_a_box_against_a_wall_is_a_thing_and_a_poster_on_it_is_none() -> None:
-    wall = WALL.take(
-        ~((np.abs(WALL.p_m[:, 1] + 0.14) < 0.06) & (np.abs(WALL.p_m[:, 2] - 0.17) < 0.07))
-    )
-    points = together(wall, *PARCEL, POSTER)
+    points = together(BEHIND, *PARCEL, POSTER)
     is_parcel = np.zeros(len(points), dtype=bool)
-    is_parcel[len(wall) : len(points) - len(POSTER)] = True
+    is_parcel[len(BEHIND) : len(points) - len(POSTER)] = True
     labels = cut_into_patches(points, VOXEL_M)
     assert labels.max() == 1
     assert share(labels, is_parcel) > 0.85
     found = segment(points)
     assert found.plane is None
     assert [thing.label.split()[0] for thing in found.things] == ["red"]
+
+
+def test_the_image_of_a_box_in_a_shining_floor_is_no_part_of_it() -> None:
+    image = face([0.1, -0.2, 0.1], [-0.08, 0, -0.08], [0, 0.12, 0], RED)
+    is_parcel = np.repeat([False, True, False], [len(BEHIND), sum(map(len, PARCEL)), len(image)])
+    points = together(BEHIND, *PARCEL, image)
+    assert share(cut_into_patches(points, VOXEL_M), is_parcel) < 0.8
+    assert share(segment(points).labels, is_parcel) > 0.9
 
 
 def test_a_box_of_the_colour_of_the_wall_is_part_of_it() -> None:
