@@ -32,6 +32,8 @@ GRID_PX = np.mgrid[-REACH_PX : REACH_PX + 1, -REACH_PX : REACH_PX + 1][::-1].res
 MOST_EDGES = 3000
 JUMP = 0.06
 """Depths of neighbours that differ by more than this share are of two surfaces."""
+GAP_PX = 7
+"""Gaps in depth so wide, at half size, are the shadow of what is near, on what is behind."""
 LEAST_GAIN = 1.08
 """So many times as strong an agreement of edges says that something else is true."""
 SURE = 3.0
@@ -117,8 +119,8 @@ def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
     wider = [_peak(half[:, 1])[0] - _peak(half[:, 0])[0] for half in (sides[::2], sides[1::2])]
     sure = abs(wider[0] - wider[1]) <= SAME_PEAK_PX and abs(sum(wider)) >= 4 * SHIFT_PX
     if sure and sides.mean(axis=0).max(axis=1).sum() > here:
-        times = 1 + sum(wider) / views[0].half.camera.width
-        return [f"its colour is {times:.2f} x as large as its depth has it: a focal length"]
+        word = "larger" if sum(wider) > 0 else "smaller"
+        return [f"its colour is {word} than its depth has it: a wrong focal length"]
     x, y = 2 * _peak(each)
     if _is_sure(each) and maps.max() > here and np.hypot(x, y) >= 2 * SHIFT_PX:
         return [
@@ -158,10 +160,10 @@ def _meeting(
     target = view.half
     edges = ndimage.gaussian_gradient_magnitude(turn(_grey(target)), 1.0)
     edges = np.minimum(edges / max(float(np.quantile(edges, 0.9)), 1e-6), 1.0)
-    near, far = (
-        find(target.depth_m, footprint=[[1, 1], [1, 0]], origin=-1)
-        for find in (ndimage.minimum_filter, ndimage.maximum_filter)
-    )
+    behind_m = ndimage.maximum_filter(target.depth_m, GAP_PX)
+    depth_m = np.where(target.depth_m > 0, target.depth_m, behind_m)
+    near = ndimage.minimum_filter(depth_m, footprint=[[1, 1], [1, 0]], origin=-1)
+    far = ndimage.maximum_filter(depth_m, footprint=[[1, 1], [1, 0]], origin=-1)
     rows, columns = np.nonzero((near > 0) & (far - near > JUMP * near))
     thinner = max(1, len(rows) // MOST_EDGES)
     rows, columns = rows[::thinner], columns[::thinner]
@@ -169,8 +171,7 @@ def _meeting(
     margin = int(np.abs(steps).max())
     edges = np.pad(edges, margin, mode="reflect")
     found = np.array([edges[rows + y + margin, columns + x + margin] for x, y in steps])
-    both = [found[:, side].sum(axis=1) for side in (~right, right)]
-    return np.array(both) / max(len(rows), 1)
+    return np.array([found[:, side].sum(axis=1) for side in (~right, right)]) / max(len(rows), 1)
 
 
 def _blur(views: Sequence[TrainingView]) -> list[str]:
