@@ -33,7 +33,7 @@ def event_words(event: Mapping[str, Any]) -> tuple[str, str]:
     parts = [str(event[name]) for name in ("stage_id", "plan_id", "text") if event.get(name)]
     for name in ("outcome", "data"):
         if event.get(name):
-            parts.append(", ".join(f"{key} {value}" for key, value in event[name].items()))
+            parts += [", ".join(f"{k} {v}" for k, v in event[name].items() if v not in ("", None))]
     return str(event["type"]).replace("_", " "), " · ".join(parts)
 
 
