@@ -109,8 +109,8 @@ def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
     ])  # fmt: skip
     best, *parts = (int(part.mean(axis=0).argmax()) for part in (late, late[::2], late[1::2]))
     gain = late[:, best] - late[:, len(DELAYS_S) // 2]
-    delay_s, apart_s = float(DELAYS_S[best]), abs(float(np.diff(DELAYS_S[parts])[0]))
-    sure = abs(delay_s) >= LATE_S and apart_s * np.median(np.hypot(*flows.T)) <= SAME_PEAK_PX
+    delay_s, differ_s = float(DELAYS_S[best]), abs(float(np.diff(DELAYS_S[parts])[0]))
+    sure = abs(delay_s) >= LATE_S and differ_s * np.median(np.hypot(*flows.T)) <= SAME_PEAK_PX
     sure &= gain.mean() > SURE * gain.std() / np.sqrt(len(gain))
     if sure and late[some, best].mean() > maps.max():
         word = "later" if delay_s > 0 else "earlier"
@@ -171,7 +171,7 @@ def _meeting(
     margin = int(np.abs(steps).max())
     edges = np.pad(edges, margin, mode="reflect")
     found = np.array([edges[rows + y + margin, columns + x + margin] for x, y in steps])
-    return np.array([found[:, side].sum(axis=1) for side in (~right, right)]) / max(len(rows), 1)
+    return np.stack([~right, right]).astype(found.dtype) @ found.T / max(len(rows), 1)
 
 
 def _blur(views: Sequence[TrainingView]) -> list[str]:
