@@ -171,7 +171,7 @@ def _meeting(
     margin = int(np.abs(steps).max())
     edges = np.pad(edges, margin, mode="reflect")
     found = np.array([edges[rows + y + margin, columns + x + margin] for x, y in steps])
-    return np.stack([~right, right]).astype(found.dtype) @ found.T / max(len(rows), 1)
+    return np.asarray(np.stack([~right, right]).astype(found.dtype) @ found.T) / max(len(rows), 1)
 
 
 def _blur(views: Sequence[TrainingView]) -> list[str]:
