@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from bridge.geometry import se3
+from twin.scene.dataset.geometry_search import PoseAt
 from twin.scene.frames.downscaled import pixels_of
 from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.frames.selection import spread
@@ -27,11 +28,18 @@ TURNED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 REACH_PX = 14
 """Edges are looked for this far from where depth has them, at half size."""
+GRID_PX = np.mgrid[-REACH_PX : REACH_PX + 1, -REACH_PX : REACH_PX + 1][::-1].reshape(2, -1).T
 MOST_EDGES = 3000
 JUMP = 0.06
 """Depths of neighbours that differ by more than this share are of two surfaces."""
+GAP_PX = 7
+"""Gaps in depth so wide, at half size, are the shadow of what is near, on what is behind."""
 LEAST_GAIN = 1.08
 """So many times as strong an agreement of edges says that something else is true."""
+SURE = 3.0
+"""A delay must gain so many times what the views' differences leave open."""
+SAME_PEAK_PX = 2
+"""Halves of the views that say the same differ by no more, at half size."""
 SHIFT_PX, LATE_S = 2.0, 0.015
 """Less, at half size, is what cameras and their calibrations do."""
 DELAYS_S = np.arange(-0.2, 0.2001, 0.005)
@@ -64,9 +72,7 @@ class _Step(NamedTuple):
     """Mean difference of the two images, in levels."""
 
 
-def check_colour(
-    views: Sequence[TrainingView], pose_at: Callable[[int], Float[np.ndarray, "4 4"]]
-) -> list[str]:
+def check_colour(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
     """What is wrong with the images of one moving camera, one remark each.
 
     Args:
@@ -83,32 +89,40 @@ def _grey(target: Target) -> Float[np.ndarray, "height width"]:
     return np.asarray(target.planes_u8.mean(axis=0, dtype=np.float32))
 
 
-def _edges(
-    views: Sequence[TrainingView], pose_at: Callable[[int], Float[np.ndarray, "4 4"]]
-) -> list[str]:
-    """Shift, delay or turn of colour against depth, whichever makes edges meet.
+def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
+    """Shift, delay, size or turn of colour against depth, whichever makes edges meet.
 
     Said only where two halves of the views say the same.
     """
-    some = [views[k] for k in spread(np.arange(len(views)), EDGE_VIEWS)]
-    each = np.stack([_meeting(view, np.asarray) for view in some])
-    maps, middle = each.mean(axis=0), REACH_PX
+    some = spread(np.arange(len(views)), EDGE_VIEWS)
+    sides = np.stack([_meeting(views[k], np.asarray, GRID_PX) for k in some])
+    each = sides.sum(axis=1)
+    maps = each.mean(axis=0)
     for word, turn in TURNED.items():
-        turned = np.stack([_meeting(view, turn) for view in some])
+        turned = np.stack([_meeting(views[k], turn, GRID_PX).sum(axis=0) for k in some])
         if _is_sure(turned) and turned.mean(axis=0).max() > LEAST_GAIN**2 * maps.max():
             return [f"its colour images are {word} to its depth"]
-    here = float(maps[middle - 1 : middle + 2, middle - 1 : middle + 2].max())
-    flows = np.array([_flow_px_s(view, pose_at) for view in some])
-    late = np.array([_along(each, flows * delay) for delay in DELAYS_S])
-    delays = [float(DELAYS_S[int(late[:, k::2].mean(axis=1).argmax())]) for k in (0, 1)]
-    delay_s, most = float(np.mean(delays)), float(late.mean(axis=1).max())
-    sure = abs(delays[0] - delays[1]) <= 2 * LATE_S and abs(delay_s) >= LATE_S
-    if sure and most > LEAST_GAIN * here and most > maps.max():
+    flows = np.array([_flow_px_s(view, pose_at) for view in views])
+    late = np.stack([
+        _meeting(view, np.asarray, DELAYS_S[:, None] * flow).sum(axis=0)
+        for view, flow in zip(views, flows, strict=True)
+    ])  # fmt: skip
+    best, *parts = (int(part.mean(axis=0).argmax()) for part in (late, late[::2], late[1::2]))
+    gain = late[:, best] - late[:, len(DELAYS_S) // 2]
+    delay_s, differ_s = float(DELAYS_S[best]), abs(float(np.diff(DELAYS_S[parts])[0]))
+    sure = abs(delay_s) >= LATE_S and differ_s * np.median(np.hypot(*flows.T)) <= SAME_PEAK_PX
+    sure &= gain.mean() > SURE * gain.std() / np.sqrt(len(gain))
+    if sure and late[some, best].mean() > maps.max():
         word = "later" if delay_s > 0 else "earlier"
         return [f"its colour was taken {1e3 * abs(delay_s):.0f} ms {word} than its depth"]
-    shift = _peak(maps)
-    if _is_sure(each) and maps.max() > LEAST_GAIN * here and np.hypot(*shift) >= SHIFT_PX:
-        x, y = 2 * shift
+    here = LEAST_GAIN * float(maps[np.abs(GRID_PX).max(axis=1) <= 1].max())
+    wider = [_peak(half[:, 1])[0] - _peak(half[:, 0])[0] for half in (sides[::2], sides[1::2])]
+    sure = abs(wider[0] - wider[1]) <= SAME_PEAK_PX and abs(sum(wider)) >= 4 * SHIFT_PX
+    if sure and sides.mean(axis=0).max(axis=1).sum() > here:
+        word = "larger" if sum(wider) > 0 else "smaller"
+        return [f"its colour is {word} than its depth has it: a wrong focal length"]
+    x, y = 2 * _peak(each)
+    if _is_sure(each) and maps.max() > here and np.hypot(x, y) >= 2 * SHIFT_PX:
         return [
             f"its colour lies ({x:+.0f}, {y:+.0f}) pixels beside its depth: principal point, or "
             "how the two were registered"
@@ -118,24 +132,15 @@ def _edges(
 
 def _is_sure(each: np.ndarray) -> bool:
     """Whether both halves of the views have their peak at one place."""
-    return bool(np.abs(_peak(each[::2].mean(axis=0)) - _peak(each[1::2].mean(axis=0))).max() <= 2)
+    return bool(np.abs(_peak(each[::2]) - _peak(each[1::2])).max() <= SAME_PEAK_PX)
 
 
-def _peak(found: np.ndarray) -> Float[np.ndarray, "2"]:
-    """Where a map is highest, right and down of its middle."""
-    row, column = np.unravel_index(int(found.argmax()), found.shape)
-    return np.array([column - REACH_PX, row - REACH_PX], dtype=np.float64)
+def _peak(each: np.ndarray) -> Float[np.ndarray, "2"]:
+    """Where the mean of views' maps is highest, right and down of its middle."""
+    return np.asarray(GRID_PX[int(each.mean(axis=0).argmax())], dtype=np.float64)
 
 
-def _along(each: np.ndarray, places: np.ndarray) -> Float[np.ndarray, " num_views"]:
-    """The views' maps, each at its own place."""
-    index = np.clip(np.rint(places).astype(int) + REACH_PX, 0, 2 * REACH_PX)
-    return np.asarray(each[np.arange(len(each)), index[:, 1], index[:, 0]])
-
-
-def _flow_px_s(
-    view: TrainingView, pose_at: Callable[[int], Float[np.ndarray, "4 4"]]
-) -> Float[np.ndarray, "2"]:
+def _flow_px_s(view: TrainingView, pose_at: PoseAt) -> Float[np.ndarray, "2"]:
     """How fast what a camera sees runs through its half-size image [px/s]."""
     target = view.half
     p = target.camera.unproject(target.depth_m)[target.depth_m > 0][::50]
@@ -149,31 +154,24 @@ def _flow_px_s(
 
 
 def _meeting(
-    view: TrainingView, turn: Callable[[np.ndarray], np.ndarray]
-) -> Float[np.ndarray, "num_rows num_columns"]:
-    """How strong an image's edges are at depth's, for each shift of the image."""
+    view: TrainingView, turn: Callable[[np.ndarray], np.ndarray], shifts_px: np.ndarray
+) -> Float[np.ndarray, "2 num_shifts"]:
+    """How strong an image's edges are at depth's in its left and right half, for each shift."""
     target = view.half
-    grey = turn(_grey(target))
-    edges = ndimage.gaussian_gradient_magnitude(grey, 1.0)
+    edges = ndimage.gaussian_gradient_magnitude(turn(_grey(target)), 1.0)
     edges = np.minimum(edges / max(float(np.quantile(edges, 0.9)), 1e-6), 1.0)
-    depth, jumps = target.depth_m, np.zeros(grey.shape, dtype=np.float32)
-    for axis in (0, 1):
-        near, far = (
-            np.moveaxis(depth, axis, 0)[part] for part in (slice(None, -1), slice(1, None))
-        )
-        known = (near > 0) & (far > 0)
-        jump = known & (np.abs(near - far) > JUMP * np.minimum(near, far))
-        np.moveaxis(jumps, axis, 0)[:-1] += jump
-    rows, columns = np.nonzero(jumps)
-    inside = (rows >= REACH_PX) & (rows < len(grey) - REACH_PX)
-    inside &= (columns >= REACH_PX) & (columns < grey.shape[1] - REACH_PX)
-    thinner = max(1, int(inside.sum()) // MOST_EDGES)
-    rows, columns = rows[inside][::thinner], columns[inside][::thinner]
-    steps = np.arange(-REACH_PX, REACH_PX + 1)
-    if not len(rows):
-        return np.zeros((len(steps), len(steps)))
-    found = [[edges[rows + down, columns + right].mean() for right in steps] for down in steps]
-    return np.array(found)
+    behind_m = ndimage.maximum_filter(target.depth_m, GAP_PX)
+    depth_m = np.where(target.depth_m > 0, target.depth_m, behind_m)
+    near = ndimage.minimum_filter(depth_m, footprint=[[1, 1], [1, 0]], origin=-1)
+    far = ndimage.maximum_filter(depth_m, footprint=[[1, 1], [1, 0]], origin=-1)
+    rows, columns = np.nonzero((near > 0) & (far - near > JUMP * near))
+    thinner = max(1, len(rows) // MOST_EDGES)
+    rows, columns = rows[::thinner], columns[::thinner]
+    right, steps = columns >= edges.shape[1] // 2, np.rint(shifts_px).astype(int)
+    margin = int(np.abs(steps).max())
+    edges = np.pad(edges, margin, mode="reflect")
+    found = np.array([edges[rows + y + margin, columns + x + margin] for x, y in steps])
+    return np.asarray(np.stack([~right, right]).astype(found.dtype) @ found.T) / max(len(rows), 1)
 
 
 def _blur(views: Sequence[TrainingView]) -> list[str]:

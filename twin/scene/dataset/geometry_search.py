@@ -101,7 +101,7 @@ def search_geometry(
         images: Small depth images of one moving camera in time order, with poses as recorded.
         pose_at: Where the camera was at other instants; None: no delay is looked for.
     """
-    pairs = _pairs([_thinned(image) for image in images])
+    pairs = _pairs(images)
     if len(pairs) < 3:
         return None
     recorded = _agreement(pairs)
@@ -129,7 +129,7 @@ def search_geometry(
 
 @dataclass(frozen=True, kw_only=True)
 class _Pair:
-    """Points of one image and the depth of another."""
+    """Some points of one image and all depth of another."""
 
     first: DownscaledDepth
     second: DownscaledDepth
@@ -137,11 +137,13 @@ class _Pair:
     def agreement(self, depth: float, focal: float) -> tuple[float, float]:
         """Share of the overlap that agrees, and the overlap."""
         T_second_first = se3.invert(self.second.T_base_depth) @ self.first.T_base_depth
-        first = self.first.camera
-        camera = replace(first, fx=first.fx * focal, fy=first.fy * focal)
+        first, second = (
+            replace(image.camera, fx=image.camera.fx * focal, fy=image.camera.fy * focal)
+            for image in (self.first, self.second)
+        )
         z = depth * self.first.depth_m.astype(np.float64)
-        p = se3.apply(T_second_first, camera.unproject(z)[z > 0])
-        row, column, inside = pixels_of(camera, p)
+        p = se3.apply(T_second_first, first.unproject(z)[z > 0])
+        row, column, inside = pixels_of(second, p)
         measured = depth * self.second.depth_m[row[inside], column[inside]]
         met = measured > 0
         if not met.any():
@@ -207,7 +209,7 @@ def _climbed(
 def _pairs(images: Sequence[DownscaledDepth]) -> list[_Pair]:
     """Pairs near in time and farther apart, so that small and large motions count."""
     pairs = [
-        _Pair(first=images[start], second=images[start + gap])
+        _Pair(first=_thinned(images[start]), second=images[start + gap])
         for gap in GAPS
         for start in range(len(images) - gap)
         if images[start].depth_m.any() and images[start + gap].depth_m.any()

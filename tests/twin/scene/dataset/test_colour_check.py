@@ -15,8 +15,7 @@ from bridge.geometry.camera import Camera
 from twin.scene.dataset.colour_check import check_colour
 from twin.scene.frames.rgbd import Target, TrainingView
 
-STEP_NS, WALL_M, CARD_M = 100_000_000, 2.0, 1.2
-COUNT = 24
+STEP_NS, COUNT, WALL_M, CARD_M = 100_000_000, 24, 2.0, 1.2
 CARDS = np.random.default_rng(4).uniform((-1.1, -0.5), (0.9, 0.4), (14, 2))
 """Upper left corners of cards of 0.22 m x 0.16 m [m]."""
 GRAIN = gaussian_filter(np.random.default_rng(5).normal(0, 1, (400, 400)), 1.0)
@@ -32,10 +31,7 @@ def pose_at(stamp_ns: int) -> np.ndarray:
 @cache
 def drawn(stamp_ns: int, factor: int) -> tuple[np.ndarray, np.ndarray, Camera]:
     """Grey planes, depth and camera, at full size or half of it."""
-    camera = Camera(
-        width=240 // factor, height=180 // factor, fx=200 / factor, fy=200 / factor,
-        cx=120 / factor, cy=90 / factor,
-    )  # fmt: skip
+    camera = Camera(width=240, height=180, fx=200.0, fy=200.0, cx=120.0, cy=90.0).scaled(1 / factor)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy], axis=-1)
     at = pose_at(stamp_ns)[:2, 3]
@@ -68,11 +64,15 @@ def views_of(
     return [view_of(k, colour_ns(k), paint(k)) for k in range(COUNT)]
 
 
+def enlarged(planes: np.ndarray, _factor: int) -> np.ndarray:
+    inner = [((np.arange(n) - n / 2) / 1.1 + n / 2).astype(int) for n in planes.shape[1:]]
+    return planes[:, inner[0][:, None], inner[1]]
+
+
 def with_a_pose_off() -> list[TrainingView]:
     views = views_of()
-    T = views[9].T_base_color.copy()
-    T[:3, 3] += [0.3, 0.1, 0.2]
-    views[9] = replace(views[9], T_base_color=T)
+    away = np.outer([0.3, 0.1, 0.2, 0.0], [0.0, 0.0, 0.0, 1.0])
+    views[9] = replace(views[9], T_base_color=views[9].T_base_color + away)
     return views
 
 
@@ -89,6 +89,7 @@ def test_a_good_scan_has_none() -> None:
             lambda: views_of(paint=lambda _: lambda p, f: np.roll(p, 12 // f, axis=2)),
             "lies (+12, +0) pixels beside its depth",
         ),
+        (lambda: views_of(paint=lambda _: enlarged), "its colour is larger than its depth"),
         (lambda: views_of(paint=lambda _: lambda p, _: p[:, ::-1, ::-1]), "are upside down"),
         (lambda: views_of(paint=lambda _: lambda p, _: p[:, :, ::-1]), "are mirrored"),
         (
